@@ -1,0 +1,1 @@
+from ._pd import PD as PD, place_pd as place_pd

@@ -1,0 +1,9 @@
+from ._excitation import Excitation as Excitation
+from ._guidelines import (
+    check_guidelines as check_guidelines,
+    Guideline as Guideline,
+    Guidelines as Guidelines,
+)
+from ._multisine import harmonics as harmonics, multisine as multisine
+from ._pulse import doublet as doublet, three_two_one_one as three_two_one_one
+from ._sweep import sweep as sweep, sweep_frequency as sweep_frequency

@@ -1,0 +1,86 @@
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ._checks import check_positive, Number, whole_samples
+from ._excitation import Excitation, Kind
+
+
+def doublet(
+    *,
+    width: Number,
+    amplitude: Number,
+    sample_rate: Number,
+    lead: Number = 1.0,
+    tail: Number = 3.0,
+) -> Excitation:
+    """Up for `width` (s), down for as long: no net input, for verification of a model.
+
+    `lead` and `tail` (s) of zeros stand before and after. All are whole numbers of samples, or
+    ValueError is raised.
+    """
+    return _pulses("doublet", [1, -1], width, amplitude, sample_rate, lead, tail)
+
+
+def three_two_one_one(
+    *,
+    width: Number,
+    amplitude: Number,
+    sample_rate: Number,
+    lead: Number = 1.0,
+    tail: Number = 3.0,
+) -> Excitation:
+    """Up for three times `width` (s), down for two, up for one, down for one.
+
+    It excites a wider band than a doublet does, and leaves a net input of `amplitude` times
+    `width`. `lead` and `tail` (s) of zeros stand before and after. All are whole numbers of
+    samples, or ValueError is raised.
+    """
+    steps = [1, 1, 1, -1, -1, 1, -1]
+    return _pulses("3-2-1-1", steps, width, amplitude, sample_rate, lead, tail)
+
+
+def _pulses(
+    kind: Kind,
+    steps: Sequence[int],
+    width: Number,
+    amplitude: Number,
+    sample_rate: Number,
+    lead: Number,
+    tail: Number,
+) -> Excitation:
+    check_positive(width=width, amplitude=amplitude, sample_rate=sample_rate)
+    before = whole_samples("lead", lead, sample_rate, fewest=0)
+    after = whole_samples("tail", tail, sample_rate, fewest=0)
+    shape = np.repeat(
+        np.asarray(steps, dtype=np.float64), whole_samples("width", width, sample_rate)
+    )
+    signal = amplitude * np.pad(shape, (before, after))
+    omega_min, omega_max = _half_power_band(shape, sample_rate)
+    return Excitation(
+        np.arange(signal.size) / sample_rate,
+        signal,
+        np.empty(0),
+        kind=kind,
+        omega_min=omega_min,
+        omega_max=omega_max,
+        amplitude=amplitude,
+        sample_rate=sample_rate,
+        duration=shape.size / sample_rate,
+        lead=lead,
+        tail=tail,
+    )
+
+
+def _half_power_band(
+    shape: Float[np.ndarray, " samples"], sample_rate: Number
+) -> tuple[float, float]:
+    power = np.abs(np.fft.rfft(shape, 256 * shape.size)) ** 2
+    peak = int(power.argmax())
+    weak = np.flatnonzero(power < 0.5 * power[peak])
+    above = weak[weak > peak]
+    low = weak[weak < peak].max(initial=-1) + 1
+    high = above.min(initial=power.size) - 1
+    spacing = 2 * np.pi * sample_rate / (256 * shape.size)
+    return float(low * spacing), float(high * spacing)

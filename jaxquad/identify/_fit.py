@@ -1,0 +1,138 @@
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from jaxquad.spectra import FrequencyResponse, require_x64
+
+from ._assess import assess
+from ._cost import CoherenceWeighted, Cost, Mask, MaximumLikelihood
+from ._parameters import Free, name_places, Parameters, select_parameters
+from ._problem import Condition, Prior, Problem, quantity_of, unchanged
+from ._result import Fit
+from ._solve import Solution, solve
+
+
+if TYPE_CHECKING:
+    import optimistix as optx
+
+
+class NotIdentifiable(ValueError):
+    """The record holds no usable response, or fewer points than there are parameters."""
+
+
+def fit(
+    model: PyTree,
+    frf: FrequencyResponse | Sequence[FrequencyResponse],
+    *,
+    free: Free = None,
+    cost: Cost = CoherenceWeighted(),
+    conditions: Sequence[Condition | None] | None = None,
+    priors: Sequence[Prior] = (),
+    band: tuple[float, float] | None = None,
+    min_coherence: float = 0.6,
+    solver: "optx.AbstractLeastSquaresSolver | None" = None,
+    max_steps: int = 256,
+) -> Fit:
+    """Identify the `free` parameters of a model from one or several frequency responses.
+
+    `model` is any `eqx.Module` with `frequency_response(omega)`; its values are the start. `free`
+    names parameters (`"J_x"`, `"numerator[0]"`, `jq.Real("zero")`), selects them
+    (`lambda m: (m.gain, m.delay)`), or is `None` for all. A bare name keeps the sign of its start.
+    With several responses, `conditions` says how the model differs in each record, for instance
+    `(None, lambda m: m.with_added_inertia(0.03))`. `priors` are known values with standard errors.
+    Only frequencies within `band` (rad/s) with a coherence of at least `min_coherence` count.
+    `solver` is any optimistix least-squares solver, Levenberg-Marquardt by default.
+
+    Raises `NotIdentifiable` where too few frequencies are usable, `ValueError` for names that
+    the model does not have, and `PrecisionError` in 32 bits. Source: Eq. (14), corrected.
+    """
+    require_x64("a fit")
+    frfs = [frf] if isinstance(frf, FrequencyResponse) else list(frf)
+    parameters = select_parameters(model, free)
+    used = [_usable(one, band, min_coherence) for one in frfs]
+    _check_points(frfs, used, parameters, min_coherence, band)
+    problem = _problem(model, parameters, frfs, conditions, priors, cost)
+    problem, solution = _solve_reweighted(problem, frfs, used, cost, solver, max_steps)
+    return assess(problem, frfs, solution)
+
+
+def _usable(frf: FrequencyResponse, band: tuple[float, float] | None, least: float) -> Mask:
+    omega = np.asarray(frf.omega)
+    low, high = band or (0.0, np.inf)
+    if not low < high or not np.any((omega >= low) & (omega <= high)):
+        raise ValueError(
+            f"band {band} rad/s holds none of the response's frequencies, which run from "
+            f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
+        )
+    inside = ((omega >= low) & (omega <= high))[:, None, None]
+    return inside & (np.asarray(frf.coherence) >= least)
+
+
+def _check_points(
+    frfs: Sequence[FrequencyResponse],
+    used: Sequence[Mask],
+    parameters: Parameters,
+    least: float,
+    band: tuple[float, float] | None,
+) -> None:
+    points = sum(int(mask.sum()) for mask in used)
+    needed = parameters.count + 2
+    if points < needed:
+        best = max(float(np.max(np.asarray(frf.coherence))) for frf in frfs)
+        total = sum(mask.size for mask in used)
+        reasons = " ".join(remark for frf in frfs for remark in frf.remarks)
+        raise NotIdentifiable(
+            f"not identifiable from this record: coherence reaches {least:g} at {points} of "
+            f"{total} frequencies{f' (band {band} rad/s)' if band else ''}, its maximum is "
+            f"{best:.2f}, and {parameters.count} parameters need at least {needed}. Excite the axis "
+            f"(jq.sweep), record longer, or use a longer window. {reasons}".rstrip()
+        )
+
+
+def _problem(model, parameters, frfs, conditions, priors, cost) -> Problem:
+    conditions = [None] * len(frfs) if conditions is None else list(conditions)
+    if len(conditions) != len(frfs):
+        raise ValueError(f"{len(conditions)} conditions for {len(frfs)} responses: give one each")
+    if priors and not isinstance(cost, MaximumLikelihood):
+        raise ValueError(
+            "a prior has a standard error, but the cost (14) has no noise to weigh it against: "
+            "pass cost=jq.MaximumLikelihood()"
+        )
+    known = [place.name for place in name_places(model)]
+    for prior in priors:
+        if isinstance(prior.quantity, str) and prior.quantity not in known:
+            raise ValueError(f"no parameter {prior.quantity!r} for a prior; there are: {known}")
+    numbers = [[prior.value, prior.standard_error] for prior in priors]
+    shapes = [(*frf.response.shape, 2) for frf in frfs]
+    return Problem(
+        model=model,
+        parameters=parameters,
+        conditions=tuple(condition or unchanged for condition in conditions),
+        quantities=tuple(quantity_of(prior.quantity) for prior in priors),
+        omega=tuple(frf.omega for frf in frfs),
+        measured=tuple(frf.response for frf in frfs),
+        weights=tuple(jnp.zeros(shape) for shape in shapes),
+        known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
+    )
+
+
+def _solve_reweighted(problem, frfs, used, cost, solver, max_steps) -> tuple[Problem, Solution]:
+    """Solve, and once more where the weights depend on the model that came out."""
+    ratios = [np.ones(mask.shape) for mask in used]
+    z = problem.parameters.start[: problem.parameters.count]
+    weights: list[np.ndarray] = []
+    while True:
+        found = [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
+        if weights and all(np.allclose(a, b, rtol=1e-4) for a, b in zip(weights, found, strict=True)):
+            return problem, solution
+        settled = bool(weights)
+        weights = found
+        problem = problem.weighted([jnp.asarray(each) for each in weights])
+        solution = solve(problem, z, solver, max_steps)
+        if settled:
+            return problem, solution
+        z = solution.z
+        ratios = [np.exp(np.asarray(part)[..., 0]) for part in solution.sensitivity.misfits]

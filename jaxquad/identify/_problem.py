@@ -1,0 +1,130 @@
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, PyTree
+
+from ._parameters import Parameters
+
+
+Condition = Callable[[PyTree], PyTree]
+
+
+class Prior(eqx.Module):
+    """A known value of a parameter, or of any function of the model, with its standard error.
+
+    A data-sheet value, a thrust stand, a static torque: `Prior("K_t", 0.1188, 0.002)` or
+    `Prior(lambda m: m.L * m.K_t, 0.0234, 0.0003)`.
+    """
+
+    quantity: str | Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
+    value: float = eqx.field(static=True)
+    standard_error: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not (self.standard_error > 0 and np.isfinite(self.value)):
+            raise ValueError(
+                f"prior {self.value} +- {self.standard_error}: a finite value and a positive "
+                "standard error are needed"
+            )
+
+
+class Problem(eqx.Module):
+    """One least-squares problem: residuals as a function of `z`, with all that they depend on."""
+
+    model: PyTree
+    parameters: Parameters
+    conditions: tuple[Condition, ...] = eqx.field(static=True)
+    quantities: tuple[Condition, ...] = eqx.field(static=True)  # that a prior speaks of
+    omega: tuple[Float[Array, " frequencies"], ...]
+    measured: tuple[Complex[Array, "frequencies outputs inputs"], ...]
+    weights: tuple[Float[Array, "frequencies outputs inputs 2"], ...]
+    known: Float[Array, "priors 2"]  # value, standard error
+
+    def weighted(self, weights: Sequence[Float[Array, "frequencies outputs inputs 2"]]) -> "Problem":
+        """The same problem under other weights."""
+        return dataclasses.replace(self, weights=tuple(weights))
+
+
+def unchanged(model: PyTree) -> PyTree:
+    """The condition of a record that was taken on the model as it is."""
+    return model
+
+
+def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, "..."]]:
+    """The model's responses in every record's condition."""
+    model = problem.parameters.insert(problem.model, z)
+    pairs = zip(problem.conditions, problem.omega, strict=True)
+    return [condition(model).frequency_response(omega) for condition, omega in pairs]
+
+
+def misfits(z: Float[Array, " n"], problem: Problem) -> list[Float[Array, "..."]]:
+    """`ln|T/T^|` and wrapped phase of `T/T^` in rad, on a last axis of two, per record."""
+    logs = [
+        jnp.log(model / measured)
+        for model, measured in zip(responses(z, problem), problem.measured, strict=True)
+    ]
+    return [jnp.stack([jnp.real(log), jnp.imag(log)], axis=-1) for log in logs]
+
+
+def prior_misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " priors"]:
+    """Known quantities: departure in standard errors."""
+    model = problem.parameters.insert(problem.model, z)
+    values = [quantity(model) for quantity in problem.quantities]
+    if not values:
+        return jnp.zeros(0, dtype=z.dtype)
+    return (jnp.stack(values) - problem.known[:, 0]) / problem.known[:, 1]
+
+
+def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
+    """All weighted misfits in one vector: half its squared norm is what the solver lowers."""
+    parts = [
+        (misfit * weight).reshape(-1)
+        for misfit, weight in zip(misfits(z, problem), problem.weights, strict=True)
+    ]
+    return jnp.concatenate([*parts, prior_misfits(z, problem)])
+
+
+class Sensitivity(NamedTuple):
+    """Derivatives at the solution, with respect to free and then fixed parameters."""
+
+    misfits: list[Float[Array, "..."]]
+    slopes: list[Float[Array, "..."]]  # of the misfits
+    prior_misfits: Float[Array, " priors"]
+    prior_slopes: Float[Array, "priors all"]
+
+
+def sensitivity(z: Float[Array, " all"], problem: Problem) -> Sensitivity:
+    """Misfits and their Jacobians over all parameters."""
+    return Sensitivity(
+        misfits(z, problem),
+        jax.jacfwd(misfits)(z, problem),
+        prior_misfits(z, problem),
+        jax.jacfwd(prior_misfits)(z, problem),
+    )
+
+
+def quantity_of(name_or_function: str | Condition) -> Condition:
+    """A prior's quantity as a function of the model."""
+    if not isinstance(name_or_function, str):
+        return name_or_function
+    return _Named(name_or_function)
+
+
+class _Named(NamedTuple):
+    """Reads one named number; equal for equal names, so that it does not recompile."""
+
+    name: str
+
+    def __call__(self, model: PyTree) -> Float[Array, ""]:
+        arrays = eqx.filter(model, eqx.is_inexact_array)
+        for path, array in jax.tree_util.tree_flatten_with_path(arrays)[0]:
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            if self.name.split("[")[0] == name:
+                index = tuple(int(part.rstrip("]")) for part in self.name.split("[")[1:])
+                return array[index]
+        raise ValueError(f"a prior names {self.name!r}, which the model does not have")

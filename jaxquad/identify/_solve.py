@@ -1,0 +1,55 @@
+from typing import NamedTuple, TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._problem import Problem, residuals, sensitivity, Sensitivity
+
+
+if TYPE_CHECKING:
+    import optimistix as optx
+
+
+class Solution(NamedTuple):
+    """Where the solver stopped, why, and the derivatives there."""
+
+    z: Float[Array, " parameters"]
+    message: str
+    converged: bool
+    steps: int
+    sensitivity: Sensitivity
+
+
+def solve(
+    problem: Problem,
+    z0: Float[Array, " parameters"],
+    solver: "optx.AbstractLeastSquaresSolver | None",
+    max_steps: int,
+) -> Solution:
+    """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
+    # Imported late: optimistix doubles the time of `import jaxquad`.
+    import optimistix as optx
+
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8) if solver is None else solver
+    z, result, steps, derivatives = _solve(problem, z0, solver, max_steps)
+    converged = bool(result == optx.RESULTS.successful)
+    message = "" if converged else str(optx.RESULTS[result])
+    return Solution(z, message, converged, int(steps), derivatives)
+
+
+@eqx.filter_jit
+def _solve(problem, z0, solver, max_steps):
+    import optimistix as optx
+
+    solution = optx.least_squares(
+        _objective, solver, z0, args=problem, max_steps=max_steps, throw=False
+    )
+    z_all = problem.parameters.start.at[: z0.size].set(solution.value)
+    return solution.value, solution.result, solution.stats["num_steps"], sensitivity(z_all, problem)
+
+
+def _objective(z: Float[Array, " parameters"], problem: Problem) -> Float[Array, " residuals"]:
+    # A wall of NaN would look like a minimum to the solver: make it a high one instead.
+    r = residuals(z, problem)
+    return jnp.where(jnp.isfinite(r), r, 1e6)

@@ -1,0 +1,27 @@
+from ._allocation import Allocation as Allocation
+from ._attitude import Attitude as Attitude
+from ._axis import AttitudeAxis as AttitudeAxis
+from ._discretise import (
+    free_responses as free_responses,
+    Sampled as Sampled,
+    sampled as sampled,
+    simulate_linear as simulate_linear,
+)
+from ._motor import MotorLag as MotorLag
+from ._plant import Multirotor as Multirotor, MultirotorState as MultirotorState
+from ._realise import realise as realise
+from ._rotation import (
+    euler_acceleration as euler_acceleration,
+    euler_from_quaternion as euler_from_quaternion,
+    euler_rates as euler_rates,
+    euler_rates_matrix as euler_rates_matrix,
+    quaternion_derivative as quaternion_derivative,
+    quaternion_from_euler as quaternion_from_euler,
+    rotation_matrix as rotation_matrix,
+)
+from ._transfer_function import TransferFunction as TransferFunction
+from ._vehicles import (
+    HoverDataSheet as HoverDataSheet,
+    QUANSER_HOVER as QUANSER_HOVER,
+    quanser_hover as quanser_hover,
+)

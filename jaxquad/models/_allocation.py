@@ -1,0 +1,99 @@
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._parameters import align, as_float, require_positive
+
+
+# Signs of roll, pitch and yaw torque (rows) under more of each motor's input (columns).
+_SIGNS = {
+    "frd-frbl": np.array([[0, -1, 0, 1], [1, 0, -1, 0], [1, -1, 1, -1]]),
+    "quanser": np.array([[0, 0, 1, -1], [1, -1, 0, 0], [-1, -1, 1, 1]]),
+}
+_INPUTS = ("voltage", "omega2")
+
+
+class Allocation(eqx.Module):
+    """From four motor inputs to three body torques, for a "+" frame.
+
+    Source: Eq. (9), (10). `convention` names frame and rotor order: "frd-frbl" is the paper's
+    (forward, right, down; front, right, back, left), "quanser" that of the maker of its rig
+    (back, right, up; front, back, right, left). Front and back rotors turn anticlockwise seen from
+    above. `input` says what drives a motor: its "voltage", or the squared speed "omega2".
+    Raises ValueError for an unknown convention or input, and for a value that is not positive.
+    """
+
+    arm: Float[Array, "..."] = eqx.field(converter=as_float)  # L, m
+    thrust_coefficient: Float[Array, "..."] = eqx.field(converter=as_float)  # K_t, N/V or N s^2
+    torque_coefficient: Float[Array, "..."] = eqx.field(converter=as_float)  # K_l, N m/V or N m s^2
+    convention: str = eqx.field(static=True, default="frd-frbl")
+    input: str = eqx.field(static=True, default="voltage")
+
+    def __check_init__(self):
+        _require_known("convention", self.convention, tuple(_SIGNS))
+        _require_known("input", self.input, _INPUTS)
+        require_positive("arm", self.arm, "give the distance from centre to rotor in m")
+        for name in ("thrust_coefficient", "torque_coefficient"):
+            require_positive(name, getattr(self, name), "the convention holds the signs")
+
+    @property
+    def matrix(self) -> Float[Array, " 3 4 *ensemble"]:
+        """U of Eq. (10), N m per unit of motor input."""
+        signs = jnp.asarray(self._signs, dtype=self.arm.dtype)
+        effect = self._effect[:, None]
+        return align(signs, effect) * effect
+
+    def torque(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
+        """Body torque in N m of the four motor `inputs`: Eq. (9)."""
+        return align(self._effect, inputs) * self.differences(inputs)
+
+    def differences(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
+        """What Eq. (9) multiplies by L K_t, L K_t and K_l: on the paper's rig V4 - V2 and so on."""
+        signs = jnp.asarray(self._signs, dtype=inputs.dtype)
+        return jnp.tensordot(signs, inputs, 1, precision="highest")
+
+    def inputs(
+        self, torque: Float[Array, " 3 *ensemble"], collective: Float[Array, "*ensemble"] | float
+    ) -> Float[Array, " 4 *ensemble"]:
+        """The four motor inputs that give a body `torque` in N m about a mean input `collective`.
+
+        Eq. (10) has no row for the thrust, so `collective` (the bias voltage on the rig) makes the
+        answer unique. The rows are orthogonal, hence the inverse is a scaled transpose.
+        """
+        return self.from_differences(torque / align(self._effect, torque), collective)
+
+    def from_differences(
+        self, wanted: Float[Array, " 3 *ensemble"], collective: Float[Array, "*ensemble"] | float
+    ) -> Float[Array, " 4 *ensemble"]:
+        """The four motor inputs with these `differences` about a mean input `collective`."""
+        squares = np.sum(self._signs**2, axis=1, keepdims=True)
+        inverse = jnp.asarray((self._signs / squares).T, dtype=wanted.dtype)
+        common = align(jnp.asarray(collective, dtype=wanted.dtype)[None], wanted)
+        return common + jnp.tensordot(inverse, wanted, 1, precision="highest")
+
+    def spin(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, "*ensemble"]:
+        """Spin in rad/s for `Attitude.acceleration`; 0 where voltages leave the speeds unknown.
+
+        Its signs are those of the yaw torque, since both come from the rotors' sense of turning.
+        """
+        if self.input == "voltage":
+            return jnp.zeros(inputs.shape[1:], inputs.dtype)
+        turning = inputs > 0
+        speed = jnp.where(turning, jnp.sqrt(jnp.where(turning, inputs, 1)), 0)  # finite gradient
+        yaw = jnp.asarray(self._signs[2], dtype=inputs.dtype)
+        return jnp.tensordot(yaw, speed, 1, precision="highest")
+
+    @property
+    def _signs(self) -> np.ndarray:
+        return _SIGNS[self.convention]
+
+    @property
+    def _effect(self) -> Float[Array, " 3 *ensemble"]:
+        lever = self.arm * self.thrust_coefficient
+        return jnp.stack(jnp.broadcast_arrays(lever, lever, self.torque_coefficient))
+
+
+def _require_known(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise ValueError(f"{name} is {value!r}, which does not exist: use one of {known}.")

@@ -1,0 +1,70 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from ._parameters import as_float, is_concrete, require_finite, require_nonnegative
+
+
+def imaginary(omega: Float[Array, "*points"]) -> Complex[Array, "*points"]:
+    """s = j omega, in the precision of `omega`."""
+    return jax.lax.complex(jnp.zeros_like(omega), omega)
+
+
+class TransferFunction(eqx.Module):
+    """One input to one output: numerator(s) / denominator(s) exp(-delay s).
+
+    Coefficients stand with the highest power of s first. Raises ValueError if the numerator has the
+    higher degree, if the denominator starts with 0, or if the delay is negative.
+    """
+
+    numerator: Float[Array, " zeros"] = eqx.field(converter=as_float)
+    denominator: Float[Array, " poles"] = eqx.field(converter=as_float)
+    delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # s
+
+    def __check_init__(self):
+        above, below = self.numerator.size, self.denominator.size
+        if not 0 < above <= below:
+            raise ValueError(
+                f"The numerator has {above} coefficients and the denominator {below}: a proper "
+                "model has at least one, and no more above than below; drop leading zeros."
+            )
+        require_finite("numerator", self.numerator)
+        require_finite("denominator", self.denominator)
+        if is_concrete(self.denominator) and np.asarray(self.denominator)[0] == 0:
+            raise ValueError(
+                f"The denominator {self.denominator} starts with 0: drop leading zeros."
+            )
+        require_nonnegative("delay", self.delay, "a model cannot answer before its input")
+
+    def __call__(self, s: Complex[Array, "*points"]) -> Complex[Array, "*points"]:
+        """The value at complex frequencies `s` in rad/s."""
+        above, below = (
+            jnp.polyval(c.astype(s.dtype), s) for c in (self.numerator, self.denominator)
+        )
+        return above / below * jnp.exp(-self.delay.astype(s.dtype) * s)
+
+    def frequency_response(
+        self, omega: Float[Array, " frequencies"]
+    ) -> Complex[Array, "frequencies 1 1"]:
+        """The response at `omega` in rad/s, in units of output per input."""
+        return self(imaginary(omega))[:, None, None]
+
+    def __mul__(self, other: "TransferFunction") -> "TransferFunction":
+        """The two in series; their delays add."""
+        return TransferFunction(
+            jnp.convolve(self.numerator, other.numerator),
+            jnp.convolve(self.denominator, other.denominator),
+            self.delay + other.delay,
+        )
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Roots of the denominator, rad/s; on the host, so not under jit."""
+        return np.roots(np.asarray(self.denominator))
+
+    @property
+    def zeros(self) -> np.ndarray:
+        """Roots of the numerator, rad/s; on the host, so not under jit."""
+        return np.roots(np.asarray(self.numerator))

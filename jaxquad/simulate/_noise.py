@@ -1,0 +1,21 @@
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+
+def gauss_markov(
+    key: Key[Array, ""], shape: tuple[int, ...], *, deviation: float, corner: float, dt: float
+) -> Float[Array, "samples ..."]:
+    """Stationary first-order Gauss-Markov noise along the first axis, such as gusts of torque.
+
+    `deviation` is its standard deviation, `corner` its bandwidth in rad/s.
+    """
+    white = jax.random.normal(key, shape, dtype=float)
+    keep = jnp.exp(jnp.asarray(-corner * dt))
+    drive = deviation * jnp.sqrt(1 - keep**2)
+
+    def advance(level, kick):
+        level = keep * level + drive * kick
+        return level, level
+
+    return jax.lax.scan(advance, deviation * white[0], white)[1]

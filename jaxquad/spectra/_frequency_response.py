@@ -1,0 +1,52 @@
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from ._precision import require_float64
+
+
+class FrequencyResponse(eqx.Module):
+    """Measured frequency responses of every output to every input, with their random error.
+
+    `relative_covariance[o, i]` is the covariance of the relative errors `(T^ - T) / T` between
+    all pairs of frequencies: neighbouring points of overlapping windows share their noise.
+    Its diagonal is `2 random_error**2`.
+    """
+
+    omega: Float[Array, " frequencies"]  # rad/s
+    response: Complex[Array, "frequencies outputs inputs"]  # output unit per input unit
+    coherence: Float[Array, "frequencies outputs inputs"]  # of the joint estimate: the lesser one
+    random_error: Float[Array, "frequencies outputs inputs"]  # 1 sigma: relative, and in rad
+    relative_covariance: Complex[Array, "outputs inputs frequencies frequencies"]
+    direct_coherence: Float[Array, "frequencies outputs inputs"]  # input to output, no reference
+    method: Literal["direct", "joint"] = eqx.field(static=True)
+    input_names: tuple[str, ...] = eqx.field(static=True)
+    output_names: tuple[str, ...] = eqx.field(static=True)
+    remarks: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        if not isinstance(self.omega, Array | np.ndarray):
+            return
+        require_float64("the frequency response", self.response)
+
+    @property
+    def magnitude_db(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """20 log10 of the magnitude."""
+        return 20 * np.log10(np.abs(np.asarray(self.response)))
+
+    @property
+    def phase_deg(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """Phase in degrees, unwrapped along frequency."""
+        return np.degrees(np.unwrap(np.angle(np.asarray(self.response)), axis=0))
+
+    def __str__(self) -> str:
+        omega, coherence = np.asarray(self.omega), np.asarray(self.coherence)
+        lines = [f"frequency response, {self.method} estimate, {omega.size} frequencies"]
+        for o, output in enumerate(self.output_names):
+            for i, source in enumerate(self.input_names):
+                good = omega[coherence[:, o, i] >= 0.6]
+                where = f"{good[0]:.3g}..{good[-1]:.3g} rad/s" if good.size else "nowhere"
+                lines.append(f"  {source} -> {output}: coherence above 0.6 at {good.size}: {where}")
+        return "\n".join(lines + [f"  ! {remark}" for remark in self.remarks])

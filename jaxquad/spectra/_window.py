@@ -1,0 +1,24 @@
+import numpy as np
+from jaxtyping import Float
+
+
+_SHAPES = {"hann": (0.5, 0.5), "hamming": (0.54, 0.46), "rectangular": (1.0, 0.0)}
+
+
+def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
+    """A periodic raised-cosine window of `samples` points: "hann", "hamming" or "rectangular"."""
+    if name not in _SHAPES:
+        raise ValueError(f"no window {name!r}: choose one of {', '.join(_SHAPES)}")
+    level, cosine = _SHAPES[name]
+    return level - cosine * np.cos(2 * np.pi * np.arange(samples) / samples)
+
+
+def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]:
+    """First samples of windows of `length` that overlap by at least `overlap` and reach both ends.
+
+    The windows are spread evenly over the record, so that no tail is dropped: the top of a
+    frequency sweep is in its last seconds.
+    """
+    step = max(int(round(length * (1 - overlap))), 1)
+    count = -(-(samples - length) // step) + 1
+    return tuple(int(start) for start in np.round(np.linspace(0, samples - length, count)))
