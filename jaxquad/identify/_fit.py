@@ -3,7 +3,7 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
 
 from jaxquad.spectra import FrequencyResponse, require_x64
 
@@ -68,7 +68,19 @@ def _usable(frf: FrequencyResponse, band: tuple[float, float] | None, least: flo
             f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
         )
     inside = ((omega >= low) & (omega <= high))[:, None, None]
-    return inside & (np.asarray(frf.coherence) >= least)
+    return inside & (_local_mean(omega, np.asarray(frf.coherence)) >= least)
+
+
+def _local_mean(
+    omega: Float[np.ndarray, " frequencies"], values: Float[np.ndarray, "frequencies outputs inputs"]
+) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    """Mean over about a third of an octave.
+
+    Points chosen one by one, because their own coherence came out high by chance, are biased.
+    """
+    apart = np.log(omega[:, None] / omega[None, :])
+    kernel = np.exp(-0.5 * (apart / 0.2) ** 2)
+    return np.einsum("fg,goi->foi", kernel / kernel.sum(axis=1, keepdims=True), values)
 
 
 def _check_points(

@@ -6,9 +6,9 @@ from jaxtyping import Float
 
 Samples = Float[np.ndarray, " samples"]
 
-# Kaiser's formulas for 70 dB over a transition from 0.3 to 0.5 of the sample rate.
-_BETA = 0.1102 * (70 - 8.7)
-_HALF = 0.5 * (70 - 7.95) / (2.285 * 2 * np.pi * 0.2)  # samples of the target grid
+# Kaiser's formulas for 72 dB over a transition from 0.3 to 0.5 of the sample rate.
+_BETA = 0.1102 * (72 - 8.7)
+_HALF = 0.5 * (72 - 7.95) / (2.285 * 2 * np.pi * 0.2)  # samples of the target grid
 _CUTOFF = 0.4  # of the target rate, where the filter is down by 6 dB
 
 

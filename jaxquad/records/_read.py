@@ -48,22 +48,13 @@ def read(
     """
     roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
-    arrays = load_arrays(path)
-    try:
-        channels = timed_channels(arrays, names, time=time, time_unit=time_unit)
-    except ReadError as error:
-        raise ReadError(f"{path}: {error}") from error
-    if not channels:
-        raise ReadError(f"{path}: no channels were asked for: name inputs and outputs.")
-    if sample_rate is None and (kept := _shared_grid(channels, start, stop)):
+    channels = _channels(path, names, time, time_unit)
+    kept = _shared_grid(channels, start, stop) if sample_rate is None else None
+    if kept is not None:
         stamps = channels[0].time[kept]
         values = np.stack([channel.values[kept] for channel in channels], axis=1)
     else:
-        rate = (
-            sample_rate
-            if sample_rate is not None
-            else float(f"{min(channel.rate for channel in channels):.3g}")
-        )
+        rate = _slowest(channels) if sample_rate is None else sample_rate
         stamps, values = resample(channels, rate, start=start, stop=stop, max_gap=max_gap)
     columns = dict(zip(names, values.T, strict=True))
     return Record(
@@ -82,6 +73,22 @@ def _mixes(selection: Selection) -> Mixes:
     names = as_tuple(selection)
     check_distinct(names)
     return {name: {name: 1.0} for name in names}
+
+
+def _channels(
+    path: str | Path, names: Sequence[str], time: str | None, time_unit: TimeUnit | None
+) -> list[Channel]:
+    arrays = load_arrays(path)
+    if not names:
+        raise ReadError(f"{path}: no channels were asked for: name inputs and outputs.")
+    try:
+        return timed_channels(arrays, names, time=time, time_unit=time_unit)
+    except ReadError as error:
+        raise ReadError(f"{path}: {error}") from error
+
+
+def _slowest(channels: Sequence[Channel]) -> float:
+    return float(f"{min(channel.rate for channel in channels):.3g}")
 
 
 def _shared_grid(
