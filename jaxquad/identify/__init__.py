@@ -4,7 +4,8 @@ from ._cost import (
     Cost as Cost,
     MaximumLikelihood as MaximumLikelihood,
 )
-from ._fit import fit as fit, NotIdentifiable as NotIdentifiable
+from ._fit import fit as fit
+from ._identifiable import NotIdentifiable as NotIdentifiable
 from ._parameters import Positive as Positive, Real as Real
 from ._problem import Prior as Prior
 from ._result import Fit as Fit

@@ -38,11 +38,14 @@ def gauss_newton(blocks: list[Block], known: Known, count: int) -> tuple[Matrix,
     return j.T @ j, j.T @ r
 
 
-def calibrated_covariance(blocks: list[Block], known: Known, count: int) -> Matrix:
+def calibrated_covariance(
+    blocks: list[Block], known: Known, count: int, inflation: float = 1.0
+) -> Matrix:
     """Sandwich covariance: what the measured noise, with all its correlation, does to the fit.
 
     (J'WJ)^-1 J'W S W J (J'WJ)^-1 with S the covariance of the responses' errors. It holds for any
-    weights, and counts neighbouring frequencies that share their noise once only.
+    weights, and counts neighbouring frequencies that share their noise once only. `inflation`
+    multiplies S.
     """
     bread, _ = gauss_newton(blocks, known, count)
     meat = known.slopes[:, :count].T @ known.slopes[:, :count]
@@ -50,7 +53,8 @@ def calibrated_covariance(blocks: list[Block], known: Known, count: int) -> Matr
         weighted = block.weights[..., None] ** 2 * block.slopes[..., :count]
         # Circular noise: real and imaginary parts share Im S with opposite signs.
         complex_slopes = weighted[:, 0] + 1j * weighted[:, 1]
-        meat = meat + 0.5 * np.real(complex_slopes.conj().T @ block.covariance @ complex_slopes)
+        noise = np.real(complex_slopes.conj().T @ block.covariance @ complex_slopes)
+        meat = meat + 0.5 * inflation * noise
     inverse = scaled_inverse(bread)
     return inverse @ meat @ inverse
 
@@ -59,16 +63,27 @@ def scaled_inverse(matrix: Matrix) -> Matrix:
     """Pseudo-inverse after unit scaling of the diagonal."""
     scale = np.sqrt(np.diagonal(matrix))
     scale = np.where(scale > 0, scale, 1.0)
-    return np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
+    unit = matrix / np.outer(scale, scale)
+    return np.linalg.pinv(unit, rcond=1e-13, hermitian=True) / np.outer(scale, scale)
 
 
-def information_root(blocks: list[Block], count: int | None = None) -> Float[np.ndarray, "rows all"]:
+def information_root(blocks: list[Block]) -> Float[np.ndarray, "rows all"]:
     """Slopes over the random error: its singular values say what the record determines."""
     rows = [
         (np.where(block.weights > 0, 1.0, 0.0) / block.error[:, None])[..., None] * block.slopes
         for block in blocks
     ]
-    return np.concatenate([row.reshape(-1, row.shape[-1]) for row in rows])[:, :count]
+    return np.concatenate([row.reshape(-1, row.shape[-1]) for row in rows])
+
+
+def chi_squared(blocks: list[Block], known: Known, count: int) -> float:
+    """Squared misfit over random error, per degree of freedom: 1 where the model is right."""
+    used = [block.weights > 0 for block in blocks]
+    total = float(np.sum(known.misfit**2))
+    for block, mask in zip(blocks, used, strict=True):
+        total += float(np.sum((block.misfit / block.error[:, None])[mask] ** 2))
+    freedom = sum(int(mask.sum()) for mask in used) + len(known.misfit) - count
+    return total / max(freedom, 1)
 
 
 def cramer_rao(bread: Matrix) -> Float[np.ndarray, " parameters"]:

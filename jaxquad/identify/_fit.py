@@ -9,6 +9,7 @@ from jaxquad.spectra import FrequencyResponse, require_x64
 
 from ._assess import assess
 from ._cost import CoherenceWeighted, Cost, Mask, MaximumLikelihood
+from ._identifiable import NotIdentifiable
 from ._parameters import Free, name_places, Parameters, select_parameters
 from ._problem import Condition, Prior, Problem, quantity_of, unchanged
 from ._result import Fit
@@ -17,10 +18,6 @@ from ._solve import Solution, solve
 
 if TYPE_CHECKING:
     import optimistix as optx
-
-
-class NotIdentifiable(ValueError):
-    """The record holds no usable response, or fewer points than there are parameters."""
 
 
 def fit(

@@ -9,9 +9,12 @@ from ._combination import combine, Combination, echelon, Named
 
 
 LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
-_MEMBER = 0.1  # share of a null direction from which a parameter takes part in it
-_EXACT = 1e3  # standard error from which a direction is taken as exactly null
+_MEMBER = 0.05  # share of a null direction from which a parameter takes part in it
 _FLOOR = 1e-8  # of the largest singular value: below it lies rounding
+
+
+class NotIdentifiable(ValueError):
+    """The record holds no usable response, or fewer points than there are parameters."""
 
 
 class Identifiability(NamedTuple):
@@ -27,7 +30,8 @@ class Information(NamedTuple):
 
     The fixed ones take part in names only: the arm L in L K_t / J_x. `root` holds derivatives of
     ln-magnitudes and phases (alternate rows), in units of their random error, with respect to
-    relative changes; `covariance` is that of the free parameters' relative changes.
+    relative changes; `covariance` is that of the free parameters' relative changes; `order` is
+    the model's own order of its parameters.
     """
 
     root: Float[np.ndarray, "rows all"]
@@ -35,6 +39,7 @@ class Information(NamedTuple):
     names: tuple[str, ...]
     values: Float[np.ndarray, " all"]
     units: Float[np.ndarray, " all"]
+    order: tuple[int, ...]
 
 
 def decide(information: Information) -> Identifiability:
@@ -42,31 +47,39 @@ def decide(information: Information) -> Identifiability:
     count = len(information.covariance)
     _, singular, right = np.linalg.svd(information.root[:, :count], full_matrices=True)
     singular = np.pad(singular, (0, count - len(singular)))
-    spread = 1 / np.maximum(singular, max(_FLOOR * singular[0], 1e-300))
-    null = right[spread > LIMIT]
+    exact = singular <= _FLOOR * singular[0]
+    null = right[exact | (singular * LIMIT < 1)]
     if not len(null):
         return Identifiability((), (), ())
-    members = np.flatnonzero(np.linalg.norm(null, axis=0) > _MEMBER)
-    covariance = _opened(information.covariance, right[spread > _EXACT])
-    rows = _outside(null[:, members])
-    effects = information.root[:, members] @ np.linalg.pinv(rows) if len(rows) else None
-    determined = []
-    for k, row in enumerate(rows):
-        weights = _with_fixed(row, members, effects[:, k], information)
-        used = np.flatnonzero(weights)
-        spread_of = np.zeros((len(weights), len(weights)))
-        spread_of[:count, :count] = covariance
-        named = Named(
-            tuple(information.names[u] for u in used),
-            information.values[used],
-            information.units[used],
-            spread_of[np.ix_(used, used)],
-        )
-        determined.append(combine(weights[used], named))
-    directions = _directions(null, members, information.names)
-    return Identifiability(
-        tuple(information.names[k] for k in members), directions, tuple(determined)
-    )
+    null = _sparse(null)
+    opened = _opened(information.covariance, right[exact])
+    facts = information._replace(covariance=opened)
+    determined = [
+        combination for block in _blocks(null) for combination in _determined(null, block, facts)
+    ]
+    members = np.flatnonzero(np.any(null, axis=0))
+    names = information.names
+    directions = tuple({names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null)
+    return Identifiability(tuple(names[k] for k in members), directions, tuple(determined))
+
+
+def _sparse(null: Float[np.ndarray, "null parameters"]) -> Float[np.ndarray, "null parameters"]:
+    """Unit directions spanning the same space, with small shares left out."""
+    rows = echelon(null)
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.where(np.abs(rows) > _MEMBER, rows, 0.0)
+
+
+def _blocks(null: Float[np.ndarray, "null parameters"]) -> list[np.ndarray]:
+    """Groups of parameters that share null directions."""
+    groups: list[set[int]] = []
+    for row in null:
+        group = set(np.flatnonzero(row).tolist())
+        for other in [other for other in groups if other & group]:
+            groups.remove(other)
+            group |= other
+        groups.append(group)
+    return [np.array(sorted(group)) for group in groups]
 
 
 def _opened(covariance: np.ndarray, exact: np.ndarray) -> np.ndarray:
@@ -75,29 +88,43 @@ def _opened(covariance: np.ndarray, exact: np.ndarray) -> np.ndarray:
     return keep @ covariance @ keep + 1e4 * exact.T @ exact
 
 
-def _outside(null: Float[np.ndarray, "null members"]) -> Float[np.ndarray, "rows members"]:
-    """Combinations of the members that no null direction moves."""
-    _, singular, right = np.linalg.svd(null, full_matrices=True)
-    return echelon(right[int(np.sum(singular > 1e-6)) :])
+def _determined(
+    null: Float[np.ndarray, "null parameters"], block: np.ndarray, facts: Information
+) -> list[Combination]:
+    """Combinations of one group's members that no null direction moves."""
+    inside = null[:, block]
+    _, singular, right = np.linalg.svd(inside[np.any(inside, axis=1)], full_matrices=True)
+    rows = echelon(right[int(np.sum(singular > 1e-6)) :])
+    if not len(rows):
+        return []
+    effects = facts.root[:, block] @ np.linalg.pinv(rows)
+    return [_named(row, block, effects[:, k], facts) for k, row in enumerate(rows)]
+
+
+def _named(
+    row: np.ndarray, block: np.ndarray, effect: np.ndarray, facts: Information
+) -> Combination:
+    weights = np.zeros(len(facts.values))
+    weights[block] = row
+    weights = _with_fixed(weights, effect, facts)
+    used = np.array(sorted(np.flatnonzero(weights), key=lambda k: facts.order[k]))
+    count = len(facts.covariance)
+    relative = np.zeros((len(weights), len(weights)))
+    relative[:count, :count] = facts.covariance
+    names = tuple(facts.names[k] for k in used)
+    named = Named(names, facts.values[used], facts.units[used], relative[np.ix_(used, used)])
+    return combine(weights[used], named)
 
 
 def _with_fixed(
-    row: np.ndarray, members: np.ndarray, effect: np.ndarray, information: Information
+    weights: Float[np.ndarray, " all"], effect: np.ndarray, facts: Information
 ) -> Float[np.ndarray, " all"]:
     """Adds fixed parameters that act just as the combination does; signed to raise the response."""
-    weights = np.zeros(len(information.values))
-    weights[members] = row
-    for k in range(len(information.covariance), len(weights)):
-        column = information.root[:, k]
+    weights = weights.copy()
+    for k in range(len(facts.covariance), len(weights)):
+        column = facts.root[:, k]
         power = float(column @ effect) / max(float(effect @ effect), 1e-300)
-        if abs(power) > 0.1 and np.linalg.norm(column - power * effect) < 1e-6 * np.linalg.norm(column):
+        rest = np.linalg.norm(column - power * effect)
+        if abs(power) > 0.1 and rest < 1e-6 * np.linalg.norm(column):
             weights[k] = power
     return -weights if np.sum(effect[::2]) < 0 else weights
-
-
-def _directions(
-    null: np.ndarray, members: np.ndarray, names: tuple[str, ...]
-) -> tuple[dict[str, float], ...]:
-    rows = echelon(null)
-    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    return tuple({names[k]: float(row[k]) for k in members if abs(row[k]) > 0.01} for row in rows)

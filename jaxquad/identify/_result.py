@@ -1,9 +1,13 @@
+from collections.abc import Callable
+
 import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ._combination import Combination
-from ._identifiable import Identifiability
+from ._identifiable import Identifiability, NotIdentifiable
+from ._parameters import Parameters
 from ._table import fit_table
 
 
@@ -32,6 +36,8 @@ class Fit(eqx.Module):
     steps: int
     identifiability: Identifiability
     remarks: tuple[str, ...] = eqx.field(static=True)
+    parameters: Parameters
+    relative_covariance: Float[np.ndarray, "parameters parameters"]  # of what the solver moves
 
     @property
     def identifiable(self) -> bool:
@@ -58,6 +64,30 @@ class Fit(eqx.Module):
         k = self.names.index(name)
         reach = 1.96 * self.standard_errors[k]
         return float(self.values[k] - reach), float(self.values[k] + reach)
+
+    def derived(
+        self, quantity: Callable[[PyTree], Float[Array, ""]], name: str = "derived"
+    ) -> Combination:
+        """Any function of the model with its standard error: `lambda m: m.lag + m.delay`.
+
+        First-order propagation of the covariance. Raises `NotIdentifiable` where the quantity
+        depends on what the record does not determine.
+        """
+        count = len(self.names)
+        z = self.parameters.at(self.model)
+
+        def value(z: Float[Array, " parameters"]) -> Float[Array, ""]:
+            return quantity(self.parameters.insert(self.model, z))
+
+        slope = np.asarray(jax.grad(value)(z))
+        for direction in self.null_directions:
+            null = np.array([direction.get(name, 0.0) for name in self.names])
+            if abs(slope @ null) > 1e-6 * np.linalg.norm(slope):
+                raise NotIdentifiable(
+                    f"{name} changes along {direction}, which this record does not determine"
+                )
+        error = float(np.sqrt(slope @ self.relative_covariance[:count, :count] @ slope))
+        return Combination(name, float(value(z)), error)
 
     def __str__(self) -> str:
         return fit_table(self)

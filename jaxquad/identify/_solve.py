@@ -34,7 +34,7 @@ def solve(
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8) if solver is None else solver
     z, result, steps, derivatives = _solve(problem, z0, solver, max_steps)
     converged = bool(result == optx.RESULTS.successful)
-    message = "" if converged else str(optx.RESULTS[result])
+    message = "" if converged else _reason(str(optx.RESULTS[result]), int(steps))
     return Solution(z, message, converged, int(steps), derivatives)
 
 
@@ -53,3 +53,8 @@ def _objective(z: Float[Array, " parameters"], problem: Problem) -> Float[Array,
     # A wall of NaN would look like a minimum to the solver: make it a high one instead.
     r = residuals(z, problem)
     return jnp.where(jnp.isfinite(r), r, 1e6)
+
+
+def _reason(message: str, steps: int) -> str:
+    """The first sentence of a solver's message."""
+    return f"{message.strip().split('.')[0].rstrip()} (after {steps} steps)"

@@ -52,7 +52,7 @@ def _parameters(fit: "Fit") -> list[str]:
 
 
 def _quality(fit: "Fit") -> str:
-    condition = f"{fit.condition:.3g}" if np.isfinite(fit.condition) else "infinite"
+    condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
     return (
         f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
         f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} frequencies, condition {condition}, "

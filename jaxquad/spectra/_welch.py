@@ -19,7 +19,9 @@ class Welch(eqx.Module):
     windows are averaged. `integrators` is the number of pure integrations between input and
     output: the output is differenced so many times before it is windowed, and the response divided by
     the differencing filter. That keeps the steep response of 1/s^n from leaking
-    through the window (a 40 s Hann window is wrong by 10 % at 0.4 rad/s without it).
+    through the window (a 40 s Hann window is wrong by 10 % at 0.4 rad/s without it). `delay`, in s,
+    is about how much the output lags the input: it is taken out before windowing and put back
+    after, since a late output is weighed by another part of the window (1 % at the end of a sweep).
     `detrend` removes from each segment its "constant", its "linear" trend, or "none".
     """
 
@@ -28,6 +30,7 @@ class Welch(eqx.Module):
     shape: str = eqx.field(static=True, default="hann")
     detrend: str = eqx.field(static=True, default="constant")
     integrators: int = eqx.field(static=True, default=0)
+    delay: float = eqx.field(static=True, default=0.0)
 
     def __check_init__(self):
         window(self.shape, 4)
@@ -37,6 +40,8 @@ class Welch(eqx.Module):
             raise ValueError(f"detrend {self.detrend!r}: choose none, constant or linear")
         if self.integrators not in (0, 1, 2, 3):
             raise ValueError(f"integrators {self.integrators}: give 0 to 3 integrations")
+        if not 0 <= self.delay < 10:
+            raise ValueError(f"delay {self.delay} s: give 0 to 10 s")
         if self.window_length is not None and not self.window_length > 0:
             raise ValueError(f"window_length {self.window_length} s must be positive")
 
@@ -87,17 +92,19 @@ def transform_records(
 
 
 def _transform_record(record, omega, welch, starts, length):
-    n = welch.integrators
+    n, shift = welch.integrators, int(round(welch.delay / record.dt))
     outputs = np.diff(record.outputs, n, axis=0)
+    outputs = np.concatenate([outputs[shift:], np.repeat(outputs[-1:], shift, axis=0)])
     columns = [record.inputs[n:], outputs, record.references[n:]]
     taper, dt = jnp.asarray(window(welch.shape, length)), jnp.asarray(record.dt)
     values = segment_transforms(
         jnp.asarray(np.hstack(columns)), starts, taper, jnp.asarray(omega), dt, welch.detrend
     )
-    differencing = (1 - jnp.exp(-1j * jnp.asarray(omega) * record.dt)) ** n
+    turn = jnp.exp(-1j * jnp.asarray(omega) * record.dt)
+    recolour = turn**shift / (1 - turn) ** n
     first, last = columns[0].shape[1], columns[0].shape[1] + outputs.shape[1]
     return {
         "inputs": values[:, :, :first],
-        "outputs": values[:, :, first:last] / differencing[None, :, None],
+        "outputs": values[:, :, first:last] * recolour[None, :, None],
         "references": values[:, :, last:],
     }
