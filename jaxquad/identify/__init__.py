@@ -9,3 +9,4 @@ from ._identifiable import NotIdentifiable as NotIdentifiable
 from ._parameters import Positive as Positive, Real as Real
 from ._problem import Prior as Prior
 from ._result import Fit as Fit
+from ._verify import Verification as Verification, verify as verify

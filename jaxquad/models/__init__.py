@@ -7,6 +7,7 @@ from ._discretise import (
     sampled as sampled,
     simulate_linear as simulate_linear,
 )
+from ._lagged_integrator import LaggedIntegrator as LaggedIntegrator
 from ._motor import MotorLag as MotorLag
 from ._plant import Multirotor as Multirotor, MultirotorState as MultirotorState
 from ._realise import realise as realise

@@ -2,8 +2,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from ._parameters import as_float, is_concrete, require_finite, require_nonnegative
-from ._transfer_function import TransferFunction
+from ._parameters import as_float, is_zero, require_finite, require_nonnegative
+from ._transfer_function import imaginary, TransferFunction
 
 
 class LaggedIntegrator(eqx.Module):
@@ -30,13 +30,13 @@ class LaggedIntegrator(eqx.Module):
         self, omega: Float[Array, " frequencies"]
     ) -> Complex[Array, "frequencies 1 1"]:
         """Response at `omega` in rad/s."""
-        s = 1j * omega
-        late = jnp.exp(-self.delay * s) / (self.lag * s + 1)
-        return (self.gain * late / s**self.integrators)[:, None, None]
+        s = imaginary(omega)
+        gain, lag, delay = (x.astype(s.dtype) for x in (self.gain, self.lag, self.delay))
+        return (gain * jnp.exp(-delay * s) / ((lag * s + 1) * s**self.integrators))[:, None, None]
 
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials; a known lag of 0 is left out."""
         one, zero = jnp.ones_like(self.lag), jnp.zeros_like(self.lag)
-        first = [one] if is_concrete(self.lag) and self.lag == 0 else [self.lag, one]
+        first = [one] if is_zero(self.lag) else [self.lag, one]
         denominator = jnp.stack([*first, *[zero] * self.integrators])
         return TransferFunction(self.gain[None], denominator, self.delay)
