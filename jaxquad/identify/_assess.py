@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -38,8 +37,7 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
     inflation = misfit if misfit > MISFIT**2 else 1.0
     covariance = calibrated_covariance(blocks, known, count, inflation)
     verdict, by_data = _identifiability(problem, solution, blocks, known, covariance)
-    z = parameters.start.at[:count].set(solution.z)
-    values, slopes = (np.asarray(f(z))[:count] for f in (parameters.values, parameters.slopes))
+    values, slopes = np.asarray(solution.values)[:count], np.asarray(solution.slopes)[:count]
     lost = np.array([name in verdict.undetermined for name in parameters.names])
     physical = covariance * np.outer(slopes, slopes)
     physical[lost, :] = physical[:, lost] = np.nan
@@ -48,7 +46,7 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
     cost += float(np.sum(known.misfit**2))
     decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
     return Fit(
-        model=parameters.insert(problem.model, solution.z),
+        model=solution.model,
         names=parameters.names,
         values=np.where(lost, np.nan, values),
         standard_errors=np.where(lost, np.inf, np.sqrt(np.diagonal(physical))),
@@ -73,9 +71,7 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
     )
 
 
-def _blocks(
-    problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution
-) -> list[Block]:
+def _blocks(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution) -> list[Block]:
     """One block per response pair that has usable frequencies."""
     blocks = []
     for k, frf in enumerate(frfs):
@@ -106,14 +102,13 @@ def _identifiability(
 ) -> tuple[Identifiability, Identifiability]:
     """What data and priors determine together, and what the data determine alone."""
     parameters = problem.parameters
-    z = jnp.concatenate([solution.z, parameters.start[parameters.count :]])
     root = information_root(blocks)
     facts = Information(
         root,
         covariance,
         tuple(place.name for place in parameters.places),
-        np.asarray(parameters.values(z)),
-        np.asarray(parameters.slopes(z)),
+        np.asarray(solution.values),
+        np.asarray(solution.slopes),
         _ranks(parameters.places),
     )
     # Rows come in pairs of magnitude and phase; a prior's row counts once.

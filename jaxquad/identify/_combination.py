@@ -46,7 +46,7 @@ def echelon(rows: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows 
 
 
 class Named(NamedTuple):
-    """What a combination is made of; `relative` is the covariance of changes in units of `units`."""
+    """What a combination is made of; `relative` is the covariance of changes over `units`."""
 
     names: tuple[str, ...]
     values: Float[np.ndarray, " parameters"]

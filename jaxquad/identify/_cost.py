@@ -1,6 +1,6 @@
 """What a misfit costs: weights on the logarithm of the ratio of model to measurement."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
@@ -13,13 +13,15 @@ _DB = 20 / np.log(10)  # dB to a unit of natural logarithm
 _W_P = 0.01745  # 1 dB weighs as much as 7.57 deg
 
 Mask = Bool[np.ndarray, "frequencies outputs inputs"]
+Ratio = Float[np.ndarray, "frequencies outputs inputs"]
 Weights = Float[np.ndarray, "frequencies outputs inputs 2"]
 
 
+@runtime_checkable
 class Cost(Protocol):
     """Gives the weights of `ln|T/T^|` and of `angle(T/T^)` in rad, zero outside the mask."""
 
-    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Float[np.ndarray, "..."]) -> Weights:
+    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
         """`ratio` is |model / measurement|, 1 before there is a model."""
         ...
 
@@ -32,7 +34,7 @@ class CoherenceWeighted(eqx.Module):
     prints a minus and an unsquared weight.
     """
 
-    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Float[np.ndarray, "..."]) -> Weights:
+    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
         points = np.maximum(used.sum(axis=0, keepdims=True), 1)
         trust = 1.58 * (1 - np.exp(-np.asarray(frf.coherence)))
         root = np.where(used, np.sqrt(20 / points) * trust, 0.0)
@@ -46,7 +48,7 @@ class MaximumLikelihood(eqx.Module):
     the model: relative to the measurement, points that came out low by chance would weigh more.
     """
 
-    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Float[np.ndarray, "..."]) -> Weights:
+    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
         # 1e-7 keeps noise-free records from weights that overflow.
         error = np.maximum(np.asarray(frf.random_error), 1e-7)
         root = np.where(used, ratio / error, 0.0)

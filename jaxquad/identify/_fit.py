@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +16,6 @@ from ._result import Fit
 from ._solve import Solution, solve
 
 
-if TYPE_CHECKING:
-    import optimistix as optx
-
-
 def fit(
     model: PyTree,
     frf: FrequencyResponse | Sequence[FrequencyResponse],
@@ -30,7 +26,7 @@ def fit(
     priors: Sequence[Prior] = (),
     band: tuple[float, float] | None = None,
     min_coherence: float = 0.6,
-    solver: "optx.AbstractLeastSquaresSolver | None" = None,
+    solver: Any = None,
     max_steps: int = 256,
 ) -> Fit:
     """Identify the `free` parameters of a model from one or several frequency responses.
@@ -69,7 +65,8 @@ def _usable(frf: FrequencyResponse, band: tuple[float, float] | None, least: flo
 
 
 def _local_mean(
-    omega: Float[np.ndarray, " frequencies"], values: Float[np.ndarray, "frequencies outputs inputs"]
+    omega: Float[np.ndarray, " frequencies"],
+    values: Float[np.ndarray, "frequencies outputs inputs"],
 ) -> Float[np.ndarray, "frequencies outputs inputs"]:
     """Mean over about a third of an octave.
 
@@ -96,8 +93,8 @@ def _check_points(
         raise NotIdentifiable(
             f"not identifiable from this record: coherence reaches {least:g} at {points} of "
             f"{total} frequencies{f' (band {band} rad/s)' if band else ''}, its maximum is "
-            f"{best:.2f}, and {parameters.count} parameters need at least {needed}. Excite the axis "
-            f"(jq.sweep), record longer, or use a longer window. {reasons}".rstrip()
+            f"{best:.2f}, and {parameters.count} parameters need at least {needed}. Excite the "
+            f"axis (jq.sweep), record longer, or use a longer window. {reasons}".rstrip()
         )
 
 
@@ -123,7 +120,7 @@ def _problem(model, parameters, frfs, conditions, priors, cost) -> Problem:
         quantities=tuple(quantity_of(prior.quantity) for prior in priors),
         omega=tuple(frf.omega for frf in frfs),
         measured=tuple(frf.response for frf in frfs),
-        weights=tuple(jnp.zeros(shape) for shape in shapes),
+        weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
         known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
     )
 
@@ -131,17 +128,13 @@ def _problem(model, parameters, frfs, conditions, priors, cost) -> Problem:
 def _solve_reweighted(problem, frfs, used, cost, solver, max_steps) -> tuple[Problem, Solution]:
     """Solve, and once more where the weights depend on the model that came out."""
     ratios = [np.ones(mask.shape) for mask in used]
-    z = problem.parameters.start[: problem.parameters.count]
-    weights: list[np.ndarray] = []
-    while True:
-        found = [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
-        if weights and all(np.allclose(a, b, rtol=1e-4) for a, b in zip(weights, found, strict=True)):
-            return problem, solution
-        settled = bool(weights)
-        weights = found
-        problem = problem.weighted([jnp.asarray(each) for each in weights])
-        solution = solve(problem, z, solver, max_steps)
-        if settled:
-            return problem, solution
-        z = solution.z
-        ratios = [np.exp(np.asarray(part)[..., 0]) for part in solution.sensitivity.misfits]
+    weights = [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
+    z = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count])
+    problem = problem.weighted([jnp.asarray(each) for each in weights])
+    solution = solve(problem, z, solver, max_steps)
+    ratios = [np.exp(np.asarray(part)[..., 0]) for part in solution.sensitivity.misfits]
+    again = [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
+    if all(np.allclose(old, new, rtol=1e-4) for old, new in zip(weights, again, strict=True)):
+        return problem, solution
+    problem = problem.weighted([jnp.asarray(each) for each in again])
+    return problem, solve(problem, solution.z, solver, max_steps)

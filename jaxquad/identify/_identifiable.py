@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._combination import combine, Combination, echelon, Named
+from ._combination import Combination, combine, echelon, Named
 
 
 LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined

@@ -75,10 +75,11 @@ class Parameters(eqx.Module):
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)
         leaves, structure = jax.tree.flatten(arrays)
         values = self.values(z)
-        for leaf in {place.leaf for place in self.places[: z.shape[0]]}:
-            mine = [k for k, place in enumerate(self.places[: z.shape[0]]) if place.leaf == leaf]
-            flat = leaves[leaf].reshape(-1)
-            flat = flat.at[np.array([self.places[k].index for k in mine])].set(values[np.array(mine)])
+        places = self.places[: z.shape[0]]
+        for leaf in {place.leaf for place in places}:
+            mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
+            index = np.array([places[k].index for k in mine])
+            flat = leaves[leaf].reshape(-1).at[index].set(values[mine])
             leaves[leaf] = flat.reshape(leaves[leaf].shape)
         return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
@@ -123,8 +124,8 @@ def _expand(model: PyTree, places: list[Place], free: Free) -> list[str | Positi
     items = []
     for item in [free] if isinstance(free, str | Positive | Real) else free:
         name = item if isinstance(item, str) else item.name
-        whole = [place.name for place in places if place.name.split("[")[0] == name]
-        items += whole if isinstance(item, str) and len(whole) > 1 else [item]
+        whole = [place.name for place in places if place.name.startswith(f"{name}[")]
+        items += whole if isinstance(item, str) and whole else [item]
     return items
 
 

@@ -45,7 +45,7 @@ class Problem(eqx.Module):
     weights: tuple[Float[Array, "frequencies outputs inputs 2"], ...]
     known: Float[Array, "priors 2"]  # value, standard error
 
-    def weighted(self, weights: Sequence[Float[Array, "frequencies outputs inputs 2"]]) -> "Problem":
+    def weighted(self, weights: Sequence[Float[Array, "..."]]) -> "Problem":
         """The same problem under other weights."""
         return dataclasses.replace(self, weights=tuple(weights))
 

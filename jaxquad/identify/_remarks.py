@@ -14,10 +14,11 @@ def remarks_on_fit(
     problem: Problem, solution: Solution, cost: float, decrement: float, chi_squared: float
 ) -> list[str]:
     """Runaway parameters, missing convergence, misfit beyond the noise."""
-    remarks = _runaways(problem, solution)
-    if not remarks and not solution.converged:
+    runaways = _runaways(problem, solution)
+    remarks = list(runaways)
+    if not runaways and not solution.converged:
         remarks.append(f"the solver stopped early: {solution.message}")
-    if not remarks and not decrement <= 1e-3 * max(cost, 1e-9):
+    if not runaways and not decrement <= 1e-3 * max(cost, 1e-9):
         remarks.append(
             f"no minimum: one more Gauss-Newton step would lower the cost by {decrement:.3g} of "
             f"{cost:.4g}; try other starting values"

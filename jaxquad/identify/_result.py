@@ -15,9 +15,9 @@ class Fit(eqx.Module):
     """An identified model with its doubts; `str(fit)` is the table for a report.
 
     Numbers that the record does not determine are `nan`, with an infinite standard error: their
-    determined combinations are in `combinations`. `cramer_rao` and `insensitivity` are CIFER's, in percent
-    (2 sqrt((H^-1)_ii) and 1/sqrt(H_ii) of the cost's Hessian); `standard_errors` and `covariance`
-    are calibrated by the measured noise.
+    determined combinations are in `combinations`. `cramer_rao` and `insensitivity` are CIFER's, in
+    per cent (2 sqrt((H^-1)_ii) and 1/sqrt(H_ii) of the cost's Hessian); `standard_errors` and
+    `covariance` are calibrated by the measured noise.
     """
 
     model: PyTree

@@ -1,20 +1,19 @@
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from ._problem import Problem, residuals, sensitivity, Sensitivity
-
-
-if TYPE_CHECKING:
-    import optimistix as optx
+from ._problem import Problem, residuals, Sensitivity, sensitivity
 
 
 class Solution(NamedTuple):
     """Where the solver stopped, why, and the derivatives there."""
 
     z: Float[Array, " parameters"]
+    model: PyTree
+    values: Float[Array, " all"]  # physical, of free and then fixed parameters
+    slopes: Float[Array, " all"]  # of the physical values with respect to z
     message: str
     converged: bool
     steps: int
@@ -24,7 +23,7 @@ class Solution(NamedTuple):
 def solve(
     problem: Problem,
     z0: Float[Array, " parameters"],
-    solver: "optx.AbstractLeastSquaresSolver | None",
+    solver: Any,
     max_steps: int,
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
@@ -32,10 +31,10 @@ def solve(
     import optimistix as optx
 
     solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8) if solver is None else solver
-    z, result, steps, derivatives = _solve(problem, z0, solver, max_steps)
+    z, facts, result, steps, derivatives = _solve(problem, z0, solver, max_steps)
     converged = bool(result == optx.RESULTS.successful)
     message = "" if converged else _reason(str(optx.RESULTS[result]), int(steps))
-    return Solution(z, message, converged, int(steps), derivatives)
+    return Solution(z, *facts, message, converged, int(steps), derivatives)
 
 
 @eqx.filter_jit
@@ -45,8 +44,11 @@ def _solve(problem, z0, solver, max_steps):
     solution = optx.least_squares(
         _objective, solver, z0, args=problem, max_steps=max_steps, throw=False
     )
-    z_all = problem.parameters.start.at[: z0.size].set(solution.value)
-    return solution.value, solution.result, solution.stats["num_steps"], sensitivity(z_all, problem)
+    z, parameters = solution.value, problem.parameters
+    z_all = parameters.start.at[: z0.size].set(z)
+    model = parameters.insert(problem.model, z)
+    facts = (model, parameters.values(z_all), parameters.slopes(z_all))
+    return z, facts, solution.result, solution.stats["num_steps"], sensitivity(z_all, problem)
 
 
 def _objective(z: Float[Array, " parameters"], problem: Problem) -> Float[Array, " residuals"]:

@@ -35,7 +35,8 @@ class Verification(eqx.Module):
             where = f"{self.band[0]:.4g}..{self.band[1]:.4g} rad/s"
         return (
             f"verification on {self.output_name}, {where}: fit {self.fit_percent:.1f} %, "
-            f"variance accounted for {self.variance_percent:.1f} %, TIC {self.tic:.3f} (good below 0.25), J_rms {self.rms:.4g} {self.output_unit}"
+            f"variance accounted for {self.variance_percent:.1f} %, TIC {self.tic:.3f} (good "
+            f"below 0.25), J_rms {self.rms:.4g} {self.output_unit}"
         ).rstrip()
 
 
@@ -48,10 +49,11 @@ def verify(
 ) -> Verification:
     """Simulate the measured input open loop and compare, on a record that was not fitted.
 
-    `model` is a `TransferFunction` or has a method `transfer_function()`. The unknown initial state, constant
-    biases on the state derivatives and a shift of the output are estimated by least squares,
-    for no record starts in trim. `band` (rad/s) restricts the comparison: an integrating plant
-    drifts on disturbances that no model predicts. `hold` says how the input runs between its samples.
+    `model` is a `TransferFunction` or has a method `transfer_function()`. The unknown initial
+    state, constant biases on the state derivatives and a shift of the output are estimated by
+    least squares, for no record starts in trim. `band` (rad/s) restricts the comparison: an
+    integrating plant drifts on disturbances that no model predicts. `hold` says how the input
+    runs between its samples: "zero" or "first".
     Source: Tischler & Remple, time-domain verification.
     """
     require_x64("a verification")
@@ -80,8 +82,8 @@ def _transfer_function(model: Any) -> TransferFunction:
         return model
     if not hasattr(model, "transfer_function"):
         raise ValueError(
-            f"{type(model).__name__} has no transfer_function(): verify needs a jq.TransferFunction or a "
-            "model with that method"
+            f"{type(model).__name__} has no transfer_function(): verify needs a "
+            "jq.TransferFunction, or a model with that method"
         )
     return model.transfer_function()
 
@@ -122,7 +124,16 @@ def _compare(
     if spread == 0:
         raise ValueError(f"output {record.output_names[0]} does not move: nothing to compare with")
     return Verification(
-        record.time, measured, simulated, rms, rms / sum(sizes), 100 * (1 - rms / spread),
-        100 * (1 - (rms / spread) ** 2), float(weights[0]), weights[1 : 1 + states], band, record.output_names[0],
-        record.output_units[0],
-    )  # fmt: skip
+        time=record.time,
+        measured=measured,
+        simulated=simulated,
+        rms=rms,
+        tic=rms / sum(sizes),
+        fit_percent=100 * (1 - rms / spread),
+        variance_percent=100 * (1 - (rms / spread) ** 2),
+        shift=float(weights[0]),
+        bias=weights[1 : 1 + states],
+        band=band,
+        output_name=record.output_names[0],
+        output_unit=record.output_units[0],
+    )

@@ -1,0 +1,85 @@
+"""Bad input to a fit: one clear error each, that names the value and what to do."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import response_of
+
+import jaxquad as jq
+
+
+START = jq.LaggedIntegrator(150.0, 0.03, 0.02)
+
+
+@pytest.fixture(scope="module")
+def frf():
+    return response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011))
+
+
+def refuse(match, frf, error=ValueError, model=START, **options):
+    with pytest.raises(error, match=match):
+        jq.fit(model, frf, **options)
+
+
+def test_an_unknown_parameter_is_named_beside_those_that_exist(frf):
+    refuse("no parameter 'gian' in the model; it has: gain, lag, delay", frf, free=("gian",))
+
+
+def test_a_start_at_zero_asks_for_a_sign(frf):
+    refuse(
+        r"lag starts at 0.*jq.Real\('lag', scale=",
+        frf,
+        model=jq.LaggedIntegrator(1.0),
+        free=("lag",),
+    )
+    refuse(
+        r"lag starts at 0: say its size",
+        frf,
+        model=jq.LaggedIntegrator(1.0),
+        free=(jq.Real("lag"),),
+    )
+
+
+def test_nothing_free_or_the_same_twice_is_refused(frf):
+    refuse("name each free parameter once", frf, free=())
+    refuse("name each free parameter once", frf, free=("gain", "gain"))
+
+
+def test_an_empty_band_says_where_the_response_is(frf):
+    refuse("band .* holds none .* from 0.5 to 20 rad/s", frf, band=(100.0, 200.0))
+    refuse("band .* holds none", frf, band=(5.0, 1.0))
+
+
+def test_zero_coherence_is_not_identifiable(frf):
+    silent = eqx.tree_at(lambda f: f.coherence, frf, jnp.zeros_like(frf.coherence))
+    refuse(
+        "not identifiable from this record: coherence reaches 0.6 at 0 of 30 frequencies, its "
+        "maximum is 0.00",
+        silent,
+        error=jq.NotIdentifiable,
+    )
+
+
+def test_a_prior_needs_a_cost_with_noise(frf):
+    refuse("a prior has a standard error", frf, priors=[jq.Prior("lag", 0.02, 0.001)])
+    refuse(
+        "no parameter 'lagg' for a prior",
+        frf,
+        priors=[jq.Prior("lagg", 0.02, 0.001)],
+        cost=jq.MaximumLikelihood(),
+    )
+    with pytest.raises(ValueError, match="positive standard error"):
+        jq.Prior("lag", 0.02, 0.0)
+
+
+def test_every_response_needs_a_condition(frf):
+    refuse("1 conditions for 2 responses", (frf, frf), conditions=(None,))
+
+
+def test_float32_is_refused_with_the_way_out(frf):
+    with jax.enable_x64(False):
+        refuse("JAX_ENABLE_X64=1", frf, error=jq.PrecisionError)
+    single = eqx.tree_at(lambda m: m.lag, START, np.float32(0.03) * jnp.ones((), jnp.float32))
+    refuse("parameter lag is float32", frf, error=jq.PrecisionError, model=single)

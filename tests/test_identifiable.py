@@ -1,0 +1,142 @@
+"""What a record cannot tell is said before any number is read."""
+
+import numpy as np
+import pytest
+from synthetic import response_of
+
+import jaxquad as jq
+
+
+ML = jq.MaximumLikelihood()
+RIG = jq.AttitudeAxis(L=0.197, K_t=0.1188, J_x=0.0552, lag=0.02)
+GAIN = 0.197 * 0.1188 / 0.0552
+ADDED = 0.0276
+STARTS = [(0.05, 0.02), (0.3, 0.02), (0.05, 0.4), (0.9, 0.5)]
+
+
+def start(K_t=0.2, J_x=0.1, lag=0.03):
+    return jq.AttitudeAxis(L=0.197, K_t=K_t, J_x=J_x, lag=lag)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return jq.fit(start(), response_of(RIG, seed=0), free=("J_x", "K_t", "lag"), cost=ML)
+
+
+def test_inertia_and_thrust_are_refused_in_the_users_own_names(alone):
+    text = str(alone)
+    assert not alone.identifiable
+    assert text.splitlines()[0].startswith("NOT IDENTIFIABLE")
+    assert "only L K_t / J_x is determined by this record" in text
+    assert "+0.707 J_x" in text and "+0.707 K_t" in text
+    assert "jq.Prior" in text and "second record" in text
+
+
+def test_no_number_is_given_for_what_is_not_determined(alone):
+    assert np.isnan(alone.values[:2]).all() and np.isinf(alone.standard_errors[:2]).all()
+    assert np.isfinite(alone.values[2]) and alone.values[2] == pytest.approx(0.02, rel=0.2)
+    row = next(line for line in str(alone).splitlines() if line.startswith("J_x "))
+    assert "not determined" in row and not any(c.isdigit() for c in row)
+
+
+def test_the_determined_combination_has_its_own_error_bar(alone):
+    (ratio,) = alone.combinations
+    assert ratio.name == "L K_t / J_x"
+    assert abs(ratio.value - GAIN) < 3 * ratio.standard_error < 0.1 * GAIN
+    gain = alone.derived(lambda m: m.gain, "gain")
+    assert gain.value == pytest.approx(ratio.value, rel=1e-9)
+    assert gain.standard_error == pytest.approx(ratio.standard_error, rel=1e-6)
+    low, high = ratio.interval
+    assert low < ratio.value < high and f"{ratio.value:.5g}" in str(ratio)
+
+
+def test_a_quantity_along_the_null_direction_is_refused(alone):
+    with pytest.raises(jq.NotIdentifiable, match="J_x"):
+        alone.derived(lambda m: m.J_x, "J_x")
+
+
+def test_four_starts_give_four_pairs_and_one_ratio():
+    frf = response_of(RIG, seed=1)
+    fits = [jq.fit(start(*pair), frf, free=("J_x", "K_t", "lag"), cost=ML) for pair in STARTS]
+    pairs = np.array([(float(f.model.J_x), float(f.model.K_t)) for f in fits])
+    ratios = np.array([fit.combinations[0].value for fit in fits])
+    assert np.ptp(np.log(pairs[:, 0])) > 1
+    np.testing.assert_allclose(ratios, ratios[0], rtol=1e-6)
+    np.testing.assert_allclose([fit.cost for fit in fits], fits[0].cost, rtol=1e-9)
+
+
+def add_inertia(model):
+    return model.with_added_inertia(ADDED)
+
+
+def test_a_second_record_under_known_added_inertia_tells_them_apart():
+    frfs = response_of(RIG, seed=2), response_of(add_inertia(RIG), seed=3)
+    both = jq.fit(
+        start(), frfs, free=("J_x", "K_t", "lag"), conditions=(None, add_inertia), cost=ML
+    )
+    assert both.identifiable and both.condition < 100
+    np.testing.assert_array_less(
+        np.abs(both.values - [0.0552, 0.1188, 0.02]), 3 * both.standard_errors
+    )
+    # The error of the ratio is amplified by about (1 + J / dJ) sqrt(2): EQUATIONS 1.1.
+    gain = both.derived(lambda m: m.gain, "gain")
+    growth = (both.standard_errors[0] / both.values[0]) / (gain.standard_error / gain.value)
+    assert 2 < growth < 8
+
+
+def test_a_static_torque_tells_them_apart():
+    """Hanging a known mass on the arm gives L K_t, here to 1 %."""
+    prior = jq.Prior(lambda m: m.L * m.K_t, 0.197 * 0.1188, 0.01 * 0.197 * 0.1188)
+    frf = response_of(RIG, seed=4)
+    fit = jq.fit(start(), frf, free=("J_x", "K_t", "lag"), cost=ML, priors=[prior])
+    assert fit.identifiable
+    np.testing.assert_allclose(fit.values[:2], [0.0552, 0.1188], rtol=0.03)
+    assert fit.standard_errors[1] / fit.values[1] == pytest.approx(0.01, rel=0.01)
+
+
+def test_along_the_null_direction_the_posterior_is_the_prior_and_is_called_so():
+    frf = response_of(RIG, seed=4)
+    prior = jq.Prior("K_t", 0.1188, 0.006)
+    fit = jq.fit(start(), frf, free=("J_x", "K_t", "lag"), cost=ML, priors=[prior])
+    assert fit.identifiable
+    assert fit.values[1] == pytest.approx(0.1188, rel=1e-4)
+    assert fit.standard_errors[1] == pytest.approx(0.006, rel=1e-3)
+    assert any("told apart by the prior alone" in remark for remark in fit.remarks)
+
+
+def test_lag_and_delay_of_a_narrow_band_are_determined_as_a_sum():
+    truth = jq.LaggedIntegrator(280.0, 0.016, 0.011)
+    frf = response_of(truth, error=0.04, seed=0, omega=np.geomspace(3.0, 12.0, 30))
+    fit = jq.fit(jq.LaggedIntegrator(200.0, 0.02, 0.02), frf, free=("lag", "delay"), cost=ML)
+    (total,) = fit.combinations
+    assert total.name == "lag + delay"
+    assert abs(total.value - 0.027) < 3 * total.standard_error < 0.005
+
+
+def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
+    truth = jq.TransferFunction([8.0], [1.0, 3.0, 9.0])
+    fit = jq.fit(truth, response_of(truth, seed=0), cost=ML, free=("numerator", "denominator"))
+    assert set(fit.identifiability.undetermined) == set(fit.names)
+    shares = np.array(list(fit.null_directions[0].values()))
+    np.testing.assert_allclose(np.abs(shares), 0.5, atol=1e-3)
+    assert len(fit.combinations) == 3
+
+
+def test_a_parameter_without_effect_is_named():
+    frf = response_of(RIG, seed=0)
+    fit = jq.fit(start(), frf, free=("K_t", "lag", jq.Real("K_af", scale=1e-9)), cost=ML)
+    assert fit.identifiability.undetermined == ("K_af",)
+    assert "nothing about them is determined" in str(fit)
+    assert np.isfinite(fit.values[:2]).all()
+
+
+def test_a_well_posed_fit_says_nothing_of_the_kind():
+    fit = jq.fit(start(), response_of(RIG, seed=0), free=("K_t", "lag"), cost=ML)
+    assert fit.identifiable and not fit.null_directions and "NOT" not in str(fit)
+
+
+def test_what_is_fixed_takes_part_in_names_only_where_it_acts_alike():
+    """The arm acts as the thrust does; the lag does not."""
+    frf = response_of(RIG, seed=0)
+    fit = jq.fit(start(lag=0.02), frf, free=("J_x", "K_t"), cost=ML)
+    assert [c.name for c in fit.combinations] == ["L K_t / J_x"]
