@@ -22,7 +22,7 @@ from ._accuracy import (
 from ._identifiable import decide, Identifiability, Information
 from ._parameters import Place
 from ._problem import Problem
-from ._remarks import MISFIT, remarks_on_fit
+from ._remarks import MISFIT, ran_to_zero, remarks_on_fit
 from ._result import Fit
 from ._solve import Solution
 
@@ -30,14 +30,15 @@ from ._solve import Solution
 def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution) -> Fit:
     """Costs, bounds, calibrated covariance and identifiability at the solution."""
     parameters, count = problem.parameters, problem.parameters.count
-    blocks, known = _blocks(problem, frfs, solution), _known(solution)
+    units = _units(problem, solution)
+    blocks, known = _blocks(problem, frfs, solution, units), _known(solution, units)
     bread, gradient = gauss_newton(blocks, known, count)
     misfit = chi_squared(blocks, known, count)
     # A misfit beyond the noise is in no covariance of the noise: widen the errors to match it.
     inflation = misfit if misfit > MISFIT**2 else 1.0
     covariance = calibrated_covariance(blocks, known, count, inflation)
-    verdict, by_data = _identifiability(problem, solution, blocks, known, covariance)
-    values, slopes = np.asarray(solution.values)[:count], np.asarray(solution.slopes)[:count]
+    verdict, by_data = _identifiability(problem, solution, blocks, known, covariance, units)
+    values, slopes = np.asarray(solution.values)[:count], units[:count]
     lost = np.array([name in verdict.undetermined for name in parameters.names])
     physical = covariance * np.outer(slopes, slopes)
     physical[lost, :] = physical[:, lost] = np.nan
@@ -67,16 +68,41 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
             *_remarks_on_priors(verdict, by_data),
         ),
         parameters=parameters,
+        units=units[:count],
         relative_covariance=covariance,
     )
 
 
-def _blocks(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution) -> list[Block]:
+def _units(problem: Problem, solution: Solution) -> Float[np.ndarray, " all"]:
+    """What relative changes are relative to: the value, or the start of one that ran to zero.
+
+    Relative to itself, a lag that ran to zero would look as if it had no effect, while in truth it
+    trades off with the delay.
+    """
+    units = np.asarray(solution.slopes).copy()
+    start = np.asarray(problem.parameters.values(problem.parameters.start))
+    for k in ran_to_zero(problem, solution):
+        units[k] = start[k] if units[k] != 0 else units[k]
+    return units
+
+
+def _rescale(solution: Solution, units: Float[np.ndarray, " all"]) -> Float[np.ndarray, " all"]:
+    """From derivatives by z to derivatives by changes relative to `units`."""
+    slopes = np.asarray(solution.slopes)
+    return np.where(slopes == 0, 1.0, units / np.where(slopes == 0, 1.0, slopes))
+
+
+def _blocks(
+    problem: Problem,
+    frfs: Sequence[FrequencyResponse],
+    solution: Solution,
+    units: Float[np.ndarray, " all"],
+) -> list[Block]:
     """One block per response pair that has usable frequencies."""
     blocks = []
     for k, frf in enumerate(frfs):
         misfit = np.asarray(solution.sensitivity.misfits[k])
-        slopes = np.asarray(solution.sensitivity.slopes[k])
+        slopes = np.asarray(solution.sensitivity.slopes[k]) * _rescale(solution, units)
         weights = np.asarray(problem.weights[k])
         for o, i in np.ndindex(misfit.shape[1:3]):
             # The error relative to the model: measurement over model is exp(-misfit).
@@ -88,9 +114,10 @@ def _blocks(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solut
     return [block for block in blocks if np.any(block.weights)]
 
 
-def _known(solution: Solution) -> Known:
+def _known(solution: Solution, units: Float[np.ndarray, " all"]) -> Known:
     derivatives = solution.sensitivity
-    return Known(np.asarray(derivatives.prior_misfits), np.asarray(derivatives.prior_slopes))
+    slopes = np.asarray(derivatives.prior_slopes) * _rescale(solution, units)
+    return Known(np.asarray(derivatives.prior_misfits), slopes)
 
 
 def _identifiability(
@@ -99,6 +126,7 @@ def _identifiability(
     blocks: list[Block],
     known: Known,
     covariance: Float[np.ndarray, "parameters parameters"],
+    units: Float[np.ndarray, " all"],
 ) -> tuple[Identifiability, Identifiability]:
     """What data and priors determine together, and what the data determine alone."""
     parameters = problem.parameters
@@ -108,7 +136,7 @@ def _identifiability(
         covariance,
         tuple(place.name for place in parameters.places),
         np.asarray(solution.values),
-        np.asarray(solution.slopes),
+        units,
         _ranks(parameters.places),
     )
     # Rows come in pairs of magnitude and phase; a prior's row counts once.

@@ -60,20 +60,26 @@ def combine(weights: Float[np.ndarray, " parameters"], named: Named) -> Combinat
     Whole exponents or coefficients are taken if they cost no more than a quarter in standard error;
     where nothing simple is as sharp, the weights are printed as they are.
     """
-    limit = 1.25 * _spread(weights, named)
     logarithmic = bool(np.all(named.units == named.values))
-    powers = _simple(weights)
-    if logarithmic and powers is not None:
-        if _spread(powers, named) <= limit * _length(powers, weights):
-            return _product(powers, named)
+    powers = _simple(weights) if logarithmic else None
     sums = _simple(weights / named.units)
-    if sums is not None:
-        if _spread(sums * named.units, named) <= limit * _length(sums * named.units, weights):
-            return _sum(sums, named)
+    if powers is not None and not _as_sharp(powers, weights, named):
+        powers = None
+    if sums is not None and not _as_sharp(sums * named.units, weights, named):
+        sums = None
+    if sums is not None and (powers is None or np.abs(sums).max() < np.abs(powers).max()):
+        return _sum(sums, named)
+    if powers is not None:
+        return _product(powers, named)
     if logarithmic:
         return _product(np.round(weights, 3), named)
     scaled = weights / named.units
     return _sum(np.round(scaled / np.max(np.abs(scaled)), 3), named)
+
+
+def _as_sharp(simple: np.ndarray, weights: np.ndarray, named: Named) -> bool:
+    limit = 1.25 * _spread(weights, named)
+    return _spread(simple, named) <= limit * _length(simple, weights)
 
 
 def _spread(weights: np.ndarray, named: Named) -> float:

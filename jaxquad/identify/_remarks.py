@@ -1,6 +1,7 @@
 """What a reader has to know about a fit before using its numbers."""
 
 import numpy as np
+from jaxtyping import Float
 
 from ._problem import Problem
 from ._solve import Solution
@@ -32,14 +33,23 @@ def remarks_on_fit(
     return remarks
 
 
+def ran_to_zero(problem: Problem, solution: Solution) -> list[int]:
+    """Which of the parameters that keep their sign ran towards zero."""
+    logarithmic = np.array(problem.parameters.logarithmic[: problem.parameters.count])
+    return np.flatnonzero(logarithmic & (_moved(problem, solution) < -_FAR)).tolist()
+
+
+def _moved(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
+    return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
+
+
 def _runaways(problem: Problem, solution: Solution) -> list[str]:
-    parameters = problem.parameters
-    moved = np.asarray(solution.z) - np.asarray(parameters.start)[: parameters.count]
-    remarks = []
-    for name, far, log in zip(parameters.names, moved, parameters.logarithmic, strict=False):
-        if log and abs(far) > _FAR:
-            end, remedy = ("zero", "leave it out") if far < 0 else ("infinity", "start elsewhere")
-            remarks.append(
-                f"{name} ran to {end}: {remedy}, or let its sign change with jq.Real({name!r})"
-            )
+    names, low = problem.parameters.names, ran_to_zero(problem, solution)
+    remarks = [
+        f"{names[k]} ran to zero: leave it out, or let its sign change with jq.Real({names[k]!r})"
+        for k in low
+    ]
+    for k in np.flatnonzero(_moved(problem, solution) > _FAR):
+        if problem.parameters.logarithmic[k]:
+            remarks.append(f"{names[k]} ran to infinity: start elsewhere, or leave it out")
     return remarks

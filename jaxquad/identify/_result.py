@@ -37,7 +37,8 @@ class Fit(eqx.Module):
     identifiability: Identifiability
     remarks: tuple[str, ...] = eqx.field(static=True)
     parameters: Parameters
-    relative_covariance: Float[np.ndarray, "parameters parameters"]  # of what the solver moves
+    units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
+    relative_covariance: Float[np.ndarray, "parameters parameters"]
 
     @property
     def identifiable(self) -> bool:
@@ -79,7 +80,7 @@ class Fit(eqx.Module):
         def value(z: Float[Array, " parameters"]) -> Float[Array, ""]:
             return quantity(self.parameters.insert(self.model, z))
 
-        slope = np.asarray(jax.grad(value)(z))
+        slope = np.asarray(jax.grad(value)(z)) * self.units / np.asarray(self.parameters.slopes(z))
         for direction in self.null_directions:
             null = np.array([direction.get(name, 0.0) for name in self.names])
             if abs(slope @ null) > 1e-6 * np.linalg.norm(slope):

@@ -64,7 +64,7 @@ def verify(
         )
     plant = _transfer_function(model)
     u, y = record.inputs[:, 0], record.outputs[:, 0]
-    forced = np.asarray(simulate_linear(plant, jnp.asarray(u - u.mean()), record.dt, hold=hold))
+    forced = np.asarray(simulate_linear(plant, jnp.asarray(u - u[0]), record.dt, hold=hold))
     initial, biases = (
         np.asarray(free) for free in free_responses(plant, record.samples, record.dt)
     )

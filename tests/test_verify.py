@@ -1,0 +1,101 @@
+"""Time-domain verification against signals made by scipy."""
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, dlsim, tf2ss
+
+import jaxquad as jq
+
+
+DT = 0.01
+MODEL = jq.LaggedIntegrator(30.0, 0.05, 0.03)  # the delay is three samples
+TIME = np.arange(1500) * DT
+
+
+def flight(seed=0, noise=0.0):
+    """The model's own output under held inputs, by scipy's discretisation."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.choice([-1.0, 1.0], 50), 30)
+    discrete = cont2discrete(tf2ss([30.0], [0.05, 1.0, 0.0]), DT, method="zoh")
+    late = np.concatenate([np.full(3, u[0]), u[:-3]])
+    y = dlsim(discrete, late, t=TIME)[1][:, 0]
+    return u, y + noise * rng.standard_normal(TIME.size)
+
+
+def test_a_true_model_fits_entirely():
+    u, y = flight()
+    check = jq.verify(MODEL, jq.Record(TIME, u, y))
+    assert check.fit_percent == pytest.approx(100, abs=1e-6)
+    assert check.tic < 1e-8 and check.rms < 1e-8
+
+
+def test_input_bias_and_reference_shift_are_estimated():
+    """A bias of the input drifts through the integrator; the output starts anywhere."""
+    u, y = flight()
+    check = jq.verify(MODEL, jq.Record(TIME, u + 0.2, y + 5.0))
+    assert check.fit_percent == pytest.approx(100, abs=1e-5)
+    assert np.any(np.abs(check.bias) > 0)
+
+
+def test_the_measures_are_those_of_the_textbook():
+    u, y = flight(noise=0.3)
+    check = jq.verify(MODEL, jq.Record(TIME, u, y))
+    error = check.measured - check.simulated
+    rms = np.sqrt(np.mean(error**2))
+    sizes = np.sqrt(np.mean(check.measured**2)) + np.sqrt(np.mean(check.simulated**2))
+    spread = np.linalg.norm(check.measured - check.measured.mean())
+    assert check.rms == pytest.approx(rms, rel=1e-12)
+    assert check.tic == pytest.approx(rms / sizes, rel=1e-12)
+    assert check.fit_percent == pytest.approx(100 * (1 - np.linalg.norm(error) / spread), rel=1e-9)
+    assert check.variance_percent == pytest.approx(
+        100 * (1 - np.sum(error**2) / spread**2), rel=1e-9
+    )
+    # Only the noise is left: 0.3, less the few estimated numbers.
+    assert check.rms == pytest.approx(0.3, rel=0.05)
+
+
+def test_a_wrong_gain_shows():
+    u, y = flight()
+    wrong = jq.LaggedIntegrator(36.0, 0.05, 0.03)
+    check = jq.verify(wrong, jq.Record(TIME, u, y))
+    assert 70 < check.fit_percent < 90 and check.tic > 0.05
+
+
+def test_a_band_leaves_drift_out():
+    u, y = flight()
+    drift = 8 * np.sin(0.4 * TIME)
+    record = jq.Record(TIME, u, y + drift, output_names="q", output_units="rad/s")
+    whole, band = jq.verify(MODEL, record), jq.verify(MODEL, record, band=(3.0, 60.0))
+    assert band.fit_percent > 90 > whole.fit_percent
+    assert "3..60 rad/s" in str(band) and "whole band" in str(whole)
+    assert "rad/s" in str(band).rsplit("J_rms", 1)[1]
+
+
+def test_models_and_bands_that_cannot_be_verified_are_refused():
+    u, y = flight()
+    record = jq.Record(TIME, u, y)
+    with pytest.raises(ValueError, match="has no transfer_function"):
+        jq.verify(object(), record)
+    with pytest.raises(ValueError, match="Nyquist frequency 314.2"):
+        jq.verify(MODEL, record, band=(1.0, 400.0))
+    with pytest.raises(ValueError, match="overflows within 14.99 s"):
+        jq.verify(jq.TransferFunction([1.0], [1.0, -60.0]), record)
+    two = jq.Record(TIME, np.stack([u, u + 1], axis=1), y)
+    with pytest.raises(ValueError, match="one input with one output"):
+        jq.verify(MODEL, two)
+
+
+def test_the_antx_model_verifies_on_the_other_flight(data):
+    """Fitted on the PRBS flight, verified on the sweep flight, between 0.7 and 12 Hz."""
+    band = (2 * np.pi * 0.7, 2 * np.pi * 12)
+    channels = dict(inputs=["M"], outputs=["q"], references=["x0"], sample_rate=250.0)
+    prbs = jq.read(data / "antx_pitch/antx_log3_prbs.npz", start=50.0, stop=76.0, **channels)
+    sweep = jq.read(data / "antx_pitch/antx_log2_sweep.npz", start=132.8, stop=158.0, **channels)
+    estimator = jq.JointInputOutput(jq.Welch(integrators=1, delay=0.024))
+    frf = jq.frequency_response(prbs, np.geomspace(*band, 80), estimator=estimator)
+    fit = jq.fit(jq.LaggedIntegrator(200.0, 0.02, 0.01), frf, cost=jq.MaximumLikelihood())
+    late = fit.derived(lambda m: m.lag + m.delay)
+    assert 270 < fit.values[0] < 295 and 0.024 < late.value < 0.029
+    check = jq.verify(fit.model, sweep, band=band)
+    # 75 % of the variance; by the norm of the error that is 50 %.
+    assert check.variance_percent > 75 and check.tic < 0.25
