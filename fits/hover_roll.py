@@ -109,54 +109,56 @@ def coverage_table(draws: int) -> tuple[str, dict]:
     return "\n".join(lines), summary
 
 
-def main() -> None:
+def compare(frfs: dict[str, jq.FrequencyResponse]) -> str:
+    """L K_t / J_x by every estimator and cost, beside the truth."""
+    lines = [f"L K_t / J_x by estimator and cost; the simulated truth is {TRUTH:.5f} rad/s^2/V"]
+    for name, frf in frfs.items():
+        for cost, weighing in COSTS.items():
+            gain = gain_of(identify(frf, weighing))
+            error = f"{100 * (gain.value / TRUTH - 1):+.2f} %"
+            numbers = f"{gain.value:9.4f} +- {gain.standard_error:.4f} {error:>10}"
+            lines.append(f"  {name + ', ' + cost:<27}{numbers}")
+    return "\n".join(lines)
+
+
+def options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=0, help="noise draws of a coverage study")
     parser.add_argument("--seed", type=int, default=0, help="noise of the one flight shown")
     parser.add_argument("--out", type=Path, default=Path("results/hover_roll"))
-    options = parser.parse_args()
-    began = time.perf_counter()
+    return parser.parse_args()
 
+
+def main(out: Path, seed: int, draws: int) -> None:
+    began = time.perf_counter()
     print(jq.check_guidelines(SWEEP), "\n")
-    record, loaded, pulses = experiments(options.seed)
+    record, loaded, pulses = experiments(seed)
     frfs = {n: jq.frequency_response(record, OMEGA, estimator=e) for n, e in ESTIMATORS.items()}
-    print(record, "\n", frfs["joint"], "\n", sep="")
+    print(record, frfs["joint"], sep="\n")
 
     alone = identify(frfs["joint"])
-    print(f"One record, asked for J_x and K_t:\n{alone}\n")
-    print(f"L K_t / J_x by estimate and cost; the simulated truth is {TRUTH:.5f} rad/s^2/V")
-    for name, frf in frfs.items():
-        for cost, weighing in COSTS.items():
-            gain = gain_of(identify(frf, weighing))
-            off = 100 * (gain.value / TRUTH - 1)
-            print(
-                f"  {name + ', ' + cost:<27}{gain.value:8.4f} +- {gain.standard_error:.4f}{off:+8.2f} %"
-            )
-
+    print(f"\nOne record, asked for J_x and K_t:\n{alone}\n\n{compare(frfs)}")
     second = jq.frequency_response(loaded, OMEGA, estimator=ESTIMATORS["joint"])
     both = identify_both(frfs["joint"], second)
-    print(
-        f"\nWith a second run under {ADDED} kg m^2 of added inertia (truth: J_x 0.0552, K_t 0.1188):\n{both}\n"
-    )
+    print(f"\nWith a second run under {ADDED} kg m^2 of added inertia; the truth is J_x = 0.0552,")
+    print(f"K_t = 0.1188, lag = 0.02:\n{both}")
     check = jq.verify(both.model, pulses)
-    print(f"3-2-1-1, not used in the fit: {check}")
+    print(f"\nA 3-2-1-1 that was not fitted: {check}")
 
-    summary = None
-    if options.draws:
-        table, summary = coverage_table(options.draws)
+    extra = {
+        "truth": {"gain": TRUTH, "J_x": SHEET.inertia[0], "K_t": SHEET.thrust_coefficient},
+        "one_record": [combination._asdict() for combination in alone.combinations],
+    }
+    if draws:
+        table, extra["coverage"] = coverage_table(draws)
         print(f"\n{table}")
-    extra = {"truth": {"gain": TRUTH, "J_x": SHEET.inertia[0], "K_t": SHEET.thrust_coefficient}}
-    extra |= {"one_record": [combination._asdict() for combination in alone.combinations]}
-    extra |= {"coverage": summary} if summary else {}
-    write_results(options.out, fit=both, frf=frfs["joint"], check=check, extra=extra)
-    models = {"identified": both.model}
-    figure = bode(frfs["joint"], models, others={"direct (H1)": frfs["direct"]})
-    figure.savefig(options.out / "bode.png", dpi=130)
-    overlay(check).savefig(options.out / "verification.png", dpi=130)
-    print(
-        f"\n{options.out}: result.json, bode.png, verification.png; {time.perf_counter() - began:.1f} s"
-    )
+    write_results(out, fit=both, frf=frfs["joint"], check=check, extra=extra)
+    figure = bode(frfs["joint"], {"identified": both.model}, others={"direct": frfs["direct"]})
+    figure.savefig(out / "bode.png", dpi=130)
+    overlay(check).savefig(out / "verification.png", dpi=130)
+    seconds = time.perf_counter() - began
+    print(f"\n{out}: result.json, bode.png, verification.png; {seconds:.1f} s")
 
 
 if __name__ == "__main__":
-    main()
+    main(**vars(options()))

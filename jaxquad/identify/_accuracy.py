@@ -38,25 +38,40 @@ def gauss_newton(blocks: list[Block], known: Known, count: int) -> tuple[Matrix,
     return j.T @ j, j.T @ r
 
 
-def calibrated_covariance(
-    blocks: list[Block], known: Known, count: int, inflation: float = 1.0
-) -> Matrix:
-    """Sandwich covariance: what the measured noise, with all its correlation, does to the fit.
+class Noise(NamedTuple):
+    """What the noise does: J'W S W J of data and of priors, and its share of the cost."""
 
-    (J'WJ)^-1 J'W S W J (J'WJ)^-1 with S the covariance of the responses' errors. It holds for any
-    weights, and counts neighbouring frequencies that share their noise once only. `inflation`
-    multiplies S.
-    """
-    bread, _ = gauss_newton(blocks, known, count)
-    meat = known.slopes[:, :count].T @ known.slopes[:, :count]
+    data: Matrix
+    priors: Matrix
+    cost: float  # expected cost of the noise before any parameter is fitted to it
+
+
+def noise_effect(blocks: list[Block], known: Known, count: int) -> Noise:
+    """The responses' errors, with all their correlation, seen through weights and slopes."""
+    data, cost = np.zeros((count, count)), float(len(known.misfit))
     for block in blocks:
         weighted = block.weights[..., None] ** 2 * block.slopes[..., :count]
         # Circular noise: real and imaginary parts share Im S with opposite signs.
         complex_slopes = weighted[:, 0] + 1j * weighted[:, 1]
-        noise = np.real(complex_slopes.conj().T @ block.covariance @ complex_slopes)
-        meat = meat + 0.5 * inflation * noise
+        data += 0.5 * np.real(complex_slopes.conj().T @ block.covariance @ complex_slopes)
+        cost += float(np.sum(block.weights**2 * block.error[:, None] ** 2))
+    return Noise(data, known.slopes[:, :count].T @ known.slopes[:, :count], cost)
+
+
+def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -> Matrix:
+    """Sandwich covariance: (J'WJ)^-1 J'W S W J (J'WJ)^-1, S the covariance of the errors.
+
+    It holds for any weights, and counts neighbouring frequencies that share their noise once only.
+    `inflation` multiplies S.
+    """
     inverse = scaled_inverse(bread)
-    return inverse @ meat @ inverse
+    return inverse @ (inflation * noise.data + noise.priors) @ inverse
+
+
+def misfit_ratio(cost: float, bread: Matrix, noise: Noise) -> float:
+    """Cost over what the noise alone would leave of it: about 1 where the model is right."""
+    fitted = float(np.trace(scaled_inverse(bread) @ (noise.data + noise.priors)))
+    return cost / max(noise.cost - fitted, 1e-300)
 
 
 def scaled_inverse(matrix: Matrix) -> Matrix:
@@ -74,16 +89,6 @@ def information_root(blocks: list[Block]) -> Float[np.ndarray, "rows all"]:
         for block in blocks
     ]
     return np.concatenate([row.reshape(-1, row.shape[-1]) for row in rows])
-
-
-def chi_squared(blocks: list[Block], known: Known, count: int) -> float:
-    """Squared misfit over random error, per degree of freedom: 1 where the model is right."""
-    used = [block.weights > 0 for block in blocks]
-    total = float(np.sum(known.misfit**2))
-    for block, mask in zip(blocks, used, strict=True):
-        total += float(np.sum((block.misfit / block.error[:, None])[mask] ** 2))
-    freedom = sum(int(mask.sum()) for mask in used) + len(known.misfit) - count
-    return total / max(freedom, 1)
 
 
 def cramer_rao(bread: Matrix) -> Float[np.ndarray, " parameters"]:

@@ -10,13 +10,14 @@ from jaxquad.spectra import FrequencyResponse
 from ._accuracy import (
     Block,
     calibrated_covariance,
-    chi_squared,
     condition_number,
     cramer_rao,
     gauss_newton,
     information_root,
     insensitivity,
     Known,
+    misfit_ratio,
+    noise_effect,
     scaled_inverse,
 )
 from ._identifiable import decide, Identifiability, Information
@@ -33,18 +34,18 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
     units = _units(problem, solution)
     blocks, known = _blocks(problem, frfs, solution, units), _known(solution, units)
     bread, gradient = gauss_newton(blocks, known, count)
-    misfit = chi_squared(blocks, known, count)
+    noise = noise_effect(blocks, known, count)
+    cost = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
+    cost += float(np.sum(known.misfit**2))
+    misfit = misfit_ratio(cost, bread, noise)
     # A misfit beyond the noise is in no covariance of the noise: widen the errors to match it.
-    inflation = misfit if misfit > MISFIT**2 else 1.0
-    covariance = calibrated_covariance(blocks, known, count, inflation)
+    covariance = calibrated_covariance(bread, noise, misfit if misfit > MISFIT**2 else 1.0)
     verdict, by_data = _identifiability(problem, solution, blocks, known, covariance, units)
     values, slopes = np.asarray(solution.values)[:count], units[:count]
     lost = np.array([name in verdict.undetermined for name in parameters.names])
     physical = covariance * np.outer(slopes, slopes)
     physical[lost, :] = physical[:, lost] = np.nan
     percent = 100 * np.abs(slopes / np.where(values == 0, np.nan, values))
-    cost = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
-    cost += float(np.sum(known.misfit**2))
     decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
     return Fit(
         model=solution.model,

@@ -29,7 +29,7 @@ class Fit(eqx.Module):
     insensitivity: Float[np.ndarray, " parameters"]  # %
     cost: float  # summed over the responses
     average_cost: float  # per response
-    chi_squared: float  # squared misfit over random error, per degree of freedom
+    chi_squared: float  # cost over what the measured noise alone would leave: about 1
     newton_decrement: float  # what one more Gauss-Newton step would lower the cost by
     condition: float  # of the scaled Jacobian
     points: int  # frequencies used, over all responses

@@ -1,0 +1,115 @@
+"""One transfer-function fit beside scipy's, in one run.
+
+    python -m pytest tests/benchmarks/test_fit_speed.py -o addopts= --benchmark-columns=min,median
+
+Both start from the same values on the same response, fit logarithms of five parameters (gain,
+lag, damping, natural frequency, delay) under the same weights, and must agree. Ours also gives
+covariance, identifiability and remarks; `solve` is the minimisation and its Jacobian alone.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import jaxquad as jq
+from jaxquad.identify._fit import _problem, _usable
+from jaxquad.identify._parameters import select_parameters
+from jaxquad.identify._solve import solve
+
+
+jax.config.update("jax_enable_x64", True)
+
+OMEGA = np.geomspace(0.6, 40.0, 60)
+TRUTH = np.array([18.0, 0.045, 0.55, 7.0, 0.018])
+ERROR = 0.02
+
+
+class Airframe(eqx.Module):
+    """K wn^2 / (s^2 + 2 zeta wn s + wn^2) / (tau s + 1) exp(-delay s)."""
+
+    K: jax.Array
+    tau: jax.Array
+    zeta: jax.Array
+    wn: jax.Array
+    delay: jax.Array
+
+    def frequency_response(self, omega):
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
+        leaves = (self.K, self.tau, self.zeta, self.wn, self.delay)
+        K, tau, zeta, wn, delay = (leaf.astype(s.dtype) for leaf in leaves)
+        rigid = K * wn**2 / (s * s + 2 * zeta * wn * s + wn**2)
+        return (rigid / (tau * s + 1) * jnp.exp(-delay * s))[:, None, None]
+
+
+def _numpy_response(values):
+    K, tau, zeta, wn, delay = values
+    s = 1j * OMEGA
+    rigid = K * wn**2 / (s * s + 2 * zeta * wn * s + wn**2)
+    return rigid / (tau * s + 1) * np.exp(-delay * s)
+
+
+@pytest.fixture(scope="module")
+def frf():
+    rng = np.random.default_rng(0)
+    noise = ERROR * (rng.standard_normal(60) + 1j * rng.standard_normal(60))
+    shape = (60, 1, 1)
+    return jq.FrequencyResponse(
+        jnp.asarray(OMEGA),
+        jnp.asarray(_numpy_response(TRUTH) * (1 + noise))[:, None, None],
+        jnp.full(shape, 0.95),
+        jnp.full(shape, ERROR),
+        jnp.asarray(2 * ERROR**2 * np.eye(60), dtype=complex)[None, None],
+        jnp.full(shape, 0.95),
+        "joint",
+        ("u",),
+        ("y",),
+    )
+
+
+START = TRUTH * 1.3
+
+
+def _peer(frf):
+    measured = np.asarray(frf.response)[:, 0, 0]
+
+    def residual(z):
+        log = np.log(_numpy_response(np.exp(z)) / measured) / ERROR
+        return np.concatenate([log.real, log.imag])
+
+    return np.exp(least_squares(residual, np.log(START), method="lm").x)
+
+
+def _model():
+    return Airframe(*(jnp.asarray(value) for value in START))
+
+
+class _OneSolve(eqx.Module):
+    """Maximum likelihood without the second solve under the model's own weights."""
+
+    def weights(self, frf, used, ratio):
+        return jq.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
+
+
+@pytest.mark.benchmark(group="fit")
+def test_scipy_least_squares(benchmark, frf):
+    benchmark(_peer, frf)
+
+
+@pytest.mark.benchmark(group="fit")
+def test_solve(benchmark, frf):
+    parameters = select_parameters(_model(), None)
+    cost = _OneSolve()
+    problem = _problem(_model(), parameters, [frf], None, (), cost)
+    used = _usable(frf, None, 0.6)
+    problem = problem.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
+    found = benchmark(lambda: solve(problem, parameters.start[:5], None, 256).z.block_until_ready())
+    np.testing.assert_allclose(np.exp(found), _peer(frf), rtol=1e-5)
+
+
+@pytest.mark.benchmark(group="fit")
+def test_fit_with_all_its_doubts(benchmark, frf):
+    fit = benchmark(lambda: jq.fit(_model(), frf, cost=_OneSolve()))
+    np.testing.assert_allclose(fit.values, _peer(frf), rtol=1e-5)
