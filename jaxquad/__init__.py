@@ -52,6 +52,7 @@ from .records import (
 )
 from .simulate import (
     Encoder as Encoder,
+    excite as excite,
     gauss_markov as gauss_markov,
     MotorDrive as MotorDrive,
     Scenario as Scenario,

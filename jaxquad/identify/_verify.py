@@ -49,9 +49,9 @@ def verify(
 ) -> Verification:
     """Simulate the measured input open loop and compare, on a record that was not fitted.
 
-    `model` is a `TransferFunction` or has a method `transfer_function()`. The unknown initial
-    state, constant biases on the state derivatives and a shift of the output are estimated by
-    least squares, for no record starts in trim. `band` (rad/s) restricts the comparison: an
+    `model` is a `TransferFunction` or has a method `transfer_function()`. Constant biases
+    on the state derivatives and a shift of the output are estimated by least squares, for no
+    record starts in perfect trim. `band` (rad/s) restricts the comparison: an
     integrating plant drifts on disturbances that no model predicts. `hold` says how the input
     runs between its samples: "zero" or "first".
     Source: Tischler & Remple, time-domain verification.
@@ -65,10 +65,8 @@ def verify(
     plant = _transfer_function(model)
     u, y = record.inputs[:, 0], record.outputs[:, 0]
     forced = np.asarray(simulate_linear(plant, jnp.asarray(u - u[0]), record.dt, hold=hold))
-    initial, biases = (
-        np.asarray(free) for free in free_responses(plant, record.samples, record.dt)
-    )
-    columns = np.column_stack([y, forced, np.ones_like(y), biases, initial])
+    biases = np.asarray(free_responses(plant, record.samples, record.dt)[1])
+    columns = np.column_stack([y, forced, np.ones_like(y), biases])
     if not np.all(np.isfinite(columns)):
         raise ValueError(
             f"the model's open-loop response overflows within {record.duration:.4g} s: its poles "

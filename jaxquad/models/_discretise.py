@@ -2,7 +2,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import expm
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._realise import realise
 from ._transfer_function import TransferFunction
@@ -57,14 +57,14 @@ def sampled(
 
 
 def simulate_linear(
-    model: TransferFunction, u: Float[Array, " samples"], dt: float, *, hold: str = "zero"
+    model: TransferFunction, u: Float[ArrayLike, " samples"], dt: float, *, hold: str = "zero"
 ) -> Float[Array, " samples"]:
     """The output at the samples of an input `u`, which was 0 before the first: exact, from rest.
 
     Between samples `dt` seconds apart the input stays at the last one (`hold="zero"`) or runs
     straight to the next (`hold="first"`). Raises ValueError for another hold.
     """
-    return _respond(model, _segments(u, hold), dt)
+    return _respond(model, _segments(jnp.asarray(u), hold), dt)
 
 
 @eqx.filter_jit

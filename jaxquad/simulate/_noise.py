@@ -4,7 +4,12 @@ from jaxtyping import Array, Float, Key
 
 
 def gauss_markov(
-    key: Key[Array, ""], shape: tuple[int, ...], *, deviation: float, corner: float, dt: float
+    key: Key[Array, ""],
+    shape: tuple[int, ...],
+    *,
+    deviation: float | Float[Array, ""],
+    corner: float | Float[Array, ""],
+    dt: float,
 ) -> Float[Array, "samples ..."]:
     """Stationary first-order Gauss-Markov noise along the first axis, such as gusts of torque.
 
@@ -15,7 +20,6 @@ def gauss_markov(
     drive = deviation * jnp.sqrt(1 - keep**2)
 
     def advance(level, kick):
-        level = keep * level + drive * kick
-        return level, level
+        return keep * level + drive * kick, level
 
-    return jax.lax.scan(advance, deviation * white[0], white)[1]
+    return jax.lax.scan(advance, deviation * white[0], jnp.roll(white, -1, axis=0))[1]

@@ -1,0 +1,3 @@
+from ._bode import bode as bode
+from ._overlay import overlay as overlay, record_figure as record_figure
+from ._results import write_results as write_results

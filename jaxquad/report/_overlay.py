@@ -1,0 +1,59 @@
+from typing import Any
+
+import numpy as np
+
+from jaxquad.identify import Verification
+from jaxquad.records import Record
+
+
+def overlay(check: Verification, *, title: str = "") -> Any:
+    """Measured and simulated output over time, with the difference below.
+
+    Angles are drawn in degrees. Returns a `matplotlib.figure.Figure`.
+    """
+    from matplotlib.figure import Figure
+
+    scale, unit = _shown(check.output_unit)
+    measured, simulated = scale * check.measured, scale * check.simulated
+    figure = Figure(figsize=(6.5, 4.5), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1.2])
+    top.plot(check.time, measured, color="0.15", lw=1.0, label="measured")
+    top.plot(check.time, simulated, color="tab:blue", lw=1.6, ls="--", label="simulated, open loop")
+    top.legend(loc="upper right", fontsize=9, ncols=2)
+    top.set_ylabel(f"{check.output_name}{unit}")
+    bottom.plot(check.time, measured - simulated, color="tab:red", lw=0.9)
+    bottom.set_ylabel(f"difference{unit}")
+    bottom.set_xlabel("time, s")
+    for axis in (top, bottom):
+        axis.grid(True, color="0.9", lw=0.5)
+        axis.margins(x=0)
+    low, high = top.get_ylim()
+    top.set_ylim(low, high + 0.15 * (high - low))
+    where = f", {check.band[0]:.3g}..{check.band[1]:.3g} rad/s" if check.band else ""
+    numbers = f"fit {check.fit_percent:.1f} %, TIC {check.tic:.3f}{where}"
+    figure.suptitle(f"{title}: {numbers}" if title else numbers, fontsize=11)
+    return figure
+
+
+def record_figure(record: Record) -> Any:
+    """All channels of a record over time, stacked. Returns a `matplotlib.figure.Figure`."""
+    from matplotlib.figure import Figure
+
+    names = (*record.reference_names, *record.input_names, *record.output_names)
+    figure = Figure(figsize=(6.5, 1.2 + 1.4 * len(names)), layout="constrained")
+    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, name in zip(axes, names, strict=True):
+        scale, unit = _shown(record.unit(name))
+        axis.plot(record.time, scale * record.channel(name), color="0.15", lw=0.7)
+        axis.set_ylabel(f"{name}{unit}")
+        axis.grid(True, color="0.9", lw=0.5)
+        axis.margins(x=0)
+    axes[-1].set_xlabel("time, s")
+    return figure
+
+
+def _shown(unit: str) -> tuple[float, str]:
+    """Factor and label of a unit as it is drawn."""
+    if unit in ("rad", "rad/s"):
+        return float(np.degrees(1.0)), ", " + unit.replace("rad", "deg")
+    return 1.0, f", {unit}" if unit else ""
