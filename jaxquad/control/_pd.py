@@ -1,8 +1,13 @@
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
+
+
+def _as_float(x: ArrayLike | Sequence[Any]) -> Array:
+    return jnp.asarray(x, dtype=jnp.result_type(float))
 
 
 class PDState(NamedTuple):
@@ -20,8 +25,8 @@ class PD(eqx.Module):
     first-order filter of `bandwidth` (rad/s) at the sample interval `dt` (s).
     """
 
-    proportional: Float[Array, " axes"] = eqx.field(converter=jnp.asarray)  # V/rad
-    derivative: Float[Array, " axes"] = eqx.field(converter=jnp.asarray)  # V s/rad
+    proportional: Float[Array, " axes"] = eqx.field(converter=_as_float)  # V/rad
+    derivative: Float[Array, " axes"] = eqx.field(converter=_as_float)  # V s/rad
     bandwidth: float = eqx.field(static=True, default=125.0)  # 20 Hz
     dt: float = eqx.field(static=True, default=0.002)
 
@@ -53,11 +58,15 @@ class PD(eqx.Module):
 
 
 def place_pd(
-    gain: Float[ArrayLike, " axes"], *, natural_frequency: float, damping: float, dt: float = 0.002
+    gain: ArrayLike | Sequence[Any],
+    *,
+    natural_frequency: float,
+    damping: float,
+    dt: float = 0.002,
 ) -> PD:
     """The `PD` that gives gain/s^2 per axis this natural frequency (rad/s) and damping ratio.
 
     `gain` in rad/s^2 per unit of command.
     """
-    gain = jnp.asarray(gain, dtype=float)
+    gain = _as_float(gain)
     return PD(natural_frequency**2 / gain, 2 * damping * natural_frequency / gain, dt=dt)

@@ -5,6 +5,7 @@ from ._cost import (
     MaximumLikelihood as MaximumLikelihood,
 )
 from ._fit import fit as fit
+from ._guess import guess_lagged_integrator as guess_lagged_integrator
 from ._identifiable import NotIdentifiable as NotIdentifiable
 from ._parameters import Positive as Positive, Real as Real
 from ._problem import Prior as Prior

@@ -45,7 +45,7 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
     lost = np.array([name in verdict.undetermined for name in parameters.names])
     physical = covariance * np.outer(slopes, slopes)
     physical[lost, :] = physical[:, lost] = np.nan
-    percent = 100 * np.abs(slopes / np.where(values == 0, np.nan, values))
+    percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
     decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
     return Fit(
         model=solution.model,
@@ -81,9 +81,9 @@ def _units(problem: Problem, solution: Solution) -> Float[np.ndarray, " all"]:
     trades off with the delay.
     """
     units = np.asarray(solution.slopes).copy()
-    start = np.asarray(problem.parameters.values(problem.parameters.start))
+    scale, start = (np.asarray(x) for x in (problem.parameters.scale, problem.parameters.start))
     for k in ran_to_zero(problem, solution):
-        units[k] = start[k] if units[k] != 0 else units[k]
+        units[k] = scale[k] * np.exp(start[k]) if units[k] != 0 else units[k]
     return units
 
 

@@ -61,15 +61,6 @@ class Parameters(eqx.Module):
         ones = jnp.ones_like(z)
         return self.scale[:n] * jnp.where(np.array(self.logarithmic[:n]), jnp.exp(z), ones)
 
-    def at(self, model: PyTree) -> Float[Array, " parameters"]:
-        """The vector `z` of a model's free parameters."""
-        leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
-        free = self.places[: self.count]
-        values = jnp.stack([leaves[place.leaf].reshape(-1)[place.index] for place in free])
-        ratio = values / self.scale[: self.count]
-        logs = np.array(self.logarithmic[: self.count])
-        return jnp.where(logs, jnp.log(jnp.where(logs, ratio, 1.0)), ratio)
-
     def insert(self, model: PyTree, z: Float[Array, " n"]) -> PyTree:
         """The model with its first `n` parameters set."""
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)

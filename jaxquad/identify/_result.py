@@ -74,21 +74,18 @@ class Fit(eqx.Module):
         First-order propagation of the covariance. Raises `NotIdentifiable` where the quantity
         depends on what the record does not determine.
         """
-        count = len(self.names)
-        z = self.parameters.at(self.model)
-
-        def value(z: Float[Array, " parameters"]) -> Float[Array, ""]:
-            return quantity(self.parameters.insert(self.model, z))
-
-        slope = np.asarray(jax.grad(value)(z)) * self.units / np.asarray(self.parameters.slopes(z))
+        gradient = jax.tree.leaves(eqx.filter_grad(quantity)(self.model))
+        places = self.parameters.places[: len(self.names)]
+        each = [np.asarray(gradient[place.leaf]).reshape(-1)[place.index] for place in places]
+        slope = np.array(each) * self.units
         for direction in self.null_directions:
             null = np.array([direction.get(name, 0.0) for name in self.names])
             if abs(slope @ null) > 1e-6 * np.linalg.norm(slope):
                 raise NotIdentifiable(
                     f"{name} changes along {direction}, which this record does not determine"
                 )
-        error = float(np.sqrt(slope @ self.relative_covariance[:count, :count] @ slope))
-        return Combination(name, float(value(z)), error)
+        error = float(np.sqrt(slope @ self.relative_covariance @ slope))
+        return Combination(name, float(quantity(self.model)), error)
 
     def __str__(self) -> str:
         return fit_table(self)

@@ -42,8 +42,10 @@ def sampled(
     shift = jax.lax.stop_gradient(jnp.floor(delay / dt + _WHOLE))
     late = delay / dt - shift
     old, new = _parts(late, B.shape[1])
-    first, effect_of_old = _propagate(A, B, late * dt)
-    second, effect_of_new = _propagate(A, B, (1 - late) * dt)
+    spans = jnp.stack([late, 1 - late]) * dt
+    (first, second), (effect_of_old, effect_of_new) = jax.vmap(_propagate, in_axes=(None, None, 0))(
+        A, B, spans
+    )
     drive = [_dot(second, _dot(effect_of_old, old)), _dot(effect_of_new, new)]
     whole, values = late <= _WHOLE, slice(B.shape[1])
     at_sample = [jnp.where(whole, 0, old[values]), jnp.where(whole, new[values], 0)]

@@ -1,9 +1,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from jaxquad.spectra import FrequencyResponse
 
@@ -91,15 +92,20 @@ def _model(
     axes: Any, frf: FrequencyResponse, model: Any, o: int, i: int, name: str, line: str
 ) -> None:
     omega = np.geomspace(float(frf.omega[0]), float(frf.omega[-1]), 300)
-    response: Complex[np.ndarray, " frequencies"] = np.asarray(
-        model.frequency_response(jnp.asarray(omega))
-    )[:, o, i]
+    response = np.asarray(_response(model, jnp.asarray(omega)))[:, o, i]
     phase = np.degrees(np.unwrap(np.angle(response)))
     measured = np.interp(omega, np.asarray(frf.omega), _phase(frf, o, i))
     phase = phase - 360 * np.round(np.median(phase - measured) / 360)
     style = dict(ls=line, lw=1.6, color="tab:blue", label=name)
     axes[0].plot(omega, 20 * np.log10(np.abs(response)), **style)
     axes[1].plot(omega, phase, **style)
+
+
+@eqx.filter_jit
+def _response(
+    model: Any, omega: Float[Array, " frequencies"]
+) -> Complex[Array, "frequencies outputs inputs"]:
+    return model.frequency_response(omega)
 
 
 def _phase(frf: FrequencyResponse, o: int, i: int) -> Float[np.ndarray, " frequencies"]:

@@ -1,4 +1,8 @@
-from ._estimate import frequency_response as frequency_response, JointInputOutput as JointInputOutput
+from ._density import spectral_density as spectral_density, SpectralDensity as SpectralDensity
+from ._estimate import (
+    frequency_response as frequency_response,
+    JointInputOutput as JointInputOutput,
+)
 from ._frequency_response import FrequencyResponse as FrequencyResponse
 from ._precision import (
     PrecisionError as PrecisionError,

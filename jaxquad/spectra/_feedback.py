@@ -61,8 +61,9 @@ def remarks_on_feedback(
             remarks += _explained_by_reference(omega, coherence[:, o], direct[:, o])
         elif phase_rises(omega, phase[:, o], error[:, o], coherence[:, o]):
             remarks.append(
-                "feedback-dominated: the phase rises with frequency at the top of the coherent band, "
-                "as that of -1/C does and no actuator's; the coherence there comes from the controller"
+                "feedback-dominated: the phase rises with frequency at the top of the coherent "
+                "band, as that of -1/C does and no actuator's; the coherence there comes from the "
+                "controller"
             )
     return tuple(dict.fromkeys(remarks))
 
@@ -77,7 +78,8 @@ def _explained_by_reference(
         return []
     span = omega[mine]
     return [
-        f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} frequencies, "
-        f"but at {np.sum(mine)} of them ({span[0]:.3g}..{span[-1]:.3g} rad/s) the reference explains "
-        "neither: there the controller feeds noise back, and nothing tells about the plant"
+        f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
+        f"frequencies, but at {np.sum(mine)} of them ({span[0]:.3g}..{span[-1]:.3g} rad/s) the "
+        "reference explains neither: there the controller feeds noise back, and nothing tells "
+        "about the plant"
     ]

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from ._transform import turn
 from ._window import window
 
 
@@ -47,12 +48,12 @@ def relative_covariance(
     power = _noise_power(z, x, y, response, omega, windows)
     cross = jnp.sum(jnp.conj(z) * x, axis=0)
     effect = jnp.einsum("sf,st->ft", jnp.conj(z), windows.astype(z.dtype))
-    effect = effect * jnp.exp(-1j * omega[:, None] * times[None, :])
-    gain = jnp.sqrt(power) / (cross * response)
+    effect = effect * turn(omega[:, None] * times[None, :])
+    gain = jnp.sqrt(power).astype(z.dtype) / (cross * response)
     effect = effect * gain[:, None]
     apart = jnp.abs(omega[:, None] - omega[None, :])
     shared = effect @ jnp.conj(effect.T)
-    return jnp.where(apart < _REACH * resolution, shared, 0.0)
+    return jnp.where(apart < _REACH * resolution, shared, jnp.zeros_like(shared))
 
 
 def _noise_power(
@@ -80,9 +81,10 @@ def _residual_moments(
     overlap: Complex[Array, "segments segments"],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Expected residual energy for unit noise, and its effective complex degrees of freedom."""
-    project = jnp.outer(x, jnp.conj(z)) / jnp.vdot(z, x)
-    left = overlap - project @ overlap
-    moment = left - left @ jnp.conj(project.T)
+    cross = jnp.vdot(z, x)
+    # From both sides, less the projection x z* / cross, which takes the fitted response out.
+    left = overlap - jnp.outer(x, jnp.conj(z) @ overlap / cross)
+    moment = left - jnp.outer(left @ z / jnp.conj(cross), jnp.conj(x))
     trace = jnp.real(jnp.trace(moment))
     return trace, trace**2 / jnp.sum(jnp.abs(moment) ** 2)
 

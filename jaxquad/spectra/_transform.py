@@ -2,26 +2,37 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 
 @eqx.filter_jit
 def segment_transforms(
-    signals: Float[Array, "samples channels"],
+    signals: Float[ArrayLike, "samples channels"],
     starts: tuple[int, ...],
-    taper: Float[Array, " window"],
-    omega: Float[Array, " frequencies"],
-    dt: Float[Array, ""],
+    taper: Float[ArrayLike, " window"],
+    angle: Float[ArrayLike, " frequencies"],
     detrend: str,
+    *,
+    origin: Float[ArrayLike, ""] = 0.0,
+    factor: Complex[ArrayLike, "frequencies channels"] | None = None,
 ) -> Complex[Array, "segments frequencies channels"]:
-    """Windowed Fourier sums of every segment at any frequencies `omega` (rad/s).
+    """Windowed Fourier sums of every segment at any frequencies, `angle` in rad per sample.
 
-    `sum_n taper[n] x[start + n] exp(-j omega n dt)`: the phase counts from the segment's start.
+    `factor sum_n taper[n] x[start + n] exp(-j angle (origin + start + n))`: the phase is absolute,
+    of a record whose first sample is number `origin`.
     """
+    signals, taper, angle = jnp.asarray(signals), jnp.asarray(taper), jnp.asarray(angle)
     # Slices at known places, not a gather of indices: the gather is six times slower.
     segments = jnp.stack([signals[start : start + taper.size] for start in starts])
-    segments = _remove_trend(segments, detrend)
-    return _fourier_sums(segments * taper[None, :, None], omega, dt)
+    sums = _fourier_sums(_remove_trend(segments, detrend) * taper[None, :, None], angle)
+    places = jnp.asarray(origin, angle.dtype) + jnp.asarray(starts, angle.dtype)
+    turned = sums * turn(places[:, None] * angle[None, :])[:, :, None]
+    return turned if factor is None else turned * jnp.asarray(factor)[None, :, :]
+
+
+def turn(angle: Float[Array, "*shape"]) -> Complex[Array, "*shape"]:
+    """`exp(-j angle)`, in the precision of `angle`."""
+    return jax.lax.complex(jnp.cos(angle), -jnp.sin(angle))
 
 
 def _remove_trend(
@@ -38,20 +49,17 @@ def _remove_trend(
 
 
 def _fourier_sums(
-    segments: Float[Array, "segments window channels"],
-    omega: Float[Array, " frequencies"],
-    dt: Float[Array, ""],
+    segments: Float[Array, "segments window channels"], angle: Float[Array, " frequencies"]
 ) -> Complex[Array, "segments frequencies channels"]:
-    """Two levels: within short blocks, then over the blocks, so that few exponentials are needed."""
+    """Two levels, within short blocks and over the blocks, so that few exponentials are needed."""
     count, window, channels = segments.shape
     block = max(int(np.sqrt(window)), 1)
     blocks = -(-window // block)
     padded = jnp.pad(segments, ((0, 0), (0, blocks * block - window), (0, 0)))
     parts = padded.reshape(count, blocks, block, channels)
-    angle = omega[:, None] * dt
-    inner = angle * jnp.arange(block, dtype=omega.dtype)[None, :]
-    outer = jnp.exp(-1j * angle * (block * jnp.arange(blocks, dtype=omega.dtype))[None, :])
+    inner = angle[:, None] * jnp.arange(block, dtype=angle.dtype)[None, :]
+    outer = angle[:, None] * jnp.arange(0, blocks * block, block, dtype=angle.dtype)[None, :]
     # Real factors: a product of a real with a complex array would double the arithmetic.
     real = jnp.einsum("sbnc,fn->sbfc", parts, jnp.cos(inner))
     imag = jnp.einsum("sbnc,fn->sbfc", parts, jnp.sin(inner))
-    return jnp.einsum("sbfc,fb->sfc", jax.lax.complex(real, -imag), outer)
+    return jnp.einsum("sbfc,fb->sfc", jax.lax.complex(real, -imag), turn(outer))

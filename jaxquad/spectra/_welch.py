@@ -17,8 +17,8 @@ class Welch(eqx.Module):
 
     `window_length` in s; by default a fifth of the longest record, so that five independent
     windows are averaged. `integrators` is the number of pure integrations between input and
-    output: the output is differenced so many times before it is windowed, and the response divided by
-    the differencing filter. That keeps the steep response of 1/s^n from leaking
+    output: the output is differenced so many times before it is windowed, and the response divided
+    by the differencing filter. That keeps the steep response of 1/s^n from leaking
     through the window (a 40 s Hann window is wrong by 10 % at 0.4 rad/s without it). `delay`, in s,
     is about how much the output lags the input: it is taken out before windowing and put back
     after, since a late output is weighed by another part of the window (1 % at the end of a sweep).
@@ -57,54 +57,75 @@ class Welch(eqx.Module):
                 f"{shortest}: at least two windows of 8 samples must fit; set window_length "
                 f"below {shortest * records[0].dt / 2:.4g} s"
             )
+        if self.delay >= length * records[0].dt:
+            raise ValueError(
+                f"a delay of {self.delay:.4g} s is not shorter than the window of {seconds:.4g} s"
+            )
         return length
+
+    def late(self, record: Record) -> int:
+        """Samples of `delay`."""
+        return int(round(self.delay / record.dt))
 
     def default_omega(self, records: Sequence[Record]) -> Float[np.ndarray, " frequencies"]:
         """100 log-spaced frequencies, from one cycle to a window to a tenth of the sample rate."""
         dt = records[0].dt
-        lowest = 2 * np.pi / (self.length(records) * dt)
-        return np.geomspace(lowest, 2 * np.pi / (10 * dt), 100)
+        length = self.length(records)
+        if length <= 10:
+            raise ValueError(
+                f"a window of {length} samples resolves nothing below a tenth of the sample rate: "
+                "set a longer window_length, or name the frequencies with omega="
+            )
+        return np.geomspace(2 * np.pi / (length * dt), 2 * np.pi / (10 * dt), 100)
 
 
 class Segments(eqx.Module):
-    """Windowed transforms of all channels, over all windows of all records, in absolute phase."""
+    """Windowed transforms over all windows of all records, in absolute phase.
 
-    transforms: dict[str, Complex[Array, "segments frequencies channels"]]
-    starts: tuple[int, ...] = eqx.field(static=True)
+    Channels stand as in `Record.names`: inputs, outputs, references.
+    """
+
+    transforms: Complex[Array, "segments frequencies channels"]
+    starts: tuple[int, ...] = eqx.field(static=True)  # the records one after the other, apart
     length: int = eqx.field(static=True)
 
 
 def transform_records(
     records: Sequence[Record], omega: Float[np.ndarray, " frequencies"], welch: Welch
 ) -> Segments:
-    """Transform inputs, outputs and references; no window spans the seam of two records."""
+    """Transform all channels; no window spans the seam of two records."""
     require_x64("a frequency response")
-    length, dt = welch.length(records), records[0].dt
-    shifts = np.cumsum([0] + [record.samples + length for record in records[:-1]])
-    parts, starts = [], []
-    for record, shift in zip(records, shifts, strict=True):
+    length = welch.length(records)
+    origin, parts, starts = 0, [], []
+    for record in records:
         local = segment_starts(record.samples - welch.integrators, length, welch.overlap)
-        parts.append(_transform_record(record, omega, welch, local, length))
-        starts += [int(shift) + start for start in local]
-    turn = jnp.exp(-1j * jnp.asarray(np.outer(starts, omega) * dt))[:, :, None]
-    joined = {key: jnp.concatenate([part[key] for part in parts]) * turn for key in parts[0]}
+        parts.append(_transform_record(record, omega, welch, local, length, origin))
+        starts += [origin + start for start in local]
+        origin += record.samples + length
+    joined = parts[0] if len(parts) == 1 else jnp.concatenate(parts)
     return Segments(joined, tuple(starts), length)
 
 
-def _transform_record(record, omega, welch, starts, length):
-    n, shift = welch.integrators, int(round(welch.delay / record.dt))
+def _transform_record(
+    record: Record,
+    omega: Float[np.ndarray, " frequencies"],
+    welch: Welch,
+    starts: tuple[int, ...],
+    length: int,
+    origin: int,
+) -> Complex[Array, "segments frequencies channels"]:
+    n, late = welch.integrators, welch.late(record)
     outputs = np.diff(record.outputs, n, axis=0)
-    outputs = np.concatenate([outputs[shift:], np.repeat(outputs[-1:], shift, axis=0)])
-    columns = [record.inputs[n:], outputs, record.references[n:]]
-    taper, dt = jnp.asarray(window(welch.shape, length)), jnp.asarray(record.dt)
-    values = segment_transforms(
-        jnp.asarray(np.hstack(columns)), starts, taper, jnp.asarray(omega), dt, welch.detrend
-    )
-    turn = jnp.exp(-1j * jnp.asarray(omega) * record.dt)
-    recolour = turn**shift / (1 - turn) ** n
-    first, last = columns[0].shape[1], columns[0].shape[1] + outputs.shape[1]
-    return {
-        "inputs": values[:, :, :first],
-        "outputs": values[:, :, first:last] * recolour[None, :, None],
-        "references": values[:, :, last:],
-    }
+    outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
+    # A difference looks back by n/2 samples, which the window would weigh like any other delay.
+    centre = slice(n - n // 2, record.samples - n // 2)
+    columns = np.hstack([record.inputs[centre], outputs, record.references[centre]])
+    angle = omega * record.dt
+    factor = np.ones((omega.size, columns.shape[1]), complex)
+    first = len(record.input_names)
+    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
+    factor[:, first : first + outputs.shape[1]] = recolour[:, None]
+    return segment_transforms(
+        columns, starts, window(welch.shape, length), angle, welch.detrend,
+        origin=np.asarray(float(origin)), factor=factor,
+    )  # fmt: skip

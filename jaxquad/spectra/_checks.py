@@ -1,0 +1,101 @@
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from jaxquad.records import Record
+
+from ._welch import Welch
+from ._window import window
+
+
+_MOST_FREQUENCIES = 1024  # the covariance between them is kept whole
+_ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
+
+
+def check_alike(records: Sequence[Record]) -> None:
+    """Raise `ValueError` unless the records can be averaged."""
+    if not records:
+        raise ValueError("no record given: pass one jq.Record or a list of them")
+    first = records[0]
+    for other in records[1:]:
+        if not math.isclose(other.dt, first.dt, rel_tol=1e-6):
+            raise ValueError(
+                f"records sampled at {first.sample_rate:.6g} and {other.sample_rate:.6g} Hz cannot "
+                "be averaged: read them with the same sample_rate"
+            )
+        names = (other.input_names, other.output_names, other.reference_names)
+        if names != (first.input_names, first.output_names, first.reference_names):
+            raise ValueError(f"records hold different channels: {first} and {other}")
+
+
+def check_one_input(records: Sequence[Record]) -> None:
+    """Raise `ValueError` for several inputs at once."""
+    names = records[0].input_names
+    if len(names) != 1:
+        raise ValueError(
+            f"the record has {len(names)} inputs {list(names)}: "
+            "one at a time; pick one with jq.select(record, inputs=[...])"
+        )
+
+
+def check_reference(records: Sequence[Record]) -> None:
+    """Raise `ValueError` unless there is one outside reference."""
+    names = records[0].reference_names
+    if len(names) != 1:
+        raise ValueError(
+            f"the joint estimate needs one outside reference, the record has {len(names)}: "
+            f"{list(names)}; name one with references=[...], or use estimator=jq.Welch()"
+        )
+
+
+def check_excited(
+    omega: Float[np.ndarray, " frequencies"],
+    power: Float[np.ndarray, "channels frequencies"],
+    records: Sequence[Record],
+    welch: Welch,
+    method: Literal["direct", "joint"],
+) -> None:
+    """Raise `ValueError` for a channel that never moves, or a spectrum of mere rounding errors."""
+    first = records[0]
+    names = first.input_names + (first.reference_names if method == "joint" else ())
+    for name in names + first.output_names:
+        if all(np.ptp(record.channel(name)) == 0 for record in records):
+            raise ValueError(f"no excitation: {name!r} is constant; check that it was logged")
+    gain = np.sum(window(welch.shape, welch.length(records)))
+    for name, level in zip(names, np.sqrt(power), strict=False):
+        largest = max(np.max(np.abs(record.channel(name))) for record in records)
+        lost = np.flatnonzero(~(level > _ROUNDING * gain * largest))
+        if lost.size:
+            raise ValueError(
+                f"no excitation at {omega[lost[0]]:.4g} rad/s: the spectrum of {name!r} is zero "
+                "there; keep omega within the band that was excited"
+            )
+
+
+def checked_omega(
+    omega: Float[ArrayLike, " frequencies"] | None, records: Sequence[Record], welch: Welch
+) -> Float[np.ndarray, " frequencies"]:
+    """Frequencies in rad/s, by default `welch`'s; `ValueError` unless the window resolves them."""
+    if omega is None:
+        return welch.default_omega(records)
+    omega = np.asarray(omega, dtype=float)
+    nyquist = np.pi / records[0].dt
+    if omega.ndim != 1 or not 0 < omega.size <= _MOST_FREQUENCIES:
+        raise ValueError(
+            f"omega has shape {omega.shape}: give 1 to {_MOST_FREQUENCIES} frequencies in rad/s"
+        )
+    if not (np.all(np.diff(omega) > 0) and omega[0] > 0 and omega[-1] < nyquist):
+        raise ValueError(
+            f"omega must rise from above 0 to below the Nyquist frequency {nyquist:.4g} rad/s; "
+            f"it runs from {omega.min():.4g} to {omega.max():.4g}"
+        )
+    lowest = 2 * np.pi / (welch.length(records) * records[0].dt)
+    if omega[0] < 0.999 * lowest:
+        raise ValueError(
+            f"{omega[0]:.4g} rad/s is below the {lowest:.4g} rad/s that the window resolves "
+            f"(one cycle): raise it, or set window_length above {2 * np.pi / omega[0]:.4g} s"
+        )
+    return omega

@@ -1,0 +1,139 @@
+import warnings
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from jaxquad.records import read, Record, RecordWarning
+from jaxquad.spectra import frequency_response, JointInputOutput, Welch
+from jaxquad.spectra._feedback import dominated_by_feedback, phase_rises
+
+
+RATE, SAMPLES = 50.0, 3000
+OMEGA = np.geomspace(2.0, 100.0, 40)
+Z = np.exp(1j * OMEGA / RATE)
+PLANT = 0.4 / (Z - 0.8)
+GAIN = 0.5  # of the controller
+WELCH = Welch(8.0)
+
+
+def filtered(numerator, denominator, x):
+    return np.asarray(signal.lfilter(numerator, denominator, x))
+
+
+def closed_loop(seed, *, sweep=1.0, noise=1.0):
+    """y = PLANT u + e under u = r - GAIN y, simulated by its exact difference equation."""
+    r, e = np.array([[sweep], [noise]]) * np.random.default_rng(seed).standard_normal((2, SAMPLES))
+    loop = [1.0, -0.8 + 0.4 * GAIN]
+    y = filtered([0.0, 0.4], loop, r) + filtered([1.0, -0.8], loop, e)
+    return Record(np.arange(SAMPLES) / RATE, r - GAIN * y, y, r)
+
+
+def mean_response(estimator, noise):
+    """The mean of 40 draws, and its standard error."""
+    draws = [
+        np.asarray(
+            frequency_response(closed_loop(k, noise=noise), OMEGA, estimator=estimator).response
+        )[:, 0, 0]
+        for k in range(40)
+    ]
+    return np.mean(draws, axis=0), np.std(draws, axis=0) / np.sqrt(40)
+
+
+def test_the_joint_estimate_is_unbiased_in_closed_loop():
+    found, error = mean_response(JointInputOutput(WELCH), 0.5)
+    # The largest of 40 values, and the ratio's own bias, which is the square of its error of 0.2.
+    assert np.max(np.abs(found - PLANT) / error) < 4
+    assert np.max(np.abs(found / PLANT - 1)) < 0.1
+
+
+def test_the_direct_estimate_lies_between_the_plant_and_the_inverse_controller():
+    found, error = mean_response(WELCH, 0.5)
+    # The input's power is that of r less GAIN times the noise, and only r passes the plant.
+    expected = (PLANT - GAIN * 0.5**2) / (1 + GAIN**2 * 0.5**2)
+    assert np.max(np.abs(found - expected) / error) < 4
+    assert np.median(np.abs(found - PLANT) / error) > 5
+
+
+def test_without_a_reference_the_direct_estimate_shows_the_inverse_controller():
+    # A little sensor noise keeps the input from being an exact copy of the output.
+    found = frequency_response(closed_loop(0, sweep=0.05), OMEGA, estimator=WELCH)
+    np.testing.assert_allclose(found.response[:, 0, 0], -1 / GAIN, rtol=0.15)
+
+
+def test_the_direct_estimate_always_says_that_feedback_may_bias_it():
+    found = frequency_response(closed_loop(0), OMEGA, estimator=WELCH)
+    assert any("biased towards -1/C" in remark for remark in found.remarks)
+
+
+def test_a_reference_that_explains_input_and_output_needs_no_remark():
+    estimator = JointInputOutput(WELCH)
+    found = frequency_response(closed_loop(0, noise=0.05), OMEGA, estimator=estimator)
+    assert found.remarks == ()
+
+
+def test_a_reference_that_explains_neither_is_remarked():
+    estimator = JointInputOutput(WELCH)
+    found = frequency_response(closed_loop(0, sweep=0.1), OMEGA, estimator=estimator)
+    assert any(remark.startswith("feedback-dominated") for remark in found.remarks)
+
+
+def test_feedback_dominates_where_only_input_and_output_are_coherent():
+    direct, by_reference = np.array([0.9, 0.9, 0.3, 0.3]), np.array([0.9, 0.1, 0.9, 0.1])
+    found = dominated_by_feedback(direct, by_reference)
+    assert found.tolist() == [False, True, False, False]
+
+
+def tilted(delay, *, scatter=0.05, coherence=0.9):
+    """The phase of a lag or, of -1/C with a delayed controller, a lead; wrapped, with noise."""
+    noise = scatter * np.random.default_rng(0).standard_normal(OMEGA.size)
+    phase = np.angle(np.exp(1j * (noise - delay * OMEGA)))
+    flat = np.full(OMEGA.size, 1.0)
+    return OMEGA, phase, scatter * flat, coherence * flat
+
+
+def test_the_phase_of_a_lag_falls_and_that_of_an_inverse_controller_rises():
+    assert phase_rises(*tilted(-0.01))
+    assert not phase_rises(*tilted(0.01))
+    assert not phase_rises(*tilted(0.0))
+
+
+def test_a_rise_within_its_error_or_without_coherence_is_none():
+    assert not phase_rises(*tilted(-0.0001))
+    assert not phase_rises(*tilted(-0.01, coherence=0.5))
+
+
+def measured(path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecordWarning)  # of gaps of a few samples
+        return frequency_response(read(path, **options))
+
+
+def dominated(found):
+    return any(remark.startswith("feedback-dominated") for remark in found.remarks)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_flight_without_excitation_is_dominated_by_feedback(data, axis):
+    found = measured(
+        data / "betaflight_ar8" / "LOG00037.npz",
+        inputs=f"pid_sum[{axis}]",
+        outputs=f"gyro_dps[{axis}]",
+        references=f"setpoint_dps[{axis}]",
+        sample_rate=900,
+    )
+    assert found.method == "joint"
+    assert dominated(found)
+
+
+def test_a_flight_with_a_random_set_point_is_not(data):
+    path = data / "antx_pitch" / "antx_log3_prbs.npz"
+    roles = dict(inputs="M", outputs="q", references="x0")
+    assert not dominated(measured(path, **roles, sample_rate=250, start=50, stop=76))
+
+
+def test_strong_manual_manoeuvres_are_not(data):
+    mix = {"motor_u16[0]": -1, "motor_u16[1]": -1, "motor_u16[2]": 1, "motor_u16[3]": 1}
+    path = data / "crazyflie_rollpitch" / "log15.npz"
+    roles = dict(inputs={"roll": mix}, outputs="gyro_dps[0]")
+    assert not dominated(measured(path, **roles, sample_rate=500, start=55, stop=90))
