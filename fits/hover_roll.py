@@ -74,19 +74,20 @@ def gain_of(fit: jq.Fit) -> jq.Combination:
     return fit.derived(lambda axis: axis.gain, "L K_t / J_x")
 
 
-def draw_gains(draws: int, seed: int = 1, chunk: int = 25) -> dict[tuple[str, str], np.ndarray]:
-    """Estimate and standard error of L K_t / J_x for every estimator and cost, over noise draws."""
-    found = {(name, cost): [] for name in ESTIMATORS for cost in COSTS}
+def draw_gains(
+    draws: int, cases=tuple((name, cost) for name in ESTIMATORS for cost in COSTS), seed: int = 1
+) -> dict[tuple[str, str], np.ndarray]:
+    """Estimate and standard error of L K_t / J_x by estimator and cost, over noise draws."""
+    found, chunk = {case: [] for case in cases}, 25
     for first in range(0, draws, chunk):
         signals = np.repeat(SWEEP.signal[:, None], chunk, axis=1)
         flights = fly(signals, np.zeros(chunk), jax.random.key(seed + first))
         for member in range(min(chunk, draws - first)):
             record = flights.record("roll", member=member)
-            for name, estimator in ESTIMATORS.items():
-                frf = jq.frequency_response(record, OMEGA, estimator=estimator)
-                for cost, weighing in COSTS.items():
-                    gain = gain_of(identify(frf, weighing))
-                    found[name, cost].append((gain.value, gain.standard_error))
+            for name, cost in cases:
+                frf = jq.frequency_response(record, OMEGA, estimator=ESTIMATORS[name])
+                gain = gain_of(identify(frf, COSTS[cost]))
+                found[name, cost].append((gain.value, gain.standard_error))
     return {key: np.array(rows) for key, rows in found.items()}
 
 

@@ -1,3 +1,4 @@
 from ._bode import bode as bode
+from ._comparison import comparison as comparison
 from ._overlay import overlay as overlay, record_figure as record_figure
 from ._results import write_results as write_results

@@ -30,22 +30,31 @@ def overlay(check: Verification, *, title: str = "") -> Any:
     low, high = top.get_ylim()
     top.set_ylim(low, high + 0.15 * (high - low))
     where = f", {check.band[0]:.3g}..{check.band[1]:.3g} rad/s" if check.band else ""
-    numbers = f"fit {check.fit_percent:.1f} %, TIC {check.tic:.3f}{where}"
-    figure.suptitle(f"{title}: {numbers}" if title else numbers, fontsize=11)
+    numbers = (
+        f"fit {check.fit_percent:.1f} %, variance accounted for {check.variance_percent:.1f} %, "
+        f"TIC {check.tic:.3f}{where}"
+    )
+    figure.suptitle(f"{title}\n{numbers}" if title else numbers, fontsize=10)
     return figure
 
 
 def record_figure(record: Record) -> Any:
-    """All channels of a record over time, stacked. Returns a `matplotlib.figure.Figure`."""
+    """References, inputs and outputs of a record over time, stacked; angles in degrees.
+
+    Returns a `matplotlib.figure.Figure`.
+    """
     from matplotlib.figure import Figure
 
-    names = (*record.reference_names, *record.input_names, *record.output_names)
-    figure = Figure(figsize=(6.5, 1.2 + 1.4 * len(names)), layout="constrained")
-    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, name in zip(axes, names, strict=True):
+    roles = {"reference": record.reference_names, "input": record.input_names}
+    roles |= {"output": record.output_names}
+    rows = [(role, name) for role, names in roles.items() for name in names]
+    figure = Figure(figsize=(6.5, 0.8 + 1.5 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, (role, name) in zip(axes, rows, strict=True):
         scale, unit = _shown(record.unit(name))
         axis.plot(record.time, scale * record.channel(name), color="0.15", lw=0.7)
         axis.set_ylabel(f"{name}{unit}")
+        axis.set_title(role, loc="left", fontsize=9, pad=3)
         axis.grid(True, color="0.9", lw=0.5)
         axis.margins(x=0)
     axes[-1].set_xlabel("time, s")

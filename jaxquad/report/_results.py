@@ -1,73 +1,76 @@
 import json
 import math
 import os
-import tempfile
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
-from jaxquad.identify import Fit, Verification
+from jaxquad.identify import Fit, NotIdentifiable, Verification
 from jaxquad.spectra import FrequencyResponse
 
 
 def write_results(
     folder: str | Path,
     *,
-    fit: Fit,
+    fit: Fit | NotIdentifiable,
     frf: FrequencyResponse | None = None,
     check: Verification | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write `result.json` into `folder`, whole or not at all; returns its path.
 
-    Numbers that the record does not determine are null: JSON has no nan.
+    Numbers that the record does not determine are null: JSON has no nan. Where nothing was, the
+    exception may stand for the fit. Raises TypeError for an `extra` that JSON cannot hold.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    content = {"jaxquad": _version(), "fit": _fit(fit)}
+    content: dict[str, Any] = {"jaxquad_version": _version(), "fit": _fit(fit)}
     content |= {"response": _response(frf)} if frf is not None else {}
     content |= {"verification": _verification(check)} if check is not None else {}
     content |= dict(extra or {})
     text = json.dumps(_plain(content), indent=2, allow_nan=False) + "\n"
-    handle, draft = tempfile.mkstemp(dir=folder, suffix=".json.part")
-    with os.fdopen(handle, "w") as file:
-        file.write(text)
-    os.chmod(draft, 0o644)
-    os.replace(draft, folder / "result.json")
-    return folder / "result.json"
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    draft = folder / f"result.json.{os.getpid()}.part"
+    draft.write_text(text)
+    return draft.replace(folder / "result.json")
 
 
-def _version() -> str:
+def _version() -> str | None:
     try:
         return version("jaxquad")
     except PackageNotFoundError:
-        return "not installed"
+        return None
 
 
-def _fit(fit: Fit) -> dict[str, Any]:
-    parameters = [
-        {
-            "name": name,
-            "value": fit.values[k],
-            "standard_error": fit.standard_errors[k],
-            "interval_95": fit.interval(name),
-            "cramer_rao_percent": fit.cramer_rao[k],
-            "insensitivity_percent": fit.insensitivity[k],
-        }
-        for k, name in enumerate(fit.names)
-    ]
-    numbers = ("cost", "average_cost", "chi_squared", "newton_decrement", "condition", "points")
+def _fit(fit: Fit | NotIdentifiable) -> dict[str, Any]:
+    if isinstance(fit, NotIdentifiable):
+        return {"identifiable": False, "remarks": [str(fit)]}
+    numbers = ("cost", "average_cost", "chi_squared", "condition", "newton_decrement")
     return {
         "identifiable": fit.identifiable,
-        "parameters": parameters,
-        "combinations": [combination._asdict() for combination in fit.combinations],
-        "null_directions": list(fit.null_directions),
+        "parameters": [_parameter(fit, k) for k in range(len(fit.names))],
+        "combinations": [
+            combination._asdict() | {"interval_95": combination.interval}
+            for combination in fit.combinations
+        ],
+        "null_directions": fit.null_directions,
         "covariance": fit.covariance,
-        **{name: getattr(fit, name) for name in (*numbers, "steps")},
+        **{name: getattr(fit, name) for name in (*numbers, "points", "steps")},
         "remarks": fit.remarks,
+    }
+
+
+def _parameter(fit: Fit, k: int) -> dict[str, Any]:
+    return {
+        "name": fit.names[k],
+        "value": fit.values[k],
+        "standard_error": fit.standard_errors[k],
+        "interval_95": fit.interval(fit.names[k]),
+        "cramer_rao_percent": fit.cramer_rao[k],
+        "insensitivity_percent": fit.insensitivity[k],
     }
 
 
@@ -96,12 +99,12 @@ def _verification(check: Verification) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """JSON's own types, with null for what is not finite."""
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return _plain(np.asarray(value).tolist())
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if isinstance(value, str | bool | int) or value is None:
-        return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return _plain(np.asarray(value).tolist())
+    return value
