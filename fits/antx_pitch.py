@@ -5,6 +5,7 @@ this repository: JAXQUAD_DATA names the folder that holds `antx_pitch/`.
 """
 
 import argparse
+import functools as ft
 import os
 import time
 from pathlib import Path
@@ -24,13 +25,13 @@ WELCH = jq.Welch(integrators=1, delay=0.024)
 ESTIMATORS = {"joint": jq.JointInputOutput(WELCH), "direct": WELCH}
 COSTS = {"maximum likelihood": jq.MaximumLikelihood(), "Eq. (14)": jq.CoherenceWeighted()}
 START = jq.LaggedIntegrator(gain=200.0, lag=0.02, delay=0.01)
-CHANNELS = dict(inputs=["M"], outputs=["q"], references=["x0"], sample_rate=250.0)
+READ = ft.partial(jq.read, inputs="M", outputs="q", references="x0", sample_rate=250.0)
 
 
 def read_flights(folder: Path) -> tuple[jq.Record, jq.Record]:
     """The PRBS part of one flight and the sweep of the other."""
-    prbs = jq.read(folder / "antx_log3_prbs.npz", start=50.0, stop=76.0, **CHANNELS)
-    sweep = jq.read(folder / "antx_log2_sweep.npz", start=132.8, stop=158.0, **CHANNELS)
+    prbs = READ(folder / "antx_log3_prbs.npz", start=50.0, stop=76.0)
+    sweep = READ(folder / "antx_log2_sweep.npz", start=132.8, stop=158.0)
     return prbs, sweep
 
 
@@ -47,7 +48,7 @@ def row(name: str, fit: jq.Fit) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     default = Path(os.environ.get("JAXQUAD_DATA", "../shared/data")) / "antx_pitch"
     parser.add_argument("--data", type=Path, default=default, help="folder of the two logs")
     parser.add_argument("--out", type=Path, default=Path("results/antx_pitch"))

@@ -123,7 +123,7 @@ def compare(frfs: dict[str, jq.FrequencyResponse]) -> str:
 
 
 def options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=0, help="noise draws of a coverage study")
     parser.add_argument("--seed", type=int, default=0, help="noise of the one flight shown")
     parser.add_argument("--out", type=Path, default=Path("results/hover_roll"))

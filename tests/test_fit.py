@@ -42,7 +42,7 @@ def test_the_cost_is_equation_14_and_its_minimum_that_of_scipy():
         ratio = jq.LaggedIntegrator(*np.exp(log_values)).frequency_response(jnp.asarray(OMEGA))
         log = np.log(np.asarray(ratio / frf.response)[:, 0, 0])
         weight = np.sqrt(20 / OMEGA.size) * 1.58 * (1 - np.exp(-0.95))
-        decibels, degrees = log.real * 20 / np.log(10), np.degrees(log.imag)
+        decibels, degrees = np.real(log) * 20 / np.log(10), np.degrees(np.imag(log))
         return weight * np.concatenate([decibels, np.sqrt(0.01745) * degrees])
 
     peer = least_squares(root, np.log([150.0, 0.03, 0.02]), method="lm", xtol=1e-12, ftol=1e-12)

@@ -2,6 +2,7 @@
 
 import json
 
+import equinox as eqx
 import numpy as np
 import pytest
 from synthetic import OMEGA, response_of
@@ -56,14 +57,17 @@ def test_the_model_is_drawn_on_the_branch_of_the_measured_phase():
     """A delay of many turns, and a response that starts beyond -180 deg."""
     slow = jq.LaggedIntegrator(280.0, 0.016, 1.0)
     figure = bode(response_of(slow), {"model": slow})
-    measured, model = (lines(figure.axes[1])[name] for name in ("joint", "model"))
+    measured, model = (lines(figure.axes[1])[name] for name in ("joint estimate", "model"))
     drawn = np.interp(measured.get_xdata(), model.get_xdata(), model.get_ydata())
     assert np.max(np.abs(drawn - measured.get_ydata())) < 2  # deg, of linear interpolation
 
 
 def test_points_without_coherence_are_shown_apart(frf):
-    figure = bode(response_of(TRUTH), others={"direct": frf})
-    assert {"joint", "unused", "direct"} <= set(lines(figure.axes[0]))
+    weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence.at[:5].set(0.3))
+    drawn = lines(bode(weak, others={"direct": frf}).axes[0])
+    assert len(drawn["joint estimate"].get_xdata()) == OMEGA.size - 5
+    assert len(drawn["joint estimate, coherence below 0.6"].get_xdata()) == 5
+    assert drawn["direct"].get_marker() != drawn["joint estimate"].get_marker()
     with pytest.raises(ValueError, match=r"no response \('p', 'u0'\)"):
         bode(frf, pair=("p", "u0"))
 
@@ -93,7 +97,7 @@ def test_a_result_file_holds_the_numbers_of_the_fit(tmp_path, fit, frf, check):
     assert gain["standard_error"] == pytest.approx(float(fit.standard_errors[0]))
     assert content["verification"]["tic"] == pytest.approx(check.tic)
     assert len(content["response"]["omega_rad_per_s"]) == OMEGA.size
-    assert content["note"] == "x" and content["jaxquad"]
+    assert content["note"] == "x" and content["jaxquad_version"]
     assert [file.name for file in path.parent.iterdir()] == ["result.json"]
 
 

@@ -1,5 +1,7 @@
 """Time-domain verification against signals made by scipy."""
 
+import functools as ft
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim, tf2ss
@@ -88,9 +90,9 @@ def test_models_and_bands_that_cannot_be_verified_are_refused():
 def test_the_antx_model_verifies_on_the_other_flight(data):
     """Fitted on the PRBS flight, verified on the sweep flight, between 0.7 and 12 Hz."""
     band = (2 * np.pi * 0.7, 2 * np.pi * 12)
-    channels = dict(inputs=["M"], outputs=["q"], references=["x0"], sample_rate=250.0)
-    prbs = jq.read(data / "antx_pitch/antx_log3_prbs.npz", start=50.0, stop=76.0, **channels)
-    sweep = jq.read(data / "antx_pitch/antx_log2_sweep.npz", start=132.8, stop=158.0, **channels)
+    read = ft.partial(jq.read, inputs="M", outputs="q", references="x0", sample_rate=250.0)
+    prbs = read(data / "antx_pitch/antx_log3_prbs.npz", start=50.0, stop=76.0)
+    sweep = read(data / "antx_pitch/antx_log2_sweep.npz", start=132.8, stop=158.0)
     estimator = jq.JointInputOutput(jq.Welch(integrators=1, delay=0.024))
     frf = jq.frequency_response(prbs, np.geomspace(*band, 80), estimator=estimator)
     fit = jq.fit(jq.LaggedIntegrator(200.0, 0.02, 0.01), frf, cost=jq.MaximumLikelihood())

@@ -120,7 +120,9 @@ def _expand(model: PyTree, places: list[Place], free: Free) -> list[str | Positi
     return items
 
 
-def _marked(model: PyTree, places: list[Place], where: Callable[[PyTree], PyTree]) -> list[str]:
+def _marked(
+    model: PyTree, places: list[Place], where: Callable[[PyTree], PyTree]
+) -> list[str | Positive | Real]:
     arrays = eqx.filter(model, eqx.is_inexact_array)
     flags = jax.tree.map(lambda _: False, arrays)
     flags = eqx.tree_at(where, flags, replace_fn=lambda _: True)
