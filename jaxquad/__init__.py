@@ -65,5 +65,7 @@ from .spectra import (
     FrequencyResponse as FrequencyResponse,
     JointInputOutput as JointInputOutput,
     PrecisionError as PrecisionError,
+    spectral_density as spectral_density,
+    SpectralDensity as SpectralDensity,
     Welch as Welch,
 )

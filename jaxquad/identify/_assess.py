@@ -23,7 +23,7 @@ from ._accuracy import (
 from ._identifiable import decide, Identifiability, Information
 from ._parameters import Place
 from ._problem import Problem
-from ._remarks import MISFIT, ran_to_zero, remarks_on_fit
+from ._remarks import MISFIT, ran_to_zero, remarks_on_fit, remarks_on_leakage
 from ._result import Fit
 from ._solve import Solution
 
@@ -66,6 +66,7 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
         remarks=(
             *dict.fromkeys(remark for frf in frfs for remark in frf.remarks),
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
+            *remarks_on_leakage(problem, frfs, solution),
             *_remarks_on_priors(verdict, by_data),
         ),
         parameters=parameters,
@@ -140,9 +141,12 @@ def _identifiability(
         units,
         _ranks(parameters.places),
     )
+    by_data = decide(facts)
+    if not len(known.misfit):
+        return by_data, by_data
     # Rows come in pairs of magnitude and phase; a prior's row counts once.
     priors = np.repeat(known.slopes, 2, axis=0) / np.sqrt(2)
-    return decide(facts._replace(root=np.concatenate([root, priors]))), decide(facts)
+    return decide(facts._replace(root=np.concatenate([root, priors]))), by_data
 
 
 def _ranks(places: Sequence[Place]) -> tuple[int, ...]:

@@ -107,7 +107,7 @@ def _problem(model, parameters, frfs, conditions, priors, cost) -> Problem:
             "a prior has a standard error, but the cost (14) has no noise to weigh it against: "
             "pass cost=jq.MaximumLikelihood()"
         )
-    known = [place.name for place in name_places(model)]
+    known = [place.name for place in name_places(model)] if priors else []
     for prior in priors:
         if isinstance(prior.quantity, str) and prior.quantity not in known:
             raise ValueError(f"no parameter {prior.quantity!r} for a prior; there are: {known}")

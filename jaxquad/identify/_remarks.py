@@ -1,7 +1,11 @@
 """What a reader has to know about a fit before using its numbers."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
+
+from jaxquad.spectra import FrequencyResponse
 
 from ._problem import Problem
 from ._solve import Solution
@@ -31,6 +35,34 @@ def remarks_on_fit(
             f"explain the whole response; standard errors are widened by {ratio:.1f}"
         )
     return remarks
+
+
+def remarks_on_leakage(
+    problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution
+) -> list[str]:
+    """Responses of integrating plants that were estimated as if there were no integrator."""
+    misfits = solution.sensitivity.misfits
+    for frf, weights, misfit in zip(frfs, problem.weights, misfits, strict=True):
+        level = np.log(np.abs(np.asarray(frf.response))) + np.asarray(misfit)[..., 0]
+        for o, i in np.ndindex(level.shape[1:]):
+            used = np.flatnonzero(np.asarray(weights)[:, o, i, 0] > 0)[:3]
+            if len(used) < 3:
+                continue
+            omega, error = np.asarray(frf.omega)[used], np.asarray(frf.random_error)[used[0], o, i]
+            steepness = round(-np.polyfit(np.log(omega), level[used, o, i], 1)[0])
+            leak = _leakage(steepness - frf.integrators, frf.resolution / omega[0])
+            if leak > error:
+                return [
+                    f"the response falls as 1/s^{steepness} at its lowest frequencies and leaks "
+                    f"through the window, by up to {100 * leak:.2g} % at {omega[0]:.3g} rad/s: "
+                    f"estimate it with jq.Welch(integrators={min(steepness, 3)})"
+                ]
+    return []
+
+
+def _leakage(integrators: int, resolution: float) -> float:
+    """Relative error of 1/s^n behind a Hann window of 1 / resolution cycles, to second order."""
+    return max(integrators, 0) * (integrators + 1) / 6 * resolution**2
 
 
 def ran_to_zero(problem: Problem, solution: Solution) -> list[int]:

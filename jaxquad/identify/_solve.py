@@ -30,7 +30,7 @@ def solve(
     # Imported late: optimistix doubles the time of `import jaxquad`.
     import optimistix as optx
 
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8) if solver is None else solver
+    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6) if solver is None else solver
     z, facts, result, steps, derivatives = _solve(problem, z0, solver, max_steps)
     converged = bool(result == optx.RESULTS.successful)
     message = "" if converged else _reason(str(optx.RESULTS[result]), int(steps))

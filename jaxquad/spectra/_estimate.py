@@ -88,6 +88,8 @@ def _respond(
         input_names=records[0].input_names,
         output_names=records[0].output_names,
         remarks=remarks,
+        integrators=welch.integrators,
+        resolution=2 * np.pi / (segments.length * dt),
     )
 
 

@@ -25,6 +25,8 @@ class FrequencyResponse(eqx.Module):
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
     remarks: tuple[str, ...] = eqx.field(static=True, default=())
+    integrators: int = eqx.field(static=True, default=0)  # taken out before windowing
+    resolution: float = eqx.field(static=True, default=0.0)  # one cycle to a window, rad/s
 
     def __check_init__(self):
         if not isinstance(self.omega, Array | np.ndarray):
