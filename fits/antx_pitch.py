@@ -25,7 +25,14 @@ WELCH = jq.Welch(integrators=1, delay=0.024)
 ESTIMATORS = {"joint": jq.JointInputOutput(WELCH), "direct": WELCH}
 COSTS = {"maximum likelihood": jq.MaximumLikelihood(), "Eq. (14)": jq.CoherenceWeighted()}
 START = jq.LaggedIntegrator(gain=200.0, lag=0.02, delay=0.01)
-READ = ft.partial(jq.read, inputs="M", outputs="q", references="x0", sample_rate=250.0)
+READ = ft.partial(
+    jq.read,
+    inputs="M",
+    outputs="q",
+    references="x0",
+    sample_rate=250.0,
+    units={"q": "rad/s", "x0": "m"},
+)
 
 
 def read_flights(folder: Path) -> tuple[jq.Record, jq.Record]:

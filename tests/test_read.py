@@ -272,3 +272,13 @@ def test_betaflight_jitter_comes_to_a_uniform_grid(data):
     record = read(path, inputs="pid_sum[0]", outputs="gyro_dps[0]", references="setpoint_dps[0]")
     assert record.sample_rate == pytest.approx(985.0, rel=1e-9)
     assert record.duration == pytest.approx(17.02, abs=0.01)
+
+
+def test_units_are_given_by_name_and_refused_for_channels_that_are_not_read(tmp_path):
+    path = tmp_path / "units.npz"
+    time = np.arange(50) / 100
+    np.savez(path, t=time, M=np.sin(time), q=np.cos(time))
+    record = read(path, inputs="M", outputs="q", units={"q": "rad/s"})
+    assert record.unit("q") == "rad/s" and record.unit("M") == ""
+    with pytest.raises(RecordError, match="a unit for 'p'.*There are: M, q"):
+        read(path, inputs="M", outputs="q", units={"p": "rad/s"})

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from ._channel import Channel
 from ._clock import departure, JITTER, window
 from ._edit import combine
-from ._errors import ReadError
+from ._errors import ReadError, RecordError
 from ._formats import load_arrays
-from ._names import as_tuple, check_distinct
+from ._names import as_tuple, check_distinct, unknown_name
 from ._record import Record
 from ._resample import resample
 from ._timebase import timed_channels, TimeUnit
@@ -31,6 +31,7 @@ def read(
     time: str | None = None,
     time_unit: TimeUnit | None = None,
     max_gap: float | int | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Record:
     """Read a record from a .csv, .npz or .mat file.
 
@@ -42,7 +43,7 @@ def read(
     `start` and `stop` are in s of the file's own time, which the record keeps. Without a
     `sample_rate` (Hz), channels that share one uniform time base are passed on bit by bit;
     others come to the lowest of their own rates, rounded to three digits. See `resample` for how,
-    and for `max_gap` (s).
+    and for `max_gap` (s). `units` by the record's own channel names go onto figures and tables.
 
     Raises ReadError for what is wrong with the file, RecordError for what is wrong with the data.
     """
@@ -57,14 +58,25 @@ def read(
         rate = _slowest(channels) if sample_rate is None else sample_rate
         stamps, values = resample(channels, rate, start=start, stop=stop, max_gap=max_gap)
     columns = dict(zip(names, values.T, strict=True))
+    units = _known_units(units or {}, [name for role in roles for name in role])
     return Record(
         stamps,
         *(_blend(role, columns, stamps.size) for role in roles),
         input_names=tuple(roles[0]),
         output_names=tuple(roles[1]),
         reference_names=tuple(roles[2]),
+        input_units=[units[name] for name in roles[0]],
+        output_units=[units[name] for name in roles[1]],
+        reference_units=[units[name] for name in roles[2]],
         source=str(path),
     )
+
+
+def _known_units(units: Mapping[str, str], names: Sequence[str]) -> dict[str, str]:
+    for name in units:
+        if name not in names:
+            raise RecordError(f"a unit for {name!r}: {unknown_name(name, names)}")
+    return {name: units.get(name, "") for name in names}
 
 
 def _mixes(selection: Selection) -> Mixes:
