@@ -158,3 +158,15 @@ def test_derived_quantities_carry_the_covariance():
     assert total.standard_error == pytest.approx(by_hand, rel=1e-9)
     assert total.value == pytest.approx(fit.values[1] + fit.values[2], rel=1e-12)
     assert total.standard_error < 0.5 * fit.standard_errors[1]
+
+
+def test_undamped_gauss_newton_that_diverges_says_so():
+    solver = optx.GaussNewton(rtol=1e-8, atol=1e-8)
+    with pytest.raises(ValueError, match="the fit diverged.*damped default"):
+        jq.fit(jq.LaggedIntegrator(1.0, 0.5, 0.5), response_of(TRUTH, seed=0), solver=solver)
+
+
+def test_a_local_minimum_is_called_one():
+    """A delay that starts a whole turn away stays there."""
+    fit = jq.fit(jq.LaggedIntegrator(1e4, 1.0, 1.0), response_of(TRUTH, seed=0))
+    assert any("local minimum" in remark for remark in fit.remarks)

@@ -40,7 +40,8 @@ def fit(
     `solver` is any optimistix least-squares solver, Levenberg-Marquardt by default.
 
     Raises `NotIdentifiable` where too few frequencies are usable, `ValueError` for names that
-    the model does not have, and `PrecisionError` in 32 bits. Source: Eq. (14), corrected.
+    the model does not have and for a solver that diverged, `PrecisionError` in 32 bits.
+    Source: Eq. (14), corrected.
     """
     require_x64("a fit")
     frfs = [frf] if isinstance(frf, FrequencyResponse) else list(frf)
@@ -49,6 +50,7 @@ def fit(
     _check_points(frfs, used, parameters, min_coherence, band)
     problem = _problem(model, parameters, frfs, conditions, priors, cost)
     problem, solution = _solve_reweighted(problem, frfs, used, cost, solver, max_steps)
+    _check_finite(solution)
     return assess(problem, frfs, solution)
 
 
@@ -95,6 +97,15 @@ def _check_points(
             f"{total} frequencies{f' (band {band} rad/s)' if band else ''}, its maximum is "
             f"{best:.2f}, and {parameters.count} parameters need at least {needed}. Excite the "
             f"axis (jq.sweep), record longer, or use a longer window. {reasons}".rstrip()
+        )
+
+
+def _check_finite(solution: Solution) -> None:
+    finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
+    if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
+        raise ValueError(
+            f"the fit diverged: {solution.message or 'the model has no finite response there'}; "
+            "start nearer to the answer, or leave solver= at its damped default"
         )
 
 

@@ -23,6 +23,7 @@ class Identifiability(NamedTuple):
     undetermined: tuple[str, ...]
     null_directions: tuple[dict[str, float], ...]  # unit vectors of relative changes
     determined: tuple[Combination, ...]  # combinations of the undetermined ones
+    exact: Float[np.ndarray, "null parameters"]  # those null directions that no noise explains
 
 
 class Information(NamedTuple):
@@ -50,7 +51,7 @@ def decide(information: Information) -> Identifiability:
     exact = singular <= _FLOOR * singular[0]
     null = right[exact | (singular * LIMIT < 1)]
     if not len(null):
-        return Identifiability((), (), ())
+        return Identifiability((), (), (), right[exact])
     null = _sparse(null)
     opened = _opened(information.covariance, right[exact])
     facts = information._replace(covariance=opened)
@@ -60,7 +61,8 @@ def decide(information: Information) -> Identifiability:
     members = np.flatnonzero(np.any(null, axis=0))
     names = information.names
     directions = tuple({names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null)
-    return Identifiability(tuple(names[k] for k in members), directions, tuple(determined))
+    lost = tuple(names[k] for k in members)
+    return Identifiability(lost, directions, tuple(determined), right[exact])
 
 
 def _sparse(null: Float[np.ndarray, "null parameters"]) -> Float[np.ndarray, "null parameters"]:

@@ -12,6 +12,8 @@ from ._solve import Solution
 
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+_POOR = 10.0  # ratio from which a wrong minimum is likely
+_LOCAL = ", or this is a local minimum: try other starting values"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
 
 
@@ -32,7 +34,8 @@ def remarks_on_fit(
         ratio = np.sqrt(chi_squared)
         remarks.append(
             f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
-            f"explain the whole response; standard errors are widened by {ratio:.1f}"
+            f"explain the whole response{_LOCAL if ratio > _POOR else ''}; standard errors are "
+            f"widened by {ratio:.1f}"
         )
     return remarks
 

@@ -78,12 +78,13 @@ class Fit(eqx.Module):
         places = self.parameters.places[: len(self.names)]
         each = [np.asarray(gradient[place.leaf]).reshape(-1)[place.index] for place in places]
         slope = np.array(each) * self.units
-        for direction in self.null_directions:
-            null = np.array([direction.get(name, 0.0) for name in self.names])
-            if abs(slope @ null) > 1e-6 * np.linalg.norm(slope):
-                raise NotIdentifiable(
-                    f"{name} changes along {direction}, which this record does not determine"
-                )
+        moved = self.identifiability.exact @ slope
+        if np.any(np.abs(moved) > 1e-6 * np.linalg.norm(slope)):
+            lost = ", ".join(self.identifiability.undetermined)
+            raise NotIdentifiable(
+                f"{name} changes with what this record does not determine ({lost}): fit it under "
+                "a jq.Prior or with a second record, or ask for a determined combination"
+            )
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
         return Combination(name, float(quantity(self.model)), error)
 
