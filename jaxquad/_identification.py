@@ -1,0 +1,179 @@
+"""`jaxquad identify`: from the options of the command line to a printed report and a folder."""
+
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from .identify import (
+    CoherenceWeighted,
+    Fit,
+    fit,
+    guess_lagged_integrator,
+    MaximumLikelihood,
+    NotIdentifiable,
+    Verification,
+    verify,
+)
+from .models import LaggedIntegrator
+from .records import read, Record
+from .report import bode, comparison, overlay, record_figure, write_results
+from .spectra import frequency_response, FrequencyResponse, JointInputOutput, Welch
+
+
+Outcome = Fit | NotIdentifiable  # the exception stands for the fit where there is none
+_COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
+_POINTS = 100  # frequencies, log-spaced over the band
+
+
+def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | None]:
+    """Identify, print the report, write the files.
+
+    Returns the path of `result.json` and, where the parameters are not determined, why.
+    """
+    record = _record(options)
+    methods = ("joint", "direct") if options.reference else ("direct",)
+    frfs, outcomes = {}, {}
+    for method in methods:
+        frfs[method], outcomes[method] = _fit_twice(record, method, options)
+    frf, outcome = frfs[methods[0]], outcomes[methods[0]]
+    print(f"{record}\n\n{frf}\n\n{_formula(options)}, {methods[0]} estimate:\n{outcome}")
+    late = {} if options.no_lag or options.no_delay else {"lag + delay": _late}
+    if options.reference:
+        print(f"\n{comparison(outcomes, late)}")
+    elif late and isinstance(outcome, Fit):
+        print(_sum(outcome))
+    check = _verified(outcome, frf, options)
+    print(f"\n{check}" if check else "")
+    path, figures = _write(options, record, frfs, outcome, check)
+    print(f"{path}, {', '.join(figures)}")
+    return path, _failure(outcome)
+
+
+def _record(options: Namespace) -> Record:
+    asked = {*options.input, *options.output, *(options.reference or {})}
+    return read(
+        options.file,
+        inputs=options.input,
+        outputs=options.output,
+        references=options.reference,
+        sample_rate=options.rate,
+        start=options.start,
+        stop=options.stop,
+        time=options.time,
+        time_unit=options.time_unit,
+        units={name: unit for name, unit in options.unit if name in asked},
+    )
+
+
+def _fit_twice(
+    record: Record, method: str, options: Namespace
+) -> tuple[FrequencyResponse, Outcome]:
+    """The second response is windowed with the delay that the first fit found."""
+    band, delay = _band(options), 0.0
+    omega = np.geomspace(*band, _POINTS) if band else None
+    fixed = {"lag": options.no_lag, "delay": options.no_delay}
+    free = ["gain", *(name for name, is_fixed in fixed.items() if not is_fixed)]
+    while True:
+        welch = Welch(options.window, integrators=options.integrators, delay=delay)
+        estimator = JointInputOutput(welch) if method == "joint" else welch
+        frf = frequency_response(record, omega, estimator=estimator)
+        try:
+            found = fit(_start(frf, options), frf, free=free, cost=_COSTS[options.cost])
+        except NotIdentifiable as error:
+            return frf, error
+        late = record.dt * round(float(_late(found.model)) / record.dt)
+        if delay or not 0 < late < 0.1 * record.dt * welch.length([record]):
+            return frf, found
+        delay = late
+
+
+def _band(options: Namespace) -> tuple[float, float] | None:
+    """In rad/s."""
+    given, scale = (options.band, 2 * np.pi) if options.band else (options.band_rad, 1.0)
+    if given is None:
+        return None
+    if not 0 < given[0] < given[1] < np.inf:
+        raise ValueError(f"the band {given[0]:g} .. {given[1]:g} has to rise from above 0")
+    return scale * given[0], scale * given[1]
+
+
+def _start(frf: FrequencyResponse, options: Namespace) -> LaggedIntegrator:
+    guess = guess_lagged_integrator(frf, options.integrators)
+    late = _late(guess)
+    lag = 0.0 if options.no_lag else late if options.no_delay else guess.lag
+    delay = 0.0 if options.no_delay else late if options.no_lag else guess.delay
+    return LaggedIntegrator(guess.gain, lag, delay, options.integrators)
+
+
+def _late(model: LaggedIntegrator) -> Float[Array, ""]:
+    """The sum of lag and delay, which a record determines better than either."""
+    return model.lag + model.delay
+
+
+def _sum(found: Fit) -> str:
+    try:
+        return str(found.derived(_late, "lag + delay"))
+    except NotIdentifiable as error:
+        return str(error)
+
+
+def _formula(options: Namespace) -> str:
+    n = options.integrators
+    factors = [] if n == 0 else ["s"] if n == 1 else [f"s^{n}"]
+    factors += [] if options.no_lag else ["(lag s + 1)"]
+    below = " ".join(factors)
+    above = "K" if options.no_delay else "K e^(-delay s)"
+    [output], [source] = options.output, options.input
+    ratio = f" / ({below})" if len(factors) > 1 else f" / {below}" if factors else ""
+    return f"{output} / {source} = {above}{ratio}"
+
+
+def _verified(outcome: Outcome, frf: FrequencyResponse, options: Namespace) -> Verification | None:
+    """The other record simulated, within the band that was fitted."""
+    if options.verify is None or not isinstance(outcome, Fit):
+        return None
+    swapped = {
+        "file": options.verify,
+        "start": options.verify_start,
+        "stop": options.verify_stop,
+        "reference": None,
+    }
+    other = _record(Namespace(**(vars(options) | swapped)))
+    return verify(outcome.model, other, band=(float(frf.omega[0]), float(frf.omega[-1])))
+
+
+def _failure(outcome: Outcome) -> NotIdentifiable | None:
+    if isinstance(outcome, NotIdentifiable):
+        return outcome
+    lost = " and ".join(outcome.identifiability.undetermined)
+    known = ", ".join(str(combination) for combination in outcome.combinations) or "nothing"
+    text = f"not identifiable from this record, each by itself: {lost}; determined is {known}"
+    return NotIdentifiable(text) if lost else None
+
+
+def _write(
+    options: Namespace,
+    record: Record,
+    frfs: dict[str, FrequencyResponse],
+    outcome: Outcome,
+    check: Verification | None,
+) -> tuple[Path, list[str]]:
+    folder = options.out or Path("results") / options.file.stem
+    method, *rest = frfs
+    source = {"file": str(options.file), "start_s": float(record.time[0])}
+    source |= {"stop_s": float(record.time[-1]), "sample_rate_hz": record.sample_rate}
+    extra = {"record": source}
+    path = write_results(folder, fit=outcome, frf=frfs[method], check=check, extra=extra)
+    models = {"identified": outcome.model} if isinstance(outcome, Fit) else None
+    others = {f"{name} estimate": frfs[name] for name in rest}
+    figures = {
+        "record.png": record_figure(record),
+        "bode.png": bode(frfs[method], models, others=others, title=options.file.name),
+    }
+    if check is not None:
+        figures["verification.png"] = overlay(check, title=options.verify.name)
+    for name, figure in figures.items():
+        figure.savefig(folder / name, dpi=130)
+    return path, list(figures)
