@@ -61,8 +61,72 @@ def test_bad_input_is_one_line_on_stderr(flight, capsys):
 def test_noise_is_not_identifiable(tmp_path, capsys):
     noise = np.random.default_rng(1).standard_normal((4096, 2))
     np.savez(tmp_path / "hover.npz", t=np.arange(4096) / 100, M=noise[:, 0], q=noise[:, 1])
-    assert identify(tmp_path / "hover.npz", channels=("M", "q")) == 3
-    assert "not identifiable from this record" in capsys.readouterr().out
+    out = tmp_path / "out"
+    assert identify(tmp_path / "hover.npz", "--out", str(out), channels=("M", "q")) == 3
+    printed = capsys.readouterr()
+    assert "not identifiable from this record" in printed.out
+    assert printed.err.count("\n") == 1 and printed.err.startswith("jaxquad: error: not ident")
+    assert not json.loads((out / "result.json").read_text())["fit"]["identifiable"]
+    assert (out / "bode.png").stat().st_size > 10_000
+
+
+def test_json_is_all_that_stdout_holds_and_knows_no_nan(flight, tmp_path, capsys):
+    """Below 1 / lag the lag and the delay trade off: what is not determined is null."""
+    code = identify(flight, "--out", str(tmp_path), "--band", "0.5", "1", "--json")
+    printed = capsys.readouterr()
+    result = json.loads(printed.out, parse_constant=pytest.fail)
+    by_name = {row["name"]: row for row in result["fit"]["parameters"]}
+    assert code == 3 and by_name["lag"]["value"] is None
+    assert by_name["gain"]["value"] == pytest.approx(GAIN, rel=0.03)
+    assert "jaxquad: error: not identifiable from this record" in printed.err
+    assert "standard_error" not in printed.err and "std.err." in printed.err
+
+
+def test_a_model_without_a_lag_has_the_whole_of_it_as_delay(flight, tmp_path, capsys):
+    band = ["--band-rad", "3", "12"]
+    assert identify(flight, "--out", str(tmp_path), *band, "--no-lag", "--cost", "coherence") == 0
+    assert "q / M = K e^(-delay s) / s," in capsys.readouterr().out
+    result = json.loads((tmp_path / "result.json").read_text())
+    gain, delay = result["fit"]["parameters"]
+    assert gain["name"] == "gain" and delay["name"] == "delay"
+    assert delay["value"] == pytest.approx(LAG + DELAY + 0.005, rel=0.05)
+
+
+def test_a_warning_of_the_reader_is_one_line(tmp_path, capsys):
+    time = np.delete(np.arange(2000) / 100, slice(700, 704))
+    noise = np.random.default_rng(2).standard_normal((time.size, 2))
+    np.savez(tmp_path / "gap.npz", t=time, M=noise[:, 0], q=noise[:, 1])
+    identify(tmp_path / "gap.npz", "--out", str(tmp_path), channels=("M", "q"))
+    warning, error = capsys.readouterr().err.splitlines()
+    assert warning.startswith("! gaps bridged by interpolation") and error.startswith("jaxquad: ")
+
+
+@pytest.mark.parametrize(
+    ("option", "complaint"),
+    [
+        (["--band", "6", "0.5"], "has to rise"),
+        (["--integrators", "7"], "0 to 3"),
+        (["--start", "90"], "90"),
+        (["--window", "900"], "window"),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused(flight, capsys, option, complaint):
+    assert identify(flight, *option) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("jaxquad: error:") and complaint in printed
+    assert printed.count("\n") == 1
+
+
+def test_the_pitch_axis_of_a_measured_flight(data, tmp_path, capsys):
+    path = data / "antx_pitch/antx_log3_prbs.npz"
+    span = ["--rate", "250", "--start", "50", "--stop", "76", "--band", "0.7", "12"]
+    more = ["--reference", "x0", "--unit", "q=rad/s", "--out", str(tmp_path)]
+    assert identify(path, *span, *more, channels=("M", "q")) == 0
+    printed = capsys.readouterr().out
+    gain, lag, delay = json.loads((tmp_path / "result.json").read_text())["fit"]["parameters"]
+    assert 270 < gain["value"] < 295
+    assert 0.024 < lag["value"] + delay["value"] < 0.029  # s
+    assert "joint" in printed and "direct" in printed and "lag + delay" in printed
 
 
 @pytest.mark.parametrize(
@@ -71,6 +135,8 @@ def test_noise_is_not_identifiable(tmp_path, capsys):
         ("M", {"M": {"M": 1.0}}),
         ("roll=-m1+0.5*m2", {"roll": {"m1": -1.0, "m2": 0.5}}),
         ("p = m[0] - 2 * m[1]", {"p": {"m[0]": 1.0, "m[1]": -2.0}}),
+        ("r=u[deg/s]-.5*u[1]+u[1]", {"r": {"u[deg/s]": 1.0, "u[1]": 0.5}}),
+        ("axis-rate", {"axis-rate": {"axis-rate": 1.0}}),
         ("d=a-a.b+1e-3*c", {"d": {"a": 1.0, "a.b": -1.0, "c": 0.001}}),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
-from jaxquad.report import bode, overlay, record_figure, write_results
+from jaxquad.report import bode, comparison, overlay, record_figure, write_results
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -115,3 +115,19 @@ def test_a_failed_write_leaves_the_old_result(tmp_path, fit):
     with pytest.raises(TypeError):
         write_results(tmp_path, fit=fit, extra={"bad": object()})
     assert path.read_text() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_fits_stand_side_by_side_and_what_is_missing_says_so(fit):
+    nothing = jq.NotIdentifiable("not identifiable from this record")
+    late = {"lag + delay": lambda model: model.lag + model.delay}
+    head, joint, direct = comparison({"joint": fit, "direct": nothing}, late).splitlines()
+    assert head.split() == "gain lag delay lag + delay misfit / error".split()
+    assert f"{fit.values[0]:.5g} +- {fit.standard_errors[0]:.2g}" in joint
+    assert str(f"{fit.derived(late['lag + delay']).value:.5g}") in joint
+    assert direct.split() == ["direct", "not", "identifiable"]
+
+
+def test_an_exception_stands_for_the_fit_that_there_is_not(tmp_path, frf):
+    path = write_results(tmp_path, fit=jq.NotIdentifiable("no excitation"), frf=frf)
+    fit = json.loads(path.read_text())["fit"]
+    assert fit == {"identifiable": False, "remarks": ["no excitation"]}
