@@ -174,6 +174,8 @@ def _write(
     }
     if check is not None:
         figures["verification.png"] = overlay(check, title=options.verify.name)
+    if check is None:
+        (folder / "verification.png").unlink(missing_ok=True)  # of an earlier run
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=130)
     return path, list(figures)

@@ -8,6 +8,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
+from jaxquad.identify._checks import check_options, checked_responses
 
 
 START = jq.LaggedIntegrator(150.0, 0.03, 0.02)
@@ -74,8 +75,49 @@ def test_a_prior_needs_a_cost_with_noise(frf):
         jq.Prior("lag", 0.02, 0.0)
 
 
-def test_every_response_needs_a_condition(frf):
-    refuse("1 conditions for 2 responses", (frf, frf), conditions=(None,))
+def test_every_response_needs_a_condition_and_counts_once(frf):
+    other = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), seed=1)
+    refuse("1 conditions for 2 responses", (frf, other), conditions=(None,))
+    refuse("response 1 of 2 is there twice", (frf, frf))
+
+
+def test_what_is_no_response_is_named():
+    with pytest.raises(ValueError, match="a list of them, not nothing"):
+        checked_responses([])
+    with pytest.raises(ValueError, match="not LaggedIntegrator.*jq.fit"):
+        checked_responses(START)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ((jq.MaximumLikelihood, None, 0.6, 9), "pass an object, jq.CoherenceWeighted"),
+        (("ml", None, 0.6, 9), "cost='ml': pass an object"),
+        ((jq.MaximumLikelihood(), 5.0, 0.6, 9), "band=5.0: give two frequencies"),
+        ((jq.MaximumLikelihood(), None, 2.0, 9), "min_coherence is 2.0"),
+        ((jq.MaximumLikelihood(), None, 0.6, 0), "max_steps is 0"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options, match):
+    with pytest.raises(ValueError, match=match):
+        check_options(*options)
+
+
+def test_a_prior_on_what_is_not_free_is_refused(frf):
+    refuse(
+        "prior 1 speaks of nothing that is free",
+        frf,
+        free=("gain",),
+        priors=[jq.Prior("lag", 0.02, 0.001)],
+        cost=jq.MaximumLikelihood(),
+    )
+
+
+def test_a_model_of_another_shape_is_refused(frf):
+    two = eqx.tree_at(lambda f: f.response, frf, jnp.tile(frf.response, (1, 2, 1)))
+    two = eqx.tree_at(lambda f: f.coherence, two, jnp.tile(frf.coherence, (1, 2, 1)))
+    two = eqx.tree_at(lambda f: f.random_error, two, jnp.tile(frf.random_error, (1, 2, 1)))
+    refuse(r"response has shape \(30, 1, 1\), the measured one \(30, 2, 1\)", two)
 
 
 def test_float32_is_refused_with_the_way_out(frf):

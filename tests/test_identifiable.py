@@ -1,5 +1,8 @@
 """What a record cannot tell is said before any number is read."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import response_of
@@ -141,3 +144,65 @@ def test_what_is_fixed_takes_part_in_names_only_where_it_acts_alike():
     frf = response_of(RIG, seed=0)
     fit = jq.fit(start(lag=0.02), frf, free=("J_x", "K_t"), cost=ML)
     assert [c.name for c in fit.combinations] == ["L K_t / J_x"]
+
+
+class Sum(eqx.Module):
+    """A gain that is the sum of three, and one that is a product with a sum."""
+
+    a: jax.Array
+    b: jax.Array
+    c: jax.Array
+    product: bool = eqx.field(static=True, default=False)
+
+    def frequency_response(self, omega):
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
+        gain = self.a * (self.b + self.c) if self.product else self.a + self.b + self.c
+        return (gain.astype(s.dtype) / s)[:, None, None]
+
+
+def summed(values, product=False):
+    return Sum(*(jnp.asarray(float(value)) for value in values), product)
+
+
+@pytest.mark.parametrize("values", [(2, 2, 2), (1, 3, 5), (0.5, 0.5, 9)])
+def test_a_sum_is_never_taken_for_a_product(values):
+    """At equal values the two are alike to first order: only a finite move tells."""
+    fit = jq.fit(summed(values), response_of(summed((2, 2, 4)), seed=0), cost=ML)
+    (total,) = fit.combinations
+    assert total.name == "a + b + c" and abs(total.value - 8) < 3 * total.standard_error
+    with pytest.raises(jq.NotIdentifiable):
+        fit.derived(lambda m: m.a * m.b * m.c, "a b c")
+
+
+def test_what_is_no_product_and_no_sum_is_not_named():
+    truth, start = summed((2, 2, 2), True), summed((1, 3, 5), True)
+    fit = jq.fit(start, response_of(truth, seed=0), cost=ML)
+    assert not fit.combinations and not fit.identifiable
+    assert "neither a product nor a sum" in str(fit)
+    with pytest.raises(jq.NotIdentifiable):
+        fit.derived(lambda m: m.a**2 * m.b * m.c)
+
+
+def test_a_fit_from_the_wrong_sign_is_doubted_aloud():
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.1, 0.02), seed=0)
+    fit = jq.fit(jq.LaggedIntegrator(-8.0, 0.1, 0.02), frf, cost=ML)
+    assert not fit.identifiable
+    assert any("minimum" in remark and "starting values" in remark for remark in fit.remarks)
+
+
+def test_where_there_is_no_minimum_no_number_is_given():
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.1, 0.02), seed=0)
+    fit = jq.fit(jq.LaggedIntegrator(2.0, 0.4, 0.1), frf, cost=ML, max_steps=1)
+    assert not fit.identifiable and not fit.combinations
+    assert np.isnan(fit.values).all() and np.isinf(fit.standard_errors).all()
+    assert any(remark.startswith("no minimum") for remark in fit.remarks)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_number_has_an_error_of_more_than_half_its_size(seed):
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.02, 0.0), error=0.3, seed=seed)
+    fit = jq.fit(jq.LaggedIntegrator(8.0, 0.03), frf, free=("gain", "lag"), cost=ML)
+    determined = np.isfinite(fit.standard_errors)
+    sizes = np.maximum(np.abs(fit.values), np.abs(fit.units))[determined]
+    assert np.all(fit.standard_errors[determined] <= 0.5 * sizes)
+    assert set(np.array(fit.names)[~determined]) == set(fit.identifiability.undetermined)

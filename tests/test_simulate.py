@@ -11,6 +11,7 @@ from jaxquad.control import PD, place_pd
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
 from jaxquad.simulate import (
     Encoder,
+    excite,
     MotorDrive,
     runge_kutta,
     Scenario,
@@ -201,3 +202,22 @@ def test_a_controller_made_for_another_sample_interval_is_refused():
         simulate(rig(), PILOT, scenario(), dt=0.004)
     with pytest.raises(ValueError, match="dt is 0.0 s"):
         simulate(rig(), PILOT, scenario(), dt=0.0)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"dt": 0.0},
+        {"torque_noise": -1.0},
+        {"sensor_noise": float("nan")},
+        {"torque_corner": 0.0},
+        {"axis": "surge"},
+    ],
+    ids=lambda bad: next(iter(bad)),
+)
+def test_an_experiment_that_means_nothing_is_refused(bad):
+    options = {"key": jax.random.key(0), "dt": 0.01} | bad
+    with pytest.raises(ValueError, match=f"{next(iter(bad))}"):
+        excite(np.zeros(50), **options)
+    with pytest.raises(ValueError, match="jq.sweep"):
+        excite(np.full(50, np.nan), key=jax.random.key(0), dt=0.01)

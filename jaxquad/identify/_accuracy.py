@@ -48,7 +48,7 @@ class Noise(NamedTuple):
 
 def noise_effect(blocks: list[Block], known: Known, count: int) -> Noise:
     """The responses' errors, with all their correlation, seen through weights and slopes."""
-    data, cost = np.zeros((count, count)), float(len(known.misfit))
+    data, cost = np.zeros((count, count)), 0.0
     for block in blocks:
         weighted = block.weights[..., None] ** 2 * block.slopes[..., :count]
         # Circular noise: real and imaginary parts share Im S with opposite signs.
@@ -69,8 +69,8 @@ def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -
 
 
 def misfit_ratio(cost: float, bread: Matrix, noise: Noise) -> float:
-    """Cost over what the noise alone would leave of it: about 1 where the model is right."""
-    fitted = float(np.trace(scaled_inverse(bread) @ (noise.data + noise.priors)))
+    """The data's cost over what noise alone would leave of it: about 1 for the right model."""
+    fitted = float(np.trace(scaled_inverse(bread) @ noise.data))
     return cost / max(noise.cost - fitted, 1e-300)
 
 

@@ -1,5 +1,6 @@
 """From a solver's stop to a result that states what it is worth."""
 
+import functools as ft
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,9 +24,16 @@ from ._accuracy import (
 from ._identifiable import decide, Identifiability, Information
 from ._parameters import Place
 from ._problem import Problem
-from ._remarks import MISFIT, ran_to_zero, remarks_on_fit, remarks_on_leakage
+from ._remarks import (
+    FAILED,
+    MISFIT,
+    ran_to_zero,
+    remarks_on_fit,
+    remarks_on_leakage,
+    remarks_on_priors,
+)
 from ._result import Fit
-from ._solve import Solution
+from ._solve import same_responses, Solution
 
 
 def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution) -> Fit:
@@ -35,18 +43,22 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
     blocks, known = _blocks(problem, frfs, solution, units), _known(solution, units)
     bread, gradient = gauss_newton(blocks, known, count)
     noise = noise_effect(blocks, known, count)
-    cost = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
-    cost += float(np.sum(known.misfit**2))
-    misfit = misfit_ratio(cost, bread, noise)
+    data_cost = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
+    cost = data_cost + float(np.sum(known.misfit**2))
+    misfit = misfit_ratio(data_cost, bread, noise)
     # A misfit beyond the noise is in no covariance of the noise: widen the errors to match it.
-    covariance = calibrated_covariance(bread, noise, misfit if misfit > MISFIT**2 else 1.0)
-    verdict, by_data = _identifiability(problem, solution, blocks, known, covariance, units)
+    inflation = misfit if misfit > MISFIT**2 else 1.0
+    covariance = calibrated_covariance(bread, noise, inflation)
+    decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
+    verdict = by_data = Identifiability(parameters.names, (), (), np.eye(count), (), ())
+    if decrement <= FAILED * max(cost, 1e-9):
+        facts = _information(problem, solution, blocks, covariance, units, inflation)
+        verdict, by_data = _identifiability(facts, known)
     values, slopes = np.asarray(solution.values)[:count], units[:count]
     lost = np.array([name in verdict.undetermined for name in parameters.names])
     physical = covariance * np.outer(slopes, slopes)
     physical[lost, :] = physical[:, lost] = np.nan
     percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
-    decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
     return Fit(
         model=solution.model,
         names=parameters.names,
@@ -67,7 +79,7 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
             *dict.fromkeys(remark for frf in frfs for remark in frf.remarks),
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
             *remarks_on_leakage(problem, frfs, solution),
-            *_remarks_on_priors(verdict, by_data),
+            *remarks_on_priors(known.misfit, verdict, by_data),
         ),
         parameters=parameters,
         units=units[:count],
@@ -122,45 +134,38 @@ def _known(solution: Solution, units: Float[np.ndarray, " all"]) -> Known:
     return Known(np.asarray(derivatives.prior_misfits), slopes)
 
 
-def _identifiability(
+def _information(
     problem: Problem,
     solution: Solution,
     blocks: list[Block],
-    known: Known,
     covariance: Float[np.ndarray, "parameters parameters"],
     units: Float[np.ndarray, " all"],
-) -> tuple[Identifiability, Identifiability]:
-    """What data and priors determine together, and what the data determine alone."""
-    parameters = problem.parameters
-    root = information_root(blocks)
-    facts = Information(
-        root,
-        covariance,
-        tuple(place.name for place in parameters.places),
-        np.asarray(solution.values),
-        units,
-        _ranks(parameters.places),
+    inflation: float,
+) -> Information:
+    """What the data say, with errors as wide as they are printed."""
+    places = problem.parameters.places
+    return Information(
+        root=information_root(blocks) / np.sqrt(inflation),
+        covariance=covariance,
+        names=tuple(place.name for place in places),
+        values=np.asarray(solution.values),
+        units=units,
+        order=_ranks(places),
+        same=ft.partial(same_responses, problem, solution),
     )
-    by_data = decide(facts)
+
+
+def _identifiability(facts: Information, known: Known) -> tuple[Identifiability, Identifiability]:
+    """What data and priors determine together, and what the data determine alone."""
     if not len(known.misfit):
-        return by_data, by_data
+        verdict = decide(facts)
+        return verdict, verdict
     # Rows come in pairs of magnitude and phase; a prior's row counts once.
     priors = np.repeat(known.slopes, 2, axis=0) / np.sqrt(2)
-    return decide(facts._replace(root=np.concatenate([root, priors]))), by_data
+    return decide(facts._replace(root=np.concatenate([facts.root, priors]))), decide(facts)
 
 
 def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
     """Each parameter's place in the model's own order."""
     ordered = sorted(places, key=lambda place: (place.leaf, place.index))
     return tuple(ordered.index(place) for place in places)
-
-
-def _remarks_on_priors(verdict: Identifiability, by_data: Identifiability) -> list[str]:
-    resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
-    if not resolved:
-        return []
-    known = ", ".join(combination.name for combination in by_data.determined)
-    return [
-        f"{' and '.join(resolved)}: told apart by the prior alone; the record by itself determines "
-        f"only {known or 'none of them'}"
-    ]

@@ -1,12 +1,15 @@
 """Combinations of parameters that a record determines, in the user's own names."""
 
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ._accuracy import Matrix
+
+
+Kind = Literal["product", "sum"]
 
 
 class Combination(NamedTuple):
@@ -54,15 +57,20 @@ class Named(NamedTuple):
     relative: Matrix
 
 
-def combine(weights: Float[np.ndarray, " parameters"], named: Named) -> Combination:
+def combine(
+    weights: Float[np.ndarray, " parameters"],
+    named: Named,
+    kinds: tuple[Kind, ...] = ("product", "sum"),
+) -> Combination:
     """The simplest product or sum that is as sharp as `weights` times the relative changes.
 
     Whole exponents or coefficients are taken if they cost no more than a quarter in standard error;
     where nothing simple is as sharp, the weights are printed as they are.
     """
     logarithmic = bool(np.all(named.units == named.values))
-    powers = _simple(weights) if logarithmic else None
-    sums = _simple(weights / named.units)
+    products = logarithmic and "product" in kinds
+    powers = _simple(weights) if products else None
+    sums = _simple(weights / named.units) if "sum" in kinds else None
     if powers is not None and not _as_sharp(powers, weights, named):
         powers = None
     if sums is not None and not _as_sharp(sums * named.units, weights, named):
@@ -71,7 +79,7 @@ def combine(weights: Float[np.ndarray, " parameters"], named: Named) -> Combinat
         return _sum(sums, named)
     if powers is not None:
         return _product(powers, named)
-    if logarithmic:
+    if products:
         return _product(np.round(weights, 3), named)
     scaled = weights / named.units
     return _sum(np.round(scaled / np.max(np.abs(scaled)), 3), named)

@@ -8,6 +8,13 @@ from jaxtyping import Float, PyTree
 from jaxquad.spectra import FrequencyResponse, require_x64
 
 from ._assess import assess
+from ._checks import (
+    check_finite,
+    check_options,
+    check_priors,
+    check_shapes,
+    checked_responses,
+)
 from ._cost import CoherenceWeighted, Cost, Mask, MaximumLikelihood
 from ._identifiable import NotIdentifiable
 from ._parameters import Free, name_places, Parameters, select_parameters
@@ -44,13 +51,16 @@ def fit(
     Source: Eq. (14), corrected.
     """
     require_x64("a fit")
-    frfs = [frf] if isinstance(frf, FrequencyResponse) else list(frf)
+    frfs = checked_responses(frf)
+    check_options(cost, band, min_coherence, max_steps)
     parameters = select_parameters(model, free)
     used = [_usable(one, band, min_coherence) for one in frfs]
     _check_points(frfs, used, parameters, min_coherence, band)
     problem = _problem(model, parameters, frfs, conditions, priors, cost)
+    check_shapes(problem)
     problem, solution = _solve_reweighted(problem, frfs, used, cost, solver, max_steps)
-    _check_finite(solution)
+    check_finite(solution)
+    check_priors(problem, solution)
     return assess(problem, frfs, solution)
 
 
@@ -97,15 +107,6 @@ def _check_points(
             f"{total} frequencies{f' (band {band} rad/s)' if band else ''}, its maximum is "
             f"{best:.2f}, and {parameters.count} parameters need at least {needed}. Excite the "
             f"axis (jq.sweep), record longer, or use a longer window. {reasons}".rstrip()
-        )
-
-
-def _check_finite(solution: Solution) -> None:
-    finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
-    if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
-        raise ValueError(
-            f"the fit diverged: {solution.message or 'the model has no finite response there'}; "
-            "start nearer to the answer, or leave solver= at its damped default"
         )
 
 

@@ -1,15 +1,17 @@
 """What a record can and cannot tell, decided from the Fisher information before any number."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ._combination import Combination, combine, echelon, Named
+from ._combination import Combination, combine, echelon, Kind, Named
 
 
 LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
 _MEMBER = 0.05  # share of a null direction from which a parameter takes part in it
+_MOVE = 0.4  # finite relative change along a null direction that has to change nothing
 _FLOOR = 1e-8  # of the largest singular value: below it lies rounding
 
 
@@ -24,6 +26,8 @@ class Identifiability(NamedTuple):
     null_directions: tuple[dict[str, float], ...]  # unit vectors of relative changes
     determined: tuple[Combination, ...]  # combinations of the undetermined ones
     exact: Float[np.ndarray, "null parameters"]  # those null directions that no noise explains
+    alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
+    curved: tuple[str, ...]  # what is determined of these is no product and no sum
 
 
 class Information(NamedTuple):
@@ -32,7 +36,8 @@ class Information(NamedTuple):
     The fixed ones take part in names only: the arm L in L K_t / J_x. `root` holds derivatives of
     ln-magnitudes and phases (alternate rows), in units of their random error, with respect to
     relative changes; `covariance` is that of the free parameters' relative changes; `order` is
-    the model's own order of its parameters.
+    the model's own order of its parameters; `same` says whether other values of the free ones
+    give the same responses.
     """
 
     root: Float[np.ndarray, "rows all"]
@@ -41,6 +46,16 @@ class Information(NamedTuple):
     values: Float[np.ndarray, " all"]
     units: Float[np.ndarray, " all"]
     order: tuple[int, ...]
+    same: Callable[[Float[np.ndarray, " parameters"]], bool]
+
+
+class _Group(NamedTuple):
+    """Parameters that share null directions, and what they leave determined."""
+
+    members: np.ndarray
+    combinations: list[Combination]
+    alternatives: list[np.ndarray]
+    curved: bool
 
 
 def decide(information: Information) -> Identifiability:
@@ -50,19 +65,25 @@ def decide(information: Information) -> Identifiability:
     singular = np.pad(singular, (0, count - len(singular)))
     exact = singular <= _FLOOR * singular[0]
     null = right[exact | (singular * LIMIT < 1)]
-    if not len(null):
-        return Identifiability((), (), (), right[exact])
-    null = _sparse(null)
-    opened = _opened(information.covariance, right[exact])
-    facts = information._replace(covariance=opened)
-    determined = [
-        combination for block in _blocks(null) for combination in _determined(null, block, facts)
-    ]
-    members = np.flatnonzero(np.any(null, axis=0))
-    names = information.names
-    directions = tuple({names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null)
-    lost = tuple(names[k] for k in members)
-    return Identifiability(lost, directions, tuple(determined), right[exact])
+    null = _sparse(null) if len(null) else null
+    sure = _sparse(right[exact]) if np.any(exact) else null[:0]
+    facts = information._replace(covariance=_opened(information.covariance, right[exact]))
+    groups = [_explore(null, sure, block, facts) for block in _blocks(null)]
+    names, blurred = information.names, _blurred(information.covariance)
+    lost = np.flatnonzero(np.any(null, axis=0) | blurred)
+    return Identifiability(
+        tuple(names[k] for k in lost),
+        tuple({names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null),
+        tuple(combination for group in groups for combination in group.combinations),
+        right[exact],
+        tuple(values for group in groups for values in group.alternatives),
+        tuple(names[k] for group in groups if group.curved for k in group.members),
+    )
+
+
+def _blurred(covariance: np.ndarray) -> np.ndarray:
+    """Parameters with a standard error beyond the limit, whatever direction it comes from."""
+    return np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) > LIMIT
 
 
 def _sparse(null: Float[np.ndarray, "null parameters"]) -> Float[np.ndarray, "null parameters"]:
@@ -90,32 +111,60 @@ def _opened(covariance: np.ndarray, exact: np.ndarray) -> np.ndarray:
     return keep @ covariance @ keep + 1e4 * exact.T @ exact
 
 
-def _determined(
-    null: Float[np.ndarray, "null parameters"], block: np.ndarray, facts: Information
-) -> list[Combination]:
-    """Combinations of one group's members that no null direction moves."""
-    inside = null[:, block]
-    _, singular, right = np.linalg.svd(inside[np.any(inside, axis=1)], full_matrices=True)
-    rows = echelon(right[int(np.sum(singular > 1e-6)) :])
-    if not len(rows):
-        return []
-    effects = facts.root[:, block] @ np.linalg.pinv(rows)
-    return [_named(row, block, effects[:, k], facts) for k, row in enumerate(rows)]
+def _explore(
+    null: Float[np.ndarray, "null parameters"],
+    sure: Float[np.ndarray, "exact parameters"],
+    block: np.ndarray,
+    facts: Information,
+) -> _Group:
+    """One group: which kind of combination survives a finite move, and its determined ones."""
+    sure = sure[np.any(sure[:, block], axis=1)]
+    kinds: dict[Kind, np.ndarray | None] = {"product": None, "sum": None}
+    if len(sure):
+        moves = {kind: _moved(sure, kind, facts) for kind in kinds}
+        kinds = {kind: values for kind, values in moves.items() if facts.same(values)}
+    rows = _outside(null[:, block])
+    effects = facts.root[:, block] @ np.linalg.pinv(rows) if len(rows) else None
+    found = []
+    for k, row in enumerate(rows if kinds else []):
+        found.append(_named(row, block, effects[:, k], facts, tuple(kinds)))
+    alternatives = [values for values in kinds.values() if values is not None]
+    return _Group(block, found, alternatives, not kinds and len(rows) > 0)
+
+
+def _moved(
+    sure: Float[np.ndarray, "exact parameters"], kind: Kind, facts: Information
+) -> Float[np.ndarray, " parameters"]:
+    """Values a finite way along the null directions, at constant products or at constant sums."""
+    count = len(facts.covariance)
+    direction = _MOVE * np.sum(sure * np.arange(1, len(sure) + 1)[:, None] / len(sure), axis=0)
+    values, units = facts.values[:count], facts.units[:count]
+    return values * np.exp(direction) if kind == "product" else values + units * direction
+
+
+def _outside(null: Float[np.ndarray, "null members"]) -> Float[np.ndarray, "rows members"]:
+    """Combinations of the members that no null direction moves."""
+    _, singular, right = np.linalg.svd(null[np.any(null, axis=1)], full_matrices=True)
+    return echelon(right[int(np.sum(singular > 1e-6)) :])
 
 
 def _named(
-    row: np.ndarray, block: np.ndarray, effect: np.ndarray, facts: Information
+    row: np.ndarray,
+    block: np.ndarray,
+    effect: np.ndarray,
+    facts: Information,
+    kinds: tuple[Kind, ...],
 ) -> Combination:
     weights = np.zeros(len(facts.values))
     weights[block] = row
-    weights = _with_fixed(weights, effect, facts)
+    weights = _with_fixed(weights, effect, facts) if "product" in kinds else weights
     used = np.array(sorted(np.flatnonzero(weights), key=lambda k: facts.order[k]))
     count = len(facts.covariance)
     relative = np.zeros((len(weights), len(weights)))
     relative[:count, :count] = facts.covariance
     names = tuple(facts.names[k] for k in used)
     named = Named(names, facts.values[used], facts.units[used], relative[np.ix_(used, used)])
-    return combine(weights[used], named)
+    return combine(weights[used], named, kinds)
 
 
 def _with_fixed(

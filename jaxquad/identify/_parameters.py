@@ -61,6 +61,15 @@ class Parameters(eqx.Module):
         ones = jnp.ones_like(z)
         return self.scale[:n] * jnp.where(np.array(self.logarithmic[:n]), jnp.exp(z), ones)
 
+    def replace(self, model: PyTree, values: Float[np.ndarray, " parameters"]) -> PyTree:
+        """The model with other physical values of its free parameters, outside of any trace."""
+        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+        leaves, structure = jax.tree.flatten(arrays)
+        leaves = [np.array(leaf) for leaf in leaves]
+        for place, value in zip(self.places, values, strict=False):
+            leaves[place.leaf].reshape(-1)[place.index] = value
+        return eqx.combine(jax.tree.unflatten(structure, [jnp.asarray(x) for x in leaves]), rest)
+
     def insert(self, model: PyTree, z: Float[Array, " n"]) -> PyTree:
         """The model with its first `n` parameters set."""
         arrays, rest = eqx.partition(model, eqx.is_inexact_array)

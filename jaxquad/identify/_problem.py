@@ -26,7 +26,7 @@ class Prior(eqx.Module):
     standard_error: float = eqx.field(static=True)
 
     def __check_init__(self):
-        if not (self.standard_error > 0 and np.isfinite(self.value)):
+        if not (0 < self.standard_error < np.inf and np.isfinite(self.value)):
             raise ValueError(
                 f"prior {self.value} +- {self.standard_error}: a finite value and a positive "
                 "standard error are needed"

@@ -7,11 +7,13 @@ from jaxtyping import Float
 
 from jaxquad.spectra import FrequencyResponse
 
+from ._identifiable import Identifiability
 from ._problem import Problem
 from ._solve import Solution
 
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+FAILED = 1e-2  # share of the cost that a step would still save, from which nothing is a result
 _POOR = 10.0  # ratio from which a wrong minimum is likely
 _LOCAL = ", or this is a local minimum: try other starting values"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
@@ -21,14 +23,13 @@ def remarks_on_fit(
     problem: Problem, solution: Solution, cost: float, decrement: float, chi_squared: float
 ) -> list[str]:
     """Runaway parameters, missing convergence, misfit beyond the noise."""
-    runaways = _runaways(problem, solution)
-    remarks = list(runaways)
-    if not runaways and not solution.converged:
+    remarks, no_minimum = _runaways(problem, solution), decrement > 1e-3 * max(cost, 1e-9)
+    if not solution.converged and (no_minimum or not remarks):
         remarks.append(f"the solver stopped early: {solution.message}")
-    if not runaways and not decrement <= 1e-3 * max(cost, 1e-9):
+    if no_minimum:
         remarks.append(
             f"no minimum: one more Gauss-Newton step would lower the cost by {decrement:.3g} of "
-            f"{cost:.4g}; try other starting values"
+            f"{cost:.4g}; try other starting values{_opposite(problem, solution)}"
         )
     if chi_squared > MISFIT**2:
         ratio = np.sqrt(chi_squared)
@@ -36,6 +37,36 @@ def remarks_on_fit(
             f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
             f"explain the whole response{_LOCAL if ratio > _POOR else ''}; standard errors are "
             f"widened by {ratio:.1f}"
+        )
+    return remarks
+
+
+def _opposite(problem: Problem, solution: Solution) -> str:
+    """A hint where the model turns the wrong way at the lowest frequencies."""
+    for weights, misfit in zip(problem.weights, solution.sensitivity.misfits, strict=True):
+        used = np.asarray(weights)[..., 0] > 0
+        phases = np.abs(np.asarray(misfit)[..., 1][used])
+        if phases.size and np.median(phases[: max(phases.size // 4, 1)]) > 2.5:
+            return "; the phase is off by about 180 deg: try the other sign of the gain"
+    return ""
+
+
+def remarks_on_priors(
+    pulls: Float[np.ndarray, " priors"], verdict: Identifiability, by_data: Identifiability
+) -> list[str]:
+    """What rests on the priors alone, and which of them the data contradict."""
+    remarks = [
+        f"prior {k + 1} is {abs(pull):.1f} of its standard errors away from the fit: data and "
+        "prior contradict each other"
+        for k, pull in enumerate(pulls)
+        if abs(pull) > 3
+    ]
+    resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
+    if resolved:
+        known = ", ".join(combination.name for combination in by_data.determined)
+        remarks.append(
+            f"{' and '.join(resolved)}: told apart by the prior alone; the record by itself "
+            f"determines only {known or 'none of them'}"
         )
     return remarks
 
@@ -84,7 +115,7 @@ def _runaways(problem: Problem, solution: Solution) -> list[str]:
         f"{names[k]} ran to zero: leave it out, or let its sign change with jq.Real({names[k]!r})"
         for k in low
     ]
-    for k in np.flatnonzero(_moved(problem, solution) > _FAR):
+    for k in np.flatnonzero(_moved(problem, solution) > 2 * _FAR):
         if problem.parameters.logarithmic[k]:
             remarks.append(f"{names[k]} ran to infinity: start elsewhere, or leave it out")
     return remarks

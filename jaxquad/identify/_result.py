@@ -78,8 +78,7 @@ class Fit(eqx.Module):
         places = self.parameters.places[: len(self.names)]
         each = [np.asarray(gradient[place.leaf]).reshape(-1)[place.index] for place in places]
         slope = np.array(each) * self.units
-        moved = self.identifiability.exact @ slope
-        if np.any(np.abs(moved) > 1e-6 * np.linalg.norm(slope)):
+        if self._moves(quantity, slope):
             lost = ", ".join(self.identifiability.undetermined)
             raise NotIdentifiable(
                 f"{name} changes with what this record does not determine ({lost}): fit it under "
@@ -87,6 +86,19 @@ class Fit(eqx.Module):
             )
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
         return Combination(name, float(quantity(self.model)), error)
+
+    def _moves(self, quantity: Callable[[PyTree], Float[Array, ""]], slope: np.ndarray) -> bool:
+        """Whether a quantity changes with what leaves all responses as they are."""
+        verdict = self.identifiability
+        first_order = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
+        touched = [slope[self.names.index(name)] != 0 for name in verdict.curved]
+        here = float(quantity(self.model))
+        others = [
+            float(quantity(self.parameters.replace(self.model, values)))
+            for values in verdict.alternatives
+        ]
+        apart = [abs(other - here) > 1e-6 * abs(here) for other in others]
+        return bool(np.any(first_order) or any(touched) or any(apart))
 
     def __str__(self) -> str:
         return fit_table(self)

@@ -2,9 +2,10 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._problem import Problem, residuals, Sensitivity, sensitivity
+from ._problem import misfits, Problem, residuals, Sensitivity, sensitivity
 
 
 class Solution(NamedTuple):
@@ -60,3 +61,21 @@ def _objective(z: Float[Array, " parameters"], problem: Problem) -> Float[Array,
 def _reason(message: str, steps: int) -> str:
     """The first sentence of a solver's message."""
     return f"{message.strip().split('.')[0].rstrip()} (after {steps} steps)"
+
+
+def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> bool:
+    """Whether other values of the free parameters leave all responses as they are."""
+    parameters, count = problem.parameters, problem.parameters.count
+    ratio = values / np.asarray(parameters.scale)[:count]
+    logarithmic = np.array(parameters.logarithmic[:count])
+    if np.any(logarithmic & (ratio <= 0)):
+        return False
+    z = np.where(logarithmic, np.log(np.where(logarithmic, ratio, 1.0)), ratio)
+    moved = _misfits(jnp.asarray(z), problem)
+    return all(
+        np.allclose(new, old, atol=1e-6, rtol=0, equal_nan=True)
+        for new, old in zip(moved, solution.sensitivity.misfits, strict=True)
+    )
+
+
+_misfits = eqx.filter_jit(misfits)

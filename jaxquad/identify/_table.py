@@ -19,6 +19,9 @@ def _verdict(fit: Any) -> list[str]:
     if fit.combinations:
         known = " and ".join(combination.name for combination in fit.combinations)
         lines.append(f"  only {known} is determined by this record")
+    elif fit.identifiability.curved:
+        curved = ", ".join(fit.identifiability.curved)
+        lines.append(f"  what it determines of {curved} is neither a product nor a sum of them")
     else:
         lines.append("  nothing about them is determined by this record")
     lines += [f"    {combination}" for combination in fit.combinations]

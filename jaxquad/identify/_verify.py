@@ -45,7 +45,7 @@ def verify(
     record: Record,
     *,
     band: tuple[float, float] | None = None,
-    hold: str = "zero",
+    hold: str = "first",
 ) -> Verification:
     """Simulate the measured input open loop and compare, on a record that was not fitted.
 
@@ -53,7 +53,8 @@ def verify(
     on the state derivatives and a shift of the output are estimated by least squares, for no
     record starts in perfect trim. `band` (rad/s) restricts the comparison: an
     integrating plant drifts on disturbances that no model predicts. `hold` says how the input
-    runs between its samples: "zero" or "first".
+    runs between its samples: "first" (straight), which suits an identified model, whose delay
+    contains the half sample for which an input is held; or "zero" (held), for one without.
     Source: Tischler & Remple, time-domain verification.
     """
     require_x64("a verification")

@@ -64,8 +64,11 @@ def simulate_linear(
     """The output at the samples of an input `u`, which was 0 before the first: exact, from rest.
 
     Between samples `dt` seconds apart the input stays at the last one (`hold="zero"`) or runs
-    straight to the next (`hold="first"`). Raises ValueError for another hold.
+    straight to the next (`hold="first"`). Raises ValueError for another hold, and for a `dt` that
+    is not positive.
     """
+    if not dt > 0:
+        raise ValueError(f"dt is {dt} s: give a positive sample interval")
     return _respond(model, _segments(jnp.asarray(u), hold), dt)
 
 

@@ -1,6 +1,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from ._loop import AXES, Scenario
@@ -25,8 +26,33 @@ def excite(
     """
     if axis not in AXES:
         raise ValueError(f"axis {axis!r}: choose one of {', '.join(AXES)}")
+    _check(signal, dt, torque_noise, torque_corner, sensor_noise)
     levels = jnp.asarray([torque_noise, torque_corner, sensor_noise], dtype=float)
     return _scenario(jnp.asarray(signal, dtype=float), key, levels, dt, AXES.index(axis))
+
+
+def _check(
+    signal: Float[ArrayLike, " samples *ensemble"],
+    dt: float,
+    torque_noise: float,
+    torque_corner: float,
+    sensor_noise: float,
+) -> None:
+    shape = np.shape(signal)
+    if not shape or shape[0] < 2 or not np.all(np.isfinite(np.asarray(signal))):
+        raise ValueError(
+            f"a signal of shape {shape} in V: give at least 2 finite samples, for instance the "
+            ".signal of jq.sweep(...)"
+        )
+    for name, value, least in (
+        ("dt", dt, 0.0),
+        ("torque_corner", torque_corner, 0.0),
+        ("torque_noise", torque_noise, -1e-300),
+        ("sensor_noise", sensor_noise, -1e-300),
+    ):
+        if not least < value < np.inf:
+            bound = "above 0" if least == 0 else "0 or above"
+            raise ValueError(f"{name} is {value}: it is {bound} and finite")
 
 
 @eqx.filter_jit

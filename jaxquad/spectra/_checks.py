@@ -31,6 +31,21 @@ def check_alike(records: Sequence[Record]) -> None:
             raise ValueError(f"records hold different channels: {first} and {other}")
 
 
+def check_distinct(records: Sequence[Record]) -> None:
+    """Raise `ValueError` for a record given twice, or a channel that is another one."""
+    for k, record in enumerate(records):
+        if any(np.array_equal(record.outputs, other.outputs) for other in records[:k]):
+            raise ValueError(f"record {k} of {len(records)} is there twice: its noise counts once")
+        columns = [record.channel(name) for name in record.names]
+        for a, name in enumerate(record.names):
+            for b in range(a):
+                if np.array_equal(columns[a], columns[b]):
+                    raise ValueError(
+                        f"{name!r} is the same signal as {record.names[b]!r}: a response needs an "
+                        "input and an output, and a reference that comes from outside"
+                    )
+
+
 def check_one_input(records: Sequence[Record]) -> None:
     """Raise `ValueError` for several inputs at once."""
     names = records[0].input_names

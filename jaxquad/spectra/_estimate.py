@@ -10,6 +10,7 @@ from jaxquad.records import Record
 
 from ._checks import (
     check_alike,
+    check_distinct,
     check_excited,
     check_one_input,
     check_reference,
@@ -19,6 +20,12 @@ from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
 from ._random_error import relative_covariance, window_grid
 from ._welch import transform_records, Welch
+
+
+_FEW = (
+    "only {count:.1f} independent windows: coherence is near 1 whatever the signals do, and errors "
+    "are rough; record longer, or use a shorter window"
+)
 
 
 class JointInputOutput(eqx.Module):
@@ -49,6 +56,7 @@ def frequency_response(
     records = [record] if isinstance(record, Record) else list(record)
     check_alike(records)
     check_one_input(records)
+    check_distinct(records)
     if estimator is None:
         estimator = JointInputOutput() if records[0].reference_names else Welch()
     if isinstance(estimator, JointInputOutput):
@@ -77,6 +85,9 @@ def _respond(
     remarks = remarks_on_feedback(
         method, omega, *(np.asarray(c)[:, :, 0] for c in (*columns, estimate.direct_coherence))
     )
+    independent = sum(record.samples for record in records) / segments.length
+    if independent < 3:
+        remarks += (_FEW.format(count=independent),)
     return FrequencyResponse(
         omega=jnp.asarray(omega),
         response=estimate.response,

@@ -68,15 +68,18 @@ class Welch(eqx.Module):
         return int(round(self.delay / record.dt))
 
     def default_omega(self, records: Sequence[Record]) -> Float[np.ndarray, " frequencies"]:
-        """100 log-spaced frequencies, from one cycle to a window to a tenth of the sample rate."""
+        """100 log-spaced frequencies, from three cycles to a window to a tenth of the sample rate.
+
+        Below, what leaks through the window outweighs the random error of a good record.
+        """
         dt = records[0].dt
         length = self.length(records)
-        if length <= 10:
+        if length <= 30:
             raise ValueError(
                 f"a window of {length} samples resolves nothing below a tenth of the sample rate: "
                 "set a longer window_length, or name the frequencies with omega="
             )
-        return np.geomspace(2 * np.pi / (length * dt), 2 * np.pi / (10 * dt), 100)
+        return np.geomspace(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt), 100)
 
 
 class Segments(eqx.Module):

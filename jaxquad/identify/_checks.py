@@ -1,0 +1,76 @@
+"""What a fit refuses, before and after it is solved."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from jaxquad.spectra import FrequencyResponse
+
+from ._cost import Cost
+from ._problem import Problem, responses
+from ._solve import Solution
+
+
+def checked_responses(frf: Any) -> list[FrequencyResponse]:
+    """One response or several, each measured on its own."""
+    frfs = list(frf) if isinstance(frf, Sequence) else [frf]
+    if not frfs or not all(isinstance(one, FrequencyResponse) for one in frfs):
+        kinds = ", ".join(sorted({type(one).__name__ for one in frfs})) or "nothing"
+        raise ValueError(
+            f"a fit needs a jq.FrequencyResponse or a list of them, not {kinds}: make one with "
+            "jq.frequency_response(record), and call jq.fit(model, response)"
+        )
+    for k, one in enumerate(frfs):
+        for other in frfs[:k]:
+            if np.array_equal(np.asarray(one.response), np.asarray(other.response)):
+                raise ValueError(f"response {k} of {len(frfs)} is there twice: it counts once")
+    return frfs
+
+
+def check_options(cost: Any, band: Any, min_coherence: float, max_steps: int) -> None:
+    """Values that mean nothing."""
+    if isinstance(cost, type) or not isinstance(cost, Cost):
+        raise ValueError(
+            f"cost={cost!r}: pass an object, jq.CoherenceWeighted() or jq.MaximumLikelihood()"
+        )
+    if band is not None and np.shape(band) != (2,):
+        raise ValueError(f"band={band!r}: give two frequencies in rad/s, (low, high)")
+    if not 0 < min_coherence < 1:
+        raise ValueError(f"min_coherence is {min_coherence}: it lies between 0 and 1, usually 0.6")
+    if max_steps < 1:
+        raise ValueError(f"max_steps is {max_steps}: give at least 1")
+
+
+def check_shapes(problem: Problem) -> None:
+    """A model with other outputs or inputs than the response."""
+    start = problem.parameters.start[: problem.parameters.count]
+    shapes = eqx.filter_eval_shape(responses, start, problem)
+    for shape, measured in zip(shapes, problem.measured, strict=True):
+        if shape.shape != measured.shape:
+            raise ValueError(
+                f"the model's response has shape {shape.shape}, the measured one {measured.shape} "
+                "(frequencies, outputs, inputs): pick channels with jq.select, or extend the model"
+            )
+
+
+def check_finite(solution: Solution) -> None:
+    """A solver that diverged."""
+    finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
+    if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
+        raise ValueError(
+            f"the fit diverged: {solution.message or 'the model has no finite response there'}; "
+            "start nearer to the answer, or leave solver= at its damped default"
+        )
+
+
+def check_priors(problem: Problem, solution: Solution) -> None:
+    """A prior on something that nothing free moves."""
+    slopes = np.asarray(solution.sensitivity.prior_slopes)[:, : problem.parameters.count]
+    idle = np.flatnonzero(~np.any(slopes, axis=1))
+    if idle.size:
+        raise ValueError(
+            f"prior {idle[0] + 1} speaks of nothing that is free: free its parameter, or leave "
+            f"the prior out; free are {', '.join(problem.parameters.names)}"
+        )
