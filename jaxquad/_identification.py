@@ -148,8 +148,9 @@ def _failure(outcome: Outcome) -> NotIdentifiable | None:
     if isinstance(outcome, NotIdentifiable):
         return outcome
     lost = " and ".join(outcome.identifiability.undetermined)
-    known = ", ".join(str(combination) for combination in outcome.combinations) or "nothing"
-    text = f"not identifiable from this record, each by itself: {lost}; determined is {known}"
+    known = ", ".join(str(combination) for combination in outcome.combinations)
+    rest = f"only {known}" if known else "nothing of them is determined"
+    text = f"not identifiable from this record, each by itself: {lost}; {rest}"
     return NotIdentifiable(text) if lost else None
 
 
