@@ -161,7 +161,8 @@ class Sum(eqx.Module):
 
 
 def summed(values, product=False):
-    return Sum(*(jnp.asarray(float(value)) for value in values), product)
+    a, b, c = (jnp.asarray(float(value)) for value in values)
+    return Sum(a, b, c, product)
 
 
 @pytest.mark.parametrize("values", [(2, 2, 2), (1, 3, 5), (0.5, 0.5, 9)])

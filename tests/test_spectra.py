@@ -9,11 +9,15 @@ from jaxquad.records import Record
 from jaxquad.spectra import frequency_response, JointInputOutput, spectral_density, Welch
 
 
-RATE, LENGTH, SEGMENTS = 50.0, 200, 9
-SAMPLES = LENGTH + (SEGMENTS - 1) * LENGTH // 5  # windows that overlap by 0.8 tile it exactly
+RATE, LENGTH, SEGMENTS = 50.0, 200, 11
+SAMPLES = LENGTH + (SEGMENTS - 1) * LENGTH // 5  # windows that overlap by 0.8 or 0.5 tile it
 BINS = 2 * np.pi * RATE / LENGTH * np.arange(1, 80)  # rad/s, where scipy's transforms lie
 HANN = np.asarray(signal.get_window("hann", LENGTH))
 WELCH = Welch(window_length=LENGTH / RATE)
+
+RATE_SWEEP = 100.0
+SWEEP = sweep(0.5, 12.0, duration=80.0, sample_rate=RATE_SWEEP, amplitude=1.0).signal
+OMEGA = np.geomspace(0.6, 10.0, 30)
 
 
 def filtered(numerator, denominator, x):
@@ -68,7 +72,7 @@ def test_power_and_cross_spectra_are_those_of_scipy():
     ],
 )
 def test_windows_trends_and_overlaps_are_those_of_scipy(ours, scipys):
-    data = record(samples=LENGTH * 4)
+    data = record()
     found = spectral_density(data, BINS, welch=Welch(LENGTH / RATE, **ours)).power("y")
     # Where a mean is left in, the far bins of its 1e4 times larger leakage hold 1e-9 of rounding.
     expected = by_scipy(signal.welch, data.outputs[:, 0], **scipys)
@@ -142,22 +146,16 @@ def test_no_window_spans_the_seam_of_two_records():
 
 
 def test_records_of_different_lengths_are_averaged():
-    found = frequency_response([record(1), record(2, samples=SAMPLES + 31)], estimator=WELCH)
+    found = frequency_response([record(1), record(2, samples=SAMPLES + 31)], BINS, estimator=WELCH)
     assert np.all(np.isfinite(found.random_error))
 
 
 def test_a_known_filter_is_recovered_without_noise():
-    taps, u = np.array([0.5, 0.3, -0.2]), record(samples=9000).inputs[:, 0]
-    omega = np.geomspace(1.0, 120.0, 40)
-    found = response(filtered(taps, 1.0, u), u, RATE, Welch(20.0), omega)
-    expected = np.exp(-1j * np.outer(omega / RATE, np.arange(3))) @ taps
-    # The filter's memory of 2 in 1000 samples leaks past the window's edges, weighed by its slope.
+    taps, u = np.array([0.5, 0.3, -0.2]), record(samples=SWEEP.size).inputs[:, 0]
+    found = response(filtered(taps, 1.0, u), u, RATE_SWEEP, Welch(20.0), OMEGA)
+    expected = np.exp(-1j * np.outer(OMEGA / RATE_SWEEP, np.arange(3))) @ taps
+    # The filter's memory of 2 in 2000 samples leaks past the window's edges, weighed by its slope.
     np.testing.assert_allclose(found, expected, rtol=2e-3)
-
-
-RATE_SWEEP = 100.0
-SWEEP = sweep(0.5, 12.0, duration=80.0, sample_rate=RATE_SWEEP, amplitude=1.0).signal
-OMEGA = np.geomspace(0.6, 10.0, 30)
 
 
 def worst(found, exact):

@@ -10,6 +10,7 @@ from ._accuracy import Matrix
 
 
 Kind = Literal["product", "sum"]
+KINDS: tuple[Kind, ...] = ("product", "sum")
 
 
 class Combination(NamedTuple):
@@ -60,7 +61,7 @@ class Named(NamedTuple):
 def combine(
     weights: Float[np.ndarray, " parameters"],
     named: Named,
-    kinds: tuple[Kind, ...] = ("product", "sum"),
+    kinds: tuple[Kind, ...] = KINDS,
 ) -> Combination:
     """The simplest product or sum that is as sharp as `weights` times the relative changes.
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._combination import Combination, combine, echelon, Kind, Named
+from ._combination import Combination, combine, echelon, Kind, KINDS, Named
 
 
 LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
@@ -119,17 +119,13 @@ def _explore(
 ) -> _Group:
     """One group: which kind of combination survives a finite move, and its determined ones."""
     sure = sure[np.any(sure[:, block], axis=1)]
-    kinds: dict[Kind, np.ndarray | None] = {"product": None, "sum": None}
-    if len(sure):
-        moves = {kind: _moved(sure, kind, facts) for kind in kinds}
-        kinds = {kind: values for kind, values in moves.items() if facts.same(values)}
+    moves = {kind: _moved(sure, kind, facts) for kind in KINDS} if len(sure) else {}
+    kept = {kind: values for kind, values in moves.items() if facts.same(values)}
+    kinds = tuple(kind for kind in KINDS if kind in kept or not len(sure))
     rows = _outside(null[:, block])
-    effects = facts.root[:, block] @ np.linalg.pinv(rows) if len(rows) else None
-    found = []
-    for k, row in enumerate(rows if kinds else []):
-        found.append(_named(row, block, effects[:, k], facts, tuple(kinds)))
-    alternatives = [values for values in kinds.values() if values is not None]
-    return _Group(block, found, alternatives, not kinds and len(rows) > 0)
+    effects = facts.root[:, block] @ np.linalg.pinv(rows) if len(rows) else rows.T
+    found = [_named(row, block, effects[:, k], facts, kinds) for k, row in enumerate(rows) if kinds]
+    return _Group(block, found, list(kept.values()), not kinds and len(rows) > 0)
 
 
 def _moved(
