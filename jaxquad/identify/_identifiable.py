@@ -119,13 +119,15 @@ def _explore(
 ) -> _Group:
     """One group: which kind of combination survives a finite move, and its determined ones."""
     sure = sure[np.any(sure[:, block], axis=1)]
-    moves = {kind: _moved(sure, kind, facts) for kind in KINDS} if len(sure) else {}
-    kept = {kind: values for kind, values in moves.items() if facts.same(values)}
-    kinds = tuple(kind for kind in KINDS if kind in kept or not len(sure))
+    kept: list[tuple[Kind, np.ndarray]] = []
+    for kind in KINDS if len(sure) else ():
+        values = _moved(sure, kind, facts)
+        kept += [(kind, values)] if facts.same(values) else []
+    kinds = tuple(kind for kind, _ in kept) if len(sure) else KINDS
     rows = _outside(null[:, block])
     effects = facts.root[:, block] @ np.linalg.pinv(rows) if len(rows) else rows.T
     found = [_named(row, block, effects[:, k], facts, kinds) for k, row in enumerate(rows) if kinds]
-    return _Group(block, found, list(kept.values()), not kinds and len(rows) > 0)
+    return _Group(block, found, [values for _, values in kept], not kinds and len(rows) > 0)
 
 
 def _moved(
