@@ -1,7 +1,7 @@
 """Combinations of parameters that a record determines, in the user's own names."""
 
 from fractions import Fraction
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -9,8 +9,7 @@ from jaxtyping import Float
 from ._accuracy import Matrix
 
 
-Kind = Literal["product", "sum"]
-KINDS: tuple[Kind, ...] = ("product", "sum")
+KINDS = ("product", "sum")
 
 
 class Combination(NamedTuple):
@@ -61,7 +60,7 @@ class Named(NamedTuple):
 def combine(
     weights: Float[np.ndarray, " parameters"],
     named: Named,
-    kinds: tuple[Kind, ...] = KINDS,
+    kinds: tuple[str, ...] = KINDS,
 ) -> Combination:
     """The simplest product or sum that is as sharp as `weights` times the relative changes.
 

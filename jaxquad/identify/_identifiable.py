@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._combination import Combination, combine, echelon, Kind, KINDS, Named
+from ._combination import Combination, combine, echelon, KINDS, Named
 
 
 LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
@@ -119,7 +119,7 @@ def _explore(
 ) -> _Group:
     """One group: which kind of combination survives a finite move, and its determined ones."""
     sure = sure[np.any(sure[:, block], axis=1)]
-    kept: list[tuple[Kind, np.ndarray]] = []
+    kept: list[tuple[str, np.ndarray]] = []
     for kind in KINDS if len(sure) else ():
         values = _moved(sure, kind, facts)
         kept += [(kind, values)] if facts.same(values) else []
@@ -131,7 +131,7 @@ def _explore(
 
 
 def _moved(
-    sure: Float[np.ndarray, "exact parameters"], kind: Kind, facts: Information
+    sure: Float[np.ndarray, "exact parameters"], kind: str, facts: Information
 ) -> Float[np.ndarray, " parameters"]:
     """Values a finite way along the null directions, at constant products or at constant sums."""
     count = len(facts.covariance)
@@ -151,7 +151,7 @@ def _named(
     block: np.ndarray,
     effect: np.ndarray,
     facts: Information,
-    kinds: tuple[Kind, ...],
+    kinds: tuple[str, ...],
 ) -> Combination:
     weights = np.zeros(len(facts.values))
     weights[block] = row
