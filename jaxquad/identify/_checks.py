@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from jaxquad.spectra import FrequencyResponse
 
 from ._cost import Cost
-from ._problem import Problem, responses
+from ._problem import Problem
 from ._solve import Solution
 
 
@@ -41,18 +40,6 @@ def check_options(cost: Any, band: Any, min_coherence: float, max_steps: int) ->
         raise ValueError(f"min_coherence is {min_coherence}: it lies between 0 and 1, usually 0.6")
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}: give at least 1")
-
-
-def check_shapes(problem: Problem) -> None:
-    """A model with other outputs or inputs than the response."""
-    start = problem.parameters.start[: problem.parameters.count]
-    shapes = eqx.filter_eval_shape(responses, start, problem)
-    for shape, measured in zip(shapes, problem.measured, strict=True):
-        if shape.shape != measured.shape:
-            raise ValueError(
-                f"the model's response has shape {shape.shape}, the measured one {measured.shape} "
-                "(frequencies, outputs, inputs): pick channels with jq.select, or extend the model"
-            )
 
 
 def check_finite(solution: Solution) -> None:

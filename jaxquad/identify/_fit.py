@@ -12,7 +12,6 @@ from ._checks import (
     check_finite,
     check_options,
     check_priors,
-    check_shapes,
     checked_responses,
 )
 from ._cost import CoherenceWeighted, Cost, Mask, MaximumLikelihood
@@ -57,7 +56,6 @@ def fit(
     used = [_usable(one, band, min_coherence) for one in frfs]
     _check_points(frfs, used, parameters, min_coherence, band)
     problem = _problem(model, parameters, frfs, conditions, priors, cost)
-    check_shapes(problem)
     problem, solution = _solve_reweighted(problem, frfs, used, cost, solver, max_steps)
     check_finite(solution)
     check_priors(problem, solution)

@@ -65,10 +65,22 @@ def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, ".
 def misfits(z: Float[Array, " n"], problem: Problem) -> list[Float[Array, "..."]]:
     """`ln|T/T^|` and wrapped phase of `T/T^` in rad, on a last axis of two, per record."""
     logs = [
-        jnp.log(model / measured)
+        jnp.log(_alike(model, measured) / measured)
         for model, measured in zip(responses(z, problem), problem.measured, strict=True)
     ]
     return [jnp.stack([jnp.real(log), jnp.imag(log)], axis=-1) for log in logs]
+
+
+def _alike(
+    model: Complex[Array, "..."], measured: Complex[Array, "frequencies outputs inputs"]
+) -> Complex[Array, "frequencies outputs inputs"]:
+    # Broadcasting would fit one output to all of them without a word.
+    if model.shape != measured.shape:
+        raise ValueError(
+            f"the model's response has shape {model.shape}, the measured one {measured.shape} "
+            "(frequencies, outputs, inputs): pick channels with jq.select, or extend the model"
+        )
+    return model
 
 
 def prior_misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " priors"]:
