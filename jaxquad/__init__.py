@@ -61,8 +61,11 @@ from .simulate import (
     Simulation as Simulation,
 )
 from .spectra import (
+    Composite as Composite,
+    ErrorCovariance as ErrorCovariance,
     frequency_response as frequency_response,
     FrequencyResponse as FrequencyResponse,
+    independent_errors as independent_errors,
     JointInputOutput as JointInputOutput,
     PrecisionError as PrecisionError,
     spectral_density as spectral_density,

@@ -1,22 +1,25 @@
 """From the derivatives at the solution to covariances, bounds and conditioning (host side)."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
+
+from jaxquad.spectra import FrequencyResponse
 
 
 Matrix = Float[np.ndarray, "parameters parameters"]
 
 
 class Block(NamedTuple):
-    """One response pair: slopes of ln-magnitude and phase, their weights, and the noise."""
+    """One response pair: slopes of ln-magnitude and phase, their weights, and the error."""
 
     misfit: Float[np.ndarray, "frequencies 2"]
     slopes: Float[np.ndarray, "frequencies 2 all"]
     weights: Float[np.ndarray, "frequencies 2"]
     error: Float[np.ndarray, " frequencies"]  # random error relative to the model
-    covariance: Complex[np.ndarray, "frequencies frequencies"]  # of the relative error
 
 
 class Known(NamedTuple):
@@ -46,16 +49,51 @@ class Noise(NamedTuple):
     cost: float  # expected cost of the noise before any parameter is fitted to it
 
 
-def noise_effect(blocks: list[Block], known: Known, count: int) -> Noise:
+class Record(NamedTuple):
+    """One frequency response as the fit sees it."""
+
+    frf: FrequencyResponse
+    misfit: Float[np.ndarray, "frequencies outputs inputs 2"]
+    slopes: Float[np.ndarray, "frequencies outputs inputs 2 all"]
+    weights: Float[np.ndarray, "frequencies outputs inputs 2"]
+
+    @property
+    def ratio(self) -> Complex[np.ndarray, "frequencies outputs inputs"]:
+        """Measurement over model."""
+        return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
+
+
+def blocks_of(records: Sequence[Record]) -> list[Block]:
+    """One block per response pair that has usable frequencies."""
+    blocks = []
+    for record in records:
+        # An exact response would have infinite weight.
+        error = np.maximum(np.asarray(record.frf.random_error) * np.abs(record.ratio), 1e-7)
+        for o, i in np.ndindex(error.shape[1:]):
+            parts = (record.misfit, record.slopes, record.weights, error)
+            blocks.append(Block(*(part[:, o, i] for part in parts)))
+    return [block for block in blocks if np.any(block.weights)]
+
+
+def noise_effect(records: Sequence[Record], blocks: list[Block], known: Known, count: int) -> Noise:
     """The responses' errors, with all their correlation, seen through weights and slopes."""
-    data, cost = np.zeros((count, count)), 0.0
-    for block in blocks:
-        weighted = block.weights[..., None] ** 2 * block.slopes[..., :count]
-        # Circular noise: real and imaginary parts share Im S with opposite signs.
-        complex_slopes = weighted[:, 0] + 1j * weighted[:, 1]
-        data += 0.5 * np.real(complex_slopes.conj().T @ block.covariance @ complex_slopes)
-        cost += float(np.sum(block.weights**2 * block.error[:, None] ** 2))
+    data = np.sum([_through_fit(record, count) for record in records], axis=0)
+    used = [block.weights[:, 0] > 0 for block in blocks]
+    cost = sum(
+        float(np.sum(block.weights[mine] ** 2 * block.error[mine, None] ** 2))
+        for block, mine in zip(blocks, used, strict=True)
+    )
     return Noise(data, known.slopes[:, :count].T @ known.slopes[:, :count], cost)
+
+
+def _through_fit(record: Record, count: int) -> Matrix:
+    weighted = record.weights[..., None] ** 2 * record.slopes[..., :count]
+    model = np.asarray(record.frf.response) / record.ratio
+    used = record.weights[..., :1] > 0
+    # Circular noise: real and imaginary parts share its covariance with opposite signs.
+    columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / model.conj()[..., None]
+    effect = record.frf.errors.project(jnp.asarray(np.where(used, columns, 0.0)))
+    return 0.5 * np.real(np.asarray(effect))
 
 
 def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -> Matrix:
@@ -85,7 +123,7 @@ def scaled_inverse(matrix: Matrix) -> Matrix:
 def information_root(blocks: list[Block]) -> Float[np.ndarray, "rows all"]:
     """Slopes over the random error: its singular values say what the record determines."""
     rows = [
-        (np.where(block.weights > 0, 1.0, 0.0) / block.error[:, None])[..., None] * block.slopes
+        np.where(block.weights > 0, 1 / block.error[:, None], 0.0)[..., None] * block.slopes
         for block in blocks
     ]
     return np.concatenate([row.reshape(-1, row.shape[-1]) for row in rows])

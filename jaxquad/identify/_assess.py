@@ -10,6 +10,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._accuracy import (
     Block,
+    blocks_of,
     calibrated_covariance,
     condition_number,
     cramer_rao,
@@ -19,6 +20,7 @@ from ._accuracy import (
     Known,
     misfit_ratio,
     noise_effect,
+    Record,
     scaled_inverse,
 )
 from ._identifiable import decide, Identifiability, Information
@@ -40,9 +42,10 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
     """Costs, bounds, calibrated covariance and identifiability at the solution."""
     parameters, count = problem.parameters, problem.parameters.count
     units = _units(problem, solution)
-    blocks, known = _blocks(problem, frfs, solution, units), _known(solution, units)
+    records = _records(problem, frfs, solution, units)
+    blocks, known = blocks_of(records), _known(solution, units)
     bread, gradient = gauss_newton(blocks, known, count)
-    noise = noise_effect(blocks, known, count)
+    noise = noise_effect(records, blocks, known, count)
     data_cost = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
     cost = data_cost + float(np.sum(known.misfit**2))
     misfit = misfit_ratio(data_cost, bread, noise)
@@ -106,26 +109,17 @@ def _rescale(solution: Solution, units: Float[np.ndarray, " all"]) -> Float[np.n
     return np.where(slopes == 0, 1.0, units / np.where(slopes == 0, 1.0, slopes))
 
 
-def _blocks(
+def _records(
     problem: Problem,
     frfs: Sequence[FrequencyResponse],
     solution: Solution,
     units: Float[np.ndarray, " all"],
-) -> list[Block]:
-    """One block per response pair that has usable frequencies."""
-    blocks = []
-    for k, frf in enumerate(frfs):
-        misfit = np.asarray(solution.sensitivity.misfits[k])
-        slopes = np.asarray(solution.sensitivity.slopes[k]) * _rescale(solution, units)
-        weights = np.asarray(problem.weights[k])
-        for o, i in np.ndindex(misfit.shape[1:3]):
-            # The error relative to the model: measurement over model is exp(-misfit).
-            ratio = np.exp(-misfit[:, o, i, 0] - 1j * misfit[:, o, i, 1])
-            covariance = np.asarray(frf.relative_covariance)[o, i] * np.outer(ratio, ratio.conj())
-            error = np.maximum(np.asarray(frf.random_error)[:, o, i] * np.abs(ratio), 1e-7)
-            mine = (misfit[:, o, i], slopes[:, o, i], weights[:, o, i])
-            blocks.append(Block(*mine, error, covariance))
-    return [block for block in blocks if np.any(block.weights)]
+) -> list[Record]:
+    scale, parts = _rescale(solution, units), solution.sensitivity
+    weights = [np.asarray(each) for each in problem.weights]
+    misfits = [np.asarray(each) for each in parts.misfits]
+    slopes = [np.asarray(each) * scale for each in parts.slopes]
+    return [Record(*each) for each in zip(frfs, misfits, slopes, weights, strict=True)]
 
 
 def _known(solution: Solution, units: Float[np.ndarray, " all"]) -> Known:

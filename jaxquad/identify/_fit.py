@@ -71,7 +71,8 @@ def _usable(frf: FrequencyResponse, band: tuple[float, float] | None, least: flo
             f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
         )
     inside = ((omega >= low) & (omega <= high))[:, None, None]
-    return inside & (_local_mean(omega, np.asarray(frf.coherence)) >= least)
+    known = np.isfinite(np.asarray(frf.response)) & np.isfinite(np.asarray(frf.random_error))
+    return inside & known & (_local_mean(omega, np.asarray(frf.coherence)) >= least)
 
 
 def _local_mean(
@@ -129,7 +130,8 @@ def _problem(model, parameters, frfs, conditions, priors, cost) -> Problem:
         conditions=tuple(condition or unchanged for condition in conditions),
         quantities=tuple(quantity_of(prior.quantity) for prior in priors),
         omega=tuple(frf.omega for frf in frfs),
-        measured=tuple(frf.response for frf in frfs),
+        # Where a response is unknown its weight is zero, and nan times zero is not.
+        measured=tuple(jnp.where(jnp.isfinite(f.response), f.response, 1.0) for f in frfs),
         weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
         known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
     )

@@ -7,6 +7,8 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad.records import Record
 
+from ._average import Channels
+from ._segments import Segments
 from ._welch import Welch
 from ._window import window
 
@@ -46,24 +48,26 @@ def check_distinct(records: Sequence[Record]) -> None:
                     )
 
 
-def check_one_input(records: Sequence[Record]) -> None:
-    """Raise `ValueError` for several inputs at once."""
-    names = records[0].input_names
-    if len(names) != 1:
+def check_references(records: Sequence[Record]) -> None:
+    """Raise `ValueError` unless there is one outside reference for each input."""
+    names, inputs = records[0].reference_names, records[0].input_names
+    if len(names) != len(inputs):
         raise ValueError(
-            f"the record has {len(names)} inputs {list(names)}: "
-            "one at a time; pick one with jq.select(record, inputs=[...])"
+            f"the joint estimate needs one outside reference for each input, the record has "
+            f"{len(names)} references {list(names)} for {len(inputs)} inputs {list(inputs)}: name "
+            "them with references=[...], pick channels with jq.select, or use "
+            "estimator=jq.Composite()"
         )
 
 
-def check_reference(records: Sequence[Record]) -> None:
-    """Raise `ValueError` unless there is one outside reference."""
-    names = records[0].reference_names
-    if len(names) != 1:
-        raise ValueError(
-            f"the joint estimate needs one outside reference, the record has {len(names)}: "
-            f"{list(names)}; name one with references=[...], or use estimator=jq.Welch()"
-        )
+def check_windows(independent: Sequence[float], segments: Segments, channels: Channels) -> None:
+    """Raise `ValueError` where there are too few windows to tell the inputs apart."""
+    for count, (_, starts) in zip(independent, segments.groups, strict=True):
+        if len(starts) <= channels.inputs or count < channels.inputs:
+            raise ValueError(
+                f"{count:.1f} independent windows cannot tell {channels.inputs} inputs apart: use "
+                f"a window below a {channels.inputs + 2}th of the record, or record longer"
+            )
 
 
 def check_excited(
@@ -90,14 +94,12 @@ def check_excited(
             )
 
 
-def checked_omega(
-    omega: Float[ArrayLike, " frequencies"] | None, records: Sequence[Record], welch: Welch
-) -> Float[np.ndarray, " frequencies"]:
-    """Frequencies in rad/s, by default `welch`'s; `ValueError` unless the window resolves them."""
+def check_band(omega: Float[ArrayLike, " frequencies"] | None, dt: float) -> None:
+    """Raise `ValueError` for frequencies that no record at this rate can have."""
     if omega is None:
-        return welch.default_omega(records)
+        return
     omega = np.asarray(omega, dtype=float)
-    nyquist = np.pi / records[0].dt
+    nyquist = np.pi / dt
     if omega.ndim != 1 or not 0 < omega.size <= _MOST_FREQUENCIES:
         raise ValueError(
             f"omega has shape {omega.shape}: give 1 to {_MOST_FREQUENCIES} frequencies in rad/s"
@@ -107,10 +109,22 @@ def checked_omega(
             f"omega must rise from above 0 to below the Nyquist frequency {nyquist:.4g} rad/s; "
             f"it runs from {omega.min():.4g} to {omega.max():.4g}"
         )
-    lowest = 2 * np.pi / (welch.length(records) * records[0].dt)
+
+
+def checked_omega(
+    omega: Float[ArrayLike, " frequencies"] | None, records: Sequence[Record], welch: Welch
+) -> Float[np.ndarray, " frequencies"]:
+    """Frequencies in rad/s, by default `welch`'s; `ValueError` unless the window resolves them."""
+    if omega is None:
+        return welch.default_omega(records)
+    check_band(omega, records[0].dt)
+    omega = np.asarray(omega, dtype=float)
+    seconds = welch.length(records) * records[0].dt
+    lowest = 2 * np.pi / seconds
     if omega[0] < 0.999 * lowest:
         raise ValueError(
-            f"{omega[0]:.4g} rad/s is below the {lowest:.4g} rad/s that the window resolves "
-            f"(one cycle): raise it, or set window_length above {2 * np.pi / omega[0]:.4g} s"
+            f"{omega[0]:.4g} rad/s is below the {lowest:.4g} rad/s of which one cycle fits the "
+            f"window of {seconds:.4g} s: raise it, or set a window above "
+            f"{2 * np.pi / omega[0]:.4g} s"
         )
     return omega

@@ -8,7 +8,8 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from jaxquad.records import Record
 
 from ._checks import check_alike, checked_omega
-from ._welch import transform_records, Welch
+from ._segments import transform_records
+from ._welch import Welch
 from ._window import window
 
 
@@ -57,9 +58,9 @@ def spectral_density(
     check_alike(records)
     welch = Welch() if welch is None else welch
     omega = checked_omega(omega, records, welch)
-    segments = transform_records(records, omega, welch)
-    energy = np.sum(window(welch.shape, segments.length) ** 2)
-    density = _averaged(segments.transforms, np.asarray(2 * records[0].dt / energy))
+    [transforms], [(length, _)] = transform_records(records, omega, [welch])
+    energy = np.sum(window(welch.shape, length) ** 2)
+    density = _averaged(transforms, np.asarray(2 * records[0].dt / energy))
     return SpectralDensity(jnp.asarray(omega), density, records[0].names)
 
 

@@ -1,149 +1,164 @@
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float, Int
+from jaxtyping import ArrayLike, Bool, Float
 
 from jaxquad.records import Record
 
+from ._average import average, Averaged, Channels
 from ._checks import (
     check_alike,
+    check_band,
     check_distinct,
     check_excited,
-    check_one_input,
-    check_reference,
+    check_references,
+    check_windows,
     checked_omega,
 )
+from ._composite import Composite
+from ._errors import ErrorCovariance
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._random_error import relative_covariance, window_grid
-from ._welch import transform_records, Welch
+from ._inputs import remarks_on_inputs
+from ._joint import JointInputOutput
+from ._placement import overlaps, place_windows
+from ._segments import Segments, transform_records
+from ._welch import Welch
+from ._window import window
 
 
+Method = Literal["direct", "joint"]
+_CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
     "only {count:.1f} independent windows: coherence is near 1 whatever the signals do, and errors "
     "are rough; record longer, or use a shorter window"
 )
 
 
-class JointInputOutput(eqx.Module):
-    """Response by way of an outside reference r: G = S_ry / S_ru, unbiased in closed loop.
-
-    The noise that the controller feeds back to the input is uncorrelated with the reference,
-    so it averages out; in the direct estimate it does not. `welch` sets windows and averaging.
-    Needs a reference that no feedback computes. Source: joint input-output method, Tischler &
-    Remple; instrumental variables.
-    """
-
-    welch: Welch = Welch()
-
-
 def frequency_response(
     record: Record | Sequence[Record],
     omega: Float[ArrayLike, " frequencies"] | None = None,
     *,
-    estimator: Welch | JointInputOutput | None = None,
+    estimator: Welch | Composite | JointInputOutput | None = None,
 ) -> FrequencyResponse:
-    """Frequency responses of all outputs to the input of one record, or of several taken together.
+    """Frequency responses of all outputs to all inputs, of one record or of several together.
 
-    `omega` in rad/s, by default 100 log-spaced values within what the window can resolve.
-    Without an `estimator`, the joint input-output estimate where the record has a reference,
-    otherwise the direct one, H1 = S_uy / S_uu (Eq. 13), which then says that feedback may bias it.
+    `omega` in rad/s, by default 100 log-spaced values within what the windows can resolve.
+    Several inputs are conditioned on each other: `(Z* X)^-1 Z* Y`. Without an `estimator`, composite
+    windows, by the joint input-output method where the record has references, otherwise the
+    direct one, H1 = G_xx^-1 G_xy (Eq. 13), which then says that feedback may bias it.
     Raises `ValueError` for an unusable band or record, `PrecisionError` in 32 bits.
     """
     records = [record] if isinstance(record, Record) else list(record)
     check_alike(records)
-    check_one_input(records)
     check_distinct(records)
     if estimator is None:
-        estimator = JointInputOutput() if records[0].reference_names else Welch()
+        estimator = JointInputOutput() if records[0].reference_names else Composite()
     if isinstance(estimator, JointInputOutput):
-        check_reference(records)
-        welch, method = estimator.welch, "joint"
-    else:
-        welch, method = estimator, "direct"
-    return _respond(records, checked_omega(omega, records, welch), welch, method)
+        check_references(records)
+        return _by_windows(records, omega, estimator.spectra, "joint")
+    return _by_windows(records, omega, estimator, "direct")
 
 
-def _respond(
+def _by_windows(
+    records: Sequence[Record],
+    omega: Float[ArrayLike, " frequencies"] | None,
+    spectra: Welch | Composite,
+    method: Method,
+) -> FrequencyResponse:
+    check_band(omega, records[0].dt)
+    members = (spectra,) if isinstance(spectra, Welch) else spectra.members(records, omega)
+    omega = checked_omega(omega, records, members[0])
+    segments = transform_records(records, omega, members)
+    channels = _channels(records[0], method)
+    independent = _independent(records, segments)
+    check_windows(independent, segments, channels)
+    found = average(
+        segments.transforms, channels, omega, overlaps(segments.groups, members[0].shape),
+        _scales(segments, members[0], records[0].dt), _resolved(segments, omega * records[0].dt),
+        _freedom(independent, segments, members[0], channels.inputs),
+    )  # fmt: skip
+    check_excited(omega, np.asarray(found.excitation), records, members[0], method)
+    return _result(records, omega, members, segments, found, method)
+
+
+def _channels(record: Record, method: Method) -> Channels:
+    instruments = len(record.reference_names) if method == "joint" else 0
+    return Channels(len(record.input_names), len(record.output_names), instruments)
+
+
+def _independent(records: Sequence[Record], segments: Segments) -> list[float]:
+    """Windows that do not overlap, for each length (n_d)."""
+    return [sum(record.samples for record in records) / length for length, _ in segments.groups]
+
+
+def _scales(segments: Segments, welch: Welch, dt: float) -> Float[np.ndarray, " groups"]:
+    """From mean squared transforms to one-sided densities."""
+    lengths = [length for length, _ in segments.groups]
+    return np.array([2 * dt / np.sum(window(welch.shape, length) ** 2) for length in lengths])
+
+
+def _resolved(
+    segments: Segments, angle: Float[np.ndarray, " frequencies"]
+) -> Bool[np.ndarray, "groups frequencies"]:
+    """Where a window holds `_CYCLES`; the longest serves everywhere."""
+    lengths = np.array([length for length, _ in segments.groups], float)
+    lengths[0] = np.inf
+    return angle[None, :] * lengths[:, None] >= 2 * np.pi * _CYCLES
+
+
+def _freedom(
+    independent: list[float], segments: Segments, welch: Welch, inputs: int
+) -> Float[np.ndarray, "groups 2"]:
+    """Independent windows and the residuals' degrees of freedom, less those that inputs take."""
+    shared, at, rows = overlaps(segments.groups, welch.shape), 0, []
+    for count, (_, starts) in zip(independent, segments.groups, strict=True):
+        mine = shared[at : at + len(starts), at : at + len(starts)]
+        left = np.trace(mine) ** 2 / np.sum(mine**2) - inputs
+        rows.append((max(count - inputs + 1, 0.5), max(float(left), 0.5)))
+        at += len(starts)
+    return np.array(rows)
+
+
+def _result(
     records: Sequence[Record],
     omega: Float[np.ndarray, " frequencies"],
-    welch: Welch,
-    method: Literal["direct", "joint"],
+    members: Sequence[Welch],
+    segments: Segments,
+    found: Averaged,
+    method: Method,
 ) -> FrequencyResponse:
-    segments = transform_records(records, omega, welch)
-    times, windows = window_grid(welch.shape, segments.length, segments.starts)
-    dt, outputs = records[0].dt, len(records[0].output_names)
-    estimate = _by_instrument(
-        segments.transforms, outputs, np.asarray(0 if method == "direct" else 1 + outputs),
-        omega, times * dt, windows, np.asarray(2 * np.pi / (segments.length * dt)),
-    )  # fmt: skip
-    check_excited(omega, np.asarray(estimate.excitation), records, welch, method)
-    columns = np.angle(estimate.response), estimate.random_error, estimate.coherence
+    first, dt = records[0], records[0].dt
+    independent = _independent(records, segments)
     remarks = remarks_on_feedback(
-        method, omega, *(np.asarray(c)[:, :, 0] for c in (*columns, estimate.direct_coherence))
-    )
-    independent = sum(record.samples for record in records) / segments.length
-    if independent < 3:
-        remarks += (_FEW.format(count=independent),)
+        method, omega, *(_pairs(each) for each in (
+            np.angle(found.response), found.random_error, found.coherence, found.direct_coherence
+        ))
+    )  # fmt: skip
+    remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
+    if max(independent) < 3:
+        remarks += (_FEW.format(count=max(independent)),)
+    counts = tuple(len(starts) for _, starts in segments.groups)
+    windows = place_windows(segments.groups, members[0].shape, dt, omega[-1] - omega[0])
+    grid = jnp.asarray(omega)
     return FrequencyResponse(
-        omega=jnp.asarray(omega),
-        response=estimate.response,
-        coherence=estimate.coherence,
-        random_error=estimate.random_error,
-        relative_covariance=estimate.relative_covariance,
-        direct_coherence=estimate.direct_coherence,
+        omega=grid,
+        response=found.response,
+        coherence=found.coherence,
+        random_error=found.random_error,
+        errors=ErrorCovariance(grid, found.effect, found.noise, found.share, windows, counts),
+        direct_coherence=found.direct_coherence,
+        multiple_coherence=found.multiple_coherence,
         method=method,
-        input_names=records[0].input_names,
-        output_names=records[0].output_names,
+        input_names=first.input_names,
+        output_names=first.output_names,
         remarks=remarks,
-        integrators=welch.integrators,
-        resolution=2 * np.pi / (segments.length * dt),
+        integrators=members[0].integrators,
+        resolution=2 * np.pi / (segments.groups[0][0] * dt),
     )
 
 
-class Estimate(NamedTuple):
-    response: Complex[Array, "frequencies outputs 1"]
-    coherence: Float[Array, "frequencies outputs 1"]
-    random_error: Float[Array, "frequencies outputs 1"]
-    direct_coherence: Float[Array, "frequencies outputs 1"]
-    relative_covariance: Complex[Array, "outputs 1 frequencies frequencies"]
-    excitation: Float[Array, "channels frequencies"]  # power of the input, and of the reference
-
-
-@eqx.filter_jit
-def _by_instrument(
-    transforms: Complex[Array, "segments frequencies channels"],
-    outputs: int,
-    instrument: Int[ArrayLike, ""],  # its channel
-    omega: Float[ArrayLike, " frequencies"],
-    times: Float[ArrayLike, " times"],
-    windows: Float[ArrayLike, "segments times"],
-    resolution: Float[ArrayLike, ""],
-) -> Estimate:
-    x = transforms[:, :, 0]
-    z = jnp.take(transforms, instrument, axis=2)
-    grid = [jnp.asarray(each) for each in (omega, times, windows, resolution)]
-    columns, covariances = [], []
-    for y in jnp.moveaxis(transforms[:, :, 1 : 1 + outputs], 2, 0):
-        response = jnp.sum(jnp.conj(z) * y, axis=0) / jnp.sum(jnp.conj(z) * x, axis=0)
-        covariances.append(relative_covariance(z, x, y, response, *grid))
-        error = jnp.sqrt(jnp.real(jnp.diagonal(covariances[-1])) / 2)
-        lesser = jnp.minimum(_coherence(z, y), _coherence(z, x))
-        columns.append((response, lesser, error, _coherence(x, y)))
-    response, coherence, error, direct = (
-        jnp.stack(part, axis=1)[:, :, None] for part in zip(*columns, strict=True)
-    )
-    excitation = jnp.stack([jnp.mean(jnp.abs(each) ** 2, axis=0) for each in (x, z)])
-    covariance = jnp.stack(covariances)[:, None]
-    return Estimate(response, coherence, error, direct, covariance, excitation)
-
-
-def _coherence(
-    a: Complex[Array, "segments frequencies"], b: Complex[Array, "segments frequencies"]
-) -> Float[Array, " frequencies"]:
-    """Magnitude-squared coherence, from 0 to 1."""
-    power = jnp.sum(jnp.abs(a) ** 2, axis=0) * jnp.sum(jnp.abs(b) ** 2, axis=0)
-    return jnp.abs(jnp.sum(jnp.conj(a) * b, axis=0)) ** 2 / power
+def _pairs(columns) -> Float[np.ndarray, "frequencies pairs"]:
+    return np.asarray(columns).reshape(len(columns), -1)

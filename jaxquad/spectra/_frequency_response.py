@@ -4,23 +4,26 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from ._errors import ErrorCovariance
 from ._precision import require_float64
 
 
 class FrequencyResponse(eqx.Module):
     """Measured frequency responses of every output to every input, with their random error.
 
-    `relative_covariance[o, i]` is the covariance of the relative errors `(T^ - T) / T` between
-    all pairs of frequencies: neighbouring points of overlapping windows share their noise.
-    Its diagonal is `2 random_error**2`.
+    With several inputs, responses are conditioned on the other inputs and `coherence` is partial.
+    Where inputs could not be told apart, the response is nan and its random error infinite.
+    `errors` holds how the noise enters all of them at once: neighbouring frequencies of
+    overlapping windows share their noise.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s
     response: Complex[Array, "frequencies outputs inputs"]  # output unit per input unit
     coherence: Float[Array, "frequencies outputs inputs"]  # of the joint estimate: the lesser one
     random_error: Float[Array, "frequencies outputs inputs"]  # 1 sigma: relative, and in rad
-    relative_covariance: Complex[Array, "outputs inputs frequencies frequencies"]
+    errors: ErrorCovariance
     direct_coherence: Float[Array, "frequencies outputs inputs"]  # input to output, no reference
+    multiple_coherence: Float[Array, "frequencies outputs"]  # of the output with all inputs
     method: Literal["direct", "joint"] = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
@@ -42,6 +45,17 @@ class FrequencyResponse(eqx.Module):
     def phase_deg(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Phase in degrees, unwrapped along frequency."""
         return np.degrees(np.unwrap(np.angle(np.asarray(self.response)), axis=0))
+
+    def relative_covariance(
+        self, output: int = 0, input: int = 0
+    ) -> Complex[np.ndarray, "frequencies frequencies"]:
+        """Covariance of one response's relative error between all pairs of frequencies.
+
+        Its diagonal is `2 random_error**2`.
+        """
+        response = np.asarray(self.response)[:, output, input]
+        covariance = self.errors.between((output, input), (output, input))
+        return covariance / np.outer(response, response.conj())
 
     def __str__(self) -> str:
         omega, coherence = np.asarray(self.omega), np.asarray(self.coherence)

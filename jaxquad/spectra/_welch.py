@@ -1,15 +1,12 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Float
 
 from jaxquad.records import Record
 
-from ._precision import require_x64
-from ._transform import segment_transforms
-from ._window import segment_starts, window
+from ._window import window
 
 
 class Welch(eqx.Module):
@@ -80,55 +77,3 @@ class Welch(eqx.Module):
                 "set a longer window_length, or name the frequencies with omega="
             )
         return np.geomspace(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt), 100)
-
-
-class Segments(eqx.Module):
-    """Windowed transforms over all windows of all records, in absolute phase.
-
-    Channels stand as in `Record.names`: inputs, outputs, references.
-    """
-
-    transforms: Complex[Array, "segments frequencies channels"]
-    starts: tuple[int, ...] = eqx.field(static=True)  # the records one after the other, apart
-    length: int = eqx.field(static=True)
-
-
-def transform_records(
-    records: Sequence[Record], omega: Float[np.ndarray, " frequencies"], welch: Welch
-) -> Segments:
-    """Transform all channels; no window spans the seam of two records."""
-    require_x64("a frequency response")
-    length = welch.length(records)
-    origin, parts, starts = 0, [], []
-    for record in records:
-        local = segment_starts(record.samples - welch.integrators, length, welch.overlap)
-        parts.append(_transform_record(record, omega, welch, local, length, origin))
-        starts += [origin + start for start in local]
-        origin += record.samples + length
-    joined = parts[0] if len(parts) == 1 else jnp.concatenate(parts)
-    return Segments(joined, tuple(starts), length)
-
-
-def _transform_record(
-    record: Record,
-    omega: Float[np.ndarray, " frequencies"],
-    welch: Welch,
-    starts: tuple[int, ...],
-    length: int,
-    origin: int,
-) -> Complex[Array, "segments frequencies channels"]:
-    n, late = welch.integrators, welch.late(record)
-    outputs = np.diff(record.outputs, n, axis=0)
-    outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
-    # A difference looks back by n/2 samples, which the window would weigh like any other delay.
-    centre = slice(n - n // 2, record.samples - n // 2)
-    columns = np.hstack([record.inputs[centre], outputs, record.references[centre]])
-    angle = omega * record.dt
-    factor = np.ones((omega.size, columns.shape[1]), complex)
-    first = len(record.input_names)
-    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
-    factor[:, first : first + outputs.shape[1]] = recolour[:, None]
-    return segment_transforms(
-        columns, starts, window(welch.shape, length), angle, welch.detrend,
-        origin=np.asarray(float(origin)), factor=factor,
-    )  # fmt: skip

@@ -7,10 +7,15 @@ _SHAPES = {"hann": (0.5, 0.5), "hamming": (0.54, 0.46), "rectangular": (1.0, 0.0
 
 def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
     """A periodic raised-cosine window of `samples` points: "hann", "hamming" or "rectangular"."""
+    level, cosine = coefficients(name)
+    return level - cosine * np.cos(2 * np.pi * np.arange(samples) / samples)
+
+
+def coefficients(name: str) -> tuple[float, float]:
+    """Level and cosine amplitude of a window: level - cosine cos(2 pi n / samples)."""
     if name not in _SHAPES:
         raise ValueError(f"no window {name!r}: choose one of {', '.join(_SHAPES)}")
-    level, cosine = _SHAPES[name]
-    return level - cosine * np.cos(2 * np.pi * np.arange(samples) / samples)
+    return _SHAPES[name]
 
 
 def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]:

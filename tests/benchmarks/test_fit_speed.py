@@ -56,16 +56,20 @@ def frf():
     rng = np.random.default_rng(0)
     noise = ERROR * (rng.standard_normal(60) + 1j * rng.standard_normal(60))
     shape = (60, 1, 1)
+    response = _numpy_response(TRUTH) * (1 + noise)
     return jq.FrequencyResponse(
-        jnp.asarray(OMEGA),
-        jnp.asarray(_numpy_response(TRUTH) * (1 + noise))[:, None, None],
-        jnp.full(shape, 0.95),
-        jnp.full(shape, ERROR),
-        jnp.asarray(2 * ERROR**2 * np.eye(60), dtype=complex)[None, None],
-        jnp.full(shape, 0.95),
-        "joint",
-        ("u",),
-        ("y",),
+        omega=jnp.asarray(OMEGA),
+        response=jnp.asarray(response)[:, None, None],
+        coherence=jnp.full(shape, 0.95),
+        random_error=jnp.full(shape, ERROR),
+        errors=jq.independent_errors(
+            jnp.asarray(OMEGA), 2 * ERROR**2 * jnp.abs(jnp.asarray(response))[:, None, None] ** 2
+        ),
+        direct_coherence=jnp.full(shape, 0.95),
+        multiple_coherence=jnp.full((60, 1), 0.95),
+        method="joint",
+        input_names=("u",),
+        output_names=("y",),
     )
 
 
