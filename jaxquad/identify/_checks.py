@@ -1,6 +1,6 @@
 """What a fit refuses, before and after it is solved."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,8 +34,9 @@ def check_options(cost: Any, band: Any, min_coherence: float, max_steps: int) ->
         raise ValueError(
             f"cost={cost!r}: pass an object, jq.CoherenceWeighted() or jq.MaximumLikelihood()"
         )
-    if band is not None and np.shape(band) != (2,):
-        raise ValueError(f"band={band!r}: give two frequencies in rad/s, (low, high)")
+    for limits in band.values() if isinstance(band, Mapping) else [band]:
+        if limits is not None and np.shape(limits) != (2,):
+            raise ValueError(f"band={limits!r}: give two frequencies in rad/s, (low, high)")
     if not 0 < min_coherence < 1:
         raise ValueError(f"min_coherence is {min_coherence}: it lies between 0 and 1, usually 0.6")
     if max_steps < 1:

@@ -1,4 +1,4 @@
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,9 +14,10 @@ from ._checks import (
     check_priors,
     checked_responses,
 )
+from ._band import Band, usable
 from ._cost import CoherenceWeighted, Cost, Mask, MaximumLikelihood
 from ._identifiable import NotIdentifiable
-from ._parameters import Free, name_places, Parameters, select_parameters
+from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Condition, Prior, Problem, quantity_of, unchanged
 from ._result import Fit
 from ._solve import Solution, solve
@@ -27,10 +28,11 @@ def fit(
     frf: FrequencyResponse | Sequence[FrequencyResponse],
     *,
     free: Free = None,
+    tied: Mapping[str, Tie] | None = None,
     cost: Cost = CoherenceWeighted(),
     conditions: Sequence[Condition | None] | None = None,
     priors: Sequence[Prior] = (),
-    band: tuple[float, float] | None = None,
+    band: Band = None,
     min_coherence: float = 0.6,
     solver: Any = None,
     max_steps: int = 256,
@@ -40,9 +42,12 @@ def fit(
     `model` is any `eqx.Module` with `frequency_response(omega)`; its values are the start. `free`
     names parameters (`"J_x"`, `"numerator[0]"`, `jq.Real("zero")`), selects them
     (`lambda m: (m.gain, m.delay)`), or is `None` for all. A bare name keeps the sign of its start.
+    `tied` are numbers that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
     With several responses, `conditions` says how the model differs in each record, for instance
     `(None, lambda m: m.with_added_inertia(0.03))`. `priors` are known values with standard errors.
-    Only frequencies within `band` (rad/s) with a coherence of at least `min_coherence` count.
+    Only frequencies within `band` (rad/s) with a coherence of at least `min_coherence` count; a
+    mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs a band of their own, or `None` to
+    leave them out.
     `solver` is any optimistix least-squares solver, Levenberg-Marquardt by default.
 
     Raises `NotIdentifiable` where too few frequencies are usable, `ValueError` for names that
@@ -52,8 +57,8 @@ def fit(
     require_x64("a fit")
     frfs = checked_responses(frf)
     check_options(cost, band, min_coherence, max_steps)
-    parameters = select_parameters(model, free)
-    used = [_usable(one, band, min_coherence) for one in frfs]
+    parameters = select_parameters(model, free, tied)
+    used = [usable(one, band, min_coherence) for one in frfs]
     _check_points(frfs, used, parameters, min_coherence, band)
     problem = _problem(model, parameters, frfs, conditions, priors, cost)
     problem, solution = _solve_reweighted(problem, frfs, used, cost, solver, max_steps)
@@ -62,38 +67,12 @@ def fit(
     return assess(problem, frfs, solution)
 
 
-def _usable(frf: FrequencyResponse, band: tuple[float, float] | None, least: float) -> Mask:
-    omega = np.asarray(frf.omega)
-    low, high = band or (0.0, np.inf)
-    if not low < high or not np.any((omega >= low) & (omega <= high)):
-        raise ValueError(
-            f"band {band} rad/s holds none of the response's frequencies, which run from "
-            f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
-        )
-    inside = ((omega >= low) & (omega <= high))[:, None, None]
-    known = np.isfinite(np.asarray(frf.response)) & np.isfinite(np.asarray(frf.random_error))
-    return inside & known & (_local_mean(omega, np.asarray(frf.coherence)) >= least)
-
-
-def _local_mean(
-    omega: Float[np.ndarray, " frequencies"],
-    values: Float[np.ndarray, "frequencies outputs inputs"],
-) -> Float[np.ndarray, "frequencies outputs inputs"]:
-    """Mean over about a third of an octave.
-
-    Points chosen one by one, because their own coherence came out high by chance, are biased.
-    """
-    apart = np.log(omega[:, None] / omega[None, :])
-    kernel = np.exp(-0.5 * (apart / 0.2) ** 2)
-    return np.einsum("fg,goi->foi", kernel / kernel.sum(axis=1, keepdims=True), values)
-
-
 def _check_points(
     frfs: Sequence[FrequencyResponse],
     used: Sequence[Mask],
     parameters: Parameters,
     least: float,
-    band: tuple[float, float] | None,
+    band: Band,
 ) -> None:
     points = sum(int(mask.sum()) for mask in used)
     needed = parameters.count + 2

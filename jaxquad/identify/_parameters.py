@@ -1,6 +1,6 @@
 """Which numbers of a model are free, under which names, and how each is scaled."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -36,10 +36,17 @@ class Place(NamedTuple):
     index: int
 
 
+Tie = Callable[[PyTree], Float[Array, ""]]
+
+
 class Parameters(eqx.Module):
-    """Free numbers first, then the fixed nonzero ones; `z` is the vector that a solver moves."""
+    """Free numbers first, then the fixed nonzero ones; `z` is the vector that a solver moves.
+
+    Tied numbers follow the others: each is a function of the model.
+    """
 
     places: tuple[Place, ...] = eqx.field(static=True)
+    ties: tuple[tuple[Place, Tie], ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)  # of free ones
     scale: Float[Array, " all"]
@@ -61,27 +68,32 @@ class Parameters(eqx.Module):
         ones = jnp.ones_like(z)
         return self.scale[:n] * jnp.where(np.array(self.logarithmic[:n]), jnp.exp(z), ones)
 
-    def replace(self, model: PyTree, values: Float[np.ndarray, " parameters"]) -> PyTree:
-        """The model with other physical values of its free parameters, outside of any trace."""
-        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-        leaves, structure = jax.tree.flatten(arrays)
-        leaves = [np.array(leaf) for leaf in leaves]
-        for place, value in zip(self.places, values, strict=False):
-            leaves[place.leaf].reshape(-1)[place.index] = value
-        return eqx.combine(jax.tree.unflatten(structure, [jnp.asarray(x) for x in leaves]), rest)
-
     def insert(self, model: PyTree, z: Float[Array, " n"]) -> PyTree:
-        """The model with its first `n` parameters set."""
-        arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-        leaves, structure = jax.tree.flatten(arrays)
-        values = self.values(z)
-        places = self.places[: z.shape[0]]
-        for leaf in {place.leaf for place in places}:
-            mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
-            index = np.array([places[k].index for k in mine])
-            flat = leaves[leaf].reshape(-1).at[index].set(values[mine])
-            leaves[leaf] = flat.reshape(leaves[leaf].shape)
-        return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+        """The model with its first `n` parameters set, and what is tied to them."""
+        return self.replace(model, self.values(z))
+
+    def replace(self, model: PyTree, values: Float[Array, " n"]) -> PyTree:
+        """The model with other physical values of its first `n` parameters."""
+        model = _written(model, self.places[: values.shape[0]], values)
+        for place, tie in self.ties:
+            value = jnp.asarray(tie(model))
+            if value.shape != ():
+                raise ValueError(
+                    f"{place.name} is tied to something of shape {value.shape}: give one number"
+                )
+            model = _written(model, (place,), value[None])
+        return model
+
+
+def _written(model: PyTree, places: Sequence[Place], values: Float[Array, " n"]) -> PyTree:
+    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    for leaf in {place.leaf for place in places}:
+        mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
+        index = np.array([places[k].index for k in mine])
+        flat = leaves[leaf].reshape(-1).at[index].set(values[mine])
+        leaves[leaf] = flat.reshape(leaves[leaf].shape)
+    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
 
 def name_places(model: PyTree) -> list[Place]:
@@ -98,22 +110,47 @@ def name_places(model: PyTree) -> list[Place]:
     return places
 
 
-def select_parameters(model: PyTree, free: Free) -> Parameters:
-    """Resolve `free=` against the model; raises `ValueError` for what it cannot mean."""
+def select_parameters(
+    model: PyTree, free: Free, tied: Mapping[str, Tie] | None = None
+) -> Parameters:
+    """Resolve `free=` and `tied=` against the model; raises `ValueError` for what they cannot mean."""
     places = name_places(model)
-    wanted = _expand(model, places, free)
+    ties = _tied(places, tied or {})
+    bound = {place.name for place, _ in ties}
+    wanted = _expand(model, [p for p in places if free is not None or p.name not in bound], free)
     values = _numbers(model, places)
     chosen = [_choose(item, places, values) for item in wanted]
     names = [place.name for place, _, _ in chosen]
     if len(set(names)) != len(names) or not names:
         raise ValueError(f"free={names}: name each free parameter once, and at least one")
-    fixed = [place for place in places if place.name not in names and values[place.name] != 0]
+    both = bound.intersection(names)
+    if both:
+        raise ValueError(
+            f"{sorted(both)} cannot be free and tied at once: leave out one of the two"
+        )
+    taken = bound.union(names)
+    fixed = [place for place in places if place.name not in taken and values[place.name] != 0]
     logs = tuple(log for _, log, _ in chosen) + (True,) * len(fixed)
     scales = [scale for _, _, scale in chosen] + [np.sign(values[p.name]) for p in fixed]
     ordered = tuple(place for place, _, _ in chosen) + tuple(fixed)
     ratio = np.array([values[p.name] for p in ordered]) / np.array(scales)
     start = np.where(logs, np.log(np.where(logs, ratio, 1.0)), ratio)
-    return Parameters(ordered, logs, len(chosen), jnp.asarray(scales, float), jnp.asarray(start))
+    return Parameters(
+        ordered, ties, logs, len(chosen), jnp.asarray(scales, float), jnp.asarray(start)
+    )
+
+
+def _tied(places: list[Place], tied: Mapping[str, Tie]) -> tuple[tuple[Place, Tie], ...]:
+    by_name = {place.name: place for place in places}
+    for name, tie in tied.items():
+        if name not in by_name:
+            raise ValueError(f"no parameter {name!r} to tie; the model has: {', '.join(by_name)}")
+        if not callable(tie):
+            raise ValueError(
+                f"{name} is tied to {tie!r}: give a function of the model, "
+                "lambda m: -m.F[0, 1]; a plain number belongs in the model"
+            )
+    return tuple((by_name[name], tie) for name, tie in tied.items())
 
 
 def _expand(model: PyTree, places: list[Place], free: Free) -> list[str | Positive | Real]:

@@ -2,6 +2,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
@@ -74,10 +75,9 @@ class Fit(eqx.Module):
         First-order propagation of the covariance. Raises `NotIdentifiable` where the quantity
         depends on what the record does not determine.
         """
-        gradient = jax.tree.leaves(eqx.filter_grad(quantity)(self.model))
-        places = self.parameters.places[: len(self.names)]
-        each = [np.asarray(gradient[place.leaf]).reshape(-1)[place.index] for place in places]
-        slope = np.array(each) * self.units
+        here = jnp.asarray(self._fitted())
+        gradient = jax.grad(lambda x: quantity(self.parameters.replace(self.model, x)))(here)
+        slope = np.asarray(gradient) * self.units
         if self._moves(quantity, slope):
             lost = ", ".join(self.identifiability.undetermined)
             raise NotIdentifiable(
@@ -87,6 +87,12 @@ class Fit(eqx.Module):
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
         return Combination(name, float(quantity(self.model)), error)
 
+    def _fitted(self) -> Float[np.ndarray, " parameters"]:
+        """Values where the solver stopped, the undetermined ones too."""
+        leaves = jax.tree.leaves(eqx.filter(self.model, eqx.is_inexact_array))
+        places = self.parameters.places[: len(self.names)]
+        return np.array([np.asarray(leaves[p.leaf]).reshape(-1)[p.index] for p in places])
+
     def _moves(self, quantity: Callable[[PyTree], Float[Array, ""]], slope: np.ndarray) -> bool:
         """Whether a quantity changes with what leaves all responses as they are."""
         verdict = self.identifiability
@@ -94,7 +100,7 @@ class Fit(eqx.Module):
         touched = [slope[self.names.index(name)] != 0 for name in verdict.curved]
         here = float(quantity(self.model))
         others = [
-            float(quantity(self.parameters.replace(self.model, values)))
+            float(quantity(self.parameters.replace(self.model, jnp.asarray(values))))
             for values in verdict.alternatives
         ]
         apart = [abs(other - here) > 1e-6 * abs(here) for other in others]

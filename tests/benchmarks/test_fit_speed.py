@@ -15,7 +15,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import jaxquad as jq
-from jaxquad.identify._fit import _problem, _usable
+from jaxquad.identify._band import usable
+from jaxquad.identify._fit import _problem
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._solve import solve
 
@@ -107,7 +108,7 @@ def test_solve(benchmark, frf):
     parameters = select_parameters(_model(), None)
     cost = _OneSolve()
     problem = _problem(_model(), parameters, [frf], None, (), cost)
-    used = _usable(frf, None, 0.6)
+    used = usable(frf, None, 0.6)
     problem = problem.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
     found = benchmark(lambda: solve(problem, parameters.start[:5], None, 256).z.block_until_ready())
     np.testing.assert_allclose(np.exp(found), _peer(frf), rtol=1e-5)
