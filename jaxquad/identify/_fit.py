@@ -3,18 +3,18 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import PyTree
 
 from jaxquad.spectra import FrequencyResponse, require_x64
 
 from ._assess import assess
+from ._band import Band, usable
 from ._checks import (
     check_finite,
     check_options,
     check_priors,
     checked_responses,
 )
-from ._band import Band, usable
 from ._cost import CoherenceWeighted, Cost, Mask, MaximumLikelihood
 from ._identifiable import NotIdentifiable
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie

@@ -113,7 +113,7 @@ def name_places(model: PyTree) -> list[Place]:
 def select_parameters(
     model: PyTree, free: Free, tied: Mapping[str, Tie] | None = None
 ) -> Parameters:
-    """Resolve `free=` and `tied=` against the model; raises `ValueError` for what they cannot mean."""
+    """Resolve `free=` and `tied=` against the model; `ValueError` for what they cannot mean."""
     places = name_places(model)
     ties = _tied(places, tied or {})
     bound = {place.name for place, _ in ties}
