@@ -1,10 +1,13 @@
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from ._levenberg import CONVERGED, minimise, Normal, RUNNING, STALLED, TOLERANCE
 from ._problem import misfits, Problem, residuals, Sensitivity, sensitivity
 
 
@@ -21,6 +24,23 @@ class Solution(NamedTuple):
     sensitivity: Sensitivity
 
 
+class Stop(NamedTuple):
+    """Where and how a solver stopped; `reason` indexes the messages of that solver."""
+
+    z: Float[Array, " parameters"]
+    converged: Bool[Array, ""]
+    reason: Any
+    steps: Int[Array, ""]
+
+
+Residual = Callable[[Float[Array, " parameters"], Any], Float[Array, " residuals"]]
+
+_MESSAGES = {
+    RUNNING: "The maximum number of steps was reached",
+    STALLED: "Every shorter step fails too: the model is not finite nearby, or not smooth",
+}
+
+
 def solve(
     problem: Problem,
     z0: Float[Array, " parameters"],
@@ -28,39 +48,84 @@ def solve(
     max_steps: int,
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
-    # Imported late: optimistix doubles the time of `import jaxquad`.
-    import optimistix as optx
+    stop, facts, derivatives = _solve(problem, z0, solver, max_steps)
+    return solution_at(stop, facts, derivatives)
 
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6) if solver is None else solver
-    z, facts, result, steps, derivatives = _solve(problem, z0, solver, max_steps)
-    converged = bool(result == optx.RESULTS.successful)
-    message = "" if converged else _reason(str(optx.RESULTS[result]), int(steps))
-    return Solution(z, *facts, message, converged, int(steps), derivatives)
+
+def solution_at(stop: Stop, facts: tuple, derivatives: Sensitivity) -> Solution:
+    """A stop with its reason in words, on the host."""
+    converged, steps = bool(stop.converged), int(stop.steps)
+    message = "" if converged else f"{_reason(stop.reason)} (after {steps} steps)"
+    return Solution(stop.z, *facts, message, converged, steps, derivatives)
 
 
 @eqx.filter_jit
 def _solve(problem, z0, solver, max_steps):
-    import optimistix as optx
+    stop = least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
+    return stop, *describe(stop.z, problem)
 
-    solution = optx.least_squares(
-        _objective, solver, z0, args=problem, max_steps=max_steps, throw=False
-    )
-    z, parameters = solution.value, problem.parameters
-    z_all = parameters.start.at[: z0.size].set(z)
+
+def describe(z: Float[Array, " parameters"], problem: Problem) -> tuple[tuple, Sensitivity]:
+    """Model, values and slopes at `z`, and the derivatives by all parameters."""
+    parameters = problem.parameters
+    z_all = parameters.start.at[: z.size].set(z)
     model = parameters.insert(problem.model, z)
     facts = (model, parameters.values(z_all), parameters.slopes(z_all))
-    return z, facts, solution.result, solution.stats["num_steps"], sensitivity(z_all, problem)
+    return facts, sensitivity(z_all, problem)
 
 
-def _objective(z: Float[Array, " parameters"], problem: Problem) -> Float[Array, " residuals"]:
-    # A wall of NaN would look like a minimum to the solver: make it a high one instead.
-    r = residuals(z, problem)
-    return jnp.where(jnp.isfinite(r), r, 1e6)
+def least_squares(
+    residual: Residual,
+    z0: Float[Array, " parameters"],
+    args: Any,
+    *,
+    solver: Any = None,
+    max_steps: int,
+    tolerance: float = TOLERANCE,
+) -> Stop:
+    """The solver set-up of every fit; `None` is Levenberg-Marquardt on the normal equations.
+
+    `z` should be relative or logarithmic, so that one unit means the same for all elements. Any
+    optimistix least-squares solver can take its place.
+    """
+    if solver is not None:
+        return _with_optimistix(residual, z0, args, solver, max_steps)
+    state = minimise(lambda z: normal_equations(residual, z, args), z0, max_steps, tolerance)
+    return Stop(state.z, state.status == CONVERGED, state.status, state.steps)
 
 
-def _reason(message: str, steps: int) -> str:
-    """The first sentence of a solver's message."""
-    return f"{message.strip().split('.')[0].rstrip()} (after {steps} steps)"
+def normal_equations(residual: Residual, z: Float[Array, " parameters"], args: Any) -> Normal:
+    """Cost, gradient and Gauss-Newton Hessian, by one forward derivative for each parameter."""
+
+    def twice(z):
+        r = residual(z, args)
+        return r, r
+
+    jacobian, r = jax.jacfwd(twice, has_aux=True)(z)
+    return Normal(0.5 * jnp.sum(r**2), jacobian.T @ r, jacobian.T @ jacobian)
+
+
+def _with_optimistix(residual, z0, args, solver, max_steps) -> Stop:
+    # Imported late: optimistix doubles the time of `import jaxquad`.
+    import optimistix as optx
+
+    def walled(z, args):
+        # A wall of NaN would look like a minimum to the solver: make it a high one instead.
+        r = residual(z, args)
+        return jnp.where(jnp.isfinite(r), r, 1e6)
+
+    found = optx.least_squares(walled, solver, z0, args=args, max_steps=max_steps, throw=False)
+    converged = found.result == optx.RESULTS.successful
+    return Stop(found.value, converged, found.result, found.stats["num_steps"])
+
+
+def _reason(reason: Any) -> str:
+    """The first sentence of why a solver stopped."""
+    if isinstance(reason, jax.Array):
+        return _MESSAGES[int(reason)]
+    import optimistix as optx
+
+    return str(optx.RESULTS[reason]).strip().split(".")[0].rstrip()
 
 
 def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> bool:
