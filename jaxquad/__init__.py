@@ -21,6 +21,8 @@ from .identify import (
     Positive as Positive,
     Prior as Prior,
     Real as Real,
+    reduce_structure as reduce_structure,
+    Reduction as Reduction,
     Verification as Verification,
     verify as verify,
 )

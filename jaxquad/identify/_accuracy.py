@@ -108,8 +108,12 @@ def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -
 
 def misfit_ratio(cost: float, bread: Matrix, noise: Noise) -> float:
     """The data's cost over what noise alone would leave of it: about 1 for the right model."""
-    fitted = float(np.trace(scaled_inverse(bread) @ noise.data))
-    return cost / max(noise.cost - fitted, 1e-300)
+    return cost / max(noise.cost - fitted_noise(bread, noise), 1e-300)
+
+
+def fitted_noise(bread: Matrix, noise: Noise) -> float:
+    """Cost that the parameters take off by following the noise: their number, if it were white."""
+    return float(np.trace(scaled_inverse(bread) @ noise.data))
 
 
 def scaled_inverse(matrix: Matrix) -> Matrix:

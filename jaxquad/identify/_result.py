@@ -30,6 +30,7 @@ class Fit(eqx.Module):
     insensitivity: Float[np.ndarray, " parameters"]  # %
     cost: float  # summed over the responses
     average_cost: float  # per response
+    information: float  # Takeuchi's criterion: cost plus what fitting the noise took off it, twice
     chi_squared: float  # cost over what the measured noise alone would leave: about 1
     newton_decrement: float  # what one more Gauss-Newton step would lower the cost by
     condition: float  # of the scaled Jacobian

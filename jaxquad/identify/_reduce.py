@@ -1,0 +1,169 @@
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from jaxquad.spectra import FrequencyResponse
+
+from ._band import Band
+from ._cost import CoherenceWeighted, Cost
+from ._fit import fit
+from ._parameters import Free, Parameters, Positive, Real, select_parameters, Tie
+from ._result import Fit
+
+
+class Step(NamedTuple):
+    """One parameter tried without: why, and what became of it."""
+
+    parameter: str
+    reason: str
+    average_cost: float  # without it
+    rise: float  # of the average cost
+    information: float  # without it
+    change: float  # of the information criterion
+    dropped: bool
+    verdict: str
+
+
+class Reduction(eqx.Module):
+    """The smallest structure that explains the responses, and the protocol that led there."""
+
+    fit: Fit
+    first: Fit
+    steps: tuple[Step, ...] = eqx.field(static=True)
+
+    @property
+    def dropped(self) -> tuple[str, ...]:
+        """Parameters left out, in order."""
+        return tuple(step.parameter for step in self.steps if step.dropped)
+
+    def __str__(self) -> str:
+        width = max(9, *(len(step.parameter) for step in self.steps)) if self.steps else 9
+        lines = [
+            f"start: {len(self.first.names)} parameters, J_ave {self.first.average_cost:.4g}, "
+            f"information criterion {self.first.information:.5g}",
+            f"{'parameter':<{width}}  {'why':<16}{'J_ave':>9}{'rise':>10}{'change':>12}  verdict",
+        ]
+        for step in self.steps:
+            numbers = f"{step.average_cost:9.4g}{step.rise:+10.3g}{step.change:+12.4g}"
+            lines.append(f"{step.parameter:<{width}}  {step.reason:<16}{numbers}  {step.verdict}")
+        return "\n".join([*lines, f"{len(self.fit.names)} parameters are left:", str(self.fit)])
+
+
+class _Options(NamedTuple):
+    tied: Mapping[str, Tie] | None
+    cost: Cost
+    band: Band
+    min_coherence: float
+    null: Mapping[str, float]
+
+
+def reduce_structure(
+    model: PyTree,
+    frf: FrequencyResponse | Sequence[FrequencyResponse],
+    *,
+    free: Free = None,
+    tied: Mapping[str, Tie] | None = None,
+    cost: Cost = CoherenceWeighted(),
+    band: Band = None,
+    min_coherence: float = 0.6,
+    null: Mapping[str, float] | None = None,
+    insensitivity: float = 10.0,
+    cramer_rao: float = 20.0,
+    rise: float | None = None,
+) -> Reduction:
+    """Leave out, one after the other, the parameters that the responses do not need.
+
+    First the one with the largest insensitivity above `insensitivity` (%), then the largest
+    Cramer-Rao bound above `cramer_rao` (%); each is set to its `null` value, 0 by default, and the
+    rest fitted again. It stays out if Takeuchi's information criterion does not rise (which counts
+    errors that neighbouring frequencies share once only), or, with a number for `rise`, if the
+    average cost rises by no more than that: CIFER's habit is 1 to 2. Other options are `jq.fit`'s.
+    Source: Tischler & Remple, ch. 13, model structure determination.
+    """
+    options = _Options(tied, cost, band, min_coherence, null or {})
+    parameters = select_parameters(model, free, tied)
+    kinds = _kinds(parameters)
+    unknown = set(options.null) - set(parameters.names)
+    if unknown:
+        raise ValueError(
+            f"null={sorted(unknown)}: not free; free are {', '.join(parameters.names)}"
+        )
+    first = best = _fitted(model, frf, kinds, options)
+    steps, needed = [], set()
+    while len(best.names) > 1:
+        worst = _worst(best, needed, insensitivity, cramer_rao)
+        if worst is None:
+            break
+        name, reason = worst
+        trial = _without(best, frf, kinds, name, options)
+        step = _judged(best, trial, name, reason, rise)
+        steps.append(step)
+        needed.add(name)
+        best = trial if step.dropped and trial is not None else best
+    return Reduction(best, first, tuple(steps))
+
+
+def _kinds(parameters: Parameters) -> dict[str, Positive | Real]:
+    """How each free parameter is fitted, with the size it had at the start."""
+    scales = np.abs(np.asarray(parameters.scale))
+    rows = zip(parameters.names, parameters.logarithmic, scales, strict=False)
+    return {name: Positive(name) if log else Real(name, float(size)) for name, log, size in rows}
+
+
+def _fitted(model: PyTree, frf, kinds: Mapping[str, Positive | Real], options: _Options) -> Fit:
+    return fit(
+        model,
+        frf,
+        free=list(kinds.values()),
+        tied=options.tied,
+        cost=options.cost,
+        band=options.band,
+        min_coherence=options.min_coherence,
+    )
+
+
+def _worst(
+    best: Fit, needed: set[str], insensitivity: float, cramer_rao: float
+) -> tuple[str, str] | None:
+    """The parameter to try without, and why: insensitivity comes first."""
+    for label, values, limit in (
+        ("I", best.insensitivity, insensitivity),
+        ("CR", best.cramer_rao, cramer_rao),
+    ):
+        open_ = [k for k, name in enumerate(best.names) if name not in needed]
+        if open_ and (k := max(open_, key=lambda k: values[k])) is not None and values[k] > limit:
+            shown = f"{values[k]:.3g} %" if np.isfinite(values[k]) else "unbounded"
+            return best.names[k], f"{label} {shown}"
+    return None
+
+
+def _without(
+    best: Fit, frf, kinds: Mapping[str, Positive | Real], name: str, options: _Options
+) -> Fit | None:
+    """The fit without one parameter, or None where the model has no response then."""
+    place = best.parameters.places[best.names.index(name)]
+    alone = Parameters((place,), (), (False,), 1, jnp.ones(1), jnp.zeros(1))
+    model = alone.replace(best.model, jnp.asarray([options.null.get(name, 0.0)]))
+    rest = {each: kinds[each] for each in best.names if each != name}
+    try:
+        return _fitted(model, frf, rest, options)
+    except ValueError:
+        return None
+
+
+def _judged(best: Fit, trial: Fit | None, name: str, reason: str, rise: float | None) -> Step:
+    if trial is None or not np.isfinite(trial.cost):
+        return Step(
+            name, reason, np.inf, np.inf, np.inf, np.inf, False, "kept: no response without"
+        )
+    higher = trial.average_cost - best.average_cost
+    change = trial.information - best.information
+    dropped = change <= 0 if rise is None else higher <= rise
+    verdict = "dropped" if dropped else "kept: needed"
+    return Step(
+        name, reason, trial.average_cost, higher, trial.information, change, dropped, verdict
+    )
