@@ -74,33 +74,27 @@ def test_one_window_alone_is_welch():
 
 def spectra(seed, groups=3, frequencies=7):
     """Spectra of several window lengths about one truth."""
-    rng = np.random.default_rng(seed)
-    parts = []
-    for _ in range(groups):
-        shape = (frequencies, 1, 1)
-        gain = 2.0 + 0.2 * rng.standard_normal((frequencies, 1))
-        response = (1 + 0.5j) * np.exp(0.1 * rng.standard_normal(shape))
-        coherence = np.clip(0.8 + 0.1 * rng.standard_normal(shape), 0.3, 0.99)
-        answer = np.abs(response) ** 2 * gain[:, None] / coherence
-        parts.append(
-            Conditioned(
-                response=jnp.asarray(response),
-                effect=jnp.zeros((frequencies, 1, 4), complex),
-                power=jnp.asarray(gain),
-                alone=jnp.ones((frequencies, 1)),
-                answer=jnp.asarray(answer),
-                coherence=jnp.asarray(coherence),
-                moved=jnp.ones((frequencies, 1)),
-                multiple=jnp.ones((frequencies, 1)),
-            )
-        )
-    return parts
+    rng, shape = np.random.default_rng(seed), (groups, frequencies, 1, 1)
+    gain = 2.0 + 0.2 * rng.standard_normal(shape[:3])
+    response = (1 + 0.5j) * np.exp(0.1 * rng.standard_normal(shape))
+    coherence = np.clip(0.8 + 0.1 * rng.standard_normal(shape), 0.3, 0.99)
+    ones = jnp.ones(shape[:3])
+    return Conditioned(
+        response=jnp.asarray(response),
+        effect=jnp.zeros((groups, frequencies, 1, 4), complex),
+        power=jnp.asarray(gain),
+        alone=ones,
+        answer=jnp.asarray(np.abs(response) ** 2 * gain[..., None] / coherence),
+        coherence=jnp.asarray(coherence),
+        moved=ones,
+        multiple=ones,
+    )
 
 
 def published(parts, freedom, f):
     """T&R eq. 10.4 at one frequency, minimised by scipy over four unknowns."""
     xx, yy, tt, g2 = (
-        np.array([np.asarray(getattr(part, name))[f].item() for part in parts])
+        np.asarray(getattr(parts, name))[:, f].reshape(-1)
         for name in ("power", "answer", "response", "coherence")
     )
     xy = tt * xx

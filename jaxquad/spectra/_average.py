@@ -3,11 +3,12 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
-from ._combine import combine, Combined
+from ._combine import alone, combine, Combined
 from ._conditioned import condition, Conditioned
 from ._noise import noise_root
 
@@ -49,25 +50,26 @@ def average(
     """One response from all window lengths, with the effect of noise in each window.
 
     `freedom` holds, for each length, the independent windows less the inputs, and the degrees of
-    freedom of the residuals.
+    freedom of the residuals. Lengths with fewer windows are filled up with zeros.
     """
     averages, left = jnp.asarray(freedom).T
-    split = [_split(part, channels) for part in transforms]
-    parts = [condition(z, x, y) for z, x, y in split]
-    combined = _combined(parts, scales, averages, resolved)
-    alone = jnp.einsum(
-        "fig,gfi->fi", jnp.mean(combined.share, axis=1), jnp.stack([part.alone for part in parts])
-    )
-    lost = ~(alone >= _ALIKE)
-    parts, combined = _without(lost, parts, combined)
-    gain, traces = _unit_noise(parts, combined.share, [x for _, x, _ in split], overlap)
-    residuals = [y - x @ jnp.swapaxes(combined.response, 1, 2) for _, x, y in split]
+    counts = jnp.asarray([float(len(part)) for part in transforms])
+    z, x, y = _split(_stacked(transforms), channels)
+    parts = jax.vmap(condition)(z, x, y, counts)
+    combined = combine(parts, scales, averages, resolved) if len(transforms) > 1 else alone(parts)
+    apart = jnp.einsum("fig,gfi->fi", jnp.mean(combined.share, axis=1), parts.alone)
+    lost = ~(apart >= _ALIKE)
+    parts, combined = _without(jnp.any(lost, axis=1), parts, combined)
+    many = tuple(len(part) for part in transforms)
+    effect = jnp.concatenate([parts.effect[g, :, :, :n] for g, n in enumerate(many)], axis=2)
+    flat = jnp.swapaxes(jnp.concatenate(transforms), 0, 1)
+    _, inputs, outputs = _split(flat, channels)
+    gain, trace = _unit_noise(effect, combined.share, inputs, jnp.asarray(overlap), many)
     weights = jnp.mean(combined.share, axis=2)
     trust = jnp.where(jnp.any(lost, axis=1), 1e-9, 1.0)[:, None, None]
-    noise = noise_root(
-        jnp.asarray(omega), residuals, [y for *_, y in split], traces,
-        left, weights * trust,
-    )  # fmt: skip
+    residuals = outputs - inputs @ jnp.swapaxes(combined.response, 1, 2)
+    member = jnp.asarray(np.repeat(np.eye(len(many)), many, axis=0))
+    noise = noise_root(jnp.asarray(omega), residuals, outputs, member, trace, left, weights * trust)
     power = jnp.sum(jnp.abs(noise) ** 2, axis=2)
     error = jnp.sqrt(power[:, :, None] * gain / 2) / jnp.abs(combined.response)
     gone = lost[:, None, :]
@@ -75,87 +77,87 @@ def average(
         jnp.where(gone, jnp.nan, combined.response),
         jnp.where(gone, 0.0, combined.coherence),
         jnp.where(gone, jnp.inf, error),
-        _direct(split, combined, channels),
-        jnp.einsum("fog,gfo->fo", weights, jnp.stack([part.multiple for part in parts])),
-        1 - jnp.nan_to_num(alone),
-        jnp.concatenate([part.effect for part in parts], axis=2),
+        _direct(x, y, counts, combined, channels),
+        jnp.einsum("fog,gfo->fo", weights, parts.multiple),
+        1 - jnp.nan_to_num(apart),
+        effect,
         combined.share,
         noise,
         _excitation(transforms[0], channels),
     )
 
 
-def _without(
-    lost: Bool[Array, "frequencies inputs"], parts: list[Conditioned], combined: Combined
-) -> tuple[list[Conditioned], Combined]:
-    """Finite numbers where inputs cannot be told apart, which are marked as lost elsewhere."""
-    every = jnp.any(lost, axis=1)[:, None, None]
-    clean = [
-        part._replace(
-            effect=jnp.where(every, 0.0, part.effect),
-            multiple=jnp.where(every[:, :, 0], 0.0, part.multiple),
-        )
-        for part in parts
-    ]
-    share = jnp.where(every[..., None], 1 / len(parts), combined.share)
-    response = jnp.where(every, 1e-300, combined.response)
-    coherence = jnp.where(every, 0.0, combined.coherence)
-    return clean, Combined(response, coherence, share)
+def _stacked(
+    transforms: tuple[Complex[Array, "_ frequencies channels"], ...],
+) -> Complex[Array, "groups frequencies windows channels"]:
+    most = max(len(part) for part in transforms)
+    padded = [jnp.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in transforms]
+    return jnp.swapaxes(jnp.stack(padded), 1, 2)
 
 
-def _split(transforms: Complex[Array, "windows frequencies channels"], channels: Channels):
-    """Instruments, inputs and outputs, frequency first."""
-    rows = jnp.swapaxes(transforms, 0, 1)
+def _split(rows: Complex[Array, "*groups windows channels"], channels: Channels):
+    """Instruments, inputs and outputs."""
     n, m = channels.inputs, channels.inputs + channels.outputs
-    x = rows[:, :, :n]
-    return (rows[:, :, m : m + n] if channels.instruments else x), x, rows[:, :, n:m]
+    x = rows[..., :n]
+    return (rows[..., m : m + n] if channels.instruments else x), x, rows[..., n:m]
 
 
-def _combined(parts: list[Conditioned], scales, freedom, resolved) -> Combined:
-    if len(parts) > 1:
-        return combine(parts, scales, freedom, resolved)
-    [part] = parts
-    coherence = jnp.minimum(part.coherence, part.moved[:, None, :])
-    return Combined(part.response, coherence, jnp.ones((*part.response.shape, 1)))
+def _without(
+    lost: Bool[Array, " frequencies"], parts: Conditioned, combined: Combined
+) -> tuple[Conditioned, Combined]:
+    """Finite numbers where inputs cannot be told apart, which are marked as lost elsewhere."""
+    gone = lost[:, None, None]
+    clean = parts._replace(
+        effect=jnp.where(gone[None], 0.0, parts.effect),
+        multiple=jnp.where(lost[None, :, None], 0.0, parts.multiple),
+    )
+    share = jnp.where(gone[..., None], 1 / combined.share.shape[-1], combined.share)
+    response = jnp.where(gone, 1e-300, combined.response)
+    return clean, Combined(response, jnp.where(gone, 0.0, combined.coherence), share)
 
 
 def _unit_noise(
-    parts: list[Conditioned],
+    effect: Complex[Array, "frequencies inputs windows"],
     share: Float[Array, "frequencies outputs inputs groups"],
-    inputs: list[Complex[Array, "frequencies _ inputs"]],
-    overlap: Float[ArrayLike, "windows windows"],
-) -> tuple[Float[Array, "frequencies outputs inputs"], list[Float[Array, "frequencies outputs"]]]:
-    """Variance of the responses under noise of unit power, and the residual energy it leaves."""
-    overlap = jnp.asarray(overlap)
-    ends = np.cumsum([0, *(part.effect.shape[2] for part in parts)])
-    places = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
-    kind = share.astype(parts[0].effect.dtype)
-    spread = [
-        part.effect @ overlap[mine].astype(kind.dtype)
-        for part, mine in zip(parts, places, strict=True)
-    ]
-    pairs = [
-        jnp.stack(
-            [each[:, :, mine] @ jnp.conj(jnp.swapaxes(part.effect, 1, 2)) for each in spread], -1
-        )
-        for part, mine in zip(parts, places, strict=True)
-    ]
-    covariance = jnp.einsum("foig,fojh,fijgh->foij", kind, kind, jnp.stack(pairs, -1))
-    traces = []
-    for x, mine in zip(inputs, places, strict=True):
-        first = jnp.stack([jnp.einsum("fsi,fis->fi", x, each[:, :, mine]) for each in spread], -1)
-        once = jnp.real(jnp.einsum("foig,fig->fo", kind, first))
-        power = jnp.einsum("fsi,fsj->fij", x, jnp.conj(x))
-        twice = jnp.real(jnp.einsum("fij,foij->fo", power, covariance))
-        traces.append(jnp.trace(overlap[mine, mine]) - 2 * once + twice)
-    return jnp.real(jnp.diagonal(covariance, axis1=2, axis2=3)), traces
+    x: Complex[Array, "frequencies windows inputs"],
+    overlap: Float[Array, "windows windows"],
+    counts: tuple[int, ...],
+) -> tuple[Float[Array, "frequencies outputs inputs"], Float[Array, "frequencies outputs groups"]]:
+    """Variance of the responses under noise of unit power, and the residual energy it leaves.
+
+    Sums over windows are taken group by group, since each output has shares of its own.
+    """
+    ends, count = np.cumsum(counts)[:-1], effect.shape[1]
+    rows = zip(jnp.split(effect, ends, axis=2), jnp.split(overlap, ends), strict=True)
+    spread = jnp.concatenate([_times_real(e, o) for e, o in rows], axis=1)
+    columns = jnp.concatenate([jnp.conj(jnp.swapaxes(effect, 1, 2)), x], axis=2)
+    kept = zip(jnp.split(spread, ends, axis=2), jnp.split(columns, ends, axis=1), strict=True)
+    sums = jnp.stack([s @ c for s, c in kept], axis=-1)
+    sums = sums.reshape(len(effect), len(counts), count, 2 * count, len(counts))
+    part, pairs, crossed = share.astype(effect.dtype), sums[:, :, :, :count], sums[:, :, :, count:]
+    covariance = jnp.einsum("foig,fgijh,fojh->foij", part, pairs, part)
+    once = jnp.einsum("foig,fgiih->foh", part, crossed)
+    moments = [jnp.swapaxes(c, 1, 2) @ jnp.conj(c) for c in jnp.split(x, ends, axis=1)]
+    twice = jnp.einsum("hfij,foij->foh", jnp.stack(moments), covariance)
+    whole = jnp.stack([jnp.sum(part) for part in jnp.split(jnp.diagonal(overlap), ends)])
+    variance = jnp.real(jnp.diagonal(covariance, axis1=2, axis2=3))
+    return variance, whole[None, None, :] - jnp.real(2 * once - twice)
 
 
-def _direct(split, combined: Combined, channels: Channels):
+def _times_real(
+    a: Complex[Array, "frequencies inputs _"], b: Float[Array, "_ windows"]
+) -> Complex[Array, "frequencies inputs windows"]:
+    rows = a.reshape(-1, a.shape[2])
+    both = jnp.concatenate([rows.real, rows.imag]) @ b
+    real, imag = jnp.split(both, 2)
+    return jax.lax.complex(real, imag).reshape(*a.shape[:2], b.shape[1])
+
+
+def _direct(x, y, counts, combined: Combined, channels: Channels):
     """Partial coherence of inputs and outputs, whatever the instruments say of it."""
     if not channels.instruments:
         return combined.coherence
-    each = jnp.stack([condition(x, x, y).coherence for _, x, y in split])
+    each = jax.vmap(condition)(x, x, y, counts).coherence
     return jnp.einsum("foig,gfoi->foi", combined.share, each)
 
 

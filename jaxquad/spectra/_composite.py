@@ -1,4 +1,3 @@
-import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -18,9 +17,10 @@ class Composite(eqx.Module):
     """Several window lengths, combined at every frequency (CIFER's FRESPID and COMPOSITE).
 
     Long windows serve the low frequencies, short ones average more and serve the high ones. Each
-    pair's spectra are weighed by (eps_i / eps_min)^-4 of their random errors. `windows` are lengths in s;
-    by default five, log-spaced from a third of all records together (half a record at
-    most) to 20 cycles of the highest frequency. The other options are those of `jq.Welch`.
+    pair's spectra are weighed by (eps_i / eps_min)^-4 of their random errors. `windows` are lengths
+    in s; by default five, log-spaced from a third of all records together (half a record at most)
+    to 20 cycles of the highest frequency. Lengths are rounded to whole blocks of samples that they
+    share. The other options are those of `jq.Welch`.
     """
 
     windows: tuple[float, ...] | None = eqx.field(static=True, default=None)

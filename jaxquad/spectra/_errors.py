@@ -18,10 +18,11 @@ class ErrorCovariance(eqx.Module):
 
         dT[f, o, i] = sum_a share[f, o, i, g(a)] effect[f, i, a] V[a, o](f)
 
-    where atoms come in groups g of `counts` each. V[a, o] is the transform of the noise of output o in window a of `windows`, or, without windows,
-    independent noise of unit power. `noise[f]` is the root of the outputs' noise covariance:
-    cov(V[o], V[p]) = sum_c noise[f, o, c] conj(noise[f, p, c]). Whole, the covariance of 20 outputs
-    and 10 inputs would fill gigabytes; what a fit needs of it is a product with a few columns.
+    where atoms come in groups g of `counts` each. V[a, o] is the transform of the noise of output
+    o in window a of `windows`, or, without windows, independent noise of unit power. `noise[f]` is
+    the root of the outputs' noise covariance: cov(V[o], V[p]) = sum_c noise[f, o, c]
+    conj(noise[f, p, c]). Whole, the covariance of 20 outputs and 10 inputs would fill gigabytes;
+    what a fit needs of it is a product with a few columns.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s

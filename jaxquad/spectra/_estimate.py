@@ -46,9 +46,9 @@ def frequency_response(
     """Frequency responses of all outputs to all inputs, of one record or of several together.
 
     `omega` in rad/s, by default 100 log-spaced values within what the windows can resolve.
-    Several inputs are conditioned on each other: `(Z* X)^-1 Z* Y`. Without an `estimator`, composite
-    windows, by the joint input-output method where the record has references, otherwise the
-    direct one, H1 = G_xx^-1 G_xy (Eq. 13), which then says that feedback may bias it.
+    Several inputs are conditioned on each other: `(Z* X)^-1 Z* Y`. Without an `estimator`,
+    composite windows, by the joint input-output method where the record has references, otherwise
+    the direct one, H1 = G_xx^-1 G_xy (Eq. 13), which then says that feedback may bias it.
     Raises `ValueError` for an unusable band or record, `PrecisionError` in 32 bits.
     """
     records = [record] if isinstance(record, Record) else list(record)

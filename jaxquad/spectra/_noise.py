@@ -1,7 +1,5 @@
 """The outputs' noise, from what the responses leave unexplained in the windows."""
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
@@ -10,47 +8,37 @@ from jaxtyping import Array, Complex, Float
 _BANDWIDTH = 0.2  # of the noise's smoothing, in ln(omega)
 _FLOOR = 1e-26  # of the output's power: below it lies rounding
 
-Residuals = Complex[Array, "frequencies _ outputs"]
+Residuals = Complex[Array, "frequencies windows outputs"]
 
 
 def noise_root(
     omega: Float[Array, " frequencies"],
-    residuals: Sequence[Residuals],
-    outputs: Sequence[Residuals],
-    traces: Sequence[Float[Array, "frequencies outputs"]],
+    residuals: Residuals,
+    outputs: Residuals,
+    member: Float[Array, "windows groups"],
+    trace: Float[Array, "frequencies outputs groups"],
     freedom: Float[Array, " groups"],
     weights: Float[Array, "frequencies outputs groups"],
 ) -> Complex[Array, "frequencies outputs outputs"]:
     """Hermitian root of the covariance of noise that would leave these residuals.
 
-    One set of `residuals` for each window length, with the energy `traces` that unit noise would
-    leave in them and the complex degrees of `freedom` of that energy; `weights` say how much each
-    length counts. Smooth along frequency.
+    `member` says which window is of which length. Each length has the energy `trace` that unit
+    noise would leave in its residuals, and the complex degrees of `freedom` of that energy;
+    `weights` say how much it counts. Smooth along frequency.
     """
     place = jnp.log(omega)
-    kinds = zip(residuals, outputs, traces, list(freedom), strict=True)
-    levels = jnp.stack([_level(*kind) for kind in kinds], axis=2)
-    weight = jnp.sum(weights * freedom[None, None, :], axis=2)
-    level = jnp.sum(weights * levels, axis=2)
-    power = jnp.exp(jax.vmap(_local_line, in_axes=(None, 1, 1), out_axes=1)(place, level, weight))
-    root = jnp.sqrt(power)
-    if power.shape[1] == 1:
+    energy, floor = (jnp.swapaxes(jnp.abs(x) ** 2, 1, 2) @ member for x in (residuals, outputs))
+    # The logarithm of a chi-squared variable is low on average: digamma(f) - ln(f).
+    low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
+    levels = jnp.log(jnp.maximum(energy, _FLOOR * floor + 1e-280) / trace) - low[None, None, :]
+    weight, level = weights @ freedom, jnp.sum(weights * levels, axis=2)
+    lines = jax.vmap(_local_line, in_axes=(None, 1, 1), out_axes=1)
+    root = jnp.exp(lines(place, level, weight) / 2)
+    if root.shape[1] == 1:
         return jax.lax.complex(root, jnp.zeros_like(root))[:, :, None]
-    return _hermitian_root(_coherency(place, residuals, weights), root)
-
-
-def _level(
-    residual: Residuals,
-    output: Residuals,
-    trace: Float[Array, "frequencies outputs"],
-    freedom: Float[Array, ""],
-) -> Float[Array, "frequencies outputs"]:
-    """Logarithm of the noise's power, unbiased."""
-    energy = jnp.sum(jnp.abs(residual) ** 2, axis=1)
-    floor = _FLOOR * jnp.sum(jnp.abs(output) ** 2, axis=1) + 1e-280
-    # The logarithm of a chi-squared variable is low on average.
-    low = jax.scipy.special.digamma(freedom) - jnp.log(freedom)
-    return jnp.log(jnp.maximum(energy, floor) / trace) - low
+    scale = jnp.sqrt(jnp.mean(weights, axis=1, keepdims=True) / (energy + 1e-280))
+    unit = residuals * jnp.swapaxes(scale @ member.T, 1, 2).astype(residuals.dtype)
+    return _hermitian_root(_coherency(place, unit), root)
 
 
 def _local_line(
@@ -69,20 +57,13 @@ def _local_line(
 
 
 def _coherency(
-    place: Float[Array, " frequencies"],
-    residuals: Sequence[Residuals],
-    weights: Float[Array, "frequencies outputs groups"],
+    place: Float[Array, " frequencies"], unit: Residuals
 ) -> Complex[Array, "frequencies outputs outputs"]:
     """Correlation between the outputs' noise, of unit diagonal and positive semidefinite."""
-    total = jnp.zeros((1,), residuals[0].dtype)
-    for g, residual in enumerate(residuals):
-        size = jnp.sqrt(jnp.sum(jnp.abs(residual) ** 2, axis=1, keepdims=True)) + 1e-280
-        scaled = residual / size.astype(residual.dtype)
-        counts = jnp.mean(weights[:, :, g], axis=1)[:, None, None].astype(residual.dtype)
-        product = jnp.einsum("fso,fsp->fop", scaled, jnp.conj(scaled)) * counts
-        total = total + product if g else product
+    total = jnp.swapaxes(unit, 1, 2) @ jnp.conj(unit)
     kernel = jnp.exp(-0.5 * ((place[None, :] - place[:, None]) / _BANDWIDTH) ** 2)
-    smooth = jnp.einsum("fg,gop->fop", kernel.astype(total.dtype), total)
+    flat = total.reshape(place.size, -1)
+    smooth = jax.lax.complex(kernel @ flat.real, kernel @ flat.imag).reshape(total.shape)
     deviation = jnp.sqrt(jnp.real(jnp.diagonal(smooth, axis1=1, axis2=2))).astype(smooth.dtype)
     return smooth / (deviation[:, :, None] * deviation[:, None, :])
 

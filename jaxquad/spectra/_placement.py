@@ -50,9 +50,9 @@ def overlaps(
     """What two windows share: the sum over samples of their product."""
     level, cosine = coefficients(shape)
     step = max(min(length for length, _ in groups) / _POINTS, 1.0)
-    rows = []
     last = max(mine[-1] + length for length, mine in groups)
     times = np.arange(min(mine[0] for _, mine in groups), last, step)
+    rows = []
     for length, mine in groups:
         into = (times[None, :] - np.asarray(mine)[:, None]) / length
         inside = (into >= 0) & (into < 1)
