@@ -1,13 +1,9 @@
 from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._axis import AttitudeAxis as AttitudeAxis
-from ._discretise import (
-    free_responses as free_responses,
-    Sampled as Sampled,
-    sampled as sampled,
-    simulate_linear as simulate_linear,
-)
+from ._connect import series as series, state_space as state_space
 from ._lagged_integrator import LaggedIntegrator as LaggedIntegrator
+from ._modes import Mode as Mode, modes as modes
 from ._motor import MotorLag as MotorLag
 from ._plant import Multirotor as Multirotor, MultirotorState as MultirotorState
 from ._realise import realise as realise
@@ -20,6 +16,11 @@ from ._rotation import (
     quaternion_from_euler as quaternion_from_euler,
     rotation_matrix as rotation_matrix,
 )
+from ._simulate_linear import (
+    free_responses as free_responses,
+    simulate_linear as simulate_linear,
+)
+from ._state_space import StateSpace as StateSpace
 from ._transfer_function import TransferFunction as TransferFunction
 from ._vehicles import (
     HoverDataSheet as HoverDataSheet,

@@ -1,0 +1,99 @@
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._parameters import is_concrete
+from ._realise import realise
+from ._state_space import StateSpace
+from ._transfer_function import TransferFunction
+
+
+def state_space(model: TransferFunction) -> StateSpace:
+    """A transfer function in states, those of `realise`; its delay becomes that of the input.
+
+    A direct passage from input to output, which H0 x + H1 x' has no place for, becomes a share of
+    x'. Raises ValueError for a pure gain, which has no states.
+    """
+    A, B, C, D = realise(model)
+    if not len(A):
+        raise ValueError(
+            f"numerator {model.numerator} and denominator {model.denominator} are a pure gain "
+            "without states: scale G or H0 of a neighbouring model by it."
+        )
+    late = model.delay[None]
+    if model.numerator.size < model.denominator.size:
+        return StateSpace(F=A, G=B, H0=C, input_delay=late)
+    # x' = A x + B u with B = (b, 0, ...): D / b of the first derivative holds D u.
+    H1 = jnp.zeros_like(C).at[0, 0].set(D[0, 0] / B[0, 0])
+    return StateSpace(F=A, G=B, H0=C - jnp.dot(H1, A, precision="highest"), H1=H1, input_delay=late)
+
+
+def series(first: StateSpace, second: StateSpace) -> StateSpace:
+    """The outputs of `first` drive the inputs of `second`; the response is second times first.
+
+    Raises ValueError where their numbers differ, and where several signals between the two are late
+    by different times: then no delay of an input or output does the same.
+    """
+    made, taken = first.H0.shape[0], second.G.shape[1]
+    if made != taken:
+        raise ValueError(
+            f"The first model has {made} outputs, the second {taken} inputs: pick channels with "
+            "model.select."
+        )
+    between = _common(_sum(first.output_delay, second.input_delay))
+    late = first.input_delay
+    if between is not None:
+        late = _sum(late, jnp.broadcast_to(between, (first.G.shape[1],)))
+    driven = -_dot(second.G, _some(first.H1, first.H0))
+    return StateSpace(
+        F=_blocks(first.F, _dot(second.G, first.H0), second.F),
+        G=jnp.concatenate([first.G, jnp.zeros((len(second.F), first.G.shape[1]), first.G.dtype)]),
+        H0=_behind(first, second.H0),
+        H1=None if second.H1 is None else _behind(first, second.H1),
+        M=_mass(first, second, driven),
+        input_delay=late,
+        output_delay=second.output_delay,
+    )
+
+
+def _mass(first: StateSpace, second: StateSpace, driven: Array) -> Array | None:
+    if first.M is None and second.M is None and first.H1 is None:
+        return None
+    ones = [jnp.eye(len(each.F), dtype=each.F.dtype) for each in (first, second)]
+    return _blocks(_given(first.M, ones[0]), driven, _given(second.M, ones[1]))
+
+
+def _blocks(upper: Array, across: Array, lower: Array) -> Float[Array, "states states"]:
+    none = jnp.zeros((len(upper), len(lower)), upper.dtype)
+    return jnp.block([[upper, none], [across, lower]])
+
+
+def _behind(first: StateSpace, H: Array) -> Float[Array, "outputs states"]:
+    return jnp.concatenate([jnp.zeros((len(H), len(first.F)), H.dtype), H], axis=1)
+
+
+def _common(late: Float[Array, " signals"] | None) -> Float[Array, ""] | None:
+    if late is None or late.size == 1:
+        return None if late is None else late[0]
+    if is_concrete(late) and np.ptp(np.asarray(late)) == 0:
+        return late[0]
+    raise ValueError(
+        f"The signals between the models are late by {late} s: give them one known delay, or put "
+        "the delays on the first inputs and the last outputs."
+    )
+
+
+def _sum(a: Array | None, b: Array | None) -> Array | None:
+    return b if a is None else a if b is None else a + b
+
+
+def _some(matrix: Array | None, like: Array) -> Array:
+    return jnp.zeros_like(like) if matrix is None else matrix
+
+
+def _given(matrix: Array | None, otherwise: Array) -> Array:
+    return otherwise if matrix is None else matrix
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.dot(a, b, precision="highest")

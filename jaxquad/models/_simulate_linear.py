@@ -1,0 +1,151 @@
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import expm
+from jaxtyping import Array, ArrayLike, Float
+
+from ._discretise import at_delay, dot, propagation, shifted, split_delay
+from ._realise import realise
+from ._recursion import free_motion, recursion
+from ._state_space import explicit, StateSpace
+from ._transfer_function import TransferFunction
+
+
+_HOLDS = ("zero", "first")
+
+
+def simulate_linear(
+    model: TransferFunction | StateSpace,
+    u: Float[ArrayLike, " samples"] | Float[ArrayLike, "samples inputs"],
+    dt: float,
+    *,
+    hold: str = "zero",
+) -> Float[Array, " samples"] | Float[Array, "samples outputs"]:
+    """The outputs at the samples of an input `u`, which was 0 before the first: exact, from rest.
+
+    A `TransferFunction` takes and gives (samples,), a `StateSpace` (samples, inputs) and (samples,
+    outputs). Between samples `dt` seconds apart the inputs stay at the last one (`hold="zero"`) or
+    run straight to the next (`hold="first"`); they may be late by fractions of a sample, and the
+    outputs too. Where a held input jumps, x' jumps: H1 x' is the value just after. Raises
+    ValueError for another hold, a `dt` that is not positive and a `u` of another shape.
+    """
+    if not dt > 0:
+        raise ValueError(f"dt is {dt} s: give a positive sample interval")
+    if hold not in _HOLDS:
+        raise ValueError(f"hold is {hold!r}, which does not exist: use one of {_HOLDS}.")
+    inputs = _inputs(model, jnp.asarray(u))
+    found = _respond(_plant(model), _segments(inputs, hold), dt)
+    return found[:, 0] if isinstance(model, TransferFunction) else found
+
+
+def free_responses(
+    model: TransferFunction | StateSpace, samples: int, dt: float
+) -> tuple[Float[Array, "samples *outputs states"], Float[Array, "samples *outputs states"]]:
+    """The outputs, `dt` seconds apart, of each unit initial state, and of each unit constant bias.
+
+    A bias adds to the derivative of a state, and so to H1 x'. An output that is late shows the same
+    motion, continued to before the first sample. Of a `StateSpace`, (samples, outputs, states); of
+    a `TransferFunction`, (samples, states), where the states are those of `realise`, so that only
+    the span of the columns has a meaning. They are regressors for a record's start and trim.
+    """
+    start, bias = _free(_plant(model), samples, dt)
+    if isinstance(model, TransferFunction):
+        return start[:, 0], bias[:, 0]
+    return start, bias
+
+
+class _Plant(NamedTuple):
+    A: Float[Array, "states states"]
+    B: Float[Array, "states inputs"]
+    C: Float[Array, "outputs states"]
+    D: Float[Array, "outputs inputs"] | None
+    bias: Float[Array, "outputs states"] | None  # H1, through which a bias on x' passes
+    input_delay: Float[Array, " inputs"]
+    output_delay: Float[Array, " outputs"] | None
+
+
+def _plant(model: TransferFunction | StateSpace) -> _Plant:
+    if isinstance(model, TransferFunction):
+        return _Plant(*realise(model), None, model.delay[None], None)
+    A, B, C, D = explicit(model)
+    late = jnp.zeros(B.shape[1], B.dtype) if model.input_delay is None else model.input_delay
+    passing = None if model.H1 is None else D
+    return _Plant(A, B, C, passing, model.H1, late, model.output_delay)
+
+
+def _inputs(model: TransferFunction | StateSpace, u: Array) -> Float[Array, "samples inputs"]:
+    if isinstance(model, TransferFunction):
+        wanted, right = "(samples,)", u.ndim == 1
+    else:
+        columns = model.G.shape[1]
+        wanted, right = f"(samples, {columns})", u.ndim == 2 and u.shape[1] == columns
+    if not right:
+        raise ValueError(f"u has shape {u.shape}, but this model takes {wanted}: reshape it.")
+    return u[:, None] if u.ndim == 1 else u
+
+
+def _segments(u: Float[Array, "samples inputs"], hold: str) -> Float[Array, "inputs samples 2"]:
+    change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
+    return jnp.stack([u.T, change.T], axis=2)
+
+
+@eqx.filter_jit
+def _respond(
+    plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: float
+) -> Float[Array, "samples outputs"]:
+    shift, late = split_delay(plant.input_delay, dt)
+    parts = [jax.vmap(shifted)(segments, shift + n) for n in (1, 0)]
+    acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
+    acting = acting.reshape(segments.shape[1], 4 * len(segments))
+    step, drive = propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
+    states = recursion(step, dot(acting, drive))
+    if plant.output_delay is None:
+        found = dot(states, plant.C.T)
+    else:
+        found = _late_outputs(plant, states, acting, late, dt)
+    return found if plant.D is None else found + _passing(plant, plant.D, segments, dt)
+
+
+def _late_outputs(
+    plant: _Plant,
+    states: Float[Array, "samples states"],
+    acting: Float[Array, "samples segments"],
+    late: Float[Array, " inputs"],
+    dt: float,
+) -> Float[Array, "samples outputs"]:
+    # An output that is late shows the state somewhere within an earlier sample.
+    def output(row, delay):
+        shift, wait = split_delay(delay, dt)
+        step, drive = propagation(plant.A, plant.B, late, 1 - wait, dt)
+        within = dot(states, dot(row, step)) + dot(acting, dot(drive, row))
+        return shifted(within[:, None], shift + 1)[:, 0]
+
+    return jax.vmap(output, out_axes=1)(plant.C, plant.output_delay)
+
+
+def _passing(
+    plant: _Plant, D: Array, segments: Float[Array, "inputs samples 2"], dt: float
+) -> Float[Array, "samples outputs"]:
+    wait = jnp.zeros(len(D), D.dtype) if plant.output_delay is None else plant.output_delay
+    one = lambda wait, late, segments: at_delay(segments, wait + late, dt)
+    by_input = jax.vmap(one, in_axes=(None, 0, 0))
+    by_both = jax.vmap(by_input, in_axes=(0, None, None))(wait, plant.input_delay, segments)
+    return jnp.einsum("oi,oik->ko", D, by_both, precision="highest")
+
+
+@eqx.filter_jit
+def _free(
+    plant: _Plant, samples: int, dt: float
+) -> tuple[Float[Array, "samples outputs states"], Float[Array, "samples outputs states"]]:
+    A, states = plant.A, len(plant.A)
+    block = jnp.zeros((2 * states, 2 * states), A.dtype)
+    block = block.at[:states].set(jnp.concatenate([A, jnp.eye(states, dtype=A.dtype)], axis=1))
+    bias = jnp.zeros_like(plant.C) if plant.bias is None else plant.bias
+    rows = jnp.concatenate([plant.C, bias], axis=1)
+    if plant.output_delay is not None:
+        back = jax.vmap(lambda delay: expm(-delay * block))(plant.output_delay)
+        rows = jnp.einsum("oi,oij->oj", rows, back, precision="highest")
+    found = free_motion(rows, expm(block * dt), samples)
+    return found[:, :, :states], found[:, :, states:]

@@ -1,0 +1,174 @@
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from ._parameters import (
+    as_float,
+    as_float_or_none,
+    is_concrete,
+    require_finite,
+    require_nonnegative,
+)
+from ._response import Matrices, response
+from ._zeros import transmission_zeros
+
+
+class StateSpace(eqx.Module):
+    """M x' = F x + G u(t - input_delay), y(t + output_delay) = H0 x + H1 x': CIFER's DERIVID form.
+
+    x' is the derivative that the late input causes, so H1 x' holds accelerations as they are
+    measured. None leaves a term out: an M of ones, no H1, no delay; what is left out is no
+    parameter of a fit. The entries are named `F[0][1]`, `input_delay[0]`.
+    Source: Tischler & Remple, eq. 12.6 to 12.12. Raises ValueError for shapes that do not fit
+    together, values that are not finite, a negative delay and a singular M.
+    """
+
+    F: Float[Array, "states states"] = eqx.field(converter=as_float)
+    G: Float[Array, "states inputs"] = eqx.field(converter=as_float)
+    H0: Float[Array, "outputs states"] = eqx.field(converter=as_float)
+    H1: Float[Array, "outputs states"] | None = eqx.field(converter=as_float_or_none, default=None)
+    M: Float[Array, "states states"] | None = eqx.field(converter=as_float_or_none, default=None)
+    input_delay: Float[Array, " inputs"] | None = eqx.field(
+        converter=as_float_or_none, default=None
+    )  # s
+    output_delay: Float[Array, " outputs"] | None = eqx.field(
+        converter=as_float_or_none, default=None
+    )  # s
+
+    def __check_init__(self):
+        _check_shapes(self)
+        for name in ("F", "G", "H0", "H1", "M"):
+            if getattr(self, name) is not None:
+                require_finite(name, getattr(self, name))
+        for name in ("input_delay", "output_delay"):
+            if getattr(self, name) is not None:
+                remedy = "a model cannot answer before its input"
+                require_nonnegative(name, getattr(self, name), remedy)
+        _check_mass(self.M)
+
+    def frequency_response(
+        self, omega: Float[Array, " frequencies"]
+    ) -> Complex[Array, "frequencies outputs inputs"]:
+        """The response at `omega` in rad/s, outputs per inputs in their units.
+
+        Infinite at a pole, to within rounding. Differentiable any number of times, in either mode.
+        """
+        return _frequency_response(self, omega)
+
+    def select(self, outputs: Sequence[int], inputs: Sequence[int]) -> "StateSpace":
+        """The model of some channels, by position and in the order given."""
+        rows, columns = np.array(outputs, int), np.array(inputs, int)
+        pick = lambda x, where: None if x is None else x[where]
+        return StateSpace(
+            F=self.F,
+            G=self.G[:, columns],
+            H0=self.H0[rows],
+            H1=pick(self.H1, rows),
+            M=self.M,
+            input_delay=pick(self.input_delay, columns),
+            output_delay=pick(self.output_delay, rows),
+        )
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Eigenvalues of M^-1 F, rad/s; on the host, so not under jit."""
+        return np.linalg.eigvals(_host(self)[0])
+
+    @property
+    def zeros(self) -> np.ndarray:
+        """Transmission zeros of all channels together, rad/s; on the host, so not under jit.
+
+        Those of one pair are the zeros of `select([output], [input])`.
+        """
+        return transmission_zeros(*_host(self))
+
+    @property
+    def lateness(self) -> Float[Array, "outputs inputs"] | None:
+        """Seconds from each input to each output; None without any delay."""
+        by_input, by_output = self.input_delay, self.output_delay
+        if by_input is None and by_output is None:
+            return None
+        shape = (self.H0.shape[0], self.G.shape[1])
+        rows = jnp.zeros(shape[0], self.F.dtype) if by_output is None else by_output
+        columns = jnp.zeros(shape[1], self.F.dtype) if by_input is None else by_input
+        return rows[:, None] + columns[None]
+
+
+def explicit(
+    model: StateSpace,
+) -> tuple[
+    Float[Array, "states states"],
+    Float[Array, "states inputs"],
+    Float[Array, "outputs states"],
+    Float[Array, "outputs inputs"],
+]:
+    """A, B, C, D of x' = A x + B u, y = C x + D u: the model without M, H1 and its delays."""
+    A, B, C = model.F, model.G, model.H0
+    if model.M is not None:
+        rows = jnp.max(jnp.abs(model.M), axis=1, keepdims=True)
+        solved = jnp.linalg.solve(model.M / rows, jnp.concatenate([A, B], axis=1) / rows)
+        A, B = solved[:, : len(A)], solved[:, len(A) :]
+    if model.H1 is None:
+        return A, B, C, jnp.zeros((len(C), B.shape[1]), B.dtype)
+    return A, B, C + _dot(model.H1, A), _dot(model.H1, B)
+
+
+@eqx.filter_jit  # one call of many small operations is slow outside of it
+def _frequency_response(model: StateSpace, omega: Array) -> Array:
+    matrices = Matrices(model.F, model.G, model.H0, model.H1, model.M, model.lateness)
+    parts = response(matrices, omega)
+    return jax.lax.complex(parts[:, 0], parts[:, 1])
+
+
+def _host(model: StateSpace) -> tuple[np.ndarray, ...]:
+    return tuple(np.asarray(part) for part in explicit(model))
+
+
+def _check_shapes(model: StateSpace) -> None:
+    F, G, H0 = model.F, model.G, model.H0
+    if F.ndim != 2 or F.shape[0] != F.shape[1] or not F.size:
+        raise ValueError(f"F has shape {F.shape}: give a square matrix of one row per state.")
+    if G.ndim != 2 or H0.ndim != 2 or not G.shape[1] or not H0.shape[0]:
+        raise ValueError(
+            f"G has shape {G.shape} and H0 {H0.shape}: give matrices, a column of G per input and "
+            "a row of H0 per output."
+        )
+    (states, inputs), outputs = (len(F), G.shape[1]), len(H0)
+    wanted = {
+        "G": (states, inputs),
+        "H0": (outputs, states),
+        "H1": (outputs, states),
+        "M": (states, states),
+        "input_delay": (inputs,),
+        "output_delay": (outputs,),
+    }
+    for name, shape in wanted.items():
+        found = getattr(model, name)
+        if found is not None and found.shape != shape:
+            raise ValueError(
+                f"{name} has shape {found.shape}, but {states} states, {inputs} inputs and "
+                f"{outputs} outputs need {shape}: look at F, G and H0 too."
+            )
+
+
+def _check_mass(M: Array | None) -> None:
+    if M is None or not is_concrete(M):
+        return
+    mass = np.asarray(M)
+    rows = np.max(np.abs(mass), axis=1, keepdims=True)
+    mass = mass / np.where(rows > 0, rows, 1)
+    columns = np.max(np.abs(mass), axis=0, keepdims=True)
+    mass = mass / np.where(columns > 0, columns, 1)
+    if np.linalg.matrix_rank(mass) < len(mass):
+        raise ValueError(
+            f"M is {M}, which is singular: a row of it must tell each state's derivative apart; "
+            "eliminate states that obey no differential equation."
+        )
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.dot(a, b, precision="highest")

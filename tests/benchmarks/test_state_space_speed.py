@@ -1,0 +1,176 @@
+"""A state-space fit of 20 parameters beside scipy's, in one run.
+
+    python -m pytest tests/benchmarks/test_state_space_speed.py -o addopts=
+
+Eight states of a helicopter near hover, six outputs, three inputs, 40 frequencies. The peer solves
+all frequencies in one call of `numpy.linalg.solve` and differentiates numerically, as MINPACK does.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import jaxquad as jq
+from jaxquad.identify._band import usable
+from jaxquad.identify._fit import _problem
+from jaxquad.identify._parameters import select_parameters
+from jaxquad.identify._solve import solve
+from jaxquad.models import simulate_linear, StateSpace
+
+
+jax.config.update("jax_enable_x64", True)
+
+OMEGA, ERROR = np.geomspace(0.3, 20.0, 40), 0.02
+# u, v, p, q, w, r, phi, theta; longitudinal, lateral and collective or pedal inputs.
+F = np.zeros((8, 8))
+F[0, [0, 3, 4, 7]] = -0.05, 1.2, 0.1, -9.81
+F[1, [1, 2, 4, 6]] = -0.12, -1.1, 0.2, 9.81
+F[2, [0, 1, 2, 3, 4]] = 0.02, -0.06, -4.5, 0.9, 0.2
+F[3, [0, 1, 2, 3, 4]] = 0.03, 0.02, -0.7, -2.1, 0.3
+F[4, [1, 2, 4]] = 0.05, -0.3, -0.6
+F[5, [1, 2, 5]] = 0.1, -0.2, -0.8
+F[6, 2] = F[7, 3] = 1
+G = np.zeros((8, 3))
+G[:6] = [[0, 0.4, 0.3], [0.5, 0, 0.3], [20, 3, 0.2], [-2, 9, 0.4], [0.6, 0.2, 5], [0.3, 0.1, 4]]
+H0, DELAY = np.eye(6, 8), np.array([0.03, 0.03, 0.02])
+ROWS, COLUMNS = (
+    np.array([0, 0, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4]),
+    np.array([0, 3, 1, 0, 1, 2, 3, 0, 1, 2, 3, 1, 4]),
+)
+PUSHED, PUSHES = np.array([2, 2, 3, 3, 4]), np.array([0, 1, 0, 1, 2])
+TRUTH = np.concatenate([F[ROWS, COLUMNS], G[PUSHED, PUSHES], DELAY[:2]])
+NAMES = [f"F[{i}][{j}]" for i, j in zip(ROWS, COLUMNS, strict=True)]
+NAMES += [f"G[{i}][{j}]" for i, j in zip(PUSHED, PUSHES, strict=True)]
+NAMES += ["input_delay[0]", "input_delay[1]"]
+START = TRUTH * np.exp(0.15 * np.random.default_rng(0).choice([-1, 1], TRUTH.size))
+TURNED = 1j * OMEGA[:, None, None] * np.eye(8)
+
+
+def matrices(values):
+    f, g, late = F.copy(), G.copy(), DELAY.copy()
+    f[ROWS, COLUMNS], g[PUSHED, PUSHES], late[:2] = values[:13], values[13:18], values[18:]
+    return f, g, late
+
+
+def numpy_response(values):
+    f, g, late = matrices(values)
+    states = np.linalg.solve(TURNED - f, g[None].astype(complex))
+    return H0 @ states * np.exp(-1j * OMEGA[:, None] * late)[:, None, :]
+
+
+def measured():
+    rng = np.random.default_rng(1)
+    truth = numpy_response(TRUTH)
+    noise = rng.standard_normal((2, *truth.shape))
+    return truth * (1 + ERROR * (noise[0] + 1j * noise[1]))
+
+
+MEASURED = measured()
+
+
+def peer_residual(z):
+    log = np.log(numpy_response(np.sign(TRUTH) * np.exp(z)) / MEASURED) / ERROR
+    return np.concatenate([log.real.ravel(), log.imag.ravel()])
+
+
+def peer():
+    z = least_squares(peer_residual, np.log(np.abs(START)), method="lm").x
+    return np.sign(TRUTH) * np.exp(z)
+
+
+def model(values):
+    f, g, late = matrices(values)
+    return StateSpace(F=f, G=g, H0=H0, input_delay=late)
+
+
+class _OneSolve(eqx.Module):
+    def weights(self, frf, used, ratio):
+        return jq.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
+
+
+def problem():
+    shape = MEASURED.shape
+    omega, variance = jnp.asarray(OMEGA), 2 * ERROR**2 * np.abs(MEASURED) ** 2
+    frf = jq.FrequencyResponse(
+        omega=omega,
+        response=jnp.asarray(MEASURED),
+        coherence=jnp.full(shape, 0.95),
+        random_error=jnp.full(shape, ERROR),
+        errors=jq.independent_errors(omega, jnp.asarray(variance)),
+        direct_coherence=jnp.full(shape, 0.95),
+        multiple_coherence=jnp.full(shape[:2], 0.95),
+        method="joint",
+        input_names=("lon", "lat", "col"),
+        output_names=("u", "v", "p", "q", "w", "r"),
+    )
+    parameters = select_parameters(model(START), NAMES)
+    cost, used = _OneSolve(), usable(frf, None, 0.6)
+    made = _problem(model(START), parameters, [frf], None, (), cost)
+    return made.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
+
+
+@pytest.mark.benchmark(group="state-space fit")
+def test_scipy_least_squares(benchmark):
+    benchmark(peer)
+
+
+@pytest.mark.benchmark(group="state-space fit")
+def test_solve(benchmark):
+    made = problem()
+    z = made.parameters.start[: TRUTH.size]
+    found = benchmark(lambda: solve(made, z, None, 256).z.block_until_ready())
+    values = np.asarray(made.parameters.values(found))
+    np.testing.assert_allclose(values, peer(), rtol=1e-4, atol=1e-6)
+
+
+@jax.jit
+def response(z):
+    at = model(START)
+    values = jnp.asarray(np.sign(TRUTH)) * jnp.exp(z)
+    late = jnp.concatenate([values[18:], jnp.asarray(DELAY[2:])])
+    f = at.F.at[ROWS, COLUMNS].set(values[:13])
+    return StateSpace(
+        F=f, G=at.G.at[PUSHED, PUSHES].set(values[13:18]), H0=at.H0, input_delay=late
+    ).frequency_response(jnp.asarray(OMEGA))
+
+
+Z = np.log(np.abs(START))
+
+
+@pytest.mark.benchmark(group="response")
+def test_numpy_response(benchmark):
+    benchmark(numpy_response, START)
+
+
+@pytest.mark.benchmark(group="response")
+def test_response(benchmark):
+    found = benchmark(lambda: response(Z).block_until_ready())
+    np.testing.assert_allclose(found, numpy_response(START), rtol=1e-11)
+
+
+@pytest.mark.benchmark(group="Jacobian")
+def test_numpy_differences(benchmark):
+    step = 1e-7 * np.eye(TRUTH.size)
+    benchmark(lambda: [numpy_response(START * (1 + each)) for each in (*step, 0 * step[0])])
+
+
+@pytest.mark.benchmark(group="Jacobian")
+def test_jacobian(benchmark):
+    jacobian = jax.jit(jax.jacfwd(response))
+    benchmark(lambda: jacobian(Z).block_until_ready())
+
+
+@pytest.mark.benchmark(group="20 000 samples, 10 states")
+def test_simulate_a_long_record(benchmark):
+    rng = np.random.default_rng(2)
+    plant = StateSpace(
+        F=rng.standard_normal((10, 10)) - 6 * np.eye(10),
+        G=rng.standard_normal((10, 3)),
+        H0=rng.standard_normal((6, 10)),
+        input_delay=[0.013, 0.02, 0.031],
+    )
+    u = jnp.asarray(rng.standard_normal((20_000, 3)))
+    benchmark(lambda: simulate_linear(plant, u, 0.01).block_until_ready())
