@@ -31,13 +31,28 @@ from .models import (
     Attitude as Attitude,
     AttitudeAxis as AttitudeAxis,
     LaggedIntegrator as LaggedIntegrator,
+    Mode as Mode,
+    modes as modes,
     MotorLag as MotorLag,
     Multirotor as Multirotor,
     QUANSER_HOVER as QUANSER_HOVER,
     quanser_hover as quanser_hover,
     realise as realise,
+    series as series,
     simulate_linear as simulate_linear,
+    state_space as state_space,
+    StateSpace as StateSpace,
     TransferFunction as TransferFunction,
+)
+from .qualities import (
+    attitude_bandwidth as attitude_bandwidth,
+    Bandwidth as Bandwidth,
+    disturbance_rejection as disturbance_rejection,
+    Margins as Margins,
+    margins as margins,
+    Rejection as Rejection,
+    rms_response as rms_response,
+    RmsResponse as RmsResponse,
 )
 from .records import (
     Channel as Channel,
