@@ -79,11 +79,14 @@ from .simulate import (
 )
 from .spectra import (
     Composite as Composite,
+    Distortion as Distortion,
     ErrorCovariance as ErrorCovariance,
     frequency_response as frequency_response,
     FrequencyResponse as FrequencyResponse,
     independent_errors as independent_errors,
     JointInputOutput as JointInputOutput,
+    LocalPolynomial as LocalPolynomial,
+    Periodic as Periodic,
     PrecisionError as PrecisionError,
     spectral_density as spectral_density,
     SpectralDensity as SpectralDensity,

@@ -9,6 +9,7 @@ import pytest
 
 from jaxquad.records import Record, RecordWarning
 from jaxquad.spectra import (
+    Composite,
     frequency_response,
     JointInputOutput,
     PrecisionError,
@@ -41,12 +42,24 @@ def still(channel):
         (np.array([9.0, 5.0]), "omega must rise"),
         (np.array([0.0, 5.0]), "omega must rise from above 0"),
         (np.array([np.nan, 5.0]), "omega must rise"),
-        (np.array([0.2, 5.0]), r"0.2 rad/s is below the 1.881 rad/s .* a window above 31.42 s"),
+        (np.array([0.2, 5.0]), "omega runs from 0.2 to 5 rad/s, the records from one cycle, 0.6283"),
     ],
 )
 def test_an_unusable_band_is_refused_with_its_limits(omega, message):
     with pytest.raises(ValueError, match=message):
         frequency_response(RECORD, omega)
+
+
+@pytest.mark.parametrize(
+    "estimator, message",
+    [
+        (Welch(2.0), r"1.5 rad/s is below the 3.142 rad/s .* a window above 4.189 s"),
+        (Composite(), r"1.5 rad/s is below the 1.881 rad/s of which one cycle fits"),
+    ],
+)
+def test_a_band_below_what_the_window_resolves_is_refused(estimator, message):
+    with pytest.raises(ValueError, match=message):
+        frequency_response(RECORD, np.array([1.5, 5.0]), estimator=estimator)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,12 @@
 from ._composite import Composite as Composite
 from ._density import spectral_density as spectral_density, SpectralDensity as SpectralDensity
+from ._distortion import Distortion as Distortion
 from ._errors import ErrorCovariance as ErrorCovariance, independent_errors as independent_errors
 from ._estimate import frequency_response as frequency_response
 from ._frequency_response import FrequencyResponse as FrequencyResponse
 from ._joint import JointInputOutput as JointInputOutput
+from ._local_polynomial import LocalPolynomial as LocalPolynomial
+from ._periodic import Periodic as Periodic
 from ._precision import (
     PrecisionError as PrecisionError,
     require_float64 as require_float64,

@@ -85,15 +85,7 @@ def check_excited(
     """Raise `ValueError` for a channel that never moves, or a spectrum of mere rounding errors."""
     first = records[0]
     names = first.input_names + (first.reference_names if method == "joint" else ())
-    columns = [[record.channel(name) for name in first.names] for record in records]
-    low, high = (
-        np.array([[reduce(column) for column in mine] for mine in columns])
-        for reduce in (np.min, np.max)
-    )
-    for name, still in zip(first.names, np.all(low == high, axis=0), strict=True):
-        if still and name in names + first.output_names:
-            raise ValueError(f"no excitation: {name!r} is constant; check that it was logged")
-    largest = np.max(np.maximum(np.abs(low), np.abs(high)), axis=0)
+    largest = check_moving(records, method)
     gain = np.sum(window(welch.shape, welch.length(records)))
     for name, level in zip(names, np.sqrt(power), strict=False):
         lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[first.names.index(name)]))
@@ -102,6 +94,23 @@ def check_excited(
                 f"no excitation at {omega[lost[0]]:.4g} rad/s: the spectrum of {name!r} is zero "
                 "there; keep omega within the band that was excited"
             )
+
+
+def check_moving(
+    records: Sequence[Record], method: Literal["direct", "joint"]
+) -> Float[np.ndarray, " channels"]:
+    """The largest value of each channel; `ValueError` for one that is used and never moves."""
+    first = records[0]
+    names = first.input_names + (first.reference_names if method == "joint" else ())
+    columns = [[record.channel(name) for name in first.names] for record in records]
+    low, high = (
+        np.array([[reduce(column) for column in mine] for mine in columns])
+        for reduce in (np.min, np.max)
+    )
+    for name, still in zip(first.names, np.all(low == high, axis=0), strict=True):
+        if still and name in names + first.output_names:
+            raise ValueError(f"no excitation: {name!r} is constant; check that it was logged")
+    return np.max(np.maximum(np.abs(low), np.abs(high)), axis=0)
 
 
 def check_band(omega: Float[ArrayLike, " frequencies"] | None, dt: float) -> None:

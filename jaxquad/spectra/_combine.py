@@ -41,9 +41,9 @@ def combine(
 
         sum_i W_i {(G_xx - G_xx,i)^2 + (G_yy - G_yy,i)^2 + |G_xy - G_xy,i|^2 + 5 (g^2 - g_i^2)^2}
 
-    each part relative to its mean under W_i^2 (G_xx~ and so on). |G_xy~| stands for the textbook's Re G_xy~ and
-    Im G_xy~, one of which may be zero. Only weighted means of the spectra enter, and the phase is
-    that of the mean. Source: Tischler & Remple eq. 10.4.
+    each part relative to its mean under W_i^2 (G_xx~ and so on). |G_xy~| stands for the textbook's
+    Re G_xy~ and Im G_xy~, one of which may be zero. Only weighted means of the spectra enter, and
+    the phase is that of the mean. Source: Tischler & Remple eq. 10.4.
     """
     known = jnp.asarray(resolved)[:, :, None, None]
     weight = jnp.where(known, _weights(parts.coherence, freedom), 0.0)

@@ -50,6 +50,14 @@ class ErrorCovariance(eqx.Module):
 
         return jax.lax.scan(add, start, self._times())[0]
 
+    def variance(self) -> Float[Array, "frequencies outputs inputs"]:
+        """Mean squared error E|dT|^2 of each response, of atoms that are not windows."""
+        if self.windows is not None or self.share is not None:
+            raise ValueError("windows overlap: take the diagonal of errors.between(pair, pair)")
+        gain = jnp.sum(jnp.abs(self.effect) ** 2, axis=2)
+        power = jnp.sum(jnp.abs(self.noise) ** 2, axis=2)
+        return power[:, :, None] * gain[:, None, :]
+
     def between(
         self, first: tuple[int, int], second: tuple[int, int]
     ) -> Complex[np.ndarray, "frequencies frequencies"]:

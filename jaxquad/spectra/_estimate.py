@@ -1,164 +1,53 @@
 from collections.abc import Sequence
-from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float
+from jaxtyping import ArrayLike, Float
 
 from jaxquad.records import Record
 
-from ._average import average, Averaged, Channels
-from ._checks import (
-    check_alike,
-    check_band,
-    check_distinct,
-    check_excited,
-    check_references,
-    check_windows,
-    checked_omega,
-)
+from ._checks import check_alike, check_band, check_distinct, check_references
 from ._composite import Composite
-from ._errors import ErrorCovariance
-from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._inputs import remarks_on_inputs
+from ._from_bins import by_period, by_polynomial
+from ._from_windows import by_windows
 from ._joint import JointInputOutput
-from ._placement import overlaps, place_windows
-from ._segments import Segments, transform_records
+from ._local_polynomial import LocalPolynomial
+from ._periodic import Periodic
+from ._precision import require_x64
 from ._welch import Welch
-from ._window import window
 
 
-Method = Literal["direct", "joint"]
-_CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
-_FEW = (
-    "only {count:.1f} independent windows: coherence is near 1 whatever the signals do, and errors "
-    "are rough; record longer, or use a shorter window"
-)
+Estimator = Welch | Composite | LocalPolynomial | Periodic | JointInputOutput
 
 
 def frequency_response(
     record: Record | Sequence[Record],
     omega: Float[ArrayLike, " frequencies"] | None = None,
     *,
-    estimator: Welch | Composite | JointInputOutput | None = None,
+    estimator: Estimator | None = None,
 ) -> FrequencyResponse:
     """Frequency responses of all outputs to all inputs, of one record or of several together.
 
-    `omega` in rad/s, by default 100 log-spaced values within what the windows can resolve.
-    Several inputs are conditioned on each other: `(Z* X)^-1 Z* Y`. Without an `estimator`,
-    composite windows, by the joint input-output method where the record has references, otherwise
-    the direct one, H1 = G_xx^-1 G_xy (Eq. 13), which then says that feedback may bias it.
+    `omega` in rad/s, by default 100 log-spaced values within what the records can resolve.
+    Several inputs are conditioned on each other. Without an `estimator`, local polynomials, by the
+    joint input-output method where the record has references, otherwise direct, from input to
+    output (H1, Eq. 13), which then says that feedback may bias it.
     Raises `ValueError` for an unusable band or record, `PrecisionError` in 32 bits.
     """
+    require_x64("a frequency response")
     records = [record] if isinstance(record, Record) else list(record)
     check_alike(records)
     check_distinct(records)
+    check_band(omega, records[0].dt)
     if estimator is None:
-        estimator = JointInputOutput() if records[0].reference_names else Composite()
+        estimator = JointInputOutput() if records[0].reference_names else LocalPolynomial()
+    method = "direct"
     if isinstance(estimator, JointInputOutput):
         check_references(records)
-        return _by_windows(records, omega, estimator.spectra, "joint")
-    return _by_windows(records, omega, estimator, "direct")
-
-
-def _by_windows(
-    records: Sequence[Record],
-    omega: Float[ArrayLike, " frequencies"] | None,
-    spectra: Welch | Composite,
-    method: Method,
-) -> FrequencyResponse:
-    check_band(omega, records[0].dt)
-    members = (spectra,) if isinstance(spectra, Welch) else spectra.members(records, omega)
-    omega = checked_omega(omega, records, members[0])
-    segments = transform_records(records, omega, members)
-    channels = _channels(records[0], method)
-    independent = _independent(records, segments)
-    check_windows(independent, segments, channels)
-    found = average(
-        segments.transforms, channels, omega, overlaps(segments.groups, members[0].shape),
-        _scales(segments, members[0], records[0].dt), _resolved(segments, omega * records[0].dt),
-        _freedom(independent, segments, members[0], channels.inputs),
-    )  # fmt: skip
-    check_excited(omega, np.asarray(found.excitation), records, members[0], method)
-    return _result(records, omega, members, segments, found, method)
-
-
-def _channels(record: Record, method: Method) -> Channels:
-    instruments = len(record.reference_names) if method == "joint" else 0
-    return Channels(len(record.input_names), len(record.output_names), instruments)
-
-
-def _independent(records: Sequence[Record], segments: Segments) -> list[float]:
-    """Windows that do not overlap, for each length (n_d)."""
-    return [sum(record.samples for record in records) / length for length, _ in segments.groups]
-
-
-def _scales(segments: Segments, welch: Welch, dt: float) -> Float[np.ndarray, " groups"]:
-    """From mean squared transforms to one-sided densities."""
-    lengths = [length for length, _ in segments.groups]
-    return np.array([2 * dt / np.sum(window(welch.shape, length) ** 2) for length in lengths])
-
-
-def _resolved(
-    segments: Segments, angle: Float[np.ndarray, " frequencies"]
-) -> Bool[np.ndarray, "groups frequencies"]:
-    """Where a window holds `_CYCLES`; the longest serves everywhere."""
-    lengths = np.array([length for length, _ in segments.groups], float)
-    lengths[0] = np.inf
-    return angle[None, :] * lengths[:, None] >= 2 * np.pi * _CYCLES
-
-
-def _freedom(
-    independent: list[float], segments: Segments, welch: Welch, inputs: int
-) -> Float[np.ndarray, "groups 2"]:
-    """Independent windows and the residuals' degrees of freedom, less those that inputs take."""
-    shared, at, rows = overlaps(segments.groups, welch.shape), 0, []
-    for count, (_, starts) in zip(independent, segments.groups, strict=True):
-        mine = shared[at : at + len(starts), at : at + len(starts)]
-        left = np.trace(mine) ** 2 / np.sum(mine**2) - inputs
-        rows.append((max(count - inputs + 1, 0.5), max(float(left), 0.5)))
-        at += len(starts)
-    return np.array(rows)
-
-
-def _result(
-    records: Sequence[Record],
-    omega: Float[np.ndarray, " frequencies"],
-    members: Sequence[Welch],
-    segments: Segments,
-    found: Averaged,
-    method: Method,
-) -> FrequencyResponse:
-    first, dt = records[0], records[0].dt
-    independent = _independent(records, segments)
-    remarks = remarks_on_feedback(
-        method, omega, *(_pairs(each) for each in (
-            np.angle(found.response), found.random_error, found.coherence, found.direct_coherence
-        ))
-    )  # fmt: skip
-    remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
-    if max(independent) < 3:
-        remarks += (_FEW.format(count=max(independent)),)
-    counts = tuple(len(starts) for _, starts in segments.groups)
-    windows = place_windows(segments.groups, members[0].shape, dt, omega[-1] - omega[0])
-    grid = jnp.asarray(omega)
-    return FrequencyResponse(
-        omega=grid,
-        response=found.response,
-        coherence=found.coherence,
-        random_error=found.random_error,
-        errors=ErrorCovariance(grid, found.effect, found.noise, found.share, windows, counts),
-        direct_coherence=found.direct_coherence,
-        multiple_coherence=found.multiple_coherence,
-        method=method,
-        input_names=first.input_names,
-        output_names=first.output_names,
-        remarks=remarks,
-        integrators=members[0].integrators,
-        resolution=2 * np.pi / (segments.groups[0][0] * dt),
-    )
-
-
-def _pairs(columns) -> Float[np.ndarray, "frequencies pairs"]:
-    return np.asarray(columns).reshape(len(columns), -1)
+        method, estimator = "joint", estimator.spectra
+    asked = None if omega is None else np.asarray(omega, float)
+    if isinstance(estimator, LocalPolynomial):
+        return by_polynomial(records, asked, estimator, method)
+    if isinstance(estimator, Periodic):
+        return by_period(records, asked, estimator, method)
+    return by_windows(records, asked, estimator, method)

@@ -4,6 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from ._distortion import Distortion
 from ._errors import ErrorCovariance
 from ._precision import require_float64
 
@@ -30,6 +31,7 @@ class FrequencyResponse(eqx.Module):
     remarks: tuple[str, ...] = eqx.field(static=True, default=())
     integrators: int = eqx.field(static=True, default=0)  # taken out before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle to a window, rad/s
+    distortion: Distortion | None = None  # of a periodic excitation
 
     def __check_init__(self):
         if not isinstance(self.omega, Array | np.ndarray):

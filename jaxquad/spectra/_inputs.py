@@ -30,7 +30,7 @@ def remarks_on_inputs(
             )
         elif np.mean(coherence[:, i]) > _TOGETHER:
             remarks.append(
-                f"input {name} moves with the others: their coherence is {coherence[:, i].mean():.2f} "
-                "on average, above 0.5; conditioned responses have larger errors than each alone"
+                f"input {name} moves with the others: their coherence averages "
+                f"{coherence[:, i].mean():.2f}, above 0.5; conditioned responses have larger errors"
             )
     return tuple(remarks)

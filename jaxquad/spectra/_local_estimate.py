@@ -1,0 +1,183 @@
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from jaxquad.records import Record
+
+from ._errors import ErrorCovariance
+from ._local_bins import Bins, check_bins, enough_bins, recolour, record_bins
+from ._local_error import error_covariance, multiple_coherence, partial_coherence
+from ._local_fit import local_fit, LocalFit, replaced
+from ._local_joint import coherence_of_references, joint_fit
+from ._local_noise import Noise, smooth_noise
+from ._local_polynomial import LocalPolynomial
+from ._local_width import choose_widths, Respond, Shape
+
+
+_FREEDOM = 10  # complex degrees of freedom left over by the least window
+_NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are judged
+_PER_OCTAVE = 4  # frequencies that help to judge, beside those asked for
+
+Grid = Float[np.ndarray, " frequencies"]
+Method = Literal["direct", "joint"]
+
+
+class LocalEstimate(NamedTuple):
+    """What the local polynomial method finds; nan and infinite errors where undetermined.
+
+    `coherence` is what an input explains of an output's power near each frequency, less what the
+    other inputs explain; of the joint estimate, the lesser of what the references explain of the
+    input and of the output. `direct_coherence` is always that from input to output.
+    """
+
+    response: Complex[Array, "frequencies outputs inputs"]
+    coherence: Float[Array, "frequencies outputs inputs"]
+    direct_coherence: Float[Array, "frequencies outputs inputs"]
+    multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
+    errors: ErrorCovariance
+    half_width: Grid  # rad/s
+    rational: Bool[np.ndarray, " frequencies"]  # where a resonance asked for it
+    remarks: tuple[str, ...]
+
+
+def estimate_local_polynomial(
+    records: Sequence[Record], omega: Grid, options: LocalPolynomial, method: Method
+) -> LocalEstimate:
+    """Responses of all outputs to all inputs at rising `omega` in rad/s, records taken together.
+
+    "joint" goes by way of the references, of which there are as many as inputs. Raises
+    `ValueError` for records too short, a band they do not hold, another number of references.
+    """
+    bins = record_bins(records, options.integrators, options.delay)
+    inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
+    if method == "joint":
+        _check_references(records[0], inputs)
+    coefficients, order = inputs * (options.order + 1), options.order
+    check_bins(omega, bins, coefficients, order + 1, _FREEDOM)
+    grid, at = _with_neighbours(omega, bins)
+    least = enough_bins(grid, bins, coefficients, order + 1, _FREEDOM)
+    respond = _responder(bins, inputs, outputs, order, method)
+    narrow_width = np.maximum(least, _NARROW * grid)
+    narrow = _determined(grid, narrow_width, respond)
+    noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
+    width, rational = _widths(grid, least, noise, respond, options)
+    width, rational = width[at], rational[at]
+    fit = _merged(omega, width, rational, respond)
+    direct, multiple = _direct_coherence(bins, inputs, outputs, order, grid, narrow_width)
+    direct = direct[at]
+    coherence = direct
+    if method == "joint":
+        stack = _stack(bins, inputs, outputs, grid, narrow_width, "polynomial", order)
+        coherence = coherence_of_references(grid, narrow_width, stack, inputs)[at]
+    back = recolour(omega, options.integrators, options.delay, records[0].dt)[:, None, None]
+    known = np.isfinite(fit.response)
+    return LocalEstimate(
+        jnp.asarray(fit.response * back),
+        jnp.asarray(np.where(known, coherence, 0.0)),
+        jnp.asarray(np.where(known, direct, 0.0)),
+        jnp.asarray(multiple[at]),
+        error_covariance(omega, fit, noise, at, bins, back),
+        width,
+        rational,
+        _remarks(omega, np.all(known, axis=(1, 2)), least[at], options),
+    )
+
+
+def _check_references(record: Record, inputs: int) -> None:
+    count = record.references.shape[1]
+    if count != inputs:
+        raise ValueError(
+            f"the joint estimate of {inputs} inputs {list(record.input_names)} needs as many "
+            f"outside references; the record has {count}: {list(record.reference_names)}"
+        )
+
+
+def _with_neighbours(
+    omega: Grid, bins: Bins
+) -> tuple[Float[np.ndarray, " grid"], Int[np.ndarray, " frequencies"]]:
+    """`omega` among others, to an octave beyond, and the places it has there."""
+    first, last = max(omega[0] / 2, bins.omega[0]), min(omega[-1] * 2, bins.omega[-1])
+    steps = _PER_OCTAVE * np.log2([first, last])
+    lattice = 2 ** (np.arange(np.ceil(steps[0]), np.floor(steps[1]) + 1) / _PER_OCTAVE)
+    grid = np.union1d(omega, lattice)
+    return grid, np.searchsorted(grid, omega)
+
+
+def _responder(bins: Bins, inputs: int, outputs: int, order: int, method: Method) -> Respond:
+    def direct(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
+        u, y = slice(0, inputs), slice(inputs, inputs + outputs)
+        return local_fit(omega, half_width, bins, u, y, order, shape)
+
+    def joint(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
+        return joint_fit(_stack(bins, inputs, outputs, omega, half_width, shape, order), inputs)
+
+    return direct if method == "direct" else joint
+
+
+def _stack(
+    bins: Bins, inputs: int, outputs: int, omega: Grid, half_width: Grid, shape: Shape, order: int
+) -> LocalFit:
+    """From the references to inputs and outputs."""
+    first = inputs + outputs
+    references, both = slice(first, first + inputs), slice(0, first)
+    return local_fit(omega, half_width, bins, references, both, order, shape)
+
+
+def _determined(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
+    """The fit within `width`, or, between the lines of a multisine, the least that is enough."""
+    fit = respond(grid, width, "polynomial")
+    for _ in range(6):
+        lost = ~np.isfinite(fit.response[:, 0, 0])
+        if not np.any(lost):
+            break
+        width = np.where(lost, 1.5 * width, width)
+        fit = replaced(fit, lost, respond(grid[lost], width[lost], "polynomial"))
+    return fit
+
+
+def _widths(
+    grid: Grid, least: Grid, noise: Noise, respond: Respond, options: LocalPolynomial
+) -> tuple[Grid, Bool[np.ndarray, " frequencies"]]:
+    if options.width is None:
+        return choose_widths(grid, least, noise, respond)
+    return np.full(grid.size, float(options.width)), np.zeros(grid.size, bool)
+
+
+def _merged(
+    omega: Grid, width: Grid, rational: Bool[np.ndarray, " frequencies"], respond: Respond
+) -> LocalFit:
+    """Polynomials, and rational functions where `rational`."""
+    fit = respond(omega, width, "polynomial")
+    if not np.any(rational):
+        return fit
+    return replaced(fit, rational, respond(omega[rational], width[rational], "rational"))
+
+
+def _direct_coherence(
+    bins: Bins, inputs: int, outputs: int, order: int, grid: Grid, half_width: Grid
+) -> tuple[
+    Float[np.ndarray, "frequencies outputs inputs"], Float[np.ndarray, "frequencies outputs"]
+]:
+    """Partial and multiple."""
+    fit = _responder(bins, inputs, outputs, order, "direct")(grid, half_width, "polynomial")
+    noise = smooth_noise(grid, half_width, fit.scatter, fit.freedom)
+    return partial_coherence(fit, noise.power), multiple_coherence(fit, noise.power)
+
+
+def _remarks(
+    omega: Grid, known: Bool[np.ndarray, " frequencies"], least: Grid, options: LocalPolynomial
+) -> tuple[str, ...]:
+    lost = omega[~known]
+    if lost.size == 0:
+        return ()
+    remark = (
+        f"undetermined at {lost.size} of {omega.size} frequencies ({lost[0]:.4g}..{lost[-1]:.4g} "
+        "rad/s): the inputs are not excited there, or not distinguishable from each other or "
+        "from transients"
+    )
+    if options.width is not None:
+        remark += f"; or the width is too small: {np.max(least[~known]):.4g} rad/s holds enough"
+    return (remark,)

@@ -1,0 +1,114 @@
+"""How wide a local window may be before its bias shows above the noise."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ._local_fit import LocalFit, replaced
+from ._local_noise import Noise
+
+
+_RATIO = 1.8  # of successive half-widths
+_WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
+_SMOOTHING = 0.2  # of the tests for bias, in ln(omega)
+_CHANCE = 3e-4  # of refusing a window whose differences, averaged over neighbours, are noise
+_CHANCE_ALONE = 1e-5  # of refusing it for the difference at one frequency
+_DOUBTED = 4.0  # ratio of variances from which a narrower window's word counts for less
+_KNOWN = 0.1  # largest relative error of a rational function that is trusted
+
+Grid = Float[np.ndarray, " frequencies"]
+Powers = Float[np.ndarray, "frequencies outputs"]
+Shape = Literal["polynomial", "rational"]
+Respond = Callable[[Grid, Grid, Shape], LocalFit]
+
+
+def choose_widths(
+    omega: Grid, least: Grid, noise: Noise, respond: Respond
+) -> tuple[Grid, Bool[np.ndarray, " frequencies"]]:
+    """Half-widths from `least` upwards, by intersecting confidence intervals; where rational.
+
+    A wider window is taken while its response agrees with those of all narrower ones within the
+    variance of their difference (Goldenshluger and Nemirovski, 1997), at the frequency and on
+    average over its neighbours. A bias of the size of the noise would hide from that: the window
+    used is one rung lower, where it is some five times smaller. Where the least window leaves
+    more than noise, as at a resonance, a rational function takes the polynomial's place.
+    """
+    widest = np.maximum(_WIDEST * omega, _LEAST_SPAN * least)
+    rungs = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
+    widths = np.stack([np.minimum(least * _RATIO**m, widest) for m in range(rungs)])
+    fits = [respond(omega, widths[0], "polynomial")]
+    for below, width in zip(widths[:-1], widths[1:], strict=True):
+        wider = width > below
+        part = respond(omega[wider], width[wider], "polynomial")
+        fits.append(replaced(fits[-1], wider, part))
+    rational = _resonant(fits, respond(omega, least, "rational"), noise)
+    rung, each = _climb(omega, widths, fits, noise), np.arange(omega.size)
+    gain = np.stack([np.mean(fit.gain, axis=(1, 2)) for fit in fits])
+    # At the lowest frequencies one rung less can cost more than any bias.
+    below = gain[np.maximum(rung - 1, 0), each]
+    dear = ~(below <= _DOUBTED * gain[rung, each])
+    climbed = widths[rung, each] / np.where(dear, 1.0, _RATIO)
+    return np.where(rational, least, np.maximum(climbed, least)), rational
+
+
+def _resonant(
+    fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise
+) -> Bool[np.ndarray, " frequencies"]:
+    """Where the least polynomial is certainly wrong, and a rational function well known.
+
+    The error of a rational function is linear in the noise only while it is small.
+    """
+    pairs = noise.power.shape[1] * sharp.response.shape[2]
+    left = np.real(np.diagonal(fits[0].scatter, axis1=1, axis2=2)) / noise.power
+    wrong = np.any(left > _quantile(fits[0].freedom, noise, _CHANCE_ALONE)[:, None], axis=1)
+    for wide in fits[1:2]:
+        statistic, count = _differences(wide, fits[0], noise.power)
+        alone = _quantile(np.full(len(left), float(pairs)), noise, _CHANCE_ALONE)
+        wrong |= statistic > alone * np.maximum(count, 1)
+    error = noise.power[:, :, None] * sharp.gain
+    known = error < _KNOWN**2 * np.abs(sharp.response) ** 2
+    return wrong & np.all(known, axis=(1, 2))
+
+
+def _climb(
+    omega: Grid,
+    widths: Float[np.ndarray, "rungs frequencies"],
+    fits: Sequence[LocalFit],
+    noise: Noise,
+) -> Int[np.ndarray, " frequencies"]:
+    rung, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
+    kernel = np.exp(-0.5 * ((np.log(omega)[:, None] - np.log(omega)) / _SMOOTHING) ** 2)
+    pairs = noise.power.shape[1] * fits[0].response.shape[2]
+    alone = _quantile(np.full(omega.size, float(pairs)), noise, _CHANCE_ALONE)
+    for m in range(1, len(fits)):
+        windows = 1 + np.sqrt(np.pi) * _SMOOTHING * omega / widths[m]
+        shared = _quantile(pairs * windows, noise, _CHANCE)
+        for narrow in fits[:m]:
+            statistic, count = _differences(fits[m], narrow, noise.power)
+            # One frequency far off, as beside a resonance, says nothing about its neighbours.
+            total = kernel @ np.minimum(statistic, alone * count)
+            going &= total <= shared * (kernel @ count)
+            going &= statistic <= alone * pairs
+        rung = np.where(going, m, rung)
+    return rung
+
+
+def _quantile(count: Grid, noise: Noise, chance: float) -> Grid:
+    """What the mean of `count` squared differences over their estimated variance seldom exceeds."""
+    from scipy.special import fdtri
+
+    return fdtri(2 * count, 2 * np.maximum(noise.freedom, 1.0), 1 - chance)
+
+
+def _differences(wide: LocalFit, narrow: LocalFit, noise: Powers) -> tuple[Grid, Grid]:
+    """Sums over the pairs of squared differences over their variance, and how many pairs count."""
+    # A narrow window much noisier than the wide one tells little of its bias, and costs much.
+    doubt = np.maximum(1.0, narrow.gain / (_DOUBTED * np.maximum(wide.gain, 1e-300)))
+    variance = noise[:, :, None] * (narrow.gain - wide.gain) * doubt
+    tested = variance > 0.02 * noise[:, :, None] * wide.gain
+    tested &= np.isfinite(wide.response) & np.isfinite(narrow.response)
+    apart = np.abs(wide.response - narrow.response) ** 2
+    statistic = np.where(tested, apart / np.where(tested, variance, 1.0), 0.0)
+    return np.sum(statistic, axis=(1, 2)), np.sum(tested, axis=(1, 2)).astype(float)

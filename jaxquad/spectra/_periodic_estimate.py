@@ -1,0 +1,201 @@
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from jaxquad.records import Record
+
+from ._distortion import Distortion
+from ._errors import ErrorCovariance
+from ._periodic import excited_lines, line_frequencies, Periodic, Periods, pooled, record_periods
+from ._realisations import Averages, instrumental, judge_scatter, Scatter
+
+
+_UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
+_UNSETTLED = 4.0  # power of the first period's departure, to that of the noise
+
+Lines = Int[np.ndarray, " frequencies"]
+Coherence = Float[np.ndarray, "frequencies outputs inputs"]
+
+
+class PeriodicEstimate(NamedTuple):
+    """Responses at the excited lines; nan and an immense error where undetermined."""
+
+    omega: Float[np.ndarray, " frequencies"]  # rad/s
+    response: Complex[Array, "frequencies outputs inputs"]
+    coherence: Float[Array, "frequencies outputs inputs"]
+    direct_coherence: Float[Array, "frequencies outputs inputs"]
+    multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
+    errors: ErrorCovariance
+    distortion: Distortion
+    remarks: tuple[str, ...]
+
+
+def estimate_periodic(
+    records: Sequence[Record],
+    omega: Float[np.ndarray, " asked"] | None,
+    options: Periodic,
+    method: Literal["direct", "joint"],
+) -> PeriodicEstimate:
+    """Responses of all outputs to all inputs, by default at all lines that are excited.
+
+    With Z the period averages of the references ("joint") or of the inputs ("direct") over the
+    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which noise fed
+    back to the input does not bias either: only its average over the periods remains. Raises
+    `ValueError` for fewer records than inputs, and for an `omega` that is no excited line.
+    """
+    inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
+    _check(records, inputs, options, method)
+    periods = [record_periods(record, options) for record in records]
+    first = inputs + outputs if method == "joint" else 0
+    instruments = slice(first, first + inputs)
+    grid = line_frequencies(records[0], options)
+    lines = _chosen(excited_lines(periods, instruments), grid, omega)
+    averages = np.stack([each.mean[lines] for each in periods], axis=2)
+    u, y, z = averages[:, :inputs], averages[:, inputs : inputs + outputs], averages[:, instruments]
+    fit = instrumental(u, y, z)
+    scatter = judge_scatter(grid[lines], fit, periods, lines)
+    direct, lesser = _coherence(fit, scatter, periods, lines)
+    return PeriodicEstimate(
+        grid[lines],
+        jnp.asarray(np.where(fit.known[:, None, None], fit.response, np.nan)),
+        jnp.asarray(lesser if method == "joint" else direct),
+        jnp.asarray(direct),
+        jnp.asarray(_multiple(fit, scatter)),
+        _errors(grid[lines], fit, scatter),
+        _distortion(grid[lines], fit, scatter, records[0], len(records)),
+        _remarks(grid[lines], fit, scatter, periods),
+    )
+
+
+def _check(
+    records: Sequence[Record], inputs: int, options: Periodic, method: Literal["direct", "joint"]
+) -> None:
+    sizes = {options.samples(record) for record in records}
+    if len(sizes) > 1:
+        raise ValueError(f"periods of {sorted(sizes)} samples: read the records at one sample_rate")
+    if len(records) < inputs:
+        raise ValueError(
+            f"{inputs} inputs at once need as many records, with other phases in each; there are "
+            f"{len(records)}: record more, or use jq.LocalPolynomial()"
+        )
+    count = records[0].references.shape[1]
+    if method == "joint" and count != inputs:
+        raise ValueError(
+            f"the joint estimate of {inputs} inputs needs as many outside references; the record "
+            f"has {count}: {list(records[0].reference_names)}"
+        )
+
+
+def _chosen(
+    lines: Int[np.ndarray, " excited"],
+    grid: Float[np.ndarray, " lines"],
+    omega: Float[np.ndarray, " asked"] | None,
+) -> Int[np.ndarray, " chosen"]:
+    """The excited lines, or those of `omega`."""
+    if lines.size == 0:
+        raise ValueError(
+            "no harmonic of the period stands out of the noise in the input: check the period, or "
+            "use another estimator for an excitation that is not periodic"
+        )
+    if omega is None:
+        return lines
+    nearest = lines[np.argmin(np.abs(grid[lines][None, :] - omega[:, None]), axis=1)]
+    off = np.abs(grid[nearest] - omega) > 1e-6 * omega + 1e-6 * grid[0]
+    if np.any(off):
+        raise ValueError(
+            f"{omega[off][0]:.6g} rad/s is no excited line: the nearest one is "
+            f"{grid[nearest][off][0]:.6g} rad/s; without omega all {lines.size} lines are taken"
+        )
+    return nearest
+
+
+def _coherence(
+    fit: Averages, scatter: Scatter, periods: Sequence[Periods], lines: Lines
+) -> tuple[Coherence, Coherence]:
+    """Of one period: what an input explains of an output, and the lesser of that and of the
+    repeated part of the input."""
+    inputs = fit.u.shape[1]
+    power = np.einsum("fir,fjr->fij", fit.u, np.conj(fit.u)) / fit.u.shape[2]
+    power = np.where(fit.known[:, None, None], power, np.eye(inputs))
+    alone = 1 / np.real(np.diagonal(np.linalg.inv(power), axis1=1, axis2=2))
+    explained = np.abs(fit.response) ** 2 * alone[:, None, :]
+    left = scatter.noise * scatter.periods + scatter.nonlinear()
+    direct = np.where(fit.known[:, None, None], explained / (explained + left[:, :, None]), 0.0)
+    jitter = pooled(periods)[lines][:, :inputs, :inputs]
+    steady = alone / (alone + np.real(np.diagonal(jitter, axis1=1, axis2=2)))
+    return direct, np.minimum(direct, steady[:, None, :] * fit.known[:, None, None])
+
+
+def _multiple(fit: Averages, scatter: Scatter) -> Float[np.ndarray, "frequencies outputs"]:
+    """Of one period: what all inputs together explain of an output."""
+    explained = np.mean(np.abs(np.nan_to_num(fit.response) @ fit.u) ** 2, axis=2)
+    return explained / (explained + scatter.noise * scatter.periods + scatter.nonlinear())
+
+
+def _errors(
+    omega: Float[np.ndarray, " frequencies"], fit: Averages, scatter: Scatter
+) -> ErrorCovariance:
+    """Each line has noise of its own, as many atoms as inputs."""
+    count, inputs, _ = fit.effect.shape
+    kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
+    kernel = np.where(fit.known[:, None, None], kernel, _UNKNOWN**2 * np.eye(inputs))
+    values, vectors = np.linalg.eigh(kernel)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    effect = np.zeros((count, inputs, count, inputs), complex)
+    effect[np.arange(count), :, np.arange(count)] = root
+    effect = effect.reshape(count, inputs, -1)
+    noise = np.where(fit.known[:, None, None], scatter.root, np.eye(scatter.root.shape[1]))
+    return ErrorCovariance(jnp.asarray(omega), jnp.asarray(effect), jnp.asarray(noise))
+
+
+def _distortion(
+    omega: Float[np.ndarray, " frequencies"],
+    fit: Averages,
+    scatter: Scatter,
+    record: Record,
+    realisations: int,
+) -> Distortion:
+    explained = np.abs(fit.response @ fit.u) ** 2
+    unknown = np.nan if scatter.total is None else 1.0
+    total = scatter.noise if scatter.total is None else scatter.total
+    return Distortion(
+        omega,
+        np.sqrt(np.mean(explained, axis=2)),
+        np.sqrt(scatter.noise),
+        np.sqrt(total) * unknown,
+        np.sqrt(scatter.nonlinear()) * unknown,
+        scatter.significant,
+        record.output_names,
+        realisations,
+    )
+
+
+def _remarks(
+    omega: Float[np.ndarray, " frequencies"],
+    fit: Averages,
+    scatter: Scatter,
+    periods: Sequence[Periods],
+) -> tuple[str, ...]:
+    remarks, lost = [], omega[~fit.known]
+    if lost.size:
+        remarks.append(
+            f"undetermined at {lost.size} of {omega.size} lines ({lost[0]:.4g}..{lost[-1]:.4g} "
+            "rad/s): the records excite the inputs too much alike there"
+        )
+    unsettled = [each.settled for each in periods if each.settled > _UNSETTLED]
+    if unsettled:
+        remarks.append(
+            f"the first period kept differs from the later ones by {max(unsettled):.3g} times the "
+            "power of the noise: a transient is left; discard more periods"
+        )
+    if scatter.total is None:
+        remarks.append(
+            "no more records than inputs: errors hold the noise only; nonlinear distortion shows "
+            "between records whose lines have other phases"
+        )
+    elif np.any(scatter.significant):
+        remarks.append("nonlinear distortion: errors are those of the best linear approximation")
+    return tuple(remarks)
