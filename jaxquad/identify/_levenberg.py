@@ -20,14 +20,14 @@ class Normal(NamedTuple):
     """Half the sum of squares r'r / 2, its gradient J'r and its Gauss-Newton Hessian J'J."""
 
     cost: Float[Array, " *batch"]
-    gradient: Float[Array, "parameters *batch"]
+    gradient: Float[Array, " parameters *batch"]
     hessian: Float[Array, "parameters parameters *batch"]
 
 
 class Descent(NamedTuple):
     """Where each member of the batch stands, and how damped its next step is."""
 
-    z: Float[Array, "parameters *batch"]
+    z: Float[Array, " parameters *batch"]
     normal: Normal
     damping: Float[Array, " *batch"]  # in units of the largest diagonal element of the Hessian
     growth: Float[Array, " *batch"]  # of the damping, should the next step fail
@@ -35,12 +35,12 @@ class Descent(NamedTuple):
     status: Int[Array, " *batch"]
 
 
-Evaluate = Callable[[Float[Array, "parameters *batch"]], Normal]
+Evaluate = Callable[[Float[Array, " parameters *batch"]], Normal]
 
 
 def minimise(
     evaluate: Evaluate,
-    z0: Float[Array, "parameters *batch"],
+    z0: Float[Array, " parameters *batch"],
     max_steps: int,
     tolerance: float = TOLERANCE,
 ) -> Descent:
@@ -53,7 +53,6 @@ def minimise(
     batch = z0.shape[1:]
     counter = jnp.zeros(batch, int)
     normal = evaluate(z0)
-    # Nothing but a start where the model is not finite can be known to lead nowhere.
     status = jnp.where(_finite(normal), RUNNING, STALLED)
     start = Descent(
         z0, normal, jnp.full(batch, 1e-3), jnp.full(batch, 2.0), counter, counter + status
@@ -73,9 +72,10 @@ def minimise(
 
 
 def _step(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float) -> Descent:
-    size = _size(state.normal.hessian)
-    damping = state.damping * size
-    change, definite = solve_definite(_damped(state.normal.hessian, damping), -state.normal.gradient)
+    damping = state.damping * _size(state.normal.hessian)
+    change, definite = solve_definite(
+        _damped(state.normal.hessian, damping), -state.normal.gradient
+    )
     predicted = 0.5 * jnp.sum(change * (damping[None] * change - state.normal.gradient), axis=0)
     trial = state.z + change
     normal = evaluate(trial)
@@ -93,15 +93,20 @@ def _step(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float) 
     damping = jnp.maximum(state.damping * factor, 1e-14)
     status = jnp.where(small, CONVERGED, jnp.where(damping > 1e16, STALLED, RUNNING))
     taken = active & accepted
-    select = lambda old, new: jax.tree.map(lambda a, b: jnp.where(taken, b, a), old, new)
     return Descent(
-        select(state.z, trial),
-        select(state.normal, normal),
+        _select(taken, trial, state.z),
+        Normal(*(_select(taken, *pair) for pair in zip(normal, state.normal, strict=True))),
         jnp.where(active, damping, state.damping),
         jnp.where(accepted, 2.0, 2 * state.growth),
         state.steps + active.astype(int),
         jnp.where(active, status, state.status),
     )
+
+
+def _select(
+    which: Bool[Array, " *batch"], yes: Float[Array, "..."], no: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    return jnp.where(which.reshape((1,) * (yes.ndim - which.ndim) + which.shape), yes, no)
 
 
 def decrement(normal: Normal) -> Float[Array, " *batch"]:
@@ -114,8 +119,8 @@ def decrement(normal: Normal) -> Float[Array, " *batch"]:
 
 def solve_definite(
     matrix: Float[Array, "parameters parameters *batch"],
-    vector: Float[Array, "parameters *batch"],
-) -> tuple[Float[Array, "parameters *batch"], Bool[Array, " *batch"]]:
+    vector: Float[Array, " parameters *batch"],
+) -> tuple[Float[Array, " parameters *batch"], Bool[Array, " *batch"]]:
     """Gauss-Jordan elimination of a symmetric matrix, and whether it is positive definite."""
     count = vector.shape[0]
     rows = np.arange(count).reshape((count,) + (1,) * vector.ndim)
@@ -123,7 +128,7 @@ def solve_definite(
     def eliminate(k, state):
         system, definite = state
         pivot = system[k, k]
-        row = system[k] / pivot
+        row = system[k] / pivot[None]
         others = system - system[:, k][:, None] * row[None]
         return jnp.where(rows == k, row[None], others), definite & (pivot > 0)
 

@@ -56,7 +56,8 @@ def solution_at(stop: Stop, facts: tuple, derivatives: Sensitivity) -> Solution:
     """A stop with its reason in words, on the host."""
     converged, steps = bool(stop.converged), int(stop.steps)
     message = "" if converged else f"{_reason(stop.reason)} (after {steps} steps)"
-    return Solution(stop.z, *facts, message, converged, steps, derivatives)
+    model, values, slopes = facts
+    return Solution(stop.z, model, values, slopes, message, converged, steps, derivatives)
 
 
 @eqx.filter_jit

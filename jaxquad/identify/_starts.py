@@ -1,0 +1,189 @@
+"""Local minima: many starting points, solved at once, and what each of them led to."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ._levenberg import CONVERGED, decrement, Descent, minimise, Normal, RUNNING, TOLERANCE
+from ._parameters import Parameters
+from ._problem import Problem, residuals
+from ._solve import describe, least_squares, normal_equations, Solution, solution_at, Stop
+
+
+MINIMUM = "minimum"
+FLAT = "flat: some change of parameters leaves the cost as it is"
+SADDLE = "stationary, but no minimum: the cost falls to one side"
+WALL = "a wall: no shorter step lowers the cost, yet its slope is not zero"
+UNFINISHED = "the maximum number of steps was reached"
+NOWHERE = "the model is not finite at the start"
+
+
+class Minimum(NamedTuple):
+    """A point at which solves from some of the starts stopped."""
+
+    cost: float  # sum of squares
+    z: Float[np.ndarray, " parameters"]
+    values: Float[np.ndarray, " parameters"]  # physical
+    starts: tuple[int, ...]  # which of them led here
+    decrement: float  # what one more Gauss-Newton step would save of half the cost
+    curvature: float  # smallest eigenvalue of the cost's Hessian, scaled to unit diagonal
+    kind: str  # "minimum", or what it is instead
+
+    @property
+    def is_minimum(self) -> bool:
+        """Whether slope and curvature are those of a minimum, isolated or flat."""
+        return self.kind in (MINIMUM, FLAT)
+
+
+def spread_starts(
+    parameters: Parameters,
+    count: int,
+    *,
+    fastest: float,
+    factor: float = 5.0,
+    seed: int = 0,
+) -> Float[np.ndarray, "starts parameters"]:
+    """Starting vectors `z`: the given start, then a Latin hypercube around it.
+
+    Parameters that keep their sign spread over `factor` to both sides, evenly in the logarithm;
+    those that may cross zero over twice their scale. A delay stays below half a turn at the
+    `fastest` frequency (rad/s), beyond which its minima repeat every turn: it is a parameter whose
+    name ends in `delay`. Raises ValueError for no starts, or a factor that spreads nothing.
+    """
+    if count < 1:
+        raise ValueError(f"starts is {count}: give 1 for the given start alone, or more")
+    if not (1 < factor < np.inf and 0 < fastest < np.inf):
+        raise ValueError(
+            f"factor {factor} and fastest frequency {fastest} rad/s: give a finite factor above 1, "
+            "for instance 5, and a positive frequency"
+        )
+    n, rng = parameters.count, np.random.default_rng(seed)
+    start, scale = (np.asarray(x)[:n] for x in (parameters.start, parameters.scale))
+    cells = np.stack([rng.permutation(count - 1) for _ in range(n)], axis=1).reshape(count - 1, n)
+    unit = (cells + rng.uniform(size=cells.shape)) / max(count - 1, 1)
+    logarithmic = np.array(parameters.logarithmic[:n])
+    reach = np.where(logarithmic, np.log(factor), 2.0)
+    low, high = start - reach, start + reach
+    for k, name in enumerate(parameters.names):
+        if name.split(".")[-1].split("[")[0].endswith("delay") and logarithmic[k]:
+            most = max(np.log(np.pi / fastest / abs(scale[k])), start[k])
+            high[k] = min(high[k], most)
+    return np.concatenate([start[None], low + (high - low) * unit])
+
+
+def solve_from_many(
+    problem: Problem,
+    starts: Float[np.ndarray, "starts parameters"],
+    solver: Any,
+    max_steps: int,
+) -> tuple[Solution, tuple[Minimum, ...]]:
+    """Solve from every start in one call; the best point, and all distinct ones, best first.
+
+    A minimum comes before a wall of lower cost only in the first result: the tuple is sorted by
+    cost. Starts of `solver=None` run side by side, those of an optimistix solver one by one, since
+    its LAPACK calls can hang under `vmap`. Raises ValueError if no start has a finite response.
+    """
+    z, status, normal, steps, bent = _solve_all(problem, jnp.asarray(starts), solver, max_steps)
+    host = jax.tree.map(np.asarray, (z, status, normal, bent))
+    found = _distinct(problem.parameters, *host)
+    if not any(np.isfinite(point.cost) for point in found):
+        raise ValueError(
+            f"the model's response is not finite at any of {len(starts)} starts: check the model "
+            "at its starting values with model.frequency_response(omega)"
+        )
+    best = min(found, key=lambda point: (not point.is_minimum, point.cost))
+    k = best.starts[0]
+    stop = Stop(z[k], jnp.asarray(best.is_minimum), status[k], steps[k])
+    return solution_at(stop, *_describe(z[k], problem)), found
+
+
+_describe = eqx.filter_jit(describe)
+
+
+@eqx.filter_jit
+def _solve_all(problem, starts, solver, max_steps):
+    def normal_at(z):
+        return normal_equations(residuals, z, problem)
+
+    if solver is None:
+        side_by_side = jax.vmap(normal_at, in_axes=-1, out_axes=-1)
+        state: Descent = minimise(side_by_side, starts.T, max_steps, TOLERANCE)
+        z, status, steps = state.z.T, state.status, state.steps
+    else:
+        solve = lambda z0: least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
+        stop = jax.lax.map(solve, starts)
+        z, steps = stop.z, stop.steps
+        status = jnp.where(stop.converged, CONVERGED, RUNNING)
+    normal = jax.vmap(normal_at)(z)
+    # Forward over forward: a model need not support reverse differentiation.
+    bent = jax.vmap(jax.jacfwd(lambda z: normal_at(z).gradient))(z)
+    return z, status, normal, steps, bent
+
+
+def _distinct(
+    parameters: Parameters,
+    z: np.ndarray,
+    status: np.ndarray,
+    normal: Normal,
+    bent: Float[np.ndarray, "starts parameters parameters"],
+) -> tuple[Minimum, ...]:
+    """Stops that no more than a millionth of the cost tells apart are one point."""
+    order = [int(k) for k in np.argsort(normal.cost) if np.isfinite(normal.cost[k])]
+    groups: list[list[int]] = []
+    for k in order:
+        for group in groups:
+            if _same(z[group[0]] - z[k], normal, group[0], k):
+                group.append(k)
+                break
+        else:
+            groups.append([k])
+    points = [_point(parameters, z, status, normal, bent, group) for group in groups]
+    lost = tuple(k for k in range(len(z)) if not np.isfinite(normal.cost[k]))
+    if lost:
+        first = z[lost[0]]
+        values = np.asarray(parameters.values(jnp.asarray(first)))
+        points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOWHERE))
+    return tuple(points)
+
+
+def _same(apart: np.ndarray, normal: Normal, one: int, other: int) -> bool:
+    floor = 1e-6 * (normal.cost[one] + 1e-6)
+    if abs(normal.cost[other] - normal.cost[one]) > floor:
+        return False
+    near = bool(np.max(np.abs(apart)) <= 1e-4)
+    return near or bool(0.5 * apart @ normal.hessian[one] @ apart <= floor)
+
+
+def _point(parameters, z, status, normal, bent, group) -> Minimum:
+    k = group[0]
+    left = float(decrement(Normal(*(jnp.asarray(part[k]) for part in normal))))
+    curvature = _curvature(bent[k])
+    return Minimum(
+        cost=2 * float(normal.cost[k]),
+        z=z[k],
+        values=np.asarray(parameters.values(jnp.asarray(z[k]))),
+        starts=tuple(sorted(group)),
+        decrement=left,
+        curvature=curvature,
+        kind=_kind(int(status[k]), left, float(normal.cost[k]), curvature),
+    )
+
+
+def _curvature(hessian: Float[np.ndarray, "parameters parameters"]) -> float:
+    if not np.all(np.isfinite(hessian)):
+        return -np.inf
+    size = np.sqrt(np.maximum(np.abs(np.diagonal(hessian)), 1e-300))
+    return float(np.linalg.eigvalsh(hessian / np.outer(size, size))[0])
+
+
+def _kind(status: int, left: float, cost: float, curvature: float) -> str:
+    # Noise-free data leave a cost of rounding errors, of which no share means anything.
+    if left > 1e-6 * cost + 1e-12:
+        return UNFINISHED if status == RUNNING else WALL
+    if curvature < -1e-6:
+        return SADDLE
+    return MINIMUM if curvature > 1e-9 else FLAT
