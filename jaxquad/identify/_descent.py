@@ -25,7 +25,7 @@ def descend(samples: Samples, start: Rational, *, steps: int, free_delay: bool) 
     """Lower the cost of `start` by damped Gauss-Newton; a delay stops at 0.
 
     The unknowns are polynomials orthonormal over the grid, made afresh at each step: dP/P for the
-    numerator P, dQ/Q for the denominator Q. So orders of 8 and ranges of many decades cost no digits.
+    numerator P, dQ/Q for the denominator Q. High orders and many decades then cost no digits.
     """
     best, damping = assessed(samples, start), 1e-2
     tangent = None
@@ -37,7 +37,7 @@ def descend(samples: Samples, start: Rational, *, steps: int, free_delay: bool) 
             if not np.all(np.isfinite(tangent.jacobian)):
                 break
         step = _step(samples, best, tangent, damping)
-        trial = assessed(samples, _moved(best, tangent, step))
+        trial = assessed(samples, _moved(samples, best, tangent, step))
         if not trial.cost < best.cost:
             if np.max(np.abs(step)) < _CONVERGED * np.sqrt(2 * samples.s.size):
                 break
@@ -54,9 +54,9 @@ def _tangent(samples: Samples, model: Rational, free_delay: bool) -> _Tangent:
         over, from_over = basis(s, 1 / polyval(s, model.above), model.above.size - 1)
         under, from_under = basis(s, 1 / polyval(s, model.below), max(poles - 1, 0))
     under, from_under = under[:, :poles], from_under[:, :poles]
-    late = s[:, None] / np.abs(s).max() if free_delay else s[:, :0, None].reshape(s.size, 0)
+    late = np.reshape(s / samples.omega[-1], (-1, 1))[:, : int(free_delay)]
     columns = np.concatenate([over, -under, -late], axis=1)
-    parts = np.stack([columns.real, columns.imag], axis=1) * samples.weights[:, :, None]
+    parts = np.stack([np.real(columns), np.imag(columns)], axis=1) * samples.weights[:, :, None]
     return _Tangent(from_over, from_under, parts.reshape(2 * s.size, -1))
 
 
@@ -64,12 +64,10 @@ def _step(
     samples: Samples, model: Rational, tangent: _Tangent, damping: float
 ) -> Float[np.ndarray, " unknowns"]:
     residual, jacobian = misfit(samples, model).reshape(-1), tangent.jacobian
-    free = np.ones(jacobian.shape[1], bool)
-    step = _damped(jacobian, residual, damping)
-    held = model.delay == 0 and jacobian.shape[1] > _known(tangent) and step[-1] < 0
-    if held:
-        free[-1], step[-1] = False, 0.0
-        step[free] = _damped(jacobian[:, free], residual, damping)
+    step, others = _damped(jacobian, residual, damping), _known(tangent)
+    if model.delay == 0 and np.any(step[others:] < 0):
+        held = _damped(jacobian[:, :others], residual, damping)
+        step = np.append(held, 0.0)
     return step
 
 
@@ -88,10 +86,11 @@ def _damped(
     return np.linalg.lstsq(rows, -np.pad(residual, (0, size.size)), rcond=None)[0] / size
 
 
-def _moved(model: Rational, tangent: _Tangent, step: Float[np.ndarray, " unknowns"]) -> Rational:
-    split = [tangent.over.shape[1], _known(tangent)]
-    over, under, late = np.split(step, split)
+def _moved(
+    samples: Samples, model: Rational, tangent: _Tangent, step: Float[np.ndarray, " unknowns"]
+) -> Rational:
+    over, under, late = np.split(step, [tangent.over.shape[1], _known(tangent)])
     below = model.below.copy()
     below[:-1] += (tangent.under @ under)[: below.size - 1]
-    delay = model.delay
-    return Rational(model.above + tangent.over @ over, below, delay + float(late.sum()))
+    delay = model.delay + float(late.sum()) / float(samples.omega[-1])
+    return Rational(model.above + tangent.over @ over, below, max(delay, 0.0))

@@ -8,8 +8,8 @@ from numpy.polynomial.polynomial import polyval
 
 
 Grid = Complex[np.ndarray, " frequencies"]
-Coefficients = Float[np.ndarray, " powers"]
-_SK_STEPS = 15
+Coefficients = Float[np.ndarray, " _"]
+_SK_STEPS = 12
 
 
 class Samples(NamedTuple):
@@ -19,6 +19,11 @@ class Samples(NamedTuple):
     response: Grid  # without the integrators that are taken as given
     weights: Float[np.ndarray, "frequencies 2"]  # of the misfit of ln-magnitude and phase
     unit: float  # rad/s
+
+    @property
+    def omega(self) -> Float[np.ndarray, " frequencies"]:
+        """Over `unit`."""
+        return np.imag(self.s)
 
     @property
     def trust(self) -> Float[np.ndarray, " frequencies"]:
@@ -39,7 +44,7 @@ def misfit(samples: Samples, model: Rational) -> Float[np.ndarray, "frequencies 
     """Weighted ln-magnitude and wrapped phase (rad) of model over measurement."""
     ratio = polyval(samples.s, model.above) / polyval(samples.s, model.below) / samples.response
     log = np.log(ratio * np.exp(-model.delay * samples.s))
-    return samples.weights * np.stack([log.real, log.imag], axis=1)
+    return samples.weights * np.stack([np.real(log), np.imag(log)], axis=1)
 
 
 def assessed(samples: Samples, model: Rational) -> Rational:
@@ -63,7 +68,7 @@ def basis(
     vector, powers = start, np.eye(degree + 1)[0]
     for k in range(degree + 1):
         if k:
-            vector, powers = s * values[:, k - 1], np.roll(coefficients[:, k - 1], 1)
+            vector, powers = s * values[:, k - 1], np.append(0.0, coefficients[:-1, k - 1])
         for _ in range(2):
             shared = np.real(values[:, :k].conj().T @ vector)
             vector = vector - values[:, :k] @ shared
@@ -80,8 +85,7 @@ def sanathanan_koerner(samples: Samples, zeros: int, poles: int, delay: float) -
     either side. Source: Sanathanan and Koerner, IEEE Trans. Automatic Control 8 (1963), p. 56.
     """
     target = samples.response * np.exp(delay * samples.s)
-    size = np.abs(samples.s)
-    corners = np.geomspace(size.min(), size.max(), poles + 2)[1:-1]
+    corners = np.geomspace(samples.omega[0], samples.omega[-1], poles + 2)[1:-1]
     last = np.prod(samples.s[:, None] + corners, axis=1)
     best = Rational(np.zeros(zeros + 1), np.eye(poles + 1)[-1], delay)
     for _ in range(_SK_STEPS):
@@ -102,10 +106,10 @@ def _linear_fit(
     under, from_under = basis(samples.s, samples.trust / last, poles)
     shared = np.real(over.conj().T @ under)
     rest = under - over @ shared
-    parts = np.concatenate([rest.real, rest.imag])
+    parts = np.concatenate([np.real(rest), np.imag(rest)])
     if not np.all(np.isfinite(parts)):
         return np.full(zeros + 1, np.nan), np.full(poles + 1, np.nan)
     # No coefficient can be set to 1 beforehand: any of them may be the one that is 0.
-    choice = np.linalg.svd(parts)[2][-1]
+    choice = np.linalg.svd(parts, full_matrices=False)[2][-1]
     above, below = from_over @ (shared @ choice), from_under @ choice
     return above / below[-1], below / below[-1]

@@ -1,0 +1,167 @@
+"""A fitted transfer function as gain, zeros and poles with their standard errors."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jaxquad.models import TransferFunction
+
+from ._cancellation import FEWER
+from ._combination import Combination
+from ._factor_text import factors_text
+from ._identifiable import LIMIT, NotIdentifiable
+from ._result import Fit
+
+
+_CLOSE = 3.0  # standard errors between two roots, within which they count as repeated
+
+
+class Factor(NamedTuple):
+    """`(s + a)` for a real root -a, or `s^2 + 2 zeta omega s + omega^2` for a pair.
+
+    `values` are (a,) or (zeta, omega), in rad/s, nan where the record does not determine them.
+    The errors of a `repeated` root are nan: a root that may split has no first-order error.
+    """
+
+    root: complex  # rad/s; the upper one of a pair
+    values: tuple[float, ...]
+    standard_errors: tuple[float, ...]
+    repeated: bool = False
+
+
+class Factors(eqx.Module):
+    """Gain, zeros, poles and delay; `str` is the field's shorthand, `gain (a) / [zeta, omega]`."""
+
+    gain: Combination  # of the highest powers
+    zeros: tuple[Factor, ...]
+    poles: tuple[Factor, ...]
+    integrators: int
+    delay: Combination  # s; its error is 0 where it was fixed
+
+    def __str__(self) -> str:
+        return factors_text(self)
+
+
+class _Spread(NamedTuple):
+    """What turns slopes by the parameters' relative changes into standard errors."""
+
+    covariance: Float[np.ndarray, "parameters parameters"]
+    exact: Float[np.ndarray, "null parameters"]
+    identifiable: bool
+
+    def error(self, slope: Float[np.ndarray, " parameters"]) -> float:
+        """Infinite along a direction that changes nothing."""
+        if np.any(np.abs(self.exact @ slope) > 1e-6 * np.linalg.norm(slope)):
+            return np.inf
+        return float(np.sqrt(max(slope @ self.covariance @ slope, 0.0)))
+
+    def given(self, value: float, slope: Float[np.ndarray, " parameters"]) -> tuple[float, float]:
+        """Value and error, or nan and infinity if the error is too large for a number."""
+        error = self.error(slope)
+        lost = not self.identifiable and not error <= LIMIT * abs(value)
+        return (np.nan, np.inf) if lost else (value, error)
+
+
+def factors(fit: Fit) -> Factors:
+    """Factor the transfer function of a fit; errors by first-order propagation.
+
+    A coefficient that moves by dc_j moves a root r of P by -r^j dc_j / P'(r). Raises ValueError
+    if the model is no `jq.TransferFunction`, `NotIdentifiable` if no coefficient is determined.
+    """
+    model = fit.model
+    if not isinstance(model, TransferFunction):
+        raise ValueError(
+            f"factors of a {type(model).__name__}: only a fit of a jq.TransferFunction has them; "
+            "see jq.fit_transfer_function"
+        )
+    if np.all(np.isnan(fit.values)):
+        reasons = [remark for remark in fit.remarks if FEWER in remark]
+        advice = "; ".join(reasons) or "fit fewer zeros and poles, or excite a wider band"
+        raise NotIdentifiable(f"no factors, for no coefficient is determined: {advice}")
+    spread = _Spread(fit.relative_covariance, fit.identifiability.exact, fit.identifiable)
+    above, below = (np.asarray(c) for c in (model.numerator, model.denominator))
+    gain_slope = (
+        _slopes(fit, "numerator", 1)[0] / below[0]
+        - above[0] / below[0] ** 2 * (_slopes(fit, "denominator", 1)[0])
+    )
+    late = _slopes(fit, "delay", 1)[0]
+    integrators = _integrators(fit, below)
+    return Factors(
+        gain=Combination("gain", *spread.given(float(above[0] / below[0]), gain_slope)),
+        zeros=_factored(above, _slopes(fit, "numerator", above.size), spread),
+        poles=_factored(
+            below[: below.size - integrators],
+            _slopes(fit, "denominator", below.size - integrators),
+            spread,
+        ),
+        integrators=integrators,
+        delay=Combination("delay", *spread.given(float(model.delay), late)),
+    )
+
+
+def _slopes(fit: Fit, leaf: str, count: int) -> Float[np.ndarray, "coefficients parameters"]:
+    """Derivatives of coefficients by the relative changes of the free parameters."""
+    rows = np.zeros((count, len(fit.names)))
+    for k, name in enumerate(fit.names):
+        where, _, index = name.partition("[")
+        row = int(index.rstrip("]") or 0)
+        if where == leaf and row < count:
+            rows[row, k] = fit.units[k]
+    return rows
+
+
+def _integrators(fit: Fit, below: Float[np.ndarray, " powers"]) -> int:
+    """Poles that are fixed at 0."""
+    fixed = [c == 0 and f"denominator[{k}]" not in fit.names for k, c in enumerate(below)]
+    return len(fixed) if all(fixed) else fixed[::-1].index(False)
+
+
+def _factored(
+    coefficients: Float[np.ndarray, " powers"],
+    slopes: Float[np.ndarray, "powers parameters"],
+    spread: _Spread,
+) -> tuple[Factor, ...]:
+    """The factors of one polynomial, slowest first."""
+    roots = np.roots(coefficients).astype(complex)
+    upper = sorted(np.flatnonzero(np.imag(roots) >= 0), key=lambda k: abs(roots[k]))
+    powers = np.arange(coefficients.size - 1, -1, -1)
+    found = []
+    for k in upper:
+        steep = np.polyval(np.polyder(coefficients), roots[k])
+        with np.errstate(all="ignore"):
+            slope = -(roots[k] ** powers) @ slopes / steep
+        repeated = _is_repeated(np.delete(roots, k), roots[k], slope, spread)
+        found.append(_factor(complex(roots[k]), slope, repeated, spread))
+    return tuple(found)
+
+
+def _is_repeated(
+    others: Complex[np.ndarray, " others"],
+    root: complex,
+    slope: Complex[np.ndarray, " parameters"],
+    spread: _Spread,
+) -> bool:
+    """Whether another root lies so near that the sum and difference of the two are mixed up."""
+    apart = float(np.min(np.abs(others - root), initial=np.inf))
+    if apart <= 1e-6 * abs(root) or not np.all(np.isfinite(slope)):
+        return True
+    error = np.hypot(spread.error(np.real(slope)), spread.error(np.imag(slope)))
+    return bool(apart < min(_CLOSE * error, LIMIT * abs(root)))
+
+
+def _factor(
+    root: complex, slope: Complex[np.ndarray, " parameters"], repeated: bool, spread: _Spread
+) -> Factor:
+    size, across, along = abs(root), np.real(slope), np.imag(slope)
+    if root.imag == 0:
+        pairs = [(-root.real, -across)]
+    else:
+        wider = (root.real * across + root.imag * along) / size
+        damping = -root.real / size
+        pairs = [(damping, -(across + damping * wider) / size), (size, wider)]
+    if repeated:
+        return Factor(root, tuple(v for v, _ in pairs), (np.nan,) * len(pairs), True)
+    given = [spread.given(*pair) for pair in pairs]
+    return Factor(root, tuple(v for v, _ in given), tuple(e for _, e in given))
