@@ -11,6 +11,7 @@ from .excitation import (
     three_two_one_one as three_two_one_one,
 )
 from .identify import (
+    BatchFit as BatchFit,
     CoherenceWeighted as CoherenceWeighted,
     Combination as Combination,
     Factor as Factor,
@@ -18,10 +19,12 @@ from .identify import (
     factors as factors,
     Fit as Fit,
     fit as fit,
+    fit_batch as fit_batch,
     fit_transfer_function as fit_transfer_function,
     guess_lagged_integrator as guess_lagged_integrator,
     guess_transfer_function as guess_transfer_function,
     MaximumLikelihood as MaximumLikelihood,
+    Minimum as Minimum,
     NotIdentifiable as NotIdentifiable,
     Positive as Positive,
     Prior as Prior,

@@ -147,4 +147,4 @@ def condition_number(bread: Matrix) -> float:
     """Condition of the weighted Jacobian with columns of unit length."""
     scale = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
     values = np.linalg.eigvalsh(bread / np.outer(scale, scale))
-    return float(np.sqrt(values[-1] / max(values[0], 1e-30 * values[-1])))
+    return float(np.sqrt(values[-1] / max(values[0], 1e-30 * values[-1], 1e-300)))

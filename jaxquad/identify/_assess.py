@@ -37,9 +37,16 @@ from ._remarks import (
 )
 from ._result import Fit
 from ._solve import same_responses, Solution
+from ._starts import Minimum
+from ._stationary import remarks_on_minima
 
 
-def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution) -> Fit:
+def assess(
+    problem: Problem,
+    frfs: Sequence[FrequencyResponse],
+    solution: Solution,
+    minima: tuple[Minimum, ...] = (),
+) -> Fit:
     """Costs, bounds, calibrated covariance and identifiability at the solution."""
     parameters, count = problem.parameters, problem.parameters.count
     units = _units(problem, solution)
@@ -83,12 +90,14 @@ def assess(problem: Problem, frfs: Sequence[FrequencyResponse], solution: Soluti
         remarks=(
             *dict.fromkeys(remark for frf in frfs for remark in frf.remarks),
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
+            *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_leakage(problem, frfs, solution),
             *remarks_on_priors(known.misfit, verdict, by_data),
         ),
         parameters=parameters,
         units=units[:count],
         relative_covariance=covariance,
+        minima=minima,
     )
 
 

@@ -12,6 +12,7 @@ from ._cost import MaximumLikelihood
 from ._descent import descend
 from ._identifiable import Identifiability
 from ._rational import Rational, Samples
+from ._remarks import FEWER
 from ._result import Fit
 from ._transfer_function_guess import search, Structure, usable_samples
 
@@ -20,7 +21,6 @@ from ._transfer_function_guess import search, Structure, usable_samples
 # lowers the squared misfit by 9 in 1 of 100 cases, and by 13.5 at most in 200.
 _CHANCE = 15.0
 _BEYOND = 20.0  # times the highest frequency, from which a pole is a constant
-FEWER = "fit those orders"
 
 
 def idle_pair(

@@ -4,11 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxquad.spectra import FrequencyResponse
 
-from ._cost import Cost
-from ._problem import Problem
+from ._cost import Cost, MaximumLikelihood
+from ._parameters import name_places
+from ._problem import Prior, Problem
 from ._solve import Solution
 
 
@@ -41,6 +43,19 @@ def check_options(cost: Any, band: Any, min_coherence: float, max_steps: int) ->
         raise ValueError(f"min_coherence is {min_coherence}: it lies between 0 and 1, usually 0.6")
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}: give at least 1")
+
+
+def check_knowledge(model: PyTree, priors: Sequence[Prior], cost: Cost) -> None:
+    """Priors that the cost cannot weigh, or that speak of what the model does not have."""
+    if priors and not isinstance(cost, MaximumLikelihood):
+        raise ValueError(
+            "a prior has a standard error, but the cost (14) has no noise to weigh it against: "
+            "pass cost=jq.MaximumLikelihood()"
+        )
+    known = [place.name for place in name_places(model)] if priors else []
+    for prior in priors:
+        if isinstance(prior.quantity, str) and prior.quantity not in known:
+            raise ValueError(f"no parameter {prior.quantity!r} for a prior; there are: {known}")
 
 
 def check_finite(solution: Solution) -> None:

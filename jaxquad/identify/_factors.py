@@ -8,10 +8,10 @@ from jaxtyping import Complex, Float
 
 from jaxquad.models import TransferFunction
 
-from ._cancellation import FEWER
 from ._combination import Combination
 from ._factor_text import factors_text
 from ._identifiable import LIMIT, NotIdentifiable
+from ._remarks import FEWER
 from ._result import Fit
 
 

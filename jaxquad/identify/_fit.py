@@ -11,16 +11,18 @@ from ._assess import assess
 from ._band import Band, usable
 from ._checks import (
     check_finite,
+    check_knowledge,
     check_options,
     check_priors,
     checked_responses,
 )
-from ._cost import CoherenceWeighted, Cost, Mask, MaximumLikelihood
+from ._cost import CoherenceWeighted, Cost, Mask, Ratio, Weights
 from ._identifiable import NotIdentifiable
-from ._parameters import Free, name_places, Parameters, select_parameters, Tie
-from ._problem import Condition, Prior, Problem, quantity_of, unchanged
+from ._parameters import Free, Parameters, select_parameters, Tie
+from ._problem import Condition, make_problem, Prior, Problem
 from ._result import Fit
 from ._solve import Solution, solve
+from ._starts import Minimum, solve_from_many, spread_starts
 
 
 def fit(
@@ -34,6 +36,7 @@ def fit(
     priors: Sequence[Prior] = (),
     band: Band = None,
     min_coherence: float = 0.6,
+    starts: int = 1,
     solver: Any = None,
     max_steps: int = 256,
 ) -> Fit:
@@ -47,7 +50,8 @@ def fit(
     `(None, lambda m: m.with_added_inertia(0.03))`. `priors` are known values with standard errors.
     Only frequencies within `band` (rad/s) with a coherence of at least `min_coherence` count; a
     mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs a band of their own, or `None` to
-    leave them out.
+    leave them out. With several `starts`, a Latin hypercube around the given one is solved side by
+    side, and `Fit.minima` lists all distinct stops with their costs.
     `solver` is any optimistix least-squares solver, Levenberg-Marquardt by default.
 
     Raises `NotIdentifiable` where too few frequencies are usable, `ValueError` for names that
@@ -60,11 +64,12 @@ def fit(
     parameters = select_parameters(model, free, tied)
     used = [usable(one, band, min_coherence) for one in frfs]
     _check_points(frfs, used, parameters, min_coherence, band)
-    problem = _problem(model, parameters, frfs, conditions, priors, cost)
-    problem, solution = _solve_reweighted(problem, frfs, used, cost, solver, max_steps)
+    check_knowledge(model, priors, cost)
+    problem = make_problem(model, parameters, frfs, conditions, priors)
+    problem, solution, minima = _solved(problem, frfs, used, cost, (starts, solver, max_steps))
     check_finite(solution)
     check_priors(problem, solution)
-    return assess(problem, frfs, solution)
+    return assess(problem, frfs, solution, minima)
 
 
 def _check_points(
@@ -88,44 +93,35 @@ def _check_points(
         )
 
 
-def _problem(model, parameters, frfs, conditions, priors, cost) -> Problem:
-    conditions = [None] * len(frfs) if conditions is None else list(conditions)
-    if len(conditions) != len(frfs):
-        raise ValueError(f"{len(conditions)} conditions for {len(frfs)} responses: give one each")
-    if priors and not isinstance(cost, MaximumLikelihood):
-        raise ValueError(
-            "a prior has a standard error, but the cost (14) has no noise to weigh it against: "
-            "pass cost=jq.MaximumLikelihood()"
-        )
-    known = [place.name for place in name_places(model)] if priors else []
-    for prior in priors:
-        if isinstance(prior.quantity, str) and prior.quantity not in known:
-            raise ValueError(f"no parameter {prior.quantity!r} for a prior; there are: {known}")
-    numbers = [[prior.value, prior.standard_error] for prior in priors]
-    shapes = [(*frf.response.shape, 2) for frf in frfs]
-    return Problem(
-        model=model,
-        parameters=parameters,
-        conditions=tuple(condition or unchanged for condition in conditions),
-        quantities=tuple(quantity_of(prior.quantity) for prior in priors),
-        omega=tuple(frf.omega for frf in frfs),
-        # Where a response is unknown its weight is zero, and nan times zero is not.
-        measured=tuple(jnp.where(jnp.isfinite(f.response), f.response, 1.0) for f in frfs),
-        weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
-        known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
-    )
-
-
-def _solve_reweighted(problem, frfs, used, cost, solver, max_steps) -> tuple[Problem, Solution]:
+def _solved(
+    problem: Problem,
+    frfs: Sequence[FrequencyResponse],
+    used: Sequence[Mask],
+    cost: Cost,
+    how: tuple[int, Any, int],
+) -> tuple[Problem, Solution, tuple[Minimum, ...]]:
     """Solve, and once more where the weights depend on the model that came out."""
-    ratios = [np.ones(mask.shape) for mask in used]
-    weights = [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
-    z = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count])
+    starts, solver, max_steps = how
+    weights = _weights(cost, frfs, used, [np.ones(mask.shape) for mask in used])
     problem = problem.weighted([jnp.asarray(each) for each in weights])
-    solution = solve(problem, z, solver, max_steps)
-    ratios = [np.exp(np.asarray(part)[..., 0]) for part in solution.sensitivity.misfits]
-    again = [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
+    z, minima = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count]), ()
+    if starts == 1:
+        solution = solve(problem, z, solver, max_steps)
+    else:
+        fastest = max(float(frf.omega[-1]) for frf in frfs)
+        spread = spread_starts(problem.parameters, starts, fastest=fastest)
+        solution, minima = solve_from_many(problem, spread, solver, max_steps)
+    again = _weights(cost, frfs, used, ratios(solution))
     if all(np.allclose(old, new, rtol=1e-4) for old, new in zip(weights, again, strict=True)):
-        return problem, solution
+        return problem, solution, minima
     problem = problem.weighted([jnp.asarray(each) for each in again])
-    return problem, solve(problem, solution.z, solver, max_steps)
+    return problem, solve(problem, solution.z, solver, max_steps), minima
+
+
+def _weights(cost: Cost, frfs, used, ratios) -> list[Weights]:
+    return [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
+
+
+def ratios(solution: Solution) -> list[Ratio]:
+    """|model / measurement| at a solution."""
+    return [np.exp(np.asarray(part)[..., 0]) for part in solution.sensitivity.misfits]

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
+from jaxquad.spectra import FrequencyResponse
+
 from ._parameters import Parameters
 
 
@@ -48,6 +50,32 @@ class Problem(eqx.Module):
     def weighted(self, weights: Sequence[Float[Array, "..."]]) -> "Problem":
         """The same problem under other weights."""
         return dataclasses.replace(self, weights=tuple(weights))
+
+
+def make_problem(
+    model: PyTree,
+    parameters: Parameters,
+    frfs: Sequence[FrequencyResponse],
+    conditions: Sequence[Condition | None] | None = None,
+    priors: Sequence[Prior] = (),
+) -> Problem:
+    """The problem of these responses, under weights of zero."""
+    conditions = [None] * len(frfs) if conditions is None else list(conditions)
+    if len(conditions) != len(frfs):
+        raise ValueError(f"{len(conditions)} conditions for {len(frfs)} responses: give one each")
+    numbers = [[prior.value, prior.standard_error] for prior in priors]
+    shapes = [(*frf.response.shape, 2) for frf in frfs]
+    return Problem(
+        model=model,
+        parameters=parameters,
+        conditions=tuple(condition or unchanged for condition in conditions),
+        quantities=tuple(quantity_of(prior.quantity) for prior in priors),
+        omega=tuple(frf.omega for frf in frfs),
+        # Where a response is unknown its weight is zero, and nan times zero is not.
+        measured=tuple(jnp.where(jnp.isfinite(f.response), f.response, 1.0) for f in frfs),
+        weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
+        known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
+    )
 
 
 def unchanged(model: PyTree) -> PyTree:

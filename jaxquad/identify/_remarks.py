@@ -14,6 +14,7 @@ from ._solve import Solution
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 FAILED = 1e-2  # share of the cost that a step would still save, from which nothing is a result
+FEWER = "fit those orders"  # the advice where a pole and a zero do nothing
 _POOR = 10.0  # ratio from which a wrong minimum is likely
 _LOCAL = ", or this is a local minimum: try other starting values"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity

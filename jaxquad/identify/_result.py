@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PyTree
 from ._combination import Combination
 from ._identifiable import Identifiability, NotIdentifiable
 from ._parameters import Parameters
+from ._starts import Minimum
 from ._table import fit_table
 
 
@@ -41,6 +42,7 @@ class Fit(eqx.Module):
     parameters: Parameters
     units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
     relative_covariance: Float[np.ndarray, "parameters parameters"]
+    minima: tuple[Minimum, ...] = ()  # distinct stops of several starts, by the first weights
 
     @property
     def identifiable(self) -> bool:

@@ -4,10 +4,15 @@ from typing import Any
 
 import numpy as np
 
+from ._remarks import FEWER
+
+
+_SHOWN = 6  # stops of several starts
+
 
 def fit_table(fit: Any) -> str:
     """Identifiability first, then the table of parameters, then how good the fit is."""
-    lines = [*_verdict(fit), *_parameters(fit), _quality(fit)]
+    lines = [*_verdict(fit), *_parameters(fit), _quality(fit), *_minima(fit)]
     return "\n".join(lines + [f"! {remark}" for remark in fit.remarks])
 
 
@@ -28,7 +33,7 @@ def _verdict(fit: Any) -> list[str]:
     for direction in fit.null_directions:
         parts = ", ".join(f"{share:+.3f} {name}" for name, share in direction.items())
         lines.append(f"  null direction (relative changes that change nothing): {parts}")
-    if not any("ran to" in remark for remark in fit.remarks):
+    if not any("ran to" in remark or FEWER in remark for remark in fit.remarks):
         lines += _remedies(lost)
     return lines
 
@@ -55,6 +60,19 @@ def _parameters(fit: Any) -> list[str]:
             cells += [f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:7.2f}"]
         lines.append(" ".join([f"{name:<{width}}", *cells]))
     return lines
+
+
+def _minima(fit: Any) -> list[str]:
+    """Where the starts led, if there were several."""
+    if not fit.minima:
+        return []
+    starts = sum(len(point.starts) for point in fit.minima)
+    lines = [f"{starts} starts led to {len(fit.minima)} points:"]
+    for point in fit.minima[:_SHOWN]:
+        values = ", ".join(f"{value:.4g}" for value in point.values)
+        lines.append(f"  cost {point.cost:9.4g} from {len(point.starts)}: {point.kind}; {values}")
+    rest = len(fit.minima) - _SHOWN
+    return lines + ([f"  and {rest} more of higher cost"] if rest > 0 else [])
 
 
 def _quality(fit: Any) -> str:

@@ -19,6 +19,7 @@ from ._local_width import choose_widths, Respond, Shape
 
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
 _NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are judged
+_SHARPER = 0.5  # of a residual's power, that noise alone seldom leaves of it
 _PER_OCTAVE = 4  # frequencies that help to judge, beside those asked for
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -62,6 +63,7 @@ def estimate_local_polynomial(
     respond = _responder(bins, inputs, outputs, order, method)
     narrow_width = np.maximum(least, _NARROW * grid)
     narrow = _determined(grid, narrow_width, respond)
+    narrow = _least_residual(narrow, respond(grid, narrow_width, "rational"))
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
     width, rational = _widths(grid, least, noise, respond, options)
     width, rational = width[at], rational[at]
@@ -124,6 +126,20 @@ def _stack(
     first = inputs + outputs
     references, both = slice(first, first + inputs), slice(0, first)
     return local_fit(omega, half_width, bins, references, both, order, shape)
+
+
+def _least_residual(polynomial: LocalFit, rational: LocalFit) -> LocalFit:
+    """The rational fit where it leaves so much less that a resonance must be in the window."""
+    left = [np.real(np.diagonal(fit.scatter, axis1=1, axis2=2)) for fit in (polynomial, rational)]
+    with np.errstate(invalid="ignore"):
+        sharper = np.any(left[1] < _SHARPER * left[0], axis=1)
+    return (
+        replaced(polynomial, sharper, _rows(rational, sharper)) if np.any(sharper) else polynomial
+    )
+
+
+def _rows(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"]) -> LocalFit:
+    return LocalFit(*(field[rows] for field in fit))
 
 
 def _determined(grid: Grid, width: Grid, respond: Respond) -> LocalFit:

@@ -25,9 +25,10 @@ class Noise(NamedTuple):
         return np.exp(np.stack(columns, axis=1))
 
     def root(self) -> Complex[np.ndarray, "frequencies outputs outputs"]:
-        """Hermitian roots of the covariances."""
+        """Roots of the covariances, which change along frequency as slowly as they do."""
         values, vectors = np.linalg.eigh(self.correlation)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        stretched = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        root = stretched @ np.conj(np.swapaxes(vectors, 1, 2))
         return np.sqrt(self.power)[:, :, None] * root
 
 

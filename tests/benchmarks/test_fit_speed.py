@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 import jaxquad as jq
 from jaxquad.identify._band import usable
-from jaxquad.identify._fit import _problem
+from jaxquad.identify._problem import make_problem
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._solve import solve
 
@@ -107,7 +107,7 @@ def test_scipy_least_squares(benchmark, frf):
 def test_solve(benchmark, frf):
     parameters = select_parameters(_model(), None)
     cost = _OneSolve()
-    problem = _problem(_model(), parameters, [frf], None, (), cost)
+    problem = make_problem(_model(), parameters, [frf])
     used = usable(frf, None, 0.6)
     problem = problem.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
     found = benchmark(lambda: solve(problem, parameters.start[:5], None, 256).z.block_until_ready())

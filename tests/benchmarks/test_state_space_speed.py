@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 import jaxquad as jq
 from jaxquad.identify._band import usable
-from jaxquad.identify._fit import _problem
+from jaxquad.identify._problem import make_problem
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._solve import solve
 from jaxquad.models import simulate_linear, StateSpace
@@ -108,7 +108,7 @@ def problem():
     )
     parameters = select_parameters(model(START), NAMES)
     cost, used = _OneSolve(), usable(frf, None, 0.6)
-    made = _problem(model(START), parameters, [frf], None, (), cost)
+    made = make_problem(model(START), parameters, [frf])
     return made.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
 
 
