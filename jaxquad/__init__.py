@@ -87,8 +87,11 @@ from .simulate import (
 )
 from .spectra import (
     Composite as Composite,
+    deembed as deembed,
     Distortion as Distortion,
     ErrorCovariance as ErrorCovariance,
+    Feedback as Feedback,
+    feedback_pull as feedback_pull,
     frequency_response as frequency_response,
     FrequencyResponse as FrequencyResponse,
     independent_errors as independent_errors,

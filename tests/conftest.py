@@ -1,6 +1,10 @@
 import os
 from pathlib import Path
 
+
+# Many small matrices: threads would only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 

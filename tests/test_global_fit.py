@@ -57,7 +57,7 @@ def test_all_stops_are_listed_by_cost_and_say_what_they_are(many):
 
 
 class Even(eqx.Module):
-    """A response that depends on the square of a number: at 0 it is stationary whatever the data."""
+    """A response that depends on the square of a number: stationary at 0 whatever the data."""
 
     root: jax.Array
 

@@ -42,7 +42,7 @@ def still(channel):
         (np.array([9.0, 5.0]), "omega must rise"),
         (np.array([0.0, 5.0]), "omega must rise from above 0"),
         (np.array([np.nan, 5.0]), "omega must rise"),
-        (np.array([0.2, 5.0]), "omega runs from 0.2 to 5 rad/s, the records from one cycle, 0.6283"),
+        (np.array([0.2, 5.0]), "runs from 0.2 to 5 rad/s, the records from one cycle, 0.6283"),
     ],
 )
 def test_an_unusable_band_is_refused_with_its_limits(omega, message):

@@ -11,7 +11,7 @@ from jaxquad.models._transfer_function import imaginary
 
 
 class Pair(eqx.Module):
-    """Two lags that share a gain, of opposite signs: y1 = K u / (T s + 1), y2 = -K u / (S s + 1)."""
+    """Two lags that share a gain, of opposite signs: K u / (T s + 1) and -K u / (S s + 1)."""
 
     gains: jnp.ndarray
     lags: jnp.ndarray

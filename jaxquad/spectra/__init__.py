@@ -1,4 +1,5 @@
 from ._composite import Composite as Composite
+from ._deembed import deembed as deembed
 from ._density import spectral_density as spectral_density, SpectralDensity as SpectralDensity
 from ._distortion import Distortion as Distortion
 from ._errors import ErrorCovariance as ErrorCovariance, independent_errors as independent_errors
@@ -12,4 +13,5 @@ from ._precision import (
     require_float64 as require_float64,
     require_x64 as require_x64,
 )
+from ._pull import Feedback as Feedback, feedback_pull as feedback_pull
 from ._welch import Welch as Welch

@@ -24,7 +24,7 @@ jax.config.update("jax_enable_x64", True)
 
 RATE = 50.0
 RATIO_DB = 25.0  # signal to noise
-BAND = np.geomspace(0.6, 40.0, 50)
+BAND = (0.6, 40.0)  # rad/s
 
 
 class Airframe(eqx.Module):
@@ -173,8 +173,9 @@ def studies() -> dict[str, Study]:
     }
 
 
-def omega_of(name: str) -> np.ndarray:
-    return np.geomspace(0.4, 22.0, 40) if name == "two inputs" else BAND
+def omega_of(name: str, frequencies: int = 50) -> np.ndarray:
+    low, high = (0.4, 22.0) if name == "two inputs" else BAND
+    return np.geomspace(low, high, frequencies)
 
 
 def draw(study: Study, omega: np.ndarray, draws: int) -> tuple[np.ndarray, np.ndarray]:
