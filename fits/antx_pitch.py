@@ -21,8 +21,8 @@ jax.config.update("jax_enable_x64", True)
 
 BAND = (2 * np.pi * 0.7, 2 * np.pi * 12.0)  # rad/s
 OMEGA = np.geomspace(*BAND, 80)
-WELCH = jq.Welch(integrators=1, delay=0.024)
-ESTIMATORS = {"joint": jq.JointInputOutput(WELCH), "direct": WELCH}
+SPECTRA = jq.LocalPolynomial(integrators=1, delay=0.024)
+ESTIMATORS = {"joint": jq.JointInputOutput(SPECTRA), "direct": SPECTRA}
 COSTS = {"maximum likelihood": jq.MaximumLikelihood(), "Eq. (14)": jq.CoherenceWeighted()}
 START = jq.LaggedIntegrator(gain=200.0, lag=0.02, delay=0.01)
 READ = ft.partial(

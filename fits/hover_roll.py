@@ -23,8 +23,8 @@ ADDED = 0.0276  # kg m^2, known weights on the arms in the second run: half the 
 SHEET = jq.QUANSER_HOVER
 TRUTH = SHEET.arm * SHEET.thrust_coefficient / SHEET.inertia[0]
 OMEGA = np.geomspace(0.35, 12.0, 60)  # rad/s
-WELCH = jq.Welch(integrators=2, delay=0.02)
-ESTIMATORS = {"joint": jq.JointInputOutput(WELCH), "direct": WELCH}
+SPECTRA = jq.LocalPolynomial(integrators=2, delay=0.02)
+ESTIMATORS = {"joint": jq.JointInputOutput(SPECTRA), "direct": SPECTRA}
 COSTS = {"maximum likelihood": jq.MaximumLikelihood(), "Eq. (14)": jq.CoherenceWeighted()}
 # A wrong first guess; the held input is half a sample late.
 START = jq.AttitudeAxis(L=SHEET.arm, K_t=0.2, J_x=0.1, lag=0.03, delay=DT / 2)

@@ -8,23 +8,34 @@ from jaxtyping import Array, Float
 
 from .identify import (
     CoherenceWeighted,
+    factors,
     Fit,
     fit,
+    fit_transfer_function,
     guess_lagged_integrator,
     MaximumLikelihood,
     NotIdentifiable,
     Verification,
     verify,
 )
-from .models import LaggedIntegrator
+from .models import LaggedIntegrator, TransferFunction
 from .records import read, Record
 from .report import bode, comparison, overlay, record_figure, write_results
-from .spectra import frequency_response, FrequencyResponse, JointInputOutput, Welch
+from .spectra import (
+    Composite,
+    Estimator,
+    frequency_response,
+    FrequencyResponse,
+    JointInputOutput,
+    LocalPolynomial,
+    Welch,
+)
 
 
 Outcome = Fit | NotIdentifiable  # the exception stands for the fit where there is none
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
+_LATE = 0.02  # of the record: a delay above it is no delay of the vehicle
 
 
 def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | None]:
@@ -39,7 +50,10 @@ def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | N
         frfs[method], outcomes[method] = _fit_twice(record, method, options)
     frf, outcome = frfs[methods[0]], outcomes[methods[0]]
     print(f"{record}\n\n{frf}\n\n{_formula(options)}, {methods[0]} estimate:\n{outcome}")
-    late = {} if options.no_lag or options.no_delay else {"lag + delay": _late}
+    ordered = options.poles is not None
+    if ordered and isinstance(outcome, Fit):
+        print(factors(outcome))
+    late = {} if ordered or options.no_lag or options.no_delay else {"lag + delay": _late}
     if options.reference:
         print(f"\n{comparison(outcomes, late)}")
     elif late and isinstance(outcome, Fit):
@@ -70,23 +84,40 @@ def _record(options: Namespace) -> Record:
 def _fit_twice(
     record: Record, method: str, options: Namespace
 ) -> tuple[FrequencyResponse, Outcome]:
-    """The second response is windowed with the delay that the first fit found."""
+    """The second response is estimated with the delay that the first fit found taken out."""
     band, delay = _band(options), 0.0
     omega = np.geomspace(*band, _POINTS) if band else None
-    fixed = {"lag": options.no_lag, "delay": options.no_delay}
-    free = ["gain", *(name for name, is_fixed in fixed.items() if not is_fixed)]
     while True:
-        welch = Welch(options.window, integrators=options.integrators, delay=delay)
-        estimator = JointInputOutput(welch) if method == "joint" else welch
-        frf = frequency_response(record, omega, estimator=estimator)
+        frf = frequency_response(record, omega, estimator=_estimator(options, method, delay))
         try:
-            found = fit(_start(frf, options), frf, free=free, cost=_COSTS[options.cost])
+            found = _fitted(frf, options)
         except NotIdentifiable as error:
             return frf, error
         late = record.dt * round(float(_late(found.model)) / record.dt)
-        if delay or not 0 < late < 0.1 * record.dt * welch.length([record]):
+        if delay or not 0 < late < _LATE * record.duration:
             return frf, found
         delay = late
+
+
+def _estimator(options: Namespace, method: str, delay: float) -> Estimator:
+    late = {"integrators": options.integrators, "delay": delay}
+    spectra = {
+        "local": LocalPolynomial(**late),
+        "composite": Composite(**late),
+        "welch": Welch(options.window, **late),
+    }["welch" if options.window else options.estimator]
+    return JointInputOutput(spectra) if method == "joint" else spectra
+
+
+def _fitted(frf: FrequencyResponse, options: Namespace) -> Fit:
+    cost, fixed = _COSTS[options.cost], {"lag": options.no_lag, "delay": options.no_delay}
+    if options.poles is not None:
+        n = options.integrators
+        delay = 0.0 if options.no_delay else "free"
+        orders = {"zeros": options.zeros, "poles": options.poles + n, "integrators": n}
+        return fit_transfer_function(frf, delay=delay, cost=cost, **orders)
+    free = ["gain", *(name for name, is_fixed in fixed.items() if not is_fixed)]
+    return fit(_start(frf, options), frf, free=free, cost=cost)
 
 
 def _band(options: Namespace) -> tuple[float, float] | None:
@@ -107,9 +138,9 @@ def _start(frf: FrequencyResponse, options: Namespace) -> LaggedIntegrator:
     return LaggedIntegrator(guess.gain, lag, delay, options.integrators)
 
 
-def _late(model: LaggedIntegrator) -> Float[Array, ""]:
+def _late(model: LaggedIntegrator | TransferFunction) -> Float[Array, ""]:
     """The sum of lag and delay, which a record determines better than either."""
-    return model.lag + model.delay
+    return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
 
 
 def _sum(found: Fit) -> str:
@@ -126,6 +157,9 @@ def _formula(options: Namespace) -> str:
     below = " ".join(factors)
     above = "K" if options.no_delay else "K e^(-delay s)"
     [output], [source] = options.output, options.input
+    if options.poles is not None:
+        kind = f"{options.zeros} zeros over {options.poles} poles and {n} integrators"
+        return f"{output} / {source}, {kind}{'' if options.no_delay else ', delayed'}"
     ratio = f" / ({below})" if len(factors) > 1 else f" / {below}" if factors else ""
     return f"{output} / {source} = {above}{ratio}"
 

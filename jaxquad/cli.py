@@ -17,6 +17,7 @@ _LIST = """example:
 _FIT = """examples:
   jaxquad identify flight.npz --input M --output q --reference x0 --rate 250 --start 50 --stop 76
   jaxquad identify flight.csv --input "roll=-m1-m2+m3+0.5*m4" --output p --band 0.7 12 --no-lag
+  jaxquad identify flight.csv --input elevator --output q --integrators 0 --poles 3 --zeros 1
   jaxquad identify a.npz --input "cmd[0]" --output "rate[0]" --verify b.npz --json > fit.json
 
 exit codes: 0, 2 for what cannot be used, 3 where the record does not determine the parameters
@@ -91,12 +92,18 @@ def _add_identify(command: argparse.ArgumentParser) -> None:
     add("--stop", help="in the file's time", **seconds)
     band = command.add_mutually_exclusive_group()
     for name, unit in (("--band", "Hz"), ("--band-rad", "rad/s")):
-        text = f"{unit}, to fit within; by default what the window resolves"
+        text = f"{unit}, to fit within; by default what the record resolves"
         band.add_argument(name, type=float, nargs=2, metavar=("LOW", "HIGH"), help=text)
     add("--integrators", type=int, default=1, help="n: 1 from a moment to a rate, 2 to an angle")
     add("--no-lag", action="store_true", help="a model without a lag")
     add("--no-delay", action="store_true", help="a model without a delay")
-    add("--window", help="length of a window; by default a fifth of the record", **seconds)
+    add("--poles", type=int, metavar="N", help="fit a transfer function of so many poles beside "
+        "the integrators, instead of a lag")  # fmt: skip
+    add("--zeros", type=int, metavar="N", default=0, help="and of so many zeros")
+    add("--estimator", choices=("local", "composite", "welch"), default="local",
+        help="local polynomials, composite windows, or windows of one length")  # fmt: skip
+    add("--window", help="length of a window for welch, a fifth of the record by default",
+        **seconds)  # fmt: skip
     add("--cost", choices=("ml", "coherence"), default="ml",
         help="maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14)")  # fmt: skip
     add("--verify", type=Path, metavar="FILE", help="a record with the same channels to simulate")

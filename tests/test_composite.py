@@ -81,7 +81,7 @@ def spectra(seed, groups=3, frequencies=7):
     ones = jnp.ones(shape[:3])
     return Conditioned(
         response=jnp.asarray(response),
-        effect=jnp.zeros((groups, frequencies, 1, 4), complex),
+        solver=jnp.zeros((groups, frequencies, 1, 1), complex),
         power=jnp.asarray(gain),
         alone=ones,
         answer=jnp.asarray(np.abs(response) ** 2 * gain[..., None] / coherence),

@@ -3,7 +3,7 @@ from ._deembed import deembed as deembed
 from ._density import spectral_density as spectral_density, SpectralDensity as SpectralDensity
 from ._distortion import Distortion as Distortion
 from ._errors import ErrorCovariance as ErrorCovariance, independent_errors as independent_errors
-from ._estimate import frequency_response as frequency_response
+from ._estimate import Estimator as Estimator, frequency_response as frequency_response
 from ._frequency_response import FrequencyResponse as FrequencyResponse
 from ._joint import JointInputOutput as JointInputOutput
 from ._local_polynomial import LocalPolynomial as LocalPolynomial

@@ -9,19 +9,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from ._combine import alone, combine, Combined
-from ._conditioned import condition, Conditioned
+from ._conditioned import Channels, condition, Conditioned
 from ._noise import noise_root
 
 
 _ALIKE = 1e-4  # share of an input's power below which it cannot be told from the others
-
-
-class Channels(NamedTuple):
-    """How many channels are inputs, outputs and instruments; without instruments, inputs serve."""
-
-    inputs: int
-    outputs: int
-    instruments: int
 
 
 class Averaged(NamedTuple):
@@ -50,20 +42,22 @@ def average(
     """One response from all window lengths, with the effect of noise in each window.
 
     `freedom` holds, for each length, the independent windows less the inputs, and the degrees of
-    freedom of the residuals. Lengths with fewer windows are filled up with zeros.
+    freedom of the residuals.
     """
     averages, left = jnp.asarray(freedom).T
-    counts = jnp.asarray([float(len(part)) for part in transforms])
-    z, x, y = _split(_stacked(transforms), channels)
-    parts = jax.vmap(condition)(z, x, y, counts)
-    combined = combine(parts, scales, averages, resolved) if len(transforms) > 1 else alone(parts)
+    many = tuple(len(part) for part in transforms)
+    flat = jnp.swapaxes(jnp.concatenate(transforms), 0, 1)
+    rows = jnp.split(flat, np.cumsum(many)[:-1], axis=1)
+    products = jnp.stack([jnp.conj(jnp.swapaxes(row, 1, 2)) @ row for row in rows])
+    counts = jnp.asarray(many, float)
+    parts = _conditioned(products, channels, counts)
+    combined = combine(parts, scales, averages, resolved) if len(many) > 1 else alone(parts)
     apart = jnp.einsum("fig,gfi->fi", jnp.mean(combined.share, axis=1), parts.alone)
     lost = ~(apart >= _ALIKE)
     parts, combined = _without(jnp.any(lost, axis=1), parts, combined)
-    many = tuple(len(part) for part in transforms)
-    effect = jnp.concatenate([parts.effect[g, :, :, :n] for g, n in enumerate(many)], axis=2)
-    flat = jnp.swapaxes(jnp.concatenate(transforms), 0, 1)
-    _, inputs, outputs = _split(flat, channels)
+    z, inputs, outputs = channels.split(flat)
+    split = jnp.split(jnp.conj(jnp.swapaxes(z, 1, 2)), np.cumsum(many)[:-1], axis=2)
+    effect = jnp.concatenate([s @ c for s, c in zip(parts.solver, split, strict=True)], axis=2)
     gain, trace = _unit_noise(effect, combined.share, inputs, jnp.asarray(overlap), many)
     weights = jnp.mean(combined.share, axis=2)
     trust = jnp.where(jnp.any(lost, axis=1), 1e-9, 1.0)[:, None, None]
@@ -77,29 +71,18 @@ def average(
         jnp.where(gone, jnp.nan, combined.response),
         jnp.where(gone, 0.0, combined.coherence),
         jnp.where(gone, jnp.inf, error),
-        _direct(x, y, counts, combined, channels),
+        _direct(products, counts, combined, channels),
         jnp.einsum("fog,gfo->fo", weights, parts.multiple),
         1 - jnp.nan_to_num(apart),
         effect,
         combined.share,
         noise,
-        _excitation(transforms[0], channels),
+        _excitation(products[0] / many[0], channels),
     )
 
 
-def _stacked(
-    transforms: tuple[Complex[Array, "_ frequencies channels"], ...],
-) -> Complex[Array, "groups frequencies windows channels"]:
-    most = max(len(part) for part in transforms)
-    padded = [jnp.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in transforms]
-    return jnp.swapaxes(jnp.stack(padded), 1, 2)
-
-
-def _split(rows: Complex[Array, "*groups windows channels"], channels: Channels):
-    """Instruments, inputs and outputs."""
-    n, m = channels.inputs, channels.inputs + channels.outputs
-    x = rows[..., :n]
-    return (rows[..., m : m + n] if channels.instruments else x), x, rows[..., n:m]
+def _conditioned(products, channels: Channels, counts: Float[Array, " groups"]) -> Conditioned:
+    return jax.vmap(lambda p, count: condition(p, channels, count))(products, counts)
 
 
 def _without(
@@ -108,7 +91,7 @@ def _without(
     """Finite numbers where inputs cannot be told apart, which are marked as lost elsewhere."""
     gone = lost[:, None, None]
     clean = parts._replace(
-        effect=jnp.where(gone[None], 0.0, parts.effect),
+        solver=jnp.where(gone[None], 0.0, parts.solver),
         multiple=jnp.where(lost[None, :, None], 0.0, parts.multiple),
     )
     share = jnp.where(gone[..., None], 1 / combined.share.shape[-1], combined.share)
@@ -153,15 +136,18 @@ def _times_real(
     return jax.lax.complex(real, imag).reshape(*a.shape[:2], b.shape[1])
 
 
-def _direct(x, y, counts, combined: Combined, channels: Channels):
+def _direct(products, counts, combined: Combined, channels: Channels):
     """Partial coherence of inputs and outputs, whatever the instruments say of it."""
     if not channels.instruments:
         return combined.coherence
-    each = jax.vmap(condition)(x, x, y, counts).coherence
+    plain = channels._replace(instruments=0)
+    each = _conditioned(products, plain, counts).coherence
     return jnp.einsum("foig,gfoi->foi", combined.share, each)
 
 
-def _excitation(transforms: Complex[Array, "windows frequencies channels"], channels: Channels):
+def _excitation(
+    products: Complex[Array, "frequencies channels channels"], channels: Channels
+) -> Float[Array, "moving frequencies"]:
+    power = jnp.real(jnp.diagonal(products, axis1=1, axis2=2)).T
     first, last = channels.inputs, channels.inputs + channels.outputs
-    moving = jnp.concatenate([transforms[:, :, :first], transforms[:, :, last:]], axis=2)
-    return jnp.mean(jnp.abs(moving) ** 2, axis=0).T
+    return jnp.concatenate([power[:first], power[last:]])

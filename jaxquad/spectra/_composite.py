@@ -1,3 +1,4 @@
+import functools as ft
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -54,4 +55,8 @@ class Composite(eqx.Module):
         return np.unique(np.geomspace(shortest, longest, _LENGTHS)).tolist()
 
     def _member(self, length: float | None) -> Welch:
-        return Welch(length, self.overlap, self.shape, self.detrend, self.integrators, self.delay)
+        return _welch(length, self.overlap, self.shape, self.detrend, self.integrators, self.delay)
+
+
+# Making and checking a module takes as long as transforming one window length.
+_welch = ft.lru_cache(maxsize=64)(Welch)

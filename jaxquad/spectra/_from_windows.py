@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 
 from jaxquad.records import Record
 
-from ._average import average, Averaged, Channels
+from ._average import average, Averaged
 from ._checks import check_excited, check_windows, checked_omega
 from ._composite import Composite
+from ._conditioned import Channels
 from ._errors import ErrorCovariance
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
@@ -19,7 +20,7 @@ from ._inputs import remarks_on_inputs
 from ._placement import overlaps, place_windows
 from ._segments import Segments, transform_records
 from ._welch import Welch
-from ._window import window
+from ._window import coefficients
 
 
 Method = Literal["direct", "joint"]
@@ -64,8 +65,9 @@ def _independent(records: Sequence[Record], segments: Segments) -> list[float]:
 
 def _scales(segments: Segments, welch: Welch, dt: float) -> Float[np.ndarray, " groups"]:
     """From mean squared transforms to one-sided densities."""
-    lengths = [length for length, _ in segments.groups]
-    return np.array([2 * dt / np.sum(window(welch.shape, length) ** 2) for length in lengths])
+    level, cosine = coefficients(welch.shape)
+    energy = level**2 + cosine**2 / 2
+    return np.array([2 * dt / (energy * length) for length, _ in segments.groups])
 
 
 def _resolved(

@@ -37,8 +37,8 @@ class Feedback(eqx.Module):
         worst = int(np.argmax(self.pull))
         size = np.abs(self.bias)
         lines = [
-            f"feedback: {100 * np.median(self.pull):.2g} % of the input is fed back noise (median), "
-            f"at most {100 * self.pull[worst]:.2g} % at {self.omega[worst]:.3g} rad/s",
+            f"feedback: {100 * np.median(self.pull):.2g} % of the input is fed back noise "
+            f"(median), at most {100 * self.pull[worst]:.2g} % at {self.omega[worst]:.3g} rad/s",
             f"  the direct estimate is off by {100 * np.median(size):.2g} % (median), at most "
             f"{100 * size.max():.2g} % at {self.omega[int(np.argmax(size))]:.3g} rad/s",
         ]
@@ -55,9 +55,9 @@ def feedback_pull(
 ) -> Feedback:
     """Split input and output by the reference, and compare direct estimate, plant and -1/C.
 
-    One input, one output, one outside reference. Source: Wellstead (1981), Non-parametric methods of
-    system identification; Forssell & Ljung (1999), Closed-loop identification revisited.
-    Raises `ValueError` for other channels, an unusable band or record.
+    One input, one output, one outside reference. Raises `ValueError` for other channels, an
+    unusable band or record. Source: Wellstead (1981), Non-parametric methods of system
+    identification; Forssell & Ljung (1999), Closed-loop identification revisited.
     """
     records = [record] if isinstance(record, Record) else list(record)
     check_alike(records)
