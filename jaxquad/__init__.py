@@ -1,6 +1,17 @@
 """From a flight record to an identified model with honest error bars, in JAX."""
 
 from .control import PD as PD, place_pd as place_pd
+from .design import (
+    AOptimal as AOptimal,
+    Criterion as Criterion,
+    Design as Design,
+    DOptimal as DOptimal,
+    LargestError as LargestError,
+    MeasuredNoise as MeasuredNoise,
+    optimal_multisine as optimal_multisine,
+    predict_accuracy as predict_accuracy,
+    Prediction as Prediction,
+)
 from .excitation import (
     check_guidelines as check_guidelines,
     doublet as doublet,

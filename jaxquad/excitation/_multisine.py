@@ -65,7 +65,7 @@ def multisine(
     check_positive(period=period, amplitude=amplitude, sample_rate=sample_rate)
     if periods < 1:
         raise ValueError(f"periods is {periods}: at least one is needed, three to judge noise.")
-    _check_lines(omega, period, sample_rate)
+    check_lines(omega, period, sample_rate)
     count = whole_samples("period", period, sample_rate)
     time = np.arange(count * periods) / sample_rate
     orders = np.round(omega * period / (2 * np.pi)).astype(int)
@@ -107,7 +107,7 @@ def _least_peak(
     return best
 
 
-def _check_lines(omega: Lines, period: Number, sample_rate: Number) -> None:
+def check_lines(omega: Lines, period: Number, sample_rate: Number) -> None:
     if omega.size < 2 or not (np.diff(omega) > 0).all():
         raise ValueError(f"{omega.size} lines: give two or more in rising order, in rad/s.")
     check_band(float(omega[0]), float(omega[-1]), sample_rate)

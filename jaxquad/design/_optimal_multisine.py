@@ -1,0 +1,154 @@
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, PyTree
+
+from jaxquad.excitation import Excitation, harmonics
+from jaxquad.excitation._checks import check_positive, whole_samples
+from jaxquad.excitation._multisine import check_lines
+from jaxquad.identify._parameters import Free, select_parameters
+from jaxquad.spectra import require_x64
+
+from ._criteria import Criterion, DOptimal
+from ._design import Design
+from ._information import check_distinct
+from ._limits import gather_limits
+from ._noise import Noise
+from ._phases import waves
+from ._prediction import Prediction, unit_information
+from ._search import Plan, search, Trial
+
+
+_LINES = (2, 4, 8)  # least lines to a parameter that are tried
+_D_OPTIMAL = DOptimal()
+
+Number = float | int
+Lines = Float[np.ndarray, " frequencies"]
+
+
+def optimal_multisine(
+    model: PyTree | Sequence[PyTree],
+    *,
+    noise: Noise,
+    amplitude: Number,
+    period: Number,
+    sample_rate: Number,
+    periods: int = 4,
+    free: Free = None,
+    band: tuple[Number, Number] | None = None,
+    omega: Lines | None = None,
+    rate: Number | None = None,
+    output_amplitude: Number | Sequence[float] | None = None,
+    criterion: Criterion = _D_OPTIMAL,
+    lines: int | None = None,
+    input: int = 0,
+    seed: int = 0,
+) -> Design:
+    """The multisine that tells most of a model's `free` parameters within the limits of a flight.
+
+    Offered are all harmonics of `period` (s) in the `band`, or those of `omega` (rad/s). The
+    signal's peak is at most `amplitude`, that of its derivative `rate` (per s), that of each
+    output, settled, `output_amplitude`. `noise` is the outputs' one-sided spectral density in
+    units^2/Hz, as in `predict_accuracy`. Information is that of `periods` settled periods: fly one
+    more before them, or estimate the transient.
+
+    Several models stand for what is not known yet: the mean of their log information counts. No
+    line takes more than 1/`lines` of what the limits leave it alone, so that at least so many are
+    used: with 1, p parameters may get as few as p/2, which leave nothing to judge the model by. By
+    default two, four and eight to a parameter are tried, since more lines also peak less; the most
+    informative signal is taken. `seed` is that of the phases' random starts.
+
+    Raises ValueError for limits, lines and parameters that allow no design.
+    """
+    require_x64("a design")
+    models = list(model) if isinstance(model, list | tuple) else [model]
+    samples = _whole_period(models, amplitude, period, periods, sample_rate)
+    offered = _offered(band, omega, period, sample_rate)
+    parameters = [select_parameters(each, free) for each in models]
+    if len({each.names for each in parameters}) > 1:
+        raise ValueError(f"models with other parameters: {[each.names for each in parameters]}")
+    names, seconds = parameters[0].names, float(period * periods)
+    found = [
+        unit_information(m, p, offered, noise, input)
+        for m, p in zip(models, parameters, strict=True)
+    ]
+    for _, unit in found:
+        check_distinct(unit.sum(axis=0), names)
+    limits = gather_limits(offered, [r for r, _ in found], amplitude, rate, output_amplitude)
+    per_power = seconds * np.stack([unit for _, unit in found])
+    orders = np.round(offered * period / (2 * np.pi)).astype(int)
+    plan = Plan(offered, orders, samples, names, per_power, limits, criterion)
+    best = search(plan, _least_lines(lines, len(names), offered.size), seed)
+    return _design(plan, best, periods, float(sample_rate))
+
+
+def _whole_period(
+    models: list[PyTree], amplitude: Number, period: Number, periods: int, sample_rate: Number
+) -> int:
+    """Samples of a period."""
+    if not models:
+        raise ValueError("no model: a design needs one, or a list of those that may be true")
+    check_positive(amplitude=amplitude, period=period, sample_rate=sample_rate)
+    if periods < 1 or periods != int(periods):
+        raise ValueError(f"periods is {periods}: give a whole number, 1 or more")
+    return whole_samples("period", period, sample_rate)
+
+
+def _offered(
+    band: tuple[Number, Number] | None, omega: Lines | None, period: Number, sample_rate: Number
+) -> Lines:
+    if (band is None) == (omega is None):
+        raise ValueError("give either a band in rad/s, or the lines omega of which to choose")
+    omega = np.asarray(omega, float) if band is None else harmonics(*band, period=period)
+    check_lines(omega, period, sample_rate)
+    return omega
+
+
+def _least_lines(lines: int | None, parameters: int, offered: int) -> tuple[int, ...]:
+    """The least numbers of lines to try."""
+    if lines is None:
+        tried = [each * parameters for each in _LINES if each * parameters <= offered // 2]
+        return tuple(tried) or (max(1, offered // 2),)
+    if not 1 <= lines <= offered:
+        raise ValueError(f"lines is {lines}: of {offered} offered lines, use 1 to {offered}")
+    return (int(lines),)
+
+
+def _design(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Design:
+    totals = np.einsum("f,mfpq->mpq", best.power, plan.per_power)
+    names, peaks = plan.limits.names, plan.limits.peaks
+    seconds = plan.samples * periods / sample_rate
+    return Design(
+        excitation=_excitation(plan, best, periods, sample_rate),
+        power=best.power[best.power > 0],
+        predictions=tuple(Prediction(plan.names, total, seconds) for total in totals),
+        offered=plan.omega,
+        dispersion=best.dispersion,
+        efficiency=best.efficiency,
+        limits={
+            name: (float(share * limit), float(limit))
+            for name, share, limit in zip(names, best.peaks, peaks, strict=True)
+        },
+        crest_factor=float(best.peaks[0] * peaks[0] / np.sqrt(best.power.sum())),
+        criterion=plan.criterion,
+        lines=best.lines,
+    )
+
+
+def _excitation(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Excitation:
+    """The signal from its sample nearest to zero on."""
+    amplitudes = np.sqrt(2 * best.power).astype(complex)[None, :]
+    wave = waves(plan.orders, best.phase, amplitudes, plan.samples)[0]
+    wave = np.roll(wave, -int(np.abs(wave).argmin()))
+    lines = plan.omega[best.power > 0]
+    return Excitation(
+        np.arange(plan.samples * periods) / sample_rate,
+        np.tile(wave, periods),
+        lines,
+        kind="multisine",
+        omega_min=lines[0],
+        omega_max=lines[-1],
+        amplitude=np.abs(wave).max(),
+        sample_rate=sample_rate,
+        duration=plan.samples * periods / sample_rate,
+    )
