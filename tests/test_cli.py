@@ -76,7 +76,7 @@ def test_json_is_all_that_stdout_holds_and_knows_no_nan(flight, tmp_path, capsys
     printed = capsys.readouterr()
     result = json.loads(printed.out, parse_constant=pytest.fail)
     by_name = {row["name"]: row for row in result["fit"]["parameters"]}
-    assert code == 3 and by_name["lag"]["value"] is None
+    assert code == 3 and None in [by_name[name]["value"] for name in ("lag", "delay")]
     assert by_name["gain"]["value"] == pytest.approx(GAIN, rel=0.03)
     assert "jaxquad: error: not identifiable from this record" in printed.err
     assert "standard_error" not in printed.err and "std.err." in printed.err
@@ -166,3 +166,22 @@ def test_a_hover_without_excitation_is_not_identifiable(data, tmp_path, capsys, 
     channels = (f"cmd[{axis}]", f"rate[{axis}]")
     assert identify(path, "--out", str(tmp_path), channels=channels) == 3
     assert "not identifiable from this record" in capsys.readouterr().out.lower()
+
+
+def test_poles_and_zeros_of_given_orders_are_fitted(flight, tmp_path, capsys):
+    orders = ("--poles", "1", "--zeros", "0", "--band", "0.5", "6")
+    assert identify(flight, "--out", str(tmp_path), *orders) == 0
+    printed = capsys.readouterr().out
+    assert "0 zeros over 1 poles and 1 integrators, delayed" in printed
+    result = json.loads((tmp_path / "result.json").read_text())
+    names = [row["name"] for row in result["fit"]["parameters"]]
+    assert names == ["numerator[0]", "denominator[1]", "delay"]
+    values = [row["value"] for row in result["fit"]["parameters"]]
+    assert values[0] == pytest.approx(GAIN / LAG, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["composite", "welch"])
+def test_windows_can_be_asked_for(flight, tmp_path, name, capsys):
+    assert identify(flight, "--out", str(tmp_path), "--estimator", name, "--band", "0.5", "6") == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["fit"]["parameters"][0]["value"] == pytest.approx(GAIN, rel=0.02)
