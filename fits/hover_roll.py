@@ -84,9 +84,12 @@ def draw_gains(
         flights = fly(signals, np.zeros(chunk), jax.random.key(seed + first))
         for member in range(min(chunk, draws - first)):
             record = flights.record("roll", member=member)
+            frfs = {
+                name: jq.frequency_response(record, OMEGA, estimator=ESTIMATORS[name])
+                for name in {name for name, _ in cases}
+            }
             for name, cost in cases:
-                frf = jq.frequency_response(record, OMEGA, estimator=ESTIMATORS[name])
-                gain = gain_of(identify(frf, COSTS[cost]))
+                gain = gain_of(identify(frfs[name], COSTS[cost]))
                 found[name, cost].append((gain.value, gain.standard_error))
     return {key: np.array(rows) for key, rows in found.items()}
 

@@ -22,6 +22,7 @@ from .excitation import (
     three_two_one_one as three_two_one_one,
 )
 from .identify import (
+    Agreement as Agreement,
     BatchFit as BatchFit,
     CoherenceWeighted as CoherenceWeighted,
     Combination as Combination,
@@ -42,6 +43,7 @@ from .identify import (
     Real as Real,
     reduce_structure as reduce_structure,
     Reduction as Reduction,
+    refine as refine,
     Verification as Verification,
     verify as verify,
 )

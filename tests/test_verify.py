@@ -2,11 +2,14 @@
 
 import functools as ft
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim, tf2ss
 
 import jaxquad as jq
+from jaxquad.models import StateSpace
+from jaxquad.report import overlay
 
 
 DT = 0.01
@@ -110,3 +113,69 @@ def test_the_antx_model_verifies_on_the_other_flight(data):
     check = jq.verify(fit.model, sweep, band=band)
     # 75 % of the variance; by the norm of the error that is 50 %.
     assert check.variance_percent > 75 and check.tic < 0.25
+
+
+def aircraft():
+    """Two inputs, three outputs: a fast lag, a resonance and an integrator."""
+    F = np.array([[-25.0, 0, 0, 0], [4, -1, 6, 0], [0, -6, -1, 0], [0, 1, 0, 0]])
+    G = np.array([[25.0, 0], [0, 2], [0, 0], [0, 0]])
+    H0 = np.array([[0, 1.0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])
+    return StateSpace(F=F, G=G, H0=H0, input_delay=(0.03, 0.02))
+
+
+def flown(noise=(0.0, 0.0, 0.0), trim=0.0):
+    """Under held inputs that stand `trim` beside the record's, by scipy, from a state in motion."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([-1.0, 1.0], (50, 2)), 30, axis=0)
+    model = aircraft()
+    system = tuple(np.asarray(part) for part in (model.F, model.G, model.H0, np.zeros((3, 2))))
+    late = [np.concatenate([np.full(n, x[0]), x[:-n]]) for n, x in zip((3, 2), u.T, strict=True)]
+    x0 = np.array([0.5, -0.3, 0.2, 1.0])
+    y = dlsim(cont2discrete(system, DT), np.stack(late, axis=1) + trim, x0=x0)[1]
+    y = y + noise * rng.standard_normal(y.shape)
+    names, units = ("p", "phi", "a_y"), ("rad/s", "rad", "m/s^2")
+    return jq.Record(TIME, u, y, output_names=names, output_units=units)
+
+
+def test_several_inputs_and_outputs_share_their_biases():
+    check = jq.verify(aircraft(), flown(trim=0.1), hold="zero")
+    assert check.fit_percent == pytest.approx(100, abs=1e-5)
+    assert check.measured.shape == check.simulated.shape == (TIME.size, 3)
+    assert check.bias.shape == check.initial.shape == (4,) and check.omitted == 0
+
+
+def test_each_output_has_its_measures_and_weights_join_them():
+    size, weights = np.array([0.02, 0.1, 0.05]), np.array([1.0, 0.25, 4.0])
+    check = jq.verify(aircraft(), flown(noise=size), hold="zero", weights=weights.tolist())
+    found = [one.rms for one in check.outputs]
+    np.testing.assert_allclose(found, size, rtol=0.05)  # 1500 samples
+    assert check.rms == pytest.approx(np.sqrt(np.mean(weights * np.square(found))), rel=1e-12)
+    assert [one.name for one in check.outputs] == ["p", "phi", "a_y"] and check.output_unit == ""
+    assert str(check).count("TIC") == 4
+    assert len(overlay(check).axes) == 6
+    with pytest.raises(ValueError, match="one positive number for each output"):
+        jq.verify(aircraft(), flown(), weights=(1.0, 2.0))
+
+
+class Aircraft(eqx.Module):
+    damping: float
+
+    def state_space(self):
+        return aircraft()
+
+
+def test_a_model_with_a_state_space_is_simulated_as_that():
+    record = flown(noise=(0.02, 0.1, 0.05))
+    direct, by_method = jq.verify(aircraft(), record), jq.verify(Aircraft(1.0), record)
+    np.testing.assert_allclose(direct.simulated, by_method.simulated, rtol=0, atol=1e-12)
+
+
+def test_a_drift_does_not_pass_for_a_fast_transient_at_the_start():
+    """A random walk is as far off at the start as elsewhere: no spike of a motor's lag mends it."""
+    u = flight()[0]
+    y = np.asarray(jq.simulate_linear(MODEL.transfer_function(), u - u[0], DT))
+    walk = np.cumsum(np.random.default_rng(3).standard_normal(TIME.size)) * 0.2
+    check = jq.verify(MODEL, jq.Record(TIME, u, y + walk + 2.0), hold="zero")
+    assert check.omitted == 1
+    wander = (check.simulated - y)[:15]  # three lags
+    assert np.ptp(wander) < 0.1 * np.std(check.measured - check.simulated)

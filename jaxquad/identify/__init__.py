@@ -9,6 +9,7 @@ from ._fit import fit as fit
 from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from ._guess import guess_lagged_integrator as guess_lagged_integrator
 from ._identifiable import NotIdentifiable as NotIdentifiable
+from ._output_error import refine as refine
 from ._parameters import Positive as Positive, Real as Real
 from ._problem import Prior as Prior
 from ._reduce import reduce_structure as reduce_structure, Reduction as Reduction

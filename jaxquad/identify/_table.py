@@ -79,6 +79,6 @@ def _quality(fit: Any) -> str:
     condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
     return (
         f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
-        f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} frequencies, condition {condition}, "
+        f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} points, condition {condition}, "
         f"Newton decrement {fit.newton_decrement:.1e}, {fit.steps} steps"
     )

@@ -7,28 +7,20 @@ from jaxquad.records import Record
 
 
 def overlay(check: Verification, *, title: str = "") -> Any:
-    """Measured and simulated output over time, with the difference below.
+    """Measured and simulated outputs over time, with the difference below each.
 
     Angles are drawn in degrees. Returns a `matplotlib.figure.Figure`.
     """
     from matplotlib.figure import Figure
 
-    scale, unit = _shown(check.output_unit)
-    measured, simulated = scale * check.measured, scale * check.simulated
-    figure = Figure(figsize=(6.5, 4.5), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1.2])
-    top.plot(check.time, measured, color="0.15", lw=1.0, label="measured")
-    top.plot(check.time, simulated, color="tab:blue", lw=1.6, ls="--", label="simulated, open loop")
-    top.legend(loc="upper right", fontsize=9, ncols=2)
-    top.set_ylabel(f"{check.output_name}{unit}")
-    bottom.plot(check.time, measured - simulated, color="tab:red", lw=0.9)
-    bottom.set_ylabel(f"difference{unit}")
-    bottom.set_xlabel("time, s")
-    for axis in (top, bottom):
-        axis.grid(True, color="0.9", lw=0.5)
-        axis.margins(x=0)
-    low, high = top.get_ylim()
-    top.set_ylim(low, high + 0.15 * (high - low))
+    count = len(check.outputs)
+    figure = Figure(figsize=(6.5, 4.5 if count == 1 else 3.2 * count + 0.6), layout="constrained")
+    axes = figure.subplots(2 * count, 1, sharex=True, height_ratios=[3, 1.2] * count)
+    shape = (check.time.size, count)
+    measured, simulated = check.measured.reshape(shape), check.simulated.reshape(shape)
+    for k, one in enumerate(check.outputs):
+        _draw(axes[2 * k : 2 * k + 2], check.time, measured[:, k], simulated[:, k], one)
+    axes[-1].set_xlabel("time, s")
     where = f", {check.band[0]:.3g}..{check.band[1]:.3g} rad/s" if check.band else ""
     numbers = (
         f"fit {check.fit_percent:.1f} %, variance accounted for {check.variance_percent:.1f} %, "
@@ -36,6 +28,23 @@ def overlay(check: Verification, *, title: str = "") -> Any:
     )
     figure.suptitle(f"{title}\n{numbers}" if title else numbers, fontsize=10)
     return figure
+
+
+def _draw(axes: Any, time: np.ndarray, measured: np.ndarray, simulated: np.ndarray, one: Any):
+    top, bottom = axes
+    scale, unit = _shown(one.unit)
+    top.plot(time, scale * measured, color="0.15", lw=1.0, label="measured")
+    model = {"color": "tab:blue", "lw": 1.6, "ls": "--", "label": "simulated, open loop"}
+    top.plot(time, scale * simulated, **model)
+    top.legend(loc="upper right", fontsize=9, ncols=2)
+    top.set_ylabel(f"{one.name}{unit}")
+    bottom.plot(time, scale * (measured - simulated), color="tab:red", lw=0.9)
+    bottom.set_ylabel(f"difference{unit}")
+    for axis in axes:
+        axis.grid(True, color="0.9", lw=0.5)
+        axis.margins(x=0)
+    low, high = top.get_ylim()
+    top.set_ylim(low, high + 0.15 * (high - low))
 
 
 def record_figure(record: Record) -> Any:

@@ -89,11 +89,16 @@ def _response(frf: FrequencyResponse) -> dict[str, Any]:
 
 
 def _verification(check: Verification) -> dict[str, Any]:
-    names = ("rms", "tic", "fit_percent", "variance_percent", "shift", "bias")
+    measures = ("rms", "tic", "fit_percent", "variance_percent")
+    names = (*measures, "shift", "bias", "initial")
     return {name: getattr(check, name) for name in names} | {
         "band_rad_per_s": check.band,
         "output": check.output_name,
         "unit": check.output_unit,
+        "outputs": [
+            {name: getattr(one, name) for name in ("name", "unit", *measures)}
+            for one in check.outputs
+        ],
     }
 
 

@@ -1,0 +1,156 @@
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from jaxquad.records import Record
+from jaxquad.spectra import require_x64
+
+from ._checks import check_priors
+from ._integrated import is_plant, states_of
+from ._output_error_descent import relaxed
+from ._output_error_result import assess_output_error
+from ._parameters import Free, name_places, Parameters, select_parameters, Tie
+from ._problem import Prior, Problem, quantity_of
+from ._result import Fit
+from ._simulated import check_channels, check_growth, linear_model, motions_of
+from ._trial import found_at, OutputError, Trial
+from ._zero_phase import band_gain, filtered
+
+
+def refine(
+    model: PyTree,
+    record: Record | Sequence[Record],
+    *,
+    free: Free = None,
+    tied: Mapping[str, Tie] | None = None,
+    hold: str = "first",
+    band: tuple[float, float] | None = None,
+    priors: Sequence[Prior] = (),
+    max_steps: int = 64,
+) -> Fit:
+    """Output-error estimate of the `free` parameters in the time domain, from the model's values.
+
+    A linear model (`TransferFunction`, `StateSpace`, or with `transfer_function()` or
+    `state_space()`) is discretised exactly; initial state, biases on the state derivatives and a
+    shift of each output are eliminated by least squares. Any other `eqx.Module` with `init()`,
+    `derivative(state, inputs, disturbance)` and `measure(state)` is integrated by diffrax without
+    disturbance (zeros like what it measures), and its initial state, beside `init()`, estimated.
+    `free`, `tied` and `priors` are those of `jq.fit`, `hold` and `band` those of `jq.verify`; model
+    and data are filtered alike. Each record has its own start, trim and noise level. Outputs are
+    weighted by their residuals' variance, estimated in turn with the parameters; `cost` is in
+    units of it. Standard errors hold for coloured residuals.
+
+    Raises ValueError for what `jq.fit` and `jq.verify` refuse and for a model that cannot be
+    simulated at its starting values, `PrecisionError` in 32 bits.
+    Source: Klein & Morelli, Aircraft System Identification, ch. 6 (modified Newton-Raphson with
+    relaxation, errors corrected for coloured residuals).
+    """
+    require_x64("an output-error fit")
+    records = _checked(record, max_steps, hold)
+    parameters = select_parameters(model, free, tied)
+    base = _base(model, parameters, priors)
+    trials = tuple(_trial(model, one, hold, band) for one in records)
+    problem = _with_units(OutputError(base, trials, _known_zeros(model, parameters)))
+    descent = relaxed(problem, max_steps)
+    check_priors(base, descent.solution)
+    return assess_output_error(descent, records)
+
+
+def _checked(record: Record | Sequence[Record], max_steps: int, hold: str) -> list[Record]:
+    records = [record] if isinstance(record, Record) else list(record)
+    if not records or not all(isinstance(one, Record) for one in records):
+        kinds = ", ".join(sorted({type(one).__name__ for one in records})) or "nothing"
+        raise ValueError(f"refine needs a jq.Record or a list of them, not {kinds}")
+    if max_steps < 1:
+        raise ValueError(f"max_steps is {max_steps}: give at least 1")
+    if hold not in ("first", "zero"):
+        raise ValueError(f'hold is {hold!r}: inputs run straight ("first") or are held ("zero")')
+    for one in records:
+        still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
+        if still:
+            raise ValueError(f"output {still[0]} does not move: leave it out with jq.select")
+    return records
+
+
+def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Problem:
+    known = [place.name for place in name_places(model)]
+    for prior in priors:
+        if isinstance(prior.quantity, str) and prior.quantity not in known:
+            raise ValueError(f"no parameter {prior.quantity!r} for a prior; there are: {known}")
+    numbers = [[prior.value, prior.standard_error] for prior in priors]
+    return Problem(
+        model=model,
+        parameters=parameters,
+        conditions=(),
+        quantities=tuple(quantity_of(prior.quantity) for prior in priors),
+        omega=(),
+        measured=(),
+        weights=(),
+        known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
+    )
+
+
+def _trial(model: Any, record: Record, hold: str, band: tuple[float, float] | None) -> Trial:
+    gain = band_gain(band, record)
+    gain = None if gain is None else jnp.asarray(gain)
+    if is_plant(model) and not _is_linear(model):
+        motions, start = None, jnp.ones(states_of(model))
+        _check_measured(model, record)
+    else:
+        plant = linear_model(model)
+        check_channels(plant, record)
+        check_growth(plant, record)
+        found = motions_of(plant, record.duration)
+        motions, start = (found.slow, found.fast), jnp.zeros(0)
+    y = filtered(jnp.asarray(record.outputs), gain)
+    weights = 1 / jnp.std(y, axis=0)
+    return Trial(jnp.asarray(record.inputs), y, weights, gain, motions, start, record.dt, hold)
+
+
+def _check_measured(model: Any, record: Record) -> None:
+    measured = jnp.size(model.measure(model.init()))
+    if measured != len(record.output_names):
+        raise ValueError(
+            f"the plant measures {measured} outputs, the record has {record.output_names}: pick "
+            "them with jq.select"
+        )
+
+
+def _is_linear(model: Any) -> bool:
+    return hasattr(model, "transfer_function") or hasattr(model, "state_space")
+
+
+def _with_units(problem: OutputError) -> OutputError:
+    """Initial states in units that each move the output by its own size, as far as they show."""
+    if not problem.unknown:
+        return problem
+    count = problem.base.parameters.count
+    z = jnp.concatenate([problem.base.parameters.start[:count], jnp.zeros(problem.unknown)])
+    slopes = found_at(z, problem).slopes
+    trials, at = [], count
+    for trial, one in zip(problem.trials, slopes, strict=True):
+        mine = np.asarray(one)[:, :, at : at + trial.start.size]
+        sizes = np.sqrt(np.mean(mine**2, axis=(0, 1)))
+        if not np.all(np.isfinite(sizes)):
+            raise ValueError(
+                "the plant cannot be integrated over the record from its starting values: it "
+                "diverges or is too stiff; start from other values, or cut the record with jq.trim"
+            )
+        seen = sizes > 1e-6 * np.max(sizes, initial=0.0)
+        start = jnp.asarray(np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0))
+        trials.append(dataclasses.replace(trial, start=start))
+        at += trial.start.size
+    return dataclasses.replace(problem, trials=tuple(trials))
+
+
+def _known_zeros(model: PyTree, parameters: Parameters) -> tuple[int, ...]:
+    moved = {place.leaf for place in parameters.places} | {p.leaf for p, _ in parameters.ties}
+    leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+    still = [k for k, leaf in enumerate(leaves) if not np.any(np.asarray(leaf))]
+    return tuple(k for k in still if k not in moved)

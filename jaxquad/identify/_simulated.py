@@ -1,0 +1,137 @@
+"""Linear models over a record: what the inputs force, and what start and trim add to it."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad.models import (
+    free_responses,
+    realise,
+    simulate_linear,
+    StateSpace,
+    TransferFunction,
+)
+from jaxquad.models._state_space import explicit
+from jaxquad.records import Record
+
+
+_SLOW = 15.0  # a fifth of a record over which a motion decays by e^-15 leaves 5 % of it
+_OUTGROWN = 1e10  # growth over a record that leaves too few digits for what is measured
+
+
+class Motions(NamedTuple):
+    """Which unknown motions of the states are allowed for: unit vectors by column.
+
+    Biases act on x' of the slow states and initial values on the fast ones. With a shift of each
+    output they span all that constant biases, initial state and shifts can do, and no two of them
+    look alike: a bias on a fast state is the transient of an initial value and a shift.
+    """
+
+    slow: Float[Array, "states slow"]
+    fast: Float[Array, "states fast"]  # the slower ones first
+    groups: tuple[int, ...]  # how many of the fast columns belong to each speed
+
+
+def linear_model(model: Any) -> TransferFunction | StateSpace:
+    """The model as one that `simulate_linear` takes."""
+    if isinstance(model, TransferFunction | StateSpace):
+        return model
+    for name in ("state_space", "transfer_function"):
+        if callable(getattr(model, name, None)):
+            return getattr(model, name)()
+    raise ValueError(
+        f"{type(model).__name__} has no transfer_function() and no state_space(): give a "
+        "jq.TransferFunction, a jq.StateSpace, or a model with one of these methods"
+    )
+
+
+def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None:
+    """A model for other channels than the record has."""
+    inputs, outputs = 1, 1
+    if isinstance(plant, StateSpace):
+        inputs, outputs = plant.G.shape[1], len(plant.H0)
+    if (len(record.input_names), len(record.output_names)) != (inputs, outputs):
+        raise ValueError(
+            f"the model compares {_count(inputs, 'input')} with {_count(outputs, 'output')}, the "
+            f"record has {record.input_names} and {record.output_names}: pick them with jq.select"
+        )
+
+
+def check_growth(plant: TransferFunction | StateSpace, record: Record) -> None:
+    """An unstable model over so long a record that its own motion drowns every measurement."""
+    poles = np.asarray(plant.poles)
+    fastest = np.max(np.real(poles), initial=0.0) * record.duration
+    if not fastest < np.log(_OUTGROWN):
+        raise ValueError(
+            f"the model's open-loop response overflows within {record.duration:.4g} s: its poles "
+            f"are {poles}, and it grows by e^{fastest:.3g}; take an unstable model on a shorter "
+            "record (jq.trim), or fit it to frequency responses, which need no simulation"
+        )
+
+
+def forced(
+    plant: TransferFunction | StateSpace, u: Float[Array, "samples inputs"], dt: float, hold: str
+) -> Float[Array, "samples outputs"]:
+    """The outputs under inputs that stood at their first values before the record, from rest."""
+    u = u - u[:1]
+    if isinstance(plant, TransferFunction):
+        return simulate_linear(plant, u[:, 0], dt, hold=hold)[:, None]
+    return simulate_linear(plant, u, dt, hold=hold)
+
+
+def motions_of(plant: TransferFunction | StateSpace, duration: float) -> Motions:
+    """The invariant subspaces of all speeds; slow is what a fifth of the record does not damp."""
+    A = _dynamics(plant)
+    if not len(A):
+        return Motions(jnp.zeros((0, 0)), jnp.zeros((0, 0)), ())
+    edges = _edges(-np.real(np.linalg.eigvals(A)) * duration / _SLOW)
+    within = lambda low, high: _subspace(A * duration / _SLOW, low, high)
+    slow = within(-np.inf, edges[0])
+    parts = [within(low, high) for low, high in zip(edges, edges[1:], strict=False)]
+    parts = parts or [slow[:, :0]]
+    groups = tuple(part.shape[1] for part in parts if part.shape[1])
+    return Motions(jnp.asarray(slow), jnp.asarray(np.concatenate(parts, axis=1)), groups)
+
+
+def free(
+    plant: TransferFunction | StateSpace, motions: Motions, samples: int, dt: float
+) -> Float[Array, "samples outputs unknowns"]:
+    """The outputs of a unit shift of each output, of unit biases and of unit initial values."""
+    outputs = len(plant.H0) if isinstance(plant, StateSpace) else 1
+    shifts = jnp.broadcast_to(jnp.eye(outputs)[None], (samples, outputs, outputs))
+    if not len(motions.slow):
+        return shifts
+    start, bias = free_responses(plant, samples, dt)
+    if isinstance(plant, TransferFunction):
+        start, bias = start[:, None], bias[:, None]
+    dot = lambda x, way: jnp.einsum("toi,ik->tok", x, way, precision="highest")
+    return jnp.concatenate([shifts, dot(bias, motions.slow), dot(start, motions.fast)], axis=2)
+
+
+def _dynamics(plant: TransferFunction | StateSpace) -> Float[np.ndarray, "states states"]:
+    parts = explicit(plant) if isinstance(plant, StateSpace) else realise(plant)
+    return np.asarray(parts[0])
+
+
+def _edges(speed: Float[np.ndarray, " states"]) -> list[float]:
+    """Where one speed ends and the next begins, from the end of the slow ones at 1."""
+    # Equal poles scatter by a root of the rounding, and have to stay together.
+    speed = np.sort(np.maximum(speed, 0.2))
+    gaps = np.flatnonzero(speed[1:] > 1.001 * speed[:-1])
+    middles = np.sqrt(speed[gaps] * speed[gaps + 1])
+    first = [0.0] if speed[0] > 1 else []
+    return [*first, *middles[speed[gaps + 1] > 1].tolist(), np.inf]
+
+
+def _subspace(A: np.ndarray, low: float, high: float) -> Float[np.ndarray, "states within"]:
+    """An orthonormal basis of the motions that decay faster than at `low`, up to `high`."""
+    from scipy.linalg import schur
+
+    found = schur(A, output="real", sort=lambda re, im: low < -re <= high)
+    return found[1][:, : int(found[-1])]
+
+
+def _count(number: int, what: str) -> str:
+    return f"one {what}" if number == 1 else f"{number} {what}s"
