@@ -4,7 +4,7 @@ Built without LAPACK: `vmap` over LAPACK calls inside a loop can hang on few cor
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 TOLERANCE = 1e-8  # of a step, relative to 1 + |z|, and of the root of the cost it would save
 RUNNING, CONVERGED, STALLED = 0, 1, 2
+_DAMPING = 1e-2  # of the first step, in units of the largest diagonal element of the Hessian
 
 
 class Normal(NamedTuple):
@@ -50,28 +51,36 @@ def minimise(
     unit means the same for all. A trial point that is not finite counts as a failed step.
     Damping follows Nielsen (1999), Damping parameter in Marquardt's method, IMM-REP-1999-05.
     """
-    batch = z0.shape[1:]
-    counter = jnp.zeros(batch, int)
-    normal = evaluate(z0)
-    status = jnp.where(_finite(normal), RUNNING, STALLED)
-    start = Descent(
-        z0, normal, jnp.full(batch, 1e-3), jnp.full(batch, 2.0), counter, counter + status
-    )
+    start = begin(evaluate, z0)
 
     def running(state: Descent) -> Bool[Array, ""]:
         return jnp.any((state.status == RUNNING) & (state.steps < max_steps))
 
     def body(state: Descent) -> Descent:
-        return _step(evaluate, state, max_steps, tolerance)
+        return advance(evaluate, state, max_steps, tolerance)
 
-    final = jax.lax.while_loop(running, body, start)
-    # Rounding can stop the descent at a minimum: what is left to save tells it from a wall.
-    level = decrement(final.normal) <= 1e-9 * final.normal.cost
-    status = jnp.where((final.status == STALLED) & level, CONVERGED, final.status)
-    return final._replace(status=status)
+    return settle(jax.lax.while_loop(running, body, start))
 
 
-def _step(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float) -> Descent:
+def begin(evaluate: Evaluate, z0: Float[Array, " parameters *batch"]) -> Descent:
+    """Every member at its start; one whose start is not finite has stopped there."""
+    batch = z0.shape[1:]
+    counter = jnp.zeros(batch, int)
+    normal = evaluate(z0)
+    status = jnp.where(_finite(normal), RUNNING, STALLED)
+    damping, growth = jnp.full(batch, _DAMPING), jnp.full(batch, 2.0)
+    return Descent(z0, normal, damping, growth, counter, counter + status)
+
+
+def settle(state: Descent) -> Descent:
+    """Rounding can stop the descent at a minimum: what is left to save tells it from a wall."""
+    level = decrement(state.normal) <= 1e-9 * state.normal.cost
+    status = jnp.where((state.status == STALLED) & level, CONVERGED, state.status)
+    return state._replace(status=status)
+
+
+def advance(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float) -> Descent:
+    """One step of every member that is still running."""
     damping = state.damping * _size(state.normal.hessian)
     change, definite = solve_definite(
         _damped(state.normal.hessian, damping), -state.normal.gradient
@@ -101,6 +110,16 @@ def _step(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float) 
         state.steps + active.astype(int),
         jnp.where(active, status, state.status),
     )
+
+
+def normal_equations(
+    residual: Callable[..., Any], z: Float[Array, " parameters"], args: Any
+) -> Normal:
+    """Cost, gradient and Gauss-Newton Hessian, by one forward derivative for each parameter."""
+    along = lambda change: jax.jvp(lambda z: residual(z, args), (z,), (change,))
+    # One row for each parameter: columns would have to be gathered.
+    r, rows = jax.vmap(along, out_axes=(None, 0))(jnp.eye(z.size, dtype=z.dtype))
+    return Normal(0.5 * jnp.sum(r**2), rows @ r, rows @ rows.T)
 
 
 def _select(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ._levenberg import CONVERGED, minimise, Normal, RUNNING, STALLED, TOLERANCE
+from ._levenberg import normal_equations as normal_equations, RUNNING, STALLED, TOLERANCE
 from ._problem import misfits, Problem, residuals, Sensitivity, sensitivity
 
 
@@ -48,8 +48,8 @@ def solve(
     max_steps: int,
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
-    stop, facts, derivatives = _solve(problem, z0, solver, max_steps)
-    return solution_at(stop, facts, derivatives)
+    stop = descend(problem, z0, solver, max_steps)
+    return solution_at(stop, *_describe(stop.z, problem))
 
 
 def solution_at(stop: Stop, facts: tuple, derivatives: Sensitivity) -> Solution:
@@ -61,9 +61,9 @@ def solution_at(stop: Stop, facts: tuple, derivatives: Sensitivity) -> Solution:
 
 
 @eqx.filter_jit
-def _solve(problem, z0, solver, max_steps):
-    stop = least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
-    return stop, *describe(stop.z, problem)
+def descend(problem: Problem, z0: Float[Array, " parameters"], solver: Any, max_steps: int) -> Stop:
+    """The minimisation alone, in one compiled call."""
+    return least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
 
 
 def describe(z: Float[Array, " parameters"], problem: Problem) -> tuple[tuple, Sensitivity]:
@@ -75,6 +75,9 @@ def describe(z: Float[Array, " parameters"], problem: Problem) -> tuple[tuple, S
     return facts, sensitivity(z_all, problem)
 
 
+_describe = eqx.filter_jit(describe)
+
+
 def least_squares(
     residual: Residual,
     z0: Float[Array, " parameters"],
@@ -84,40 +87,33 @@ def least_squares(
     max_steps: int,
     tolerance: float = TOLERANCE,
 ) -> Stop:
-    """The solver set-up of every fit; `None` is Levenberg-Marquardt on the normal equations.
+    """The solver set-up of every fit; `None` is `DampedGaussNewton`, on the normal equations.
 
     `z` should be relative or logarithmic, so that one unit means the same for all elements. Any
-    optimistix least-squares solver can take its place.
+    optimistix least-squares solver can take its place, with a tolerance of its own.
     """
-    if solver is not None:
-        return _with_optimistix(residual, z0, args, solver, max_steps)
-    state = minimise(lambda z: normal_equations(residual, z, args), z0, max_steps, tolerance)
-    return Stop(state.z, state.status == CONVERGED, state.status, state.steps)
-
-
-def normal_equations(residual: Residual, z: Float[Array, " parameters"], args: Any) -> Normal:
-    """Cost, gradient and Gauss-Newton Hessian, by one forward derivative for each parameter."""
-
-    def twice(z):
-        r = residual(z, args)
-        return r, r
-
-    jacobian, r = jax.jacfwd(twice, has_aux=True)(z)
-    return Normal(0.5 * jnp.sum(r**2), jacobian.T @ r, jacobian.T @ jacobian)
-
-
-def _with_optimistix(residual, z0, args, solver, max_steps) -> Stop:
     # Imported late: optimistix doubles the time of `import jaxquad`.
     import optimistix as optx
 
+    from ._gauss_newton import DampedGaussNewton
+
+    ours = solver is None
+    if ours:
+        solver = DampedGaussNewton(tolerance)
+    function = residual if ours else _walled(residual)
+    found = optx.least_squares(function, solver, z0, args=args, max_steps=max_steps, throw=False)
+    converged = found.result == optx.RESULTS.successful
+    reason = found.state.status if ours else found.result
+    return Stop(found.value, converged, reason, found.stats["num_steps"])
+
+
+def _walled(residual: Residual) -> Residual:
     def walled(z, args):
         # A wall of NaN would look like a minimum to the solver: make it a high one instead.
         r = residual(z, args)
         return jnp.where(jnp.isfinite(r), r, 1e6)
 
-    found = optx.least_squares(walled, solver, z0, args=args, max_steps=max_steps, throw=False)
-    converged = found.result == optx.RESULTS.successful
-    return Stop(found.value, converged, found.result, found.stats["num_steps"])
+    return walled
 
 
 def _reason(reason: Any) -> str:

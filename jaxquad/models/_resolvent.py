@@ -4,7 +4,8 @@ Complex arrays are split into real and imaginary parts: compilers make them fast
 frequencies. No LAPACK: its threads can wait for each other under `vmap` on a machine of two cores.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,9 @@ class Split(NamedTuple):
     imag: Float[Array, "rows columns frequencies"]
 
 
+Scales = tuple[Float[Array, "states frequencies"], Float[Array, "states frequencies"]]
+
+
 def product(a: Split, b: Split) -> Split:
     """The matrix product at each frequency."""
     real = imag = jnp.zeros((), a.real.dtype)
@@ -28,22 +32,36 @@ def product(a: Split, b: Split) -> Split:
     return Split(real, imag)
 
 
+def apart(function: Callable[..., Any], *args: Any) -> Any:
+    """A call that the CPU's compiler does not fuse: what it fuses, it computes for each user anew.
+
+    Without its private mark, a plain call.
+    """
+    try:
+        from jax.experimental.xla_metadata import set_xla_metadata
+    except ImportError:
+        return function(*args)
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(function)(*args)
+
+
 @jax.custom_jvp
-def inverse(matrix: Split) -> Split:
+def inverse(matrix: Split, scales: Scales) -> Split:
     """The inverse at each frequency, by Gauss-Jordan elimination with partial pivoting.
 
-    Rows and columns are first scaled alike by powers of two, so that the unit of a state does not
-    matter. A pivot of zero becomes a very small one: the inverse is then huge, not undefined.
+    Rows and columns are first scaled alike by `scales`, see `equilibrium`, so that the unit of a
+    state does not matter. A pivot of zero becomes a very small one: the inverse is then huge, not
+    undefined.
     Source: Higham, Accuracy and Stability of Numerical Algorithms, section 14.4.
     """
-    rows, columns = equilibrium(jnp.maximum(jnp.abs(matrix.real), jnp.abs(matrix.imag)))
+    rows, columns = scales
     scaled = Split(*(rows[:, None] * part * columns[None] for part in matrix))
     return Split(*(columns[:, None] * part * rows[None] for part in _exchange(scaled)))
 
 
 @inverse.defjvp
 def _inverse_jvp(primals, tangents):
-    found = inverse(*primals)
+    found = inverse(*primals)  # whatever the scales
     change = product(product(found, tangents[0]), found)
     return found, Split(-change.real, -change.imag)
 

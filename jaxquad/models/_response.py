@@ -7,10 +7,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from ._resolvent import equilibrium, inverse, Split
-
-
-Parts = Float[Array, "frequencies 2 _ _"]  # real and imaginary, rows, columns
+from ._resolvent import apart, equilibrium, inverse, product, Scales, Split
 
 
 class Matrices(NamedTuple):
@@ -25,18 +22,25 @@ class Matrices(NamedTuple):
 
 
 @jax.custom_jvp
-def response(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Parts:
+def response(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
     """(H0 + s H1) (s M - F)^-1 G exp(-s late); rows are outputs and columns inputs.
 
     Infinite, with an undefined phase, where a pole lies so near that more than a hundredth of the
     states may be rounding. Source: Tischler & Remple, eq. 12.11 and 12.12.
     """
-    resolvent = _resolvent(matrices, omega)
-    states = _times(resolvent, matrices.G)
+    return _solved(matrices, omega)[0]
+
+
+def _solved(matrices: Matrices, omega: Float[Array, " frequencies"]) -> tuple[Split, Split, Split]:
+    """The response, the resolvent R = (s M - F)^-1 and the states X = R G."""
+    pencil = _pencil(matrices, omega)
+    scales = jax.lax.stop_gradient(equilibrium(_size(pencil)))
+    resolvent = inverse(pencil, scales)
+    states = Split(*(_times(part, matrices.G) for part in resolvent))
     found = _turned(_output(matrices, omega, states), matrices.late, omega)
-    lost = _lost(matrices, omega, resolvent, states)
-    undefined = jnp.asarray([jnp.inf, jnp.nan], omega.dtype)[None, :, None, None]
-    return jnp.where(lost[:, None], undefined, found)
+    lost = _lost(*jax.lax.stop_gradient((matrices, omega, scales, resolvent, states)))
+    value = Split(jnp.where(lost, jnp.inf, found.real), jnp.where(lost, jnp.nan, found.imag))
+    return value, resolvent, states
 
 
 @ft.partial(response.defjvp, symbolic_zeros=True)
@@ -45,38 +49,32 @@ def _response_jvp(primals, tangents):
     # dT = L (dG + dF X - d(s M) X) + d(H0 + s H1) X, late, and -j d(omega late) T.
     matrices, omega = primals
     d, d_omega = (_present(each) for each in tangents)
-    value = response(matrices, omega)
-    resolvent = _resolvent(matrices, omega)
-    states = _times(resolvent, matrices.G)
+    value, resolvent, states = _solved(matrices, omega)
     rate = _derivative(states, omega)
-    push = [_applied(d.F, states), _applied(d.M, -rate), _real(d.G, states)]
+    push = [_applied(d.F, states), _negative(_applied(d.M, rate)), _real(d.G, states)]
     change = [_applied(d.H0, states), _applied(d.H1, rate)]
     if d_omega is not None:
         turned = _derivative(states, d_omega)
-        push.append(-turned if matrices.M is None else _applied(matrices.M, -turned))
+        push.append(_negative(turned if matrices.M is None else _applied(matrices.M, turned)))
         change.append(_applied(matrices.H1, turned))
     pushed = _sum(push)
     if pushed is not None:
-        change.append(_product(_output(matrices, omega, resolvent), pushed))
+        change.append(apart(product, _output(matrices, omega, resolvent), pushed))
     changed = _sum(change)
     moved = [None if changed is None else _turned(changed, matrices.late, omega)]
     for late, frequency in ((d.late, omega), (matrices.late, d_omega)):
         if late is not None and frequency is not None:
-            angle = (frequency[:, None, None] * late[None])[:, None]
-            moved.append(angle * jnp.stack([value[:, 1], -value[:, 0]], axis=1))
-    return value, _sum([jnp.zeros_like(value), *moved])
+            angle = late[:, :, None] * frequency[None, None]
+            moved.append(Split(angle * value.imag, -angle * value.real))
+    return value, _sum([Split(*(jnp.zeros_like(part) for part in value)), *moved])
 
 
-def _turned(parts: Parts, late: Array | None, omega: Float[Array, " frequencies"]) -> Parts:
+def _turned(parts: Split, late: Array | None, omega: Float[Array, " frequencies"]) -> Split:
     if late is None:
         return parts
-    angle = omega[:, None, None] * late[None]
-    (real, imag), (c, s) = (parts[:, 0], parts[:, 1]), (jnp.cos(angle), jnp.sin(angle))
-    return jnp.stack([real * c + imag * s, imag * c - real * s], axis=1)
-
-
-def _resolvent(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Parts:
-    return jnp.transpose(jnp.stack(inverse(_pencil(matrices, omega))), (3, 0, 1, 2))
+    angle = late[:, :, None] * omega[None, None]
+    (real, imag), c, s = parts, apart(jnp.cos, angle), apart(jnp.sin, angle)
+    return Split(real * c + imag * s, imag * c - real * s)
 
 
 def _pencil(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
@@ -90,68 +88,68 @@ def _mass(matrices: Matrices) -> Float[Array, "states states"]:
     return jnp.eye(len(F), dtype=F.dtype) if M is None else M
 
 
-def _output(matrices: Matrices, omega: Float[Array, " frequencies"], states: Parts) -> Parts:
+def _output(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
     """(H0 + s H1) times `states`, or times the resolvent."""
-    found = _dot("ij,fcjk->fcik", matrices.H0, states)
-    if matrices.H1 is None:
-        return found
-    return found + _dot("ij,fcjk->fcik", matrices.H1, _derivative(states, omega))
+    found = _applied(matrices.H0, states)
+    return _sum([found, _applied(matrices.H1, _derivative(states, omega))])
 
 
 def _lost(
-    matrices: Matrices, omega: Float[Array, " frequencies"], resolvent: Parts, states: Parts
-) -> Bool[Array, "frequencies outputs inputs"]:
+    matrices: Matrices,
+    omega: Float[Array, " frequencies"],
+    scales: Scales,
+    resolvent: Split,
+    states: Split,
+) -> Bool[Array, "outputs inputs frequencies"]:
     # A first-order bound of the rounding error in the states, beside the largest state in the
     # units that make the equations alike; and what only a pivot of zero can make so large.
-    pencil = _pencil(matrices, omega)
-    scales = equilibrium(jnp.maximum(jnp.abs(pencil.real), jnp.abs(pencil.imag)))
-    row, unit = (jnp.transpose(scale)[:, :, None] for scale in scales)
-    size, gain = (jnp.sum(jnp.abs(x), axis=1) for x in (states, resolvent))
-    turned = omega[:, None, None] * _dot("ij,fjk->fik", jnp.abs(_mass(matrices)), size)
-    error = _dot("fij,fjk->fik", gain, _dot("ij,fjk->fik", jnp.abs(matrices.F), size) + turned)
+    row, unit = (scale[:, None] for scale in scales)
+    size, gain = (jnp.abs(x.real) + jnp.abs(x.imag) for x in (states, resolvent))
+    mass = size if matrices.M is None else _dot(jnp.abs(matrices.M), size)
+    terms = _dot(jnp.abs(matrices.F), size) + omega[None, None] * mass
+    error = sum(gain[:, k, None] * terms[k][None] for k in range(len(gain)))
     limit = 0.01 / float(jnp.finfo(omega.dtype).eps)
-    push = jnp.max(row * jnp.abs(matrices.G)[None], axis=1, keepdims=True)
-    doubtful = ~(error / unit <= limit * jnp.max(size / unit, axis=1, keepdims=True))
+    push = jnp.max(row * jnp.abs(matrices.G)[:, :, None], axis=0, keepdims=True)
+    doubtful = ~(error / unit <= limit * jnp.max(size / unit, axis=0, keepdims=True))
     doubtful = doubtful | (size / unit > limit**1.5 * push)
     H = [jnp.abs(each) for each in (matrices.H0, matrices.H1) if each is not None]
     seen = (sum(H[1:], H[0]) > 0).astype(omega.dtype)
-    return _dot("ij,fjk->fik", seen, doubtful.astype(omega.dtype)) > 0
+    return _dot(seen, doubtful.astype(omega.dtype)) > 0
 
 
-def _derivative(states: Parts, omega: Float[Array, " frequencies"]) -> Parts:
-    factor = omega[:, None, None]
-    return jnp.stack([-factor * states[:, 1], factor * states[:, 0]], axis=1)
+def _size(parts: Split) -> Float[Array, "rows columns frequencies"]:
+    return jnp.maximum(jnp.abs(parts.real), jnp.abs(parts.imag))
 
 
-def _product(a: Parts, b: Parts) -> Parts:
-    # Of complex matrices as one of real blocks: small, but far quicker than complex numbers.
-    real, imag = a[:, 0], a[:, 1]
-    rows = [jnp.concatenate([real, -imag], axis=2), jnp.concatenate([imag, real], axis=2)]
-    stacked = b.reshape(b.shape[0], -1, b.shape[-1])
-    found = _dot("fij,fjk->fik", jnp.concatenate(rows, axis=1), stacked)
-    return found.reshape(a.shape[0], 2, a.shape[2], b.shape[3])
+def _derivative(states: Split, omega: Float[Array, " frequencies"]) -> Split:
+    factor = omega[None, None]
+    return Split(-factor * states.imag, factor * states.real)
 
 
-def _times(resolvent: Parts, G: Float[Array, "states inputs"]) -> Parts:
-    return _dot("fcij,jk->fcik", resolvent, G)
-
-
-def _applied(matrix: Array | None, states: Parts) -> Parts | None:
-    return None if matrix is None else _dot("ij,fcjk->fcik", matrix, states)
-
-
-def _real(matrix: Array | None, like: Parts) -> Parts | None:
+def _applied(matrix: Array | None, states: Split) -> Any:
+    """A real matrix times both parts, in one product."""
     if matrix is None:
         return None
-    zero = jnp.zeros_like(matrix)
-    return jnp.broadcast_to(jnp.stack([matrix, zero])[None], like.shape)
+    both = jnp.concatenate(states, axis=1)
+    found, inputs = _dot(matrix, both), states.real.shape[1]
+    return Split(found[:, :inputs], found[:, inputs:])
 
 
-def _sum(terms: Sequence[Parts | None]) -> Any:
-    total = None
-    for term in terms:
-        total = term if total is None else total if term is None else total + term
-    return total
+def _real(matrix: Array | None, like: Split) -> Any:
+    if matrix is None:
+        return None
+    return Split(jnp.broadcast_to(matrix[:, :, None], like.real.shape), jnp.zeros_like(like.imag))
+
+
+def _negative(parts: Any) -> Any:
+    return None if parts is None else Split(-parts.real, -parts.imag)
+
+
+def _sum(terms: Sequence[Any]) -> Any:
+    present = [term for term in terms if term is not None]
+    if not present:
+        return None
+    return ft.reduce(lambda a, b: Split(a.real + b.real, a.imag + b.imag), present)
 
 
 def _present(tangents: Any) -> Any:
@@ -160,5 +158,10 @@ def _present(tangents: Any) -> Any:
     return jax.tree.map(lambda x: None if absent(x) else x, tangents, is_leaf=absent)
 
 
-def _dot(axes: str, a: Array, b: Array) -> Array:
-    return jnp.einsum(axes, a, b, precision="highest")
+def _times(array: Array, matrix: Array) -> Array:
+    terms = [array[:, k, None] * matrix[k][None, :, None] for k in range(len(matrix))]
+    return ft.reduce(jnp.add, terms)
+
+
+def _dot(matrix: Array, array: Array) -> Array:
+    return jnp.einsum("ij,jkf->ikf", matrix, array, precision="highest")

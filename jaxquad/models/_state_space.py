@@ -121,7 +121,7 @@ def explicit(
 def _frequency_response(model: StateSpace, omega: Array) -> Array:
     matrices = Matrices(model.F, model.G, model.H0, model.H1, model.M, model.lateness)
     parts = response(matrices, omega)
-    return jax.lax.complex(parts[:, 0], parts[:, 1])
+    return jnp.moveaxis(jax.lax.complex(parts.real, parts.imag), -1, 0)
 
 
 def _host(model: StateSpace) -> tuple[np.ndarray, ...]:

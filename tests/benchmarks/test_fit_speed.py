@@ -4,7 +4,7 @@
 
 Both start from the same values on the same response, fit logarithms of five parameters (gain,
 lag, damping, natural frequency, delay) under the same weights, and must agree. Ours also gives
-covariance, identifiability and remarks; `solve` is the minimisation and its Jacobian alone.
+covariance, identifiability and remarks; `descend` is the minimisation alone, as scipy's call is.
 """
 
 import equinox as eqx
@@ -16,9 +16,9 @@ from scipy.optimize import least_squares
 
 import jaxquad as jq
 from jaxquad.identify._band import usable
-from jaxquad.identify._problem import make_problem
 from jaxquad.identify._parameters import select_parameters
-from jaxquad.identify._solve import solve
+from jaxquad.identify._problem import make_problem
+from jaxquad.identify._solve import descend
 
 
 jax.config.update("jax_enable_x64", True)
@@ -104,13 +104,15 @@ def test_scipy_least_squares(benchmark, frf):
 
 
 @pytest.mark.benchmark(group="fit")
-def test_solve(benchmark, frf):
+def test_descend(benchmark, frf):
     parameters = select_parameters(_model(), None)
     cost = _OneSolve()
     problem = make_problem(_model(), parameters, [frf])
     used = usable(frf, None, 0.6)
     problem = problem.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
-    found = benchmark(lambda: solve(problem, parameters.start[:5], None, 256).z.block_until_ready())
+    found = benchmark(
+        lambda: descend(problem, parameters.start[:5], None, 256).z.block_until_ready()
+    )
     np.testing.assert_allclose(np.exp(found), _peer(frf), rtol=1e-5)
 
 
