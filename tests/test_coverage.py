@@ -8,7 +8,7 @@ import pytest
 
 
 sys.path.append(str(Path(__file__).parent / "benchmarks"))
-from coverage_study import draw, omega_of, studies  # noqa: E402
+from coverage_study import draw, omega_of, studies  # noqa: E402  # pyright: ignore
 
 
 STUDIES = studies()

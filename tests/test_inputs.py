@@ -25,7 +25,7 @@ def together(seed=0, share=0.6):
 
 
 def answer(u, seed=None, deviation=0.3):
-    y = sum(signal.lfilter(*part, u[:, k]) for k, part in enumerate(PLANT))
+    y = np.sum([signal.lfilter(*part, u[:, k]) for k, part in enumerate(PLANT)], axis=0)
     return y if seed is None else y + noise(seed, deviation=deviation)[:, 0]
 
 

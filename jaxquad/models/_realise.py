@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -5,6 +6,7 @@ from jaxtyping import Array, Float
 from ._transfer_function import TransferFunction
 
 
+@eqx.filter_jit  # one compilation instead of one for each small operation
 def realise(
     model: TransferFunction,
 ) -> tuple[

@@ -77,7 +77,7 @@ def average(
         effect,
         combined.share,
         noise,
-        _excitation(products[0] / many[0], channels),
+        _excitation(products[0] / counts[0].astype(products.dtype), channels),
     )
 
 

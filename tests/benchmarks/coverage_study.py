@@ -96,7 +96,7 @@ def passed(model, u: np.ndarray) -> np.ndarray:
     count = 2 * len(u)
     omega = 2 * np.pi * np.fft.rfftfreq(count, 1 / RATE)
     response = np.asarray(model.frequency_response(jnp.asarray(omega[1:])))
-    response = np.concatenate([response[:1].real + 0j, response])
+    response = np.concatenate([np.real(response[:1]) + 0j, response])
     spectrum = np.einsum("foi,fi->fo", response, np.fft.rfft(u, count, axis=0))
     return np.fft.irfft(spectrum, count, axis=0)[: len(u)]
 

@@ -1,6 +1,6 @@
-"""Conditioned composite responses of three inputs and six outputs beside NumPy and scipy, in one run.
+"""Conditioned composite responses of three inputs and six outputs beside scipy's, in one run.
 
-    python -m pytest tests/benchmarks/test_composite_speed.py -o addopts= --benchmark-columns=min,median
+    python -m pytest tests/benchmarks/test_composite_speed.py -o addopts=
 
 120 s at 500 Hz, windows of 30, 20, 12, 8 and 5 s that overlap by half, 100 frequencies. The peer
 stacks tapered segments, transforms them with `scipy.signal.ZoomFFT` (on a linear grid, since it has
@@ -38,7 +38,8 @@ ESTIMATOR = jq.Composite(windows=LENGTHS, overlap=0.5)
 COLUMNS = np.hstack([RECORD.inputs, RECORD.outputs])
 BAND = (LINEAR[0] / (2 * np.pi), LINEAR[-1] / (2 * np.pi))
 ZOOMS = {
-    seconds: ZoomFFT(int(seconds * RATE), BAND, 100, fs=RATE, endpoint=True) for seconds in LENGTHS
+    seconds: ZoomFFT(int(seconds * RATE), BAND, 100, fs=int(RATE), endpoint=True)
+    for seconds in LENGTHS
 }
 
 
