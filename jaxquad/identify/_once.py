@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
+from jaxquad.models._apart import apart
+
 
 _COSTLY = {"exp", "log", "sin", "cos", "tan", "div", "atan2", "sqrt", "rsqrt", "pow", "tanh"}
 _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
@@ -83,7 +85,7 @@ def _single(equation: Any, args: list[Any], known: dict) -> Any:
     if name == "integer_pow" and params["y"] < 0 and jnp.iscomplexobj(args[0]):
         return jax.lax.integer_pow(_reciprocal_of(args[0], known), -params["y"])
     if name in _COSTLY:
-        return _apart(lambda *xs: _bind(equation, xs)[0])(*args)
+        return apart(lambda *xs: _bind(equation, xs)[0], *args)
     return _bind(equation, args)[0]
 
 
@@ -95,23 +97,9 @@ def _bind(equation: Any, args: Sequence[Any]) -> list[Any]:
 
 
 def _reciprocal_of(value: Any, known: dict) -> Any:
-    return _remembered(("reciprocal",), [value], known, lambda: [_apart(_reciprocal)(value)])[0]
+    return _remembered(("reciprocal",), [value], known, lambda: [apart(_reciprocal, value)])[0]
 
 
 def _reciprocal(value: Any) -> Any:
     squared = jnp.real(value) ** 2 + jnp.imag(value) ** 2
     return jax.lax.complex(jnp.real(value) / squared, -jnp.imag(value) / squared)
-
-
-def _apart(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A call that the compiler neither inlines nor fuses; without its private mark, a plain one."""
-    try:
-        from jax.experimental.xla_metadata import set_xla_metadata
-    except ImportError:
-        return function
-
-    def run(*args: Any) -> Any:
-        with set_xla_metadata(inlineable="false"):
-            return jax.jit(function)(*args)
-
-    return run

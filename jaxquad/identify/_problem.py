@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
-from jaxquad.models._resolvent import apart
+from jaxquad.models._apart import apart
 from jaxquad.spectra import FrequencyResponse
 
 from ._parameters import Parameters

@@ -4,8 +4,7 @@ Complex arrays are split into real and imaginary parts: compilers make them fast
 frequencies. No LAPACK: its threads can wait for each other under `vmap` on a machine of two cores.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,19 +29,6 @@ def product(a: Split, b: Split) -> Split:
         real = real + (left.real * right.real - left.imag * right.imag)
         imag = imag + (left.real * right.imag + left.imag * right.real)
     return Split(real, imag)
-
-
-def apart(function: Callable[..., Any], *args: Any) -> Any:
-    """A call that the CPU's compiler does not fuse: what it fuses, it computes for each user anew.
-
-    Without its private mark, a plain call.
-    """
-    try:
-        from jax.experimental.xla_metadata import set_xla_metadata
-    except ImportError:
-        return function(*args)
-    with set_xla_metadata(inlineable="false"):
-        return jax.jit(function)(*args)
 
 
 @jax.custom_jvp

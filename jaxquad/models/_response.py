@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from ._resolvent import apart, equilibrium, inverse, product, Scales, Split
+from ._apart import apart
+from ._resolvent import equilibrium, inverse, product, Scales, Split
 
 
 class Matrices(NamedTuple):
