@@ -162,10 +162,12 @@ def omega_of(name: str, frequencies: int = 50) -> np.ndarray:
     return np.geomspace(low, high, frequencies)
 
 
-def draw(study: Study, omega: np.ndarray, draws: int) -> tuple[np.ndarray, np.ndarray]:
-    """Estimates and standard errors, (draws, parameters)."""
+def draw(
+    study: Study, omega: np.ndarray, draws: int, first: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates and standard errors, (draws, parameters), of the seeds from `first` on."""
     fits = []
-    for seed in range(draws):
+    for seed in range(first, first + draws):
         fit = study.identify(jq.frequency_response(study.fly(seed), omega))
         fits.append((fit.values, fit.standard_errors))
     values, errors = (np.stack(part) for part in zip(*fits, strict=True))
@@ -189,9 +191,11 @@ def table(name: str, study: Study, values: np.ndarray, errors: np.ndarray) -> st
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=1000)
-    draws = parser.parse_args().draws
+    parser.add_argument("--seed", type=int, default=0, help="of the first draw")
+    options = parser.parse_args()
     for name, study in studies().items():
-        print(table(name, study, *draw(study, omega_of(name), draws)), "\n", flush=True)
+        drawn = draw(study, omega_of(name), options.draws, options.seed)
+        print(table(name, study, *drawn), "\n", flush=True)
 
 
 if __name__ == "__main__":
