@@ -22,7 +22,7 @@ def script():
 def gains(script):
     """Relative error and relative standard error of L K_t / J_x by estimator and cost."""
     joint = [("joint", "maximum likelihood"), ("joint", "Eq. (14)")]
-    found = script.draw_gains(100, joint) | script.draw_gains(50, [("direct", "Eq. (14)")])
+    found = script.draw_gains(200, joint) | script.draw_gains(50, [("direct", "Eq. (14)")])
     return {key: rows / script.TRUTH - [1.0, 0.0] for key, rows in found.items()}
 
 
@@ -37,11 +37,10 @@ def test_the_direct_estimate_is_biased_by_several_per_cent(gains):
     assert np.median(gains["direct", "Eq. (14)"][:, 0]) < -0.03
 
 
-def test_the_95_per_cent_interval_covers_the_truth_as_often_as_it_says(gains):
+def test_the_95_per_cent_interval_covers_the_truth_in_90_to_98_per_cent(gains):
     errors = gains["joint", "maximum likelihood"]
     covered = np.mean(np.abs(errors[:, 0]) < 1.96 * errors[:, 1])
-    # 100 draws know it to 2.2 %; fits/hover_roll.py --draws 200 to 1.5 %.
-    assert len(errors) == 100 and 0.90 <= covered <= 0.99
+    assert len(errors) == 200 and 0.90 <= covered <= 0.98
 
 
 def test_a_run_with_added_inertia_tells_inertia_from_thrust(script):

@@ -13,7 +13,7 @@ from ._welch import Welch
 from ._window import window
 
 
-_MOST_FREQUENCIES = 1024  # the covariance between them is kept whole
+_MOST_FREQUENCIES = 1024  # the covariance of a pair is made between all of them
 _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
 
 

@@ -42,8 +42,7 @@ def by_period(
     """Averages over the periods of a periodic excitation, at its lines."""
     check_moving(records, method)
     found = estimate_periodic(records, omega, options, method)
-    # Whole periods do not leak, whatever the plant integrates.
-    return _result(records, found.omega, found, method, 3)
+    return _result(records, found.omega, found, method, 0)
 
 
 def _result(
