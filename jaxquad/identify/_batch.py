@@ -86,10 +86,11 @@ def _solve(model, parameters, omega, measured, weights, max_steps, tolerance) ->
     def chunk(data):
         evaluate = lambda z: _normal(model, parameters, z, omega, *data)
         state = minimise(evaluate, z0, max_steps, tolerance)
-        left = decrement(state.normal)
-        level = left <= 1e-6 * state.normal.cost + 1e-12
+        normal = evaluate(state.z)
+        left = decrement(normal)
+        level = left <= 1e-6 * normal.cost + 1e-12
         converged = (state.status == CONVERGED) & level
-        return state.z, 2 * state.normal.cost, left, state.steps, converged
+        return state.z, 2 * normal.cost, left, state.steps, converged
 
     stacked = jax.lax.map(chunk, (_chunked(inverse, size), _chunked(weights, size)))
     batch = measured.shape[0]

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 TOLERANCE = 1e-8  # of a step, relative to 1 + |z|, and of the root of the cost it would save
 RUNNING, CONVERGED, STALLED = 0, 1, 2
-_DAMPING = 1e-2  # of the first step, in units of the largest diagonal element of the Hessian
+_DAMPING = 3e-2  # of the first step, in units of the largest diagonal element of the Hessian
+_SHRINKING = 0.1  # the least factor from one step to the next that is believed
 
 
 class Normal(NamedTuple):
@@ -26,12 +27,15 @@ class Normal(NamedTuple):
 
 
 class Descent(NamedTuple):
-    """Where each member of the batch stands, and how damped its next step is."""
+    """Where each member of the batch stands, and the step that it will try next."""
 
     z: Float[Array, " parameters *batch"]
     normal: Normal
     damping: Float[Array, " *batch"]  # in units of the largest diagonal element of the Hessian
     growth: Float[Array, " *batch"]  # of the damping, should the next step fail
+    change: Float[Array, " parameters *batch"]  # the next step
+    predicted: Float[Array, " *batch"]  # what it would save of the cost; 0 where it is undefined
+    size: Float[Array, " *batch"]  # of the last step taken, relative to 1 + |z|
     steps: Int[Array, " *batch"]
     status: Int[Array, " *batch"]
 
@@ -51,7 +55,7 @@ def minimise(
     unit means the same for all. A trial point that is not finite counts as a failed step.
     Damping follows Nielsen (1999), Damping parameter in Marquardt's method, IMM-REP-1999-05.
     """
-    start = begin(evaluate, z0)
+    start = begin(z0)
 
     def running(state: Descent) -> Bool[Array, ""]:
         return jnp.any((state.status == RUNNING) & (state.steps < max_steps))
@@ -62,54 +66,75 @@ def minimise(
     return settle(jax.lax.while_loop(running, body, start))
 
 
-def begin(evaluate: Evaluate, z0: Float[Array, " parameters *batch"]) -> Descent:
-    """Every member at its start; one whose start is not finite has stopped there."""
-    batch = z0.shape[1:]
-    counter = jnp.zeros(batch, int)
-    normal = evaluate(z0)
-    status = jnp.where(_finite(normal), RUNNING, STALLED)
-    damping, growth = jnp.full(batch, _DAMPING), jnp.full(batch, 2.0)
-    return Descent(z0, normal, damping, growth, counter, counter + status)
+def begin(z0: Float[Array, " parameters *batch"]) -> Descent:
+    """Every member before its start: the first step of `advance` is none, and evaluates it."""
+    zero, none = jnp.zeros(z0.shape[1:], z0.dtype), jnp.zeros_like(z0)
+    hessian = jnp.zeros((len(z0), *z0.shape), z0.dtype)
+    normal, counter = Normal(zero + jnp.inf, none, hessian), jnp.zeros(zero.shape, int)
+    levels = zero + _DAMPING, zero + 2.0
+    return Descent(z0, normal, *levels, none, zero, zero + jnp.inf, counter, counter + RUNNING)
 
 
 def settle(state: Descent) -> Descent:
     """Rounding can stop the descent at a minimum: what is left to save tells it from a wall."""
-    level = decrement(state.normal) <= 1e-9 * state.normal.cost
+    cost = state.normal.cost
+    level = jnp.isfinite(cost) & (decrement(state.normal) <= 1e-9 * cost)
     status = jnp.where((state.status == STALLED) & level, CONVERGED, state.status)
     return state._replace(status=status)
 
 
 def advance(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float) -> Descent:
     """One step of every member that is still running."""
-    damping = state.damping * _size(state.normal.hessian)
-    change, definite = solve_definite(
-        _damped(state.normal.hessian, damping), -state.normal.gradient
-    )
-    predicted = 0.5 * jnp.sum(change * (damping[None] * change - state.normal.gradient), axis=0)
-    trial = state.z + change
+    trial = state.z + state.change
     normal = evaluate(trial)
+    first, finite = jnp.isinf(state.normal.cost), _finite(normal)
     saved = state.normal.cost - normal.cost
-    ratio = saved / jnp.where(predicted > 0, predicted, 1e-300)
-    moved = jnp.max(jnp.abs(change) / (1 + jnp.abs(state.z)), axis=0)
-    # A step that damping has shortened says nothing about the distance to the minimum.
-    small = (moved <= tolerance) | (predicted <= tolerance**2 * state.normal.cost)
-    small = small & definite & (state.damping <= 1e-2)
-    # The last steps save less than the rounding of the cost.
-    equal = small & (saved >= -1e-12 * state.normal.cost)
-    accepted = definite & _finite(normal) & ((ratio > 1e-3) | equal)
+    ratio = jnp.where(first, 0.5, saved / jnp.where(state.predicted > 0, state.predicted, 1e-300))
+    accepted = finite & (first | ((state.predicted > 0) & (ratio > 1e-3)))
     active = (state.status == RUNNING) & (state.steps < max_steps)
     factor = jnp.where(accepted, jnp.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0), state.growth)
     damping = jnp.maximum(state.damping * factor, 1e-14)
-    status = jnp.where(small, CONVERGED, jnp.where(damping > 1e16, STALLED, RUNNING))
+    stalled = active & ((damping > 1e16) | (first & ~finite))
     taken = active & accepted
-    return Descent(
-        _select(taken, trial, state.z),
-        Normal(*(_select(taken, *pair) for pair in zip(normal, state.normal, strict=True))),
-        jnp.where(active, damping, state.damping),
-        jnp.where(accepted, 2.0, 2 * state.growth),
-        state.steps + active.astype(int),
-        jnp.where(active, status, state.status),
+    size = jnp.where(taken & ~first, _relative(state.change, state.z), state.size)
+    moved = state._replace(
+        z=_select(taken, trial, state.z),
+        normal=Normal(*(_select(taken, *both) for both in zip(normal, state.normal, strict=True))),
+        damping=jnp.where(active, damping, state.damping),
+        growth=jnp.where(accepted, 2.0, 2 * state.growth),
+        size=size,
+        steps=state.steps + (active & ~first).astype(int),
+        status=jnp.where(stalled, STALLED, state.status),
     )
+    return _aimed(moved, tolerance)
+
+
+def _aimed(state: Descent, tolerance: float) -> Descent:
+    """The next step, damped; the last one is taken at once, for it needs no judgement."""
+    damping = state.damping * _size(state.normal.hessian)
+    hessian, gradient = _damped(state.normal.hessian, damping), state.normal.gradient
+    change, definite = solve_definite(hessian, -gradient)
+    predicted = jnp.where(
+        definite, 0.5 * jnp.sum(change * (damping[None] * change - gradient), 0), 0
+    )
+    size = _relative(change, state.z)
+    # Near a minimum each step shrinks as the one before: what is left after the next is known.
+    left = size * jnp.clip(size / state.size, _SHRINKING, 1.0)
+    enough = (left <= tolerance) | (predicted <= tolerance**2 * state.normal.cost)
+    # A step that damping has shortened says nothing about the distance to the minimum.
+    last = (state.status == RUNNING) & definite & (state.damping <= _DAMPING) & enough
+    return state._replace(
+        z=_select(last, state.z + change, state.z),
+        change=change,
+        predicted=predicted,
+        status=jnp.where(last, CONVERGED, state.status),
+    )
+
+
+def _relative(
+    change: Float[Array, " parameters *batch"], z: Float[Array, " parameters *batch"]
+) -> Float[Array, " *batch"]:
+    return jnp.max(jnp.abs(change) / (1 + jnp.abs(z)), axis=0)
 
 
 def normal_equations(

@@ -11,7 +11,8 @@ from jaxtyping import Float
 from ._levenberg import CONVERGED, decrement, Descent, minimise, Normal, RUNNING, TOLERANCE
 from ._parameters import Parameters
 from ._problem import Problem, residuals
-from ._solve import describe, least_squares, normal_equations, Solution, solution_at, Stop
+from ._solve import describe, least_squares, Solution, solution_at, Stop
+from ._structured import problem_normal
 
 
 MINIMUM = "minimum"
@@ -107,7 +108,7 @@ _describe = eqx.filter_jit(describe)
 @eqx.filter_jit
 def _solve_all(problem, starts, solver, max_steps):
     def normal_at(z):
-        return normal_equations(residuals, z, problem)
+        return problem_normal(z, problem)
 
     if solver is None:
         side_by_side = jax.vmap(normal_at, in_axes=-1, out_axes=-1)

@@ -82,7 +82,8 @@ def _exchange(matrix: Split) -> Split:
 
     (table, _), row = jax.lax.scan(step, (matrix, unused), jnp.arange(states))
     # Column k belongs to the right side row[k], and row[k] holds the unknown k.
-    place = jnp.argsort(row, axis=0)
+    number = jnp.arange(states)
+    place = jnp.sum(jnp.where(row[:, None] == number[None, :, None], number[:, None, None], 0), 0)
     index = (row[:, None] * states + place[None]).reshape(-1, frequencies)
     order = lambda part: _taken(part.reshape(-1, frequencies), index, 0).reshape(part.shape)
     return Split(order(table.real), order(table.imag))

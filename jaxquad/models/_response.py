@@ -29,19 +29,31 @@ def response(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
     Infinite, with an undefined phase, where a pole lies so near that more than a hundredth of the
     states may be rounding. Source: Tischler & Remple, eq. 12.11 and 12.12.
     """
-    return _solved(matrices, omega)[0]
+    return _guarded(matrices, omega, solved(matrices, omega))
 
 
-def _solved(matrices: Matrices, omega: Float[Array, " frequencies"]) -> tuple[Split, Split, Split]:
-    """The response, the resolvent R = (s M - F)^-1 and the states X = R G."""
-    pencil = _pencil(matrices, omega)
-    scales = jax.lax.stop_gradient(equilibrium(_size(pencil)))
-    resolvent = inverse(pencil, scales)
+class Solved(NamedTuple):
+    """The response and what it is made of."""
+
+    value: Split  # (outputs, inputs, frequencies), rounding or not
+    resolvent: Split  # R = (s M - F)^-1
+    states: Split  # X = R G
+    scales: Scales
+
+
+def solved(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Solved:
+    """The response without a look at its rounding error."""
+    scales = jax.lax.stop_gradient(_scales(matrices, omega))
+    resolvent = inverse(_pencil(matrices, omega), scales)
     states = Split(*(_times(part, matrices.G) for part in resolvent))
-    found = _turned(_output(matrices, omega, states), matrices.late, omega)
-    lost = _lost(*jax.lax.stop_gradient((matrices, omega, scales, resolvent, states)))
-    value = Split(jnp.where(lost, jnp.inf, found.real), jnp.where(lost, jnp.nan, found.imag))
-    return value, resolvent, states
+    value = _turned(output_of(matrices, omega, states), matrices.late, omega)
+    return Solved(value, resolvent, states, scales)
+
+
+def _guarded(matrices: Matrices, omega: Float[Array, " frequencies"], found: Solved) -> Split:
+    lost = _lost(*jax.lax.stop_gradient((matrices, omega, found)))
+    real, imag = found.value
+    return Split(jnp.where(lost, jnp.inf, real), jnp.where(lost, jnp.nan, imag))
 
 
 @ft.partial(response.defjvp, symbolic_zeros=True)
@@ -50,7 +62,8 @@ def _response_jvp(primals, tangents):
     # dT = L (dG + dF X - d(s M) X) + d(H0 + s H1) X, late, and -j d(omega late) T.
     matrices, omega = primals
     d, d_omega = (_present(each) for each in tangents)
-    value, resolvent, states = _solved(matrices, omega)
+    found = solved(matrices, omega)
+    value, states = _guarded(matrices, omega, found), found.states
     rate = _derivative(states, omega)
     push = [_applied(d.F, states), _negative(_applied(d.M, rate)), _real(d.G, states)]
     change = [_applied(d.H0, states), _applied(d.H1, rate)]
@@ -60,7 +73,7 @@ def _response_jvp(primals, tangents):
         change.append(_applied(matrices.H1, turned))
     pushed = _sum(push)
     if pushed is not None:
-        change.append(apart(product, _output(matrices, omega, resolvent), pushed))
+        change.append(apart(product, output_of(matrices, omega, found.resolvent), pushed))
     changed = _sum(change)
     moved = [None if changed is None else _turned(changed, matrices.late, omega)]
     for late, frequency in ((d.late, omega), (matrices.late, d_omega)):
@@ -84,28 +97,32 @@ def _pencil(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
     return Split(jnp.broadcast_to(-F[:, :, None], shape), M[:, :, None] * omega[None, None])
 
 
+def _scales(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Scales:
+    """Of rows and columns, from the geometric mean of the frequencies: units know no frequency."""
+    middle = jnp.exp(jnp.mean(jnp.log(jnp.where(omega > 0, omega, 1.0))))[None]
+    shape = (len(matrices.F), omega.size)
+    rows, columns = equilibrium(_size(_pencil(matrices, middle)))
+    return jnp.broadcast_to(rows, shape), jnp.broadcast_to(columns, shape)
+
+
 def _mass(matrices: Matrices) -> Float[Array, "states states"]:
     F, M = matrices.F, matrices.M
     return jnp.eye(len(F), dtype=F.dtype) if M is None else M
 
 
-def _output(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
+def output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
     """(H0 + s H1) times `states`, or times the resolvent."""
     found = _applied(matrices.H0, states)
     return _sum([found, _applied(matrices.H1, _derivative(states, omega))])
 
 
 def _lost(
-    matrices: Matrices,
-    omega: Float[Array, " frequencies"],
-    scales: Scales,
-    resolvent: Split,
-    states: Split,
+    matrices: Matrices, omega: Float[Array, " frequencies"], found: Solved
 ) -> Bool[Array, "outputs inputs frequencies"]:
     # A first-order bound of the rounding error in the states, beside the largest state in the
     # units that make the equations alike; and what only a pivot of zero can make so large.
-    row, unit = (scale[:, None] for scale in scales)
-    size, gain = (jnp.abs(x.real) + jnp.abs(x.imag) for x in (states, resolvent))
+    row, unit = (scale[:, None] for scale in found.scales)
+    size, gain = (jnp.abs(x.real) + jnp.abs(x.imag) for x in (found.states, found.resolvent))
     mass = size if matrices.M is None else _dot(jnp.abs(matrices.M), size)
     terms = _dot(jnp.abs(matrices.F), size) + omega[None, None] * mass
     error = sum(gain[:, k, None] * terms[k][None] for k in range(len(gain)))
@@ -114,8 +131,9 @@ def _lost(
     doubtful = ~(error / unit <= limit * jnp.max(size / unit, axis=0, keepdims=True))
     doubtful = doubtful | (size / unit > limit**1.5 * push)
     H = [jnp.abs(each) for each in (matrices.H0, matrices.H1) if each is not None]
-    seen = (sum(H[1:], H[0]) > 0).astype(omega.dtype)
-    return _dot(seen, doubtful.astype(omega.dtype)) > 0
+    seen = sum(H[1:], H[0]) > 0
+    each = [seen[:, k, None, None] & doubtful[k][None] for k in range(len(doubtful))]
+    return ft.reduce(jnp.logical_or, each)
 
 
 def _size(parts: Split) -> Float[Array, "rows columns frequencies"]:
