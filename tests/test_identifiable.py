@@ -81,7 +81,7 @@ def test_a_second_record_under_known_added_inertia_tells_them_apart():
     np.testing.assert_array_less(
         np.abs(both.values - [0.0552, 0.1188, 0.02]), 3 * both.standard_errors
     )
-    # The error of the ratio is amplified by about (1 + J / dJ) sqrt(2): EQUATIONS 1.1.
+    # The error of the ratio is amplified by about (1 + J / dJ) sqrt(2).
     gain = both.derived(lambda m: m.gain, "gain")
     growth = (both.standard_errors[0] / both.values[0]) / (gain.standard_error / gain.value)
     assert 2 < growth < 8
