@@ -196,6 +196,18 @@ def test_an_ensemble_along_the_last_axis_equals_the_single_runs():
             np.testing.assert_allclose(many[..., i], one, rtol=0, atol=1e-13)  # 200 roundings
 
 
+def test_dry_friction_takes_momentum_at_a_constant_rate_and_never_turns_it_round():
+    attitude = Attitude(INERTIA, coulomb=[0.01, 0.01, 0.02])
+    _, rate = tumble(attitude, jnp.array([0.0, 0.0, 0.5]), 0.002)
+    third = np.asarray(rate)[:, 2]
+    lasts = 0.5 * INERTIA[2] / 0.02  # s
+    before = int(0.8 * lasts / 0.002)
+    assert third[before] == pytest.approx(0.5 * 0.2, rel=1e-3)
+    assert np.all(third > 0) and third[-1] < 1e-6
+    still = attitude.acceleration(STILL, STILL)
+    np.testing.assert_array_equal(still, 0)
+
+
 @pytest.mark.parametrize("inertia", [[0.05, 0.0, 0.1], [0.05, -0.07, 0.1], [0.05, np.nan, 0.1]])
 def test_an_inertia_that_is_not_positive_is_refused(inertia):
     with pytest.raises(ValueError, match="inertia is .* above 0"):

@@ -2,6 +2,7 @@ from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._axis import AttitudeAxis as AttitudeAxis
 from ._connect import series as series, state_space as state_space
+from ._decoupled import AxesState as AxesState, DecoupledAxes as DecoupledAxes
 from ._lagged_integrator import LaggedIntegrator as LaggedIntegrator
 from ._modes import Mode as Mode, modes as modes
 from ._motor import MotorLag as MotorLag
@@ -23,6 +24,9 @@ from ._simulate_linear import (
 from ._state_space import StateSpace as StateSpace
 from ._transfer_function import TransferFunction as TransferFunction
 from ._vehicles import (
+    CRAZYFLIE as CRAZYFLIE,
+    crazyflie as crazyflie,
+    CrazyflieDataSheet as CrazyflieDataSheet,
     HoverDataSheet as HoverDataSheet,
     QUANSER_HOVER as QUANSER_HOVER,
     quanser_hover as quanser_hover,

@@ -1,3 +1,5 @@
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -6,22 +8,33 @@ from jaxtyping import Array, Float
 from ._parameters import align, as_float, require_positive
 
 
-# Signs of roll, pitch and yaw torque (rows) under more of each motor's input (columns).
-_SIGNS = {
-    "frd-frbl": np.array([[0, -1, 0, 1], [1, 0, -1, 0], [1, -1, 1, -1]]),
-    "quanser": np.array([[0, 0, 1, -1], [1, -1, 0, 0], [-1, -1, 1, 1]]),
+class _Frame(NamedTuple):
+    signs: np.ndarray  # of roll, pitch and yaw torque (rows) under more of each motor's input
+    lever: float  # of a rotor about the roll and pitch axes, in arms
+
+
+_DIAGONAL = 0.5**0.5
+_FRAMES = {
+    "frd-frbl": _Frame(np.array([[0, -1, 0, 1], [1, 0, -1, 0], [1, -1, 1, -1]]), 1.0),
+    "quanser": _Frame(np.array([[0, 0, 1, -1], [1, -1, 0, 0], [-1, -1, 1, 1]]), 1.0),
+    "px4-x": _Frame(np.array([[-1, 1, 1, -1], [1, -1, 1, -1], [1, 1, -1, -1]]), _DIAGONAL),
+    "crazyflie": _Frame(np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]), _DIAGONAL),
 }
 _INPUTS = ("voltage", "omega2")
 
 
 class Allocation(eqx.Module):
-    """From four motor inputs to three body torques, for a "+" frame.
+    """From four motor inputs to three body torques, for "+" and "x" frames.
 
-    Source: Eq. (9), (10). `convention` names frame and rotor order: "frd-frbl" is the paper's
-    (forward, right, down; front, right, back, left), "quanser" that of the maker of its rig
-    (back, right, up; front, back, right, left). Front and back rotors turn anticlockwise seen from
-    above. `input` says what drives a motor: its "voltage", or the squared speed "omega2".
-    Raises ValueError for an unknown convention or input, and for a value that is not positive.
+    Source: Eq. (9), (10). `convention` names body axes and rotor order:
+    "frd-frbl", the paper's "+" (forward, right, down; front, right, back, left);
+    "quanser", a "+" of the maker of its rig (back, right, up; front, back, right, left);
+    "px4-x", and ArduPilot's (forward, right, down; front right, back left, front left, back right);
+    "crazyflie", an "x" (forward, left, up; front right, back right, back left, front left).
+    Seen from above, anticlockwise turn front and back, or front right and back left. In an "x" the
+    lever is arm / sqrt(2). `input` says what drives a motor: its "voltage", or the squared speed
+    "omega2". Raises ValueError for an unknown convention or input, and for a value that is not
+    positive.
     """
 
     arm: Float[Array, "..."] = eqx.field(converter=as_float)  # L, m
@@ -31,7 +44,7 @@ class Allocation(eqx.Module):
     input: str = eqx.field(static=True, default="voltage")
 
     def __check_init__(self):
-        _require_known("convention", self.convention, tuple(_SIGNS))
+        _require_known("convention", self.convention, tuple(_FRAMES))
         _require_known("input", self.input, _INPUTS)
         require_positive("arm", self.arm, "give the distance from centre to rotor in m")
         for name in ("thrust_coefficient", "torque_coefficient"):
@@ -41,15 +54,15 @@ class Allocation(eqx.Module):
     def matrix(self) -> Float[Array, " 3 4 *ensemble"]:
         """U of Eq. (10), N m per unit of motor input."""
         signs = jnp.asarray(self._signs, dtype=self.arm.dtype)
-        effect = self._effect[:, None]
+        effect = self.torque_per_difference[:, None]
         return align(signs, effect) * effect
 
     def torque(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
         """Body torque in N m of the four motor `inputs`: Eq. (9)."""
-        return align(self._effect, inputs) * self.differences(inputs)
+        return align(self.torque_per_difference, inputs) * self.differences(inputs)
 
     def differences(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
-        """What Eq. (9) multiplies by L K_t, L K_t and K_l: on the paper's rig V4 - V2 and so on."""
+        """What Eq. (9) multiplies by lever K_t (twice) and K_l: V4 - V2 and so on in the paper."""
         signs = jnp.asarray(self._signs, dtype=inputs.dtype)
         return jnp.tensordot(signs, inputs, 1, precision="highest")
 
@@ -61,7 +74,7 @@ class Allocation(eqx.Module):
         Eq. (10) has no row for the thrust, so `collective` (the bias voltage on the rig) makes the
         answer unique. The rows are orthogonal, hence the inverse is a scaled transpose.
         """
-        return self.from_differences(torque / align(self._effect, torque), collective)
+        return self.from_differences(torque / align(self.torque_per_difference, torque), collective)
 
     def from_differences(
         self, wanted: Float[Array, " 3 *ensemble"], collective: Float[Array, "*ensemble"] | float
@@ -86,11 +99,12 @@ class Allocation(eqx.Module):
 
     @property
     def _signs(self) -> np.ndarray:
-        return _SIGNS[self.convention]
+        return _FRAMES[self.convention].signs
 
     @property
-    def _effect(self) -> Float[Array, " 3 *ensemble"]:
-        lever = self.arm * self.thrust_coefficient
+    def torque_per_difference(self) -> Float[Array, " 3 *ensemble"]:
+        """Torque in N m per unit of `differences`, axis by axis."""
+        lever = _FRAMES[self.convention].lever * self.arm * self.thrust_coefficient
         return jnp.stack(jnp.broadcast_arrays(lever, lever, self.torque_coefficient))
 
 

@@ -2,6 +2,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._friction import friction
 from ._parameters import (
     align,
     as_float,
@@ -20,13 +21,17 @@ class Attitude(eqx.Module):
     Each parameter is one value per axis, with an optional trailing ensemble axis. `stiffness`, in
     N m/rad, is the pull of a rig whose centre of mass hangs below its pivot: a body torque per
     Euler angle, right to first order in the angles; None leaves it out, and the trigonometry too.
-    Raises ValueError for an inertia that is not positive.
+    `coulomb` is the dry friction of a rig's bearings, coulomb * tanh(rate / 0.01 rad/s); None
+    leaves it out. Raises ValueError for an inertia that is not positive.
     """
 
     inertia: Float[Array, "3 ..."] = eqx.field(converter=as_float)  # kg m^2
     damping: Float[Array, "3 ..."] = eqx.field(converter=as_float, default=(0.0,) * 3)  # N m s/rad
     rotor_inertia: Float[Array, "..."] = eqx.field(converter=as_float, default=0.0)  # kg m^2
     stiffness: Float[Array, "3 ..."] | None = eqx.field(converter=as_float_or_none, default=None)
+    coulomb: Float[Array, "3 ..."] | None = eqx.field(
+        converter=as_float_or_none, default=None
+    )  # N m
 
     def __check_init__(self):
         require_vector("inertia", self.inertia, 3)
@@ -37,6 +42,9 @@ class Attitude(eqx.Module):
         if self.stiffness is not None:
             require_vector("stiffness", self.stiffness, 3)
             require_finite("stiffness", self.stiffness)
+        if self.coulomb is not None:
+            require_vector("coulomb", self.coulomb, 3)
+            require_nonnegative("coulomb", self.coulomb, "friction acts against the motion")
 
     def acceleration(
         self,
@@ -54,6 +62,8 @@ class Attitude(eqx.Module):
         rotors = align(jnp.asarray(self.rotor_inertia * spin)[None], rate)
         down = align(jnp.array([0, 0, 1], dtype=rate.dtype), rate)
         momentum = inertia * rate - rotors * down  # anticlockwise from above points up
+        if self.coulomb is not None:
+            torque = torque + friction(self.coulomb, rate)
         return (torque - damping * rate - jnp.cross(rate, momentum, axis=0)) / inertia
 
     def restoring_torque(self, euler: Float[Array, " 3 *ensemble"]) -> Float[Array, " 3 *ensemble"]:

@@ -7,8 +7,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._allocation import Allocation
 from ._attitude import Attitude
+from ._decoupled import added, DecoupledAxes
 from ._motor import MotorLag
-from ._parameters import align, as_float, is_concrete, is_zero
+from ._parameters import align, is_concrete, is_zero
 from ._rotation import euler_from_quaternion, quaternion_derivative, quaternion_from_euler
 
 
@@ -47,8 +48,7 @@ class Multirotor(eqx.Module):
         vectors = [attitude.inertia, attitude.damping]
         scalars = [attitude.rotor_inertia, allocation.arm]
         scalars += [allocation.thrust_coefficient, allocation.torque_coefficient]
-        if attitude.stiffness is not None:
-            vectors.append(attitude.stiffness)
+        vectors += [x for x in (attitude.stiffness, attitude.coulomb) if x is not None]
         if self.motor is not None:
             scalars.append(self.motor.time_constant)
         return jnp.broadcast_shapes(*(v.shape[1:] for v in vectors), *(s.shape for s in scalars))
@@ -60,7 +60,8 @@ class Multirotor(eqx.Module):
 
         The state is as wide as `ensemble`, the parameters and `euler` ask for together.
         """
-        euler = as_float((0.0, 0.0, 0.0) if euler is None else euler)
+        dtype = self.attitude.inertia.dtype
+        euler = jnp.zeros(3, dtype) if euler is None else jnp.asarray(euler, dtype)
         shape = jnp.broadcast_shapes(self.ensemble, ensemble, euler.shape[1:])
         rate = jnp.zeros((3, *shape), euler.dtype)
         quaternion = quaternion_from_euler(jnp.broadcast_to(align(euler, rate), rate.shape))
@@ -88,3 +89,25 @@ class Multirotor(eqx.Module):
         """Euler angles in rad: what the encoders of a rig, or an attitude filter, report."""
         length = jnp.linalg.norm(state.quaternion, axis=0, keepdims=True)
         return euler_from_quaternion(state.quaternion / length)
+
+    def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "Multirotor":
+        """The same vehicle carrying a known extra `inertia` in kg m^2, such as a payload."""
+        return eqx.tree_at(
+            lambda p: p.attitude.inertia, self, added(self.attitude.inertia, inertia)
+        )
+
+    def decoupled(self) -> DecoupledAxes:
+        """The three axes near level flight, driven by the allocation's differences.
+
+        Those are what a `jq.MotorDrive` makes voltages of, such as V4 - V2. Gyroscopic terms and
+        the coupling of the axes are of second order and left out.
+        """
+        attitude, allocation = self.attitude, self.allocation
+        return DecoupledAxes(
+            allocation.torque_per_difference,
+            attitude.inertia,
+            lag=None if self.motor is None else self.motor.time_constant[None],
+            damping=attitude.damping,
+            stiffness=0.0 if attitude.stiffness is None else attitude.stiffness,
+            coulomb=attitude.coulomb,
+        )

@@ -32,18 +32,69 @@ def quanser_hover(
     lag: float | None = 0.02,
     damping: Sequence[float] = (0.0, 0.0, 0.0),
     stiffness: Sequence[float] | None = None,
+    coulomb: Sequence[float] | None = None,
     convention: str = "frd-frbl",
 ) -> Multirotor:
     """The rig of the paper's section 5, the Quanser 3 DOF Hover, driven by four voltages.
 
     The data sheet gives no propeller `lag`: 0.02 s is an assumption, and None leaves it out.
-    `damping` (N m s/rad) and `stiffness` (N m/rad) are not in it either.
+    `damping` (N m s/rad), `stiffness` (N m/rad) and `coulomb` friction (N m) are not in it either.
     """
     sheet = QUANSER_HOVER
     return Multirotor(
-        Attitude(sheet.inertia, damping=damping, stiffness=stiffness),
+        Attitude(sheet.inertia, damping=damping, stiffness=stiffness, coulomb=coulomb),
         Allocation(
             sheet.arm, sheet.thrust_coefficient, sheet.torque_coefficient, convention=convention
+        ),
+        None if lag is None else MotorLag(lag),
+    )
+
+
+class CrazyflieDataSheet(NamedTuple):
+    """Bitcraze's Crazyflie 2.0, as identified on the bench.
+
+    Source: J. Foerster, System identification of the Crazyflie 2.0 nano quadrocopter, bachelor
+    thesis, ETH Zurich, 2015, doi 10.3929/ethz-b-000214143, as quoted by Bitcraze's firmware and
+    several simulators: diagonal of the inertia (products of inertia reach 11 % of it and are left
+    out), ratio of torque to thrust, and the polynomials that give thrust and rotor speed over the
+    16-bit command, whose ratio is the thrust coefficient. The arm is the firmware's; others quote
+    0.040 m.
+    """
+
+    arm: float = 0.046  # m, centre to rotor
+    thrust_coefficient: float = 1.28192e-8  # N s^2: 2.130295e-11 / 0.04076521^2
+    torque_coefficient: float = 7.6461e-11  # N m s^2: 0.005964552 of the thrust
+    inertia: tuple[float, float, float] = (16.571710e-6, 16.655602e-6, 29.261652e-6)  # kg m^2
+    mass: float = 0.028  # kg
+    lag: float = 0.0647  # s, 1 / 15.4666 rad/s from command to thrust
+    top_speed: float = 3052.0  # rad/s, at a command of 65535
+
+    @property
+    def hover_input(self) -> float:
+        """Squared speed in rad^2/s^2 at which four rotors carry the mass."""
+        return self.mass * 9.81 / (4 * self.thrust_coefficient)
+
+
+CRAZYFLIE = CrazyflieDataSheet()
+
+
+def crazyflie(
+    *, lag: float | None = CRAZYFLIE.lag, damping: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Multirotor:
+    """A Crazyflie 2.0, driven by four squared rotor speeds in rad^2/s^2.
+
+    An "x" frame in the firmware's axes (forward, left, up). The `lag` is that of the thrust; None
+    leaves it out. The spin of the rotors and `damping` (N m s/rad) are not in the data sheet.
+    """
+    sheet = CRAZYFLIE
+    return Multirotor(
+        Attitude(sheet.inertia, damping=damping),
+        Allocation(
+            sheet.arm,
+            sheet.thrust_coefficient,
+            sheet.torque_coefficient,
+            convention="crazyflie",
+            input="omega2",
         ),
         None if lag is None else MotorLag(lag),
     )
