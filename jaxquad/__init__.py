@@ -1,6 +1,28 @@
 """From a flight record to an identified model with honest error bars, in JAX."""
 
-from .control import PD as PD, place_pd as place_pd
+from .control import (
+    AdaptiveLADRC as AdaptiveLADRC,
+    BackCalculation as BackCalculation,
+    certainty_equivalence as certainty_equivalence,
+    Clamping as Clamping,
+    CurrentObserver as CurrentObserver,
+    EulerObserver as EulerObserver,
+    FuzzyMap as FuzzyMap,
+    InertiaEstimate as InertiaEstimate,
+    InertiaMap as InertiaMap,
+    LADRC as LADRC,
+    LinearController as LinearController,
+    LockInInertia as LockInInertia,
+    PD as PD,
+    PID as PID,
+    place_pd as place_pd,
+    PredictiveObserver as PredictiveObserver,
+    printed_map as printed_map,
+    ProbeTones as ProbeTones,
+    RecursiveInertia as RecursiveInertia,
+    Setpoint as Setpoint,
+    WindowedInertia as WindowedInertia,
+)
 from .design import (
     AOptimal as AOptimal,
     Criterion as Criterion,
@@ -47,10 +69,20 @@ from .identify import (
     Verification as Verification,
     verify as verify,
 )
+from .loops import (
+    analyse_loop as analyse_loop,
+    gain_window as gain_window,
+    GainWindow as GainWindow,
+    LoopAnalysis as LoopAnalysis,
+    LoopResponse as LoopResponse,
+)
 from .models import (
     Allocation as Allocation,
     Attitude as Attitude,
     AttitudeAxis as AttitudeAxis,
+    CRAZYFLIE as CRAZYFLIE,
+    crazyflie as crazyflie,
+    DecoupledAxes as DecoupledAxes,
     LaggedIntegrator as LaggedIntegrator,
     Mode as Mode,
     modes as modes,
@@ -90,13 +122,31 @@ from .records import (
     trim as trim,
 )
 from .simulate import (
+    Authority as Authority,
+    authority as authority,
+    AuthorityWarning as AuthorityWarning,
+    ceti_gust as ceti_gust,
     Encoder as Encoder,
+    evaluate as evaluate,
     excite as excite,
     gauss_markov as gauss_markov,
+    Gust as Gust,
+    Metrics as Metrics,
+    metrics as metrics,
     MotorDrive as MotorDrive,
+    Pulse as Pulse,
+    Ramp as Ramp,
+    ReferenceModel as ReferenceModel,
+    Saturation as Saturation,
     Scenario as Scenario,
+    scenario as scenario,
     simulate as simulate,
     Simulation as Simulation,
+    Sine as Sine,
+    SmoothStep as SmoothStep,
+    Step as Step,
+    Summary as Summary,
+    WhiteNoise as WhiteNoise,
 )
 from .spectra import (
     Composite as Composite,

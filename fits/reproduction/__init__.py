@@ -1,0 +1,1 @@
+"""What `fits/paper.py` runs: one file for each part of the paper, and the ledger."""
