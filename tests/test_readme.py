@@ -4,19 +4,33 @@ import re
 import subprocess
 import sys
 
+import pytest
 from conftest import ROOT
 
 
 README = (ROOT / "README.md").read_text()
 
 
-def test_the_python_example_prints_a_table(capsys):
-    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+
+
+@pytest.mark.parametrize(
+    ("example", "words"),
+    [
+        (EXAMPLES[0], ("gain", "lag + delay = 0.05")),
+        (
+            EXAMPLES[1],
+            ("stable loop", "stable for gains of 0.1104 to 2.148", "256 members", "CVaR20"),
+        ),
+    ],
+    ids=["identify", "control"],
+)
+def test_the_python_examples_print_what_they_promise(example, words):
     assert len(example.splitlines()) <= 12
     # jnp's strict promotion, which the tests switch on, is not what a user has.
     run = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert "gain" in run.stdout and "lag + delay = 0.05" in run.stdout
+    assert all(word in run.stdout for word in words), run.stdout
 
 
 def test_there_are_exactly_two_commands_to_set_up():

@@ -32,6 +32,13 @@ class GainWindow(NamedTuple):
     low: Float[Array, "*ensemble"]
     high: Float[Array, "*ensemble"]
 
+    def __str__(self) -> str:
+        low, high = np.atleast_1d(self.low), np.atleast_1d(self.high)
+        if np.all(np.isnan(low)):
+            return "no gain makes the loop stable"
+        text = f"stable for gains of {np.nanmax(low):.4g} to {np.nanmin(high):.4g}"
+        return text if low.size == 1 else f"{text}, all of {np.sum(~np.isnan(low))} members"
+
 
 def gain_window(
     controller: Any,

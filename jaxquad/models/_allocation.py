@@ -63,8 +63,7 @@ class Allocation(eqx.Module):
 
     def differences(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
         """What Eq. (9) multiplies by lever K_t (twice) and K_l: V4 - V2 and so on in the paper."""
-        signs = jnp.asarray(self._signs, dtype=inputs.dtype)
-        return jnp.tensordot(signs, inputs, 1, precision="highest")
+        return _product(self._signs, inputs)
 
     def inputs(
         self, torque: Float[Array, " 3 *ensemble"], collective: Float[Array, "*ensemble"] | float
@@ -81,9 +80,8 @@ class Allocation(eqx.Module):
     ) -> Float[Array, " 4 *ensemble"]:
         """The four motor inputs with these `differences` about a mean input `collective`."""
         squares = np.sum(self._signs**2, axis=1, keepdims=True)
-        inverse = jnp.asarray((self._signs / squares).T, dtype=wanted.dtype)
         common = align(jnp.asarray(collective, dtype=wanted.dtype)[None], wanted)
-        return common + jnp.tensordot(inverse, wanted, 1, precision="highest")
+        return common + _product((self._signs / squares).T, wanted)
 
     def spin(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, "*ensemble"]:
         """Spin in rad/s for `Attitude.acceleration`; 0 where voltages leave the speeds unknown.
@@ -94,8 +92,7 @@ class Allocation(eqx.Module):
             return jnp.zeros(inputs.shape[1:], inputs.dtype)
         turning = inputs > 0
         speed = jnp.where(turning, jnp.sqrt(jnp.where(turning, inputs, 1)), 0)  # finite gradient
-        yaw = jnp.asarray(self._signs[2], dtype=inputs.dtype)
-        return jnp.tensordot(yaw, speed, 1, precision="highest")
+        return _product(self._signs[2:], speed)[0]
 
     @property
     def _signs(self) -> np.ndarray:
@@ -106,6 +103,15 @@ class Allocation(eqx.Module):
         """Torque in N m per unit of `differences`, axis by axis."""
         lever = _FRAMES[self.convention].lever * self.arm * self.thrust_coefficient
         return jnp.stack(jnp.broadcast_arrays(lever, lever, self.torque_coefficient))
+
+
+def _product(matrix: np.ndarray, vectors: Float[Array, " n *ensemble"]) -> Array:
+    # Plain sums: a matrix product would end the one kernel that a time loop is compiled to.
+    rows = [
+        sum(float(weight) * x for weight, x in zip(row, vectors, strict=True) if weight)
+        for row in matrix
+    ]
+    return jnp.stack(rows)
 
 
 def _require_known(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -1,8 +1,10 @@
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxquad.models import Allocation, QUANSER_HOVER
+from jaxquad.models._parameters import align, as_float, is_concrete
 
 
 class MotorDrive(eqx.Module):
@@ -28,3 +30,28 @@ class MotorDrive(eqx.Module):
     def achieved(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
         """The command that these voltages amount to: less than was asked for where they clip."""
         return self.allocation.differences(inputs)
+
+
+class Saturation(eqx.Module):
+    """A drive that takes commands as they are, within a limit: for `jq.DecoupledAxes`.
+
+    Raises ValueError for a limit that is not above 0.
+    """
+
+    limit: Float[Array, "..."] = eqx.field(converter=as_float)  # of |u|; [], [axes] or with members
+
+    def __check_init__(self):
+        if is_concrete(self.limit) and not np.all(np.asarray(self.limit) > 0):
+            raise ValueError(
+                f"limit is {self.limit}, but it must be above 0: it bounds the command on both "
+                "sides, in the command's unit"
+            )
+
+    def inputs(self, command: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+        """The command within the limit."""
+        limit = align(self.limit, command).astype(command.dtype)
+        return jnp.clip(command, -limit, limit)
+
+    def achieved(self, inputs: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+        """The command that these inputs amount to: themselves."""
+        return inputs

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from ._loop import AXES, Scenario
 from ._noise import gauss_markov
+from ._scenario import AXES, Scenario
 
 
 def excite(

@@ -1,0 +1,102 @@
+"""Metrics of 1000 closed loops while they run, beside metrics from their records, in one run.
+
+    python -m pytest tests/benchmarks/test_evaluate_speed.py -o addopts= \
+        --benchmark-columns=min,median
+
+One axis with a motor lag and an LADRC, 5000 steps of 2 ms, 1000 inertias, a step and a pulse. The
+memory in `extra_info` is what XLA reserves for temporaries and results; `test_alone` is the loop
+with nothing but its final angle, which shows what the metrics add.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxquad.control import LADRC
+from jaxquad.models import DecoupledAxes
+from jaxquad.simulate import evaluate, metrics, Pulse, Saturation, scenario, simulate, Step
+from jaxquad.simulate._evaluate import _run
+from jaxquad.simulate._loop import scan_loop
+from jaxquad.simulate._settings import loop_settings
+from jaxquad.simulate._simulate import _run as _run_stored
+from jaxquad.simulate._window import Window
+
+
+jax.config.update("jax_enable_x64", True)
+
+MEMBERS = 1000
+HAPPENS = scenario(
+    duration=10.0,
+    axes=1,
+    reference={0: Step(np.radians(4.0))},
+    disturbance={0: Pulse(0.1, width=1.0, at=5.0)},
+)
+CONTROLLER, DRIVE = LADRC([10.0], [30.0], [0.8478]), Saturation(20.0)
+WINDOW = Window(*(jnp.asarray(x) for x in (0, 4999, 0, 4999)))
+
+
+def plant(members):
+    inertia = 0.0552 * np.geomspace(0.5, 2.0, members)
+    return DecoupledAxes([0.0468], inertia[None] if members > 1 else inertia, lag=[0.005])
+
+
+def reserved(compiled):
+    memory = compiled.compiled.memory_analysis()
+    return (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 1e6
+
+
+@pytest.fixture(scope="module", params=[1, MEMBERS])
+def rig(request):
+    return plant(request.param)
+
+
+@pytest.mark.benchmark(group="evaluate")
+def test_evaluate(benchmark, rig):
+    found = benchmark(
+        lambda: jax.block_until_ready(evaluate(rig, CONTROLLER, HAPPENS, drive=DRIVE))
+    )
+    settings = loop_settings(drive=DRIVE)
+    compiled = _run.lower(rig, CONTROLLER, HAPPENS, settings, WINDOW).compile()
+    benchmark.extra_info["MB"] = reserved(compiled)
+    assert np.isfinite(found.itae).all()
+
+
+@pytest.mark.benchmark(group="evaluate")
+def test_simulate_then_metrics(benchmark, rig):
+    run = lambda: metrics(simulate(rig, CONTROLLER, HAPPENS, drive=DRIVE))
+    found = benchmark(lambda: jax.block_until_ready(run()))
+    compiled = _run_stored.lower(rig, CONTROLLER, HAPPENS, loop_settings(drive=DRIVE)).compile()
+    benchmark.extra_info["MB"] = reserved(compiled)
+    exact = evaluate(rig, CONTROLLER, HAPPENS, drive=DRIVE)
+    np.testing.assert_allclose(found.itae, exact.itae, rtol=1e-12)
+
+
+@pytest.mark.benchmark(group="evaluate")
+def test_alone(benchmark, rig):
+    keep, settings = lambda angle, now: (now.angle, None), loop_settings(drive=DRIVE)
+    run = eqx.filter_jit(
+        lambda rig, controller, happens: scan_loop(
+            rig, controller, happens, settings, keep, lambda like: like
+        )[0]
+    )
+    benchmark(lambda: jax.block_until_ready(run(rig, CONTROLLER, HAPPENS)))
+
+
+@pytest.mark.benchmark(group="gradient of the mean ITAE, 3 gains")
+def test_gradient(benchmark, rig):
+    def itae(gains, rig, happens):
+        wc, wo, b0 = (x[None] for x in gains)
+        return jnp.mean(evaluate(rig, LADRC(wc, wo, b0), happens, drive=DRIVE).itae)
+
+    gains = jnp.asarray([10.0, 30.0, 0.8478])
+    slope = eqx.filter_jit(eqx.filter_grad(itae))
+    found = benchmark(lambda: jax.block_until_ready(slope(gains, rig, HAPPENS)))
+    cost = lambda gains: itae(gains, rig, HAPPENS)
+    step = 1e-5 * gains
+    numeric = [
+        (cost(gains.at[k].add(step[k])) - cost(gains.at[k].add(-step[k]))) / (2 * step[k])
+        for k in range(3)
+    ]
+    np.testing.assert_allclose(found, np.array(numeric), rtol=1e-5)
