@@ -7,26 +7,39 @@ from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import stablehlo
 
 
-# XLA hands these to libraries or callbacks, which a kernel cannot call (some end the process) ...
-_FOREIGN = {"custom_call", "sort", "scatter", "fft", "cholesky", "triangular_solve", "convolution"}
-_FOREIGN |= {"rng_bit_generator", "infeed", "outfeed", "send", "recv", "top_k", "composite"}
-# ... and sums and products from so many numbers on. Wide arithmetic fits, but one thread without
-# XLA's fusion is then the slower way.
+# What a kernel is known to hold. XLA hands other operations (sorts, scatters, custom calls, ...) to
+# libraries or callbacks, which a kernel cannot call: some raise, and some end the process.
+_HELD = set(
+    """
+    abs add and atan2 bitcast_convert cbrt ceil clamp compare convert cosine divide exponential
+    exponential_minus_one floor is_finite log log_plus_one logistic maximum minimum multiply negate
+    not or power reduce_precision remainder round_nearest_afz round_nearest_even rsqrt select
+    shift_left shift_right_arithmetic shift_right_logical sign sine sqrt subtract tan tanh xor
+    acos acosh asin asinh atan atanh cosh erf erfc erf_inv lgamma next_after sinh square
+    broadcast broadcast_in_dim concatenate constant dynamic_slice dynamic_update_slice gather iota
+    pad reshape reverse slice transpose
+    case if optimization_barrier reduce reduce_window return while dot dot_general
+    """.split()
+)
+# Sums and products of so many numbers: wide arithmetic fits, but one thread without XLA's fusion is
+# then the slower way.
 _COUNTED = {"reduce", "reduce_window", "dot_general", "dot", "add", "subtract", "multiply"}
 _LARGE = 4096
 
 
 def fits_a_kernel(call: Any, module: Any) -> bool:
-    """Whether all that `call` leads to fits, and all that it is given is used.
-
-    XLA ends the process over an argument that is not used.
-    """
+    """Whether all that `call` takes, leads to and returns fits."""
     functions = {_text(f, "sym_name"): f.operation for f in module.body.operations}
     called = functions[_text(call, "callee")]
-    arguments = called.regions[0].blocks[0].arguments
-    return all(_is_used(argument, functions) for argument in arguments) and _is_plain(
-        called, functions, set()
-    )
+    ends = (*call.operands, *call.results)
+    return all(_holds_numbers(x.type) for x in ends) and _is_plain(called, functions, set())
+
+
+def _holds_numbers(kind: Any) -> bool:
+    """Whether these are real numbers, integers or booleans, at least one of them."""
+    array = ir.RankedTensorType(kind)
+    real = isinstance(array.element_type, ir.FloatType | ir.IntegerType)
+    return real and array.has_static_shape and _size(kind) > 0
 
 
 def _text(op: Any, attribute: str) -> str:
@@ -59,7 +72,7 @@ def _fits(op: Any) -> bool:
     if kind in _COUNTED:
         sizes = (_size(operand.type) for operand in op.operands)
         return all(size < _LARGE for size in sizes) and (kind[:3] != "dot" or _is_thin(op))
-    return kind not in _FOREIGN
+    return kind in _HELD
 
 
 def _size(kind: Any) -> int:
@@ -81,20 +94,3 @@ def _is_thin(dot: Any) -> bool:
         shape = ir.RankedTensorType(operand.type).shape
         wide.append(any(n > 1 for k, n in enumerate(shape) if k not in taken))
     return not all(wide)
-
-
-def _is_used(value: Any, functions: dict[str, Any]) -> bool:
-    """Whether something is computed from a value; handing it on is not enough."""
-    for use in value.uses:
-        op, place = use.owner.operation, use.operand_number
-        if op.name == "func.call":
-            inner = [functions[_text(op, "callee")].regions[0].blocks[0].arguments[place]]
-        elif op.name == "stablehlo.while":
-            inner = [region.blocks[0].arguments[place] for region in op.regions]
-        elif op.name in ("stablehlo.return", "func.return"):
-            inner = []
-        else:
-            return True
-        if any(_is_used(x, functions) for x in inner):
-            return True
-    return False
