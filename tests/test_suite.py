@@ -1,5 +1,6 @@
 """The scenario suite: its data, the matching of its designs, and laws that its rows obey."""
 
+import functools as ft
 import importlib
 import sys
 from types import SimpleNamespace
@@ -8,10 +9,23 @@ import jax
 import numpy as np
 import pytest
 from conftest import ROOT
-from scipy.linalg import solve_discrete_lyapunov
+from scipy.linalg import expm, solve_discrete_lyapunov
 
 
-_MODULES = ("suite", "data", "rigs", "signals", "designs", "matching", "flights", "loops", "rows")
+_MODULES = (
+    "suite",
+    "data",
+    "rigs",
+    "signals",
+    "designs",
+    "filtered_pid",
+    "matching",
+    "nominal",
+    "pid_shape",
+    "flights",
+    "loops",
+    "rows",
+)
 
 
 @pytest.fixture(scope="module")
@@ -41,18 +55,22 @@ def altered(fits, data, scenario, name, **changes):
     return case._replace(data=case.data | changes)
 
 
-def test_the_suite_has_the_scenarios_s0_to_s11_and_six_designs(data):
+def test_the_suite_has_the_scenarios_s0_to_s11_and_seven_designs(data):
     assert list(data["scenarios"]) == [f"S{k}" for k in range(12)]
-    assert len(data["designs"]) == 6
+    assert len(data["designs"]) == 7
     assert all(scenario["purpose"] for scenario in data["scenarios"].values())
 
 
 def test_every_case_builds_its_rig_its_signals_and_every_controller(fits, data):
     designs = [
-        fits.designs.Design(name, x, {"wc": 2.0, "wo": 20.0, "pole": 2.0, "filter": 10.0})
+        fits.designs.Design(
+            name,
+            x,
+            {"wc": 2.0, "wo": 20.0, "pole": 2.0, "filter": 10.0, "damping": 0.5, "ratio": 1.0},
+        )
         for name, x in data["designs"].items()
     ]
-    width = fits.matching.WIDTH
+    width = fits.nominal.WIDTH
     for case in fits.data.cases(data):
         members = fits.data.members_of(case, quick=True, seed=0)
         assert sum(len(group.place) for group in members.groups) == members.count
@@ -62,13 +80,10 @@ def test_every_case_builds_its_rig_its_signals_and_every_controller(fits, data):
         belief, truth = fits.flights.believed(case, chunk, data)
         for design in designs:
             fits.designs.controller(design, belief, dt=data["dt"])
-        happening = fits.signals.scenario_of(
-            case,
-            chunk,
-            dt=data["dt"],
-            axes=len(truth.torque_gain),
-            key=jax.random.key(0),
+        signals = ft.partial(
+            fits.signals.scenario_of, case, chunk, dt=data["dt"], axes=len(truth.torque_gain)
         )
+        happening = jax.eval_shape(lambda key, build=signals: build(key=key), jax.random.key(0))
         samples = round(case.data["duration"] / data["dt"])
         assert happening.reference.shape == (samples, len(truth.torque_gain), width)
         assert happening.ensemble == (width,)
@@ -112,7 +127,7 @@ def test_every_family_meets_the_common_targets(data, loops):
     free = [
         loop for loop in loops.values() if "free" in loop.design.data or "as" in loop.design.data
     ]
-    assert len(free) == 5
+    assert len(free) == 6
     for loop in free:
         assert loop.matched
         assert loop.sensitivity_peak == pytest.approx(targets["sensitivity_peak"]["A"], rel=0.005)
@@ -125,29 +140,103 @@ def test_the_printed_design_is_not_matched_and_says_what_it_reaches(loops):
     assert printed.sensitivity_peak == pytest.approx(7.1, rel=0.01)
 
 
+def textbook(gains):
+    """kp, ki, kd of a PID on 1/s^2 from the poles that its gains place."""
+    pole, damping = gains["pole"], gains["damping"]
+    pair = pole * (-damping + 1j * np.sqrt(1 - damping**2))
+    kd, kp, ki = np.poly([-gains["ratio"] * pole, pair, np.conj(pair)])[1:].real
+    return kp, ki, kd, gains["filter"]
+
+
+def by_hand(gains, dt):
+    """Sampled double integrator and PID in units of b u: x+ = matrix x + noise n + step r.
+
+    x = angle, rate, integral, filtered rate; u = sent x - through n.
+    """
+    kp, ki, kd, filter = textbook(gains)
+    keep = np.exp(-dt * filter)
+    sharp = (1 - keep) / dt
+    row, through = np.array([1.0, kd]), kp + ki * dt / 2 + kd * sharp
+    entry = np.array([ki * dt, (keep - 1) * sharp])
+    drive = np.array([dt**2 / 2, dt])
+    top = np.hstack([[[1, dt], [0, 1]] - np.outer(drive, [through, 0]), -np.outer(drive, row)])
+    matrix = np.vstack([top, np.hstack([np.outer(entry, [1, 0]), np.diag([1.0, keep])])])
+    noise = np.concatenate([-drive * through, entry])
+    step = np.concatenate([drive * ki * dt / 2, [-ki * dt, 0.0]])
+    return matrix, noise, step, -np.concatenate([[through, 0], row]), through
+
+
 def test_the_matched_pid_has_that_ms_and_that_activity_by_its_textbook_form(data, loops):
-    """Sampled double integrator and PID written out by hand, in units of b u."""
     dt, gains = data["dt"], loops["tuned PID"].design.gains
-    p, keep = gains["pole"], np.exp(-dt * gains["filter"])
-    kp, ki, kd = 3 * p**2, p**3, 3 * p
+    kp, ki, kd, filter = textbook(gains)
+    keep = np.exp(-dt * filter)
     z = np.exp(1j * dt * np.geomspace(0.1, 100.0, 40001))
     plant = dt**2 / 2 * (z + 1) / (z - 1) ** 2
     law = kp + ki * dt / 2 * (z + 1) / (z - 1) + kd * (1 - keep) / dt * (z - 1) / (z - keep)
     peak = np.abs(1 / (1 + plant * law)).max()
     assert peak == pytest.approx(data["targets"]["sensitivity_peak"]["A"], rel=1e-4)
-
-    # x = angle, rate, integral, filtered rate; u = -(C x + D y), y = angle + noise.
-    sharp = (1 - keep) / dt
-    row, through = np.array([1.0, kd]), kp + ki * dt / 2 + kd * sharp
-    inner = np.diag([1.0, keep])
-    entry = np.array([ki * dt, (keep - 1) * sharp])
-    drive = np.array([dt**2 / 2, dt])
-    top = np.hstack([[[1, dt], [0, 1]] - np.outer(drive, [through, 0]), -np.outer(drive, row)])
-    matrix = np.vstack([top, np.hstack([np.outer(entry, [1, 0]), inner])])
-    noise = np.concatenate([-drive * through, entry])
-    sent = -np.concatenate([[through, 0], row])
+    matrix, noise, _, sent, through = by_hand(gains, dt)
     power = sent @ solve_discrete_lyapunov(matrix, np.outer(noise, noise)) @ sent + through**2
     assert np.sqrt(power) == pytest.approx(data["targets"]["activity"], rel=1e-4)
+
+
+def test_the_step_of_the_matched_pid_overshoots_as_far_as_it_may(data, loops):
+    matrix, _, step, *_ = by_hand(loops["tuned PID"].design.gains, data["dt"])
+    state, highest = np.zeros(4), 0.0
+    for _ in range(4000):
+        state = matrix @ state + step
+        highest = max(highest, state[0])
+    # Both are within 1e-4 of the peak in continuous time.
+    allowed = data["designs"]["tuned PID"]["shape"]["overshoot"]
+    assert highest - 1 == pytest.approx(allowed, abs=2e-4)
+
+
+def test_a_filtered_measurement_is_filtered_as_scipy_does_and_flown_as_linearised(fits):
+    pid = fits.filtered_pid.FilteredPID(
+        kp=np.array([40.0]), ki=np.array([100.0]), kd=np.array([9.0]), filter=np.array([50.0]),
+        limit=np.array([np.inf]), told=True, dt=0.002,
+    )  # fmt: skip
+    law, w = pid.linear(0), 50.0
+    exact = expm(0.002 * np.array([[0, 1, 0], [-(w**2), -np.sqrt(2) * w, w**2], [0, 0, 0]]))
+    assert np.asarray(law.A)[:2, :2] == pytest.approx(exact[:2, :2], abs=1e-12)
+    assert np.asarray(law.measurement_in)[:2] == pytest.approx(exact[:2, 2], abs=1e-12)
+    state, measured = pid.init(np.zeros(1)), np.random.default_rng(0).normal(size=8)
+    x = np.zeros(3)
+    for y in measured:
+        state, command = pid.step(state, np.array([0.3]), np.array([y]))
+        sent = law.C @ x + law.reference_through * 0.3 + law.measurement_through * y
+        assert command[0] == pytest.approx(float(sent), rel=1e-9, abs=1e-9)
+        x = law.A @ x + law.reference_in * 0.3 + law.measurement_in * y
+
+
+def test_no_other_shape_of_a_pid_has_more_integral_gain_at_the_same_targets(fits, data, loops):
+    design = loops["tuned PID"].design
+    names = ("pole", "filter", "damping", "ratio")
+    best = np.log([design.gains[name] for name in names])
+    triple = dict(design.data)
+    del triple["shape"]
+    altered = data | {"designs": {"PID": triple}}
+    before = fits.matching.match(altered, "A")["PID"].design.gains
+    assert design.gains["ratio"] * design.gains["pole"] ** 3 > 2 * before["pole"] ** 3
+
+    angle = 2 * np.pi * np.arange(8) / 8
+    logs = best[:, None] + np.vstack([np.zeros((2, 8)), 0.05 * np.cos(angle), 0.05 * np.sin(angle)])
+    goal = np.log([data["targets"]["sensitivity_peak"]["A"], data["targets"]["activity"]])
+    aside = 1e-4 * np.eye(4)[:, :2]
+    for _ in range(5):
+        tried = [logs, logs + aside[:, :1], logs + aside[:, 1:]]
+        gains = dict(zip(names, np.exp(np.hstack(tried)), strict=True))
+        found, reached = fits.nominal.loops_at(design, data["plants"]["A"], data["dt"], gains)
+        now, *moved = np.split(reached, 3, axis=1)
+        slopes = np.stack([(x - now) / 1e-4 for x in moved], axis=-1)  # [2, 8, 2]
+        change = np.linalg.solve(slopes.transpose(1, 0, 2), (goal[:, None] - now).T[..., None])
+        over = fits.pid_shape.overshoot(found.reference)[:8]
+        ends = logs
+        logs = logs + np.vstack([change[..., 0].T, np.zeros((2, 8))])
+    assert np.abs(now - goal[:, None]).max() < 1e-6
+    more = 3 * ends[0] + ends[3] > 3 * best[0] + best[3]
+    assert more.any()
+    assert np.all(over[more] > data["designs"]["tuned PID"]["shape"]["overshoot"])
 
 
 def test_a_linear_loop_answers_steps_of_all_sizes_alike(fits, data, loops):

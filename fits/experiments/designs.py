@@ -20,13 +20,15 @@ from jaxquad.control import (
     ProbeTones,
 )
 
+from .filtered_pid import FilteredPID
+
 
 class Design(NamedTuple):
     """A controller's law with its gains, before it knows the plant."""
 
     name: str
     data: dict[str, Any]  # of scenarios.toml
-    gains: dict[str, float]  # wc and wo, or pole and filter, in rad/s
+    gains: dict[str, float]  # wc and wo, or pole and filter, in rad/s; damping, ratio
 
     @property
     def law(self) -> str:
@@ -113,14 +115,22 @@ def b0_of(design: Design, belief: Belief) -> np.ndarray:
 
 def _pid(
     design: Design, belief: Belief, second: np.ndarray, limit: np.ndarray, told: bool, dt: float
-) -> PID:
-    pole, per_unit = design.gains["pole"], 1 / belief.gain
+) -> PID | FilteredPID:
+    per_unit, gains = 1 / belief.gain, design.gains
+    kp, ki, kd = pid_gains(gains["pole"], gains.get("damping", 1.0), gains.get("ratio", 1.0))
+    if design.data.get("filtered") == "measurement":
+        filter = gains["filter"] * second
+        return FilteredPID(kp * per_unit, ki * per_unit, kd * per_unit, filter, limit, told, dt)
     return PID(
-        3 * pole**2 * per_unit, pole**3 * per_unit, 3 * pole * per_unit,
-        filter=design.gains["filter"] * second,
+        kp * per_unit, ki * per_unit, kd * per_unit, filter=gains["filter"] * second,
         proportional_weight=design.data["proportional_weight"] + 0 * per_unit,
         limit=limit, anti_windup=Clamping() if told else None, dt=dt,
     )  # fmt: skip
+
+
+def pid_gains(pole: Any, damping: Any, ratio: Any) -> tuple[Any, Any, Any]:
+    """kp, ki, kd of b u: poles of (s + ratio pole)(s^2 + 2 damping pole s + pole^2) on 1/s^2."""
+    return (1 + 2 * damping * ratio) * pole**2, ratio * pole**3, (2 * damping + ratio) * pole
 
 
 def _adaptive(

@@ -14,10 +14,11 @@ from .rows import Row
 
 
 _STYLES = (
-    ("black", "-", "o"), ("tab:blue", "--", "s"), ("0.55", "-", "x"), ("tab:red", "-.", "^"),
+    ("black", "-", "o"), ("tab:purple", (0, (4, 1)), "P"), ("tab:blue", "--", "s"),
+    ("0.55", "-", "x"), ("tab:red", "-.", "^"),
     ("tab:green", (0, (1, 1.2)), "D"), ("0.35", (0, (6, 1, 1, 1)), "v"),
 )  # fmt: skip
-_COMPARED = ("tuned PID", "LADRC, b0 = KT/Jhat", "adaptive LADRC")
+_COMPARED = ("tuned PID", "tuned PID, filtered y", "LADRC, b0 = KT/Jhat", "adaptive LADRC")
 
 
 def draw(

@@ -11,8 +11,9 @@ from jaxquad.simulate import AuthorityWarning, simulate, Simulation
 from .data import Case, Members, members_of, Numbers
 from .designs import Belief, controller, Design
 from .identification import identified
-from .matching import Matched, WIDTH
+from .matching import Matched
 from .members import linear_numbers
+from .nominal import WIDTH
 from .rigs import Rig, rig
 from .rows import Row, with_loop, with_variation
 from .signals import scenario_of

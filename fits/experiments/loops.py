@@ -10,10 +10,12 @@ from jaxquad.loops import LoopAnalysis
 from .data import Case
 from .designs import b0_of, controller, Design
 from .linear import analysed, Late, stable_gains
-from .matching import Matched, nominal_belief, nominal_loops, WIDTH
+from .matching import Matched
 from .members import plain
+from .nominal import nominal_belief, nominal_loops, WIDTH
 from .rigs import lateness, linear_axis, LONGEST_DELAY
 from .rows import Row, with_loop
+from .theory import integral_gain
 
 
 def loop_rows(case: Case, suite: dict[str, Any], loops: dict[str, Matched]) -> list[Row]:
@@ -24,6 +26,7 @@ def loop_rows(case: Case, suite: dict[str, Any], loops: dict[str, Matched]) -> l
         design = loops[name].design
         found = nominal_loops(design, level, dt).member(0)
         numbers = _numbers(found) | _window(design, level, dt)
+        numbers["ki"] = integral_gain(found, float(nominal_belief(level).inertia[0, 0]))
         parity = _placement_error(found, design, level)
         numbers |= {} if parity is None else {"placement_error": parity}
         row = Row(case, "", name, numbers, note=_note(numbers))
@@ -139,5 +142,5 @@ def _note(numbers: dict[str, float]) -> str:
     return (
         f"slowest pole {numbers['slowest_pole']:.3g} rad/s, gain x{numbers['gain_margin']:.3g} "
         f"and x{numbers['gain_reduction']:.3g}, PM {numbers['phase_margin_deg']:.3g} deg, "
-        f"delay margin {numbers['delay_margin_ms']:.3g} ms, {window}"
+        f"delay margin {numbers['delay_margin_ms']:.3g} ms, ki {numbers['ki']:.3g} /s^3, {window}"
     )

@@ -1,21 +1,16 @@
 """Gains that give every design the same Ms and the same activity on a plant's nominal loop."""
 
-import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxquad.loops import LoopAnalysis
-
-from .designs import Belief, controller, Design
-from .linear import analysed
-from .rigs import lateness, linear_axis, rig
+from .designs import Design
+from .nominal import HOPELESS, loops_at, WIDTH
+from .pid_shape import shaped
 
 
-WIDTH = 32  # members of every ensemble, so that all cases share what is compiled
 _STARTS, _STEP = 6, 1e-4
-_HOPELESS = 1e6  # Ms and activity of loops that are unstable
 
 
 class Matched(NamedTuple):
@@ -44,52 +39,29 @@ def match(data: dict[str, Any], plant: str) -> dict[str, Matched]:
     return found
 
 
-def nominal_loops(
-    design: Design, level: dict[str, Any], dt: float, gains: dict[str, Any] | None = None
-) -> LoopAnalysis:
-    """The nominal linear loop, `WIDTH` times: with other `gains` by member if they are given."""
-    belief = nominal_belief(level)
-    wanted = design._replace(gains=design.gains | (gains or {}))
-    plain = wanted._replace(data=wanted.data | {"law": "pid" if design.law == "pid" else "ladrc"})
-    axis = linear_axis(level, WIDTH, {})
-    return analysed(axis, controller(plain, belief, dt=dt), lateness(level, WIDTH))
-
-
-def nominal_belief(level: dict[str, Any]) -> Belief:
-    """That of the first axis, in `WIDTH` copies."""
-    at = rig(level, WIDTH)
-    gain, inertia, limit = (x[:1] for x in (at.torque_gain, at.inertia, at.limit))
-    return Belief(gain, inertia, gain / inertia, limit, at.volts[:1])
-
-
 def _matched(name: str, data: dict[str, Any], suite: dict[str, Any], plant: str) -> Matched:
     targets, free = suite["targets"], data.get("free")
     goal = np.log([targets["sensitivity_peak"][plant], targets["activity"]])
+    level, dt = suite["plants"][plant], suite["dt"]
     design = Design(name, data, dict(data.get("gains", {})))
-    numbers = ft.partial(_reached, design, suite["plants"][plant], suite["dt"])
     if not free:
-        peak, activity = np.exp(numbers(np.zeros((0, 1)))[:, 0])
-        unstable = peak > 0.99 * _HOPELESS
+        peak, activity = np.exp(loops_at(design, level, dt, {})[1][:, 0])
+        unstable = peak > 0.99 * HOPELESS
         peak, activity = (np.inf if unstable else float(x) for x in (peak, activity))
         return Matched(design, plant, peak, activity, False, "its gains are as printed")
+
+    def numbers(logs: np.ndarray) -> np.ndarray:
+        return loops_at(design, level, dt, dict(zip(free, np.exp(logs), strict=True)))[1]
+
     logs = solve(numbers, goal, np.log(list(free.values())))
-    reached = numbers(logs[:, None])[:, 0]
-    met = bool(np.all(np.abs(reached - goal) < targets["tolerance"]))
     solved = design._replace(gains=dict(zip(free, np.exp(logs).tolist(), strict=True)))
+    if "shape" in data:
+        solved = shaped(solved, level, dt, goal)
+    reached = loops_at(solved, level, dt, {})[1][:, 0]
+    met = bool(np.all(np.abs(reached - goal) < targets["tolerance"]))
     peak, activity = np.exp(reached).tolist()
     why = "" if met else f"the nearest of {_STARTS} searches"
     return Matched(solved, plant, peak, activity, met, why)
-
-
-def _reached(design: Design, level: dict[str, Any], dt: float, logs: np.ndarray) -> np.ndarray:
-    """ln Ms and ln activity at up to `WIDTH` pairs of ln gains [2, n]; at its own, of none."""
-    gains = {}
-    for name, row in zip(design.data.get("free", ()), np.exp(logs), strict=True):
-        gains[name] = np.append(row, np.full(WIDTH - row.size, row[0]))
-    loops = nominal_loops(design, level, dt, gains)
-    b = float(nominal_belief(level).gain[0, 0])
-    values = np.array([loops.sensitivity_peak, b * np.asarray(loops.noise_gain)])
-    return np.log(np.where(np.isfinite(values), values, _HOPELESS))[:, : logs.shape[1]]
 
 
 def solve(numbers: Numbers, goal: np.ndarray, bounds: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from jaxquad.simulate import Simulation
 from .data import Case, Members, Numbers
 from .designs import Belief, controller, Design
 from .linear import analysed
-from .matching import WIDTH
+from .nominal import WIDTH
 from .rigs import lateness, linear_axis
 
 

@@ -171,7 +171,16 @@ def markdown(rows: list[Row]) -> str:
 
 def matching_table(loops: list[Matched], markup: bool = False) -> str:
     """What the designs' gains are, and which are matched."""
-    lines = [["plant", "design", "gains, rad/s", "Ms", "activity, rad/s^2/rad", "matched"]]
+    lines = [
+        [
+            "plant",
+            "design",
+            "gains (rad/s; damping, ratio: 1)",
+            "Ms",
+            "activity, rad/s^2/rad",
+            "matched",
+        ]
+    ]
     for loop in loops:
         gains = ", ".join(f"{name} {value:.4g}" for name, value in loop.design.gains.items())
         peak, activity = (

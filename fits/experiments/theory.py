@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad.loops import LoopResponse
+from jaxquad.loops import LoopAnalysis, LoopResponse
 
 from .data import Case, Group, Members
 from .designs import Design
-from .matching import nominal_loops
+from .nominal import nominal_loops
 
 
 def theory_rms(
@@ -34,6 +34,12 @@ def theory_rms(
         density = 2 * deviation**2 * corner / (omega**2 + corner**2)
         return float(np.degrees(np.sqrt(np.trapezoid(gain**2 * density, omega) / np.pi)))
     raise ValueError(f"no theory of a {spec['signal']!r}: there are sine and gust")
+
+
+def integral_gain(loop: LoopAnalysis, inertia: float) -> float:
+    """ki of b u in 1/s^3: under a step of `load` in N m the angle integrates to load/(J ki)."""
+    omega = 1e-4  # rad/s
+    return omega / (inertia * float(_gain(loop.disturbance, jnp.array([omega]))[0]))
 
 
 @eqx.filter_jit
