@@ -3,7 +3,7 @@
     python -m pytest tests/benchmarks/test_loop_speed.py -o addopts= --benchmark-columns=min,median
 
 C and "as C" compute the same: Euler angles, rates and lagging torques of a quadrotor under three
-LADRC, one Runge-Kutta step a sample (shared/baselines/ladrc_loop, or the folder that
+LADRC, one Runge-Kutta step a sample (`baselines/ladrc_loop` beside the data, or the folder that
 JAXQUAD_BASELINES names; skipped where it or gcc is not there). The rig is the library's own:
 quaternions, four motor voltages with lag and limits. C keeps no trajectory in the ensemble; ours
 keeps angle, measurement, command and disturbance of every sample.
