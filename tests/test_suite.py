@@ -268,6 +268,8 @@ def test_verdicts_and_cells_say_what_failed_and_what_is_missing(fits, data):
     row = fits.rows.Row(case, "", "tuned PID", {"peak": 6.25, "itae": float("nan")})
     assert row.verdict == "FAIL: peak 6.25 > 5; itae - > 1"
     assert row._replace(numbers={"peak": 4.0}).verdict == "pass"
+    unstable = row._replace(numbers={"peak": 4.0, "sensitivity_peak": float("inf")})
+    assert unstable.verdict == "FAIL: the linear loop is unstable"
     texts = [fits.rows.shown(x, 3) for x in (float("nan"), float("inf"), fits.rows.NEVER, 0.0)]
     assert texts == ["-", "lost", "never", "0"]
 

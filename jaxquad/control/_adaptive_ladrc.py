@@ -72,7 +72,7 @@ class AdaptiveLADRC(eqx.Module):
         full = jnp.zeros(like.shape[:1] + self._members(like), like.dtype)
         return AdaptiveLADRCState(self.ladrc.init(full, measurement), self.estimator.init(full))
 
-    def _members(self, like):
+    def _members(self, like: Float[Array, " axes *ensemble"]) -> tuple[int, ...]:
         return np.broadcast_shapes(like.shape[1:], self.ensemble)
 
     def step(
@@ -89,7 +89,9 @@ class AdaptiveLADRC(eqx.Module):
         command = jnp.clip(command + self.estimator.probe(memory), -limit, limit)
         return AdaptiveLADRCState(self.ladrc.applied(ladrc, command), memory), command
 
-    def _moved(self, b0, memory):
+    def _moved(
+        self, b0: Float[Array, " axes *ensemble"], memory: PyTree
+    ) -> Float[Array, " axes *ensemble"]:
         found = self.estimator.estimate(memory)
         share = found.trusted * -math.expm1(-self.dt / self.settling)
         known = jnp.where(found.trusted > 0, found.inertia, jnp.ones_like(found.inertia))
