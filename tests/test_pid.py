@@ -1,5 +1,7 @@
 """PID against scipy's continuous systems, in a saturated loop, and its linear form."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,8 @@ TIME = DT * np.arange(400)
 def commands(pid, reference, angle):
     step = lambda state, now: pid.step(state, *now)
     inputs = jax.tree.map(lambda x: jnp.asarray(x)[:, None], (reference, angle))
-    run = jax.jit(lambda: jax.lax.scan(step, pid.init(jnp.zeros(1)), inputs)[1])
+    start = pid.init(jnp.zeros(1), inputs[1][0])
+    run = jax.jit(lambda: jax.lax.scan(step, start, inputs)[1])
     return np.asarray(run())[:, 0]
 
 
@@ -60,8 +63,47 @@ def test_a_setpoint_brings_its_own_rate_and_acceleration():
 
 def test_a_flight_that_starts_off_level_gives_no_derivative_kick():
     off = np.full(len(TIME), 0.2)
-    found = commands(PID([KP], [0.0], [KD], dt=DT), np.zeros(len(TIME)), off)
-    np.testing.assert_allclose(found, -0.2 * KP, rtol=1e-13)
+    for smooth in (None, SMOOTH):
+        pid = PID([KP], [0.0], [KD], measurement_filter=smooth, dt=DT)
+        found = commands(pid, np.zeros(len(TIME)), off)
+        np.testing.assert_allclose(found, -0.2 * KP, rtol=1e-13)
+
+
+SMOOTH = 35.0  # rad/s, of the measurement
+
+
+def behind_scipys_filter(y):
+    """Filtered angle and rate of a measurement that is held over the sample before it."""
+    w = SMOOTH
+    system = ([[0, 1], [-(w**2), -np.sqrt(2) * w]], [[0], [w**2]], np.eye(2), np.zeros((2, 1)))
+    held = np.append(y[1:], y[-1]) - y[0]
+    found = signal.lsim(system, held, TIME, interp=False)[1]
+    return found[:, 0] + y[0], found[:, 1]
+
+
+def test_a_filtered_measurement_and_its_rate_are_scipys():
+    r, y = broken_lines(2)
+    zero = np.zeros(len(TIME))
+    smooth: dict[str, Any] = dict(measurement_filter=[SMOOTH], filter=[BANDWIDTH], dt=DT)
+    angle, rate = behind_scipys_filter(y)
+    assert commands(PID([1.0], [0.0], [0.0], **smooth), zero, y) == pytest.approx(-angle, abs=1e-12)
+    assert commands(PID([0.0], [0.0], [1.0], **smooth), zero, y) == pytest.approx(-rate, abs=1e-10)
+    weighted = PID([KP], [KI], [KD], proportional_weight=0.3, derivative_weight=0.6, **smooth)
+    error = r - angle
+    integral = KI * DT * np.cumsum(error)
+    ahead = KD * through([BANDWIDTH, 0], [1, BANDWIDTH], 0.6 * r)  # of the reference alone
+    expected = KP * (0.3 * r - angle) + integral + ahead - KD * rate
+    assert commands(weighted, r, y) == pytest.approx(expected, rel=1e-10, abs=1e-10)
+
+
+def test_a_filter_of_the_measurement_is_second_order_for_noise():
+    """At ten times its bandwidth the command is a hundredth of that to slow signals."""
+    pid = PID([KP], [0.0], [0.0], measurement_filter=[3.0], dt=DT)
+    law = jax.tree.map(np.asarray, pid.linear(0))
+    z = np.exp(1j * 30.0 * DT)
+    gain = law.C @ np.linalg.solve(z * np.eye(4) - law.A, law.measurement_in)
+    found = np.abs(gain + law.measurement_through) / KP
+    assert found == pytest.approx(0.01, rel=0.03)  # sampling: (w dt)^2 / 4
 
 
 GAIN = 0.848  # rad/s^2 per V
@@ -97,7 +139,8 @@ def test_anti_windup_cuts_the_overshoot_of_a_saturated_step():
         assert found < 0.6 * wound and left < 1e-3
 
 
-def test_its_linear_form_gives_the_same_commands():
+@pytest.mark.parametrize("smooth", [None, [50.0, 20.0]])
+def test_its_linear_form_gives_the_same_commands(smooth):
     pid = PID(
         [1.0, KP],
         [2.0, KI],
@@ -105,6 +148,7 @@ def test_its_linear_form_gives_the_same_commands():
         filter=[9.0, BANDWIDTH],
         proportional_weight=[0.4, 0.8],
         derivative_weight=[0.2, 0.5],
+        measurement_filter=smooth,
         dt=DT,
     )
     r, y = broken_lines(1)
@@ -114,7 +158,7 @@ def test_its_linear_form_gives_the_same_commands():
     found = jax.lax.scan(step, pid.init(jnp.zeros(2)), (both(r), both(y)))[1]
     for axis in (0, 1):
         linear = jax.tree.map(np.asarray, pid.linear(axis))
-        state, expected = np.zeros(2), []
+        state, expected = np.zeros(len(linear.C)), []
         for now in zip(r, y, strict=True):
             expected.append(
                 linear.C @ state
@@ -131,6 +175,8 @@ def test_its_linear_form_gives_the_same_commands():
         (dict(filter=0.0), "filter is 0.0, but it must be above 0"),
         (dict(limit=-1.0), "limit is -1.0, but it must be above 0"),
         (dict(dt=0.0), "dt is 0.0 s"),
+        (dict(measurement_filter=-1.0), "measurement_filter is -1.0, but it must be above 0"),
+        (dict(measurement_filter=600.0), "at dt = 0.002 s it must be below 500 rad/s"),
         (dict(ki=np.nan), "ki is nan, but it must be finite"),
         (dict(kd=[1.0, 2.0]), "different numbers of axes"),
     ],

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import ROOT
-from scipy.linalg import expm, solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_lyapunov
 
 
 _MODULES = (
@@ -18,7 +18,6 @@ _MODULES = (
     "rigs",
     "signals",
     "designs",
-    "filtered_pid",
     "matching",
     "nominal",
     "pid_shape",
@@ -189,24 +188,6 @@ def test_the_step_of_the_matched_pid_overshoots_as_far_as_it_may(data, loops):
     # Both are within 1e-4 of the peak in continuous time.
     allowed = data["designs"]["tuned PID"]["shape"]["overshoot"]
     assert highest - 1 == pytest.approx(allowed, abs=2e-4)
-
-
-def test_a_filtered_measurement_is_filtered_as_scipy_does_and_flown_as_linearised(fits):
-    pid = fits.filtered_pid.FilteredPID(
-        kp=np.array([40.0]), ki=np.array([100.0]), kd=np.array([9.0]), filter=np.array([50.0]),
-        limit=np.array([np.inf]), told=True, dt=0.002,
-    )  # fmt: skip
-    law, w = pid.linear(0), 50.0
-    exact = expm(0.002 * np.array([[0, 1, 0], [-(w**2), -np.sqrt(2) * w, w**2], [0, 0, 0]]))
-    assert np.asarray(law.A)[:2, :2] == pytest.approx(exact[:2, :2], abs=1e-12)
-    assert np.asarray(law.measurement_in)[:2] == pytest.approx(exact[:2, 2], abs=1e-12)
-    state, measured = pid.init(np.zeros(1)), np.random.default_rng(0).normal(size=8)
-    x = np.zeros(3)
-    for y in measured:
-        state, command = pid.step(state, np.array([0.3]), np.array([y]))
-        sent = law.C @ x + law.reference_through * 0.3 + law.measurement_through * y
-        assert command[0] == pytest.approx(float(sent), rel=1e-9, abs=1e-9)
-        x = law.A @ x + law.reference_in * 0.3 + law.measurement_in * y
 
 
 def test_no_other_shape_of_a_pid_has_more_integral_gain_at_the_same_targets(fits, data, loops):

@@ -20,8 +20,6 @@ from jaxquad.control import (
     ProbeTones,
 )
 
-from .filtered_pid import FilteredPID
-
 
 class Design(NamedTuple):
     """A controller's law with its gains, before it knows the plant."""
@@ -115,16 +113,19 @@ def b0_of(design: Design, belief: Belief) -> np.ndarray:
 
 def _pid(
     design: Design, belief: Belief, second: np.ndarray, limit: np.ndarray, told: bool, dt: float
-) -> PID | FilteredPID:
+) -> PID:
     per_unit, gains = 1 / belief.gain, design.gains
     kp, ki, kd = pid_gains(gains["pole"], gains.get("damping", 1.0), gains.get("ratio", 1.0))
+    filter = gains["filter"] * second
+    common: dict[str, Any] = {"limit": limit, "anti_windup": Clamping() if told else None, "dt": dt}
     if design.data.get("filtered") == "measurement":
-        filter = gains["filter"] * second
-        return FilteredPID(kp * per_unit, ki * per_unit, kd * per_unit, filter, limit, told, dt)
+        return PID(
+            kp * per_unit, ki * per_unit, kd * per_unit, measurement_filter=filter,
+            proportional_weight=0 * per_unit, **common,
+        )  # fmt: skip
     return PID(
-        kp * per_unit, ki * per_unit, kd * per_unit, filter=gains["filter"] * second,
-        proportional_weight=design.data["proportional_weight"] + 0 * per_unit,
-        limit=limit, anti_windup=Clamping() if told else None, dt=dt,
+        kp * per_unit, ki * per_unit, kd * per_unit, filter=filter,
+        proportional_weight=design.data["proportional_weight"] + 0 * per_unit, **common,
     )  # fmt: skip
 
 

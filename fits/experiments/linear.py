@@ -12,7 +12,7 @@ from jaxquad.loops import analyse_loop, gain_window, LoopAnalysis
 from jaxquad.models import DecoupledAxes
 
 
-_STATES = 3  # of a LADRC; a PID has two
+_STATES = 4  # of a PID behind a filter; a LADRC has three
 
 
 class LinearLaws(eqx.Module):

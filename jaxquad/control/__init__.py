@@ -25,8 +25,15 @@ from ._observers import (
     PredictiveObserver as PredictiveObserver,
 )
 from ._pd import PD as PD, place_pd as place_pd
-from ._pid import PID as PID, PIDState as PIDState
+from ._pid import PID as PID
+from ._pid_law import PIDLaw as PIDLaw, PIDState as PIDState
 from ._probe_tones import NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._recursive_inertia import RecursiveInertia as RecursiveInertia
+from ._scheduled import (
+    flown as flown,
+    ScheduledLADRC as ScheduledLADRC,
+    ScheduledPID as ScheduledPID,
+    told as told,
+)
 from ._setpoint import as_setpoint as as_setpoint, Setpoint as Setpoint
 from ._windowed_inertia import WindowedInertia as WindowedInertia

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -5,12 +6,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ._inertia_estimate import InertiaEstimator, require_above_zero
 from ._ladrc import LADRC
 from ._ladrc_law import LADRCLaw, LADRCState
 from ._per_axis import fit
+from ._scheduled import gain_at
 
 
 class AdaptiveLADRCState(NamedTuple):
@@ -62,6 +64,16 @@ class AdaptiveLADRC(eqx.Module):
         if isinstance(self.ladrc, LADRCLaw):
             return self
         return AdaptiveLADRC(self.ladrc.prepared(), self.estimator, self.map, self.settling)
+
+    def told(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
+        """The LADRC that it is while its estimate is `inertia`, kg m^2: for a linear analysis.
+
+        Raises ValueError for an inertia that is not above 0 or does not fit the map's axes, and
+        for a controller that is already prepared.
+        """
+        if isinstance(self.ladrc, LADRCLaw):
+            raise ValueError("a prepared controller has no wc and wo: tell the one it was made of")
+        return dataclasses.replace(self.ladrc, b0=gain_at(self.map, inertia))
 
     def init(
         self,

@@ -1,0 +1,1 @@
+from ._header import c_header as c_header, write_c_header as write_c_header

@@ -1,0 +1,96 @@
+"""LADRC, with its b0 fixed or scheduled by an inertia."""
+
+import numpy as np
+from jaxtyping import Array
+
+from jaxquad.control import (
+    CurrentObserver,
+    EulerObserver,
+    LADRC,
+    PredictiveObserver,
+    ScheduledLADRC,
+)
+
+from ._ladrc_text import APPLIED, ladrc_step, SCHEDULE
+from ._map import map_gains, map_source, require_map
+from ._number import Precision
+from ._source import axes_text, Gain, per_axis, require_precision, Source
+from ._start import starting
+
+
+_OBSERVERS = (CurrentObserver, PredictiveObserver, EulerObserver)
+_UNITS = {1: "rad/s per unit of command", 2: "rad/s^2 per unit of command"}  # of b0, by order
+_NOTES = {"kd": "1/s", "l1": "of the observer: 1", "l2": "1/s", "l3": "1/s^2"}
+_STATES = {
+    1: {"angle": "y, estimate", "disturbance": "f of y' = b0 u + f, estimate"},
+    2: {
+        "angle": "rad, estimate",
+        "rate": "rad/s, estimate",
+        "disturbance": "f of angle'' = b0 u + f, rad/s^2, estimate",
+    },
+}
+_COMMAND = {"command": "as applied since the last sample"}
+
+
+def ladrc_source(ladrc: LADRC, axes: int | None, precision: Precision) -> Source:
+    """The difference equations of a LADRC."""
+    count, gains = _gains_of(ladrc, axes, precision, {})
+    return Source(
+        what=f"LADRC of order {ladrc.order} for {axes_text(count)}.",
+        settings=_settings(ladrc, True),
+        gains=_noted(ladrc, gains),
+        state=_STATES[ladrc.order] | _COMMAND,
+        functions=(*_starting(ladrc, ""), ladrc_step(ladrc, "g->b0"), APPLIED),
+    )
+
+
+def scheduled_ladrc_source(law: ScheduledLADRC, axes: int | None, precision: Precision) -> Source:
+    """The same with b0 in the state, moved by `schedule` without a jump of the command."""
+    ladrc, rule = law.ladrc, require_map(law.map)
+    count, gains = _gains_of(ladrc, axes, precision, map_gains(rule))
+    source = map_source(rule, gains, precision)
+    noted = _noted(ladrc, gains | {"b0": source.start})
+    noted["b0"] = noted["b0"]._replace(note=f"{_UNITS[ladrc.order]}, at the nominal inertia")
+    start = _starting(ladrc, "state->b0[k] = ${name}_table[k].b0;")
+    return Source(
+        what=f"LADRC of order {ladrc.order} for {axes_text(count)}, b0 after the inertia.",
+        settings=_settings(ladrc, False)
+        | {"b0": "piecewise linear from ln inertia to ln b0, constant beyond the knots"},
+        gains=noted,
+        state=_STATES[ladrc.order] | _COMMAND | {"b0": f"in force, {_UNITS[ladrc.order]}"},
+        functions=(*start, source.function, SCHEDULE, ladrc_step(ladrc, "state->b0[k]"), APPLIED),
+        tables=source.tables,
+        needs_libm=True,
+    )
+
+
+def _gains_of(
+    ladrc: LADRC, axes: int | None, precision: Precision, more: dict[str, Array]
+) -> tuple[int, dict[str, np.ndarray]]:
+    if type(ladrc.observer) not in _OBSERVERS:
+        known = ", ".join(f"{kind.__name__}()" for kind in _OBSERVERS)
+        raise ValueError(f"observer is {ladrc.observer!r}: in C there are {known}.")
+    kp, kd, correction = ladrc.gains
+    values = {"kp": kp} | ({} if kd is None else {"kd": kd})
+    values |= {f"l{k + 1}": row for k, row in enumerate(correction)}
+    values |= {"b0": ladrc.b0, "limit": ladrc.limit, **more}
+    require_precision(values, precision)
+    return per_axis(values, axes)
+
+
+def _noted(ladrc: LADRC, gains: dict[str, np.ndarray]) -> dict[str, Gain]:
+    notes = {"kp": "1/s^2" if ladrc.order == 2 else "1/s", **_NOTES}
+    notes |= {"b0": _UNITS[ladrc.order], "limit": "of |command|"}
+    return {name: Gain(note, gains[name]) for name, note in notes.items() if name in gains}
+
+
+def _settings(ladrc: LADRC, with_b0: bool) -> dict[str, str]:
+    units = {"wc": " rad/s", "wo": " rad/s", "feedback_factor": "", "observer_factor": ""}
+    units |= {"b0": f" {_UNITS[ladrc.order]}"} if with_b0 else {}
+    units |= {"limit": " of |command|"}
+    found = {n: f"{np.asarray(getattr(ladrc, n)).tolist()}{unit}" for n, unit in units.items()}
+    return found | {"observer": type(ladrc.observer).__name__, "placement": ladrc.placement}
+
+
+def _starting(ladrc: LADRC, more: str) -> tuple[str, ...]:
+    return starting((*_STATES[ladrc.order], "command"), measured="angle", more=more)

@@ -1,0 +1,126 @@
+"""PID, with its gains fixed or divided by a b0 that follows an inertia."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxquad.control import BackCalculation, Clamping, PID, ScheduledPID
+
+from ._map import map_gains, map_source, require_map
+from ._number import Precision, type_of
+from ._pid_text import pid_step, SCHEDULE
+from ._source import axes_text, Gain, per_axis, require_precision, Source
+from ._start import starting
+
+
+_NOTES = {
+    "kp": "per rad",
+    "ki": "per rad s",
+    "kd": "per rad/s",
+    "feedforward": "per rad/s^2",
+    "proportional_weight": "of the set-point",
+    "derivative_weight": "of the set-point",
+    "keep": "of the derivative's filter, a sample later",
+    "sharp": "(1 - keep) / dt, 1/s",
+    "follow": "of the integral, in a sample, towards the bounded command",
+    "angle_angle": "of the measurement's filter, a sample later",
+    "angle_rate": "s",
+    "rate_angle": "1/s",
+    "rate_rate": "1",
+    "limit": "of |command|",
+}
+
+
+def pid_source(pid: PID, axes: int | None, precision: Precision) -> Source:
+    """The difference equations of a PID."""
+    count, gains = _gains_of(pid, axes, precision, {})
+    return Source(
+        what=f"PID for {axes_text(count)}.",
+        settings=_settings(pid),
+        gains=_members(gains),
+        state=_states(pid),
+        functions=(*_starting(pid, ""), pid_step(pid, "")),
+        flags={"started": "0 before the first sample"},
+    )
+
+
+def scheduled_pid_source(law: ScheduledPID, axes: int | None, precision: Precision) -> Source:
+    """The same with gains per b0, and b0 in the state."""
+    rule = require_map(law.map)
+    count, gains = _gains_of(law.pid, axes, precision, map_gains(rule))
+    written = map_source(rule, gains, precision)
+    gains["b0"] = written.start
+    b0 = {"b0": "in force, rad/s^2 per unit of command"}
+    start = "state->b0[k] = ${name}_table[k].b0;"
+    return Source(
+        what=f"PID for {axes_text(count)}, gains per b0, b0 after the inertia.",
+        settings=_settings(law.pid)
+        | {"b0": "piecewise linear from ln inertia to ln b0, constant beyond the knots"},
+        gains=_members(gains) | {"b0": Gain("at the nominal inertia", gains["b0"])},
+        state=_states(law.pid) | b0,
+        functions=(*_starting(law.pid, start), written.function, SCHEDULE,
+                   pid_step(law.pid, " / b0")),
+        tables=written.tables,
+        flags={"started": "0 before the first sample"},
+        needs_libm=True,
+    )  # fmt: skip
+
+
+def _gains_of(pid: PID, axes: int | None, precision: Precision, more: dict) -> tuple[int, dict]:
+    if not (pid.anti_windup is None or isinstance(pid.anti_windup, Clamping | BackCalculation)):
+        raise ValueError(
+            f"anti_windup is {pid.anti_windup!r}: in C there are Clamping(), BackCalculation(time) "
+            "and None."
+        )
+    names = ("kp", "ki", "kd", "feedforward", "proportional_weight", "derivative_weight", "limit")
+    values: dict[str, Any] = {name: getattr(pid, name) for name in names} | more
+    require_precision(values | {"filter": pid.filter}, precision)
+    return per_axis(values | _samples_of(pid, precision), axes)
+
+
+def _samples_of(pid: PID, precision: Precision) -> dict[str, Array]:
+    # In the header's precision, as `PID.step` does: what is lost of 1 - keep is then the same.
+    kind = type_of(precision)
+    keep = jnp.exp(-pid.dt * pid.filter.astype(kind))
+    found = {"keep": keep, "sharp": (1 - keep) / pid.dt}
+    if isinstance(pid.anti_windup, BackCalculation):
+        found["follow"] = -jnp.expm1(-pid.dt / pid.anti_windup.time.astype(kind))
+    transition = pid.prepared().transition
+    if transition is None:
+        return found
+    names = ("angle_angle", "angle_rate", "rate_angle", "rate_rate")
+    return found | dict(zip(names, (x for row in transition for x in row), strict=True))
+
+
+def _members(gains: dict[str, np.ndarray]) -> dict[str, Gain]:
+    return {name: Gain(note, gains[name]) for name, note in _NOTES.items() if name in gains}
+
+
+def _states(pid: PID) -> dict[str, str]:
+    found = {
+        "integral": "units of the command",
+        "rate": "of the derivative's filter, rad/s",
+    }
+    if pid.measurement_filter is None:
+        return found
+    return found | {
+        "angle": "of the measurement's filter, rad",
+        "slope": "of that angle, rad/s",
+    }
+
+
+def _starting(pid: PID, more: str) -> tuple[str, ...]:
+    measured = None if pid.measurement_filter is None else "angle"
+    return starting(_states(pid), measured=measured, more=more, flags=("started",))
+
+
+def _settings(pid: PID) -> dict[str, str]:
+    units = {"kp": "per rad", "ki": "per rad s", "kd": "per rad/s", "filter": "rad/s",
+             "measurement_filter": "rad/s", "limit": "of |command|"}  # fmt: skip
+    found = {name: getattr(pid, name) for name in units}
+    text = {n: f"{np.asarray(x).tolist()} {units[n]}" for n, x in found.items() if x is not None}
+    rule = pid.anti_windup
+    time = f"({np.asarray(rule.time).tolist()} s)" if isinstance(rule, BackCalculation) else ""
+    return text | {"anti-windup": "none" if rule is None else type(rule).__name__ + time}
