@@ -172,15 +172,16 @@ def test_csv_refuses(tmp_path, content, said):
 def test_csv_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(bytes(range(256)))
-    with pytest.raises(ReadError, match="cannot be read as .csv"):
+    with pytest.raises(ReadError, match="it is no text: it holds a zero .at byte 0"):
         channels(path)
 
 
 def test_a_missing_file_and_an_unknown_kind_are_refused(tmp_path):
     with pytest.raises(ReadError, match="there is no such file"):
         channels(tmp_path / "log.npz")
-    with pytest.raises(ReadError, match=r"'.ulg' are not read, only .csv, .npz, .mat"):
-        channels(tmp_path / "log.ulg")
+    (tmp_path / "log.xyz").write_bytes(b"what is this?")
+    with pytest.raises(ReadError, match=r"neither its first bytes nor its ending '.xyz' .*.npz"):
+        channels(tmp_path / "log.xyz")
 
 
 @pytest.mark.parametrize("kept", [3, 40, 1000, 4000])
@@ -190,7 +191,7 @@ def test_a_truncated_file_is_refused(tmp_path, suffix, kept):
     arrays = {"t": TIME, "u": U, "y": Y}
     np.savez(path, **arrays) if suffix == ".npz" else savemat(path, arrays)
     path.write_bytes(path.read_bytes()[:kept])
-    with pytest.raises(ReadError, match=f"cannot be read as {suffix}, it may be cut off"):
+    with pytest.raises(ReadError, match="cut off"):
         channels(path)
 
 
@@ -199,7 +200,7 @@ def test_a_corrupted_archive_is_refused(tmp_path):
     content = bytearray(path.read_bytes())
     content[2000] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(ReadError, match="may be cut off or damaged .*CRC"):
+    with pytest.raises(ReadError, match="cut off or damaged.*CRC"):
         channels(path)
 
 
@@ -209,11 +210,11 @@ def test_a_pickled_array_is_refused_by_name(tmp_path):
         channels(path)
 
 
-def test_a_mat_file_of_version_7_3_is_refused_with_the_remedy(tmp_path):
+def test_a_mat_file_of_version_7_3_needs_more_than_its_head(tmp_path):
     path = tmp_path / "log.mat"
     head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
     path.write_bytes(head + bytes(512))
-    with pytest.raises(ReadError, match="v7.3 file, which is HDF5: .*-v7"):
+    with pytest.raises(ReadError, match="an HDF5 or MATLAB v7.3 file that is cut off or damaged"):
         channels(path)
 
 

@@ -6,6 +6,8 @@ from ._errors import (
     RecordWarning as RecordWarning,
 )
 from ._look import channels as channels, ChannelSummary as ChannelSummary
+from ._proposal import Proposal as Proposal
+from ._propose import propose as propose
 from ._read import read as read
 from ._record import Record as Record
 from ._resample import resample as resample

@@ -4,8 +4,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ._errors import RecordError
-from ._formats import load_arrays
-from ._timebase import Arrays, signal_names, timed_channels, TimeUnit
+from ._readers import load_signals
+from ._timebase import signal_names, Timebases, TimeUnit
 
 
 class ChannelSummary(NamedTuple):
@@ -30,20 +30,18 @@ def channels(
     path: str | Path, *, time: str | None = None, time_unit: TimeUnit | None = None
 ) -> list[ChannelSummary]:
     """List the channels that `read` can take from a file. Raises ReadError."""
-    arrays = load_arrays(path)
-    return [_summary(arrays, name, time, time_unit) for name in signal_names(arrays, time)]
+    signals = load_signals(path)
+    timebases = Timebases(signals, time, time_unit)
+    return [_summary(timebases, name) for name in signal_names(signals, time)]
 
 
-def _summary(
-    arrays: Arrays, name: str, time: str | None, time_unit: TimeUnit | None
-) -> ChannelSummary:
-    array, column = signal_names(arrays, time)[name]
-    values = arrays[array] if column is None else arrays[array][:, column]
+def _summary(timebases: Timebases, name: str) -> ChannelSummary:
+    values = timebases.values(name)
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
     try:
-        [channel] = timed_channels(arrays, [name], time=time, time_unit=time_unit)
+        channel = timebases.channel(name)
         clock = channel.rate, float(channel.time[0]), float(channel.time[-1])
     except RecordError:  # A listing is how one finds out what is wrong with a file.
         clock = np.nan, np.nan, np.nan
-    return ChannelSummary(name, len(values), *clock, low, high, "")
+    return ChannelSummary(name, len(values), *clock, low, high, timebases.unit(name))

@@ -5,6 +5,7 @@ from ._errors import RecordError
 
 
 Names = str | Sequence[str] | None
+_MOST = 40
 
 
 def unknown_name(name: str, known: Iterable[str]) -> str:
@@ -13,7 +14,14 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
     plain = {each.lower(): each for each in known}
     near = difflib.get_close_matches(name.lower(), plain, n=1)
     guess = f" Did you mean {plain[near[0]]!r}?" if near else ""
-    return f"no channel {name!r}.{guess} There are: {', '.join(known) or 'none'}."
+    return f"no channel {name!r}.{guess} There are: {listed(known)}."
+
+
+def listed(names: Iterable[str]) -> str:
+    """The names, of many the first."""
+    names = list(names)
+    more = f", and {len(names) - _MOST} more" if len(names) > _MOST else ""
+    return f"{', '.join(names[:_MOST]) or 'none'}{more}"
 
 
 def as_names(names: Names, letter: str, count: int) -> tuple[str, ...]:
@@ -49,3 +57,8 @@ def check_distinct(names: Sequence[str]) -> None:
             f"the channel name {twice[0]!r} occurs {names.count(twice[0])} times among "
             f"{', '.join(names)}: every channel of a record needs a name of its own."
         )
+
+
+def printable(text: str) -> str:
+    """What a file says, free of what would steer a terminal, and of moderate length."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text[:500])

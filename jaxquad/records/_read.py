@@ -7,12 +7,12 @@ from jaxtyping import Float
 from ._channel import Channel
 from ._clock import departure, JITTER, window
 from ._edit import combine
-from ._errors import ReadError, RecordError
-from ._formats import load_arrays
+from ._errors import located, ReadError, RecordError
 from ._names import as_tuple, check_distinct, unknown_name
+from ._readers import load_signals
 from ._record import Record
 from ._resample import resample
-from ._timebase import timed_channels, TimeUnit
+from ._timebase import Timebases, TimeUnit
 
 
 Mixes = Mapping[str, Mapping[str, float | int]]
@@ -33,17 +33,24 @@ def read(
     max_gap: float | int | None = None,
     units: Mapping[str, str] | None = None,
 ) -> Record:
-    """Read a record from a .csv, .npz or .mat file.
+    """Read a record from a log: ArduPilot, PX4, Betaflight, Crazyflie, or a table of arrays.
+
+    The first bytes say which kind of file it is, else its name: DataFlash .bin and .log, ULog,
+    blackbox .bbl and .bfl or what blackbox_decode makes of them, Crazyflie uSD, ROS 2 bags, MAT
+    of versions 5 to 7.3, HDF5, Parquet, .npz, .npy, .csv. `channels` lists what a file holds.
 
     `inputs`, `outputs` and `references` are channel names, or new names with the weighted sums
     that make them: `{"roll": {"motor[0]": -1, "motor[1]": 1}}`. The columns of a 2-D array `x`
-    are `x[0]`, `x[1]`, ... The time base of `x` is `t_x`, else the array that `time` names, else
-    t, time, time_s or timestamp; `time_unit` None means s and refuses steps of 1 s and more.
+    are `x[0]`, `x[1]`, ... Where the log does not say, the time base of `x` is `t_x`, else the
+    array that `time` names, else t, time, time_s or timestamp; `time_unit` None means s and
+    refuses steps of 1 s and more. Counters that wrap go on, and up to 1 % of stamps that repeat or
+    go back are dropped with their rows, both with a RecordWarning.
 
     `start` and `stop` are in s of the file's own time, which the record keeps. Without a
     `sample_rate` (Hz), channels that share one uniform time base are passed on bit by bit;
     others come to the lowest of their own rates, rounded to three digits. See `resample` for how,
-    and for `max_gap` (s). `units` by the record's own channel names go onto figures and tables.
+    and for `max_gap` (s). `units` by the record's own channel names, else those of the log, go
+    onto figures and tables.
 
     Raises ReadError for what is wrong with the file, RecordError for what is wrong with the data.
     """
@@ -58,7 +65,8 @@ def read(
         rate = _slowest(channels) if sample_rate is None else sample_rate
         stamps, values = resample(channels, rate, start=start, stop=stop, max_gap=max_gap)
     columns = dict(zip(names, values.T, strict=True))
-    units = _known_units(units or {}, [name for role in roles for name in role])
+    logged = {channel.name: channel.unit for channel in channels}
+    units = _all_units(units or {}, logged, roles)
     return Record(
         stamps,
         *(_blend(role, columns, stamps.size) for role in roles),
@@ -72,11 +80,17 @@ def read(
     )
 
 
-def _known_units(units: Mapping[str, str], names: Sequence[str]) -> dict[str, str]:
-    for name in units:
-        if name not in names:
-            raise RecordError(f"a unit for {name!r}: {unknown_name(name, names)}")
-    return {name: units.get(name, "") for name in names}
+def _all_units(
+    given: Mapping[str, str], logged: Mapping[str, str], roles: Sequence[Mixes]
+) -> dict[str, str]:
+    """Those given, else the log's where the channels of a mix agree."""
+    mixes = {name: mix for role in roles for name, mix in role.items()}
+    for name in given:
+        if name not in mixes:
+            raise RecordError(f"a unit for {name!r}: {unknown_name(name, mixes)}")
+    units = {name: {logged[source] for source in mix} for name, mix in mixes.items()}
+    agreed = {name: unit.pop() if len(unit) == 1 else "" for name, unit in units.items()}
+    return agreed | dict(given)
 
 
 def _mixes(selection: Selection) -> Mixes:
@@ -90,13 +104,14 @@ def _mixes(selection: Selection) -> Mixes:
 def _channels(
     path: str | Path, names: Sequence[str], time: str | None, time_unit: TimeUnit | None
 ) -> list[Channel]:
-    arrays = load_arrays(path)
+    signals = load_signals(path)
     if not names:
         raise ReadError(f"{path}: no channels were asked for: name inputs and outputs.")
     try:
-        return timed_channels(arrays, names, time=time, time_unit=time_unit)
+        timebases = Timebases(signals, time, time_unit)
+        return [timebases.channel(name) for name in names]
     except ReadError as error:
-        raise ReadError(f"{path}: {error}") from error
+        raise located(error, path) from error
 
 
 def _slowest(channels: Sequence[Channel]) -> float:

@@ -1,91 +1,149 @@
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from ._channel import Channel
-from ._errors import ReadError
-from ._names import unknown_name
+from ._errors import ReadError, RecordWarning
+from ._log import Signal, Signals
+from ._names import listed, unknown_name
+from ._stamps import Mended, mended, unwrapped
 
 
-Arrays = Mapping[str, np.ndarray]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _SHARED = ("t", "time", "time_s", "timestamp", "Time", "Timestamp", "TIME")
 
 
-def signal_names(arrays: Arrays, time: str | None) -> dict[str, tuple[str, int | None]]:
+def signal_names(signals: Signals, time: str | None) -> dict[str, tuple[str, int | None]]:
     """Channel name -> array and column; the columns of `x` are `x[0]`, `x[1]`, ..."""
     names = {}
-    for name, array in arrays.items():
-        if _is_time(arrays, name, time):
+    for name, signal in signals.arrays.items():
+        if not signal.clock and _is_time(signals.arrays, name, time):
             continue
-        if array.ndim == 1:
-            names[name] = (name, None)
-        else:
-            names |= {f"{name}[{i}]": (name, i) for i in range(array.shape[1])}
-    return names
+        names |= _columns_of(name, signal)
+    return {name: place for name, place in names.items() if name != time}
 
 
-def timed_channels(
-    arrays: Arrays, names: Sequence[str], *, time: str | None, time_unit: TimeUnit | None
-) -> list[Channel]:
-    """The named channels with their time bases, in s.
+def _columns_of(name: str, signal: Signal) -> dict[str, tuple[str, int | None]]:
+    if signal.values.ndim == 1:
+        return {name: (name, None)}
+    return {f"{name}[{i}]": (name, i) for i in range(signal.values.shape[1])}
 
-    Raises ReadError for an unknown channel and for one without a time base of its length.
-    """
-    known = signal_names(arrays, time)
-    channels = []
-    for name in names:
-        if name not in known:
-            raise ReadError(unknown_name(name, known))
-        array, column = known[name]
-        base = time_array(arrays, array, time)
-        stamps = _seconds(base, arrays[base], time_unit)
-        values = arrays[array] if column is None else arrays[array][:, column]
-        if stamps.size != len(values):
+
+class Timebases:
+    """The clocks of a log, each put in order once."""
+
+    def __init__(self, signals: Signals, time: str | None, time_unit: TimeUnit | None):
+        if time_unit is not None and time_unit not in _PER_SECOND:
+            raise ReadError(f"time_unit {time_unit!r}: it is one of {', '.join(_PER_SECOND)}.")
+        self._signals, self._time = signals, time
+        self._unit: TimeUnit | None = time_unit
+        self._names = signal_names(signals, time)
+        self._mended: dict[str, Mended] = {}
+
+    def channel(self, name: str) -> Channel:
+        """The named channel with its time base, in s.
+
+        Raises ReadError for an unknown channel and for one without a time base of its length,
+        and warns with RecordWarning of stamps that had to be mended.
+        """
+        values, array = self.values(name), self._names[name][0]
+        base = self._base(array)
+        stamps = self._stamps(base)
+        whole = stamps.time.size if stamps.kept is None else stamps.kept.size
+        if whole != len(values):
             raise ReadError(
                 f"channel {name!r} has {len(values)} samples, its time base {base!r} "
-                f"{stamps.size}: name another with time=, or save its own as {'t_' + array!r}."
+                f"{whole}: name another with time=, or save its own as {'t_' + array!r}."
             )
-        channels.append(Channel(name, stamps, values))
-    return channels
+        kept = values if stamps.kept is None else values[stamps.kept]
+        return Channel(name, stamps.time, kept, self._signals.arrays[array].unit)
+
+    def values(self, name: str) -> np.ndarray:
+        """What the file holds of a channel, in its unit, whatever its time."""
+        if name not in self._names:
+            raise ReadError(unknown_name(name, self._names))
+        array, column = self._names[name]
+        return column_values(self._signals.arrays[array], column)
+
+    def unit(self, name: str) -> str:
+        return self._signals.arrays[self._names[name][0]].unit
+
+    def _base(self, array: str) -> str:
+        known = self._signals.arrays[array].clock
+        if known and self._time is None:
+            if self._unit not in (None, "s"):
+                raise ReadError(
+                    f"time_unit {self._unit!r}: the time of {array!r} is known and in s: leave "
+                    f"time_unit out, or name another time base with time=."
+                )
+            return known
+        return time_array(self._signals, array, self._time)
+
+    def _stamps(self, base: str) -> Mended:
+        if base not in self._mended:
+            clock = self._signals.clocks.get(base)
+            stamps, wraps = (clock, 0) if clock is not None else self._counted(base)
+            self._mended[base] = mended(stamps)
+            remark = self._mended[base].remark
+            times = "once" if wraps == 1 else f"{wraps} times"
+            turned = f"the counter wraps {times}, which was undone" if wraps else ""
+            for text in filter(None, (turned, remark)):
+                warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
+        return self._mended[base]
+
+    def _counted(self, base: str) -> tuple[Float[np.ndarray, " samples"], int]:
+        array, column = _all_names(self._signals)[base]
+        counter, wraps = unwrapped(column_values(self._signals.arrays[array], column, raw=True))
+        return _seconds(base, counter, self._unit), wraps
 
 
-def time_array(arrays: Arrays, array: str, time: str | None) -> str:
+def column_values(signal: Signal, column: int | None, *, raw: bool = False) -> np.ndarray:
+    """One column in its unit; `raw` as it stands in the file."""
+    values = signal.values if column is None else signal.values[:, column]
+    return values if raw or signal.scale == 1.0 else values * signal.scale
+
+
+def time_array(signals: Signals, array: str, time: str | None) -> str:
     """The name of the time stamps that belong to `array`.
 
     Its own, `t_<array>`, comes first; then the one asked for; then the first of t, time,
     time_s, timestamp, ... beside it (in the same struct) or in the file.
     """
     struct, dot, field = array.rpartition(".")
-    if time is not None and time not in arrays:
-        raise ReadError(f"time={time!r}: {unknown_name(time, arrays)}")
+    if time is not None and time not in signals.arrays and time not in _all_names(signals):
+        raise ReadError(f"time={time!r}: {unknown_name(time, signals.arrays)}")
     own = f"{struct}{dot}t_{field}"
     asked = [] if time is None else [time]
     shared = asked or [f"{struct}{dot}{name}" for name in _SHARED] + list(_SHARED)
-    found = [name for name in (own, *shared) if name in arrays]
+    found = [name for name in (own, *shared) if name in signals.arrays or name == time]
     if not found:
         raise ReadError(
             f"no time base for {array!r}: none of {own}, {', '.join(_SHARED)} is among "
-            f"{', '.join(arrays)}: say which it is with time=."
+            f"{listed(signals.arrays)}: say which it is with time=."
         )
-    if arrays[found[0]].ndim != 1:
-        raise ReadError(f"the time base {found[0]!r} has shape {arrays[found[0]].shape}, not 1-D.")
+    matrix = signals.arrays.get(found[0])
+    if matrix is not None and matrix.values.ndim != 1:
+        raise ReadError(f"the time base {found[0]!r} has shape {matrix.values.shape}, not 1-D.")
     return found[0]
 
 
-def _is_time(arrays: Arrays, name: str, time: str | None) -> bool:
+def _all_names(signals: Signals) -> dict[str, tuple[str, int | None]]:
+    every = (_columns_of(name, signal) for name, signal in signals.arrays.items())
+    return {name: place for names in every for name, place in names.items()}
+
+
+def _is_time(arrays: Mapping[str, Signal], name: str, time: str | None) -> bool:
     struct, dot, field = name.rpartition(".")
     owner = f"{struct}{dot}{field.removeprefix('t_')}"
     own = field.startswith("t_") and owner in arrays
-    return own or name == time or (time is None and field in _SHARED)
+    return own or (time is None and field in _SHARED)
 
 
 def _seconds(name: str, stamps: np.ndarray, unit: TimeUnit | None) -> Float[np.ndarray, " samples"]:
-    if unit is not None and unit not in _PER_SECOND:
-        raise ReadError(f"time_unit {unit!r}: it is one of {', '.join(_PER_SECOND)}.")
     seconds = stamps.astype(np.float64) / _PER_SECOND[unit or "s"]
     if unit is None and stamps.size > 1 and np.median(np.abs(np.diff(seconds))) >= 1:
         raise ReadError(

@@ -1,0 +1,79 @@
+"""Betaflight: PID sum, filtered gyro, set-point, and the chirp mode's debug channels."""
+
+import numpy as np
+
+from ._betaflight_chirp import chirps
+from ._errors import RecordError
+from ._log import flattened, Log, Table
+from ._proposal import AXES, busiest, first_logged, Setup, values_of
+
+
+_SELF_LEVELLING = 0b110  # ANGLE and HORIZON in the flight mode flags
+
+
+def betaflight_setup(log: Log, axis: str | None) -> Setup:
+    """The longest chirp of the longest log; without one, the set-point in acro, else the stick."""
+    prefix, table = _longest(log)
+    signals = flattened(log)
+    rates = {each: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, each in enumerate(AXES)}
+    if not any(rates.values()):
+        raise RecordError("no gyroADC in the log.")
+    sweeps = [each for each in chirps(table) if axis in (None, AXES[each.axis])]
+    best = max(sweeps, key=lambda each: each.stop - each.start, default=None)
+    axis = axis or (busiest(signals, rates) if best is None else AXES[best.axis])
+    i = AXES.index(axis)
+    command = first_logged(signals, [f"{prefix}axisSum[{i}]"])
+    if not command or not rates[axis]:
+        raise RecordError(f"no PID terms or gyro for {axis} in the log.")
+    remarks = [f"{rates[axis]} is behind the gyro filters, whose delay is in the model"]
+    remarks += _limited(log, prefix, axis, values_of(signals, command))
+    if best is not None:
+        return Setup(
+            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", best.start, best.stop,
+            (best.low, best.high),
+            f"chirp on the rate set-point, {best.low:.4g} .. {best.high:.4g} Hz, "
+            f"{best.stop - best.start:.4g} s", tuple(remarks),
+        )  # fmt: skip
+    setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
+    if setpoint and not _levelled(log, prefix):
+        remarks.append("flown in acro: there the set-point is the pilot's alone")
+        return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=tuple(remarks))
+    if setpoint:
+        remarks.append(
+            f"self-levelling was on, or is not known: {setpoint} is then computed from the "
+            f"attitude, contains feedback and is no outside reference"
+        )
+    stick = first_logged(signals, [f"{prefix}rcCommand[{i}]"])
+    reference = stick if stick and np.ptp(values_of(signals, stick)) else ""
+    return Setup(axis, {command: 1.0}, rates[axis], reference, remarks=tuple(remarks))
+
+
+def _longest(log: Log) -> tuple[str, Table]:
+    """The main table of the longest log in the file, and what precedes its channels."""
+    main = {
+        name: table
+        for name, table in log.tables.items()
+        if not name.endswith(("slow", "gps")) and table.time is not None and table.time.size
+    }
+    if not main:
+        raise RecordError("no main frames in the log.")
+    name = max(main, key=lambda each: np.ptp(np.asarray(main[each].time)))
+    return f"{name}." if name else "", main[name]
+
+
+def _levelled(log: Log, prefix: str) -> bool:
+    """Whether a self-levelling mode was on at any time; where that is unknown, it counts as on."""
+    flags = log.tables.get(f"{prefix}slow")
+    modes = None if flags is None else flags.columns.get("flightModeFlags")
+    if modes is None or not modes.size or modes.dtype.kind not in "iuf":
+        return True
+    return bool((modes.astype(np.int64) & _SELF_LEVELLING).any())
+
+
+def _limited(log: Log, prefix: str, axis: str, command: np.ndarray) -> list[str]:
+    """The share of the samples where the firmware cuts the PID sum off."""
+    name = "pidsum_limit_yaw" if axis == "yaw" else "pidsum_limit"
+    text = log.settings.get(f"{prefix.rstrip('.')} {name}".lstrip(), "")
+    beyond = int((np.abs(command) > int(text)).sum()) if text.isdecimal() and len(text) < 9 else 0
+    share = f"{beyond} of {command.size} samples of the command"
+    return [f"{share} lie beyond {name} = {text}, where it saturates"] if beyond else []
