@@ -4,9 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from ._combination import Combination
+from ._draws import draw_models
 from ._identifiable import Identifiability, NotIdentifiable
 from ._parameters import Parameters
 from ._starts import Minimum
@@ -89,6 +90,22 @@ class Fit(eqx.Module):
             )
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
         return Combination(name, float(quantity(self.model)), error)
+
+    def ensemble(self, n: int, key: Key[Array, ""], *, hold_undetermined: bool = False) -> PyTree:
+        """`n` models drawn from the fit; leaves with free or tied numbers get a last axis `[n]`.
+
+        The draws are normal in the coordinates of the fit (logarithms of what keeps its sign, so
+        that a lag never comes out negative), with the calibrated covariance, widened where the
+        standard errors are. Raises `NotIdentifiable` where the record leaves parameters
+        undetermined. With `hold_undetermined` these directions stay where the solver stopped and
+        only what is determined varies: right for quantities that `derived` accepts, and no spread
+        at all for others. Raises ValueError for a fit that found no minimum or has no finite
+        standard errors, and for parameters that ran to zero.
+        """
+        if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
+            raise ValueError(f"n is {n}: draw a whole number of models, 1 or more")
+        scores = jax.random.normal(key, (len(self.names), n))
+        return draw_models(self, scores, hold_undetermined=hold_undetermined)
 
     def _fitted(self) -> Float[np.ndarray, " parameters"]:
         """Values where the solver stopped, the undetermined ones too."""

@@ -1,0 +1,213 @@
+"""L-BFGS for many problems at once: each evaluation serves all of them."""
+
+from collections.abc import Callable, Generator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+Vector = Float[np.ndarray, " n"]
+Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+# values [problems] and gradients [problems, n] at points [problems, n] of the problems that are on
+
+
+class LBFGS(eqx.Module):
+    """How L-BFGS steps: by a strong-Wolfe line search that mostly takes its first trial.
+
+    It stops where a step lowers the cost by less than `tolerance` twice in a row (costs are
+    logarithms, so 1e-4 is 0.01 %), where the gradient's greatest entry is below
+    `gradient_tolerance`, or after `evaluations`. No parameter moves by more than `longest_step`
+    nepers at once. A trial without a finite cost is taken back by half.
+    Source: Nocedal and Wright, Numerical Optimization, algorithms 7.4, 3.5 and 3.6.
+    """
+
+    evaluations: int = 60
+    tolerance: float = 1e-4
+    gradient_tolerance: float = 1e-4
+    memory: int = 10
+    longest_step: float = 0.5
+    first_step: float = 0.1
+
+    def __check_init__(self):
+        if self.evaluations < 1 or self.memory < 1:
+            raise ValueError(
+                f"evaluations is {self.evaluations} and memory {self.memory}: give 1 or more"
+            )
+        if not (self.longest_step > 0 and self.first_step > 0):
+            raise ValueError(
+                f"longest_step is {self.longest_step} and first_step {self.first_step}: give "
+                "nepers above 0"
+            )
+
+
+class Descent(NamedTuple):
+    """Where each problem ended."""
+
+    z: Float[np.ndarray, "problems n"]
+    value: Float[np.ndarray, " problems"]
+    gradient: Float[np.ndarray, "problems n"]
+    evaluations: Int[np.ndarray, " problems"]
+    converged: Bool[np.ndarray, " problems"]
+    reasons: tuple[str, ...]
+
+
+class _Point(NamedTuple):
+    z: Vector
+    value: float
+    gradient: Vector
+
+
+_TRIALS = 7  # of a line search
+_End = tuple[_Point, bool, str]
+_Search = Generator[Vector, tuple[float, Vector], Any]
+
+
+def minimise(
+    evaluate: Evaluate,
+    start: Float[np.ndarray, "problems n"],
+    method: LBFGS,
+    *,
+    on: Bool[np.ndarray, " problems"] | None = None,
+    enough: Callable[[int, float], bool] | None = None,
+) -> Descent:
+    """Runs all problems in lockstep: `evaluate(z, on)` tells values and gradients of those `on`.
+
+    Problems that are not `on` from the start stay there. `enough(problem, value)` ends a problem
+    early. One that is done stays where it is best.
+    """
+    z = np.array(start, float)
+    on = np.ones(len(z), bool) if on is None else np.array(on)
+    searches = [_lbfgs(x, method, _bound(enough, k)) for k, x in enumerate(z)]
+    still = [_Point(x, np.nan, np.full_like(x, np.nan)) for x in z]
+    ends: list[Any] = [(point, False, "not started") for point in still]
+    counts = np.zeros(len(z), int)
+    z = np.stack([next(search) for search in searches])
+    while on.any():
+        values, gradients = evaluate(z, on)
+        counts += on
+        for k in np.flatnonzero(on):
+            try:
+                z[k] = searches[k].send((float(values[k]), np.array(gradients[k], float)))
+            except StopIteration as stop:
+                ends[k], on[k] = stop.value, False
+                z[k] = stop.value[0].z
+    points, converged, reasons = zip(*ends, strict=True)  # type: ignore[misc]
+    return Descent(
+        z=np.stack([p.z for p in points]),
+        value=np.array([p.value for p in points]),
+        gradient=np.stack([p.gradient for p in points]),
+        evaluations=counts,
+        converged=np.array(converged),
+        reasons=tuple(reasons),
+    )
+
+
+def _bound(enough, problem):
+    return (lambda value: False) if enough is None else (lambda value: enough(problem, value))
+
+
+def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool]) -> _Search:
+    point = _Point(z, *(yield z))
+    left, pairs, idle = method.evaluations - 1, [], 0
+    if not _finite(point):
+        return point, False, "the cost is not finite at the start"
+    while True:
+        if enough(point.value):
+            return point, True, "good enough"
+        if np.max(np.abs(point.gradient)) <= method.gradient_tolerance:
+            return point, True, "the gradient vanishes"
+        if left <= 0:
+            return point, False, f"stopped after {method.evaluations} evaluations"
+        direction = _direction(point.gradient, pairs)
+        if direction @ point.gradient >= 0:  # rounding has spoilt the pairs
+            pairs, direction = [], -point.gradient
+        step = _first(direction, pairs, method)
+        found, left = yield from _searched(point, direction, step, left, method.longest_step)
+        if found is None and pairs:
+            pairs = []  # once more, downhill
+            continue
+        if found is None:
+            return point, idle > 0, "no step lowers the cost any further"
+        s, y = found.z - point.z, found.gradient - point.gradient
+        if s @ y > 1e-10 * (y @ y):
+            pairs = [*pairs, (s, y)][-method.memory :]
+        idle = idle + 1 if point.value - found.value < method.tolerance else 0
+        point = found
+        if idle == 2:
+            return point, True, "the cost no longer falls"
+
+
+def _direction(gradient: Vector, pairs: list[tuple[Vector, Vector]]) -> Vector:
+    """Minus the inverse Hessian of the pairs times the gradient: two loops."""
+    q, shares = gradient.copy(), []
+    for s, y in reversed(pairs):
+        share = (s @ q) / (s @ y)
+        q, shares = q - share * y, [share, *shares]
+    if pairs:
+        s, y = pairs[-1]
+        q = q * (s @ y) / (y @ y)
+    for (s, y), share in zip(pairs, shares, strict=True):
+        q = q + (share - (y @ q) / (s @ y)) * s
+    return -q
+
+
+def _first(direction: Vector, pairs: list, method: LBFGS) -> float:
+    longest = np.max(np.abs(direction))
+    if pairs:
+        return min(1.0, method.longest_step / longest)
+    # Nothing is known of the curvature: the gradient's size says nothing about that of a step.
+    return method.first_step / longest
+
+
+def _searched(start: _Point, direction: Vector, step: float, left: int, longest: float) -> _Search:
+    """A point that meets the strong Wolfe conditions, or the best that lowers the cost; else None.
+
+    Returns it with the evaluations that are left.
+    """
+    slope, most = float(start.gradient @ direction), longest / np.max(np.abs(direction))
+    low, low_slope, high, best = (0.0, start.value), slope, None, None
+    for _ in range(_TRIALS):
+        if left <= 0:
+            break
+        z = start.z + step * direction
+        point = _Point(z, *(yield z))
+        left -= 1
+        if not _finite(point):
+            high, step = (step, np.inf), low[0] + 0.5 * (step - low[0])
+            continue
+        here = float(point.gradient @ direction)
+        if point.value > start.value + 1e-4 * step * slope or point.value >= low[1]:
+            high = (step, point.value)
+        else:
+            best = point
+            if abs(here) <= -0.9 * slope or (high is None and here < 0 and step >= most):
+                break
+            if here > 0 if high is None else here * (high[0] - low[0]) >= 0:
+                high = low
+            low, low_slope = (step, point.value), here
+        step = (
+            _further(low, low_slope, slope, most) if high is None else _within(low, low_slope, high)
+        )
+    return best, left
+
+
+def _further(low: tuple[float, float], here: float, slope: float, most: float) -> float:
+    """Where the slope would vanish if it changed as from the start, but not too far."""
+    share = slope / (slope - here) if here > slope else np.inf
+    return min(low[0] * float(np.clip(share, 1.5, 4.0)), most)
+
+
+def _within(low: tuple[float, float], slope: float, high: tuple[float, float]) -> float:
+    """The minimum of the parabola through both ends, well inside."""
+    width = high[0] - low[0]
+    if not np.isfinite(high[1]):
+        return low[0] + 0.5 * width
+    bend = (high[1] - low[1] - slope * width) / width**2
+    share = -slope / (2 * bend * width) if bend > 0 else 0.5
+    return low[0] + width * float(np.clip(share, 0.1, 0.9))
+
+
+def _finite(point: _Point) -> bool:
+    return bool(np.isfinite(point.value) and np.all(np.isfinite(point.gradient)))

@@ -1,0 +1,166 @@
+"""Stabilise, then optimise: all problems in lockstep, limits by an augmented Lagrangian."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ._bounds import MET, no_pull, pulled
+from ._copies import one_of
+from ._cost import Aim, evaluate, Pull, Told
+from ._descent import Descent, LBFGS, minimise
+from ._gauss_newton import GaussNewton, least_squares
+from ._limit import Limit
+from ._objective import Objective
+from ._parameters import Coordinates
+from ._problem import Problem
+from ._progress import Evaluation, Progress
+
+
+_ROUNDS = 8  # of multipliers
+_BEYOND_KNEE = 0.25  # 1/s, what the first phase aims at below the abscissa that is enough
+
+
+class Solution(NamedTuple):
+    """Where each of the problems ended; arrays [problems, ...]."""
+
+    z: Float[np.ndarray, "problems n"]
+    cost: Float[np.ndarray, " problems"]  # the objective without what limits added
+    gradient: Float[np.ndarray, "problems n"]
+    able: Bool[np.ndarray, " problems"]  # no member is unstable
+    stabilised: Bool[np.ndarray, " problems"]  # nor slower than the abscissa that is enough
+    converged: Bool[np.ndarray, " problems"]
+    reasons: tuple[str, ...]
+    evaluations: Int[np.ndarray, " problems"]  # of the second phase: flights and linear loops
+    stabilising: Int[np.ndarray, " problems"]  # of the first phase: linear loops only
+    beyond: Float[np.ndarray, "problems limits"]  # greatest, as levels: above 0, violated
+    pull: Pull
+    told: Told
+
+
+def solve(
+    coordinates: Coordinates,
+    problem: Problem,
+    start: Float[np.ndarray, "problems n"],
+    objectives: Objective,
+    limits: Sequence[Limit] = (),
+    *,
+    method: LBFGS | GaussNewton,
+    rate: float,
+    progress: Progress,
+) -> Solution:
+    """Both phases of all problems: `objectives` and `limits` hold arrays [problems, ...].
+
+    A problem whose members cannot all be made to decay at `rate` (1/s, negative) stays with the
+    first phase's best if one of them is unstable.
+    """
+    runner = _Runner(coordinates, problem, objectives, tuple(limits), method, rate, progress)
+    first = runner.stabilise(np.asarray(start, float))
+    slowest = runner.slowest(first.z)
+    able = slowest < 0
+    second, pull, told, beyond, count = runner.optimise(first.z, able)
+    costs = [float(one_of(objectives, k).risk(told.costs[k])) for k in range(len(able))]
+    return Solution(
+        z=second.z, cost=np.where(able, costs, np.nan), gradient=second.gradient,
+        able=able, stabilised=slowest < rate, converged=second.converged & able,
+        reasons=second.reasons, evaluations=count, stabilising=first.evaluations,
+        beyond=beyond, pull=pull, told=told,
+    )  # fmt: skip
+
+
+class _Runner:
+    def __init__(self, coordinates, problem, objectives, limits, method, rate, progress):
+        self.coordinates, self.problem, self.method = coordinates, problem, method
+        self.objectives, self.limits, self.rate = objectives, limits, rate
+        self.progress = progress
+        self.last: Any = None
+        self.first = method if isinstance(method, LBFGS) else LBFGS()
+
+    def told(self, z: Any, on: Any, fly: Any, pull: Pull) -> Told:
+        """One evaluation of the problems that are on."""
+        count = len(z)
+        rate = jnp.full(count, self.rate - _BEYOND_KNEE)
+        flies = jnp.broadcast_to(jnp.asarray(fly), (count,))
+        aim = Aim(self.objectives, self.limits, pull, flies, rate)
+        given = (jnp.asarray(z), jnp.asarray(on))
+        return jax.block_until_ready(evaluate(*given, self.coordinates, self.problem, aim))
+
+    def both(self, fly: bool, pull: Pull) -> Any:
+        def both(z, on):
+            self.last = self.told(z, on, fly, pull)
+            self.progress.add(_evaluation(self.last, z, on, fly, self.progress.seconds))
+            return np.asarray(self.last.value), np.asarray(self.last.gradient)
+
+        return both
+
+    def stabilise(self, z: np.ndarray) -> Descent:
+        pull = no_pull(self.problem, self.limits, len(z))
+        enough = lambda k, value: float(self.last.numbers["abscissa"][k].max()) < self.rate
+        return minimise(self.both(False, pull), z, self.first, enough=enough)
+
+    def slowest(self, z: np.ndarray) -> np.ndarray:
+        everyone = np.ones(len(z), bool)
+        told = self.told(z, everyone, False, no_pull(self.problem, self.limits, len(z)))
+        return np.asarray(told.numbers["abscissa"]).max(axis=1)
+
+    def descended(self, z: np.ndarray, on: np.ndarray, pull: Pull) -> Descent:
+        if not isinstance(self.method, GaussNewton):
+            return minimise(self.both(True, pull), z, self.method, on=on)
+        ends = [
+            least_squares(
+                self.coordinates, self.problem, one_of(self.objectives, k), x, self.method
+            )
+            if on[k]
+            else (x, 0, False)
+            for k, x in enumerate(z)
+        ]
+        points, steps, done = zip(*ends, strict=True)
+        value, gradient = self.both(True, pull)(np.stack(points), on)
+        reasons = tuple(
+            "" if d else f"stopped after {s} steps" for s, d in zip(steps, done, strict=True)
+        )
+        return Descent(np.stack(points), value, gradient, np.array(steps), np.array(done), reasons)
+
+    def optimise(self, z: np.ndarray, able: np.ndarray) -> Any:
+        pull, on = no_pull(self.problem, self.limits, len(z)), able.copy()
+        counts, beyond = np.zeros(len(z), int), np.full((len(z), len(self.limits)), np.inf)
+        descent = None
+        for _ in range(_ROUNDS if self.limits else 1):
+            found = self.descended(z, on, pull)
+            descent = found if descent is None else _merged(descent, found, on)
+            z, counts = descent.z, counts + found.evaluations
+            told = self.told(z, np.ones_like(able), able, pull)
+            if not self.limits:
+                break
+            pull, beyond = pulled(self.limits, told, pull, beyond, on)
+            on = on & (beyond.max(axis=1) > MET)
+            if not on.any():
+                break
+        return descent, pull, told, beyond, counts
+
+
+def _merged(old: Descent, new: Descent, on: np.ndarray) -> Descent:
+    pick = lambda a, b: np.where(on.reshape((-1,) + (1,) * (a.ndim - 1)), b, a)
+    reasons = tuple(b if o else a for a, b, o in zip(old.reasons, new.reasons, on, strict=True))
+    fields = Descent._fields[:-1]
+    arrays = {name: pick(getattr(old, name), getattr(new, name)) for name in fields}
+    return Descent(**arrays, reasons=reasons)
+
+
+def _evaluation(told: Told, z: np.ndarray, on: np.ndarray, fly: bool, seconds: float) -> Evaluation:
+    hide = lambda x: np.where(on, np.asarray(x), np.nan)
+    abscissa = np.asarray(told.numbers["abscissa"])
+    worst = told.costs if fly else told.numbers["abscissa"]
+    return Evaluation(
+        phase="optimise" if fly else "stabilise",
+        z=np.array(z),
+        cost=hide(told.value),
+        gradient_norm=hide(np.linalg.norm(told.gradient, axis=1)),
+        stable=hide(np.mean(abscissa < 0, axis=1)),
+        worst=hide(np.argmax(worst, axis=1)),
+        means={name: hide(np.mean(x, axis=1)) for name, x in told.numbers.items()},
+        seconds=seconds,
+    )

@@ -1,0 +1,159 @@
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from jaxquad.identify._parameters import Free
+from jaxquad.simulate import Scenario
+
+from ._certify import certify
+from ._copies import copies
+from ._descent import LBFGS
+from ._ensemble import Ensemble
+from ._gauss_newton import GaussNewton, require_squares
+from ._limit import Limit
+from ._members import Members
+from ._objective import Objective
+from ._optimum import optima, scattered
+from ._parameters import Coordinates, coordinates
+from ._phases import Solution, solve
+from ._problem import Problem, problem_of
+from ._progress import Listener, Progress
+from ._quantities import OF_THE_LOOP
+from ._tuned import Tuned
+from ._verdict import kept_limits, remarks_of
+
+
+_WIDE = 512
+
+
+def tune(
+    controller: Any,
+    ensemble: Ensemble | Members,
+    scenario: Scenario,
+    *,
+    objective: Objective | None = None,
+    limits: Sequence[Limit] = (),
+    reserve: float = 0.03,
+    free: Free = None,
+    members: int = 64,
+    fresh: int | Members | None = 256,
+    starts: int = 1,
+    scatter: float = 0.4,
+    method: LBFGS | GaussNewton | None = None,
+    peers: Mapping[str, Any] | None = None,
+    key: Key[Array, ""] | None = None,
+    progress: bool | None = None,
+    listener: Listener | None = None,
+) -> Tuned:
+    """Tune a controller by gradient through the closed loop, for all of an ensemble at once.
+
+    First the slowest pole of every one of the `members` is moved to the left of the knee of the
+    objective's penalty on the abscissa (-0.5 1/s without one), which needs no flights; then the
+    `objective` is minimised through their flights of the `scenario`, see `jq.Objective`. `limits`
+    are kept by an augmented Lagrangian, those of the linear loop on 512 further members, and by
+    `reserve` (0.03 is 3 %) more than they ask, because fresh members reach further than those that
+    were tuned on. A design whose certificate fails is
+    returned too, and says so first.
+
+    `controller` is the start: a `jq.LADRC`, `jq.PID`, one of them scheduled, an adaptive LADRC, or
+    a module of one's own with `linear`, then with `free` naming the numbers to tune, as in
+    `jq.fit`. None frees wc, wo and b0 or the map's knots, of a PID all gains that are not 0. Gains
+    keep their sign; knots of an `jq.InertiaMap` fall. With several `starts`, others are scattered
+    about the first (normal, by `scatter` nepers) and solved in lockstep; `Tuned.minima` lists where
+    they led, and the best is returned. `method` is `jq.LBFGS` or `jq.GaussNewton`. `fresh` says on
+    how many new members the certificate judges the design beside its `peers`, or on which; None
+    does without. `progress` writes a line per evaluation on stderr, by default if that is a
+    terminal; `listener` is called with each.
+    Needs float64. Raises ValueError for parts that do not fit together.
+    Source: EQUATIONS.md, section 3.
+    """
+    objective = Objective() if objective is None else objective
+    if isinstance(method, GaussNewton):
+        require_squares(objective, limits)
+    key = jax.random.key(0) if key is None else key
+    span = {name: getattr(objective, name) for name in ("events", "start", "stop", "load_start")}
+    free_ones, watched = coordinates(controller, free), Progress(progress, listener)
+    drawn = ensemble if isinstance(ensemble, Members) else ensemble.draw(members, key)
+    wide = _wide(ensemble, limits, key)
+    problem = problem_of(controller, drawn, scenario, wide, **span)
+    solution = _solved(
+        free_ones, problem, scattered(free_ones.start, starts, scatter, seed=0),
+        objective, [_tightened(limit, reserve) for limit in limits],
+        LBFGS() if method is None else method, watched,
+    )  # fmt: skip
+    seconds, best = watched.seconds, _best(solution)
+    tuned = free_ones.controller_at(jnp.asarray(solution.z[best]))
+    judged = None
+    if fresh is not None and not (isinstance(ensemble, Members) and isinstance(fresh, int)):
+        watched.say("certificate on fresh members ...")
+        others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
+        judged = certify(
+            tuned, others, scenario, limits=limits, peers=peers, members=count, key=key, **span
+        )
+    kept = kept_limits(limits, solution, best)
+    return Tuned(
+        controller=tuned,
+        certificate=judged,
+        stabilised=bool(solution.stabilised[best]),
+        converged=bool(solution.converged[best]),
+        cost=float(solution.cost[best]),
+        values=free_ones.values(solution.z[best]),
+        limits=kept,
+        minima=optima(solution.cost, solution.z, solution.converged, free_ones.values),
+        evaluations=int(solution.evaluations[best]),
+        stabilising=int(solution.stabilising[best]),
+        history=tuple(watched.history),
+        seconds=seconds,
+        remarks=tuple(remarks_of(tuned, problem, solution, best, kept)),
+    )
+
+
+def _wide(
+    ensemble: Ensemble | Members, limits: Sequence[Limit], key: Key[Array, ""]
+) -> Members | None:
+    """More members where there are limits of the linear loop, whose worst case is in a corner."""
+    if isinstance(ensemble, Members) or not any(x.quantity in OF_THE_LOOP for x in limits):
+        return None
+    return ensemble.draw(_WIDE, jax.random.fold_in(key, 1))
+
+
+def stabilising_rate(objective: Objective) -> float:
+    """The abscissa in 1/s that every member is brought to before anything is flown."""
+    knees = [float(p.knee) for p in objective.penalties if p.quantity == "abscissa"]
+    return min([*knees, -0.1]) if knees else -0.5
+
+
+def _solved(
+    free_ones: Coordinates,
+    problem: Problem,
+    start: np.ndarray,
+    objective: Objective,
+    limits: Sequence[Limit],
+    method: Any,
+    watched: Progress,
+) -> Solution:
+    count = len(start)
+    return solve(
+        free_ones, problem, start, copies(objective, count), copies(tuple(limits), count),
+        method=method, rate=stabilising_rate(objective), progress=watched,
+    )  # fmt: skip
+
+
+def _tightened(limit: Limit, reserve: float) -> Limit:
+    if not 0 <= reserve < 1:
+        raise ValueError(f"reserve is {reserve}: give the share by which limits are kept, as 0.03")
+    share = limit.sign * np.sign(np.asarray(limit.bound)) * reserve
+    name = "at_least" if limit.at_most is None else "at_most"
+    return Limit(limit.quantity, **{name: limit.bound * (1 - share)}, over=limit.over)
+
+
+def _best(solution: Solution) -> int:
+    """The lowest cost among the starts that are stable and miss limits least."""
+    missed = np.maximum(solution.beyond, 0).sum(axis=1) if solution.beyond.size else 0.0
+    missed = np.where(np.asarray(missed) > 5e-3, missed, 0.0)
+    cost = np.where(np.isnan(solution.cost), np.inf, solution.cost)
+    return int(np.lexsort((cost, np.broadcast_to(missed, cost.shape), np.isinf(cost)))[0])

@@ -1,0 +1,25 @@
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxquad.control import LADRC, PID
+
+
+_PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what an inertia told may change
+
+
+def wide(law: Any, axes: int, members: int) -> Any:
+    """The gains of a LADRC or PID in one shape, so that all of a kind share a compile."""
+    if not isinstance(law, LADRC | PID):
+        return law
+    gains = {name: x for name, x in vars(law).items() if isinstance(x, Array)}
+    full = {name: _shaped(x, name, axes, members) for name, x in gains.items()}
+    return dataclasses.replace(law, **full)
+
+
+def _shaped(gain: Array, name: str, axes: int, members: int) -> Array:
+    shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
+    aligned = gain.reshape(gain.shape + (1,) * (len(shape) - gain.ndim)) if gain.ndim else gain
+    return jnp.broadcast_to(aligned, shape)
