@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.report import bode, overlay, write_results
+from jaxquad.report import bode, overlay, provenance, write_report, write_results
 
 
 jax.config.update("jax_enable_x64", True)
@@ -160,8 +160,20 @@ def main(out: Path, seed: int, draws: int) -> None:
     figure = bode(frfs["joint"], {"identified": both.model}, others={"direct": frfs["direct"]})
     figure.savefig(out / "bode.png", dpi=130)
     overlay(check).savefig(out / "verification.png", dpi=130)
+    loaded_name = f"with {ADDED} kg m^2 of added inertia"
+    write_report(
+        out / "report.html",
+        fit=both,
+        frf={"as it is": frfs["joint"], loaded_name: second},
+        models={loaded_name: both.model.with_added_inertia(ADDED)},
+        record={"as it is": record, loaded_name: loaded},
+        checks={"3-2-1-1 that was not fitted": check},
+        derived=[gain_of(both)],
+        provenance=provenance(command=f"python fits/hover_roll.py --seed {seed} --draws {draws}"),
+        title="Quanser 3 DOF Hover, roll (simulated)",
+    )
     seconds = time.perf_counter() - began
-    print(f"\n{out}: result.json, bode.png, verification.png; {seconds:.1f} s")
+    print(f"\n{out}: result.json, report.html, bode.png, verification.png; {seconds:.1f} s")
 
 
 if __name__ == "__main__":

@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._identification_files import write_identification
+from ._identification_proposal import with_proposal
 from .identify import (
     CoherenceWeighted,
+    Combination,
     factors,
     Fit,
     fit,
@@ -20,7 +23,7 @@ from .identify import (
 )
 from .models import LaggedIntegrator, TransferFunction
 from .records import read, Record
-from .report import bode, comparison, overlay, record_figure, write_results
+from .report import comparison
 from .spectra import (
     Composite,
     Estimator,
@@ -43,8 +46,9 @@ def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | N
 
     Returns the path of `result.json` and, where the parameters are not determined, why.
     """
+    options = with_proposal(options)
     record = _record(options)
-    methods = ("joint", "direct") if options.reference else ("direct",)
+    methods = _methods(options)
     frfs, outcomes = {}, {}
     for method in methods:
         frfs[method], outcomes[method] = _fit_twice(record, method, options)
@@ -60,9 +64,23 @@ def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | N
         print(_sum(outcome))
     check = _verified(outcome, frf, options)
     print(f"\n{check}" if check else "")
-    path, figures = _write(options, record, frfs, outcome, check)
-    print(f"{path}, {', '.join(figures)}")
+    path, others = write_identification(
+        options, record, frfs, outcome, check,
+        formula=_formula(options), derived=_derived(outcome, bool(late)),
+    )  # fmt: skip
+    print(f"{path}, {', '.join(others)}")
     return path, _failure(outcome)
+
+
+def identified(options: Namespace) -> tuple[Record, FrequencyResponse, Outcome]:
+    """Without a report: the record, the response that was fitted, and the fit."""
+    record = _record(options)
+    return record, *_fit_twice(record, _methods(options)[0], options)
+
+
+def _methods(options: Namespace) -> tuple[str, ...]:
+    """The first is the one to believe."""
+    return ("joint", "direct") if options.reference else ("direct",)
 
 
 def _record(options: Namespace) -> Record:
@@ -143,6 +161,16 @@ def _late(model: LaggedIntegrator | TransferFunction) -> Float[Array, ""]:
     return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
 
 
+def _derived(outcome: Outcome, summed: bool) -> list[Combination]:
+    """The sum of lag and delay, if the record determines it."""
+    if not summed or not isinstance(outcome, Fit):
+        return []
+    try:
+        return [outcome.derived(_late, "lag + delay")]
+    except NotIdentifiable:
+        return []
+
+
 def _sum(found: Fit) -> str:
     try:
         return str(found.derived(_late, "lag + delay"))
@@ -186,31 +214,3 @@ def _failure(outcome: Outcome) -> NotIdentifiable | None:
     rest = f"only {known}" if known else "nothing of them is determined"
     text = f"not identifiable from this record, each by itself: {lost}; {rest}"
     return NotIdentifiable(text) if lost else None
-
-
-def _write(
-    options: Namespace,
-    record: Record,
-    frfs: dict[str, FrequencyResponse],
-    outcome: Outcome,
-    check: Verification | None,
-) -> tuple[Path, list[str]]:
-    folder = options.out or Path("results") / options.file.stem
-    method, *rest = frfs
-    source = {"file": str(options.file), "start_s": float(record.time[0])}
-    source |= {"stop_s": float(record.time[-1]), "sample_rate_hz": record.sample_rate}
-    extra = {"record": source}
-    path = write_results(folder, fit=outcome, frf=frfs[method], check=check, extra=extra)
-    models = {"identified": outcome.model} if isinstance(outcome, Fit) else None
-    others = {f"{name} estimate": frfs[name] for name in rest}
-    figures = {
-        "record.png": record_figure(record),
-        "bode.png": bode(frfs[method], models, others=others, title=options.file.name),
-    }
-    if check is not None:
-        figures["verification.png"] = overlay(check, title=options.verify.name)
-    if check is None:
-        (folder / "verification.png").unlink(missing_ok=True)  # of an earlier run
-    for name, figure in figures.items():
-        figure.savefig(folder / name, dpi=130)
-    return path, list(figures)

@@ -1,0 +1,76 @@
+"""What several commands share: how a command is declared, and how options are read and shown."""
+
+import argparse
+import contextlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxquad._mix_text import Mix, parse_mix
+
+
+Run = Callable[[argparse.Namespace], int]
+SECONDS: dict[str, Any] = {"type": float, "metavar": "S"}
+
+
+def command(commands: Any, name: str, run: Run, text: str, epilog: str) -> argparse.ArgumentParser:
+    """Declare a command with its examples."""
+    declared = commands.add_parser(
+        name,
+        help=text,
+        description=text,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    declared.set_defaults(run=run)
+    return declared
+
+
+def add_log(declared: argparse.ArgumentParser) -> None:
+    """The file and its clock."""
+    declared.add_argument("file", type=Path, help="a log of an autopilot, CSV, NPZ, MAT, HDF5 ...")
+    declared.add_argument("--time", help="the channel that holds the time")
+    declared.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), help="its unit")
+
+
+def add_json(declared: argparse.ArgumentParser, what: str) -> None:
+    declared.add_argument("--json", action="store_true", help=f"{what} to stdout as JSON")
+
+
+def read_mix(text: str) -> Mix:
+    """`parse_mix` for an option."""
+    try:
+        return parse_mix(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def read_unit(text: str) -> tuple[str, str]:
+    """`q=rad/s` as a name and its unit."""
+    name, sign, unit = (part.strip() for part in text.partition("="))
+    if not (name and sign and unit):
+        raise argparse.ArgumentTypeError(f"{text!r}: write NAME=UNIT, for instance q=rad/s")
+    return name, unit
+
+
+@contextlib.contextmanager
+def stdout_for_json(options: argparse.Namespace) -> Iterator[None]:
+    """With --json, stdout belongs to the JSON alone, and what is printed goes to stderr."""
+    with contextlib.redirect_stdout(sys.stderr if options.json else sys.stdout):
+        yield
+
+
+def print_json(content: Any) -> None:
+    from jaxquad.report._results import _plain as plain
+
+    print(json.dumps(plain(content), indent=2, allow_nan=False))
+
+
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """The first row is the heading; the first column is of words, the others of numbers."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for name, *cells in rows:
+        padded = (f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True))
+        print("  ".join((f"{name:<{widths[0]}}", *padded)).rstrip())

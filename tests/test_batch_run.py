@@ -1,0 +1,184 @@
+"""A fleet's logs: planned without opening them, resumed after any death, one row each."""
+
+import csv
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import batch_work
+import pytest
+from batch_work import fail, measure, started
+
+from jaxquad.batch import planned, read_settings, run_batch, Settings
+from jaxquad.batch._settings import settings_of
+
+
+def logs(folder: Path, names) -> Path:
+    """Each with a content of its own."""
+    folder.mkdir()
+    for name in names:
+        (folder / name).write_text(name)
+    return folder
+
+
+def rows_of(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "table.csv").open(newline="") as file:
+        return {row["log"]: row for row in csv.DictReader(file)}
+
+
+def results(out: Path) -> dict[str, dict]:
+    return {path.stem: json.loads(path.read_text()) for path in out.glob("results/*.json")}
+
+
+def test_ten_thousand_logs_are_planned_and_none_is_opened(tmp_path):
+    for k in range(10_000):
+        os.close(os.open(tmp_path / f"flight_{k:05}.bin", os.O_CREAT))
+    opened, watching = [], [True]
+    look = lambda event, args: opened.append(args[0]) if watching and event == "open" else None
+    sys.addaudithook(look)
+    found = planned(tmp_path, Settings(logs=("*.bin",)))
+    watching.clear()
+    assert len(found) == 10_000 and found == sorted(found)
+    assert not [path for path in opened if str(path).endswith(".bin")]
+
+
+def test_a_batch_that_is_killed_loses_nothing_and_does_nothing_twice(tmp_path):
+    folder, out = logs(tmp_path / "logs", [f"{k}.csv" for k in range(60)]), tmp_path / "out"
+    moments, before = random.Random(7), set()
+    for _ in range(3):
+        batch = subprocess.Popen([sys.executable, batch_work.__file__, str(folder), str(out)])
+        wanted = len(before) + moments.randint(2, 12)
+        while len(list(out.glob("results/*.json"))) < wanted:
+            assert batch.poll() is None
+            time.sleep(0.01)
+        time.sleep(moments.random() * 0.1)
+        batch.send_signal(signal.SIGKILL)
+        batch.wait()
+        wait_for_the_end_of({process for _, process in started(out)})
+        assert before <= set(results(out))
+        before, so_far = set(results(out)), len(started(out))
+    rows = run_batch(folder, Settings(), out=out, work=measure, workers=2)
+    assert not before & {key for key, _ in started(out)[so_far:]}
+    assert len(rows) == len(results(out)) == 60
+    assert {row["status"] for row in rows} == {"identified"}
+    # What was under way when the batch was killed: two processes, three times.
+    assert 60 <= len(started(out)) <= 60 + 2 * 3
+    assert not list(out.rglob("*.part"))
+
+
+def wait_for_the_end_of(processes):
+    deadline = time.monotonic() + 20
+    for process in processes:
+        while alive(process):
+            assert time.monotonic() < deadline, f"process {process} outlives its batch"
+            time.sleep(0.01)
+
+
+def alive(process: int) -> bool:
+    """A process that ended, but whose parent has not asked for it, counts as ended."""
+    try:
+        return ") Z" not in Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return False
+
+
+def test_one_failing_log_is_a_row_and_stops_no_other(tmp_path):
+    names = ["a.csv", "b.csv", "defect.csv", "killed.csv", "unusable.csv", "z.csv"]
+    folder, out = logs(tmp_path / "logs", names), tmp_path / "out"
+    run_batch(folder, Settings(), out=out, work=fail, workers=2)
+    found = rows_of(out)
+    assert list(found) == names
+    good = [name for name, row in found.items() if row["status"] == "identified"]
+    assert good == ["a.csv", "b.csv", "z.csv"] and found["z.csv"]["size"] == "5.0"
+    assert "no clock" in found["unusable.csv"]["error"]
+    assert found["defect.csv"]["error"] == "ZeroDivisionError: a defect"
+    assert "killed by signal 9" in found["killed.csv"]["error"]
+    # What is wrong with the log stays so; a defect or a death is tried again.
+    assert len(results(out)) == 4
+    page = (out / "summary.html").read_text()
+    assert "3 failed" in page and "&lt;b&gt;no clock" in page and "<b>no clock" not in page
+
+
+def test_equal_logs_share_a_result_and_settings_make_it_another(tmp_path):
+    folder, out = logs(tmp_path / "logs", ["a.csv"]), tmp_path / "out"
+    (folder / "copy.csv").write_text("a.csv")
+    run = lambda s: run_batch(folder, s, out=out, work=measure, workers=1)
+    assert [row["log"] for row in run(Settings())] == ["a.csv", "copy.csv"]
+    assert len(results(out)) == len(started(out)) == 1
+    run(Settings(common={"rate": 100}))
+    assert len(results(out)) == len(started(out)) == 2
+    run(Settings(overrides=((("copy*",), {"rate": 100}),)))
+    assert len(started(out)) == 2  # Both are known by now.
+
+
+def test_a_folder_has_one_batch_at_a_time(tmp_path):
+    from jaxquad.batch._store import locked
+
+    folder = logs(tmp_path / "logs", ["a.csv"])
+    with locked(tmp_path / "out"), pytest.raises(ValueError, match="another batch"):
+        run_batch(folder, Settings(), out=tmp_path / "out", work=measure, workers=1)
+
+
+def test_a_table_is_parquet_too(tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    from jaxquad.batch._table import write_tables
+
+    rows = [
+        {"log": "=cmd()", "status": "failed", "key": "k", "error": "lost \ud800"},
+        {"log": "b", "status": "identified", "key": "l", "parameters": [
+            {"name": "gain", "value": 2.5, "standard_error": None}]},
+    ]  # fmt: skip
+    write_tables(tmp_path, rows)
+    table = parquet.read_table(tmp_path / "table.parquet").to_pydict()
+    assert table["gain"] == [None, 2.5] and table["log"][1] == "b"
+    # A spreadsheet must not run what a file's name says.
+    assert list(rows_of(tmp_path))[0] == "'=cmd()"
+
+
+def test_settings_are_read_with_overrides_by_glob(tmp_path):
+    path = tmp_path / "fleet.toml"
+    path.write_text("""
+logs = ["*.npz", "old/*.csv"]
+input = "M=right-left"
+output = "q"
+band = [0.5, 6]
+lag = false
+[units]
+q = "rad/s"
+[[override]]
+logs = "old/*"
+output = "gyro"
+[[override]]
+logs = "old/7*"
+rate = 50
+""")
+    settings = read_settings(path)
+    assert settings.logs == ("*.npz", "old/*.csv")
+    assert settings.of("new.npz")["output"] == "q" and "rate" not in settings.of("old/6.csv")
+    assert settings.of("old/7.csv") == settings.of("old/6.csv") | {"rate": 50}
+    assert settings.of("old/7.csv")["output"] == "gyro"
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ({"estimater": "welch"}, "unknown key 'estimater'; did you mean 'estimator'"),
+        ({"override": [{"logs": "a", "ouput": "q"}]}, "override 1: .*did you mean 'output'"),
+        ({"override": [{"output": "q"}]}, "says of no logs"),
+        ({"rate": "fast"}, "rate = 'fast' has to be of kind int or float"),
+        ({"poles": True}, "poles = True has to be of kind int"),
+        ({"estimator": "best"}, "'best' is none of local, composite, welch"),
+        ({"band": [3, 1]}, "rising from above 0"),
+        ({"input": "roll=a b"}, "input: 'roll=a b': cannot read"),
+        ({"logs": "/etc/*"}, "below the folder"),
+        ({"band": [1, 2], "band_rad": [1, 2]}, "keep one"),
+    ],
+)
+def test_settings_that_cannot_be_say_what_to_mend(content, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        settings_of(content)
