@@ -185,6 +185,17 @@ def test_the_rig_has_the_authority_of_its_bias():
     assert "0.09361 N m without a motor turning backwards" in str(found)
 
 
+def test_the_authority_of_members_follows_whichever_coefficient_they_differ_in():
+    rig, factors = quanser_hover(), jnp.array([0.5, 1.0, 2.0])
+    alone = authority(rig, MotorDrive(rig.allocation))
+    for name in ("arm", "thrust_coefficient"):
+        where = lambda plant, name=name: getattr(plant.allocation, name)
+        members = eqx.tree_at(where, rig, where(rig) * factors)
+        found = authority(members, MotorDrive(rig.allocation))
+        expected = np.asarray(alone.torque)[:, None] * np.stack([factors, factors, factors**0])
+        np.testing.assert_allclose(found.torque, expected, rtol=1e-12)
+
+
 def test_the_authority_of_axes_is_that_of_the_nearest_limit():
     assert authority(PLANT, Saturation(2.0)).torque == pytest.approx(0.0936)
     assert np.isinf(authority(PLANT).torque).all() and np.isinf(authority(PLANT).forward).all()

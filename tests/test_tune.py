@@ -111,6 +111,14 @@ def test_every_start_is_stabilised_first_and_leads_to_the_same_cost(name):
     assert np.flatnonzero(costs < best + 0.01)[0] + 1 <= 15
 
 
+def test_a_second_tune_of_equal_shapes_compiles_nothing(caplog):
+    first = tuned("slow")
+    with jax.log_compiles():
+        again = run(STARTS["slow"], objective=objective(terms={"itae": 1.0}))
+    assert again.cost == first.cost
+    assert not [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
+
+
 def test_the_optimum_is_the_one_that_scipy_finds():
     from scipy.optimize import minimize
 

@@ -2,7 +2,8 @@
 
 The section does not print when things happen. The clock of ITAE starts again at every event, and
 activity is per second: with that, and these times, the printed designs' ITAE come out within 7 % in
-the mean, and the members' 95 % quantile and worst within 15 %.
+the mean and 15 % in the members' 95 % quantile; their worst, which rests on one member of those
+drawn, within 20 % (certainty equivalence, 10/30, is 19 % off).
 """
 
 import jax.numpy as jnp

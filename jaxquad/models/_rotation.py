@@ -2,6 +2,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._sincos import sincos
+
 
 def euler_rates_matrix(euler: Float[Array, " 3 *ensemble"]) -> Float[Array, " 3 3 *ensemble"]:
     """The W of `rate = W @ euler_rates`, for ZYX Euler angles in rad.
@@ -26,10 +28,9 @@ def euler_rates(
     """Derivatives of the Euler angles, rad/s, at a body `rate` in rad/s: Eq. (1), solved."""
     phi, theta, _ = euler
     p, q, r = rate
-    turn = jnp.sin(phi) * q + jnp.cos(phi) * r  # the heading's share of the rate
-    return jnp.stack(
-        [p + jnp.tan(theta) * turn, jnp.cos(phi) * q - jnp.sin(phi) * r, turn / jnp.cos(theta)]
-    )
+    (s_phi, c_phi), (s_theta, c_theta) = sincos(phi), sincos(theta)
+    heading = (s_phi * q + c_phi * r) / c_theta
+    return jnp.stack([p + s_theta * heading, c_phi * q - s_phi * r, heading])
 
 
 def euler_acceleration(

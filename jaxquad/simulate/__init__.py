@@ -16,6 +16,7 @@ from ._excite import excite as excite
 from ._integrate import runge_kutta as runge_kutta
 from ._metrics import Metrics as Metrics
 from ._noise import gauss_markov as gauss_markov
+from ._over_devices import over_devices as over_devices
 from ._references import (
     Ramp as Ramp,
     ReferenceModel as ReferenceModel,
@@ -28,4 +29,5 @@ from ._sensor import Encoder as Encoder
 from ._signal import Clock as Clock, Motion as Motion, Signal as Signal
 from ._simulate import simulate as simulate
 from ._simulation import Simulation as Simulation
+from ._slices import in_slices as in_slices
 from ._summary import Spread as Spread, Summary as Summary

@@ -94,13 +94,10 @@ def warn_beyond_authority(found: Authority | None, scenario: Scenario) -> None:
 
 def _torque_gain(plant: Any) -> Float[Array, " axes *ensemble"] | None:
     """N m per unit of command, where a plant says so."""
-    allocation = getattr(plant, "allocation", None)
     if hasattr(plant, "torque_gain"):
         return jnp.atleast_1d(as_float(plant.torque_gain))
-    if allocation is None:
-        return None
-    unit = jnp.ones((3, *allocation.arm.shape), allocation.arm.dtype)
-    return allocation.torque(allocation.from_differences(unit, 0.0))
+    allocation = getattr(plant, "allocation", None)
+    return None if allocation is None else allocation.torque_per_difference
 
 
 def _drive_limit(drive: Any, like: Float[Array, " axes *ensemble"]) -> Float[Array, "axes ..."]:

@@ -1,10 +1,11 @@
 import functools as ft
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 
 _SHORT = 128  # samples that need no blocks
@@ -18,24 +19,40 @@ def scan_in_blocks(
     Twice the square root of `count` carries instead of all, for one forward pass more.
     """
 
+    size = _block_size(count)
+    length = -(-count // size) * size
+    if length > count:
+        step, xs = _until(count, step), (jnp.arange(length), jax.tree.map(_lengthened(length), xs))
+
     # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
     @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
         return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, xs)
 
-    size = _block_size(count)
-    blocks = count // size
-    if blocks == 1 and size == count:
+    if length == size:
         return block(carry, xs)
-    split = blocks * size
-    apart = lambda x: x[:split].reshape(blocks, size, *x.shape[1:])
-    joined = lambda x: x.reshape(split, *x.shape[2:])
+    apart = lambda x: x.reshape(length // size, size, *x.shape[1:])
     carry, out = jax.lax.scan(block, carry, jax.tree.map(apart, xs))
-    out = jax.tree.map(joined, out)
-    if split == count:
-        return carry, out
-    carry, tail = block(carry, jax.tree.map(lambda x: x[split:], xs))
-    return carry, jax.tree.map(lambda x, y: jnp.concatenate([x, y]), out, tail)
+    return carry, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:])[:count], out)
+
+
+def _until(count: int, step: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]]) -> Any:
+    """The step, which leaves the carry as it is after `count` samples.
+
+    A last block of another length would be compiled as a second loop.
+    """
+
+    def masked(carry: PyTree, xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
+        index, now = xs
+        after, out = step(carry, now)
+        return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), after, carry), out
+
+    return masked
+
+
+def _lengthened(length: int) -> Callable[[Array], Array]:
+    """With the last sample repeated."""
+    return lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], length - x.shape[0], axis=0)])
 
 
 def _block_size(count: int) -> int:

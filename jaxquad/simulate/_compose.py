@@ -1,3 +1,4 @@
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float, Key
 from jaxquad.excitation._checks import check_positive, whole_samples
 from jaxquad.models._parameters import as_float
 
+from ._memory import require_memory
 from ._scenario import AXES, Scenario
 from ._signal import as_signal, Clock, fit, Motion, Signal
 
@@ -59,6 +61,7 @@ def scenario(
     members = (ensemble,) if isinstance(ensemble, int) else tuple(ensemble)
     clock = Clock(whole_samples("duration", duration, 1 / dt, fewest=2), dt, members)
     given = (reference, injection, disturbance, noise, payload)
+    _require_room(given, clock, len(names))
     parts = {
         name: _sampled(name, part, names, clock, _fold(key, k))
         for k, (name, part) in enumerate(zip(_PARTS, given, strict=True))
@@ -70,6 +73,16 @@ def scenario(
         for name in ("rate", "acceleration"):
             arrays[name] = _stack("reference", name, parts["reference"], clock)
     return Scenario(**arrays)
+
+
+def _require_room(given: tuple[Given, ...], clock: Clock, axes: int) -> None:
+    """For what each member draws for itself: as columns, and then side by side."""
+    signals = [list(x.values()) if isinstance(x, Mapping) else [x] for x in given]
+    drawn = sum(any(getattr(x, "random", False) for x in part) for part in signals)
+    numbers = drawn * clock.samples * axes * math.prod(clock.ensemble)
+    what = f"a scenario of {clock.samples} samples for {math.prod(clock.ensemble)} members"
+    remedy = "draw the noise of fewer members at a time, in jq.in_slices"
+    require_memory(what, 2 * numbers * as_float(0.0).dtype.itemsize, remedy)
 
 
 def _names(axes: int | Sequence[str]) -> tuple[str, ...]:

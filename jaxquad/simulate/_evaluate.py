@@ -4,15 +4,18 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad.models._parameters import as_float
 
 from ._authority import Authority, find_authority, warn_beyond_authority
 from ._check_loop import check_loop
+from ._compile import Jit
+from ._devices import Devices, gathered
 from ._loop import scan_loop
 from ._meter import Meter, Tally, wide
 from ._metrics import Metrics, tallied
+from ._over_devices import loop_over_devices, placed
 from ._protocols import Controller, Drive, Plant
 from ._scenario import Scenario
 from ._sensor import Encoder
@@ -72,11 +75,15 @@ def evaluate(
     start: float = 0.0,
     stop: float | None = None,
     load_start: float | None = None,
+    devices: int | Sequence[Any] | None = None,
 ) -> Metrics:
     """The `Metrics` of a loop without its trajectories: what is kept does not grow with time.
 
     The same numbers as `jq.metrics(jq.simulate(...), ...)`, whose options these are, in the memory
-    of one sample. Differentiable with respect to plant, controller, scenario and delay.
+    of one sample: about 0.5 kB per axis and member, and what the scenario holds for each member.
+    Where that is too much, `jq.in_slices`. Differentiable with respect to plant, controller,
+    scenario and delay; a gradient needs memory as the square root of the number of samples, and
+    `jq.over_devices` splits a cost of your own as `devices` splits this.
     Raises ValueError as both of them do; warns of disturbances beyond the torque of the drive.
     """
     settings = loop_settings(
@@ -86,7 +93,8 @@ def evaluate(
     check_loop(plant, controller, scenario, settings)
     place = window(len(scenario.reference), dt, start=start, stop=stop, load_start=load_start)
     judged = Window(*map(jnp.asarray, place))
-    found, numbers = _run(plant, controller, scenario, settings, judged)
+    loop, places = placed(plant, controller, scenario, settings, devices)
+    found, numbers = gathered(_run(*loop, judged, places))
     warn_beyond_authority(found, scenario)
     return _metrics(numbers, place, dt)
 
@@ -96,15 +104,27 @@ def _metrics(numbers: dict[str, Any], place: tuple[int, int, int, int], dt: floa
     return Metrics(**numbers, start=first * dt, stop=(last + 1) * dt, load_start=loaded * dt)
 
 
-@eqx.filter_jit
+@Jit
 def _run(
-    plant: Plant, controller: Controller, scenario: Scenario, settings: Settings, judged: Window
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    settings: Settings,
+    judged: Window,
+    devices: Devices | None = None,
 ) -> tuple[Authority | None, dict[str, Array]]:
+    loop = (plant, controller, scenario, settings)
+    found = find_authority(plant, settings.drive, controller)
+    return found, loop_over_devices(_judge, loop, judged, devices)
+
+
+def _judge(loop: PyTree, judged: Window) -> dict[str, Array]:
+    plant, controller, scenario, settings = loop
     found = find_authority(plant, settings.drive, controller)
     gain = None if found is None else found.torque_gain
     meter = make_meter(scenario, judged, settings.dt, found, gain)
     tally, _, running = scan_loop(plant, controller, scenario, settings, meter.update, meter.begin)
-    return found, _numbers(meter, tally, ~running, scenario, found)
+    return _numbers(meter, tally, ~running, scenario, found)
 
 
 @eqx.filter_jit

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ._blocks import scan_in_blocks
+from ._chunks import CHUNK, in_chunks
 from ._ensemble import common_ensemble, start_of
 from ._guard import are_sound, guarded
+from ._members import members_of_loop
 from ._protocols import Controller, Plant
 from ._sample import Carry, Loop, SampleResult
 from ._scenario import Scenario
@@ -35,9 +37,38 @@ def scan_loop(
     """
     ensemble = common_ensemble(plant, controller, scenario, settings)
     state, like = start_of(plant, scenario, ensemble)
+    carry = (_loop(plant, controller, settings, ensemble).begin(state, like), begin(like))
+    given = ((plant, controller, scenario, settings), carry, collect)
+    own = _of_members(given, ensemble)
+    if own is None:
+        return _run(given)
+    arrays, rest = eqx.partition(given, eqx.is_array)
+    try:
+        return in_chunks(lambda arrays: _run(eqx.combine(arrays, rest)), arrays, own)
+    except (TypeError, ValueError):  # `collect` has the members of all chunks where none can see.
+        return _run(given)
+
+
+def _of_members(given: PyTree, ensemble: tuple[int, ...]) -> PyTree | None:
+    """Which arrays have the members on the last axis, where these are so many that it matters."""
+    if len(ensemble) != 1 or ensemble[0] <= CHUNK:
+        return None
+    parts, *others = given
+    own = members_of_loop(parts)
+    last = lambda x: eqx.is_array(x) and x.shape[-1:] == ensemble
+    return None if own is None else (own, *jax.tree.map(last, others))
+
+
+def _loop(
+    plant: Plant, controller: Controller, settings: Settings, ensemble: tuple[int, ...]
+) -> Loop:
     prepared = getattr(controller, "prepared", lambda: controller)
-    loop = Loop(plant, prepared(), settings, ensemble)
-    carry = (loop.begin(state, like), begin(like))
+    return Loop(plant, prepared(), settings, ensemble)
+
+
+def _run(given: PyTree) -> tuple[PyTree, PyTree, Bool[Array, "*ensemble"]]:
+    (plant, controller, scenario, settings), carry, collect = given
+    loop = _loop(plant, controller, settings, carry[0].running.shape)
     arrays, rest = eqx.partition((loop, carry, scenario, collect), eqx.is_array)
     carried, stored = as_one_kernel(ft.partial(_scan, rest), arrays)
     return carried[1], stored, carried[0].running

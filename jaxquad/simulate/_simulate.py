@@ -1,11 +1,18 @@
-import equinox as eqx
+import math
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ._authority import Authority, find_authority, warn_beyond_authority
 from ._check_loop import check_loop
+from ._compile import Jit
+from ._devices import Devices, gathered
 from ._loop import scan_loop
+from ._memory import require_memory, size_of
+from ._over_devices import loop_over_devices, placed
 from ._protocols import Controller, Drive, Plant
 from ._sample import SampleResult
 from ._scenario import Scenario
@@ -26,6 +33,7 @@ def simulate(
     longest_delay: float | None = None,
     substeps: int = 1,
     bound: float = 100.0,
+    devices: int | Sequence[Any] | None = None,
 ) -> Simulation:
     """Run a sampled-data loop: measure, control, hold the inputs for `dt` seconds, repeat.
 
@@ -41,15 +49,26 @@ def simulate(
     +-`bound` rad, or whose numbers grow beyond 1e9, is held there and flagged in `diverged`, so
     that values and gradients of the others, and its own, stay finite.
 
+    `devices` compute a part of the members each; the result is the same, on the default device.
+    None: those of this process, as many as have 32 members (4096 where they are no CPUs), or those
+    that the data were put on. A number: so many of them. A sequence of `jax.Device`: those, of
+    other processes too. A CPU is one device whatever its cores, which a loop uses one of, until
+    `jax.config.update("jax_num_cpu_devices", 2)`, before the first computation, makes it two.
+    After `jax.distributed.initialize` each process makes the same call of the whole ensemble with
+    `devices=jax.devices()`, and gets all of its members.
+
     Raises `ValueError` for parts that do not fit together, such as a controller made for another
-    `dt`, ensembles of different sizes or a payload that the plant cannot carry.
+    `dt`, ensembles of different sizes or a payload that the plant cannot carry; for devices that
+    JAX does not have; for processes with different ensembles (not under jit, vmap or grad); and for
+    a record that does not fit the memory: 25 B or more per sample, axis and member.
     """
     settings = loop_settings(
         dt=dt, drive=drive, encoder=encoder, delay=delay, longest_delay=longest_delay,
         substeps=substeps, bound=bound,
     )  # fmt: skip
     check_loop(plant, controller, scenario, settings)
-    (angle, *others), running, authority = _run(plant, controller, scenario, settings)
+    loop, places = placed(plant, controller, scenario, settings, devices)
+    ((angle, *others), running), authority = gathered(_run(*loop, places))
     warn_beyond_authority(authority, scenario)
     time = jnp.asarray(dt * np.arange(angle.shape[0]), angle.dtype)
     measurement, command, saturated, signals = others
@@ -67,12 +86,27 @@ def simulate(
     )
 
 
-@eqx.filter_jit
+@Jit
 def _run(
-    plant: Plant, controller: Controller, scenario: Scenario, settings: Settings
-) -> tuple[PyTree, Bool[Array, "*ensemble"], Authority | None]:
-    _, stored, running = scan_loop(plant, controller, scenario, settings, _keep, lambda like: None)
-    return stored, running, find_authority(plant, settings.drive, controller)
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    settings: Settings,
+    devices: Devices | None = None,
+) -> tuple[tuple[PyTree, Bool[Array, "*ensemble"]], Authority | None]:
+    found = find_authority(plant, settings.drive, controller)
+    loop = (plant, controller, scenario, settings)
+    stored, running = loop_over_devices(_store, loop, None, devices)
+    samples, axes, *members = stored[0].shape
+    what = f"a record of {samples} samples of {axes} axes of {math.prod(members)} members"
+    require_memory(what, size_of(stored), "take jq.evaluate, which stores none, or jq.in_slices")
+    return (stored, running), found
+
+
+def _store(
+    loop: tuple[Plant, Controller, Scenario, Settings], nothing: None
+) -> tuple[PyTree, Bool[Array, "*ensemble"]]:
+    return scan_loop(*loop, _keep, lambda like: None)[1:]
 
 
 def _keep(nothing: None, now: SampleResult) -> tuple[None, PyTree]:

@@ -28,8 +28,12 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     """
     if enter is None or leave is None:
         return function(*args)
+
+    def jaxquad_kernel(*args: PyTree) -> PyTree:
+        return function(*args)
+
     entered = jax.tree.map(_marked(enter), args)
-    return jax.tree.map(_marked(leave), jax.jit(function)(*entered))
+    return jax.tree.map(_marked(leave), jax.jit(jaxquad_kernel)(*entered))
 
 
 def _marked(mark: Any) -> Callable[[Array], Array]:

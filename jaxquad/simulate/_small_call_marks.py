@@ -1,4 +1,4 @@
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from jax.extend.core import Primitive
@@ -6,6 +6,7 @@ from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
 from ._small_call_limits import fits_a_kernel
+from ._small_call_parts import in_parts, text
 from ._small_call_uses import shield, using_all
 
 
@@ -34,17 +35,35 @@ ad.deflinear2(leave, _transposed(enter))
 def _tag(ctx: Any, x: Any) -> list[Any]:
     """Turn the call that `x` comes from, by now differentiated and batched, into a kernel."""
     try:
-        call = getattr(x.owner, "operation", x.owner)
-        whole = ctx.module_context
-        possible = _is_plain_call(call) and _is_for_one_cpu(whole)
-        if possible and fits_a_kernel(call, whole.module):
-            callee = using_all(call, whole.module, whole.symbol_table)
-            shield(call)
-            call.attributes["callee"] = callee
-            call.attributes[_ATTRIBUTE] = ir.DictAttr.get(_tags())
+        call, whole = _owner(x), ctx.module_context
+        if _is_plain_call(call) and _is_for_one_cpu(whole):
+            for found in (call, *_forward_passes(call)):
+                _make_kernel(found, whole)
     except Exception:  # The compiler's interfaces have changed: do without the kernel.
         pass
     return [x]
+
+
+def _owner(x: Any) -> Any:
+    return getattr(x.owner, "operation", x.owner)
+
+
+def _forward_passes(call: Any) -> Iterator[Any]:
+    """The calls whose results a call takes, without their marks where nothing else was asked of."""
+    for operand in call.operands:
+        owner = _owner(operand)
+        if _is_plain_call(owner) and text(owner, "callee").startswith("jaxquad_kernel"):
+            yield owner
+
+
+def _make_kernel(call: Any, whole: Any) -> None:
+    if _is_plain_call(call) and fits_a_kernel(call, whole.module):
+        name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
+        call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
+        callee = using_all(call, whole.module, whole.symbol_table)
+        shield(call)
+        call.attributes["callee"] = callee
+        call.attributes[_ATTRIBUTE] = ir.DictAttr.get(_tags())
 
 
 def _is_plain_call(op: Any) -> bool:

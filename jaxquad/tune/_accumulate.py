@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxquad.simulate import Authority
 from jaxquad.simulate._meter import divisor, wide
@@ -23,6 +23,14 @@ class Span(NamedTuple):
     until: int
 
 
+class Steps(NamedTuple):
+    """Of the parts of a flight between events: where the reference goes, for overshoot."""
+
+    target: Float[Array, "parts axes ..."]  # rad, where the reference ends
+    before: Float[Array, "parts axes ..."]  # rad, where it was before
+    known: Bool[Array, "parts axes ..."]  # whether it is a step
+
+
 class Accumulate(eqx.Module):
     """Adds up what `wanted` quantities need: to be given to a loop, with `begin`."""
 
@@ -30,8 +38,8 @@ class Accumulate(eqx.Module):
     span: Span = eqx.field(static=True)
     dt: float = eqx.field(static=True)
     events: tuple[float, ...] = eqx.field(static=True)  # s, when the clock of ITAE starts again
-    target: Float[Array, "axes ..."]  # rad, where the reference ends
-    before: Float[Array, "axes ..."]  # rad, where it was before
+    parts: tuple[tuple[int, int], ...] = eqx.field(static=True)  # samples from and to, of `steps`
+    steps: Steps
     authority: Authority | None
 
     def begin(self, like: Float[Array, " axes *ensemble"]) -> dict[str, Array]:
@@ -74,10 +82,14 @@ class Accumulate(eqx.Module):
         return now.command
 
     def _overshoot(self, sums, now):
-        step = divisor(wide(self.target, now.angle) - wide(self.before, now.angle))
-        progress = (now.angle - wide(self.before, now.angle)) / step
-        most = jnp.maximum(sums["overshoot"], 100 * (progress - 1))
-        return jnp.where(now.index <= self.span.until, most, sums["overshoot"])
+        target, before, known = (wide(x[0], now.angle) for x in self.steps)
+        for k, (first, _) in enumerate(self.parts[1:], 1):
+            later = (wide(x[k], now.angle) for x in self.steps)
+            held = zip((target, before, known), later, strict=True)
+            target, before, known = (jnp.where(now.index >= first, b, a) for a, b in held)
+        beyond = 100 * ((now.angle - before) / divisor(target - before) - 1)
+        counts = known & (now.index <= self.parts[-1][1])
+        return jnp.where(counts, jnp.maximum(sums["overshoot"], beyond), sums["overshoot"])
 
     def _peak(self, sums, now):
         return jnp.maximum(sums["peak"], jnp.where(self._loaded(now), jnp.abs(_error(now)), 0))

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from ._copies import one_of
 from ._cost import Pull, Told
 from ._limit import Limit
 from ._problem import Problem
@@ -15,17 +14,18 @@ from ._quantities import OF_THE_LOOP
 
 MET = 2e-3  # beyond a limit, as a level: 0.2 %
 _STIFFNESS, _STIFFER = 4.0, 4.0
+_STALLED = 0.9  # of what a limit was missed by before: it falls no further
+_AS_GOOD = 1.05  # of the least miss: of rounds that miss limits so nearly alike, the cost decides
 
 
 def no_pull(problem: Problem, limits: Sequence[Limit], problems: int) -> Pull:
     """Before anything is known of the limits."""
     sizes = [_constraints(problem, limit) for limit in limits]
-    multipliers = tuple(jnp.zeros((problems, size)) for size in sizes)
-    return Pull(multipliers, jnp.full((problems, len(sizes)), _STIFFNESS))
+    multipliers = tuple(jnp.asarray(np.zeros((problems, size))) for size in sizes)
+    return Pull(multipliers, jnp.asarray(np.full((problems, len(sizes)), _STIFFNESS)))
 
 
 def pulled(
-    limits: Sequence[Limit],
     told: Told,
     pull: Pull,
     before: Float[np.ndarray, "problems limits"],
@@ -35,26 +35,50 @@ def pulled(
 
     Where a limit is missed by more than a quarter of what it was `before`, it becomes stiffer.
     """
-    keep, multipliers, most = jnp.asarray(on)[:, None], [], []
-    for k, beyond in enumerate(_beyond(limits, told)):
-        raised = jnp.maximum(pull.multipliers[k] + pull.stiffness[:, k : k + 1] * beyond, 0)
-        multipliers.append(jnp.where(keep, raised, pull.multipliers[k]))
-        most.append(np.asarray(beyond.max(axis=1)))
+    keep, multipliers, most = np.asarray(on)[:, None], [], []
+    stiffness = np.asarray(pull.stiffness)
+    for k, beyond in enumerate(map(np.asarray, told.beyond)):
+        old = np.asarray(pull.multipliers[k])
+        raised = np.maximum(old + stiffness[:, k : k + 1] * beyond, 0)
+        multipliers.append(jnp.asarray(np.where(keep, raised, old)))
+        most.append(beyond.max(axis=1))
     missed = np.stack(most, axis=1)
-    slow = jnp.asarray(missed > np.maximum(0.25 * before, MET))
-    return Pull(tuple(multipliers), jnp.where(slow & keep, _STIFFER, 1.0) * pull.stiffness), missed
+    slow = missed > np.maximum(0.25 * before, MET)
+    stiffer = np.where(slow & keep, _STIFFER, 1.0) * stiffness
+    return Pull(tuple(multipliers), jnp.asarray(stiffer)), missed
+
+
+class Rounds:
+    """Where each round of multipliers ended, and whether another one is worth it."""
+
+    def __init__(self) -> None:
+        self.points: list[Float[np.ndarray, "problems n"]] = []
+        self.costs: list[Float[np.ndarray, " problems"]] = []
+        self.missed: list[Float[np.ndarray, " problems"]] = []
+
+    def add(self, z: np.ndarray, cost: np.ndarray, beyond: np.ndarray) -> None:
+        self.points.append(np.array(z))
+        self.costs.append(np.asarray(cost))
+        self.missed.append(np.maximum(beyond, 0).sum(axis=1))
+
+    @property
+    def stalled(self) -> Bool[np.ndarray, " problems"]:
+        """Which problems have twice come no nearer to limits that they miss by more than 2 %."""
+        if len(self.missed) < 3:
+            return np.zeros(len(self.points[0]), bool)
+        least, last, now = np.min(self.missed[:-2], axis=0), *self.missed[-2:]
+        return (now > 10 * MET) & (np.minimum(last, now) > _STALLED * least)
+
+    def best(self) -> Float[np.ndarray, "problems n"]:
+        """The last round's end where it meets the limits, else the one that misses them least."""
+        missed, costs = np.stack(self.missed), np.stack(self.costs)
+        near = missed <= _AS_GOOD * missed.min(axis=0)
+        chosen = np.argmin(np.where(near, costs, np.inf), axis=0)
+        chosen = np.where(missed[-1] <= 2 * MET, len(missed) - 1, chosen)
+        return np.stack([self.points[r][k] for k, r in enumerate(chosen)])
 
 
 def _constraints(problem: Problem, limit: Limit) -> int:
     """One for each member that a limit is kept on."""
     wide = problem.wide if limit.quantity in OF_THE_LOOP else None
     return problem.members if wide is None else wide.members
-
-
-def _beyond(limits: Sequence[Limit], told: Told) -> list[Float[Array, "problems members"]]:
-    """How far each member is beyond each limit, as levels."""
-    problems = range(len(told.value))
-    return [
-        jnp.stack([one_of(limit, k).beyond(values[k]) for k in problems])
-        for limit, values in zip(limits, told.bounded, strict=True)
-    ]

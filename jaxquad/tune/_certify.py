@@ -34,6 +34,7 @@ def certify(
     stop: float | None = None,
     load_start: float | None = None,
     name: str = "tuned",
+    devices: int | Sequence[Any] | None = None,
 ) -> Certificate:
     """Show what a design does on members that its tuner never saw, beside its `peers`.
 
@@ -41,8 +42,8 @@ def certify(
     (`jax.random.key(0)` if None): give the tuner's key, whose training members are other draws.
     `jq.Members` are taken as they are, and it is on the caller that nothing was tuned on them.
     All designs fly the `scenario` with the same noise. `limits` are `jq.Limit`s. At the `events`,
-    times in s, ITAE's clock starts anew and the overshoot of a step is judged; `start`, `stop` and
-    `load_start` are those of `jq.evaluate`. All are best those of the tuner's objective. A payload
+    times in s, ITAE's clock starts anew and the overshoot of a step is judged; `start`, `stop`,
+    `load_start` and `devices` are those of `jq.evaluate`, all best as the tuner's. A payload
     counts in the linear loops with the most and the least of it, the worse of all.
     Raises ValueError for parts that do not fit, and for limits on what is not judged.
     """
@@ -51,7 +52,7 @@ def certify(
     flight = drawn.flight(scenario)
     designs = {name: controller, **{_free(n, name): peer for n, peer in (peers or {}).items()}}
     span = Span(events, start, stop, load_start)
-    judged = {n: judge(design, drawn, flight, span) for n, design in designs.items()}
+    judged = {n: judge(design, drawn, flight, span, devices) for n, design in designs.items()}
     facts, nominal = _facts(drawn), _nominal(ensemble)
     found = Certificate(
         judged, distances(judged[name], limits), facts, nominal,

@@ -31,9 +31,11 @@ class Told(NamedTuple):
 
     value: Float[Array, " problems"]
     gradient: Float[Array, "problems n"]
+    cost: Float[Array, " problems"]  # the objective, without what limits add
     costs: Float[Array, "problems members"]
     numbers: dict[str, Float[Array, "problems members"]]  # of each member's worst axis
     bounded: tuple[Float[Array, "problems members"], ...]  # of each limit, on its members
+    beyond: tuple[Float[Array, "problems members"], ...]  # the same as levels: above 0, violated
 
 
 class Aim(NamedTuple):
@@ -88,14 +90,16 @@ def _cost(controller: Any, problem: Problem, aim: Aim) -> tuple[Array, tuple[Any
     costs = objective.costs(numbers)
     seen = {name: per_member(name, x, worst=True) for name, x in numbers.items()}
     bounded = _bounded(controller, problem, limits, seen)
-    total = objective.risk(costs) + _pulled(limits, bounded, aim.pull)
+    beyond = tuple(limit.beyond(x) for limit, x in zip(limits, bounded, strict=True))
+    cost = objective.risk(costs)
     settling = jnp.mean(soft(slowest - aim.rate))
-    return jnp.where(aim.fly, total, settling), (costs, seen, bounded)
+    total = jnp.where(aim.fly, cost + _pulled(beyond, aim.pull), settling)
+    return total, (cost, costs, seen, bounded, beyond)
 
 
 def _bounded(
     controller: Any, problem: Problem, limits: Sequence[Limit], seen: dict[str, Array]
-) -> tuple[Float[Array, " members"], ...]:
+) -> tuple[Array, ...]:
     """What each limit is on: of the linear loop, which is cheap, on many more members."""
     names = {limit.quantity for limit in limits if limit.quantity in OF_THE_LOOP}
     if problem.wide is None or not names:
@@ -105,13 +109,11 @@ def _bounded(
     return tuple(found[limit.quantity] for limit in limits)
 
 
-def _pulled(
-    limits: Sequence[Limit], bounded: Sequence[Float[Array, " members"]], pull: Pull
-) -> Float[Array, ""]:
+def _pulled(beyond: Sequence[Array], pull: Pull) -> Float[Array, ""]:
     """The augmented Lagrangian of Powell, Hestenes and Rockafellar."""
     total = jnp.zeros(())
-    for k, (limit, values) in enumerate(zip(limits, bounded, strict=True)):
+    for k, levels in enumerate(beyond):
         multiplier, stiffness = pull.multipliers[k], pull.stiffness[k]
-        forced = jnp.maximum(multiplier + stiffness * limit.beyond(values), 0)
+        forced = jnp.maximum(multiplier + stiffness * levels, 0)
         total = total + jnp.sum(forced**2 - multiplier**2) / (2 * stiffness)
     return total

@@ -13,6 +13,7 @@ from jaxquad.simulate import evaluate, Metrics, Scenario
 from ._judged import Judged, LINEAR
 from ._loop_numbers import loop_numbers, LoopNumbers, worst_of
 from ._members import Members
+from ._parts import parts_of
 from ._wide import wide
 
 
@@ -30,13 +31,12 @@ class Span(NamedTuple):
 
     @property
     def parts(self) -> list[tuple[float, float | None]]:
-        """From event to event."""
-        ends = np.inf if self.stop is None else self.stop
-        inside = sorted({float(t) for t in self.events if self.start < t < ends})
-        return list(zip([self.start, *inside], [*inside, self.stop], strict=True))
+        return parts_of(self.events, self.start, self.stop)
 
 
-def judge(controller: Any, members: Members, flight: Scenario, span: Span) -> Judged:
+def judge(
+    controller: Any, members: Members, flight: Scenario, span: Span, devices: Any = None
+) -> Judged:
     """`controller` on all `members`, in a `flight` that has their noise in it.
 
     The loop in time holds every limit, the encoder and dry friction; the linear one is exact, of a
@@ -49,6 +49,7 @@ def judge(controller: Any, members: Members, flight: Scenario, span: Span) -> Ju
         return evaluate(
             members.plant, law, flight, start=start, stop=stop, load_start=load_start,
             dt=members.dt, drive=members.drive, encoder=members.encoder, delay=members.delay,
+            devices=devices,
         )  # fmt: skip
 
     whole = over(span.start, span.stop, span.load_start)

@@ -55,7 +55,7 @@ def loop_numbers(
     """`jq.analyse_loop` of each axis and member; stability by the eigenvalues themselves."""
     members = delay.shape[0]
     flat = _Laws(_linear(controller, axes, members), axes * members)
-    late = jnp.tile(delay, axes)
+    late = jnp.asarray(np.tile(np.asarray(delay), axes))
     found = analyse_loop(_flat(plant, axes, members), flat, delay=late, longest_delay=longest)
     slowest = np.real(found.poles[:, 0])
     stable = np.asarray(found.stable) & (slowest < 0)
@@ -82,9 +82,9 @@ def _where(stable: np.ndarray, found: LoopAnalysis, name: str) -> np.ndarray:
 def _flat(plant: DecoupledAxes, axes: int, members: int) -> DecoupledAxes:
     """All axes of all members as the members of one axis. Dry friction has no linear part."""
 
-    def row(x: Array) -> Array:
-        wide = x if x.ndim > 1 else x[:, None]
-        return jnp.broadcast_to(wide, (axes, members)).reshape(1, axes * members)
+    def row(x: Array) -> np.ndarray:
+        wide = np.asarray(x) if x.ndim > 1 else np.asarray(x)[:, None]
+        return np.broadcast_to(wide, (axes, members)).reshape(1, axes * members)
 
     given = {name: x for name, x in vars(plant).items() if x is not None and name != "coulomb"}
     return DecoupledAxes(**{name: row(x) for name, x in given.items()})

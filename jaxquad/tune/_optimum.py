@@ -25,7 +25,7 @@ def scattered(
     """The start itself, and others about it: normal by `scatter` (nepers), a Latin hypercube."""
     from scipy.special import ndtri
 
-    if count < 1 or not 0 < scatter < np.inf:
+    if not isinstance(count, int) or count < 1 or not 0 < scatter < np.inf:
         raise ValueError(
             f"starts is {count} with a scatter of {scatter}: give 1 for the controller as it is, "
             "or more, and a scatter above 0"

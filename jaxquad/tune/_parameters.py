@@ -45,7 +45,11 @@ class Coordinates(eqx.Module):
 
     @property
     def start(self) -> Float[np.ndarray, " n"]:
-        gains = [] if self.parameters is None else [self.parameters.start[: self.parameters.count]]
+        gains = (
+            []
+            if self.parameters is None
+            else [np.asarray(self.parameters.start)[: self.parameters.count]]
+        )
         return np.concatenate([np.asarray(x) for x in [*gains, *(row.start for row in self.rows)]])
 
     @property
@@ -67,7 +71,7 @@ class Coordinates(eqx.Module):
 
     def values(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
         """The tuned numbers by name."""
-        tuned = self.controller_at(jnp.asarray(z))
+        tuned = design_at(self, jnp.asarray(z))
         held = [np.asarray(x).reshape(-1) for x in _leaves(tuned)]
         by_name = {place.name: float(held[place.leaf][place.index]) for place in self._places}
         return {name: by_name[name] for name in self.names}
@@ -75,6 +79,12 @@ class Coordinates(eqx.Module):
     @property
     def _places(self) -> list[Place]:
         return name_places(self.controller)
+
+
+@eqx.filter_jit
+def design_at(coordinates: Coordinates, z: Float[Array, " n"]) -> Any:
+    """`coordinates.controller_at(z)`, compiled as one."""
+    return coordinates.controller_at(z)
 
 
 def coordinates(controller: Any, free: Free = None) -> Coordinates:
@@ -97,6 +107,8 @@ def coordinates(controller: Any, free: Free = None) -> Coordinates:
         rows.append(row) if row is not None else others.append(item)
     chosen = wanted if callable(wanted) else others
     parameters = select_parameters(controller, chosen) if callable(chosen) or chosen else None
+    if parameters is None and not rows:
+        raise ValueError('free is empty: name the numbers to tune, as ["wc", "wo"]')
     return Coordinates(controller, parameters, tuple(rows))
 
 

@@ -13,6 +13,7 @@ from jaxquad.simulate import Scenario
 
 from ._certificate import Certificate
 from ._certify import certify
+from ._checks import require_kinds
 from ._copies import copies
 from ._descent import LBFGS
 from ._ensemble import Ensemble
@@ -21,7 +22,7 @@ from ._judged import Judged
 from ._limit import Limit
 from ._members import Members
 from ._objective import Objective
-from ._parameters import coordinates
+from ._parameters import coordinates, design_at
 from ._penalty import Penalty
 from ._phases import solve
 from ._problem import problem_of
@@ -103,6 +104,7 @@ def pareto(
     method: LBFGS | None = None,
     key: Key[Array, ""] | None = None,
     progress: bool | None = None,
+    devices: int | Sequence[Any] | None = None,
 ) -> Pareto:
     """What tracking costs: `points` designs between little and much of `over`, tuned at once.
 
@@ -116,25 +118,37 @@ def pareto(
     if over not in _NAMES:
         raise ValueError(f"no front over {over!r}: choose one of {', '.join(_NAMES)}")
     over, objective = _NAMES[over], Objective() if objective is None else objective
+    method = LBFGS() if method is None else method
+    require_kinds(ensemble, objective, limits, method)
     held = _levels(over, objective, points, levels)
     if isinstance(ensemble, Members) and not isinstance(fresh, Members):
         raise ValueError("the members to tune on are given: give fresh=, other members, too")
     key = jax.random.key(0) if key is None else key
     span = {name: getattr(objective, name) for name in ("events", "start", "stop", "load_start")}
     free_ones, watched = coordinates(controller, free), Progress(progress)
-    problem = problem_of(controller, _drawn(ensemble, members, key), scenario, **span)
+    problem = problem_of(
+        controller, _drawn(ensemble, members, key), scenario, **span, devices=devices
+    )
     tightened = tuple(_tightened(limit, reserve) for limit in limits)
     found = solve(
         free_ones, problem, np.tile(free_ones.start, (len(held), 1)),
         _objectives(objective, over, held), copies(tightened, len(held)),
-        method=LBFGS() if method is None else method, rate=stabilising_rate(objective),
+        method=method, rate=stabilising_rate(objective),
         progress=watched,
     )  # fmt: skip
     seconds = watched.seconds
-    designs = [free_ones.controller_at(jnp.asarray(z)) for z in found.z]
+    designs = [design_at(free_ones, jnp.asarray(z)) for z in found.z]
     judged_on, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
     judge = lambda c, others: certify(
-        c, judged_on, scenario, limits=limits, peers=others, members=count, key=key, **span
+        c,
+        judged_on,
+        scenario,
+        limits=limits,
+        peers=others,
+        members=count,
+        key=key,
+        **span,
+        devices=devices,
     )
     certificates = [judge(c, {} if k else peers) for k, c in enumerate(designs)]
     others = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}

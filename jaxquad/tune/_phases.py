@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ._bounds import MET, no_pull, pulled
+from ._allowed import refusal
+from ._bounds import MET, no_pull, pulled, Rounds
 from ._copies import one_of
 from ._cost import Aim, evaluate, Pull, Told
 from ._descent import Descent, LBFGS, minimise
@@ -21,6 +23,7 @@ from ._progress import Evaluation, Progress
 
 
 _ROUNDS = 8  # of multipliers
+_TIMES = 3  # what a descent may take, of evaluations, is what all rounds may
 _BEYOND_KNEE = 0.25  # 1/s, what the first phase aims at below the abscissa that is enough
 
 
@@ -34,6 +37,7 @@ class Solution(NamedTuple):
     stabilised: Bool[np.ndarray, " problems"]  # nor slower than the abscissa that is enough
     converged: Bool[np.ndarray, " problems"]
     reasons: tuple[str, ...]
+    refusal: str  # of the last step that a controller refused, empty if none did
     evaluations: Int[np.ndarray, " problems"]  # of the second phase: flights and linear loops
     stabilising: Int[np.ndarray, " problems"]  # of the first phase: linear loops only
     beyond: Float[np.ndarray, "problems limits"]  # greatest, as levels: above 0, violated
@@ -55,18 +59,19 @@ def solve(
     """Both phases of all problems: `objectives` and `limits` hold arrays [problems, ...].
 
     A problem whose members cannot all be made to decay at `rate` (1/s, negative) stays with the
-    first phase's best if one of them is unstable.
+    first phase's best if one of them is unstable. Otherwise no step is taken to where one is, and
+    where limits cannot be met the end is the round that missed them least.
     """
     runner = _Runner(coordinates, problem, objectives, tuple(limits), method, rate, progress)
     first = runner.stabilise(np.asarray(start, float))
     slowest = runner.slowest(first.z)
     able = slowest < 0
     second, pull, told, beyond, count = runner.optimise(first.z, able)
-    costs = [float(one_of(objectives, k).risk(told.costs[k])) for k in range(len(able))]
     return Solution(
-        z=second.z, cost=np.where(able, costs, np.nan), gradient=second.gradient,
+        z=second.z, cost=np.where(able, np.asarray(told.cost), np.nan), gradient=second.gradient,
         able=able, stabilised=slowest < rate, converged=second.converged & able,
-        reasons=second.reasons, evaluations=count, stabilising=first.evaluations,
+        reasons=second.reasons, refusal=runner.refusal, evaluations=count,
+        stabilising=first.evaluations,
         beyond=beyond, pull=pull, told=told,
     )  # fmt: skip
 
@@ -77,6 +82,7 @@ class _Runner:
         self.objectives, self.limits, self.rate = objectives, limits, rate
         self.progress = progress
         self.last: Any = None
+        self.refusal = ""
         self.first = method if isinstance(method, LBFGS) else LBFGS()
 
     def told(self, z: Any, on: Any, fly: Any, pull: Pull) -> Told:
@@ -86,15 +92,28 @@ class _Runner:
         flies = jnp.broadcast_to(jnp.asarray(fly), (count,))
         aim = Aim(self.objectives, self.limits, pull, flies, rate)
         given = (jnp.asarray(z), jnp.asarray(on))
-        return jax.block_until_ready(evaluate(*given, self.coordinates, self.problem, aim))
+        told = evaluate(*given, self.coordinates, self.problem, aim)
+        return jax.tree.map(np.asarray, told)  # NumPy compiles nothing for what follows
 
     def both(self, fly: bool, pull: Pull) -> Any:
         def both(z, on):
-            self.last = self.told(z, on, fly, pull)
-            self.progress.add(_evaluation(self.last, z, on, fly, self.progress.seconds))
-            return np.asarray(self.last.value), np.asarray(self.last.gradient)
+            told = self.told(z, on, fly, pull)
+            if fly:  # limits must not buy themselves members that are unstable
+                lost = np.max(told.numbers["abscissa"], axis=1) >= 0
+                told = told._replace(value=np.where(lost, np.inf, told.value))
+            refused = [bool(go) and bool(self.refused(x)) for x, go in zip(z, on, strict=True)]
+            told = told._replace(value=np.where(refused, np.inf, told.value))
+            self.last = told
+            self.progress.add(_evaluation(told, z, on, fly, self.progress.seconds))
+            return np.asarray(told.value), np.asarray(told.gradient)
 
         return both
+
+    def refused(self, z: np.ndarray) -> str:
+        """Why no step goes to `z`; the last such reason is kept."""
+        why = refusal(self.coordinates, z)
+        self.refusal = why or self.refusal
+        return why
 
     def stabilise(self, z: np.ndarray) -> Descent:
         pull = no_pull(self.problem, self.limits, len(z))
@@ -106,9 +125,10 @@ class _Runner:
         told = self.told(z, everyone, False, no_pull(self.problem, self.limits, len(z)))
         return np.asarray(told.numbers["abscissa"]).max(axis=1)
 
-    def descended(self, z: np.ndarray, on: np.ndarray, pull: Pull) -> Descent:
+    def descended(self, z: np.ndarray, on: np.ndarray, pull: Pull, left: int) -> Descent:
         if not isinstance(self.method, GaussNewton):
-            return minimise(self.both(True, pull), z, self.method, on=on)
+            method = eqx.tree_at(lambda m: m.evaluations, self.method, left)
+            return minimise(self.both(True, pull), z, method, on=on)
         ends = [
             least_squares(
                 self.coordinates, self.problem, one_of(self.objectives, k), x, self.method
@@ -127,19 +147,42 @@ class _Runner:
     def optimise(self, z: np.ndarray, able: np.ndarray) -> Any:
         pull, on = no_pull(self.problem, self.limits, len(z)), able.copy()
         counts, beyond = np.zeros(len(z), int), np.full((len(z), len(self.limits)), np.inf)
-        descent = None
+        told = self.told(z, np.ones_like(able), able, pull)
+        _require_finite(told, able)
+        descent: Any = None
+        everyone, rounds = np.ones_like(able), Rounds()
+        most = getattr(self.method, "evaluations", 0)
         for _ in range(_ROUNDS if self.limits else 1):
-            found = self.descended(z, on, pull)
+            found = self.descended(z, on, pull, min(most, int(_TIMES * most - counts.max())))
             descent = found if descent is None else _merged(descent, found, on)
             z, counts = descent.z, counts + found.evaluations
-            told = self.told(z, np.ones_like(able), able, pull)
+            told = self.told(z, everyone, able, pull)
             if not self.limits:
+                return descent, pull, told, beyond, counts
+            pull, beyond = pulled(told, pull, beyond, on)
+            rounds.add(z, np.asarray(told.cost), beyond)
+            on = on & (beyond.max(axis=1) > MET) & ~rounds.stalled
+            if not on.any() or counts.max() >= _TIMES * most:
                 break
-            pull, beyond = pulled(self.limits, told, pull, beyond, on)
-            on = on & (beyond.max(axis=1) > MET)
-            if not on.any():
-                break
+        if np.any(rounds.best() != z):
+            z = rounds.best()
+            told = self.told(z, everyone, able, pull)
+            beyond = np.stack([np.max(x, axis=1) for x in told.beyond], axis=1)
+            descent = descent._replace(z=z, gradient=np.asarray(told.gradient))
         return descent, pull, told, beyond, counts
+
+
+def _require_finite(told: Told, able: np.ndarray) -> None:
+    """A cost that is no number would end the descent where it starts."""
+    value = np.asarray(told.value)
+    if not able.any() or np.isfinite(value[able]).any():
+        return
+    bad = [n for n, x in told.numbers.items() if not np.isfinite(np.asarray(x)[able]).all()]
+    raise ValueError(
+        f"the cost is {value[able][0]} at the start, though every member is stable, because of "
+        f"{', '.join(bad) or 'the limits'}: the scenario or the controller do not have it (only a "
+        "controller with an observer estimates a disturbance), or members diverge in flight"
+    )
 
 
 def _merged(old: Descent, new: Descent, on: np.ndarray) -> Descent:

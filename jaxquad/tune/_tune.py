@@ -10,15 +10,16 @@ from jaxquad.identify._parameters import Free
 from jaxquad.simulate import Scenario
 
 from ._certify import certify
+from ._checks import require_judges, require_kinds, require_steps
 from ._copies import copies
 from ._descent import LBFGS
 from ._ensemble import Ensemble
-from ._gauss_newton import GaussNewton, require_squares
+from ._gauss_newton import GaussNewton
 from ._limit import Limit
 from ._members import Members
 from ._objective import Objective
 from ._optimum import optima, scattered
-from ._parameters import Coordinates, coordinates
+from ._parameters import Coordinates, coordinates, design_at
 from ._phases import Solution, solve
 from ._problem import Problem, problem_of
 from ._progress import Listener, Progress
@@ -48,6 +49,7 @@ def tune(
     key: Key[Array, ""] | None = None,
     progress: bool | None = None,
     listener: Listener | None = None,
+    devices: int | Sequence[Any] | None = None,
 ) -> Tuned:
     """Tune a controller by gradient through the closed loop, for all of an ensemble at once.
 
@@ -67,32 +69,43 @@ def tune(
     they led, and the best is returned. `method` is `jq.LBFGS` or `jq.GaussNewton`. `fresh` says on
     how many new members the certificate judges the design beside its `peers`, or on which; None
     does without. `progress` writes a line per evaluation on stderr, by default if that is a
-    terminal; `listener` is called with each.
+    terminal; `listener` is called with each. The members' loops are split over `devices`, see
+    `jq.evaluate`.
     Needs float64. Raises ValueError for parts that do not fit together.
     Source: EQUATIONS.md, section 3.
     """
     objective = Objective() if objective is None else objective
-    if isinstance(method, GaussNewton):
-        require_squares(objective, limits)
+    method = LBFGS() if method is None else method
+    require_kinds(ensemble, objective, limits, method)
     key = jax.random.key(0) if key is None else key
     span = {name: getattr(objective, name) for name in ("events", "start", "stop", "load_start")}
     free_ones, watched = coordinates(controller, free), Progress(progress, listener)
     drawn = ensemble if isinstance(ensemble, Members) else ensemble.draw(members, key)
+    require_judges(fresh, drawn, peers)
     wide = _wide(ensemble, limits, key)
-    problem = problem_of(controller, drawn, scenario, wide, **span)
+    problem = problem_of(controller, drawn, scenario, wide, **span, devices=devices)
+    require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
     solution = _solved(
         free_ones, problem, scattered(free_ones.start, starts, scatter, seed=0),
         objective, [_tightened(limit, reserve) for limit in limits],
-        LBFGS() if method is None else method, watched,
+        method, watched,
     )  # fmt: skip
     seconds, best = watched.seconds, _best(solution)
-    tuned = free_ones.controller_at(jnp.asarray(solution.z[best]))
+    tuned = design_at(free_ones, jnp.asarray(solution.z[best]))
     judged = None
     if fresh is not None and not (isinstance(ensemble, Members) and isinstance(fresh, int)):
         watched.say("certificate on fresh members ...")
         others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
         judged = certify(
-            tuned, others, scenario, limits=limits, peers=peers, members=count, key=key, **span
+            tuned,
+            others,
+            scenario,
+            limits=limits,
+            peers=peers,
+            members=count,
+            key=key,
+            **span,
+            devices=devices,
         )
     kept = kept_limits(limits, solution, best)
     return Tuned(

@@ -52,6 +52,9 @@ class Tuned(eqx.Module):
 
     def __str__(self) -> str:
         first, *rest = ["NOT CERTIFIED: no fresh members were asked for"]
+        missed = [_kept(kept) for kept in self.limits if not kept.met]
+        if missed:
+            first = f"{first}; {'; '.join(missed)}"
         if self.certificate is not None:
             first, *rest = str(self.certificate).splitlines()
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
@@ -73,7 +76,9 @@ def _effort(tuned: Tuned) -> str:
 def _kept(kept: Kept) -> str:
     state = "holds the optimum back" if kept.active else "does not act" if kept.met else "MISSED"
     state = state if kept.met else "MISSED: it cannot be met with the others"
-    return f"limit on {kept.limit}: {kept.found:.4g} on the members tuned on, {state}"
+    beyond = abs(kept.found - float(kept.limit.bound))
+    by = "" if kept.met else f" (by {beyond:.3g})"
+    return f"limit on {kept.limit}: {kept.found:.4g}{by} on the members tuned on, {state}"
 
 
 def _ends(minima: tuple[Optimum, ...]) -> list[str]:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ._lag_text import lag_remark
@@ -19,7 +20,7 @@ def kept_limits(limits: Sequence[Limit], solution: Solution, index: int) -> tupl
     """Each limit as it was given, on the members that were tuned on."""
     kept = []
     for k, limit in enumerate(limits):
-        values = solution.told.bounded[k][index]
+        values = jnp.asarray(solution.told.bounded[k][index])
         excess = float(limit.excess(values))
         found = float(limit.bound) + limit.sign * excess
         acts = float(solution.pull.multipliers[k][index].sum()) > _ACTIVE
@@ -47,5 +48,7 @@ def remarks_of(
         remark = lag_remark(controller, problem.loops.delay, problem.loops.axes.lag)
         if remark is not None:
             yield remark
+    if solution.refusal:
+        yield f"steps were taken back where the controller refuses its gains: {solution.refusal}"
     if not solution.converged[index] and solution.able[index]:
         yield f"the descent has not converged: {solution.reasons[index]}"

@@ -2,6 +2,7 @@ import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxquad.control import LADRC, PID
@@ -21,5 +22,6 @@ def wide(law: Any, axes: int, members: int) -> Any:
 
 def _shaped(gain: Array, name: str, axes: int, members: int) -> Array:
     shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
-    aligned = gain.reshape(gain.shape + (1,) * (len(shape) - gain.ndim)) if gain.ndim else gain
-    return jnp.broadcast_to(aligned, shape)
+    given = np.asarray(gain)
+    aligned = given.reshape(given.shape + (1,) * (len(shape) - given.ndim)) if given.ndim else given
+    return jnp.asarray(np.broadcast_to(aligned, shape))
