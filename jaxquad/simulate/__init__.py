@@ -4,6 +4,12 @@ from ._authority import (
     authority as authority,
     AuthorityWarning as AuthorityWarning,
 )
+from ._chunks import run_ensemble as run_ensemble
+from ._compile import (
+    compiler_options as compiler_options,
+    Engine as Engine,
+    engine as engine,
+)
 from ._compose import scenario as scenario
 from ._disturbances import (
     ceti_gust as ceti_gust,

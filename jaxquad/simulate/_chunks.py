@@ -1,5 +1,6 @@
 """An ensemble computed a few members after the others, so that they stay in a CPU's cache."""
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -22,7 +23,7 @@ def run_ensemble(
     signals: PyTree,
     *,
     own: PyTree,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
 ) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` of an ensemble of loops: the last carry, and what each sample left.
 
@@ -31,9 +32,10 @@ def run_ensemble(
     sample. Members are on the last axis: of all that a step returns and of the carry it starts
     from, and of what `own` is True for, which is a tree like (parts, signals), or the top of one.
 
-    On a CPU each `chunk` of members is one compiled kernel, if it is plain arithmetic. Reverse mode
-    keeps blocks of samples of one chunk at a time. To be called under `jax.jit`, with
-    `compiler_options()` if it is the outermost one.
+    On a CPU each `chunk` of members, 128 if None, is one compiled kernel, if it is plain
+    arithmetic; other devices take all members at once. Reverse mode keeps blocks of samples of one
+    chunk at a time. To be called under `jax.jit`, with `compiler_options()` if that is the
+    outermost one.
     """
 
     def loop(given: PyTree) -> tuple[PyTree, PyTree]:
@@ -46,24 +48,31 @@ def run_ensemble(
 
 
 def in_chunks(
-    function: Callable[[PyTree], PyTree], given: PyTree, own: PyTree, chunk: int = CHUNK
+    function: Callable[[PyTree], PyTree], given: PyTree, own: PyTree, chunk: int | None = None
 ) -> PyTree:
     """`function(given)` for `chunk` members after the others, where there are more than these.
 
-    `own` tells which arrays of `given` have the members on the last axis. Of a result without them
-    the first chunk's is taken.
+    None: 128 on a CPU, all of them elsewhere. `own` tells which arrays of `given` have the members
+    on the last axis. Of a result without them the first chunk's is taken.
     """
     theirs, common = eqx.partition(given, own)
     members = jax.tree.leaves(theirs)[0].shape[-1]
-    if members <= chunk:
+    most = chunk or most_at_once()
+    if members <= most:
         return function(given)
-    number = -(-members // chunk)
+    number = math.ceil(members / most)
     size = _size(-(-members // number), given)
     split = jax.tree.map(lambda x: _split(x, -(-members // size), size), theirs)
     # Within a map nothing can be merged with the forward pass, so no barriers are needed.
     run = jax.checkpoint(lambda x: function(eqx.combine(x, common)), prevent_cse=False)
     out = jax.lax.map(run, split)
-    return jax.tree.map(lambda x: _joined(x, members) if x.shape[-1] == size else x[0], out)
+    have = lambda x: x.ndim > 1 and x.shape[-1] == size
+    return jax.tree.map(lambda x: _joined(x, members) if have(x) else x[0], out)
+
+
+def most_at_once() -> float:
+    """Members of a chunk."""
+    return CHUNK if jax.default_backend() == "cpu" else math.inf
 
 
 def _size(least: int, given: PyTree) -> int:

@@ -3,7 +3,7 @@
 import functools as ft
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,16 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from jaxquad.models._parameters import is_concrete
+
+from ._small_call import has_kernels
+
+
+class Engine(NamedTuple):
+    """What loops are compiled with here."""
+
+    platform: str
+    one_kernel: bool  # a loop is one kernel of plain vector code, if it is plain arithmetic
+    vector_bits: int | None  # of a jit with `compiler_options()`; None for the compiler's choice
 
 
 _WIDEST = {"xla_cpu_prefer_vector_width": 512}  # bits; LLVM takes half of what a CPU can, unasked
@@ -49,6 +59,13 @@ def compiler_options() -> dict[str, int]:
     On a CPU, 512-bit vectors; warns, once, if this XLA does not know the option.
     """
     return dict(_known()) if jax.default_backend() == "cpu" else {}
+
+
+def engine() -> Engine:
+    """How fast loops can be here: a CPU's XLA may lack what makes them so. It changes no result."""
+    platform = jax.default_backend()
+    bits = compiler_options().get("xla_cpu_prefer_vector_width")
+    return Engine(platform, platform == "cpu" and has_kernels(), bits)
 
 
 @ft.cache

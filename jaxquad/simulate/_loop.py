@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ._blocks import scan_in_blocks
-from ._chunks import CHUNK, in_chunks
+from ._chunks import in_chunks, most_at_once
 from ._ensemble import common_ensemble, start_of
 from ._guard import are_sound, guarded
 from ._members import members_of_loop
@@ -51,7 +51,7 @@ def scan_loop(
 
 def _of_members(given: PyTree, ensemble: tuple[int, ...]) -> PyTree | None:
     """Which arrays have the members on the last axis, where these are so many that it matters."""
-    if len(ensemble) != 1 or ensemble[0] <= CHUNK:
+    if len(ensemble) != 1 or ensemble[0] <= most_at_once():
         return None
     parts, *others = given
     own = members_of_loop(parts)

@@ -6,6 +6,8 @@ internal to XLA: on other devices, for computations that such a kernel cannot ho
 or XLA does not know them, the loop is compiled as any other.
 """
 
+import functools as ft
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +29,7 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     and each mark is the transpose of the other.
     """
     if enter is None or leave is None:
+        _say_so()
         return function(*args)
 
     def jaxquad_kernel(*args: PyTree) -> PyTree:
@@ -34,6 +37,18 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
 
     entered = jax.tree.map(_marked(enter), args)
     return jax.tree.map(_marked(leave), jax.jit(jaxquad_kernel)(*entered))
+
+
+def has_kernels() -> bool:
+    """Whether this JAX has what a kernel is marked with."""
+    return enter is not None and leave is not None
+
+
+@ft.cache
+def _say_so() -> None:
+    if jax.default_backend() == "cpu":
+        message = "loops take several times as long: this JAX lacks what makes them one kernel"
+        warnings.warn(f"{message} (jax {jax.__version__})", stacklevel=2)
 
 
 def _marked(mark: Any) -> Callable[[Array], Array]:

@@ -5,12 +5,12 @@ from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
+from ._small_call_division import ATTRIBUTE, text
 from ._small_call_limits import fits_a_kernel
-from ._small_call_parts import in_parts, text
+from ._small_call_parts import in_parts
 from ._small_call_uses import shield, using_all
 
 
-_ATTRIBUTE = "mhlo.frontend_attributes"
 _TAGS = {"inlineable": "false", "xla_cpu_small_call": "true"}
 
 
@@ -63,11 +63,11 @@ def _make_kernel(call: Any, whole: Any) -> None:
         callee = using_all(call, whole.module, whole.symbol_table)
         shield(call)
         call.attributes["callee"] = callee
-        call.attributes[_ATTRIBUTE] = ir.DictAttr.get(_tags())
+        call.attributes[ATTRIBUTE] = ir.DictAttr.get(_tags())
 
 
 def _is_plain_call(op: Any) -> bool:
-    return getattr(op, "name", "") == "func.call" and _ATTRIBUTE not in op.attributes
+    return getattr(op, "name", "") == "func.call" and ATTRIBUTE not in op.attributes
 
 
 def _is_for_one_cpu(whole: Any) -> bool:

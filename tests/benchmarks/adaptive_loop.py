@@ -6,12 +6,16 @@ quantity is an array [members], which XLA turns into the fewest and plainest loo
 """
 
 import functools as ft
+import importlib
 import os
 import pathlib
+import shutil
+import sys
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxquad.models._sincos import sincos
 from jaxquad.simulate import runge_kutta
@@ -144,3 +148,37 @@ def plain(tuning: Any, inertia: Any, load: Any) -> Any:
     begin = start(inertia.shape[1], inertia.dtype)
     parts = (tuple(tuning), (*inertia, *(1 / inertia)))
     return jax.lax.scan(lambda state, now: step(state, parts, now), begin, load)[0].cost
+
+
+class Baseline(NamedTuple):
+    """The AVX-512 code, and the case it is timed with."""
+
+    library: dict[str, Any]
+    timing: Any  # the module that builds and calls it
+
+    @property
+    def tuning(self) -> Any:
+        return np.array(self.timing.M.TUN0)
+
+    def inertias(self, members: int) -> Any:
+        return self.timing.inertias(members)
+
+    def disturbance(self, steps: int) -> Any:
+        return self.timing.disturbance(steps)
+
+    def run(self, tuning: Any, inertia: Any, load: Any, dtype: str) -> Any:
+        arrays = (np.asarray(x) for x in (inertia, load, tuning))
+        return self.timing.simulate(self.library[dtype], *arrays, np.dtype(dtype))[0]
+
+
+def baseline() -> Baseline | str:
+    """The hand-written code, or why there is none."""
+    folder = FOLDER / "adaptive_loop"
+    cpu = pathlib.Path("/proc/cpuinfo")
+    if not (folder / "run.py").is_file():
+        return f"no {folder}/run.py: set JAXQUAD_BASELINES to the folder of the baselines"
+    if shutil.which("g++") is None or "avx512dq" not in cpu.read_text():
+        return "the hand-written code needs g++ and a CPU with AVX-512"
+    sys.path.insert(0, str(folder))  # its files import each other
+    timing = importlib.import_module("run")
+    return Baseline({"float64": timing.build(True), "float32": timing.build(False)}, timing)
