@@ -1,6 +1,6 @@
 """An ensemble computed a few members after the others, so that they stay in a CPU's cache."""
 
-import math
+import sys
 from collections.abc import Callable
 
 import equinox as eqx
@@ -60,7 +60,7 @@ def in_chunks(
     most = chunk or most_at_once()
     if members <= most:
         return function(given)
-    number = math.ceil(members / most)
+    number = -(-members // most)
     size = _size(-(-members // number), given)
     split = jax.tree.map(lambda x: _split(x, -(-members // size), size), theirs)
     # Within a map nothing can be merged with the forward pass, so no barriers are needed.
@@ -70,9 +70,9 @@ def in_chunks(
     return jax.tree.map(lambda x: _joined(x, members) if have(x) else x[0], out)
 
 
-def most_at_once() -> float:
+def most_at_once() -> int:
     """Members of a chunk."""
-    return CHUNK if jax.default_backend() == "cpu" else math.inf
+    return CHUNK if jax.default_backend() == "cpu" else sys.maxsize
 
 
 def _size(least: int, given: PyTree) -> int:
