@@ -1,11 +1,16 @@
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 
 # Many small matrices: threads would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import equinox as eqx
 import jax
+import psutil
 import pytest
 
 
@@ -13,7 +18,31 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
+MEMORY = 2 * 2**30  # bytes
 ROOT = Path(__file__).parent.parent
+FOLDER, LEAST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+
+
+def share_compiled_loops() -> None:
+    """Let workers and their subprocesses take from disk what one of them has compiled."""
+    if FOLDER not in os.environ:  # as in the workers, whose parent it is that removes it
+        os.environ[FOLDER] = tempfile.mkdtemp(prefix="jaxquad-compiled-")
+        os.environ[LEAST] = "0.2"  # s of compile time
+        atexit.register(shutil.rmtree, os.environ[FOLDER], ignore_errors=True)
+    jax.config.update(FOLDER.lower(), os.environ[FOLDER])
+    jax.config.update(LEAST.lower(), float(os.environ.get(LEAST, 1.0)))
+
+
+share_compiled_loops()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bounded_memory():
+    """Forget compiled loops between modules: a worker would keep gigabytes of them."""
+    yield
+    if psutil.Process().memory_info().rss > MEMORY:
+        eqx.clear_caches()
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

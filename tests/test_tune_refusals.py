@@ -2,11 +2,17 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 import tuning_case as case
+from certificates_by_hand import certificate, judged
 
+from jaxquad.control import LADRC
+from jaxquad.simulate import scenario, Step
+from jaxquad.tune import LBFGS, Objective, tune
 from jaxquad.tune._allowed import refusal
+from jaxquad.tune._observer_alone import runaway, sluggish
 from jaxquad.tune._parameters import coordinates
 
 
@@ -44,3 +50,43 @@ def test_an_observer_that_is_unstable_by_itself_is_refused(wo, factor):
     unstable = np.abs(np.linalg.eigvals(error)).max() >= 1
     assert unstable == ("observer alone" in refused(wo=wo, observer_factor=factor))
     assert unstable
+
+
+def halved(wc, wo, factor):
+    start = case.equivalent(wc, wo)
+    return dataclasses.replace(
+        start, ladrc=dataclasses.replace(start.ladrc, observer_factor=factor)
+    )
+
+
+@pytest.mark.parametrize(("ratio", "slow"), [(5.0, False), (2.1, False), (1.9, True)])
+def test_an_observer_by_itself_must_not_be_slower_than_the_feedback(ratio, slow):
+    # s^3 + 1.5 s^2 + 1.5 s + 0.5 = (s + 0.5) (s^2 + s + 1): its slowest pole is at half of wo.
+    assert ("slower than the feedback" in sluggish(halved(4.0, 4.0 * ratio, 0.5))) == slow
+    assert sluggish(halved(4.0, 4.0 * ratio, 1.0)) == ""
+
+
+def test_observers_of_several_axes_are_judged_each_beside_its_own_wc():
+    assert sluggish(LADRC([4.0, 9.0], [20.0, 20.0], 1.0, observer_factor=0.5, order=1)) == ""
+    assert "decays at 0.7" in sluggish(LADRC([4.0, 12.5], [20.0, 20.0], 1.0, observer_factor=0.5))
+
+
+def test_a_tune_ends_at_the_bound_and_says_so():
+    brief = scenario(duration=1.0, axes=1, dt=case.DT, reference=Step(np.radians(4.0)))
+    members = case.ensemble().draw(4, jax.random.key(0))
+    found = tune(
+        halved(4.0, 40.0, 0.3), members, brief, objective=Objective(), progress=False, fresh=None,
+        free=["ladrc.observer_factor", "ladrc.wo"], method=LBFGS(evaluations=15),
+    )  # fmt: skip
+    assert not found.converged
+    assert sluggish(found.controller) == ""
+    assert any("observer alone" in remark for remark in found.remarks)
+
+
+def test_a_certificate_fails_on_an_observer_that_would_run_away_in_saturation():
+    by_hand = judged()
+    assert certificate({"tuned": by_hand}).holds
+    bad = runaway(halved(4.0, 428.0, 0.034))
+    found = certificate({"tuned": dataclasses.replace(by_hand, runaway=bad)})
+    assert not found.holds
+    assert "FAILS" in str(found).splitlines()[0] and "observer alone" in str(found).splitlines()[0]

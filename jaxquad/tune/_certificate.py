@@ -13,10 +13,11 @@ from ._row import Row, row_of
 class Certificate(eqx.Module):
     """What a design was shown to do, on members of an ensemble that its tuner never saw.
 
-    It `holds` if no member is linearly unstable (by the exact poles), none diverged in flight, and
-    every limit is met; the first line of `str()` says so, or what failed by how much and where.
-    None unstable of n members drawn at random proves a share: at most 1.2 % with 95 % confidence
-    for n = 256 (Clopper-Pearson), and no more than that. Numbers are SI; print is in degrees.
+    It `holds` if no member is linearly unstable (by the exact poles), none diverged in flight, no
+    observer is unstable by itself (it would run away in saturation), and every limit is met; the
+    first line of `str()` says so, or what failed by how much and where. None unstable of n members
+    drawn at random proves a share: at most 1.2 % with 95 % confidence for n = 256
+    (Clopper-Pearson), and no more than that. Numbers are SI; print is in degrees.
     The first of the `designs` is the one that is certified; the others are peers on the same
     members and noise. Numbers of the linear loop leave out members that are unstable, counted in
     `rows`. Of several axes each member counts by its worst one, but for the integrals in `rows`,
@@ -46,8 +47,9 @@ class Certificate(eqx.Module):
 
     @property
     def stable(self) -> bool:
-        """No member is linearly unstable, and none diverged."""
-        return self.design.unstable_count == 0 and not self.design.diverged.any()
+        """No member is linearly unstable, none diverged, and no observer is unstable by itself."""
+        design = self.design
+        return design.unstable_count == 0 and not design.diverged.any() and not design.runaway
 
     @property
     def holds(self) -> bool:

@@ -69,6 +69,8 @@ def _failures(certificate: Any) -> list[str]:
         found.append(_count(design.unstable, "linearly unstable", certificate))
     if design.diverged.any():
         found.append(_count(design.diverged, "diverged in flight", certificate))
+    if design.runaway:
+        found.append(design.runaway)
     missed = [distance for distance in certificate.distances if not distance.met]
     for distance in sorted(missed, key=lambda d: -np.inf if np.isnan(d.percent) else d.percent):
         where = "" if distance.member is None else member_text(certificate, distance.member)

@@ -122,4 +122,5 @@ def _remarks(found: Certificate, controller: Any, drawn: Members) -> list[str]:
     if counts:
         text = ", ".join(f"{count} of {n}" for n, count in counts.items())
         remarks.append(f"no Ms and no margins (n/a) over members that are unstable: {text}")
-    return remarks
+    runaways = [(n, x.runaway) for n, x in found.designs.items() if x.runaway and n != found.name]
+    return remarks + [f"of {n}, {why}" for n, why in runaways]

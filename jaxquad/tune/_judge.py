@@ -13,6 +13,7 @@ from jaxquad.simulate import evaluate, Metrics, Scenario
 from ._judged import Judged, LINEAR
 from ._loop_numbers import loop_numbers, LoopNumbers, worst_of
 from ._members import Members
+from ._observer_alone import runaway
 from ._parts import parts_of
 from ._wide import wide
 
@@ -59,7 +60,7 @@ def judge(
     if linear is not None:
         numbers |= {name: getattr(linear, name) for name in LINEAR}
     unstable = None if linear is None else ~np.all(linear.stable, axis=0)
-    return Judged(numbers, unstable, np.asarray(whole.diverged))
+    return Judged(numbers, unstable, np.asarray(whole.diverged), runaway(controller))
 
 
 def axes_of(plant: Any) -> DecoupledAxes:

@@ -22,6 +22,7 @@ class Judged(eqx.Module):
     by_axis: dict[str, Float[np.ndarray, "axes members"]]
     unstable: Bool[np.ndarray, " members"] | None  # by the exact poles; None without a linear form
     diverged: Bool[np.ndarray, " members"]
+    runaway: str = ""  # why an observer of the controller is unstable by itself, if one is
 
     @property
     def members(self) -> int:
