@@ -38,6 +38,9 @@ def figure(draw: Callable[[], Any], *, alt: str, caption: str = "", formulas: bo
 
 
 def _encoded(drawn: Any) -> tuple[str, bytes]:
+    if (layout := drawn.get_layout_engine()) is not None:
+        layout.execute(drawn)  # once: savefig would do it twice, which takes longest of all
+        drawn.set_layout_engine("none")
     svg = io.BytesIO()
     drawn.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
     if len(lines := _rounded(svg.getvalue())) <= _LARGEST:
