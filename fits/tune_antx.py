@@ -50,7 +50,7 @@ ASSUMED: dict[str, Any] = {
     "drive": jq.Saturation(LIMIT),
     "dt": DT,
 }
-FREE = ("ladrc.wc", "map.values")
+FREE, HALF = ("ladrc.wc", "map.values"), ("ladrc.feedback_factor",)
 PID_FREE = ("pid.kp", "pid.ki", "pid.proportional_weight", "map.values")
 LIMITS = (jq.Limit("sensitivity_peak", at_most=2.5), jq.Limit("overshoot", at_most=10.0))
 
@@ -83,7 +83,9 @@ def case_of(fit: jq.Fit, activity: float) -> Case:
     ladrc, pid = starts(ensemble.plant, SPAN, limit=LIMIT, dt=DT, wo=WO)
     objective = jq.Objective(penalties=penalties, events=EVENTS, load_start=EVENTS[1])
     others = equivalent(ensemble)
-    return Case(ensemble, flight(), objective, LIMITS, ladrc, pid, FREE, PID_FREE, others, 0.1)
+    return Case(
+        ensemble, flight(), objective, LIMITS, ladrc, pid, FREE, HALF, PID_FREE, others, 0.1
+    )
 
 
 def crossovers(found: Study, plant: Any, fit: jq.Fit) -> tuple[float, float]:

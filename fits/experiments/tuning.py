@@ -1,6 +1,7 @@
 """Tune a LADRC and a PID on one ensemble, certify them side by side, draw and export."""
 
 import argparse
+import dataclasses
 import functools as ft
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from jaxquad.report import certificate_figure, convergence_figure, front_figure,
 from jaxquad.tune import peers
 
 
-PID_NAME = "tuned PID"
+PID_NAME, FULL_NAME = "tuned PID", "full gains"
 
 
 class Size(NamedTuple):
@@ -22,10 +23,10 @@ class Size(NamedTuple):
     members: int = 64  # that are tuned on
     fresh: int = 256  # that judge
     points: int = 6  # of the front; 0 without one
-    pid: bool = True  # whether a PID is tuned, too
+    others: bool = True  # whether a PID and a LADRC with full gains are tuned, too
 
 
-QUICK = Size(members=16, points=0, pid=False)
+QUICK = Size(members=16, points=0, others=False)
 
 
 class Case(NamedTuple):
@@ -37,17 +38,19 @@ class Case(NamedTuple):
     limits: tuple[jq.Limit, ...]
     ladrc: jq.ScheduledLADRC
     pid: jq.ScheduledPID
-    free: Sequence[str]  # of the LADRC
+    free: Sequence[str]  # of the LADRC with full gains
+    half: Sequence[str]  # of its half-gain factors
     pid_free: Sequence[str]
     peers: Mapping[str, Any]  # that are not tuned
     reserve: float = 0.03  # by which limits are kept: more where laws have long tails
 
 
 class Study(NamedTuple):
-    """The tuned LADRC, whose certificate has all others as peers, and the tuned PID."""
+    """The tuned LADRC, whose certificate has all others as peers, and the others that are tuned."""
 
     ladrc: jq.Tuned
     pid: jq.Tuned | None
+    full: jq.Tuned | None
     peers: dict[str, Any]
 
     @property
@@ -84,15 +87,24 @@ def equivalent(ensemble: jq.Ensemble) -> dict[str, Any]:
 
 
 def study(case: Case, size: Size, key: jax.Array) -> Study:
-    """Tune the PID first, so that it stands in the LADRC's certificate."""
+    """Tune the others first, so that they stand in the LADRC's certificate."""
     tuned = ft.partial(
         jq.tune, ensemble=case.ensemble, scenario=case.flight, objective=case.objective,
         limits=case.limits, reserve=case.reserve, members=size.members, key=key,
     )  # fmt: skip
-    pid = tuned(case.pid, free=case.pid_free, fresh=None) if size.pid else None
-    others = dict(case.peers) | ({} if pid is None else {PID_NAME: pid.controller})
-    ladrc = tuned(case.ladrc, free=case.free, fresh=size.fresh, peers=others)
-    return Study(ladrc, pid, others)
+    pid = tuned(case.pid, free=case.pid_free, fresh=None) if size.others else None
+    full = tuned(case.ladrc, free=case.free, fresh=None) if size.others else None
+    named = {PID_NAME: pid, FULL_NAME: full}
+    others = {n: found.controller for n, found in named.items() if found} | dict(case.peers)
+    free = [*case.free, *case.half]
+    ladrc = tuned(halved(case.ladrc, case.half), free=free, fresh=size.fresh, peers=others)
+    return Study(ladrc, pid, full, others)
+
+
+def halved(start: jq.ScheduledLADRC, factors: Sequence[str]) -> jq.ScheduledLADRC:
+    """With those factors at 0.5."""
+    halves = {name.removeprefix("ladrc."): 0.5 for name in factors}
+    return dataclasses.replace(start, ladrc=dataclasses.replace(start.ladrc, **halves))
 
 
 def _beside(found: Study) -> str:
@@ -121,8 +133,8 @@ def front_of(
         return None
     return jq.pareto(
         found.ladrc.controller, case.ensemble, case.flight, over=over, points=size.points,
-        free=case.free, objective=case.objective, peers=found.peers, members=size.members,
-        fresh=size.fresh, key=key,
+        free=[*case.free, *case.half], objective=case.objective, peers=found.peers,
+        members=size.members, fresh=size.fresh, key=key,
     )  # fmt: skip
 
 
@@ -130,10 +142,10 @@ def write(
     out: Path, found: Study, front: jq.Pareto | None, *, name: str, extra: Mapping[str, Any]
 ) -> list[str]:
     """JSON, figures and the C header of the LADRC; the names of the files."""
-    tuned = {"LADRC": found.ladrc} | ({} if found.pid is None else {"PID": found.pid})
+    tuned = {"LADRC": found.ladrc, "PID": found.pid, "LADRC, full gains": found.full}
     content = {
         "verdict": found.verdict,
-        "tuned": {kind: _numbers(one) for kind, one in tuned.items()},
+        "tuned": {kind: _numbers(one) for kind, one in tuned.items() if one},
         **extra,
         "front": None if front is None else front.content(),
     }
@@ -186,6 +198,8 @@ def parser(description: str | None, out: str) -> argparse.ArgumentParser:
     made.add_argument("--seed", type=int, default=0, help="of the members, and of simulated noise")
     made.add_argument("--members", type=int, help="that are tuned on")
     made.add_argument("--fresh", type=int, help="that judge")
-    made.add_argument("--quick", action="store_true", help="few members, no PID and no front")
+    made.add_argument(
+        "--quick", action="store_true", help="few members, no other design tuned, no front"
+    )
     made.add_argument("--out", type=Path, default=Path(out))
     return made

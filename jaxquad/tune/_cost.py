@@ -10,12 +10,14 @@ from jaxtyping import Array, Bool, Float
 
 from ._limit import Limit
 from ._objective import Objective
+from ._observer_alone import barrier
 from ._parameters import Coordinates
 from ._penalty import soft
 from ._problem import Problem, split
 from ._quantities import OF_THE_LOOP, per_member
 
 
+RESERVE = 0.01  # of the barrier before observers that are slower than the feedback
 SMOOTHING = 1e-6  # 1/s, of the abscissa: its derivative is off by as much, relative to 1 1/s
 
 
@@ -72,7 +74,13 @@ def evaluate(
 
 
 def _told(z: Array, coordinates: Coordinates, problem: Problem, aim: Aim) -> Told:
-    total = lambda z: _cost(coordinates.controller_at(z), problem, aim)
+    def total(z):
+        controller = coordinates.controller_at(z)
+        value, others = _cost(controller, problem, aim)
+        if any("observer_factor" in name for name in coordinates.names):
+            value = value + RESERVE * barrier(controller)
+        return value, others
+
     (value, others), gradient = jax.value_and_grad(total, has_aux=True)(z)
     return Told(value, gradient, *others)
 

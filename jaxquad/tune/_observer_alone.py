@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxquad.control import LADRC
 from jaxquad.control._per_axis import times
@@ -47,6 +47,22 @@ def sluggish(controller: Any) -> str:
     return ""
 
 
+def barrier(controller: Any) -> Float[Array, ""]:
+    """What keeps a descent off the bound of `sluggish`: minus the logarithm of the room to it.
+
+    The room is by Jury's conditions on the polynomial of the observer's error, its roots scaled so
+    that those of wc come to 1, over the room without half gains. Beyond the bound it is NaN.
+    """
+    total = jnp.zeros(())
+    for ladrc in modules(controller):
+        if isinstance(ladrc, LADRC):
+            whole = dataclasses.replace(ladrc, observer_factor=jnp.ones(()))
+            pairs = zip(_room(ladrc), _room(whole), strict=True)
+            share = [jnp.minimum(times(x, 1 / full), 1.0) for x, full in pairs]
+            total = total - sum(jnp.mean(jnp.log(x)) for x in share)
+    return total
+
+
 def _observers(controller: Any) -> Iterator[LADRC]:
     """With other poles than wo's."""
     for part in modules(controller):
@@ -62,14 +78,31 @@ def modules(tree: Any) -> Iterator[eqx.Module]:
             yield from modules(getattr(tree, field.name))
 
 
+def _room(ladrc: LADRC) -> list[Float[Array, "..."]]:
+    """What is above 0 while no root of the error's polynomial is beyond exp(-wc dt)."""
+    error, closer = _error(ladrc), jnp.exp(ladrc.wc * ladrc.dt)
+    trace = times(jnp.trace(error, axis1=-2, axis2=-1), closer)
+    determinant = times(jnp.linalg.det(error), closer ** (ladrc.order + 1))
+    if ladrc.order == 1:
+        return [1 - trace + determinant, 1 - determinant]
+    square = times(jnp.trace(error @ error, axis1=-2, axis2=-1), closer**2)
+    minors = 0.5 * (trace**2 - square)
+    real = 1 - trace + minors - determinant
+    return [real, 1 - minors + determinant * (trace - determinant)]
+
+
 def _radius(ladrc: LADRC) -> Float[np.ndarray, "..."]:
-    """Of the observer's error from sample to sample, (I - l C) Ad."""
-    size = ladrc.order + 1
-    correction = np.asarray(ladrc.gains.correction)
-    undriven = ladrc.observer.predict(list(jnp.eye(size)), jnp.zeros(size), ladrc.dt)
-    predict = np.stack([np.asarray(row) for row in undriven])
-    left = np.eye(size) - np.moveaxis(correction, 0, -1)[..., None] * np.eye(size)[0]
-    return np.asarray(np.max(np.abs(np.linalg.eigvals(left @ predict)), axis=-1))
+    """Of the observer's error from sample to sample."""
+    error = np.asarray(_error(ladrc))
+    return np.asarray(np.max(np.abs(np.linalg.eigvals(error)), axis=-1))
+
+
+def _error(ladrc: LADRC) -> Float[Array, "... states states"]:
+    """(I - l C) Ad: what an error of the estimate is a sample later."""
+    correction = jnp.moveaxis(ladrc.gains.correction, 0, -1)[..., None]
+    unit = jnp.eye(ladrc.order + 1, dtype=correction.dtype)
+    undriven = ladrc.observer.predict(list(unit), jnp.zeros_like(unit[0]), ladrc.dt)
+    return (unit - correction * unit[0]) @ jnp.stack(undriven)
 
 
 def _place(ladrc: LADRC) -> str:

@@ -48,7 +48,7 @@ def remarks_of(
         remark = lag_remark(controller, problem.loops.delay, problem.loops.axes.lag)
         if remark is not None:
             yield remark
-    if solution.refusal:
+    if solution.refusal and not solution.converged[index]:
         yield f"steps were taken back where the controller refuses its gains: {solution.refusal}"
     if not solution.converged[index] and solution.able[index]:
         yield f"the descent has not converged: {solution.reasons[index]}"
