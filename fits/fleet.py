@@ -21,6 +21,7 @@ def main() -> None:
     parser.add_argument("--config", type=Path, default=HERE / "fleet.toml")
     parser.add_argument("--out", type=Path, default=HERE / "../results/fleet")
     parser.add_argument("--workers", type=int)
+    parser.add_argument("--timeout", type=float, help="s for one log, which then has failed")
     parser.add_argument("--scheduler")
     given = parser.parse_args()
     rows = run_batch(
@@ -29,6 +30,7 @@ def main() -> None:
         out=given.out,
         workers=given.workers,
         scheduler=given.scheduler,
+        timeout=given.timeout,
         listener=lambda row: print(f"{row['log']}: {row['status']}", file=sys.stderr),
     )
     for row in rows:

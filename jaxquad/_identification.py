@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._identification_bands import by_bands
 from ._identification_files import write_identification
 from ._identification_proposal import with_proposal
+from ._identification_record import described, records_of
 from .identify import (
     CoherenceWeighted,
     Combination,
@@ -22,7 +24,7 @@ from .identify import (
     verify,
 )
 from .models import LaggedIntegrator, TransferFunction
-from .records import read, Record
+from .records import Record
 from .report import comparison
 from .spectra import (
     Composite,
@@ -47,25 +49,30 @@ def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | N
     Returns the path of `result.json` and, where the parameters are not determined, why.
     """
     options = with_proposal(options)
-    record = _record(options)
+    records = records_of(options)
     methods = _methods(options)
     frfs, outcomes = {}, {}
     for method in methods:
-        frfs[method], outcomes[method] = _fit_twice(record, method, options)
-    frf, outcome = frfs[methods[0]], outcomes[methods[0]]
-    print(f"{record}\n\n{frf}\n\n{_formula(options)}, {methods[0]} estimate:\n{outcome}")
+        frfs[method], outcomes[method] = _fit_twice(records, method, options)
     ordered = options.poles is not None
+    late = {} if ordered or options.no_lag or options.no_delay else {"lag + delay": _late}
+    frf, outcome, table = frfs[methods[0]], outcomes[methods[0]], ""
+    if isinstance(outcome, Fit):
+        outcome, table = by_bands(outcome, frf, _COSTS[options.cost], late)
+    shown = f"{described(records)}\n\n{frf}"
+    print(f"{shown}\n\n{_formula(options)}, {methods[0]} estimate:\n{outcome}")
     if ordered and isinstance(outcome, Fit):
         print(factors(outcome))
-    late = {} if ordered or options.no_lag or options.no_delay else {"lag + delay": _late}
     if options.reference:
         print(f"\n{comparison(outcomes, late)}")
     elif late and isinstance(outcome, Fit):
         print(_sum(outcome))
+    if table:
+        print(f"\n{table}")
     check = _verified(outcome, frf, options)
     print(f"\n{check}" if check else "")
     path, others = write_identification(
-        options, record, frfs, outcome, check,
+        options, records, frfs, outcome, check,
         formula=_formula(options), derived=_derived(outcome, bool(late)),
     )  # fmt: skip
     print(f"{path}, {', '.join(others)}")
@@ -73,9 +80,9 @@ def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | N
 
 
 def identified(options: Namespace) -> tuple[Record, FrequencyResponse, Outcome]:
-    """Without a report: the record, the response that was fitted, and the fit."""
-    record = _record(options)
-    return record, *_fit_twice(record, _methods(options)[0], options)
+    """Without a report: the first record, the response that was fitted, and the fit."""
+    records = records_of(options)
+    return records[0], *_fit_twice(records, _methods(options)[0], options)
 
 
 def _methods(options: Namespace) -> tuple[str, ...]:
@@ -83,36 +90,21 @@ def _methods(options: Namespace) -> tuple[str, ...]:
     return ("joint", "direct") if options.reference else ("direct",)
 
 
-def _record(options: Namespace) -> Record:
-    asked = {*options.input, *options.output, *(options.reference or {})}
-    return read(
-        options.file,
-        inputs=options.input,
-        outputs=options.output,
-        references=options.reference,
-        sample_rate=options.rate,
-        start=options.start,
-        stop=options.stop,
-        time=options.time,
-        time_unit=options.time_unit,
-        units={name: unit for name, unit in options.unit if name in asked},
-    )
-
-
 def _fit_twice(
-    record: Record, method: str, options: Namespace
+    records: list[Record], method: str, options: Namespace
 ) -> tuple[FrequencyResponse, Outcome]:
     """The second response is estimated with the delay that the first fit found taken out."""
     band, delay = _band(options), 0.0
+    dt, duration = records[0].dt, max(record.duration for record in records)
     omega = np.geomspace(*band, _POINTS) if band else None
     while True:
-        frf = frequency_response(record, omega, estimator=_estimator(options, method, delay))
+        frf = frequency_response(records, omega, estimator=_estimator(options, method, delay))
         try:
             found = _fitted(frf, options)
         except NotIdentifiable as error:
             return frf, error
-        late = record.dt * round(float(_late(found.model)) / record.dt)
-        if delay or not 0 < late < _LATE * record.duration:
+        late = dt * round(float(_late(found.model)) / dt)
+        if delay or not 0 < late < _LATE * duration:
             return frf, found
         delay = late
 
@@ -200,9 +192,10 @@ def _verified(outcome: Outcome, frf: FrequencyResponse, options: Namespace) -> V
         "file": options.verify,
         "start": options.verify_start,
         "stop": options.verify_stop,
+        "segment": [],
         "reference": None,
     }
-    other = _record(Namespace(**(vars(options) | swapped)))
+    [other] = records_of(Namespace(**(vars(options) | swapped)))
     return verify(outcome.model, other, band=(float(frf.omega[0]), float(frf.omega[-1])))
 
 

@@ -27,7 +27,7 @@ _NO_OPTIONS = ("file", "run", "json")
 
 def write_identification(
     options: Namespace,
-    record: Record,
+    records: Sequence[Record],
     frfs: Mapping[str, FrequencyResponse],
     outcome: Fit | NotIdentifiable,
     check: Verification | None,
@@ -41,20 +41,23 @@ def write_identification(
     """
     folder = options.out or Path("results") / options.file.stem
     method, *rest = frfs
-    source = {"file": str(options.file), "start_s": float(record.time[0])}
-    source |= {"stop_s": float(record.time[-1]), "sample_rate_hz": record.sample_rate}
+    spans = [[float(record.time[0]), float(record.time[-1])] for record in records]
+    source = {"file": str(options.file), "start_s": min(start for start, _ in spans)}
+    source |= {"stop_s": max(stop for _, stop in spans), "segments_s": spans}
+    source |= {"sample_rate_hz": records[0].sample_rate}
     origin = _origin(options)
     extra = {"record": source, "provenance": origin.content()}
+    extra |= {"derived": [_row(each) for each in derived]}
     extra |= model_content(outcome) | setup_content(options, frfs[method])
     path = write_results(folder, fit=outcome, frf=frfs[method], check=check, extra=extra)
     others = {f"{name} estimate": frfs[name] for name in rest}
-    names = _draw(folder, options, record, frfs[method], outcome, check, others)
+    names = _draw(folder, options, records, frfs[method], outcome, check, others)
     write_report(
         folder / "report.html",
         fit=outcome,
         frf=frfs[method],
         others=others,
-        record=record,
+        record={_span(each): each for each in records},
         checks=None if check is None else {options.verify.name: check},
         derived=derived,
         provenance=origin,
@@ -66,7 +69,7 @@ def write_identification(
 def _draw(
     folder: Path,
     options: Namespace,
-    record: Record,
+    records: Sequence[Record],
     frf: FrequencyResponse,
     outcome: Fit | NotIdentifiable,
     check: Verification | None,
@@ -74,16 +77,29 @@ def _draw(
 ) -> list[str]:
     models = {"identified": outcome.model} if isinstance(outcome, Fit) else None
     figures = {
-        "record.png": record_figure(record),
+        **{_figure(k): record_figure(record) for k, record in enumerate(records, start=1)},
         "bode.png": bode(frf, models, others=others, title=options.file.name),
     }
     if check is not None:
         figures["verification.png"] = overlay(check, title=options.verify.name)
-    if check is None:
-        (folder / "verification.png").unlink(missing_ok=True)  # of an earlier run
+    for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
+        if earlier.name not in figures:
+            earlier.unlink(missing_ok=True)
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=130)
     return list(figures)
+
+
+def _row(each: Combination) -> dict[str, Any]:
+    return {"name": each.name, "value": each.value, "standard_error": each.standard_error}
+
+
+def _figure(k: int) -> str:
+    return "record.png" if k == 1 else f"record_{k}.png"
+
+
+def _span(record: Record) -> str:
+    return f"t = {record.time[0]:.6g} .. {record.time[-1]:.6g} s"
 
 
 def _origin(options: Namespace) -> Provenance:
@@ -110,6 +126,8 @@ def _words(name: str, value: Any) -> list[str]:
         return [flag, _mix(value)]
     if name == "unit":
         return [word for channel, unit in value for word in (flag, f"{channel}={unit}")]
+    if name == "segment":  # as one word, or a negative start would be taken for an option
+        return [f"{flag}={start!r}:{stop!r}" for start, stop in value]
     if isinstance(value, list | tuple):
         return [flag, *map(str, value)] if value else []
     return [flag, str(value)]

@@ -5,6 +5,7 @@ python tests/batch_work.py FOLDER OUT
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -30,6 +31,12 @@ def fail(job: Job) -> dict:
         raise ZeroDivisionError("a defect")
     if name.startswith("killed"):
         os.kill(os.getpid(), signal.SIGKILL)
+    if name.startswith("hangs"):
+        _note(job)
+        reader = subprocess.Popen(["sleep", "600"])
+        (Path(job.out) / "reader").write_text(str(reader.pid))
+        while True:
+            time.sleep(600)
     return measure(job)
 
 

@@ -104,6 +104,37 @@ def test_one_failing_log_is_a_row_and_stops_no_other(tmp_path):
     assert "3 failed" in page and "&lt;b&gt;no clock" in page and "<b>no clock" not in page
 
 
+def test_a_log_that_hangs_has_failed_and_stops_no_other(tmp_path):
+    names = ["a.csv", "b.csv", "c.csv", "hangs.csv", "killed.csv"]
+    folder, out = logs(tmp_path / "logs", names), tmp_path / "out"
+    run = lambda limit: run_batch(folder, Settings(timeout=limit), out=out, work=fail, workers=2)
+    run(12.0)  # s: a process starts within a few
+    found = rows_of(out)
+    assert [found[name]["status"] for name in names] == 3 * ["identified"] + 2 * ["failed"]
+    assert found["hangs.csv"]["error"] == "it took longer than 12 s: see --timeout"
+    assert "killed by signal 9" in found["killed.csv"]["error"]
+    # With all that it had started.
+    wait_for_the_end_of({int((out / "reader").read_text())})
+    before = len(started(out))
+    run(12.0)
+    assert len(started(out)) == before  # What hung is known to have hung.
+    run(13.0)
+    assert len(started(out)) == before + 1  # It had less time.
+
+
+@pytest.mark.parametrize("limit", [0, -1, float("inf"), float("nan")])
+def test_a_limit_that_is_none_is_refused(tmp_path, limit):
+    folder = logs(tmp_path / "logs", ["a.csv"])
+    with pytest.raises(ValueError, match="timeout is .*: give a number of s above 0"):
+        run_batch(folder, Settings(), out=tmp_path / "out", work=measure, timeout=limit)
+
+
+def test_a_limit_on_a_cluster_is_refused(tmp_path):
+    folder, limited = logs(tmp_path / "logs", ["a.csv"]), Settings(timeout=9)
+    with pytest.raises(ValueError, match="leave it out with a scheduler"):
+        run_batch(folder, limited, out=tmp_path / "out", work=measure, scheduler="tcp://none:1")
+
+
 def test_equal_logs_share_a_result_and_settings_make_it_another(tmp_path):
     folder, out = logs(tmp_path / "logs", ["a.csv"]), tmp_path / "out"
     (folder / "copy.csv").write_text("a.csv")
@@ -164,6 +195,21 @@ rate = 50
     assert settings.of("old/7.csv")["output"] == "gyro"
 
 
+def test_an_override_replaces_what_says_the_same_in_another_way():
+    settings = settings_of(
+        {
+            "start": 5, "stop": 9, "band": [1, 2],
+            "override": [
+                {"logs": "a*", "segments": [[1, 2], [3, 4]], "band_rad": [2, 9]},
+                {"logs": "ab", "stop": 7},
+            ],
+        }
+    )  # fmt: skip
+    assert settings.of("a") == {"segments": [[1, 2], [3, 4]], "band_rad": [2, 9]}
+    assert settings.of("ab") == {"stop": 7, "band_rad": [2, 9]}
+    assert settings.of("b") == {"start": 5, "stop": 9, "band": [1, 2]}
+
+
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
@@ -176,6 +222,10 @@ rate = 50
         ({"band": [3, 1]}, "rising from above 0"),
         ({"input": "roll=a b"}, "input: 'roll=a b': cannot read"),
         ({"logs": "/etc/*"}, "below the folder"),
+        ({"timeout": "long"}, "timeout = 'long' has to be a number of s above 0"),
+        ({"segments": [[3, 1]]}, r"one of segments = \[3, 1\] has to be"),
+        ({"segments": [5, 9]}, "one of segments = 5 has to be"),
+        ({"segments": [[1, 2]], "start": 0}, "leave start, stop out"),
         ({"band": [1, 2], "band_rad": [1, 2]}, "keep one"),
     ],
 )

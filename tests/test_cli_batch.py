@@ -43,6 +43,8 @@ def test_a_fleet_gives_a_table_a_summary_and_reports(fleet, tmp_path, capfd):
         table = {row["log"]: row for row in csv.DictReader(file)}
     sweep = table["sweep.npz"]
     assert abs(float(sweep["gain"]) - GAIN) < 3 * float(sweep["gain std.err."]) < 3
+    # lag + delay, and half a sample of a held input
+    assert float(sweep["lag + delay"]) == pytest.approx(0.035, rel=0.02)
     report = out / sweep["report"]
     assert "SHA-256" in report.read_text() and (report.parent / "bode.png").exists()
     assert sweep["report"] in (out / "summary.html").read_text()
@@ -57,11 +59,9 @@ def test_a_second_run_is_done_at_once_without_a_process(fleet, tmp_path, monkeyp
     out = tmp_path / "out"
     words = ["batch", str(fleet), "--config", str(fleet / "fleet.toml"), "--out", str(out)]
     content = {"status": "identified"}
-    monkeypatch.setattr(
-        _run, "performed", lambda jobs, work, n: ((j, put(j, content)) for j in jobs)
-    )
+    monkeypatch.setattr(_run, "performed", lambda jobs, *_: ((j, put(j, content)) for j in jobs))
     assert main(words) == 0
-    monkeypatch.setattr(_run, "performed", lambda jobs, work, n: ((j, pytest.fail()) for j in jobs))
+    monkeypatch.setattr(_run, "performed", lambda jobs, *_: ((j, pytest.fail()) for j in jobs))
     assert main(words) == 0
     assert "3 logs: 3 identified" in capsys.readouterr().out
 

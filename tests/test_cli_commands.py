@@ -114,21 +114,38 @@ def test_an_autopilots_log_needs_no_channels(tmp_path, capsys):
     assert "belong together" in capsys.readouterr().err
 
 
-def chirped(folder):
-    """ArduPilot's chirp into the mixer of a roll axis 100 / s under feedback of the rate."""
-    log, time = DataFlash(), 20.0 + np.arange(24 * 100) / 100
+def test_all_chirps_of_a_log_are_used_together(tmp_path, capsys):
+    path, out = chirped(tmp_path, starts=(22, 45)), tmp_path / "out"
+    assert main(["identify", str(path), "--out", str(out), "--no-lag"]) == 0
+    assert "2 times: 0.5 .. 6.5 Hz" in capsys.readouterr().out
+    assert np.allclose(result(out)["record"]["segments_s"], [(22, 42), (45, 65)], atol=0.02)
+    assert result(out)["fit"]["parameters"][0]["value"] == pytest.approx(100.0, rel=0.02)
+    # Of those, what lies where the user says to look.
+    assert main(["identify", str(path), "--out", str(out), "--no-lag", "--start", "43"]) == 0
+    assert np.allclose(result(out)["record"]["segments_s"], [(45, 65)], atol=0.02)
+
+
+def chirped(folder, starts=(22,)):
+    """ArduPilot's chirps of 20 s into the mixer of a roll axis 100 / s under feedback of the rate.
+
+    Between them the rate is disturbed, by what no channel shows.
+    """
+    log, time = DataFlash(), 20.0 + np.arange((starts[-1] + 2) * 100) / 100
     log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
     log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
     log.define("RATE", "Qfff", "TimeUS,RDes,R,ROut", units="skk-", mults="F---")
     log.write("PARM", 0, b"SID_AXIS", 10.0)
-    run = (time >= 22) & (time < 42)
-    chirp = 0.2 * np.sin(2 * np.pi * (0.5 * (time - 22) + 0.15 * (time - 22) ** 2)) * run
+    since = np.min([np.where(time < start, np.inf, time - start) for start in starts], axis=0)
+    run = since < 20
+    since = np.where(run, since, 0.0)
+    chirp = 0.2 * np.sin(2 * np.pi * (0.5 * since + 0.15 * since**2)) * run
+    idle = (time >= starts[0] + 20) & (time < starts[-1])
     rate = np.random.default_rng(0).normal(0, 0.02, time.size)
     output, moved = np.zeros(time.size), 0.0
     for k in range(time.size):
         rate[k] += moved
         output[k] = -0.02 * rate[k]
-        moved += chirp[k] + output[k]  # 100 / s for 10 ms
+        moved += chirp[k] + output[k] + idle[k] * np.sin(9 * time[k])  # 100 / s for 10 ms
     for k, t in enumerate(np.round(time * 1e6).astype(int).tolist()):
         if run[k]:
             if not run[k - 1]:

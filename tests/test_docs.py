@@ -14,7 +14,7 @@ from test_propose import ardupilot, px4
 
 
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-RUN = ("first_steps.md", "limits.md", "own_log.md")
+RUN = ("comparison.md", "first_steps.md", "how_to.md", "limits.md", "measured.md", "own_log.md")
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
 BLOCK = re.compile(r"(?:<!-- (.*?) -->\n)?```(\w*)\n(.*?)```", flags=re.S)
 MARK = "--- printed by the next block ---"

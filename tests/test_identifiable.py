@@ -207,3 +207,33 @@ def test_no_number_has_an_error_of_more_than_half_its_size(seed):
     sizes = np.maximum(np.abs(fit.values), np.abs(fit.units))[determined]
     assert np.all(fit.standard_errors[determined] <= 0.5 * sizes)
     assert set(np.array(fit.names)[~determined]) == set(fit.identifiability.undetermined)
+
+
+def narrow(noise, seed, **options):
+    """Lag and delay of 20 ms each, from a sweep that ends far below 1 / lag."""
+    truth = jq.LaggedIntegrator(gain=80.0, lag=0.02, delay=0.02)
+    sweep = jq.sweep(0.5, 6.0, duration=60.0, sample_rate=100.0, amplitude=1.0)
+    clean = np.asarray(jq.simulate_linear(truth.transfer_function(), sweep.signal, 0.01))
+    rate = clean + np.random.default_rng(seed).normal(0, noise, clean.size)
+    record = jq.Record(sweep.time, sweep.signal, rate, input_names="u", output_names="q")
+    frf = jq.frequency_response(record, estimator=jq.LocalPolynomial(integrators=1))
+    start = jq.LaggedIntegrator(gain=70.0, lag=0.02, delay=0.02)
+    return jq.fit(start, frf, cost=jq.MaximumLikelihood(), **options)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 4])
+def test_what_a_blurred_parameter_is_determined_with_is_named_whatever_direction_blurs_it(seed):
+    fit = narrow(2.0, seed)
+    assert "delay" in fit.identifiability.undetermined
+    (combination,) = fit.combinations
+    assert combination.name == "lag + delay"
+    assert abs(combination.value - 0.045) < 4 * combination.standard_error  # half a sample of hold
+    alone = set(fit.identifiability.undetermined) == {"lag", "delay"}
+    assert ("only lag + delay" in str(fit)) == alone and "lag + delay is determined" in str(fit)
+
+
+def test_a_combination_that_is_as_vague_as_its_parts_is_not_called_determined():
+    fit = narrow(60.0, 2)
+    assert fit.identifiability.undetermined
+    for found in fit.combinations:
+        assert found.standard_error <= 0.5 * abs(found.value)

@@ -1,6 +1,7 @@
 """The local polynomial method on a sweep of 90 s, with and without a resonance."""
 
 import numpy as np
+from scipy.signal import lfilter
 
 from jaxquad.excitation import sweep
 from jaxquad.records import Record
@@ -61,3 +62,37 @@ def test_without_noise_little_is_left_of_leakage():
     assert np.max(np.abs(ratio - 1)) < 1e-3
     _, ratio = ninety_seconds(0.55, 0, ratio=300.0, options=LocalPolynomial(order=4))
     assert np.max(np.abs(ratio - 1)) < 1e-4
+
+
+def test_beyond_the_end_of_a_sweep_nothing_is_taken_from_within_it():
+    """A window that reached back into the sweep would claim 3 % there, and be wrong altogether."""
+    slow = sweep(0.3, 5.0, duration=60.0, sample_rate=100.0, amplitude=1.0)
+    omega, excess = np.geomspace(0.6, 30.0, 60), []
+    held = np.exp(-0.005j * omega) * np.sinc(0.01 * omega / (2 * np.pi))
+    lag = np.exp(-0.01 / 0.3)
+    moved = lfilter([0.0, 1 - lag], [1.0, -lag], slow.signal)
+    for k in range(4):
+        noise = 0.03 * np.std(moved) * np.random.default_rng(k).standard_normal(moved.size)
+        record = Record(slow.time, slow.signal, moved + noise)
+        found = estimate_local_polynomial([record], omega, LocalPolynomial(), "direct")
+        response = np.asarray(found.response)[:, 0, 0]
+        error = np.abs(response - held / (0.3j * omega + 1)) ** 2
+        excess.append(error / variance(found))
+    beyond = np.sqrt(np.mean(excess, axis=0))[omega > 6.0]
+    assert np.sqrt(np.mean(beyond**2)) < 1.5 and beyond.max() < 3.0
+
+
+def test_a_mode_that_still_rings_when_the_record_ends_is_doubted_and_rest_cures_it():
+    slow = sweep(0.3, 5.0, duration=60.0, sample_rate=100.0, amplitude=1.0)
+    omega, found = np.geomspace(0.6, 5.5, 50), []
+    for rest in (0, 1500):
+        u = np.concatenate([slow.signal, np.zeros(rest)])
+        y = sampled(3.0, 0.05, 0.0, 0.0, u, 100.0)
+        y = y + 0.003 * np.std(y) * np.random.default_rng(0).standard_normal(y.size)
+        record = Record(0.01 * np.arange(u.size), u, y)
+        found.append(estimate_local_polynomial([record], omega, LocalPolynomial(), "direct"))
+    ringing, rested = found
+    assert any("doubtful" in remark for remark in ringing.remarks)
+    assert not rested.remarks
+    ratio = np.asarray(rested.response)[:, 0, 0] / second_order(3.0, 0.05, 0.0, 0.0, omega)
+    assert np.abs(ratio - 1).max() < 0.05

@@ -12,7 +12,9 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_prints_what_it_shows(path, capsys):
+def test_a_notebook_runs_and_prints_what_it_shows(path, capsys, request, monkeypatch):
+    if "JAXQUAD_DATA" in path.read_text():
+        monkeypatch.setenv("JAXQUAD_DATA", str(request.getfixturevalue("data")))
     matplotlib.use("Agg")
     space: dict = {}
     for cell in json.loads(path.read_text())["cells"]:

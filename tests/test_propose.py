@@ -14,7 +14,8 @@ IN_RUN = (TIME >= 22) & (TIME < 30)
 WAVE = np.sin(5 * TIME)
 
 
-def ardupilot(folder, place, *, sidd=True, gain="0"):
+def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),)):
+    """A log with chirps of 0.5 Hz up to so many, from and to so many seconds."""
     log = DataFlash()
     log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
     log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
@@ -25,9 +26,10 @@ def ardupilot(folder, place, *, sidd=True, gain="0"):
     log.write("PARM", 0, b"SID_AXIS", float(place))
     log.write("PARM", 0, b"ATC_RAT_PIT_I", float(gain))
     for k, t in enumerate(np.round(TIME * 1e6).astype(int).tolist()):
-        if sidd and IN_RUN[k]:
-            if not IN_RUN[k - 1]:
-                log.write("SIDS", t - 10, place, 0.2, 0.5, 8.0)
+        run = next((run for run in runs if run[0] <= TIME[k] < run[1]), None)
+        if sidd and run:
+            if TIME[k - 1] < run[0]:
+                log.write("SIDS", t - 10, place, 0.2, 0.5, run[2])
             log.write("SIDD", t, CHIRP[k], 1.0)
         w = float(WAVE[k])
         log.write("RATE", t + 30, w, 2 * w, 0.1 * w, w, 3 * w, 0.2 * w, w, w, w)
@@ -74,6 +76,20 @@ def test_an_integral_term_that_works_against_the_sweep_is_told(tmp_path):
     assert "ATC_RAT" not in str(propose(ardupilot(tmp_path, 11)))
 
 
+def test_all_chirps_into_one_place_are_segments_of_the_printed_line(tmp_path):
+    from jaxquad.cli import _parser
+
+    proposal = propose(ardupilot(tmp_path, 10, runs=((21, 24, 6.0), (25.5, 30, 8.0))))
+    assert "2 times: 0.5 .. 8 Hz, 2.997 + 4.497 s" in str(proposal)
+    assert np.allclose(proposal.segments, [(21, 24), (25.5, 30)], atol=0.01)
+    # One record is that of the longest.
+    assert proposal.options["start"] == pytest.approx(25.5)
+    line = str(proposal).splitlines()[-1].strip()
+    options = _parser().parse_args(shlex.split(line)[1:])
+    np.testing.assert_allclose(options.segment, proposal.segments)
+    assert options.start is None and options.stop is None
+
+
 def test_without_a_chirp_the_loops_set_point_is_no_reference(tmp_path):
     proposal = propose(ardupilot(tmp_path, 0, sidd=False), axis="pitch")
     assert proposal.options["references"] is None
@@ -117,6 +133,13 @@ def test_px4_autotune_is_found_with_its_axis_and_time(tmp_path, state, axis, i):
     assert setup.rate == f"vehicle_angular_velocity.xyz[{i}]"
     assert setup.reference == f"autotune_attitude_control_status.rate_sp[{i}]"
     assert (setup.start, setup.stop) == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
+
+
+def test_two_runs_of_autotune_are_two_segments(tmp_path):
+    twice = np.where((TIME > 24) & (TIME < 26), 0, 4)
+    proposal = propose(px4(tmp_path, state=twice))
+    assert np.allclose(proposal.segments, [(22, 24), (26, 30)], atol=0.01)
+    assert "--segment" in proposal.command_line and "--start" not in proposal.command_line
 
 
 def test_px4s_rate_set_point_is_of_the_outside_in_acro_alone(tmp_path):

@@ -4,8 +4,12 @@ from typing import Any
 from ._options import add_json, add_log, command, print_json, print_table
 
 
-EXAMPLES = """example:
+EXAMPLES = """examples:
   jaxquad channels flight.npz
+  jaxquad channels table.npy --time "data[0]"
+
+A channel whose time is not known has no rate: --time names it.
+exit codes: 0 done, 2 for what cannot be used
 """
 
 

@@ -7,6 +7,9 @@ from ._options import add_json, command, stdout_for_json
 
 EXAMPLES = """example:
   jaxquad demo
+
+The log is simulated, so that the answer can be held against the truth, which is printed.
+exit codes: 0 done, 2 for a folder that cannot be written
 """
 _NEXT = """
 The log is simulated: an axis under rate feedback, in gusts, excited by a sweep of the command.
@@ -20,7 +23,8 @@ Then at your own log:
 
 def add(commands: Any) -> None:
     declared = command(commands, "demo", run, "write a sample log, and identify it", EXAMPLES)
-    declared.add_argument("--out", type=Path, default=Path("results/demo"), metavar="FOLDER")
+    declared.add_argument("--out", type=Path, default=Path("results/demo"), metavar="FOLDER",
+        help="by default results/demo")  # fmt: skip
     add_json(declared, "result.json")
 
 

@@ -10,7 +10,7 @@ EXAMPLES = """examples:
   jaxquad design multisine --band 0.3 12 --rate 500 --amplitude 0.2 --lines 25 --json
 
 Without --duration, a sweep lasts five, a multisine ten of its longest periods.
-exit codes: 0, 2 for what cannot be designed, 4 where a guideline of the field is broken
+exit codes: 0 done, 2 for what cannot be designed, 4 where a guideline of the field is broken
 """
 BROKEN = 4
 

@@ -2,7 +2,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ._options import add_log, command, read_mix, read_unit, SECONDS, stdout_for_json
+from ._options import add_log, command, read_mix, read_segment, read_unit, SECONDS, stdout_for_json
 
 
 EXAMPLES = """examples:
@@ -10,10 +10,13 @@ EXAMPLES = """examples:
   jaxquad identify flight.npz --input M --output q --reference x0 --rate 250 --start 50 --stop 76
   jaxquad identify flight.csv --input "roll=-m1-m2+m3+0.5*m4" --output p --band 0.7 12 --no-lag
   jaxquad identify flight.csv --input elevator --output q --integrators 0 --poles 3 --zeros 1
+  jaxquad identify flight.csv --input p_cmd --output p --segment 22:30 --segment 41:49.5
+  jaxquad identify log15 --input "roll=-motor.m1^2-motor.m2^2+motor.m3^2+motor.m4^2" --output gyro.x
   jaxquad identify a.npz --input "cmd[0]" --output "rate[0]" --verify b.npz --json > fit.json
 
-Without --input and --output the log of a known autopilot says what they are.
-exit codes: 0, 2 for what cannot be used, 3 where the record does not determine the parameters
+Without --input and --output the log of a known autopilot says what they are; the line that this
+stands for is printed. Weights and powers of an input make a torque of motors with a thrust curve.
+exit codes: 0 done, 2 for what cannot be used, 3 where the record does not determine the parameters
 """
 TEXT = "fit K e^(-delay s) / (s^n (lag s + 1)) to a record"
 
@@ -46,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _add_channels(declared: argparse.ArgumentParser) -> None:
     add = declared.add_argument
-    add("--input", type=read_mix, help="a channel, or NAME=-a+b+0.5*c")
+    add("--input", type=read_mix, help="a channel, or NAME=-a+b+0.5*c, with powers: NAME=0.1*a^2")
     add("--output", type=read_mix, help="likewise")
     add("--reference", type=read_mix, help="an outside signal that no feedback computes")
     add("--axis", choices=("roll", "pitch", "yaw"), help="to propose input and output for")
@@ -55,6 +58,8 @@ def _add_channels(declared: argparse.ArgumentParser) -> None:
     add("--rate", type=float, metavar="HZ", help="to resample to; by default the file's own")
     add("--start", help="in the file's time", **SECONDS)
     add("--stop", help="in the file's time", **SECONDS)
+    add("--segment", type=read_segment, action="append", default=[], metavar="START:STOP",
+        help="instead of both of these; repeated, all segments are analysed together")  # fmt: skip
     band = declared.add_mutually_exclusive_group()
     for name, unit in (("--band", "Hz"), ("--band-rad", "rad/s")):
         text = f"{unit}, to fit within; by default what the record resolves"

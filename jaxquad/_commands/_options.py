@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -53,6 +54,18 @@ def read_unit(text: str) -> tuple[str, str]:
     if not (name and sign and unit):
         raise argparse.ArgumentTypeError(f"{text!r}: write NAME=UNIT, for instance q=rad/s")
     return name, unit
+
+
+def read_segment(text: str) -> tuple[float, float]:
+    """`22:30.5` as start and stop in s."""
+    start, _, stop = text.partition(":")
+    try:
+        span = float(start), float(stop)
+    except ValueError:
+        span = 0.0, 0.0
+    if not -math.inf < span[0] < span[1] < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: write START:STOP in s, for instance 22:30.5")
+    return span
 
 
 @contextlib.contextmanager

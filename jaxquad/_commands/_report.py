@@ -9,7 +9,7 @@ EXAMPLES = """example:
   jaxquad report results/flight
 
 The log is identified again as result.json says, and has to be the same file.
-exit codes: 0, 2 for what cannot be used, 3 where the record does not determine the parameters
+exit codes: 0 done, 2 for what cannot be used, 3 where the record does not determine the parameters
 """
 
 

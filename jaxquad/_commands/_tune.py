@@ -12,7 +12,7 @@ EXAMPLES = """examples:
 A scheduled LADRC for the angle of the axis, on all plants that the record leaves open, times the
 spread of inertia; flown over a step, a torque pulse and a step back. Writes the report, the
 certificate and a C header.
-exit codes: 0, 2 for what cannot be used, 3 where the record does not determine the plant,
+exit codes: 0 done, 2 for what cannot be used, 3 where the record does not determine the plant,
 4 where the certificate fails (the gains are written all the same)
 """
 FAILS = 4
@@ -37,8 +37,8 @@ def add(commands: Any) -> None:
     add("--dt", help="of the controller; the record's by default", **SECONDS)
     add("--members", type=int, default=64, help="to tune on; 64 by default")
     add("--fresh", type=int, default=256, help="to certify on; 256 by default")
-    add("--seed", type=int, default=0)
-    add("--name", default="attitude", help="of the functions in the C header")
+    add("--seed", type=int, default=0, help="of the draws; 0 by default")
+    add("--name", default="attitude", help="of the functions in the C header; attitude by default")
     add("--log", type=Path, metavar="FILE", help="where the log is by now")
     add("--out", type=Path, metavar="FOLDER", help="by default tuned/ in the result's folder")
     add_json(declared, "gains and certificate")

@@ -17,7 +17,7 @@ EXAMPLES = """example:
   jaxquad verify results/flight second_flight.npz --start 20 --stop 45 --out verification.png
 
 The channels, the rate and the band are those of the result, where nothing else is said.
-exit codes: 0, 2 for what cannot be used, 3 for a result that holds no model
+exit codes: 0 done, 2 for what cannot be used, 3 for a result that holds no model
 """
 
 
@@ -64,18 +64,18 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _record(options: argparse.Namespace, setup: dict[str, Any]):
-    from jaxquad import read
+    from jaxquad._mixed_record import read_segments
 
     given = lambda name: getattr(options, name) or setup[name]
-    return read(
+    [record] = read_segments(
         options.file,
+        [(options.start, options.stop)],
         inputs=given("input"),
         outputs=given("output"),
         sample_rate=given("rate"),
-        start=options.start,
-        stop=options.stop,
         time=given("time"),
         time_unit=given("time_unit"),
         units={name: unit for name, unit in setup["unit"] if name in
                {*given("input"), *given("output")}},
     )  # fmt: skip
+    return record

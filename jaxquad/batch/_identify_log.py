@@ -18,10 +18,10 @@ from ._store import Job, write_whole
 _ONE_AT_A_TIME = threading.Lock()  # stdout and matplotlib belong to the process, not to a thread
 _DEFAULTS: Mapping[str, Any] = {
     "time": None, "time_unit": None, "input": None, "output": None, "reference": None, "axis": None,
-    "unit": (), "rate": None, "start": None, "stop": None, "band": None, "band_rad": None,
-    "integrators": 1, "no_lag": False, "no_delay": False, "poles": None, "zeros": 0,
-    "estimator": "local", "window": None, "cost": "ml", "verify": None, "verify_start": None,
-    "verify_stop": None,
+    "unit": (), "rate": None, "start": None, "stop": None, "segment": (),
+    "band": None, "band_rad": None, "integrators": 1, "no_lag": False, "no_delay": False,
+    "poles": None, "zeros": 0, "estimator": "local", "window": None, "cost": "ml",
+    "verify": None, "verify_start": None, "verify_stop": None,
 }  # fmt: skip
 
 
@@ -48,7 +48,9 @@ def identify_log(job: Job) -> dict[str, Any]:
     return {
         "status": "identified" if failure is None else "not identifiable",
         "error": "" if failure is None else " ".join(str(failure).split()),
-        "parameters": [_parameter(row) for row in content["fit"].get("parameters", ())],
+        "parameters": [
+            _parameter(row) for row in [*content["fit"].get("parameters", ()), *content["derived"]]
+        ],
         "remarks": [*said, *content["fit"]["remarks"]],
         "report": (folder / "report.html").relative_to(job.out).as_posix(),
     }
@@ -60,8 +62,9 @@ def options_of(job: Job, folder: Path) -> Namespace:
     mixes = {name: parse_mix(given.pop(name)) for name in ("input", "output", "reference")
              if name in given}  # fmt: skip
     units = {"unit": [(name, str(unit)) for name, unit in given.pop("units", {}).items()]}
+    segments = {"segment": [tuple(each) for each in given.pop("segments", ())]}
     switches = {f"no_{name}": not given.pop(name) for name in ("lag", "delay") if name in given}
-    options = dict(_DEFAULTS) | given | mixes | units | switches
+    options = dict(_DEFAULTS) | given | mixes | units | segments | switches
     return Namespace(file=Path(job.log), out=folder, **options)
 
 

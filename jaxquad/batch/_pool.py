@@ -1,15 +1,18 @@
 """Local processes, one job at a time each; one that dies takes no other job with it."""
 
 import contextlib
+import math
 import multiprocessing
 import os
+import signal
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from ._perform import Content, failed, perform, Work
-from ._store import Job
+from ._store import Job, keep, kept
 
 
 _SPAWN = multiprocessing.get_context("spawn")  # JAX has threads, which do not survive a fork
@@ -26,17 +29,18 @@ class _Worker:
     def __init__(self, work: Work):
         self.connection, theirs = _SPAWN.Pipe()
         self.job: Job | None = None
+        self.due = math.inf  # by time.monotonic
         self.process = _SPAWN.Process(target=_serve, args=(work, theirs), daemon=True)
         with _environment(_NARROW):
             self.process.start()
         theirs.close()  # or the end of the process would not show on ours
 
-    def give(self, job: Job | None) -> bool:
-        """Hand out the next job, None for the end; whether there was one."""
+    def give(self, job: Job, timeout: float | int | None) -> None:
+        """Hand out the next job, to be done within so many s."""
         self.job = job
+        self.due = math.inf if timeout is None else time.monotonic() + timeout
         with contextlib.suppress(OSError):  # A process that died shows when its answer is due.
             self.connection.send(job)
-        return job is not None
 
     def answer(self) -> Content:
         """What became of the job; the death of the process is an answer."""
@@ -48,34 +52,69 @@ class _Worker:
             how = f"killed by signal {-code}" if code < 0 else f"ended with code {code}"
             return failed(f"its process was {how}: out of memory? It is tried again next time")
 
+    def overdue(self) -> bool:
+        return time.monotonic() >= self.due and not self.connection.poll()
+
+    def give_up(self, timeout: float | int) -> Content:
+        """Stop a job that takes too long; its failure is kept, or it would take as long again."""
+        assert self.job is not None
+        self.stop()
+        found = kept(self.job)  # It may have come to its end just now.
+        if found is None:
+            found = failed(f"it took longer than {timeout:g} s: see --timeout")
+            found |= {"seconds": float(timeout), "timeout": float(timeout)}
+            with contextlib.suppress(OSError):
+                keep(self.job, found)
+        return found
+
     def stop(self) -> None:
         self.connection.close()
         if self.process.is_alive():
-            self.process.kill()  # Nothing is lost: results appear whole or not at all.
+            _kill(self.process)  # Nothing is lost: results appear whole or not at all.
         self.process.join()
 
 
-def performed(jobs: Iterator[Job], work: Work, workers: int) -> Iterator[tuple[Job, Content]]:
-    """The jobs with their results, as these come in; `jobs` is read only as they are needed."""
+def performed(
+    jobs: Iterator[Job], work: Work, workers: int, timeout: float | int | None = None
+) -> Iterator[tuple[Job, Content]]:
+    """The jobs with their results, as these come in; `jobs` is read only as they are needed.
+
+    A job that takes longer than `timeout` s has failed, and its process is killed.
+    """
     busy: dict[Connection, _Worker] = {}
     try:
         for job in jobs:
-            _start(busy, _Worker(work), job)
+            _start(busy, _Worker(work), job, timeout)
             if len(busy) == workers:
                 break
         while busy:
-            for ready in wait(list(busy)):
-                worker = busy.pop(ready)  # pyright: ignore[reportArgumentType]
-                done, content = worker.job, worker.answer()
+            ready = wait(list(busy), _left(busy.values()))
+            late = [each for each, worker in busy.items() if worker.overdue()]
+            for each in [*ready, *late]:
+                worker = busy.pop(each)  # pyright: ignore[reportArgumentType]
+                done = worker.job
+                content = worker.give_up(timeout or 0) if each in late else worker.answer()
                 assert done is not None
-                _next(busy, worker, jobs, work)
+                _next(busy, worker, jobs, work, timeout)
                 yield done, content
     finally:
         for worker in busy.values():
             worker.stop()
 
 
-def _next(busy: dict[Any, _Worker], worker: _Worker, jobs: Iterator[Job], work: Work) -> None:
+def _left(workers: Iterable[_Worker]) -> float | None:
+    """Seconds until the first of them is late; None without a limit."""
+    due = min(worker.due for worker in workers)
+    return None if due == math.inf else max(0.0, due - time.monotonic())
+
+
+def _next(
+    busy: dict[Any, _Worker],
+    worker: _Worker,
+    jobs: Iterator[Job],
+    work: Work,
+    timeout: float | int | None,
+) -> None:
     job = next(jobs, None)
     if worker.process.exitcode is not None and job is not None:
         worker.stop()
@@ -83,15 +122,19 @@ def _next(busy: dict[Any, _Worker], worker: _Worker, jobs: Iterator[Job], work: 
     if job is None:
         worker.stop()
     else:
-        _start(busy, worker, job)
+        _start(busy, worker, job, timeout)
 
 
-def _start(busy: dict[Any, _Worker], worker: _Worker, job: Job) -> None:
-    worker.give(job)
+def _start(
+    busy: dict[Any, _Worker], worker: _Worker, job: Job, timeout: float | int | None
+) -> None:
+    worker.give(job, timeout)
     busy[worker.connection] = worker
 
 
 def _serve(work: Work, connection: Connection) -> None:
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)  # What it starts ends with it, see _kill.
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
     while True:
         try:
@@ -106,7 +149,17 @@ def _end_with_the_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     wait([parent.sentinel])
-    os._exit(1)
+    _kill(None)
+
+
+def _kill(process: Any) -> None:
+    """A process (None: this one) with the readers that it has started."""
+    if hasattr(os, "killpg"):
+        with contextlib.suppress(OSError):  # It has no group of its own yet.
+            os.killpg(process.pid if process else os.getpid(), signal.SIGKILL)
+    if process is None:
+        os._exit(1)
+    process.kill()
 
 
 @contextlib.contextmanager

@@ -1,3 +1,4 @@
+import math
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ def run_batch(
     workers: int | None = None,
     scheduler: str | None = None,
     again: bool = False,
+    timeout: float | int | None = None,
     listener: Listener | None = None,
 ) -> list[Row]:
     """Identify all logs of a fleet; returns a row for each, by the order of their names.
@@ -39,18 +41,23 @@ def run_batch(
     `workers` local processes share the work (by default one for each core), or the workers of the
     Dask cluster at `scheduler`, such as tcp://10.0.0.1:8786, which need the same paths. `work` maps
     a `Job` to what JSON can hold, "status" at least; it has to be importable where it runs.
-    `listener` gets each row as it comes in.
-    Raises ValueError where there is no log, another batch runs in `out`, or no scheduler.
+    `listener` gets each row as it comes in. A log that takes longer than `timeout` s (by default
+    that of the settings, else no limit) has failed; a longer limit tries it again.
+    Raises ValueError where there is no log, another batch runs in `out`, no scheduler, and for a
+    limit on a cluster, whose workers are not ours to kill.
     """
+    timeout = settings.timeout if timeout is None else timeout
+    _check(timeout, scheduler)
     count = _cores() if workers is None else workers
     if count < 1:
         raise ValueError(f"workers is {count}: give at least 1")
     out = Path(out).absolute()
     logs = planned(folder, settings, out=out)
     with locked(out):
-        fleet = _Fleet(Path(folder), settings, out, again, listener)
+        fleet = _Fleet(Path(folder), settings, out, again, timeout, listener)
         jobs = fleet.jobs(logs)
-        done = performed_on(scheduler, jobs, work) if scheduler else performed(jobs, work, count)
+        here = lambda: performed(jobs, work, count, timeout)
+        done = performed_on(scheduler, jobs, work) if scheduler else here()
         try:
             for job, content in done:
                 fleet.answered(job, content)
@@ -61,14 +68,22 @@ def run_batch(
     return rows
 
 
+def _check(timeout: float | int | None, scheduler: str | None) -> None:
+    if timeout is not None and not 0 < timeout < math.inf:
+        raise ValueError(f"timeout is {timeout}: give a number of s above 0")
+    if timeout is not None and scheduler:
+        raise ValueError("timeout is for processes of this machine: leave it out with a scheduler")
+
+
 class _Fleet:
     """Which logs wait for which result; logs of equal content and settings share one."""
 
     def __init__(
-        self, folder: Path, settings: Settings, out: Path, again: bool, listener: Listener | None
-    ):
+        self, folder: Path, settings: Settings, out: Path, again: bool,
+        timeout: float | int | None, listener: Listener | None,
+    ):  # fmt: skip
         self.folder, self.settings, self.out, self.again = folder, settings, out, again
-        self.listener = listener
+        self.timeout, self.listener = timeout, listener
         self.waiting: dict[str, list[Path]] = {}
         self.found: dict[str, Content] = {}
         self.known: dict[Path, Row] = {}
@@ -106,7 +121,11 @@ class _Fleet:
 
     def _kept(self, job: Job) -> Content | None:
         earlier = kept(job)
-        if self.again and earlier is not None and earlier.get("status") == "failed":
+        if earlier is None or earlier.get("status") != "failed":
+            return earlier
+        had = earlier.get("timeout")
+        longer = had is not None and (self.timeout is None or self.timeout > had)
+        if self.again or longer:
             forget(job)
             return None
         return earlier

@@ -2,6 +2,7 @@ import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ _NUMBER, _SWITCH, _COUNT, _TEXT = (int, float), (bool,), (int,), (str,)
 _KINDS: Mapping[str, tuple[type, ...]] = {
     "input": _TEXT, "output": _TEXT, "reference": _TEXT, "axis": _TEXT, "time": _TEXT,
     "time_unit": _TEXT, "units": (dict,), "rate": _NUMBER, "start": _NUMBER, "stop": _NUMBER,
+    "segments": (list,),
     "band": (list,), "band_rad": (list,), "integrators": _COUNT, "lag": _SWITCH, "delay": _SWITCH,
     "poles": _COUNT, "zeros": _COUNT, "estimator": _TEXT, "window": _NUMBER, "cost": _TEXT,
 }  # fmt: skip
@@ -21,6 +23,13 @@ _CHOICES: Mapping[str, Sequence[str]] = {
     "time_unit": ("s", "ms", "us", "ns"),
     "estimator": ("local", "composite", "welch"),
     "cost": ("ml", "coherence"),
+}
+_INSTEAD: Mapping[str, Sequence[str]] = {  # what a key stands for in place of
+    "segments": ("start", "stop"),
+    "start": ("segments",),
+    "stop": ("segments",),
+    "band": ("band_rad",),
+    "band_rad": ("band",),
 }
 _EVERY_LOG = ("**/*",)
 
@@ -31,12 +40,18 @@ class Settings(NamedTuple):
     logs: tuple[str, ...] = _EVERY_LOG  # globs below the folder; what starts with a dot is left out
     common: Mapping[str, Any] = {}
     overrides: tuple[tuple[tuple[str, ...], Mapping[str, Any]], ...] = ()  # globs, what they change
+    timeout: float | int | None = None  # s, of one log; what takes longer has failed
 
     def of(self, log: str) -> dict[str, Any]:
-        """Those of one log, by its path below the folder; of several overrides the last counts."""
+        """Those of one log, by its path below the folder; of several overrides the last counts.
+
+        What says the same in another way goes: `start` where an override has `segments`.
+        """
         found = dict(self.common)
         for globs, changes in self.overrides:
             if any(fnmatchcase(log, glob) for glob in globs):
+                for key in (each for given in changes for each in _INSTEAD.get(given, ())):
+                    found.pop(key, None)
                 found |= changes
         return found
 
@@ -57,7 +72,7 @@ def read_settings(path: str | Path) -> Settings:
 
 def settings_of(content: Mapping[str, Any], name: str = "settings") -> Settings:
     """As `read_settings`, of what a TOML file holds; `name` is for the errors."""
-    _check_keys(content, (*_KINDS, "logs", "override"), name)
+    _check_keys(content, (*_KINDS, "logs", "override", "timeout"), name)
     common = {key: value for key, value in content.items() if key in _KINDS}
     _check_values(common, name)
     overrides = content.get("override", [])
@@ -73,7 +88,15 @@ def settings_of(content: Mapping[str, Any], name: str = "settings") -> Settings:
         _check_values(table, where)
         changes.append((_globs(each["logs"], where), table))
     logs = _globs(content["logs"], name) if "logs" in content else _EVERY_LOG
-    return Settings(logs, common, tuple(changes))
+    timeout = content.get("timeout")
+    _check_timeout(timeout, name)
+    return Settings(logs, common, tuple(changes), timeout)
+
+
+def _check_timeout(value: Any, where: str) -> None:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if value is not None and not (number and 0 < value < inf):
+        raise ValueError(f"{where}: timeout = {value!r} has to be a number of s above 0")
 
 
 def _check_keys(content: Mapping[str, Any], known: Sequence[str], where: str) -> None:
@@ -95,7 +118,11 @@ def _check_values(table: Mapping[str, Any], where: str) -> None:
         if key in ("input", "output", "reference"):
             _check_mix(value, key, where)
         if key in ("band", "band_rad"):
-            _check_band(value, key, where)
+            _check_span(value, key, where, " from above 0")
+        if key == "segments":
+            _check_segments(value, where)
+    if "segments" in table and {"start", "stop"} & set(table):
+        raise ValueError(f"{where}: segments say where to start and stop: leave start, stop out")
     if "band" in table and "band_rad" in table:
         raise ValueError(f"{where}: band (Hz) and band_rad (rad/s) are both given: keep one")
 
@@ -107,10 +134,17 @@ def _check_mix(value: Any, key: str, where: str) -> None:
         raise ValueError(f"{where}: {key}: {error}") from error
 
 
-def _check_band(value: Any, key: str, where: str) -> None:
-    numbers = [isinstance(f, int | float) and not isinstance(f, bool) for f in value]
-    if numbers != [True, True] or not 0 < value[0] < value[1]:
-        raise ValueError(f"{where}: {key} = {value} has to be [low, high], rising from above 0")
+def _check_segments(spans: Any, where: str) -> None:
+    for each in spans:
+        _check_span(each, "one of segments", where)
+
+
+def _check_span(value: Any, key: str, where: str, above: str = "") -> None:
+    given = value if isinstance(value, list) else []
+    numbers = [isinstance(x, int | float) and not isinstance(x, bool) for x in given]
+    least = 0 if above else -inf
+    if numbers != [True, True] or not least < value[0] < value[1] < inf:
+        raise ValueError(f"{where}: {key} = {value!r} has to be [low, high], rising{above}")
 
 
 def _globs(value: Any, where: str) -> tuple[str, ...]:

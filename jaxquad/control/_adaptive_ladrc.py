@@ -16,6 +16,8 @@ from ._scheduled import gain_at
 
 
 class AdaptiveLADRCState(NamedTuple):
+    """What an adaptive LADRC remembers from the last sample."""
+
     ladrc: LADRCState
     estimator: PyTree
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._combination import Combination, combine, echelon, KINDS, Named
+from ._combination import Combination, combine, echelon, is_vague, KINDS, Named
 
 
 LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
@@ -66,13 +66,14 @@ def decide(information: Information) -> Identifiability:
     exact = singular <= _FLOOR * singular[0]
     null = right[exact | (singular * LIMIT < 1)]
     null = _sparse(null) if len(null) else null
+    lost = np.any(null, axis=0) | _blurred(information.covariance)
+    null = _explained(null, information.covariance)
     sure = _sparse(right[exact]) if np.any(exact) else null[:0]
     facts = information._replace(covariance=_opened(information.covariance, right[exact]))
     groups = [_explore(null, sure, block, facts) for block in _blocks(null)]
-    names, blurred = information.names, _blurred(information.covariance)
-    lost = np.flatnonzero(np.any(null, axis=0) | blurred)
+    names = information.names
     return Identifiability(
-        tuple(names[k] for k in lost),
+        tuple(names[k] for k in np.flatnonzero(lost)),
         tuple({names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null),
         tuple(combination for group in groups for combination in group.combinations),
         right[exact],
@@ -84,6 +85,18 @@ def decide(information: Information) -> Identifiability:
 def _blurred(covariance: np.ndarray) -> np.ndarray:
     """Parameters with a standard error beyond the limit, whatever direction it comes from."""
     return np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) > LIMIT
+
+
+def _explained(
+    null: Float[np.ndarray, "null parameters"], covariance: np.ndarray
+) -> Float[np.ndarray, "more parameters"]:
+    """With the direction that blurs each parameter that is blurred, but is in none of `null`."""
+    left = _blurred(covariance) & ~np.any(null, axis=0)
+    if not left.any():
+        return null
+    spread, directions = np.linalg.eigh(covariance)
+    most = {int(np.argmax(spread * directions[k] ** 2)) for k in np.flatnonzero(left)}
+    return _sparse(np.concatenate([null, directions.T[sorted(most)]]))
 
 
 def _sparse(null: Float[np.ndarray, "null parameters"]) -> Float[np.ndarray, "null parameters"]:
@@ -127,6 +140,7 @@ def _explore(
     rows = _outside(null[:, block])
     effects = facts.root[:, block] @ np.linalg.pinv(rows) if len(rows) else rows.T
     found = [_named(row, block, effects[:, k], facts, kinds) for k, row in enumerate(rows) if kinds]
+    found = [one for one in found if one is not None]
     return _Group(block, found, [values for _, values in kept], not kinds and len(rows) > 0)
 
 
@@ -152,7 +166,8 @@ def _named(
     effect: np.ndarray,
     facts: Information,
     kinds: tuple[str, ...],
-) -> Combination:
+) -> Combination | None:
+    """None if the record does not determine it any better than its parts."""
     weights = np.zeros(len(facts.values))
     weights[block] = row
     weights = _with_fixed(weights, effect, facts) if "product" in kinds else weights
@@ -162,7 +177,8 @@ def _named(
     relative[:count, :count] = facts.covariance
     names = tuple(facts.names[k] for k in used)
     named = Named(names, facts.values[used], facts.units[used], relative[np.ix_(used, used)])
-    return combine(weights[used], named, kinds)
+    vague = is_vague(weights[used], named, LIMIT)
+    return None if vague else combine(weights[used], named, kinds)
 
 
 def _with_fixed(

@@ -23,7 +23,9 @@ def _verdict(fit: Any) -> list[str]:
     lines = [f"NOT IDENTIFIABLE from this record, each by itself: {', '.join(lost)}"]
     if fit.combinations:
         known = " and ".join(combination.name for combination in fit.combinations)
-        lines.append(f"  only {known} is determined by this record")
+        apart = all(name in lost for row in fit.null_directions for name in row)
+        only = "only " if apart else ""  # else a parameter in it is determined by itself, too
+        lines.append(f"  {only}{known} is determined by this record")
     elif fit.identifiability.curved:
         curved = ", ".join(fit.identifiability.curved)
         lines.append(f"  what it determines of {curved} is neither a product nor a sum of them")

@@ -14,8 +14,21 @@ SLOW = 100  # Hz: a command or rate logged more slowly resolves no actuator
 Mix = Mapping[str, float]
 
 
+class Injection(NamedTuple):
+    """A signal that was injected: when, and from which to which frequency (0: unknown)."""
+
+    start: float  # s
+    stop: float
+    low: float = 0.0  # Hz
+    high: float = 0.0
+
+
 class Setup(NamedTuple):
-    """What a vehicle's log offers for one axis."""
+    """What a vehicle's log offers for one axis.
+
+    `start` and `stop` are those of the longest injection, `segments` those of all of the same
+    kind, in the order of time.
+    """
 
     axis: str
     command: Mix  # a weighted sum of channels
@@ -26,13 +39,15 @@ class Setup(NamedTuple):
     band: tuple[float, float] | None = None  # Hz
     excitation: str = "none is known to have been injected"
     remarks: tuple[str, ...] = ()
+    segments: tuple[tuple[float, float], ...] = ()  # s
 
 
 class Proposal(NamedTuple):
     """How to identify an axis from a log: a starting point to check, not a verdict.
 
-    `read(proposal.path, **proposal.options)` reads the record; `str` shows the reasons and the
-    line for the command line.
+    `read(proposal.path, **proposal.options)` reads the record; where several injections were
+    found, that of the longest, and each of `proposal.segments` with `start` and `stop` replaced
+    the others. `str` shows the reasons and the line for the command line.
     """
 
     path: str
@@ -55,14 +70,26 @@ class Proposal(NamedTuple):
         }
 
     @property
+    def segments(self) -> tuple[tuple[float, float], ...]:
+        """Start and stop of all injections of the kind, in s; empty where none is known."""
+        setup = self.setup
+        if setup.segments or setup.start is None or setup.stop is None:
+            return setup.segments
+        return ((setup.start, setup.stop),)
+
+    @property
     def command_line(self) -> str:
         """`jaxquad identify ...`, quoted for a shell."""
         setup = self.setup
         words = ["jaxquad", "identify", self.path, "--input", self._mix, "--output", setup.rate]
         words += ["--reference", setup.reference] if setup.reference else []
         words += ["--rate", f"{self.sample_rate:.6g}"]
-        words += ["--start", f"{setup.start:.12g}"] if setup.start is not None else []
-        words += ["--stop", f"{setup.stop:.12g}"] if setup.stop is not None else []
+        if len(self.segments) > 1:
+            spans = [f"{start:.12g}:{stop:.12g}" for start, stop in self.segments]
+            words += [word for span in spans for word in ("--segment", span)]
+        else:
+            words += ["--start", f"{setup.start:.12g}"] if setup.start is not None else []
+            words += ["--stop", f"{setup.stop:.12g}"] if setup.stop is not None else []
         words += ["--band", *(f"{f:.3g}" for f in setup.band)] if setup.band else []
         return shlex.join(words)
 
@@ -94,6 +121,23 @@ class Proposal(NamedTuple):
             f"  {self.command_line}",
         ]
         return "\n".join(lines)
+
+
+def injected(runs: Sequence[Injection], what: str) -> dict[str, Any]:
+    """The fields of a `Setup` that say when what was injected: all `runs` of one kind."""
+    best = max(runs, key=lambda run: run.stop - run.start)
+    known = [run for run in runs if 0 < run.low < run.high]
+    band = (min(r.low for r in known), max(r.high for r in known)) if known else None
+    lasted = " + ".join(f"{run.stop - run.start:.4g}" for run in runs)
+    times = f"{len(runs)} times: " if len(runs) > 1 else ""
+    swept = f"{band[0]:.4g} .. {band[1]:.4g} Hz, " if band else ""
+    return {
+        "start": best.start,
+        "stop": best.stop,
+        "band": band,
+        "excitation": f"{what}, {times}{swept}{lasted} s",
+        "segments": tuple((run.start, run.stop) for run in runs) if len(runs) > 1 else (),
+    }
 
 
 def finished(path: str, log: Log, setup: Setup) -> Proposal:

@@ -1,12 +1,22 @@
 """ArduPilot: RATE holds set-points, rates and outputs, SIDD and SIDS the injected chirp."""
 
+import functools as ft
 from typing import NamedTuple
 
 import numpy as np
 
 from ._errors import RecordError
 from ._log import flattened, Log, Signals, Table
-from ._proposal import AXES, busiest, channel_rate, first_logged, Setup, values_of
+from ._proposal import (
+    AXES,
+    busiest,
+    channel_rate,
+    first_logged,
+    injected,
+    Injection,
+    Setup,
+    values_of,
+)
 
 
 _LETTERS: dict[str, str] = dict(zip(AXES, "RPY", strict=True))
@@ -41,13 +51,14 @@ def ardupilot_setup(log: Log, axis: str | None) -> Setup:
     if not runs:
         return _bare(signals, axis or busiest(signals, rates), rates)
     best = max(runs, key=lambda run: run.stop - run.start)
+    alike = [run for run in runs if run.place == best.place]
     remarks = [
         f"another chirp into {_PLACES[run.place]} ({_axis(run)}), "
         f"t = {run.start:.6g} .. {run.stop:.6g} s"
         for run in runs
-        if run != best
+        if run not in alike
     ]
-    return _chirped(log, signals, best, remarks)
+    return _chirped(log, best, alike, remarks)
 
 
 def _axis(run: _Run) -> str:
@@ -91,7 +102,8 @@ def _number(value: object) -> float:
     return number if np.isfinite(number) else 0.0
 
 
-def _chirped(log: Log, signals: Signals, run: _Run, remarks: list[str]) -> Setup:
+def _chirped(log: Log, run: _Run, alike: list[_Run], remarks: list[str]) -> Setup:
+    """By all chirps into the place of `run`, of those with RATE messages."""
     axis = _axis(run)
     letter = _LETTERS[axis]
     command = {f"RATE.{letter}Out": 1.0}
@@ -105,29 +117,20 @@ def _chirped(log: Log, signals: Signals, run: _Run, remarks: list[str]) -> Setup
     rate = f"RATE.{letter}"
     remarks.append(f"{rate} is behind the gyro filter, whose lag is in the model")
     remarks += _gains(log, axis)
-    band = f", {run.low:.4g} .. {run.high:.4g} Hz" if 0 < run.low < run.high else ""
-    return Setup(
-        axis,
-        command,
-        rate,
-        "SIDD.Targ",
-        *_common(log, run),
-        (run.low, run.high) if band else None,
-        f"SystemID chirp into {_PLACES[run.place]} (SID_AXIS {run.place}){band}, "
-        f"{run.stop - run.start:.4g} s",
-        tuple(remarks),
-    )
+    found = [each for each in map(ft.partial(_common, log), alike) if each]
+    if not found:
+        raise RecordError(f"no RATE messages during the chirp at t = {run.start:.6g} s.")
+    what = f"SystemID chirp into {_PLACES[run.place]} (SID_AXIS {run.place})"
+    return Setup(axis, command, rate, "SIDD.Targ", remarks=tuple(remarks), **injected(found, what))
 
 
-def _common(log: Log, run: _Run) -> tuple[float, float]:
+def _common(log: Log, run: _Run) -> Injection | None:
     """Where RATE and SIDD overlap within the run."""
     clocks = [log.tables[name].time for name in ("RATE", "SIDD")]
     first = max(float(clock[0]) for clock in clocks if clock is not None)
     last = min(float(clock[-1]) for clock in clocks if clock is not None)
     start, stop = max(run.start, first), min(run.stop, last)
-    if not start < stop:
-        raise RecordError(f"no RATE messages during the chirp at t = {run.start:.6g} s.")
-    return start, stop
+    return Injection(start, stop, run.low, run.high) if start < stop else None
 
 
 def _gains(log: Log, axis: str) -> list[str]:

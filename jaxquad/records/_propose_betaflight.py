@@ -5,7 +5,7 @@ import numpy as np
 from ._betaflight_chirp import chirps
 from ._errors import RecordError
 from ._log import flattened, Log, Table
-from ._proposal import AXES, busiest, first_logged, Setup, values_of
+from ._proposal import AXES, busiest, first_logged, injected, Injection, Setup, values_of
 
 
 _SELF_LEVELLING = 0b110  # ANGLE and HORIZON in the flight mode flags
@@ -28,11 +28,16 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
     remarks = [f"{rates[axis]} is behind the gyro filters, whose delay is in the model"]
     remarks += _limited(log, prefix, axis, values_of(signals, command))
     if best is not None:
+        others = [each for each in sweeps if each.axis != best.axis]
+        remarks += [
+            f"another chirp on the set-point of {AXES[each.axis]}, "
+            f"t = {each.start:.6g} .. {each.stop:.6g} s"
+            for each in others
+        ]
+        alike = [Injection(*each[1:]) for each in sweeps if each.axis == best.axis]
         return Setup(
-            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", best.start, best.stop,
-            (best.low, best.high),
-            f"chirp on the rate set-point, {best.low:.4g} .. {best.high:.4g} Hz, "
-            f"{best.stop - best.start:.4g} s", tuple(remarks),
+            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", remarks=tuple(remarks),
+            **injected(alike, "chirp on the rate set-point"),
         )  # fmt: skip
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
     if setpoint and not _levelled(log, prefix):

@@ -34,7 +34,10 @@ def crazyflie_setup(log: Log, axis: str | None) -> Setup:
     if target:
         remarks.append(f"in manual flight the pilot's {target} is of the outside: --reference it")
     if len(command) > 1:
-        remarks.append("the motors' numbers are not linear in thrust")
+        remarks.append(
+            "the motors' numbers are not linear in thrust: where its curve is known, use powers "
+            "(--input 'NAME=0.1*a^2')"
+        )
     return Setup(axis, command, found[axis], remarks=tuple(remarks))
 
 

@@ -4,10 +4,11 @@ import numpy as np
 
 from ._errors import RecordError
 from ._log import flattened, Log, Signals
-from ._proposal import AXES, busiest, first_logged, moves, Setup
+from ._proposal import AXES, busiest, first_logged, injected, Injection, moves, Setup
 
 
 _STATES = {2: "roll", 4: "pitch", 6: "yaw"}  # of autotune
+_BREAK = 1.0  # s without it: another run
 _ACRO = 10  # of vehicle_status.nav_state
 _RATE_SETPOINT = "vehicle_rates_setpoint"
 _AUTOTUNE = "autotune_attitude_control_status"
@@ -26,7 +27,7 @@ def px4_setup(log: Log, axis: str | None) -> Setup:
         raise RecordError("no vehicle_angular_velocity in the log: choose a profile that logs it.")
     tuned = {each: span for each, span in _autotuned(log).items() if axis in (None, each)}
     if tuned:
-        axis = max(tuned, key=lambda each: tuned[each][1] - tuned[each][0])
+        axis = max(tuned, key=lambda each: max(run.stop - run.start for run in tuned[each]))
     axis = axis or busiest(signals, rates)
     i = AXES.index(axis)
     command = first_logged(
@@ -35,10 +36,9 @@ def px4_setup(log: Log, axis: str | None) -> Setup:
     if not command or not rates[axis]:
         raise RecordError(f"no torque set-point (vehicle_torque_setpoint) or rate for {axis}.")
     if axis in tuned:
-        start, stop = tuned[axis]
         return Setup(
-            axis, {command: 1.0}, rates[axis], f"{_AUTOTUNE}.rate_sp[{i}]", start, stop,
-            excitation=f"autotune's steps on the rate set-point, {stop - start:.4g} s",
+            axis, {command: 1.0}, rates[axis], f"{_AUTOTUNE}.rate_sp[{i}]",
+            **injected(tuned[axis], "autotune's steps on the rate set-point"),
         )  # fmt: skip
     return _untuned(log, signals, axis, command, rates[axis])
 
@@ -49,8 +49,8 @@ def _rate(signals: Signals, i: int) -> str:
     )
 
 
-def _autotuned(log: Log) -> dict[str, tuple[float, float]]:
-    """When autotune excited each axis, s."""
+def _autotuned(log: Log) -> dict[str, list[Injection]]:
+    """When autotune excited each axis; more than one run of it may be in a log."""
     table = log.tables.get(_AUTOTUNE)
     if table is None or table.time is None or not {"state", "rate_sp"} <= set(table.columns):
         return {}
@@ -59,8 +59,11 @@ def _autotuned(log: Log) -> dict[str, tuple[float, float]]:
     found = {}
     for state, axis in _STATES.items():
         rows = np.flatnonzero(table.columns["state"] == state)
-        if rows.size > 1:
-            found[axis] = float(table.time[rows[0]]), float(table.time[rows[-1]])
+        cuts = np.flatnonzero((np.diff(rows) > 1) & (np.diff(table.time[rows]) > _BREAK)) + 1
+        parts = [part for part in np.split(rows, cuts) if part.size > 1]
+        if parts:
+            ends = (table.time[part[[0, -1]]].tolist() for part in parts)
+            found[axis] = [Injection(start, stop) for start, stop in ends]
     return found
 
 

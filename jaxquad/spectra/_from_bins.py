@@ -14,6 +14,7 @@ from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
 from ._local_estimate import estimate_local_polynomial
 from ._local_polynomial import LocalPolynomial
+from ._one_blas_thread import one_blas_thread
 from ._periodic import Periodic
 from ._periodic_estimate import estimate_periodic
 
@@ -24,6 +25,7 @@ Method = Literal["direct", "joint"]
 Grid = Float[np.ndarray, " frequencies"]
 
 
+@one_blas_thread()
 def by_polynomial(
     records: Sequence[Record], omega: Grid | None, options: LocalPolynomial, method: Method
 ) -> FrequencyResponse:

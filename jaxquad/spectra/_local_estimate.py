@@ -14,12 +14,14 @@ from ._local_fit import local_fit, LocalFit, replaced
 from ._local_joint import coherence_of_references, joint_fit
 from ._local_noise import Noise, smooth_noise
 from ._local_polynomial import LocalPolynomial
+from ._local_reach import reach
 from ._local_width import choose_widths, Respond, Shape
 
 
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
 _NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are judged
 _SHARPER = 0.5  # of a residual's power, that noise alone seldom leaves of it
+_WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
 _PER_OCTAVE = 4  # frequencies that help to judge, beside those asked for
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -65,8 +67,10 @@ def estimate_local_polynomial(
     narrow = _determined(grid, narrow_width, respond)
     narrow = _least_residual(narrow, respond(grid, narrow_width, "rational"))
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
-    width, rational = _widths(grid, least, noise, respond, options)
-    width, rational = width[at], rational[at]
+    first = inputs + outputs if method == "joint" else 0
+    far = reach(grid, narrow_width, _widest(grid, least), bins, slice(first, first + inputs))
+    chosen = _widths(grid, least, far, noise, respond, options)
+    width, rational, doubted = (each[at] for each in chosen)
     fit = _merged(omega, width, rational, respond)
     direct, multiple = _direct_coherence(bins, inputs, outputs, order, grid, narrow_width)
     direct = direct[at]
@@ -84,7 +88,7 @@ def estimate_local_polynomial(
         error_covariance(omega, fit, noise, at, bins, back),
         width,
         rational,
-        _remarks(omega, np.all(known, axis=(1, 2)), least[at], options),
+        _remarks(omega, np.all(known, axis=(1, 2)), least[at], options) + _doubts(omega[doubted]),
     )
 
 
@@ -154,12 +158,17 @@ def _determined(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
     return fit
 
 
+def _widest(grid: Grid, least: Grid) -> Grid:
+    return np.maximum(_WIDEST * grid, _LEAST_SPAN * least)
+
+
 def _widths(
-    grid: Grid, least: Grid, noise: Noise, respond: Respond, options: LocalPolynomial
-) -> tuple[Grid, Bool[np.ndarray, " frequencies"]]:
+    grid: Grid, least: Grid, far: Grid, noise: Noise, respond: Respond, options: LocalPolynomial
+) -> tuple[Grid, Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
     if options.width is None:
-        return choose_widths(grid, least, noise, respond)
-    return np.full(grid.size, float(options.width)), np.zeros(grid.size, bool)
+        return choose_widths(grid, least, far, noise, respond)
+    no = np.zeros(grid.size, bool)
+    return np.full(grid.size, float(options.width)), no, no
 
 
 def _merged(
@@ -197,3 +206,13 @@ def _remarks(
     if options.width is not None:
         remark += f"; or the width is too small: {np.max(least[~known]):.4g} rad/s holds enough"
     return (remark,)
+
+
+def _doubts(omega: Grid) -> tuple[str, ...]:
+    if omega.size == 0:
+        return ()
+    return (
+        f"doubtful from {omega[0]:.4g} to {omega[-1]:.4g} rad/s and just above: the response, or "
+        "what still moves when the record ends, changes faster than the record resolves, and "
+        "errors are too small there: record longer, rest at the end, or sweep well beyond",
+    )

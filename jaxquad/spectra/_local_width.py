@@ -11,7 +11,6 @@ from ._local_noise import Noise
 
 
 _RATIO = 1.8  # of successive half-widths
-_WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
 _SMOOTHING = 0.2  # of the tests for bias, in ln(omega)
 _CHANCE = 3e-4  # of refusing a window whose differences, averaged over neighbours, are noise
 _CHANCE_ALONE = 1e-5  # of refusing it for the difference at one frequency
@@ -25,17 +24,19 @@ Respond = Callable[[Grid, Grid, Shape], LocalFit]
 
 
 def choose_widths(
-    omega: Grid, least: Grid, noise: Noise, respond: Respond
-) -> tuple[Grid, Bool[np.ndarray, " frequencies"]]:
-    """Half-widths from `least` upwards, by intersecting confidence intervals; where rational.
+    omega: Grid, least: Grid, reach: Grid, noise: Noise, respond: Respond
+) -> tuple[Grid, Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
+    """Half-widths from `least` to `reach`, by intersecting confidence intervals.
 
+    Beside them, where a rational function is taken, and where the response is doubted.
     A wider window is taken while its response agrees with those of all narrower ones within the
     variance of their difference (Goldenshluger and Nemirovski, 1997), at the frequency and on
     average over its neighbours. A bias of the size of the noise would hide from that: the window
     used is one rung lower, where it is some five times smaller. Where the least window leaves
-    more than noise, as at a resonance, a rational function takes the polynomial's place.
+    more than noise, as at a resonance, a rational function takes the polynomial's place; where that
+    is not well known either, the response is doubted.
     """
-    widest = np.maximum(_WIDEST * omega, _LEAST_SPAN * least)
+    widest = np.maximum(reach, least)
     rungs = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
     widths = np.stack([np.minimum(least * _RATIO**m, widest) for m in range(rungs)])
     fits = [respond(omega, widths[0], "polynomial")]
@@ -43,20 +44,20 @@ def choose_widths(
         wider = width > below
         part = respond(omega[wider], width[wider], "polynomial")
         fits.append(replaced(fits[-1], wider, part))
-    rational = _resonant(fits, respond(omega, least, "rational"), noise)
+    rational, doubted = _resonant(fits, respond(omega, least, "rational"), noise)
     rung, each = _climb(omega, widths, fits, noise), np.arange(omega.size)
     gain = np.stack([np.mean(fit.gain, axis=(1, 2)) for fit in fits])
     # At the lowest frequencies one rung less can cost more than any bias.
     below = gain[np.maximum(rung - 1, 0), each]
     dear = ~(below <= _DOUBTED * gain[rung, each])
     climbed = widths[rung, each] / np.where(dear, 1.0, _RATIO)
-    return np.where(rational, least, np.maximum(climbed, least)), rational
+    return np.where(rational, least, np.maximum(climbed, least)), rational, doubted
 
 
 def _resonant(
     fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise
-) -> Bool[np.ndarray, " frequencies"]:
-    """Where the least polynomial is certainly wrong, and a rational function well known.
+) -> tuple[Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
+    """Where the least polynomial is certainly wrong, and a rational function well known or not.
 
     The error of a rational function is linear in the noise only while it is small.
     """
@@ -68,8 +69,8 @@ def _resonant(
         alone = _quantile(np.full(len(left), float(pairs)), noise, _CHANCE_ALONE)
         wrong |= statistic > alone * np.maximum(count, 1)
     error = noise.power[:, :, None] * sharp.gain
-    known = error < _KNOWN**2 * np.abs(sharp.response) ** 2
-    return wrong & np.all(known, axis=(1, 2))
+    known = np.all(error < _KNOWN**2 * np.abs(sharp.response) ** 2, axis=(1, 2))
+    return wrong & known, wrong & ~known
 
 
 def _climb(
