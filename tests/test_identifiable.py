@@ -237,3 +237,11 @@ def test_a_combination_that_is_as_vague_as_its_parts_is_not_called_determined():
     assert fit.identifiability.undetermined
     for found in fit.combinations:
         assert found.standard_error <= 0.5 * abs(found.value)
+
+
+def test_what_ran_to_zero_is_at_its_bound_and_takes_nothing_else_with_it():
+    fit = narrow(4.0, 1)
+    ran = [remark for remark in fit.remarks if "ran to zero" in remark]
+    assert ran and not any("no minimum" in remark for remark in fit.remarks)
+    assert "gain" not in fit.identifiability.undetermined
+    assert [one.name for one in fit.combinations] == ["lag + delay"]

@@ -70,7 +70,7 @@ def test_beyond_the_end_of_a_sweep_nothing_is_taken_from_within_it():
     omega, excess = np.geomspace(0.6, 30.0, 60), []
     held = np.exp(-0.005j * omega) * np.sinc(0.01 * omega / (2 * np.pi))
     lag = np.exp(-0.01 / 0.3)
-    moved = lfilter([0.0, 1 - lag], [1.0, -lag], slow.signal)
+    moved = np.asarray(lfilter([0.0, 1 - lag], [1.0, -lag], slow.signal))
     for k in range(4):
         noise = 0.03 * np.std(moved) * np.random.default_rng(k).standard_normal(moved.size)
         record = Record(slow.time, slow.signal, moved + noise)
@@ -92,7 +92,7 @@ def test_a_mode_that_still_rings_when_the_record_ends_is_doubted_and_rest_cures_
         record = Record(0.01 * np.arange(u.size), u, y)
         found.append(estimate_local_polynomial([record], omega, LocalPolynomial(), "direct"))
     ringing, rested = found
-    assert any("doubtful" in remark for remark in ringing.remarks)
+    assert any("still rings" in remark for remark in ringing.remarks)
     assert not rested.remarks
     ratio = np.asarray(rested.response)[:, 0, 0] / second_order(3.0, 0.05, 0.0, 0.0, omega)
     assert np.abs(ratio - 1).max() < 0.05

@@ -1,4 +1,5 @@
 import shlex
+from typing import Any
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_without_a_chirp_the_loops_set_point_is_no_reference(tmp_path):
     assert "outside reference: none" in str(proposal) and "--reference" not in str(proposal)
 
 
-def px4(folder, *, state=0, nav_state=15):
+def px4(folder, *, state: Any = 0, nav_state=15):
     log = ULog()
     log.define("vehicle_angular_velocity:uint64_t timestamp;float[3] xyz;")
     log.define("vehicle_torque_setpoint:uint64_t timestamp;float[3] xyz;")

@@ -60,7 +60,7 @@ def assess(
     # A misfit beyond the noise is in no covariance of the noise: widen the errors to match it.
     inflation = misfit if misfit > MISFIT**2 else 1.0
     covariance = calibrated_covariance(bread, noise, inflation)
-    decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
+    decrement = _decrement(bread, gradient, ran_to_zero(problem, solution))
     verdict = by_data = Identifiability(parameters.names, (), (), np.eye(count), (), ())
     if decrement <= FAILED * max(cost, 1e-9):
         facts = _information(problem, solution, blocks, covariance, units, inflation)
@@ -99,6 +99,18 @@ def assess(
         relative_covariance=covariance,
         minima=minima,
     )
+
+
+def _decrement(
+    bread: Float[np.ndarray, "parameters parameters"],
+    gradient: Float[np.ndarray, " parameters"],
+    at_zero: Sequence[int],
+) -> float:
+    """What a Gauss-Newton step lowers the cost by; parameters at zero do not become negative."""
+    held = [k for k in at_zero if gradient[k] > 0]
+    free = np.setdiff1d(np.arange(gradient.size), held)
+    inverse = scaled_inverse(bread[np.ix_(free, free)])
+    return 0.5 * float(gradient[free] @ inverse @ gradient[free])
 
 
 def _units(problem: Problem, solution: Solution) -> Float[np.ndarray, " all"]:

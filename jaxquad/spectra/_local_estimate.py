@@ -212,7 +212,7 @@ def _doubts(omega: Grid) -> tuple[str, ...]:
     if omega.size == 0:
         return ()
     return (
-        f"doubtful from {omega[0]:.4g} to {omega[-1]:.4g} rad/s and just above: the response, or "
-        "what still moves when the record ends, changes faster than the record resolves, and "
-        "errors are too small there: record longer, rest at the end, or sweep well beyond",
+        f"between {omega[0]:.4g} and {omega[-1]:.4g} rad/s what is measured changes faster with "
+        "frequency than the record resolves, as lines in the noise do, or a mode that still rings "
+        "when it ends: errors may be too small there; record longer, or rest at the end",
     )

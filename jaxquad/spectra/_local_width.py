@@ -15,6 +15,7 @@ _SMOOTHING = 0.2  # of the tests for bias, in ln(omega)
 _CHANCE = 3e-4  # of refusing a window whose differences, averaged over neighbours, are noise
 _CHANCE_ALONE = 1e-5  # of refusing it for the difference at one frequency
 _DOUBTED = 4.0  # ratio of variances from which a narrower window's word counts for less
+_FAR_OFF = 10.0  # residual power over that of the noise from which a response is doubted
 _KNOWN = 0.1  # largest relative error of a rational function that is trusted
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -70,7 +71,7 @@ def _resonant(
         wrong |= statistic > alone * np.maximum(count, 1)
     error = noise.power[:, :, None] * sharp.gain
     known = np.all(error < _KNOWN**2 * np.abs(sharp.response) ** 2, axis=(1, 2))
-    return wrong & known, wrong & ~known
+    return wrong & known, ~known & np.any(left > _FAR_OFF, axis=1)
 
 
 def _climb(

@@ -48,7 +48,7 @@ def sluggish(controller: Any) -> str:
 
 
 def barrier(controller: Any) -> Float[Array, ""]:
-    """What keeps a descent off the bound of `sluggish`: minus the logarithm of the room to it.
+    """What keeps a descent off the bound of `sluggish`: -ln of the room to it, 0 far inside.
 
     The room is by Jury's conditions on the polynomial of the observer's error, its roots scaled so
     that those of wc come to 1, over the room without half gains. Beyond the bound it is NaN.
@@ -58,8 +58,8 @@ def barrier(controller: Any) -> Float[Array, ""]:
         if isinstance(ladrc, LADRC):
             whole = dataclasses.replace(ladrc, observer_factor=jnp.ones(()))
             pairs = zip(_room(ladrc), _room(whole), strict=True)
-            share = [jnp.minimum(times(x, 1 / full), 1.0) for x, full in pairs]
-            total = total - sum(jnp.mean(jnp.log(x)) for x in share)
+            share = [times(x, 1 / full) for x, full in pairs]
+            total = total + sum(jnp.mean(0.5 * jnp.log1p(x**2) - jnp.log(x)) for x in share)
     return total
 
 
@@ -99,10 +99,12 @@ def _radius(ladrc: LADRC) -> Float[np.ndarray, "..."]:
 
 def _error(ladrc: LADRC) -> Float[Array, "... states states"]:
     """(I - l C) Ad: what an error of the estimate is a sample later."""
-    correction = jnp.moveaxis(ladrc.gains.correction, 0, -1)[..., None]
+    correction = jnp.moveaxis(ladrc.gains.correction, 0, -1)
     unit = jnp.eye(ladrc.order + 1, dtype=correction.dtype)
-    undriven = ladrc.observer.predict(list(unit), jnp.zeros_like(unit[0]), ladrc.dt)
-    return (unit - correction * unit[0]) @ jnp.stack(undriven)
+    predict = jnp.stack(ladrc.observer.predict(list(unit), jnp.zeros_like(unit[0]), ladrc.dt))
+    shape = (*correction.shape, len(unit))
+    seen = correction[..., None] * jnp.broadcast_to(predict[0], shape)
+    return jnp.broadcast_to(predict, shape) - seen
 
 
 def _place(ladrc: LADRC) -> str:
