@@ -107,6 +107,6 @@ def require_below(name: str, value: Array, bound: float, dt: float) -> None:
     """Raises ValueError unless `value` times `dt` is below `bound`."""
     if is_concrete(value) and not np.all(np.asarray(value) * dt < bound):
         raise ValueError(
-            f"{name} is {value} rad/s, but at dt = {dt} s it must be below {bound / dt:.4g} rad/s: "
-            "lower it or sample faster."
+            f"{name} is {np.max(np.asarray(value)):.6g} rad/s, but at dt = {dt} s it must be below "
+            f"{bound / dt:.4g} rad/s: lower it or sample faster."
         )
