@@ -12,7 +12,7 @@ from jaxquad.control import LADRC
 from jaxquad.simulate import scenario, Step
 from jaxquad.tune import LBFGS, Objective, tune
 from jaxquad.tune._allowed import refusal
-from jaxquad.tune._observer_alone import runaway, sluggish
+from jaxquad.tune._observer_alone import barrier, runaway, sluggish
 from jaxquad.tune._parameters import coordinates
 
 
@@ -69,6 +69,16 @@ def test_an_observer_by_itself_must_not_be_slower_than_the_feedback(ratio, slow)
 def test_observers_of_several_axes_are_judged_each_beside_its_own_wc():
     assert sluggish(LADRC([4.0, 9.0], [20.0, 20.0], 1.0, observer_factor=0.5, order=1)) == ""
     assert "decays at 0.7" in sluggish(LADRC([4.0, 12.5], [20.0, 20.0], 1.0, observer_factor=0.5))
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_barrier_ends_where_an_observer_is_as_slow_as_the_feedback(order):
+    rng = np.random.default_rng(order)
+    wc, wo = rng.uniform(2.0, 30.0, 200), rng.uniform(5.0, 400.0, 200)
+    for gains in zip(wc, wo, np.exp(rng.uniform(-4.0, 0.0, 200)), strict=True):
+        ladrc = LADRC(*gains[:2], 1.0, order=order, observer_factor=gains[2])
+        room = barrier(ladrc)
+        assert bool(np.isfinite(room)) == (sluggish(ladrc) == "") and not room < 0
 
 
 def test_a_tune_ends_at_the_bound_and_says_so():

@@ -93,11 +93,12 @@ def _simpler(sums: np.ndarray, powers: np.ndarray) -> bool:
 def is_vague(weights: Float[np.ndarray, " parameters"], named: Named, limit: float) -> bool:
     """Whether the error of a combination is beyond `limit` times what it is made of.
 
-    That is its value, where all weights have one sign the sum of the parts: of 0.02 + 0.02 an error
-    of 0.01 is a quarter.
+    Where all parts have one sign that is their sum, else the largest: of 0.02 + 0.02 an error of
+    0.01 is a quarter. One that ran to zero adds nothing, whatever its unit.
     """
-    alike = np.all(weights >= 0) or np.all(weights <= 0)
-    size = np.sum(np.abs(weights)) if alike else np.max(np.abs(weights))
+    parts = weights * named.values / named.units
+    alike = np.all(parts >= 0) or np.all(parts <= 0)
+    size = np.sum(np.abs(parts)) if alike else np.max(np.abs(parts))
     return _spread(weights, named) > limit * float(size)
 
 

@@ -17,7 +17,7 @@ from ._problem import Problem, split
 from ._quantities import OF_THE_LOOP, per_member
 
 
-RESERVE = 0.01  # of the barrier before observers that are slower than the feedback
+_BARRIER = 0.01  # weight of the barrier before observers that are slower than the feedback
 SMOOTHING = 1e-6  # 1/s, of the abscissa: its derivative is off by as much, relative to 1 1/s
 
 
@@ -78,7 +78,7 @@ def _told(z: Array, coordinates: Coordinates, problem: Problem, aim: Aim) -> Tol
         controller = coordinates.controller_at(z)
         value, others = _cost(controller, problem, aim)
         if any("observer_factor" in name for name in coordinates.names):
-            value = value + RESERVE * barrier(controller)
+            value = value + _BARRIER * barrier(controller)
         return value, others
 
     (value, others), gradient = jax.value_and_grad(total, has_aux=True)(z)

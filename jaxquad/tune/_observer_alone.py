@@ -51,13 +51,14 @@ def barrier(controller: Any) -> Float[Array, ""]:
     """What keeps a descent off the bound of `sluggish`: -ln of the room to it, 0 far inside.
 
     The room is by Jury's conditions on the polynomial of the observer's error, its roots scaled so
-    that those of wc come to 1, over the room without half gains. Beyond the bound it is NaN.
+    that those of wc come to 1, over the room of full gains to where they are unstable. Beyond the
+    bound it is NaN.
     """
     total = jnp.zeros(())
     for ladrc in modules(controller):
         if isinstance(ladrc, LADRC):
             whole = dataclasses.replace(ladrc, observer_factor=jnp.ones(()))
-            pairs = zip(_room(ladrc), _room(whole), strict=True)
+            pairs = zip(_room(ladrc, ladrc.wc), _room(whole, 0 * ladrc.wc), strict=True)
             share = [times(x, 1 / full) for x, full in pairs]
             total = total + sum(jnp.mean(0.5 * jnp.log1p(x**2) - jnp.log(x)) for x in share)
     return total
@@ -78,9 +79,9 @@ def modules(tree: Any) -> Iterator[eqx.Module]:
             yield from modules(getattr(tree, field.name))
 
 
-def _room(ladrc: LADRC) -> list[Float[Array, "..."]]:
-    """What is above 0 while no root of the error's polynomial is beyond exp(-wc dt)."""
-    error, closer = _error(ladrc), jnp.exp(ladrc.wc * ladrc.dt)
+def _room(ladrc: LADRC, decay: Float[Array, "..."]) -> list[Float[Array, "..."]]:
+    """What is above 0 while every root of the error's polynomial is within exp(-decay dt)."""
+    error, closer = _error(ladrc), jnp.exp(decay * ladrc.dt)
     trace = times(jnp.trace(error, axis1=-2, axis2=-1), closer)
     determinant = times(jnp.linalg.det(error), closer ** (ladrc.order + 1))
     if ladrc.order == 1:
