@@ -14,16 +14,20 @@ import jax
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.report import bode, overlay, write_results
+from jaxquad.plot import bode, overlay
+from jaxquad.report import write_results
 
 
 jax.config.update("jax_enable_x64", True)
 
 BAND = (2 * np.pi * 0.7, 2 * np.pi * 12.0)  # rad/s
 OMEGA = np.geomspace(*BAND, 80)
-SPECTRA = jq.LocalPolynomial(integrators=1, delay=0.024)
-ESTIMATORS = {"joint": jq.JointInputOutput(SPECTRA), "direct": SPECTRA}
-COSTS = {"maximum likelihood": jq.MaximumLikelihood(), "Eq. (14)": jq.CoherenceWeighted()}
+SPECTRA = jq.spectra.LocalPolynomial(integrators=1, delay=0.024)
+ESTIMATORS = {"joint": jq.spectra.JointInputOutput(SPECTRA), "direct": SPECTRA}
+COSTS = {
+    "maximum likelihood": jq.identify.MaximumLikelihood(),
+    "Eq. (14)": jq.identify.CoherenceWeighted(),
+}
 START = jq.LaggedIntegrator(gain=200.0, lag=0.02, delay=0.01)
 READ = ft.partial(
     jq.read,
@@ -42,11 +46,11 @@ def read_flights(folder: Path) -> tuple[jq.Record, jq.Record]:
     return prbs, sweep
 
 
-def late(fit: jq.Fit) -> jq.Combination:
+def late(fit: jq.identify.Fit) -> jq.identify.Combination:
     return fit.derived(lambda model: model.lag + model.delay, "T + tau")
 
 
-def row(name: str, fit: jq.Fit) -> str:
+def row(name: str, fit: jq.identify.Fit) -> str:
     """K, T, tau and T + tau with their standard errors, in ms where it is time."""
     cells = [f"{fit.values[0]:8.1f} +- {fit.standard_errors[0]:4.1f}"]
     pairs = [*zip(fit.values[1:], fit.standard_errors[1:], strict=True), late(fit)[1:]]

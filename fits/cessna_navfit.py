@@ -14,7 +14,8 @@ import numpy as np
 
 import jaxquad as jq
 from jaxquad.identify import factors, fit_transfer_function
-from jaxquad.report import bode, write_results
+from jaxquad.plot import bode
+from jaxquad.report import write_results
 
 
 jax.config.update("jax_enable_x64", True)
@@ -37,21 +38,24 @@ def read_sweep(path: Path) -> jq.Record:
     """Elevator and pitch rate on a uniform grid."""
     table = np.load(path)
     time, elevator, rate = table[:, 0], table[:, 1], np.radians(table[:, 4])
-    channels = [jq.Channel("elevator", time, elevator), jq.Channel("q", time, rate, "rad/s")]
-    grid, values = jq.resample(channels, RATE)
+    channels = [
+        jq.records.Channel("elevator", time, elevator),
+        jq.records.Channel("q", time, rate, "rad/s"),
+    ]
+    grid, values = jq.records.resample(channels, RATE)
     return jq.Record(
         grid, values[:, :1], values[:, 1:], input_names="elevator", output_names="q",
         output_units="rad/s", source=path.name,
     )  # fmt: skip
 
 
-def identify(record: jq.Record) -> tuple[jq.FrequencyResponse, jq.Fit]:
+def identify(record: jq.Record) -> tuple[jq.spectra.FrequencyResponse, jq.identify.Fit]:
     """The response by composite windows, and one zero over three poles without delay."""
-    frf = jq.frequency_response(record, OMEGA, estimator=jq.Composite())
+    frf = jq.frequency_response(record, OMEGA, estimator=jq.spectra.Composite())
     return frf, fit_transfer_function(frf, zeros=1, poles=3, delay=0.0)
 
 
-def compared(fit: jq.Fit) -> str:
+def compared(fit: jq.identify.Fit) -> str:
     """CIFER's factors beside ours with their standard errors."""
     found = factors(fit)
     (zero,), (one, other) = found.zeros, found.poles

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from jaxquad.batch import read_settings, run_batch
+from jaxquad.workflows import read_settings, run_batch
 
 
 HERE = Path(__file__).parent

@@ -13,35 +13,44 @@ import jax
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.report import bode, overlay, provenance, write_report, write_results
+from jaxquad.plot import bode, overlay
+from jaxquad.report import provenance, write_report, write_results
 
 
 jax.config.update("jax_enable_x64", True)
 
 DT = 0.002  # s
 ADDED = 0.0276  # kg m^2, known weights on the arms in the second run: half the rig's inertia
-SHEET = jq.QUANSER_HOVER
+SHEET = jq.models.QUANSER_HOVER
 TRUTH = SHEET.arm * SHEET.thrust_coefficient / SHEET.inertia[0]
 OMEGA = np.geomspace(0.35, 12.0, 60)  # rad/s
-SPECTRA = jq.LocalPolynomial(integrators=2, delay=0.02)
-ESTIMATORS = {"joint": jq.JointInputOutput(SPECTRA), "direct": SPECTRA}
-COSTS = {"maximum likelihood": jq.MaximumLikelihood(), "Eq. (14)": jq.CoherenceWeighted()}
+SPECTRA = jq.spectra.LocalPolynomial(integrators=2, delay=0.02)
+ESTIMATORS = {"joint": jq.spectra.JointInputOutput(SPECTRA), "direct": SPECTRA}
+COSTS = {
+    "maximum likelihood": jq.identify.MaximumLikelihood(),
+    "Eq. (14)": jq.identify.CoherenceWeighted(),
+}
 # A wrong first guess; the held input is half a sample late.
-START = jq.AttitudeAxis(L=SHEET.arm, K_t=0.2, J_x=0.1, lag=0.03, delay=DT / 2)
+START = jq.models.AttitudeAxis(L=SHEET.arm, K_t=0.2, J_x=0.1, lag=0.03, delay=DT / 2)
 SWEEP = jq.sweep(0.3, 12.0, duration=90.0, sample_rate=1 / DT, amplitude=3.0)
-PULSES = jq.three_two_one_one(width=0.5, sample_rate=1 / DT, amplitude=3.0)
+PULSES = jq.excitation.three_two_one_one(width=0.5, sample_rate=1 / DT, amplitude=3.0)
 
 
-def fly(signals: np.ndarray, added: np.ndarray, key: jax.Array) -> jq.Simulation:
+def fly(signals: np.ndarray, added: np.ndarray, key: jax.Array) -> jq.simulation.Simulation:
     """One run per column of `signals` (V), with its own added inertia and its own noise."""
     inertia = np.array(SHEET.inertia)[:, None] + np.outer([1.0, 0.0, 0.0], added)
     thrust, torque = SHEET.thrust_coefficient, SHEET.torque_coefficient
-    allocation = jq.Allocation(SHEET.arm, thrust, torque)
-    rig = jq.Multirotor(jq.Attitude(inertia), allocation, jq.MotorLag(0.02))
+    allocation = jq.models.Allocation(SHEET.arm, thrust, torque)
+    rig = jq.models.Multirotor(jq.models.Attitude(inertia), allocation, jq.models.MotorLag(0.02))
     gains = [TRUTH, TRUTH, torque / SHEET.inertia[2]]
-    pilot = jq.place_pd(gains, natural_frequency=3.0, damping=0.8, dt=DT)
-    scenario = jq.excite(signals, key=key, dt=DT, torque_noise=0.002, sensor_noise=np.radians(0.02))
-    drive, encoder = jq.MotorDrive(allocation), jq.Encoder(SHEET.encoder_counts)
+    pilot = jq.control.place_pd(gains, natural_frequency=3.0, damping=0.8, dt=DT)
+    scenario = jq.simulation.excite(
+        signals, key=key, dt=DT, torque_noise=0.002, sensor_noise=np.radians(0.02)
+    )
+    drive, encoder = (
+        jq.simulation.MotorDrive(allocation),
+        jq.simulation.Encoder(SHEET.encoder_counts),
+    )
     return jq.simulate(rig, pilot, scenario, dt=DT, drive=drive, encoder=encoder)
 
 
@@ -52,14 +61,18 @@ def experiments(seed: int) -> list[jq.Record]:
     signals = np.stack([SWEEP.signal, SWEEP.signal, pulses], axis=1)
     flights = fly(signals, np.array([0.0, ADDED, 0.0]), jax.random.key(seed))
     records = [flights.record("roll", member=k) for k in range(3)]
-    return [*records[:2], jq.trim(records[2], 0.0, PULSES.time[-1])]
+    return [*records[:2], jq.records.trim(records[2], 0.0, PULSES.time[-1])]
 
 
-def identify(frf: jq.FrequencyResponse, cost=COSTS["maximum likelihood"]) -> jq.Fit:
+def identify(
+    frf: jq.spectra.FrequencyResponse, cost=COSTS["maximum likelihood"]
+) -> jq.identify.Fit:
     return jq.fit(START, frf, free=("J_x", "K_t", "lag"), cost=cost)
 
 
-def identify_both(frf: jq.FrequencyResponse, loaded: jq.FrequencyResponse) -> jq.Fit:
+def identify_both(
+    frf: jq.spectra.FrequencyResponse, loaded: jq.spectra.FrequencyResponse
+) -> jq.identify.Fit:
     """Two runs, the second under a known change of inertia: that tells J_x from K_t."""
     return jq.fit(
         START,
@@ -70,7 +83,7 @@ def identify_both(frf: jq.FrequencyResponse, loaded: jq.FrequencyResponse) -> jq
     )
 
 
-def gain_of(fit: jq.Fit) -> jq.Combination:
+def gain_of(fit: jq.identify.Fit) -> jq.identify.Combination:
     return fit.derived(lambda axis: axis.gain, "L K_t / J_x")
 
 
@@ -113,7 +126,7 @@ def coverage_table(draws: int) -> tuple[str, dict]:
     return "\n".join(lines), summary
 
 
-def compare(frfs: dict[str, jq.FrequencyResponse]) -> str:
+def compare(frfs: dict[str, jq.spectra.FrequencyResponse]) -> str:
     """L K_t / J_x by every estimator and cost, beside the truth."""
     lines = [f"L K_t / J_x by estimator and cost; the simulated truth is {TRUTH:.5f} rad/s^2/V"]
     for name, frf in frfs.items():
@@ -135,7 +148,7 @@ def options() -> argparse.Namespace:
 
 def main(out: Path, seed: int, draws: int) -> None:
     began = time.perf_counter()
-    print(jq.check_guidelines(SWEEP), "\n")
+    print(jq.excitation.check_guidelines(SWEEP), "\n")
     record, loaded, pulses = experiments(seed)
     frfs = {n: jq.frequency_response(record, OMEGA, estimator=e) for n, e in ESTIMATORS.items()}
     print(record, frfs["joint"], sep="\n")

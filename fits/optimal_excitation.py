@@ -21,7 +21,7 @@ from jaxtyping import Array, Complex, Float
 
 import jaxquad as jq
 from jaxquad import design as jd
-from jaxquad.models._parameters import as_float
+from jaxquad._core._arrays import as_float
 
 
 jax.config.update("jax_enable_x64", True)
@@ -97,17 +97,19 @@ def multisine_record(design: jd.Design, rng: np.random.Generator) -> jq.Record:
 
 
 def record_of(signal: np.ndarray, rng: np.random.Generator) -> jq.Record:
-    clean = jq.simulate_linear(PLANT.transfer_function(), signal, 1 / RATE, hold="first")
+    clean = jq.models.simulate_linear(PLANT.transfer_function(), signal, 1 / RATE, hold="first")
     noisy = np.asarray(clean) + NOISE * rng.standard_normal(signal.size)
     return jq.Record(np.arange(signal.size) / RATE, signal, noisy)
 
 
-def identify(record: jq.Record, omega: np.ndarray | None, estimator: Any) -> jq.Fit:
+def identify(record: jq.Record, omega: np.ndarray | None, estimator: Any) -> jq.identify.Fit:
     frf = jq.frequency_response(record, omega, estimator=estimator)
-    return jq.fit(GUESSES[1], frf, cost=jq.MaximumLikelihood(), min_coherence=0.05)
+    return jq.fit(GUESSES[1], frf, cost=jq.identify.MaximumLikelihood(), min_coherence=0.05)
 
 
-def fly(name: str, seconds: float, predicted: jd.Prediction, fits: Sequence[jq.Fit]) -> Flown:
+def fly(
+    name: str, seconds: float, predicted: jd.Prediction, fits: Sequence[jq.identify.Fit]
+) -> Flown:
     values = np.array([fit.values for fit in fits]) / TRUTH
     stated = np.array([fit.standard_errors for fit in fits]) / TRUTH
     stated = np.sqrt(np.mean(stated**2, axis=0))
@@ -201,12 +203,12 @@ def main() -> None:
     }
     rng = np.random.default_rng(1)
     fits = [
-        identify(record_of(SWEEP.signal, rng), OMEGA, jq.LocalPolynomial())
+        identify(record_of(SWEEP.signal, rng), OMEGA, jq.spectra.LocalPolynomial())
         for _ in range(options.draws)
     ]
     flights = [fly("sweep", float(SWEEP.time[-1]), predicted, fits)]
     for name, design in designs.items():
-        averaged = jq.Periodic(PERIOD, discard=0)
+        averaged = jq.spectra.Periodic(PERIOD, discard=0)
         fits = [
             identify(multisine_record(design, rng), None, averaged) for _ in range(options.draws)
         ]

@@ -43,11 +43,11 @@ EVENTS = (0.0, 1.5, 3.0, 4.5)  # s
 # An inertia of 1 makes torques accelerations in rad/s^2: the flight tells K = KT / J alone.
 ASSUMED: dict[str, Any] = {
     "believed": 1.0,
-    "inertia": jq.LogUniform(*SPAN),
-    "told": jq.Normal(0.1),
-    "torque_gain": jq.Normal(0.05),
+    "inertia": jq.ensembles.LogUniform(*SPAN),
+    "told": jq.ensembles.Normal(0.1),
+    "torque_gain": jq.ensembles.Normal(0.05),
     "noise": np.radians(0.01),  # theta of the flight has 0.007 deg of white noise above 20 Hz
-    "drive": jq.Saturation(LIMIT),
+    "drive": jq.simulation.Saturation(LIMIT),
     "dt": DT,
 }
 FREE, HALF = ("ladrc.wc", "map.values"), ("ladrc.feedback_factor",)
@@ -55,7 +55,7 @@ PID_FREE = ("pid.kp", "pid.ki", "pid.proportional_weight", "map.values")
 LIMITS = (jq.Limit("sensitivity_peak", at_most=2.5), jq.Limit("overshoot", at_most=10.0))
 
 
-def flight() -> jq.Scenario:
+def flight() -> jq.simulation.Scenario:
     """A step of 10 deg, a pulse of 10 rad/s^2, a step back by 15 deg, a sine of 5 rad/s^2."""
     return jq.scenario(
         duration=6.0,
@@ -63,7 +63,7 @@ def flight() -> jq.Scenario:
         axes=1,
         reference=jq.Step(np.radians(10.0)) + jq.Step(np.radians(-15.0), at=EVENTS[2]),
         disturbance=jq.Pulse(10.0, width=0.3, at=EVENTS[1])
-        + jq.Sine(5.0, period=1.0, at=EVENTS[3]),
+        + jq.simulation.Sine(5.0, period=1.0, at=EVENTS[3]),
     )
 
 
@@ -73,12 +73,12 @@ def own_activity(record: jq.Record) -> float:
     return float(np.sum(np.diff(moment) ** 2) / (moment.size * DT))
 
 
-def case_of(fit: jq.Fit, activity: float) -> Case:
+def case_of(fit: jq.identify.Fit, activity: float) -> Case:
     ensemble = jq.Ensemble.from_fit(fit, recorded_dt=DT, **ASSUMED)
     penalties = (
-        jq.Penalty("activity_rate", knee=activity, weight=2.0),
-        jq.Penalty("sensitivity_peak", knee=2.0, weight=3.0),
-        jq.Penalty("abscissa", knee=-0.5, weight=5.0),
+        jq.tuning.Penalty("activity_rate", knee=activity, weight=2.0),
+        jq.tuning.Penalty("sensitivity_peak", knee=2.0, weight=3.0),
+        jq.tuning.Penalty("abscissa", knee=-0.5, weight=5.0),
     )
     ladrc, pid = starts(ensemble.plant, SPAN, limit=LIMIT, dt=DT, wo=WO)
     objective = jq.Objective(penalties=penalties, events=EVENTS, load_start=EVENTS[1])
@@ -88,16 +88,21 @@ def case_of(fit: jq.Fit, activity: float) -> Case:
     )
 
 
-def crossovers(found: Study, plant: Any, fit: jq.Fit) -> tuple[float, float]:
+def crossovers(found: Study, plant: Any, fit: jq.identify.Fit) -> tuple[float, float]:
     """Of the tuned loop without errors, rad/s: |L| = 1, and the peak of |S|."""
     delay = max(float(fit.model.delay) - DT / 2, 0.0)
     controller = found.ladrc.controller.told(plant.inertia)
-    loop = jq.analyse_loop(plant, controller, delay=delay, dt=DT)
+    loop = jq.loops.analyse_loop(plant, controller, delay=delay, dt=DT)
     return float(loop.crossover), float(loop.sensitivity_frequency)
 
 
 def described(
-    fit: jq.Fit, check: jq.Verification, activity: float, case: Case, found: Study, front: Any
+    fit: jq.identify.Fit,
+    check: jq.identify.Verification,
+    activity: float,
+    case: Case,
+    found: Study,
+    front: Any,
 ) -> str:
     gain, error = fit.values[0], fit.standard_errors[0]
     later = late(fit)

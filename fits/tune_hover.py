@@ -28,7 +28,7 @@ from experiments.tuning import (
     write,
 )
 from hover_roll import DT, ESTIMATORS, fly, gain_of, identify, OMEGA, SHEET, SWEEP
-from jaxquad.tune import paper_designs
+from jaxquad.tuning import paper_designs
 
 
 jax.config.update("jax_enable_x64", True)
@@ -39,14 +39,14 @@ INERTIA = SHEET.inertia[0]  # kg m^2, believed: the sweep tells only its ratio t
 SHEET_ROLL = jq.DecoupledAxes([2 * SHEET.arm * SHEET.thrust_coefficient], [INERTIA])
 EVENTS = (0.0, 2.5, 4.5, 6.5)  # s
 ASSUMED: dict[str, Any] = {
-    "inertia": jq.LogUniform(*SPAN),
-    "told": jq.Normal(0.1),
+    "inertia": jq.ensembles.LogUniform(*SPAN),
+    "told": jq.ensembles.Normal(0.1),
     "delay": 0.004,  # s
     "damping": 0.0,
     "stiffness": 0.0,
     "coulomb": 0.002,  # N m
     "noise": np.radians(0.02),
-    "drive": jq.Saturation(LIMIT),
+    "drive": jq.simulation.Saturation(LIMIT),
     "dt": DT,
 }
 LIMITS = (jq.Limit("sensitivity_peak", at_most=3.6), jq.Limit("overshoot", at_most=10.0))
@@ -56,20 +56,20 @@ HALF = ("ladrc.feedback_factor", "ladrc.observer_factor")
 PID_FREE = ("pid.kp", "pid.ki", "pid.measurement_filter", "pid.proportional_weight", "map.values")
 
 
-def sweep(seed: int) -> jq.Fit:
+def sweep(seed: int) -> jq.identify.Fit:
     """Fly the sweep and fit it; its record alone does not tell J_x from K_t."""
     flown = fly(SWEEP.signal[:, None], np.zeros(1), jax.random.key(seed))
     record = flown.record("roll", member=0)
     return identify(jq.frequency_response(record, OMEGA, estimator=ESTIMATORS["joint"]))
 
 
-def roll(axis: jq.AttitudeAxis) -> tuple[jq.DecoupledAxes, jax.Array]:
+def roll(axis: jq.models.AttitudeAxis) -> tuple[jq.DecoupledAxes, jax.Array]:
     """The axis under +u and -u on two motors, which is twice the u of the sweep, V4 - V2."""
     plant = jq.DecoupledAxes([2 * INERTIA * axis.gain], [INERTIA], lag=axis.lag[None])
     return plant, axis.delay
 
 
-def identified(fit: jq.Fit) -> jq.Ensemble:
+def identified(fit: jq.identify.Fit) -> jq.Ensemble:
     """Gain and lag as the fit leaves them open, and the assumed rest."""
     return jq.Ensemble.from_fit(fit, plant=roll, recorded_dt=DT, **ASSUMED)
 
@@ -77,18 +77,22 @@ def identified(fit: jq.Fit) -> jq.Ensemble:
 def section_3() -> jq.Ensemble:
     """That of EQUATIONS.md, section 3: 5 % of torque and 10 to 40 ms of lag are open."""
     return jq.Ensemble(
-        SHEET_ROLL, torque_gain=jq.Normal(0.05), lag=jq.Uniform(0.01, 0.04), **ASSUMED
+        SHEET_ROLL,
+        torque_gain=jq.ensembles.Normal(0.05),
+        lag=jq.ensembles.Uniform(0.01, 0.04),
+        **ASSUMED,
     )
 
 
-def flight() -> jq.Scenario:
+def flight() -> jq.simulation.Scenario:
     """A step of 4 deg, a pulse of 0.2 N m, a step back by 3 deg, a sine of 0.1 N m."""
     return jq.scenario(
         duration=10.0,
         dt=DT,
         axes=1,
         reference=jq.Step(np.radians(4.0)) + jq.Step(np.radians(-3.0), at=EVENTS[2]),
-        disturbance=jq.Pulse(0.2, width=0.5, at=EVENTS[1]) + jq.Sine(0.1, period=2.0, at=EVENTS[3]),
+        disturbance=jq.Pulse(0.2, width=0.5, at=EVENTS[1])
+        + jq.simulation.Sine(0.1, period=2.0, at=EVENTS[3]),
     )
 
 
@@ -97,12 +101,12 @@ def case_of(ensemble: jq.Ensemble) -> Case:
     others = paper_designs(SHEET_ROLL, dt=DT) | equivalent(ensemble)
     standard = jq.Objective().penalties
     # Not as a limit alone: of few members, the worst that they keep is not that of fresh ones.
-    penalties = (*standard, jq.Penalty("overshoot", knee=5.0, weight=2.0))
+    penalties = (*standard, jq.tuning.Penalty("overshoot", knee=5.0, weight=2.0))
     objective = jq.Objective(penalties=penalties, events=EVENTS, load_start=EVENTS[1])
     return Case(ensemble, flight(), objective, LIMITS, ladrc, pid, FREE, HALF, PID_FREE, others)
 
 
-def shares(certificate: jq.Certificate) -> dict[str, float]:
+def shares(certificate: jq.tuning.Certificate) -> dict[str, float]:
     """Of members on which the paper's designs are unstable, %."""
     rows = certificate.rows
     return {
@@ -112,7 +116,9 @@ def shares(certificate: jq.Certificate) -> dict[str, float]:
     }
 
 
-def described(fit: jq.Fit, known: Study, assumed: Study, front: jq.Pareto | None) -> str:
+def described(
+    fit: jq.identify.Fit, known: Study, assumed: Study, front: jq.tuning.Pareto | None
+) -> str:
     gain, (lag, error) = gain_of(fit), lag_of(fit)
     found = " and ".join(f"{name}: {x:.0f} %" for name, x in shares(assumed.certificate).items())
     return f"""\
@@ -135,7 +141,7 @@ Unstable with the paper's gains, {found} (printed there: 75 % and 38 %).
 {assumed}"""
 
 
-def lag_of(fit: jq.Fit) -> tuple[float, float]:
+def lag_of(fit: jq.identify.Fit) -> tuple[float, float]:
     """And its standard error, s."""
     place = fit.names.index("lag")
     return float(fit.values[place]), float(fit.standard_errors[place])

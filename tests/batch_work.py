@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from jaxquad.batch import Job, run_batch, Settings
+from jaxquad.workflows import Job, run_batch, Settings
 
 
 def measure(job: Job) -> dict:

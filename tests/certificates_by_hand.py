@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad.tune import Certificate, Distance, Judged, Pareto
+from jaxquad.tuning import Certificate, Distance, Judged, Pareto
 
 
 MEMBERS = 12

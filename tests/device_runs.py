@@ -11,22 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxquad._xla._devices import devices_for, where_put
 from jaxquad.control import LADRC, PD
 from jaxquad.models import DecoupledAxes
-from jaxquad.simulate import (
-    evaluate,
-    Pulse,
-    Saturation,
-    scenario,
-    simulate,
-    Step,
-    WhiteNoise,
-)
-from jaxquad.simulate._devices import devices_for, where_put
-from jaxquad.simulate._evaluate import _run
-from jaxquad.simulate._over_devices import over_devices
-from jaxquad.simulate._settings import loop_settings
-from jaxquad.simulate._window import Window
+from jaxquad.simulation import evaluate, Pulse, Saturation, scenario, simulate, Step, WhiteNoise
+from jaxquad.simulation._delay import loop_settings
+from jaxquad.simulation._evaluate import _run
+from jaxquad.simulation._meter import Window
+from jaxquad.simulation._over_devices import over_devices
 
 
 MEMBERS, SAMPLES = 67, 120  # no multiple of two

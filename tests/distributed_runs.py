@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxquad.control import PD
 from jaxquad.models import DecoupledAxes
-from jaxquad.simulate import evaluate, scenario, Step, WhiteNoise
+from jaxquad.simulation import evaluate, scenario, Step, WhiteNoise
 
 
 MEMBERS, GAINS = 7, (40.0, 8.0)  # no multiple of two

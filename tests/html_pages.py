@@ -8,7 +8,7 @@ import numpy as np
 from certificates_by_hand import certificate, judged, missed
 
 import jaxquad as jq
-from jaxquad.tune import Evaluation, Tuned
+from jaxquad.tuning import Evaluation, Tuned
 
 
 ERROR = 0.005
@@ -85,7 +85,7 @@ def is_image(kind, data):
 def record_of(names, units, source="flight.csv"):
     time = np.arange(4000) * 0.01
     u = np.sign(np.sin(3 * time))
-    y = np.asarray(jq.simulate_linear(TRUTH.transfer_function(), u, 0.01))
+    y = np.asarray(jq.models.simulate_linear(TRUTH.transfer_function(), u, 0.01))
     return jq.Record(
         time, u, y, u, input_names=names[0], output_names=names[1], reference_names=names[2],
         input_units=units[0], output_units=units[1], reference_units=units[2], source=source,

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxquad.simulate import run_ensemble
+from jaxquad.simulation import run_ensemble
 
 
 jax.config.update("jax_enable_x64", True)

@@ -11,7 +11,7 @@ OMEGA = np.geomspace(0.5, 20.0, 30)
 
 def response_of(
     model, *, error=0.02, correlation=0.0, seed=None, omega=OMEGA
-) -> jq.FrequencyResponse:
+) -> jq.spectra.FrequencyResponse:
     """The response of `model`, noisy if there is a `seed`; neighbours' errors are correlated."""
     exact = np.asarray(model.frequency_response(jnp.asarray(omega)))
     apart = np.abs(np.arange(omega.size)[:, None] - np.arange(omega.size)[None, :])
@@ -23,7 +23,7 @@ def response_of(
         root = np.linalg.cholesky(covariance) / np.sqrt(2)
         relative = (root @ (white @ np.array([1.0, 1.0j]))).reshape(exact.shape)
     shape = exact.shape
-    return jq.FrequencyResponse(
+    return jq.spectra.FrequencyResponse(
         omega=jnp.asarray(omega),
         response=jnp.asarray(exact * (1 + relative)),
         coherence=jnp.full(shape, 0.95),
@@ -37,13 +37,13 @@ def response_of(
     )
 
 
-def shared_errors(omega, exact, covariance) -> jq.ErrorCovariance:
+def shared_errors(omega, exact, covariance) -> jq.spectra.ErrorCovariance:
     """Relative errors of one covariance between frequencies, independent between pairs."""
     count, outputs, inputs = exact.shape
     if not np.any(covariance - np.diag(np.diag(covariance))):
         variance = np.diag(covariance)[:, None, None] * np.abs(exact) ** 2
-        return jq.independent_errors(jnp.asarray(omega), jnp.asarray(variance))
+        return jq.spectra.independent_errors(jnp.asarray(omega), jnp.asarray(variance))
     assert outputs == inputs == 1, "neighbours share errors in single responses only"
     effect = exact * np.linalg.cholesky(covariance)[:, None, :]
     noise = jnp.ones((count, 1, 1), complex)
-    return jq.ErrorCovariance(jnp.asarray(omega), jnp.asarray(effect), noise)
+    return jq.spectra.ErrorCovariance(jnp.asarray(omega), jnp.asarray(effect), noise)

@@ -17,9 +17,10 @@ from jaxquad.control import (
     ScheduledLADRC,
     ScheduledPID,
 )
+from jaxquad.ensembles import Ensemble, LogUniform, Normal, Uniform
 from jaxquad.models import DecoupledAxes
-from jaxquad.simulate import Pulse, Saturation, scenario, Sine, Step
-from jaxquad.tune import Ensemble, LogUniform, Normal, Objective, Uniform
+from jaxquad.simulation import Pulse, Saturation, scenario, Sine, Step
+from jaxquad.tuning import Objective
 
 
 KT, J0, LIMIT, DT = 0.0468, 0.0552, 10.0, 0.002  # N m/V, kg m^2, V, s

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad.report import histories
+from jaxquad.plot import histories
 
 from .data import Case, cases, members_of
 from .flights import believed, chunk_of, flown, key_of

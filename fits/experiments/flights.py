@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxquad.simulate import AuthorityWarning, simulate, Simulation
+from jaxquad.simulation import AuthorityWarning, simulate, Simulation
 
 from .data import Case, Members, members_of, Numbers
 from .designs import Belief, controller, Design

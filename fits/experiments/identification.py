@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxquad.identify import fit, MaximumLikelihood, NotIdentifiable
 from jaxquad.models import LaggedIntegrator
-from jaxquad.simulate import Simulation
+from jaxquad.simulation import Simulation
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial, Periodic
 
 from .data import Case, Members, Numbers

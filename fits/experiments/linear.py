@@ -40,7 +40,7 @@ class Late(NamedTuple):
 
 
 def analysed(axis: DecoupledAxes, law: Any, late: Late) -> LoopAnalysis:
-    """`jq.analyse_loop` of a law [1, members]."""
+    """`jq.loops.analyse_loop` of a law [1, members]."""
     laws = LinearLaws(_stack(law))
     return analyse_loop(axis, laws, delay=late.delay, longest_delay=late.longest)
 

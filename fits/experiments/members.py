@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxquad.simulate import Simulation
+from jaxquad.simulation import Simulation
 
 from .data import Case, Members, Numbers
 from .designs import Belief, controller, Design

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxquad.models import DecoupledAxes, Multirotor, quanser_hover
-from jaxquad.simulate import Encoder, MotorDrive, Saturation
+from jaxquad.simulation import Encoder, MotorDrive, Saturation
 
 from .linear import Late
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxquad.excitation import Excitation, harmonics, multisine, sweep
-from jaxquad.simulate import (
+from jaxquad.simulation import (
     ceti_gust,
     Gust,
     Pulse,

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad.simulate import Metrics, metrics, Simulation
+from jaxquad.simulation import Metrics, metrics, Simulation
 
 from .data import Case, Group, Members, Numbers
 from .identification import identification_numbers

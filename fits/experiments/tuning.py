@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import jax
 
 import jaxquad as jq
-from jaxquad.report import certificate_figure, convergence_figure, front_figure, write_json
-from jaxquad.tune import peers
+from jaxquad.plot import certificate_figure, convergence_figure, front_figure
+from jaxquad.report import write_json
+from jaxquad.tuning import peers
 
 
 PID_NAME, FULL_NAME = "tuned PID", "full gains"
@@ -33,11 +34,11 @@ class Case(NamedTuple):
     """What is tuned, for whom, and by what it is judged."""
 
     ensemble: jq.Ensemble
-    flight: jq.Scenario
+    flight: jq.simulation.Scenario
     objective: jq.Objective
     limits: tuple[jq.Limit, ...]
-    ladrc: jq.ScheduledLADRC
-    pid: jq.ScheduledPID
+    ladrc: jq.control.ScheduledLADRC
+    pid: jq.control.ScheduledPID
     free: Sequence[str]  # of the LADRC with full gains
     half: Sequence[str]  # of its half-gain factors
     pid_free: Sequence[str]
@@ -48,13 +49,13 @@ class Case(NamedTuple):
 class Study(NamedTuple):
     """The tuned LADRC, whose certificate has all others as peers, and the others that are tuned."""
 
-    ladrc: jq.Tuned
-    pid: jq.Tuned | None
-    full: jq.Tuned | None
+    ladrc: jq.tuning.Tuned
+    pid: jq.tuning.Tuned | None
+    full: jq.tuning.Tuned | None
     peers: dict[str, Any]
 
     @property
-    def certificate(self) -> jq.Certificate:
+    def certificate(self) -> jq.tuning.Certificate:
         assert self.ladrc.certificate is not None
         return self.ladrc.certificate
 
@@ -68,16 +69,16 @@ class Study(NamedTuple):
 
 def starts(
     plant: Any, span: tuple[float, float], *, limit: float, dt: float, wo: float = 30.0
-) -> tuple[jq.ScheduledLADRC, jq.ScheduledPID]:
+) -> tuple[jq.control.ScheduledLADRC, jq.control.ScheduledPID]:
     """For one axis before tuning: by certainty equivalence over `span` times its inertia.
 
     The PID has about the filter of a LADRC whose `wo` is in rad/s.
     """
     gain, inertia = plant.torque_gain[0], plant.inertia[0]
-    map = ft.partial(jq.certainty_equivalence, gain, inertia, span=span)
+    map = ft.partial(jq.control.certainty_equivalence, gain, inertia, span=span)
     ladrc = jq.LADRC(10.0, wo, gain / inertia, limit=limit, dt=dt)
     pid = jq.PID(49.0, 89.0, 8.0, measurement_filter=2.0 * max(wo, 50.0), limit=limit, dt=dt)
-    return jq.ScheduledLADRC(ladrc, map()), jq.ScheduledPID(pid, map(factor=0.65))
+    return jq.control.ScheduledLADRC(ladrc, map()), jq.control.ScheduledPID(pid, map(factor=0.65))
 
 
 def equivalent(ensemble: jq.Ensemble) -> dict[str, Any]:
@@ -101,7 +102,7 @@ def study(case: Case, size: Size, key: jax.Array) -> Study:
     return Study(ladrc, pid, full, others)
 
 
-def halved(start: jq.ScheduledLADRC, factors: Sequence[str]) -> jq.ScheduledLADRC:
+def halved(start: jq.control.ScheduledLADRC, factors: Sequence[str]) -> jq.control.ScheduledLADRC:
     """With those factors at 0.5."""
     halves = {name.removeprefix("ladrc."): 0.5 for name in factors}
     return dataclasses.replace(start, ladrc=dataclasses.replace(start.ladrc, **halves))
@@ -127,11 +128,11 @@ def _beside(found: Study) -> str:
 
 def front_of(
     case: Case, found: Study, size: Size, key: jax.Array, *, over: str
-) -> jq.Pareto | None:
+) -> jq.tuning.Pareto | None:
     """Tracking against `over` for the LADRC, beside all that its certificate has."""
     if not size.points:
         return None
-    return jq.pareto(
+    return jq.tuning.pareto(
         found.ladrc.controller, case.ensemble, case.flight, over=over, points=size.points,
         free=[*case.free, *case.half], objective=case.objective, peers=found.peers,
         members=size.members, fresh=size.fresh, key=key,
@@ -139,7 +140,7 @@ def front_of(
 
 
 def write(
-    out: Path, found: Study, front: jq.Pareto | None, *, name: str, extra: Mapping[str, Any]
+    out: Path, found: Study, front: jq.tuning.Pareto | None, *, name: str, extra: Mapping[str, Any]
 ) -> list[str]:
     """JSON, figures and the C header of the LADRC; the names of the files."""
     tuned = {"LADRC": found.ladrc, "PID": found.pid, "LADRC, full gains": found.full}
@@ -161,11 +162,11 @@ def write(
         figures["front.png"] = front_figure(front, title=_title(front, found.certificate))
     for file, figure in figures.items():
         figure.savefig(out / file, dpi=130)
-    header = jq.write_c_header(out / f"{name}.h", found.ladrc.controller, name=name, axes=1)
+    header = jq.export.write_c_header(out / f"{name}.h", found.ladrc.controller, name=name, axes=1)
     return ["result.json", "certificate.json", *figures, header.name]
 
 
-def _title(front: jq.Pareto, certificate: jq.Certificate) -> str:
+def _title(front: jq.tuning.Pareto, certificate: jq.tuning.Certificate) -> str:
     """Names stable designs beyond a limit on Ms, where the picture does not show it."""
     bounds = [float(d.bound) for d in certificate.distances if d.quantity == "sensitivity_peak"]
     if front.over == "sensitivity_peak" or not bounds:
@@ -180,7 +181,7 @@ def _title(front: jq.Pareto, certificate: jq.Certificate) -> str:
     return f"{title}\nbeyond the limit on Ms, {min(bounds):g}: {', '.join(beyond)}" * bool(beyond)
 
 
-def _numbers(tuned: jq.Tuned) -> dict[str, Any]:
+def _numbers(tuned: jq.tuning.Tuned) -> dict[str, Any]:
     names = ("values", "cost", "converged", "evaluations", "stabilising", "seconds", "remarks")
     return {name: getattr(tuned, name) for name in names}
 

@@ -27,7 +27,7 @@ FIRST = PAPER * END / START  # kg m^2, which makes b0 = 3 and 1.6 of one rule b0
 DURATION = 40.0  # s
 DRAWS = 16  # of gusts and noise
 GAIN = np.array([2 * LEVER])  # N m per volt on each of two motors
-MAP = jq.certainty_equivalence(END * INERTIA, INERTIA)  # 1.6 for the manual's inertia
+MAP = jq.control.certainty_equivalence(END * INERTIA, INERTIA)  # 1.6 for the manual's inertia
 
 
 class Flight(NamedTuple):
@@ -46,13 +46,13 @@ class Flight(NamedTuple):
 def estimators() -> dict[str, Any]:
     """The paper's and better ones, all from `FIRST`; the lock-in adds a permanent test tone."""
     start = np.array([FIRST])
-    first = jq.WindowedInertia(GAIN, start, order=1, bandwidth=50.0, nuisance=(), dt=DT)
-    third = jq.WindowedInertia(GAIN, start, dt=DT)
-    lock_in = jq.LockInInertia(GAIN, start, jq.ProbeTones(above=0.0), dt=DT)
+    first = jq.control.WindowedInertia(GAIN, start, order=1, bandwidth=50.0, nuisance=(), dt=DT)
+    third = jq.control.WindowedInertia(GAIN, start, dt=DT)
+    lock_in = jq.control.LockInInertia(GAIN, start, jq.control.ProbeTones(above=0.0), dt=DT)
     return {
         "first-order observer": first,
         "third-order windows": third,
-        "recursive": jq.RecursiveInertia(GAIN, start, dt=DT),
+        "recursive": jq.control.RecursiveInertia(GAIN, start, dt=DT),
         "lock-in": lock_in,
     }
 
@@ -61,11 +61,11 @@ def fly(seed: int) -> Flight:
     """Encoder, 0.02 deg of noise and gusts of 5 mN m; the lock-in estimator adapts b0."""
     heard = estimators()
     happening = jq.scenario(
-        duration=DURATION, dt=DT, axes=1, ensemble=DRAWS, disturbance=jq.Gust(0.005),
-        noise=jq.WhiteNoise(np.radians(0.02)), key=jax.random.key(seed),
+        duration=DURATION, dt=DT, axes=1, ensemble=DRAWS, disturbance=jq.simulation.Gust(0.005),
+        noise=jq.simulation.WhiteNoise(np.radians(0.02)), key=jax.random.key(seed),
     )  # fmt: skip
     law = jq.AdaptiveLADRC(jq.LADRC(WC, WO, np.array([START]), dt=DT), heard["lock-in"], MAP)
-    encoder = jq.Encoder(SHEET.encoder_counts)
+    encoder = jq.simulation.Encoder(SHEET.encoder_counts)
     done = jq.simulate(rig([2 * LEVER] * DRAWS), law, happening, dt=DT, encoder=encoder)
     before = jnp.concatenate([jnp.zeros_like(done.command[:1]), done.command[:-1]])
     inertia = {

@@ -14,7 +14,7 @@ PERIOD, DURATION, SETTLED = 5.0, 20.0, 10.0  # s
 TORQUES = {
     "pulse, half of the period": jq.Pulse(0.2, period=PERIOD, share=0.5),
     "pulse of 0.5 s": jq.Pulse(0.2, period=PERIOD, width=0.5),
-    "sine": jq.Sine(0.3, period=PERIOD),
+    "sine": jq.simulation.Sine(0.3, period=PERIOD),
 }
 PULSES = list(TORQUES)[:2]
 PLANTS = {name: TORQUE_GAINS[name] for name in (VOLTAGE, FITTED)}  # b0 = 3 holds no other

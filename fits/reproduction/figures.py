@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.report import bode, histories
+from jaxquad.plot import bode, histories
 
 from .adaptation import Flight
 from .disturbance import Loaded, RIGHT, SETTLED, WRONG
@@ -16,7 +16,7 @@ from .steps import AFTER, BEFORE, MATCHED, Steps
 
 def responses(roll: Roll) -> Any:
     """Figure 5."""
-    paper = jq.AttitudeAxis(
+    paper = jq.models.AttitudeAxis(
         SHEET.arm, PAPER_THRUST, PAPER_INERTIA, lag=roll.joint.model.lag, delay=DT / 2
     )
     gain = roll.joint_gain.value

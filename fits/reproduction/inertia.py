@@ -51,7 +51,7 @@ def _adapts() -> Claim:
 
 def _robust() -> Claim:
     """Stable ranges of the inertia, in units of the manual's."""
-    window = jq.gain_window(ladrc(1.0), rig(1.0), member=0)
+    window = jq.loops.gain_window(ladrc(1.0), rig(1.0), member=0)
     low, high = float(window.low), float(window.high)
     gain = 2 * LEVER / INERTIA
     fixed = {b0: (gain / b0 / high, gain / b0 / low) for b0 in (END, START)}
@@ -78,7 +78,7 @@ def _robust() -> Claim:
 
 def _feasible(torque: float) -> Claim:
     allocation = jq.quanser_hover().allocation
-    most = jq.authority(jq.quanser_hover(), jq.MotorDrive(allocation))
+    most = jq.simulation.authority(jq.quanser_hover(), jq.simulation.MotorDrive(allocation))
     limits = {
         "bias of 2 V, motors never reversed": float(most.forward[0]),
         "amplifiers of 24 V, motors reversed": float(most.torque[0]),

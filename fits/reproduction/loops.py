@@ -12,7 +12,7 @@ import jaxquad as jq
 jax.config.update("jax_enable_x64", True)  # before the first array of any script that imports this
 
 DT = 0.002  # s
-SHEET = jq.QUANSER_HOVER
+SHEET = jq.models.QUANSER_HOVER
 INERTIA = SHEET.inertia[0]
 LEVER = SHEET.arm * SHEET.thrust_coefficient  # N m per volt of V4 - V2
 WC, WO = 10.0, 30.0  # rad/s
@@ -47,16 +47,18 @@ def ladrc(b0: ArrayLike, **options: Any) -> jq.LADRC:
     return jq.LADRC(WC, WO, np.atleast_1d(np.asarray(b0, float))[None], dt=DT, **options)
 
 
-def run_step(plant: Any, controller: Any, size: ArrayLike, **options: Any) -> jq.Simulation:
+def run_step(
+    plant: Any, controller: Any, size: ArrayLike, **options: Any
+) -> jq.simulation.Simulation:
     """10 s after a step of `size` rad, one or one for each member."""
     sizes = np.atleast_1d(np.asarray(size, float))
     happening = jq.scenario(duration=10.0, dt=DT, axes=1, reference=jq.Step(sizes))
     return jq.simulate(plant, controller, happening, dt=DT, **options)
 
 
-def responses(done: jq.Simulation) -> list[Response]:
+def responses(done: jq.simulation.Simulation) -> list[Response]:
     """Every member's response to its step."""
-    metrics = jq.metrics(done).normalised()
+    metrics = jq.simulation.metrics(done).normalised()
     size = np.asarray(done.reference)[-1, 0]
     angle = np.asarray(done.angle)[:, 0] / size
     lost = np.asarray(done.diverged)

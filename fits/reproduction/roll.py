@@ -20,10 +20,10 @@ class Roll(NamedTuple):
     """One flight, its responses, and what the fits make of them."""
 
     record: jq.Record
-    wide: jq.FrequencyResponse  # joint, far beyond the sweep's band
-    joint: jq.Fit
-    joint_gain: jq.Combination
-    direct_gain: jq.Combination  # Eq. (13) and (14), as the paper uses them
+    wide: jq.spectra.FrequencyResponse  # joint, far beyond the sweep's band
+    joint: jq.identify.Fit
+    joint_gain: jq.identify.Combination
+    direct_gain: jq.identify.Combination  # Eq. (13) and (14), as the paper uses them
 
 
 def fly_and_fit(seed: int) -> Roll:
@@ -99,7 +99,7 @@ def _jitters(roll: Roll) -> Claim:
 
 
 def _long_enough() -> Claim:
-    [rule] = [r for r in jq.check_guidelines(SWEEP) if r.rule == "record length"]
+    [rule] = [r for r in jq.excitation.check_guidelines(SWEEP) if r.rule == "record length"]
     lengths = {"4 s": 4.0, "4 periods of 0.3 rad/s": 4 * 2 * np.pi / 0.3}
     readings = tuple(
         Reading(name, {"record, s": length, "rule, s": rule.limit}, length > 0.999 * rule.limit)

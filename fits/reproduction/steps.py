@@ -62,7 +62,7 @@ def rough_steps() -> Steps:
     sizes = [LARGE, LARGE, SMALL, SMALL]
     names = [(size, b0) for size in ("large", "small") for b0 in (BEFORE, AFTER)]
     rubbing = rig([2 * LEVER] * 4, coulomb=np.full((1, 4), FRICTION))
-    encoder = jq.Encoder(SHEET.encoder_counts)
+    encoder = jq.simulation.Encoder(SHEET.encoder_counts)
     limited = ladrc([START, END] * 2, limit=LIMIT)
     found = {
         "linear": step(plant, controller, sizes),
@@ -79,11 +79,11 @@ def rough_steps() -> Steps:
 def moving_steps() -> dict[str, Response]:
     """The large step as the first manoeuvre, by when b0 = 3 begins to move."""
     gain, nominal = np.array([2 * LEVER]), np.array([INERTIA])
-    rule = jq.certainty_equivalence(END * INERTIA, INERTIA)
+    rule = jq.control.certainty_equivalence(END * INERTIA, INERTIA)
     found = {}
     for window in (0.25, 2.5):  # s; the first estimate takes two, one of them for the filters
         law = jq.LADRC(WC, WO, np.array([START]), dt=DT)
-        estimator = jq.WindowedInertia(gain, nominal, window=window, dt=DT)
+        estimator = jq.control.WindowedInertia(gain, nominal, window=window, dt=DT)
         controller = jq.AdaptiveLADRC(law, estimator, rule, settling=DT)
         done = run_step(rig(2 * LEVER), controller, LARGE)
         b0 = np.asarray(done.signals["b0"])[:, 0, 0]

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ._inertia_estimate import InertiaEstimator, require_above_zero
-from ._ladrc import LADRC
-from ._ladrc_law import LADRCLaw, LADRCState
-from ._per_axis import fit
+from jaxquad._core import fit
+
+from ._ladrc import LADRC, LADRCLaw, LADRCState
 from ._scheduled import gain_at
+from .inertia._estimate import InertiaEstimator, require_above_zero
 
 
 class AdaptiveLADRCState(NamedTuple):

@@ -5,9 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad.models._parameters import as_float, is_concrete
-
-from ._per_axis import fit
+from jaxquad._core import as_float, fit, is_concrete
 
 
 @runtime_checkable

@@ -1,26 +1,188 @@
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxquad.models import TransferFunction
-from jaxquad.models._parameters import as_float, require_positive
-
-from ._ladrc_gains import fastest_feedback, feedback_gains, LADRCGains, Placement
-from ._ladrc_law import LADRCLaw, LADRCState
-from ._ladrc_linear import continuous_ladrc, linear_ladrc
-from ._linear import LinearController
-from ._observers import CurrentObserver, Observer
-from ._per_axis import (
+from jaxquad._core import (
+    align,
+    as_float,
     ensemble_shape,
+    fit,
+    full_shape,
+    matched,
     pick,
     require_below,
     require_limit,
+    require_positive,
     require_sample,
     require_shapes,
     times,
 )
+from jaxquad.models import TransferFunction
+
+from ._observers import continuous_gains, CurrentObserver, Observer
+from ._protocols import LinearController, Setpoint
+
+
+Placement = Literal["discrete", "continuous"]
+
+
+class LADRCGains(NamedTuple):
+    """What multiplies errors of the angle, of the rate and of the observer, half gains included."""
+
+    proportional: Float[Array, "..."]  # 1/s^2; order 1: 1/s
+    derivative: Float[Array, "..."] | None  # 1/s; None for order 1
+    correction: Float[Array, "states ..."]  # of the observer's prediction
+
+
+def feedback_gains(
+    wc: Float[Array, "..."], dt: float, order: int, placement: Placement
+) -> tuple[Float[Array, "..."], Float[Array, "..."] | None]:
+    """kp and kd that place the poles of u0/s^2 (order 1: u0/s) at -wc; order 1 has no kd.
+
+    "discrete": at exp(-wc dt) exactly, with u0 held over the sample. "continuous": kp = wc^2 and
+    kd = 2 wc, so at -wc only as dt goes to 0. Source: docs/control.md.
+    """
+    if placement == "continuous":
+        return (wc, None) if order == 1 else (wc**2, 2 * wc)
+    off = -jnp.expm1(-wc * dt)  # 1 - exp(-wc dt) without cancellation
+    if order == 1:
+        return off / dt, None
+    return (off / dt) ** 2, off * (4 - off) / (2 * dt)
+
+
+def fastest_feedback(order: int, placement: Placement) -> float:
+    """The highest wc dt: Nyquist's, or where the held feedback turns unstable."""
+    return jnp.pi if placement == "discrete" else 2.0 / order
+
+
+class LADRCState(NamedTuple):
+    """What a LADRC remembers from the last sample."""
+
+    estimate: Float[Array, "states axes *ensemble"]  # [y, y', f], order 1 [y, f]
+    command: Float[Array, " axes *ensemble"]  # as applied
+    b0: Float[Array, " axes *ensemble"]  # in force
+
+
+class LADRCLaw(eqx.Module):
+    """A `LADRC` with its gains computed: what a loop runs, sample by sample."""
+
+    gains: LADRCGains
+    b0: Float[Array, "..."]
+    limit: Float[Array, "..."]
+    ensemble: tuple[int, ...] = eqx.field(static=True)
+    observer: Observer
+    dt: float = eqx.field(static=True)
+
+    def init(
+        self,
+        like: Float[Array, " axes *ensemble"],
+        measurement: Float[Array, " axes *ensemble"] | None = None,
+    ) -> LADRCState:
+        zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        first = zero if measurement is None else zero + align(measurement, zero)
+        estimate = jnp.stack([first] + [zero] * (len(self.gains.correction) - 1))
+        return LADRCState(estimate, zero, zero + fit(self.b0, zero))
+
+    def step(
+        self, state: LADRCState, reference: Any, measurement: Float[Array, " axes *ensemble"]
+    ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
+        return self._advance(state, state.estimate[-1], reference, measurement, self.b0)
+
+    def step_with(
+        self,
+        state: LADRCState,
+        reference: Any,
+        measurement: Float[Array, " axes *ensemble"],
+        b0: Float[Array, "..."],
+    ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
+        # f = y'' - b0 u: another b0 moves the disturbance, so that y'' and u stay as they are.
+        unknown = state.estimate[-1] + (state.b0 - fit(b0, measurement)) * state.command
+        return self._advance(state, unknown, reference, measurement, b0)
+
+    def applied(self, state: LADRCState, achieved: Float[Array, " axes *ensemble"]) -> LADRCState:
+        return state._replace(command=achieved)
+
+    def signals(self, state: LADRCState) -> dict[str, Array]:
+        return {"disturbance": state.estimate[-1] / state.b0}
+
+    def _advance(self, state, unknown, reference, measurement, b0):
+        reference = matched(reference, measurement, state.command)
+        # Row by row: stacks and slices of the estimate cost most of a reverse pass.
+        b0 = jnp.broadcast_to(fit(b0, measurement), measurement.shape)
+        estimate = [*state.estimate[:-1], unknown]
+        predicted = self.observer.predict(estimate, b0 * state.command, self.dt)
+        error = measurement - predicted[0]
+        gains = [fit(row, measurement) for row in self.gains.correction]
+        corrected = [x + l * error for x, l in zip(predicted, gains, strict=True)]
+        command = self._feedback(corrected if self.observer.current else predicted, reference) / b0
+        limit = fit(self.limit, command)
+        command = jnp.clip(command, -limit, limit)
+        return LADRCState(jnp.stack(corrected), command, b0), command
+
+    def _feedback(self, estimate: Sequence[Array], reference: Any) -> Array:
+        """What b0 u is to be, in rad/s^2; order 1 in rad/s."""
+        ahead = isinstance(reference, Setpoint)
+        angle = reference.angle if ahead else reference
+        drive = fit(self.gains.proportional, angle) * (angle - estimate[0]) - estimate[-1]
+        if self.gains.derivative is None:
+            return drive + reference.rate if ahead else drive
+        error = reference.rate - estimate[1] if ahead else -estimate[1]
+        drive = drive + fit(self.gains.derivative, angle) * error
+        return drive + reference.acceleration if ahead else drive
+
+
+def linear_ladrc(
+    gains: LADRCGains, b0: Float[Array, ""], observer: Observer, dt: float
+) -> LinearController:
+    """The law without its limit; the state is the observer's prediction."""
+    states = len(gains.correction)
+    unit, zero = jnp.eye(states, dtype=b0.dtype), jnp.zeros(states, b0.dtype)
+    transition = jnp.stack(observer.predict(list(unit), zero, dt))
+    drive = jnp.stack(observer.predict(list(zero), jnp.ones_like(b0), dt))
+    feedback = jnp.stack([x for x in (*gains[:2], jnp.ones_like(b0)) if x is not None])
+    keep = unit.at[:, 0].add(-gains.correction)
+    # b0 u = kp r - late x - direct y
+    late = _dot(feedback, keep) if observer.current else feedback
+    direct = _dot(feedback, gains.correction) if observer.current else jnp.zeros_like(b0)
+    return LinearController(
+        A=_dot(transition, keep) - drive[:, None] * late[None],
+        reference_in=drive * gains.proportional,
+        measurement_in=_dot(transition, gains.correction) - drive * direct,
+        C=-late / b0,
+        reference_through=gains.proportional / b0,
+        measurement_through=-direct / b0,
+        dt=dt,
+    )
+
+
+def continuous_ladrc(
+    wc: Float[Array, ""],
+    wo: Float[Array, ""],
+    b0: Float[Array, ""],
+    order: int,
+    factors: tuple[Float[Array, ""], Float[Array, ""]],
+) -> tuple[TransferFunction, TransferFunction]:
+    """Feedback and feedforward of u = feedforward r - feedback y; docs/control.md."""
+    l = factors[1] * continuous_gains(wo, order)
+    one, zero = jnp.ones_like(b0), jnp.zeros_like(b0)
+    if order == 1:
+        kp = factors[0] * wc
+        back = [kp * l[0] + l[1], kp * l[1]]
+        below = [one, l[0] + kp, zero]
+    else:
+        kp, kd = factors[0] * wc**2, factors[0] * 2 * wc
+        back = [kp * l[0] + kd * l[1] + l[2], kp * l[1] + kd * l[2], kp * l[2]]
+        below = [one, l[0] + kd, l[1] + kd * l[0] + kp, zero]
+    ahead = kp * jnp.concatenate([one[None], l])
+    below = jnp.stack(below)
+    return TransferFunction(jnp.stack(back) / b0, below), TransferFunction(ahead / b0, below)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.dot(a, b, precision="highest")
 
 
 class LADRC(eqx.Module):

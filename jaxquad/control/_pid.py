@@ -1,28 +1,175 @@
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxquad.models._parameters import (
+from jaxquad._core import (
+    align,
     as_float,
     as_float_or_none,
-    require_finite,
-    require_positive,
-)
-
-from ._anti_windup import AntiWindup, Clamping
-from ._linear import LinearController
-from ._measurement_filter import butterworth
-from ._per_axis import (
     ensemble_shape,
+    fit,
+    full_shape,
+    matched,
     pick,
     require_below,
+    require_finite,
     require_limit,
+    require_positive,
     require_sample,
     require_shapes,
 )
-from ._pid_law import PIDLaw, PIDState
-from ._pid_linear import linear_pid
+
+from ._anti_windup import AntiWindup, Clamping
+from ._protocols import LinearController, Setpoint
+
+
+Transition = Float[Array, "2 2 ..."]
+Filtered = tuple[Array, Array]  # the filtered angle in rad and its rate in rad/s
+
+
+def butterworth(bandwidth: Float[Array, "..."], dt: float) -> Transition:
+    """What is left after `dt` of a second-order Butterworth filter's error, and of its rate.
+
+    Of v'' + sqrt(2) w v' + w^2 v = w^2 y with w = `bandwidth` in rad/s: exp(A dt), in closed form.
+    """
+    slow = bandwidth / jnp.sqrt(2.0).astype(bandwidth.dtype)  # both parts of the poles
+    decay, turn = jnp.exp(-slow * dt), slow * dt
+    cosine, sine = decay * jnp.cos(turn), decay * jnp.sin(turn)
+    rows = [[cosine + sine, sine / slow], [-2 * slow * sine, cosine - sine]]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def filtered(
+    transition: Transition, before: Filtered, measurement: Float[Array, " axes *ensemble"]
+) -> Filtered:
+    """A sample later, exactly for a measurement that was held over the sample before it."""
+    (aa, ar), (ra, rr) = [[fit(gain, measurement) for gain in row] for row in transition]
+    away, rate = before[0] - measurement, before[1]
+    return measurement + aa * away + ar * rate, ra * away + rr * rate
+
+
+class PIDState(NamedTuple):
+    """What a PID remembers from the last sample."""
+
+    integral: Float[Array, " axes *ensemble"]  # units of the command; see `PIDLaw`
+    rate: Float[Array, " axes *ensemble"]  # filtered, without the sample to come, rad/s
+    started: Float[Array, ""]  # 0 before the first sample, then 1
+    filtered: Filtered | None = None  # of the measurement, where it is filtered
+
+
+class PIDLaw(eqx.Module):
+    """A `PID` with its filter of the measurement computed: what a loop runs, sample by sample.
+
+    Without that filter the state's integral is ahead by half a sample, by the trapezoidal rule.
+    """
+
+    gains: Mapping[str, Float[Array, "..."]]
+    transition: Transition | None
+    anti_windup: AntiWindup | None
+    ensemble: tuple[int, ...] = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
+
+    def init(
+        self,
+        like: Float[Array, " axes *ensemble"],
+        measurement: Float[Array, " axes *ensemble"] | None = None,
+    ) -> PIDState:
+        zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        first = zero if measurement is None else zero + align(measurement, zero)
+        smooth = None if self.transition is None else (first, zero)
+        return PIDState(zero, zero, jnp.zeros((), like.dtype), smooth)
+
+    def step(
+        self, state: PIDState, reference: Any, measurement: Float[Array, " axes *ensemble"]
+    ) -> tuple[PIDState, Float[Array, " axes *ensemble"]]:
+        reference = matched(reference, measurement, state.integral)
+        gain = lambda name: fit(self.gains[name], measurement)
+        angle = reference.angle if isinstance(reference, Setpoint) else reference
+        smooth, seen = state.filtered, measurement
+        if self.transition is not None and smooth is not None:
+            smooth = filtered(self.transition, smooth, measurement)
+            seen = smooth[0]
+        half = 0.5 * self.dt * gain("ki") * (angle - seen)
+        if smooth is None:
+            integral, ahead = state.integral + state.started * half, half
+        else:
+            integral, ahead = state.integral + 2 * half, jnp.zeros_like(half)
+        memory, rate = self._rate(state, reference, measurement, smooth)
+        wanted = gain("kp") * (gain("proportional_weight") * angle - seen)
+        wanted = wanted + integral + gain("kd") * rate
+        if isinstance(reference, Setpoint):
+            wanted = wanted + gain("feedforward") * reference.acceleration
+        command = jnp.clip(wanted, -gain("limit"), gain("limit"))
+        growth = integral + ahead - state.integral
+        if self.anti_windup is not None:
+            growth = self.anti_windup(growth, wanted, command, self.dt)
+        started = jnp.ones_like(state.started)
+        return PIDState(state.integral + growth, memory, started, smooth), command
+
+    def _rate(self, state, reference, measurement, smooth):
+        """What the filter of the derivative remembers, and the filtered rate of the error."""
+        keep = jnp.exp(-self.dt * fit(self.gains["filter"], measurement))
+        sharp = (1 - keep) / self.dt
+        differenced = measurement if smooth is None else jnp.zeros_like(measurement)
+        if isinstance(reference, Setpoint):
+            # Half a sample back, where the difference of the measurements is.
+            ahead = reference.rate - 0.5 * self.dt * reference.acceleration
+            change, given = -differenced, (1 - keep) * ahead
+        else:
+            weight = fit(self.gains["derivative_weight"], measurement)
+            change = weight * reference - differenced
+            given = jnp.zeros_like(measurement)
+        rate = state.started * (state.rate + sharp * change + given)
+        memory = keep * rate - sharp * change
+        return memory, rate if smooth is None else rate - smooth[1]
+
+
+def linear_pid(gains: Mapping[str, Float[Array, ""]], dt: float) -> LinearController:
+    """A PID of one axis without its limit.
+
+    The states are the integral, the filtered rate and, of a filtered measurement, the filter's.
+    """
+    if "measurement_filter" in gains:
+        return _behind_a_filter(gains, dt)
+    kp, ki, kd = gains["kp"], gains["ki"], gains["kd"]
+    keep = jnp.exp(-dt * gains["filter"])
+    sharp = (1 - keep) / dt
+    weight = gains["derivative_weight"]
+    one, zero = jnp.ones_like(kp), jnp.zeros_like(kp)
+    half = 0.5 * dt * ki
+    back = (keep - 1) * sharp  # what a sample of the angle leaves in the filter
+    return LinearController(
+        A=jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, keep])]),
+        reference_in=jnp.stack([2 * half, back * weight]),
+        measurement_in=jnp.stack([-2 * half, -back]),
+        C=jnp.stack([one, kd]),
+        reference_through=kp * gains["proportional_weight"] + half + kd * sharp * weight,
+        measurement_through=-kp - half - kd * sharp,
+        dt=dt,
+    )
+
+
+def _behind_a_filter(gains: Mapping[str, Float[Array, ""]], dt: float) -> LinearController:
+    kp, ki, kd = gains["kp"], gains["ki"], gains["kd"]
+    transition = butterworth(gains["measurement_filter"], dt)
+    entry = jnp.array([1.0, 0.0], kp.dtype) - transition[:, 0]  # of the measurement
+    bare = linear_pid({k: x for k, x in gains.items() if k != "measurement_filter"}, dt)
+    heard = jnp.stack([kp + dt * ki, kd])  # u = ... - heard (v, v')
+    none, zeros = jnp.zeros((2, 2), kp.dtype), jnp.zeros(2, kp.dtype)
+    grown = none.at[0, 0].set(-dt * ki)  # of the integral, by v
+    dot = lambda a, b: jnp.dot(a, b, precision="highest")
+    return LinearController(
+        A=jnp.block([[bare.A, dot(grown, transition)], [none, transition]]),
+        reference_in=jnp.concatenate([bare.reference_in, zeros]),
+        measurement_in=jnp.concatenate([dot(grown, entry), entry]),
+        C=jnp.concatenate([bare.C, -dot(heard, transition)]),
+        reference_through=bare.reference_through + 0.5 * dt * ki,
+        measurement_through=-dot(heard, entry),
+        dt=dt,
+    )
 
 
 class PID(eqx.Module):

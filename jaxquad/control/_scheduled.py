@@ -9,13 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad.models._parameters import as_float, require_positive
+from jaxquad._core import as_float, ensemble_shape, require_positive, require_shapes, times
 
-from ._fuzzy_map import FuzzyMap
-from ._inertia_map import InertiaMap
 from ._ladrc import LADRC
-from ._per_axis import ensemble_shape, require_shapes, times
 from ._pid import PID
+from .inertia._maps import FuzzyMap, InertiaMap
 
 
 InertiaToGain = Callable[[Array], Array]  # kg m^2 to b0 in rad/s^2 per unit of command

@@ -4,7 +4,6 @@ from ._criteria import (
     DOptimal as DOptimal,
     LargestError as LargestError,
 )
-from ._design import Design as Design
 from ._noise import MeasuredNoise as MeasuredNoise
-from ._optimal_multisine import optimal_multisine as optimal_multisine
+from ._optimal_multisine import Design as Design, optimal_multisine as optimal_multisine
 from ._prediction import predict_accuracy as predict_accuracy, Prediction as Prediction

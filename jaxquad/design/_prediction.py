@@ -1,23 +1,76 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import Array, Complex, Float, PyTree
 
+from jaxquad._core import require_x64
 from jaxquad.excitation import Excitation
-from jaxquad.identify._parameters import Free, Parameters, select_parameters
-from jaxquad.spectra import require_x64
+from jaxquad.identify import Free, Parameters, select_parameters
 
-from ._information import check_distinct, information_per_energy, response_and_slopes
 from ._noise import Noise, noise_covariance
+
+
+Informations = Float[np.ndarray, "frequencies parameters parameters"]
+_SINGULAR = 1e-12  # of a correlation matrix: beyond it, rounding decides
+
+
+@eqx.filter_jit
+def response_and_slopes(
+    model: PyTree, parameters: Parameters, omega: Float[Array, " frequencies"], input: int
+) -> tuple[Complex[Array, "frequencies outputs"], Complex[Array, "frequencies outputs parameters"]]:
+    """The response to one input, and its derivatives with respect to relative changes."""
+
+    def parts(z):
+        response = parameters.insert(model, z).frequency_response(omega)
+        if not 0 <= input < response.shape[2]:  # JAX would clamp it without a word.
+            raise ValueError(f"input is {input}: the model has inputs 0 to {response.shape[2] - 1}")
+        response = response[:, :, input]
+        return jnp.stack([jnp.real(response), jnp.imag(response)])
+
+    z = parameters.start[: parameters.count]
+    value, slopes = parts(z), jax.jacfwd(parts)(z)
+    return jax.lax.complex(value[0], value[1]), jax.lax.complex(slopes[0], slopes[1])
+
+
+def information_per_energy(
+    slopes: Complex[np.ndarray, "frequencies outputs parameters"],
+    noise: Complex[np.ndarray, "frequencies outputs outputs"],
+) -> Informations:
+    """Fisher information of each frequency per unit of energy (mean square times seconds) there.
+
+    2 Re(s^H S^-1 s) with the one-sided noise S. Source: Pintelon and Schoukens, System
+    Identification, 2nd ed., section 5.4.2.
+    """
+    weighted = np.linalg.solve(noise, slopes)
+    return 2 * np.real(np.conj(np.swapaxes(slopes, 1, 2)) @ weighted)
+
+
+def check_distinct(
+    total: Float[np.ndarray, "parameters parameters"], names: tuple[str, ...]
+) -> None:
+    """Raise ValueError where no excitation of these lines can tell the parameters apart."""
+    size = np.sqrt(np.diagonal(total))
+    for name, each in zip(names, size, strict=True):
+        if not each > 0:
+            raise ValueError(f"{name} does not change the response: leave it out of free=")
+    values, vectors = np.linalg.eigh(total / np.outer(size, size))
+    if values[0] < _SINGULAR * values[-1]:
+        direction = vectors[:, 0]
+        mixed = [n for n, x in zip(names, direction, strict=True) if abs(x) > 0.05]
+        raise ValueError(
+            f"no excitation at these lines can tell {', '.join(mixed)} apart: fix one of them "
+            "(leave it out of free=), or offer more lines"
+        )
 
 
 class Prediction(eqx.Module):
     """The best standard errors that an experiment allows: the Cramer-Rao bound of its noise.
 
-    Relative to the parameters' values, or to the scale of a `jq.Real`. `cramer_rao` is CIFER's, as
-    `jq.fit` with `jq.MaximumLikelihood` prints it: sqrt(2) times the standard error, in per cent.
+    Relative to the parameters' values, or to the scale of a `jq.identify.Real`. `cramer_rao` is CIFER's, as
+    `jq.fit` with `jq.identify.MaximumLikelihood` prints it: sqrt(2) times the standard error, in per cent.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -70,7 +123,7 @@ def predict_accuracy(
     The signal's own transform weighs the information of each frequency in the `band` (rad/s), by
     default that of the excitation; a multisine counts at its lines, settled from the first period.
     `noise` is the outputs' one-sided spectral density in units^2/Hz: a number, one for each
-    output, a function of omega in rad/s, or a `jq.MeasuredNoise`.
+    output, a function of omega in rad/s, or a `jq.design.MeasuredNoise`.
     Raises ValueError where the parameters cannot be told apart.
     """
     require_x64("a design")

@@ -2,7 +2,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._checks import check_positive, Number
+from jaxquad._core import check_positive, Number
+
 from ._excitation import Excitation
 
 

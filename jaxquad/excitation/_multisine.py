@@ -4,7 +4,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from ._checks import check_band, check_positive, Number, whole_samples
+from jaxquad._core import check_band, check_positive, Number, whole_samples
+
 from ._excitation import Excitation
 
 
@@ -117,5 +118,5 @@ def check_lines(omega: Lines, period: Number, sample_rate: Number) -> None:
         i = off.argmax()
         raise ValueError(
             f"the line {omega[i]:.6g} rad/s is {order[i]:.6g} times the fundamental of the period "
-            f"{period:.6g} s, not a whole number: take the lines from jq.harmonics."
+            f"{period:.6g} s, not a whole number: take the lines from jq.excitation.harmonics."
         )

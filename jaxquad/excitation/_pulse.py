@@ -3,7 +3,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ._checks import check_positive, Number, whole_samples
+from jaxquad._core import check_positive, Number, whole_samples
+
 from ._excitation import Excitation, Kind
 
 

@@ -1,7 +1,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from ._checks import check_band, check_not_negative, check_positive, Number
+from jaxquad._core import check_band, check_not_negative, check_positive, Number
+
 from ._excitation import Excitation
 
 

@@ -7,9 +7,8 @@ from typing import Any
 from jaxquad.control import LADRC, PID, ScheduledLADRC, ScheduledPID
 
 from ._ladrc import ladrc_source, scheduled_ladrc_source
-from ._number import Precision
 from ._pid import pid_source, scheduled_pid_source
-from ._source import written
+from ._source import Precision, written
 
 
 _SOURCES = {
@@ -44,7 +43,7 @@ def c_header(
         known = ", ".join(f"jq.{kind.__name__}" for kind in _SOURCES)
         raise ValueError(
             f"the controller is a {type(controller).__name__}, but {known} can be written in C; of "
-            "an adaptive LADRC, write the jq.ScheduledLADRC and tell it your estimate."
+            "an adaptive LADRC, write the jq.control.ScheduledLADRC and tell it your estimate."
         )
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or "__" in name:
         raise ValueError(

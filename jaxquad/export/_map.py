@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from jaxquad.control import InertiaMap
 
-from ._number import braced, number, Precision
+from ._source import braced, number, Precision
 
 
 class MapSource(NamedTuple):
@@ -23,7 +23,7 @@ def require_map(rule: Any) -> InertiaMap:
     """Raises ValueError for a map that cannot be written."""
     if not isinstance(rule, InertiaMap):
         raise ValueError(
-            f"the map is a {type(rule).__name__}, but only a jq.InertiaMap can be written in C."
+            f"the map is a {type(rule).__name__}, but only a jq.control.InertiaMap can be written in C."
         )
     return rule
 

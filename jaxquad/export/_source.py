@@ -1,13 +1,74 @@
 """What a controller brings to its header, and the text of the parts that all have in common."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from string import Template
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
-from ._number import braced, number, Precision, type_of
+
+Precision = Literal["float", "double"]
+_TYPES = {"float": np.float32, "double": np.float64}
+
+
+def type_of(precision: Precision) -> type[np.floating[Any]]:
+    """NumPy's name of a C type. Raises ValueError for another."""
+    if precision not in _TYPES:
+        raise ValueError(f'precision is {precision!r}: choose "float" or "double".')
+    return _TYPES[precision]
+
+
+def number(value: Any, name: str, precision: Precision) -> str:
+    """A C constant that reads back as the same number; FLT_MAX or DBL_MAX for infinity.
+
+    Raises ValueError for nan and for what a float cannot hold.
+    """
+    kind = type_of(precision)
+    with np.errstate(over="ignore", under="ignore"):
+        held = kind(value)
+    if np.isnan(value) or (np.isinf(held) and not np.isinf(value)) or (held == 0 and value != 0):
+        raise ValueError(f"{name} is {value}, which no {precision} of C holds: look at the gains.")
+    if np.isinf(held):
+        most = "FLT_MAX" if precision == "float" else "DBL_MAX"
+        return most if held > 0 else f"-{most}"
+    text = str(held)  # the shortest that reads back
+    text = text if any(mark in text for mark in ".e") else f"{text}.0"
+    return text + "f" * (precision == "float")
+
+
+def braced(values: Iterable[str]) -> str:
+    return "{" + ", ".join(values) + "}"
+
+
+def starting(
+    members: Iterable[str], *, measured: str | None, more: str = "", flags: Iterable[str] = ()
+) -> tuple[str, ...]:
+    """`init`, with all of the state 0 but for what `more` sets; `init_at` starts the `measured`."""
+    lines = [f"state->{name}[k] = 0;" for name in members] + [more] * bool(more)
+    body = "\n".join(f"        {line}" for line in lines)
+    whole = "".join(f"    state->{flag} = 0;\n" for flag in flags)
+    init = _INIT.replace("$lines", body).replace("$whole", whole)
+    return (init,) if measured is None else (init, _INIT_AT.replace("$measured", measured))
+
+
+_INIT = """\
+/* At rest at angle 0. */
+static inline void ${name}_init(${name}_state *state)
+{
+    for (int k = 0; k < ${NAME}_AXES; ++k) {
+$lines
+    }
+$whole}"""
+
+_INIT_AT = """\
+/* At rest at a measurement. */
+static inline void ${name}_init_at(${name}_state *state, const $real measurement[${NAME}_AXES])
+{
+    ${name}_init(state);
+    for (int k = 0; k < ${NAME}_AXES; ++k)
+        state->$measured[k] = measurement[k];
+}"""
 
 
 class Gain(NamedTuple):

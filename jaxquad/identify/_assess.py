@@ -24,7 +24,7 @@ from ._accuracy import (
     Record,
     scaled_inverse,
 )
-from ._identifiable import decide, Identifiability, Information
+from ._identifiability import decide, Identifiability, Information
 from ._parameters import Place
 from ._problem import Problem
 from ._remarks import (
@@ -37,8 +37,7 @@ from ._remarks import (
 )
 from ._result import Fit
 from ._solve import same_responses, Solution
-from ._starts import Minimum
-from ._stationary import remarks_on_minima
+from ._starts import Minimum, remarks_on_minima
 
 
 def assess(

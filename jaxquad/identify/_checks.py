@@ -20,7 +20,7 @@ def checked_responses(frf: Any) -> list[FrequencyResponse]:
     if not frfs or not all(isinstance(one, FrequencyResponse) for one in frfs):
         kinds = ", ".join(sorted({type(one).__name__ for one in frfs})) or "nothing"
         raise ValueError(
-            f"a fit needs a jq.FrequencyResponse or a list of them, not {kinds}: make one with "
+            f"a fit needs a jq.spectra.FrequencyResponse or a list of them, not {kinds}: make one with "
             "jq.frequency_response(record), and call jq.fit(model, response)"
         )
     for k, one in enumerate(frfs):
@@ -34,7 +34,7 @@ def check_options(cost: Any, band: Any, min_coherence: float, max_steps: int) ->
     """Values that mean nothing."""
     if isinstance(cost, type) or not isinstance(cost, Cost):
         raise ValueError(
-            f"cost={cost!r}: pass an object, jq.CoherenceWeighted() or jq.MaximumLikelihood()"
+            f"cost={cost!r}: pass an object, jq.identify.CoherenceWeighted() or jq.identify.MaximumLikelihood()"
         )
     for limits in band.values() if isinstance(band, Mapping) else [band]:
         if limits is not None and np.shape(limits) != (2,):
@@ -50,7 +50,7 @@ def check_knowledge(model: PyTree, priors: Sequence[Prior], cost: Cost) -> None:
     if priors and not isinstance(cost, MaximumLikelihood):
         raise ValueError(
             "a prior has a standard error, but the cost (14) has no noise to weigh it against: "
-            "pass cost=jq.MaximumLikelihood()"
+            "pass cost=jq.identify.MaximumLikelihood()"
         )
     known = [place.name for place in name_places(model)] if priors else []
     for prior in priors:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ._accuracy import Matrix
-from ._identifiable import NotIdentifiable
+from ._identifiability import NotIdentifiable
 from ._parameters import Parameters
 
 
@@ -117,7 +117,7 @@ def _refusal(fit: Any, lost: tuple[str, ...]) -> str:
     determined = f" (only {known} is)" if known else ""
     return (
         f"the record does not determine {names}{determined}, which leaves nothing to draw them "
-        "from: fix them at measured values as far as needed, give a jq.Prior or a second record; "
+        "from: fix them at measured values as far as needed, give a jq.identify.Prior or a second record; "
         "or, for what depends on determined combinations alone, draw with hold_undetermined=True"
     )
 

@@ -5,24 +5,38 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad.spectra import FrequencyResponse, require_x64
+from jaxquad._core import require_x64
+from jaxquad.models import LaggedIntegrator
+from jaxquad.spectra import FrequencyResponse
 
 from ._assess import assess
-from ._band import Band, usable
-from ._checks import (
-    check_finite,
-    check_knowledge,
-    check_options,
-    check_priors,
-    checked_responses,
-)
-from ._cost import CoherenceWeighted, Cost, Mask, Ratio, Weights
-from ._identifiable import NotIdentifiable
+from ._checks import check_finite, check_knowledge, check_options, check_priors, checked_responses
+from ._cost import Band, CoherenceWeighted, Cost, Mask, Ratio, usable, Weights
+from ._identifiability import NotIdentifiable
 from ._parameters import Free, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem
 from ._result import Fit
 from ._solve import Solution, solve
 from ._starts import Minimum, solve_from_many, spread_starts
+
+
+def guess_lagged_integrator(frf: FrequencyResponse, integrators: int) -> LaggedIntegrator:
+    """Starting values for K e^(-delay s) / (s^integrators (lag s + 1)) from a response's shape.
+
+    K from the magnitude and the phase in the lower half of the coherent band,
+    lag and delay from the slope of the phase, half each. Good enough for a fit to start from.
+    """
+    omega, response = np.asarray(frf.omega), np.asarray(frf.response)[:, 0, 0]
+    coherence = np.asarray(frf.coherence)[:, 0, 0]
+    good = coherence >= min(0.6, 0.9 * float(coherence.max()))
+    flat = (response * (1j * omega) ** integrators)[good]
+    slow = flat[: max(flat.size // 2, 1)]
+    sign = 1.0 if np.real(np.sum(slow / np.abs(slow))) >= 0 else -1.0
+    turns = np.angle(flat[1:] / flat[:-1])
+    steps = np.diff(omega[good])
+    slope = -float(np.sum(turns * steps) / np.sum(steps**2)) if steps.size else 0.0
+    late = max(slope, 0.05 / float(omega[good][-1]))
+    return LaggedIntegrator(sign * float(np.median(np.abs(slow))), late / 2, late / 2, integrators)
 
 
 def fit(
@@ -43,7 +57,7 @@ def fit(
     """Identify the `free` parameters of a model from one or several frequency responses.
 
     `model` is any `eqx.Module` with `frequency_response(omega)`; its values are the start. `free`
-    names parameters (`"J_x"`, `"numerator[0]"`, `jq.Real("zero")`), selects them
+    names parameters (`"J_x"`, `"numerator[0]"`, `jq.identify.Real("zero")`), selects them
     (`lambda m: (m.gain, m.delay)`), or is `None` for all. A bare name keeps the sign of its start.
     `tied` are numbers that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
     With several responses, `conditions` says how the model differs in each record, for instance

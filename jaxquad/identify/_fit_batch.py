@@ -2,21 +2,189 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
-from jaxquad.spectra import FrequencyResponse, require_x64
+from jaxquad._core import CONVERGED, decrement, minimise, Normal, require_x64, TOLERANCE
+from jaxquad._xla import once
+from jaxquad.spectra import FrequencyResponse
 
 from ._assess import assess
-from ._band import Range, usable
-from ._batch import BatchSolution, solve_batch
 from ._checks import check_options
-from ._cost import CoherenceWeighted, Cost, Mask
-from ._parameters import Free, Parameters, select_parameters, Tie
+from ._cost import CoherenceWeighted, Cost, Mask, Range, usable
+from ._parameters import Free, Parameters, Place, select_parameters, Tie
 from ._problem import make_problem
 from ._result import Fit
 from ._solve import describe, solution_at, Stop
+
+
+_CHUNK = 64  # fits side by side: their Jacobians stay in the cache
+
+
+class BatchSolution(NamedTuple):
+    """Where every member of a batch stopped."""
+
+    z: Float[Array, "batch parameters"]
+    values: Float[Array, "batch parameters"]  # physical
+    cost: Float[Array, " batch"]  # sum of squares
+    decrement: Float[Array, " batch"]  # what one more step would save of half the cost
+    steps: Int[Array, " batch"]
+    converged: Bool[Array, " batch"]  # stopped, and with nothing left to save
+
+
+def solve_batch(
+    model: PyTree,
+    parameters: Parameters,
+    omega: Float[Array, " frequencies"],
+    measured: Complex[Array, "batch frequencies outputs inputs"],
+    weights: Float[Array, "..."],
+    *,
+    max_steps: int = 64,
+    tolerance: float = TOLERANCE,
+) -> BatchSolution:
+    """Fit every response of the batch from the same start, by Levenberg-Marquardt.
+
+    `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
+    phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count. The model is evaluated
+    one frequency at a time. A member that did not reach a stationary point has `converged` false,
+    and its decrement says how far it is; one in a local minimum shows by its cost alone.
+    Raises ValueError for shapes that do not match, no batch at all, or a response that at one
+    frequency depends on which others are asked for.
+    """
+    if measured.shape[0] == 0 or (*measured.shape, 2) != weights.shape:
+        raise ValueError(
+            f"measured has shape {measured.shape} and weights {weights.shape}: give at least one "
+            "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
+        )
+    _check_pointwise(model, omega, measured.shape[1:])
+    return _solve_batch(model, parameters, omega, measured, weights, max_steps, tolerance)
+
+
+def _check_pointwise(model: PyTree, omega: Float[Array, " f"], shape: tuple[int, ...]) -> None:
+    whole, single = (np.asarray(part) for part in _both_ways(model, omega))
+    if whole.shape != shape:
+        raise ValueError(
+            f"the model's response has shape {whole.shape}, the measured ones {shape} (frequencies,"
+            " outputs, inputs): pick channels with jq.records.select, or extend the model"
+        )
+    if not np.allclose(whole, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(whole))):
+        raise ValueError(
+            "the model's response at one frequency depends on the other frequencies that are asked "
+            "for: a batch evaluates it frequency by frequency; fit the responses with jq.fit"
+        )
+
+
+@eqx.filter_jit
+def _both_ways(model, omega):
+    single = jax.vmap(lambda w: model.frequency_response(w[None])[0])(omega)
+    return model.frequency_response(omega), single
+
+
+@eqx.filter_jit
+def _solve_batch(
+    model, parameters, omega, measured, weights, max_steps, tolerance
+) -> BatchSolution:
+    size = min(_CHUNK, measured.shape[0])
+    used = jnp.any(weights > 0, axis=-1)
+    # Points that do not count may hold anything, NaN included.
+    inverse = jnp.where(used, 1 / jnp.where(used, measured, 1.0), 1.0)
+    z0 = jnp.broadcast_to(parameters.start[: parameters.count, None], (parameters.count, size))
+
+    def chunk(data):
+        evaluate = lambda z: _normal(model, parameters, z, omega, *data)
+        state = minimise(evaluate, z0, max_steps, tolerance)
+        normal = evaluate(state.z)
+        left = decrement(normal)
+        level = left <= 1e-6 * normal.cost + 1e-12
+        converged = (state.status == CONVERGED) & level
+        return state.z, 2 * normal.cost, left, state.steps, converged
+
+    stacked = jax.lax.map(chunk, (_chunked(inverse, size), _chunked(weights, size)))
+    batch = measured.shape[0]
+    z, *facts = (jnp.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1]) for part in stacked)
+    values = jax.vmap(parameters.values)(z)
+    return BatchSolution(z[:batch], values[:batch], *(part[:batch] for part in facts))
+
+
+def _chunked(array: Array, size: int) -> Array:
+    """[chunks, ..., size], the last chunk filled up with the last member."""
+    fill = [(0, -array.shape[0] % size)] + [(0, 0)] * (array.ndim - 1)
+    padded = jnp.pad(array, fill, mode="edge")
+    return jnp.moveaxis(padded.reshape(-1, size, *array.shape[1:]), 1, -1)
+
+
+def _normal(model, parameters, z, omega, inverse, weights) -> Normal:
+    """Normal equations of all members, frequencies outside and members inside."""
+
+    def point(z, omega, inverse, weights):
+        return _point(model, parameters, z, omega, inverse, weights)
+
+    members = jax.vmap(point, in_axes=(0, None, -1, -1))
+    everywhere = once(jax.vmap(members, in_axes=(None, 0, 0, 0)))
+    columns = everywhere(list(z), omega, inverse, weights)
+    stacked = jnp.stack([jnp.moveaxis(column, 1, -1) for column in columns])
+    return _products(stacked.reshape(len(columns), -1, z.shape[1]))
+
+
+def _point(model, parameters, z, omega, inverse, weights) -> list[Float[Array, "..."]]:
+    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency."""
+
+    def response(z):
+        return _inserted(model, parameters, z).frequency_response(omega[None])[0]
+
+    here = response(z)
+    columns = []
+    for k in range(len(z)):
+        # One parameter at a time: what does not depend on it costs nothing.
+        along = lambda x, k=k: response([*z[:k], x, *z[k + 1 :]])
+        slope = jax.jvp(along, (z[k],), (jnp.ones_like(z[k]),))[1] / here
+        columns.append(jnp.stack([jnp.real(slope), jnp.imag(slope)], axis=-1) * weights)
+    ratio = here * inverse
+    size = jnp.real(ratio) ** 2 + jnp.imag(ratio) ** 2
+    phase = jnp.arctan2(jnp.imag(ratio), jnp.real(ratio))
+    return [*columns, jnp.stack([0.5 * jnp.log(size), phase], axis=-1) * weights]
+
+
+def _inserted(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) -> PyTree:
+    """As `Parameters.insert`, but without a vector that would make each depend on all."""
+    logs, scale = parameters.logarithmic, parameters.scale
+    values = [scale[k] * (jnp.exp(x) if logs[k] else x) for k, x in enumerate(z)]
+    model = _written(model, parameters.places, values)
+    for place, tie in parameters.ties:
+        model = _written(model, (place,), [jnp.asarray(tie(model))])
+    return model
+
+
+def _written(model: PyTree, places: tuple[Place, ...], values: list[Float[Array, ""]]) -> PyTree:
+    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    for leaf in {place.leaf for place, _ in zip(places, values, strict=False)}:
+        flat = list(leaves[leaf].reshape(-1))
+        for place, value in zip(places, values, strict=False):
+            if place.leaf == leaf:
+                flat[place.index] = value
+        shape = leaves[leaf].shape
+        leaves[leaf] = flat[0] if shape == () else jnp.stack(flat).reshape(shape)
+    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+
+
+def _products(columns: Float[Array, "columns points batch"]) -> Normal:
+    """All scalar products of the columns in one pass over the points."""
+    n = columns.shape[0] - 1
+    first, second = np.tril_indices(n + 1)
+
+    def add(k, total):
+        point = columns[:, k]
+        return total + point[first] * point[second]
+
+    start = jnp.zeros((first.size, columns.shape[-1]), columns.dtype)
+    sums = jax.lax.fori_loop(0, columns.shape[1], add, start)
+    place = np.zeros((n + 1, n + 1), int)
+    place[first, second] = place[second, first] = np.arange(first.size)
+    matrix = sums[place]
+    return Normal(0.5 * matrix[n, n], matrix[n, :n], matrix[:n, :n])
 
 
 class BatchFit(eqx.Module):
@@ -85,7 +253,9 @@ def fit_batch(
     require_x64("a fit")
     frfs = list(frfs)
     if not frfs or not all(isinstance(frf, FrequencyResponse) for frf in frfs):
-        raise ValueError("a batch needs one jq.FrequencyResponse or more: fit_batch(model, frfs)")
+        raise ValueError(
+            "a batch needs one jq.spectra.FrequencyResponse or more: fit_batch(model, frfs)"
+        )
     check_options(cost, band, min_coherence, max_steps)
     parameters = select_parameters(model, free, tied)
     data = _common(frfs, band, min_coherence)

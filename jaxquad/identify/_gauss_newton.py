@@ -8,7 +8,16 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from ._levenberg import advance, begin, Descent, Normal, normal_equations, RUNNING, settle, STALLED
+from jaxquad._core import (
+    advance,
+    begin,
+    Descent,
+    Normal,
+    normal_equations,
+    RUNNING,
+    settle,
+    STALLED,
+)
 
 
 class DampedGaussNewton(optx.AbstractLeastSquaresSolver):

@@ -8,19 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from jaxquad._core import require_x64
 from jaxquad.records import Record
-from jaxquad.spectra import require_x64
 
 from ._checks import check_priors
-from ._integrated import is_plant, states_of
 from ._output_error_descent import relaxed
 from ._output_error_result import assess_output_error
+from ._output_error_trial import found_at, OutputError, Trial
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of
 from ._result import Fit
-from ._simulated import check_channels, check_growth, linear_model, motions_of
-from ._trial import found_at, OutputError, Trial
-from ._zero_phase import band_gain, filtered
+from ._simulated import (
+    band_gain,
+    check_channels,
+    check_growth,
+    filtered,
+    is_plant,
+    linear_model,
+    motions_of,
+    states_of,
+)
 
 
 def refine(
@@ -74,7 +81,9 @@ def _checked(record: Record | Sequence[Record], max_steps: int, hold: str) -> li
     for one in records:
         still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
         if still:
-            raise ValueError(f"output {still[0]} does not move: leave it out with jq.select")
+            raise ValueError(
+                f"output {still[0]} does not move: leave it out with jq.records.select"
+            )
     return records
 
 
@@ -118,7 +127,7 @@ def _check_measured(model: Any, record: Record) -> None:
     if measured != len(record.output_names):
         raise ValueError(
             f"the plant measures {measured} outputs, the record has {record.output_names}: pick "
-            "them with jq.select"
+            "them with jq.records.select"
         )
 
 
@@ -140,7 +149,7 @@ def _with_units(problem: OutputError) -> OutputError:
         if not np.all(np.isfinite(sizes)):
             raise ValueError(
                 "the plant cannot be integrated over the record from its starting values: it "
-                "diverges or is too stiff; start from other values, or cut the record with jq.trim"
+                "diverges or is too stiff; start from other values, or cut the record with jq.records.trim"
             )
         seen = sizes > 1e-6 * np.max(sizes, initial=0.0)
         start = jnp.asarray(np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0))

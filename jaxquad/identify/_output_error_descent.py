@@ -3,6 +3,7 @@
 The loop runs on the host: it is a few steps of milliseconds, and compiling it takes longer.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._output_error_trial import Found, found_at, OutputError
 from ._solve import describe, Solution
-from ._trial import Found, found_at, OutputError
 
 
 _STEP = 1e-6  # largest change of z that is none: errors are far larger on any record
@@ -82,7 +83,7 @@ def _descend(problem: OutputError, z: Float[np.ndarray, " n"], max_steps: int) -
         raise ValueError(
             "the model's simulated output, or its slope, is not finite at the starting values: it "
             "is unstable over so long a record, or the values mean nothing; start from others, cut "
-            "the record with jq.trim, or fit in the frequency domain"
+            "the record with jq.records.trim, or fit in the frequency domain"
         )
     for step in range(max_steps):
         cost, gradient, hessian = (np.asarray(part) for part in here.normal)
@@ -110,3 +111,35 @@ def _descend(problem: OutputError, z: Float[np.ndarray, " n"], max_steps: int) -
 
 def _finite(found: Found) -> bool:
     return bool(np.all([np.all(np.isfinite(np.asarray(part))) for part in found.normal]))
+
+
+_STEP_FIXED_SLOPES = 1e-5  # relative; its square is the error
+
+
+def with_fixed_slopes(descent: Descent) -> Found:
+    """The misfits' slopes by the free parameters, then the fixed, then the initial states.
+
+    Central differences: they serve for names alone, and compile nothing anew.
+    """
+    parameters, found = descent.problem.base.parameters, descent.found
+    count, values = parameters.count, np.asarray(descent.solution.values)
+    fixed = [_slopes(descent, k, values) for k in range(count, values.size)]
+    slopes = [
+        jnp.concatenate([mine[:, :, :count], jnp.stack(others, axis=2), mine[:, :, count:]], axis=2)
+        for mine, *others in zip(found.slopes, *fixed, strict=True)
+    ]
+    return found._replace(slopes=slopes)
+
+
+def _slopes(descent: Descent, k: int, values: np.ndarray) -> list:
+    problem = descent.problem
+    ends = []
+    for step in (_STEP_FIXED_SLOPES, -_STEP_FIXED_SLOPES):
+        moved = values.copy()
+        moved[k] *= np.exp(step)
+        model = problem.base.parameters.replace(problem.base.model, jnp.asarray(moved))
+        base = dataclasses.replace(problem.base, model=model)
+        ends.append(found_at(descent.z, dataclasses.replace(problem, base=base)).misfits)
+    return [
+        (after - before) / (2 * _STEP_FIXED_SLOPES) for after, before in zip(*ends, strict=True)
+    ]

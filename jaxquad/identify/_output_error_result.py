@@ -2,6 +2,7 @@
 
 import functools as ft
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,17 +16,143 @@ from ._accuracy import (
     cramer_rao,
     insensitivity,
     Known,
+    Matrix,
+    Noise,
     scaled_inverse,
 )
 from ._assess import _identifiability, _known, _ranks, _rescale, _units
-from ._fixed_slopes import with_fixed_slopes
-from ._identifiable import Identifiability, Information
-from ._output_error_descent import Descent
-from ._output_error_remarks import remarks_on_colour, remarks_on_output_error
-from ._reduced import gauss_newton, Reduced, reduced_rows, seen_records, signed_root
-from ._remarks import remarks_on_priors
+from ._coloured import orthonormal, projected_noise
+from ._identifiability import Identifiability, Information
+from ._output_error_descent import Descent, with_fixed_slopes
+from ._output_error_trial import Found, found_at, OutputError, Trial
+from ._problem import Problem
+from ._remarks import _runaways, remarks_on_priors
 from ._result import Fit
-from ._trial import found_at, OutputError, Trial
+from ._solve import Solution
+
+
+_LEFT = 1e-2  # share of what the noise moves that a step may still save
+
+
+def remarks_on_output_error(
+    base: Problem, solution: Solution, records: Sequence[Record], decrement: float, taken: float
+) -> list[str]:
+    """Runaway parameters, missing convergence, and feedback."""
+    remarks, no_minimum = _runaways(base, solution), decrement > _LEFT * max(taken, 1.0)
+    if not solution.converged and (no_minimum or not remarks):
+        remarks.append(f"the solver stopped early: {solution.message}")
+    if no_minimum:
+        remarks.append(
+            f"no minimum: one more Gauss-Newton step would lower the cost by {decrement:.3g}, "
+            f"where the noise alone accounts for {taken:.3g}; start nearer, for instance from a "
+            "frequency-domain fit"
+        )
+    fed = dict.fromkeys(name for record in records for name in record.reference_names)
+    if fed:
+        remarks.append(
+            f"the record has references ({', '.join(fed)}), so a loop may have been closed: output "
+            "error is biased where feedback returns the noise to the input; simulate the loop, or "
+            "fit the joint estimate, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())"
+        )
+    remarks.append(
+        "the noise level is that of the residuals, which makes the misfit beside it 1: judge the "
+        "model by jq.verify on another record"
+    )
+    return remarks
+
+
+def remarks_on_colour(
+    misfits: Sequence[Float[np.ndarray, "samples outputs"]], bread: Matrix, covariance: Matrix
+) -> list[str]:
+    """Residuals so coloured that it matters."""
+    white = np.diagonal(scaled_inverse(bread))
+    ratio = np.sqrt(np.diagonal(covariance) / np.maximum(white, 1e-300))
+    ratio = ratio[ratio > 1e-3]  # what nothing determines has none
+    most = float(ratio[np.argmax(np.abs(np.log(ratio)))]) if ratio.size else 1.0
+    if 0.67 < most < 1.5:
+        return []
+    pairs = [np.sum(one[1:] * one[:-1], axis=0) / np.sum(one**2, axis=0) for one in misfits]
+    correlation = max(np.concatenate(pairs), key=abs)
+    return [
+        f"the residuals are coloured (lag-one correlation {correlation:.2f}): standard errors "
+        f"allow for it, and are up to {most:.2g} times those under white noise"
+    ]
+
+
+class Seen(NamedTuple):
+    """One record at the solution, without what its initial state and trim can explain."""
+
+    misfit: Float[np.ndarray, "samples outputs"]
+    slopes: Float[np.ndarray, "samples outputs all"]  # of the misfit, by relative changes
+    nuisance: Float[np.ndarray, "samples outputs unknowns"]  # orthonormal
+
+
+class Reduced(NamedTuple):
+    """In the coordinates of orthonormal combinations of the slopes; free parameters first."""
+
+    root: Float[np.ndarray, "all all"]  # slopes
+    aim: Float[np.ndarray, " all"]  # misfit
+    noise: Float[np.ndarray, "all all"]  # covariance of the noise in the misfit
+    output: Float[np.ndarray, " all"]  # measured output
+
+
+def seen_records(
+    problem: OutputError, found: Found, rescale: Float[np.ndarray, " all"]
+) -> list[Seen]:
+    """The records with slopes by relative changes, clear of the initial states."""
+    seen, at = [], rescale.size
+    parts = zip(problem.trials, found.misfits, found.slopes, found.columns, strict=True)
+    for trial, misfit, slopes, columns in parts:
+        slopes, states = np.asarray(slopes), trial.start.size
+        own = np.concatenate([np.asarray(columns), slopes[:, :, at : at + states]], axis=2)
+        basis = orthonormal(own)
+        mine = slopes[:, :, : rescale.size] * rescale
+        share = np.einsum("tok,toa->ka", basis, mine)
+        seen.append(Seen(np.asarray(misfit), mine - basis @ share, basis))
+        at += states
+    return seen
+
+
+def reduced_rows(seen: Sequence[Seen], trials: Sequence[Trial], count: int) -> Reduced:
+    """One orthonormal basis of the slopes of all records, and everything else as it shows in it."""
+    every = seen[0].slopes.shape[2]
+    stacked = np.concatenate([one.slopes.reshape(-1, every) for one in seen])
+    basis, root = np.linalg.qr(np.concatenate([stacked, np.zeros((every, every))]))
+    aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
+    for one, trial in zip(seen, trials, strict=True):
+        mine = basis[at : at + one.misfit.size].reshape(one.slopes.shape)
+        measured = np.asarray(trial.y * trial.weights[None])
+        aim += np.einsum("tok,to->k", mine, one.misfit)
+        output += np.einsum("tok,to->k", mine, measured)
+        fitted = np.concatenate([mine[:, :, :count], one.nuisance], axis=2)
+        noise += projected_noise(mine, one.misfit, fitted)
+        at += one.misfit.size
+    return Reduced(root, aim, noise, output)
+
+
+def gauss_newton(reduced: Reduced, known: Known, count: int) -> tuple[Matrix, np.ndarray, Noise]:
+    """`J'J` and `J'r` over the free parameters, and what the noise does to the latter."""
+    root, prior = reduced.root[:, :count], known.slopes[:, :count]
+    bread = root.T @ root + prior.T @ prior
+    gradient = root.T @ reduced.aim + prior.T @ known.misfit
+    return bread, gradient, Noise(root.T @ reduced.noise @ root, prior.T @ prior, 0.0)
+
+
+def signed_root(reduced: Reduced) -> Float[np.ndarray, "rows all"]:
+    """Slopes of the output in units of their noise, whose even rows tell the way of the response.
+
+    The first row is the part along the measured output; zeros stand for the other even ones.
+    """
+    values, vectors = np.linalg.eigh(reduced.noise)
+    values = np.maximum(values, max(1e-12 * values[-1], 1e-30))
+    whitened = vectors / np.sqrt(values)
+    root, along = -whitened.T @ reduced.root, whitened.T @ reduced.output
+    turned = np.linalg.qr(np.column_stack([along, np.eye(along.size)]))[0]
+    turned[:, 0] *= np.sign(turned[:, 0] @ along) or 1.0
+    rows = turned.T @ root
+    spaced = np.zeros((2 * len(rows), rows.shape[1]))
+    spaced[0], spaced[1 : 2 * len(rows) - 2 : 2] = rows[0], rows[1:]
+    return spaced
 
 
 def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:

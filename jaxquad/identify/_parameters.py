@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad.spectra import require_float64
+from jaxquad._core import require_float64
 
 
 class Positive(NamedTuple):
@@ -74,18 +74,18 @@ class Parameters(eqx.Module):
 
     def replace(self, model: PyTree, values: Float[Array, " n"]) -> PyTree:
         """The model with other physical values of its first `n` parameters."""
-        model = _written(model, self.places[: values.shape[0]], values)
+        model = with_values(model, self.places[: values.shape[0]], values)
         for place, tie in self.ties:
             value = jnp.asarray(tie(model))
             if value.shape != ():
                 raise ValueError(
                     f"{place.name} is tied to something of shape {value.shape}: give one number"
                 )
-            model = _written(model, (place,), value[None])
+            model = with_values(model, (place,), value[None])
         return model
 
 
-def _written(model: PyTree, places: Sequence[Place], values: Float[Array, " n"]) -> PyTree:
+def with_values(model: PyTree, places: Sequence[Place], values: Float[Array, " n"]) -> PyTree:
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     for leaf in {place.leaf for place in places}:
@@ -194,11 +194,13 @@ def _choose(
     if isinstance(item, Real):
         scale = item.scale or abs(value)
         if not scale > 0:
-            raise ValueError(f"{name} starts at 0: say its size with jq.Real({name!r}, scale=...)")
+            raise ValueError(
+                f"{name} starts at 0: say its size with jq.identify.Real({name!r}, scale=...)"
+            )
         return by_name[name], False, scale
     if value == 0:
         raise ValueError(
             f"{name} starts at 0, so its sign is unknown: give a starting value, or let it cross "
-            f"zero with jq.Real({name!r}, scale=...)"
+            f"zero with jq.identify.Real({name!r}, scale=...)"
         )
     return by_name[name], True, float(np.sign(value))

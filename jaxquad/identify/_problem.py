@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
-from jaxquad.models._apart import apart
+from jaxquad._xla import apart
 from jaxquad.spectra import FrequencyResponse
 
 from ._parameters import Parameters
@@ -136,7 +136,7 @@ def _alike(
     if model.shape != measured.shape:
         raise ValueError(
             f"the model's response has shape {model.shape}, the measured one {measured.shape} "
-            "(frequencies, outputs, inputs): pick channels with jq.select, or extend the model"
+            "(frequencies, outputs, inputs): pick channels with jq.records.select, or extend the model"
         )
     return model
 

@@ -8,8 +8,7 @@ from jaxtyping import PyTree
 
 from jaxquad.spectra import FrequencyResponse
 
-from ._band import Band
-from ._cost import CoherenceWeighted, Cost
+from ._cost import Band, CoherenceWeighted, Cost
 from ._fit import fit
 from ._parameters import Free, Parameters, Positive, Real, select_parameters, Tie
 from ._result import Fit

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxquad.spectra import FrequencyResponse
 
-from ._identifiable import Identifiability
+from ._identifiability import Identifiability
 from ._problem import Problem
 from ._solve import Solution
 
@@ -90,7 +90,7 @@ def remarks_on_leakage(
                 return [
                     f"the response falls as 1/s^{steepness} at its lowest frequencies and leaks "
                     f"through the window, by up to {100 * leak:.2g} % at {omega[0]:.3g} rad/s: "
-                    f"estimate it with jq.Welch(integrators={min(steepness, 3)})"
+                    f"estimate it with jq.spectra.Welch(integrators={min(steepness, 3)})"
                 ]
     return []
 
@@ -113,7 +113,7 @@ def _moved(problem: Problem, solution: Solution) -> Float[np.ndarray, " paramete
 def _runaways(problem: Problem, solution: Solution) -> list[str]:
     names, low = problem.parameters.names, ran_to_zero(problem, solution)
     remarks = [
-        f"{names[k]} ran to zero: leave it out, or let its sign change with jq.Real({names[k]!r})"
+        f"{names[k]} ran to zero: leave it out, or let its sign change with jq.identify.Real({names[k]!r})"
         for k in low
     ]
     for k in np.flatnonzero(_moved(problem, solution) > 2 * _FAR):

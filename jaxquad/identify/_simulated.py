@@ -2,19 +2,111 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxquad.models import (
+    explicit,
     free_responses,
     realise,
     simulate_linear,
     StateSpace,
     TransferFunction,
 )
-from jaxquad.models._state_space import explicit
 from jaxquad.records import Record
+
+
+def band_gain(
+    band: tuple[float, float] | None, record: Record
+) -> Float[np.ndarray, " bins"] | None:
+    """|H|^2 of a third-order Butterworth band-pass, forwards and backwards; None without a band.
+
+    Raises ValueError for a band (rad/s) that does not rise or leaves the record's range.
+    """
+    if band is None:
+        return None
+    nyquist = np.pi / record.dt
+    if np.shape(band) != (2,) or not 0 < band[0] < band[1] < nyquist:
+        raise ValueError(
+            f"band {band} rad/s must rise and lie between 0 and the Nyquist frequency {nyquist:.4g}"
+        )
+    from scipy.signal import butter, sosfreqz
+
+    sections = butter(3, np.asarray(band) / nyquist, "bandpass", output="sos")
+    turn = np.linspace(0, np.pi, record.samples)
+    response = sosfreqz(sections, turn)[1]  # pyright: ignore
+    return np.abs(response) ** 2
+
+
+def filtered(
+    x: Float[Array, " samples *columns"], gain: Float[Array, " bins"] | None
+) -> Float[Array, " samples *columns"]:
+    """`x` within the band; outside the record it continues mirrored through its two ends."""
+    if gain is None:
+        return x
+    # A straight line is far below any band, and what is left after it starts and ends at 0.
+    ones = (1,) * (x.ndim - 1)
+    along = jnp.linspace(0.0, 1.0, len(x)).reshape(-1, *ones)
+    level = x - x[:1] - along * (x[-1:] - x[:1])
+    periodic = jnp.concatenate([level, -level[-2:0:-1]])
+    spectrum = jnp.fft.rfft(periodic, axis=0)
+    weighted = gain.reshape(-1, *ones).astype(spectrum.dtype) * spectrum
+    return jnp.fft.irfft(weighted, len(periodic), axis=0)[: len(x)]
+
+
+_RELATIVE, _ABSOLUTE = 1e-8, 1e-10  # tolerances of the states within one sample
+_STEPS = 64  # within one sample at most
+
+
+def is_plant(model: Any) -> bool:
+    """Whether a model is given by its differential equation."""
+    return all(callable(getattr(model, name, None)) for name in ("init", "derivative", "measure"))
+
+
+def states_of(plant: Any) -> int:
+    """How many numbers the state has."""
+    return ravel_pytree(plant.init())[0].size
+
+
+def integrated(
+    plant: Any,
+    u: Float[Array, "samples inputs"],
+    start: Float[Array, " states"],
+    dt: float,
+    hold: str,
+) -> Float[Array, "samples outputs"]:
+    """The outputs from `start` beyond `plant.init()`, without disturbance.
+
+    Tsit5 within each sample, so that steps end where a held input jumps or a straight one bends.
+    Not finite where a sample takes too many steps.
+    """
+    # Imported late: diffrax triples the time of `import jaxquad`.
+    import diffrax as dfx
+
+    origin, rebuild = ravel_pytree(plant.init())
+    calm = jnp.zeros_like(plant.measure(rebuild(origin)))
+    controller = dfx.PIDController(rtol=_RELATIVE, atol=_ABSOLUTE)
+
+    def slope(t, state, line):
+        value, change = line
+        inputs = value + (t / dt) * change
+        return ravel_pytree(plant.derivative(rebuild(state), inputs, calm))[0]
+
+    def sample(state, line):
+        found = dfx.diffeqsolve(
+            dfx.ODETerm(slope), dfx.Tsit5(), 0.0, dt, dt, state, line,
+            stepsize_controller=controller, adjoint=dfx.ForwardMode(),
+            max_steps=_STEPS, throw=False,
+        )  # fmt: skip
+        assert found.ys is not None
+        after = jnp.where(found.result == dfx.RESULTS.successful, found.ys[0], jnp.nan)
+        return after, jnp.atleast_1d(plant.measure(rebuild(state)))
+
+    change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
+    return jax.lax.scan(sample, origin + start, (u, change))[1]
 
 
 _SLOW = 15.0  # a fifth of a record over which a motion decays by e^-15 leaves 5 % of it
@@ -55,7 +147,7 @@ def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None
     if (len(record.input_names), len(record.output_names)) != (inputs, outputs):
         raise ValueError(
             f"the model compares {_count(inputs, 'input')} with {_count(outputs, 'output')}, the "
-            f"record has {record.input_names} and {record.output_names}: pick them with jq.select"
+            f"record has {record.input_names} and {record.output_names}: pick them with jq.records.select"
         )
 
 
@@ -67,7 +159,7 @@ def check_growth(plant: TransferFunction | StateSpace, record: Record) -> None:
         raise ValueError(
             f"the model's open-loop response overflows within {record.duration:.4g} s: its poles "
             f"are {poles}, and it grows by e^{fastest:.3g}; take an unstable model on a shorter "
-            "record (jq.trim), or fit it to frequency responses, which need no simulation"
+            "record (jq.records.trim), or fit it to frequency responses, which need no simulation"
         )
 
 

@@ -37,7 +37,7 @@ class Case(eqx.Module):
         if delay is not None:  # a traced one may be longer than it was said to be
             fresh = jnp.where(plant.shift < self.memory, plant.fresh, jnp.nan)
             plant = plant._replace(fresh=fresh)
-        return plant, _without_idle_states(self._linear(place))
+        return plant, without_idle_states(self._linear(place))
 
     def ratio(self, place: Any) -> Float[Array, ""]:
         """b/b0 of a member, with a b0 of 1 for a controller that has none."""
@@ -85,12 +85,12 @@ def case_of(
 def _require_parts(plant: Any, controller: Any) -> None:
     if not isinstance(plant, DecoupledAxes):
         raise ValueError(
-            f"the plant is a {type(plant).__name__}: give jq.DecoupledAxes or a jq.Multirotor."
+            f"the plant is a {type(plant).__name__}: give jq.DecoupledAxes or a jq.models.Multirotor."
         )
     if not isinstance(controller, LinearController) and not hasattr(controller, "linear"):
         raise ValueError(
             f"{type(controller).__name__} has no method linear(axis, member) that returns a "
-            "jq.LinearController: give it one, or pass the LinearController itself."
+            "jq.control.LinearController: give it one, or pass the LinearController itself."
         )
 
 
@@ -141,7 +141,7 @@ def _require_member(member: tuple[int, ...], ensemble: tuple[int, ...]) -> None:
         raise ValueError(f"member is {member}, but the ensemble has the shape {ensemble}.")
 
 
-def _without_idle_states(controller: LinearController) -> LinearController:
+def without_idle_states(controller: LinearController) -> LinearController:
     # A state that nothing drives, as the integral of a PID with ki = 0, stays at 0: it is no mode.
     A = controller.A
     others = jnp.where(jnp.eye(len(A), dtype=bool), 0, A)

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxquad.models import DecoupledAxes
-from jaxquad.models._discretise import split_delay
+from jaxquad.models import DecoupledAxes, split_delay
 
 
 _TERMS = 18  # of the series at a norm of 1: 1 / 19! is below the last bit

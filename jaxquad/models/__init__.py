@@ -1,13 +1,17 @@
 from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._axis import AttitudeAxis as AttitudeAxis
-from ._connect import series as series, state_space as state_space
+from ._connect import realise as realise, series as series, state_space as state_space
 from ._decoupled import AxesState as AxesState, DecoupledAxes as DecoupledAxes
-from ._lagged_integrator import LaggedIntegrator as LaggedIntegrator
+from ._discretise import split_delay as split_delay
+from ._entry_slopes import Entry as Entry, logarithmic_slopes as logarithmic_slopes
 from ._modes import Mode as Mode, modes as modes
-from ._motor import MotorLag as MotorLag
-from ._plant import Multirotor as Multirotor, MultirotorState as MultirotorState
-from ._realise import realise as realise
+from ._multirotor import (
+    MotorLag as MotorLag,
+    Multirotor as Multirotor,
+    MultirotorState as MultirotorState,
+)
+from ._response import Split as Split
 from ._rotation import (
     euler_acceleration as euler_acceleration,
     euler_from_quaternion as euler_from_quaternion,
@@ -17,12 +21,13 @@ from ._rotation import (
     quaternion_from_euler as quaternion_from_euler,
     rotation_matrix as rotation_matrix,
 )
-from ._simulate_linear import (
-    free_responses as free_responses,
-    simulate_linear as simulate_linear,
+from ._simulate_linear import free_responses as free_responses, simulate_linear as simulate_linear
+from ._state_space import explicit as explicit, matrices_of as matrices_of, StateSpace as StateSpace
+from ._transfer_function import (
+    imaginary as imaginary,
+    LaggedIntegrator as LaggedIntegrator,
+    TransferFunction as TransferFunction,
 )
-from ._state_space import StateSpace as StateSpace
-from ._transfer_function import TransferFunction as TransferFunction
 from ._vehicles import (
     CRAZYFLIE as CRAZYFLIE,
     crazyflie as crazyflie,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._parameters import align, as_float, require_positive
+from jaxquad._core import align, as_float, require_positive
 
 
 class _Frame(NamedTuple):

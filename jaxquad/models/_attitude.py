@@ -2,8 +2,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._friction import friction
-from ._parameters import (
+from jaxquad._core import (
     align,
     as_float,
     as_float_or_none,
@@ -12,6 +11,16 @@ from ._parameters import (
     require_positive,
     require_vector,
 )
+
+
+_CREEP = 0.01  # rad/s, at which the torque reaches 76 % of its level
+
+
+def friction(
+    coulomb: Float[Array, "..."], rate: Float[Array, " axes *ensemble"]
+) -> Float[Array, " axes *ensemble"]:
+    """Dry-friction torque in N m at `rate` in rad/s, smoothed so that it has a gradient."""
+    return -align(coulomb, rate) * jnp.tanh(rate / _CREEP)
 
 
 class Attitude(eqx.Module):

@@ -4,13 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float
 
-from ._parameters import (
-    as_float,
-    is_zero,
-    require_finite,
-    require_nonnegative,
-    require_positive,
-)
+from jaxquad._core import as_float, is_zero, require_finite, require_nonnegative, require_positive
+
 from ._transfer_function import imaginary, TransferFunction
 
 

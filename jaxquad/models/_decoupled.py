@@ -6,14 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ._friction import friction
-from ._parameters import (
-    align,
-    as_float,
-    require_finite,
-    require_nonnegative,
-    require_positive,
-)
+from jaxquad._core import align, as_float, require_finite, require_nonnegative, require_positive
+
+from ._attitude import friction
 
 
 def _per_axis(x: ArrayLike | Sequence[Any]) -> Array:

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._apart import apart
-from ._resolvent import Split
-from ._response import Matrices, output_of, solved
+from jaxquad._xla import apart
+
+from ._response import Matrices, output_of, solved, Split
 
 
 class Entry(NamedTuple):

@@ -6,15 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from ._parameters import (
+from jaxquad._core import (
     as_float,
     as_float_or_none,
     is_concrete,
     require_finite,
     require_nonnegative,
 )
+
+from ._modes import transmission_zeros
 from ._response import Matrices, response
-from ._zeros import transmission_zeros
 
 
 class StateSpace(eqx.Module):

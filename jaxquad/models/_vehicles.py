@@ -3,8 +3,7 @@ from typing import NamedTuple
 
 from ._allocation import Allocation
 from ._attitude import Attitude
-from ._motor import MotorLag
-from ._plant import Multirotor
+from ._multirotor import MotorLag, Multirotor
 
 
 class HoverDataSheet(NamedTuple):

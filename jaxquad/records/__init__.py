@@ -5,9 +5,14 @@ from ._errors import (
     RecordError as RecordError,
     RecordWarning as RecordWarning,
 )
-from ._look import channels as channels, ChannelSummary as ChannelSummary
-from ._proposal import Proposal as Proposal
-from ._propose import propose as propose
-from ._read import read as read
+from ._read import channels as channels, ChannelSummary as ChannelSummary, read as read
 from ._record import Record as Record
 from ._resample import resample as resample
+from ._segments import (
+    Mix as Mix,
+    parse_mix as parse_mix,
+    read_segments as read_segments,
+    Segment as Segment,
+)
+from .proposals._proposal import AXES as AXES, Proposal as Proposal
+from .proposals._propose import propose as propose

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ._channel import Channel
+from ._clock import Mended, mended, unwrapped
 from ._errors import ReadError, RecordWarning
 from ._log import Signal, Signals
 from ._names import listed, unknown_name
-from ._stamps import Mended, mended, unwrapped
 
 
 TimeUnit = Literal["s", "ms", "us", "ns"]

@@ -1,11 +1,18 @@
-from ._bode import bode as bode
-from ._certificate import certificate_figure as certificate_figure
 from ._comparison import comparison as comparison
-from ._convergence import convergence_figure as convergence_figure
-from ._front import front_figure as front_figure
-from ._histories import histories as histories
 from ._html import write_report as write_report
+from ._html_page import page as page
 from ._html_provenance import Provenance as Provenance, provenance as provenance, Source as Source
-from ._json import write_json as write_json
-from ._overlay import overlay as overlay, record_figure as record_figure
-from ._results import write_results as write_results
+from ._html_text import (
+    element as element,
+    given as given,
+    Html as Html,
+    joined as joined,
+    section as section,
+    table as table,
+)
+from ._results import (
+    plain_content as plain_content,
+    verification_content as verification_content,
+    write_json as write_json,
+    write_results as write_results,
+)

@@ -5,7 +5,7 @@ from typing import Any
 from jaxquad.identify import Combination, Fit, NotIdentifiable, Verification
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
-from jaxquad.tune import Certificate, Tuned
+from jaxquad.tuning import Certificate, Tuned
 
 from ._html_checks import check_section
 from ._html_fit import identifiability_section, parameter_section

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from jaxquad.identify import Verification
+from jaxquad.plot import extremes, overlay, short_names, unit_label
 
-from ._figures_record import extremes
 from ._html_figure import figure, short_unit
-from ._html_text import element, given, Html, joined, section, short_names, table
+from ._html_text import element, given, Html, joined, section, table
 from ._html_verdict import GOOD_TIC
-from ._overlay import _shown, overlay
 
 
 def check_section(checks: Mapping[str, Verification]) -> Html:
@@ -55,7 +54,7 @@ def _thinned(check: Verification) -> Verification:
 def _measures(check: Verification) -> Html:
     rows = []
     for one in check.outputs:
-        scale, unit = _shown(one.unit)
+        scale, unit = unit_label(one.unit)
         numbers = (f"{one.fit_percent:.1f}", f"{one.variance_percent:.1f}", f"{one.tic:.3f}")
         named = given(unit.removeprefix(", ")) if unit else "\u2013"
         rows.append([given(one.name), named, *numbers, f"{scale * one.rms:.4g}"])

@@ -7,7 +7,9 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from ._html_text import element, Html, short_names
+from jaxquad.plot import short_names
+
+from ._html_text import element, Html
 
 
 _LARGEST = 220_000  # bytes of an SVG; a PNG of the figures here has about half of that

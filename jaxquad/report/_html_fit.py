@@ -15,7 +15,7 @@ _CORRELATED = 0.9
 _DASH = "\u2013"
 _REMEDY = (
     "To resolve it: fix one of them at a measured value (leave it out of free=); or give what a "
-    "data sheet or a static test says of it as a jq.Prior; or fit a second record under a known "
+    "data sheet or a static test says of it as a jq.identify.Prior; or fit a second record under a known "
     "change of it (conditions=)."
 )
 

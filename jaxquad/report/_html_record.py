@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping
 
+from jaxquad.plot import channels_of, record_overview, ROWS, unit_label
 from jaxquad.records import Record
 
-from ._figures_record import channels_of, record_overview, ROWS
 from ._html_figure import figure
 from ._html_text import element, given, Html, joined, section, table
-from ._overlay import _shown
 
 
 def record_section(records: Mapping[str, Record]) -> Html:
@@ -42,7 +41,7 @@ def _record(record: Record) -> Html:
 def _channels(record: Record, channels: list[tuple[str, str]]) -> Html:
     rows = []
     for role, name in channels:
-        scale, unit = _shown(record.unit(name))
+        scale, unit = unit_label(record.unit(name))
         values = scale * record.channel(name)
         numbers = (values.mean(), values.std(), values.min(), values.max())
         named = given(unit.removeprefix(", ")) if unit else "\u2013"

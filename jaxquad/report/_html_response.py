@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from jaxquad.plot import bode, COHERENT, residual_figure, Residuals, residuals_of, short_names
 from jaxquad.spectra import FrequencyResponse
 
-from ._bode import _COHERENT, bode
-from ._figures_residuals import residual_figure, Residuals, residuals_of
 from ._html_figure import figure
-from ._html_text import element, given, Html, joined, section, short_names
+from ._html_text import element, given, Html, joined, section
 
 
 _PAIRS = 6  # responses that are drawn, of all estimates together
@@ -92,11 +91,11 @@ def _name(frf: FrequencyResponse, output: int, source: int) -> str:
 
 def _coherence(frf: FrequencyResponse, output: int, source: int) -> str:
     omega = np.asarray(frf.omega)
-    good = omega[np.asarray(frf.coherence)[:, output, source] >= _COHERENT]
+    good = omega[np.asarray(frf.coherence)[:, output, source] >= COHERENT]
     if not good.size:
-        return f"The coherence is below {_COHERENT} at all {omega.size} frequencies."
+        return f"The coherence is below {COHERENT} at all {omega.size} frequencies."
     return (
-        f"The coherence is {_COHERENT} or more at {good.size} of {omega.size} frequencies, "
+        f"The coherence is {COHERENT} or more at {good.size} of {omega.size} frequencies, "
         f"within {good[0]:.3g} .. {good[-1]:.3g} rad/s."
     )
 

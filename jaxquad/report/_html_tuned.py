@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from jaxquad.tune import Certificate, Tuned
-from jaxquad.tune._quantity_text import SHOWN
+from jaxquad.plot import certificate_figure, convergence_figure
+from jaxquad.tuning import Certificate, SHOWN, Tuned
 
-from ._certificate import certificate_figure
-from ._convergence import convergence_figure
 from ._html_figure import figure
 from ._html_fit import definitions
 from ._html_text import element, given, Html, items, joined, scrolling, section, table

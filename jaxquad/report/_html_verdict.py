@@ -5,10 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxquad.identify import Fit, NotIdentifiable, Verification
-from jaxquad.identify._remarks import FAILED, MISFIT
+from jaxquad.identify import FAILED, Fit, MISFIT, NotIdentifiable, Verification
 from jaxquad.spectra import FrequencyResponse
-from jaxquad.tune import Certificate, Tuned
+from jaxquad.tuning import Certificate, Tuned
 
 from ._html_text import element, Html, items, joined
 

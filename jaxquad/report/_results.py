@@ -28,9 +28,9 @@ def write_results(
     """
     content: dict[str, Any] = {"jaxquad_version": _version(), "fit": _fit(fit)}
     content |= {"response": _response(frf)} if frf is not None else {}
-    content |= {"verification": _verification(check)} if check is not None else {}
+    content |= {"verification": verification_content(check)} if check is not None else {}
     content |= dict(extra or {})
-    text = json.dumps(_plain(content), indent=2, allow_nan=False) + "\n"
+    text = json.dumps(plain_content(content), indent=2, allow_nan=False) + "\n"
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     draft = folder / f"result.json.{os.getpid()}.part"
@@ -88,7 +88,7 @@ def _response(frf: FrequencyResponse) -> dict[str, Any]:
     }
 
 
-def _verification(check: Verification) -> dict[str, Any]:
+def verification_content(check: Verification) -> dict[str, Any]:
     measures = ("rms", "tic", "fit_percent", "variance_percent")
     names = (*measures, "shift", "bias", "initial")
     return {name: getattr(check, name) for name in names} | {
@@ -102,14 +102,28 @@ def _verification(check: Verification) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain_content(value: Any) -> Any:
     """JSON's own types, with null for what is not finite."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return _plain(np.asarray(value).tolist())
+        return plain_content(np.asarray(value).tolist())
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain_content(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain_content(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value
+
+
+def write_json(path: str | Path, content: Mapping[str, Any]) -> Path:
+    """Write `content`, arrays included, to `path`, whole or not at all; returns the path.
+
+    Numbers that are not finite are null: JSON has no nan. Folders are made as needed. Raises
+    TypeError for what JSON cannot hold.
+    """
+    path = Path(path)
+    text = json.dumps(plain_content(content), indent=2, allow_nan=False) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.name}.{os.getpid()}.part")
+    draft.write_text(text)
+    return draft.replace(path)

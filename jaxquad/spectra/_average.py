@@ -8,9 +8,170 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
-from ._combine import alone, combine, Combined
 from ._conditioned import Channels, condition, Conditioned
-from ._noise import noise_root
+
+
+_BANDWIDTH = 0.2  # of the noise's smoothing, in ln(omega)
+_FLOOR = 1e-26  # of the output's power: below it lies rounding
+
+Residuals = Complex[Array, "frequencies windows outputs"]
+
+
+def noise_root(
+    omega: Float[Array, " frequencies"],
+    residuals: Residuals,
+    outputs: Residuals,
+    member: Float[Array, "windows groups"],
+    trace: Float[Array, "frequencies outputs groups"],
+    freedom: Float[Array, " groups"],
+    weights: Float[Array, "frequencies outputs groups"],
+) -> Complex[Array, "frequencies outputs outputs"]:
+    """Hermitian root of the covariance of noise that would leave these residuals.
+
+    `member` says which window is of which length. Each length has the energy `trace` that unit
+    noise would leave in its residuals, and the complex degrees of `freedom` of that energy;
+    `weights` say how much it counts. Smooth along frequency.
+    """
+    place = jnp.log(omega)
+    energy, floor = (jnp.swapaxes(jnp.abs(x) ** 2, 1, 2) @ member for x in (residuals, outputs))
+    # The logarithm of a chi-squared variable is low on average: digamma(f) - ln(f).
+    low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
+    levels = jnp.log(jnp.maximum(energy, _FLOOR * floor + 1e-280) / trace) - low[None, None, :]
+    weight, level = weights @ freedom, jnp.sum(weights * levels, axis=2)
+    lines = jax.vmap(_local_line, in_axes=(None, 1, 1), out_axes=1)
+    root = jnp.exp(lines(place, level, weight) / 2)
+    if root.shape[1] == 1:
+        return jax.lax.complex(root, jnp.zeros_like(root))[:, :, None]
+    scale = jnp.sqrt(jnp.mean(weights, axis=1, keepdims=True) / (energy + 1e-280))
+    unit = residuals * jnp.swapaxes(scale @ member.T, 1, 2).astype(residuals.dtype)
+    return _hermitian_root(_coherency(place, unit), root)
+
+
+def _local_line(
+    place: Float[Array, " frequencies"],
+    level: Float[Array, " frequencies"],
+    weight: Float[Array, " frequencies"],
+) -> Float[Array, " frequencies"]:
+    """Weighted local straight lines: a power law passes unchanged."""
+    offset = place[None, :] - place[:, None]
+    kernel = weight[None, :] * jnp.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
+    m0, m1, m2 = (jnp.sum(kernel * offset**k, axis=1) for k in (0, 1, 2))
+    l0, l1 = (jnp.sum(kernel * offset**k * level[None, :], axis=1) for k in (0, 1))
+    # One lone frequency has no slope: the small term keeps the line flat there.
+    spread = m2 + 1e-9 * m0
+    return (spread * l0 - m1 * l1) / (spread * m0 - m1**2)
+
+
+def _coherency(
+    place: Float[Array, " frequencies"], unit: Residuals
+) -> Complex[Array, "frequencies outputs outputs"]:
+    """Correlation between the outputs' noise, of unit diagonal and positive semidefinite."""
+    total = jnp.swapaxes(unit, 1, 2) @ jnp.conj(unit)
+    kernel = jnp.exp(-0.5 * ((place[None, :] - place[:, None]) / _BANDWIDTH) ** 2)
+    flat = total.reshape(place.size, -1)
+    smooth = jax.lax.complex(kernel @ flat.real, kernel @ flat.imag).reshape(total.shape)
+    deviation = jnp.sqrt(jnp.real(jnp.diagonal(smooth, axis1=1, axis2=2))).astype(smooth.dtype)
+    return smooth / (deviation[:, :, None] * deviation[:, None, :])
+
+
+def _hermitian_root(
+    coherency: Complex[Array, "frequencies outputs outputs"],
+    root: Float[Array, "frequencies outputs"],
+) -> Complex[Array, "frequencies outputs outputs"]:
+    # Not Cholesky's: along frequency the root must change as slowly as the matrix does.
+    scaled = coherency * (root[:, :, None] * root[:, None, :]).astype(coherency.dtype)
+    values, vectors = jnp.linalg.eigh(scaled)
+    stretch = jnp.sqrt(jnp.maximum(values, 0.0)).astype(vectors.dtype)
+    return (vectors * stretch[:, None, :]) @ jnp.conj(jnp.swapaxes(vectors, 1, 2))
+
+
+_COHERENCE_WEIGHT = 5.0
+_STEPS = 5  # of Gauss-Newton; each gains two digits or more
+
+Pairs = Float[Array, "frequencies outputs inputs"]
+
+
+class Combined(NamedTuple):
+    response: Complex[Array, "frequencies outputs inputs"]
+    coherence: Pairs
+    share: Float[Array, "frequencies outputs inputs groups"]  # of each length in the response
+
+
+def alone(part: Conditioned) -> Combined:
+    """One window length by itself."""
+    response, coherence = part.response[0], part.coherence[0]
+    lesser = jnp.minimum(coherence, part.moved[0][:, None, :])
+    return Combined(response, lesser, jnp.ones((*response.shape, 1)))
+
+
+def combine(
+    parts: Conditioned,
+    scales: Float[ArrayLike, " groups"],
+    freedom: Float[Array, " groups"],
+    resolved: Bool[ArrayLike, "groups frequencies"],
+) -> Combined:
+    """Weigh spectra of several window lengths by (eps_i / eps_min)^-4 and fit one set to them.
+
+    `scales` turn powers into densities, `freedom` are the independent windows less the inputs
+    that share them; `resolved` says where a window holds enough cycles. The cost is
+
+        sum_i W_i {(G_xx - G_xx,i)^2 + (G_yy - G_yy,i)^2 + |G_xy - G_xy,i|^2 + 5 (g^2 - g_i^2)^2}
+
+    each part relative to its mean under W_i^2 (G_xx~ and so on). |G_xy~| stands for the textbook's
+    Re G_xy~ and Im G_xy~, one of which may be zero. Only weighted means of the spectra enter, and
+    the phase is that of the mean. Source: Tischler & Remple eq. 10.4.
+    """
+    known = jnp.asarray(resolved)[:, :, None, None]
+    weight = jnp.where(known, _weights(parts.coherence, freedom), 0.0)
+    scale = jnp.asarray(scales)[:, None, None, None]
+    gain, answer = parts.power[:, :, None, :] * scale, parts.answer * scale
+    cross = parts.response * gain.astype(parts.response.dtype)
+    pilot, mean = (w / jnp.sum(w, axis=0, keepdims=True) for w in (weight**2, weight))
+    xx, yy, seen = (jnp.sum(pilot * each, axis=0) for each in (gain, answer, parts.coherence))
+    xy = jnp.abs(jnp.sum(pilot.astype(cross.dtype) * cross, axis=0))
+    along = jnp.sum(mean.astype(cross.dtype) * cross, axis=0)
+    size = jnp.abs(along)
+    targets = jnp.stack([
+        jnp.sum(mean * gain, axis=0) / xx,
+        jnp.sum(mean * answer, axis=0) / yy,
+        size / xy,
+        jnp.sum(mean * parts.coherence, axis=0) / seen,
+    ])  # fmt: skip
+    whole = xy**2 / (xx * yy)
+    a, b, r = _fit_spectra(targets, whole / seen)
+    moved = jnp.sum(mean * parts.moved[:, :, None, :], axis=0)
+    share = mean * gain / jnp.sum(mean * gain, axis=0, keepdims=True)
+    return Combined(
+        along * (r / a * xy / xx / size).astype(along.dtype),
+        jnp.minimum(r**2 / (a * b) * whole, moved),
+        jnp.moveaxis(share, 0, -1),
+    )
+
+
+def _weights(
+    coherence: Float[Array, "groups frequencies outputs inputs"], freedom: Float[Array, " groups"]
+) -> Float[Array, "groups frequencies outputs inputs"]:
+    """(eps_i / eps_min)^-4 with eps = sqrt(1 - g^2) / (|g| sqrt(2 n_d))."""
+    averages = 2 * freedom[:, None, None, None]
+    error = (1 - coherence + 1e-12) / (jnp.maximum(coherence, 1e-12) * averages)
+    return (jnp.min(error, axis=0, keepdims=True) / error) ** 2
+
+
+def _fit_spectra(
+    targets: Float[Array, "4 frequencies outputs inputs"], level: Pairs
+) -> Float[Array, "3 frequencies outputs inputs"]:
+    """Minimise (a - a0)^2 + (b - b0)^2 + (r - r0)^2 + 5 (level r^2 / (a b) - q0)^2."""
+    start, q0 = targets[:3], targets[3]
+
+    def step(_, u):
+        q = level * u[2] ** 2 / (u[0] * u[1])
+        slopes = jnp.stack([-q / u[0], -q / u[1], 2 * q / u[2]])
+        # Normal equations of identity plus one rank, by Sherman and Morrison.
+        norm, away = jnp.sum(slopes**2, axis=0), jnp.sum((start - u) * slopes, axis=0)
+        pull = _COHERENCE_WEIGHT * (q0 - q - away) / (1 + _COHERENCE_WEIGHT * norm)
+        return start + pull[None] * slopes
+
+    return jax.lax.fori_loop(0, _STEPS, step, start)
 
 
 _ALIKE = 1e-4  # share of an input's power below which it cannot be told from the others

@@ -8,8 +8,8 @@ from jaxtyping import ArrayLike, Float
 from jaxquad.records import Record
 
 from ._conditioned import Channels
+from ._estimators import Welch
 from ._segments import Segments
-from ._welch import Welch
 from ._window import window
 
 
@@ -60,8 +60,8 @@ def check_references(records: Sequence[Record]) -> None:
         raise ValueError(
             f"the joint estimate needs one outside reference for each input, the record has "
             f"{len(names)} references {list(names)} for {len(inputs)} inputs {list(inputs)}: name "
-            "them with references=[...], pick channels with jq.select, or use "
-            "estimator=jq.Composite()"
+            "them with references=[...], pick channels with jq.records.select, or use "
+            "estimator=jq.spectra.Composite()"
         )
 
 

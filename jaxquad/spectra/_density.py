@@ -8,8 +8,8 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from jaxquad.records import Record
 
 from ._checks import check_alike, checked_omega
+from ._estimators import Welch
 from ._segments import transform_records
-from ._welch import Welch
 from ._window import window
 
 

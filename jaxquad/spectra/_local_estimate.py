@@ -7,15 +7,107 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._errors import ErrorCovariance
-from ._local_bins import Bins, check_bins, enough_bins, recolour, record_bins
-from ._local_error import error_covariance, multiple_coherence, partial_coherence
+from ._error_covariance import ErrorCovariance
+from ._estimators import LocalPolynomial
+from ._local_bins import Bins, check_bins, enough_bins, recolour, record_bins, window_slices
 from ._local_fit import local_fit, LocalFit, replaced
-from ._local_joint import coherence_of_references, joint_fit
-from ._local_noise import Noise, smooth_noise
-from ._local_polynomial import LocalPolynomial
-from ._local_reach import reach
+from ._local_noise import (
+    error_covariance,
+    multiple_coherence,
+    Noise,
+    partial_coherence,
+    smooth_noise,
+)
 from ._local_width import choose_widths, Respond, Shape
+
+
+_DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest
+
+
+def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
+    """The fit of the plant, G = T_ry T_ru^-1, from that of the references to [inputs, outputs].
+
+    Its error is (dT_ry - G dT_ru) T_ru^-1: the noise is v = y - G u, and the effect that of the
+    references taken through T_ru^-1. Source: Pintelon and Schoukens, System Identification,
+    2nd ed., section 2.6 (several inputs: 7.2.7).
+    """
+    known = np.isfinite(fit.response[:, 0, 0])
+    through = np.where(known[:, None, None], fit.response[:, :inputs], np.eye(inputs))
+    strength = np.linalg.svd(through, compute_uv=False)
+    known &= strength[:, -1] > _DEPENDENT * strength[:, 0]
+    back = np.linalg.inv(np.where(known[:, None, None], through, np.eye(inputs)))
+    response = fit.response[:, inputs:] @ back
+    outputs = response.shape[1]
+    ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
+    left = np.concatenate([-response, ones], axis=2)
+    blank = np.where(known, 1.0, np.nan)[:, None, None]
+    effect = np.swapaxes(back, 1, 2) @ fit.effect * blank
+    scatter = left @ fit.scatter @ _adjoint(left) * blank
+    boosted = left * fit.boost[:, None, :]
+    boosted = _diagonal(boosted @ fit.scatter @ _adjoint(boosted))
+    boost = np.sqrt(boosted / np.maximum(_diagonal(scatter), 1e-300))
+    gain = boost[:, :, None] ** 2 * np.sum(np.abs(effect) ** 2, axis=2)[:, None, :]
+    power = through @ fit.power @ _adjoint(through)
+    freedom = np.where(known, fit.freedom, 0.0)
+    return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
+
+
+def coherence_of_references(
+    omega: Float[np.ndarray, " frequencies"],
+    half_width: Float[np.ndarray, " frequencies"],
+    fit: LocalFit,
+    inputs: int,
+) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    """The lesser of what all references explain of each input's power and of each output's."""
+    noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
+    explained = _diagonal(fit.response @ fit.power @ _adjoint(fit.response))
+    coherence = explained / (explained + noise.power)
+    return np.minimum(coherence[:, inputs:, None], coherence[:, None, :inputs])
+
+
+def _diagonal(x: Complex[np.ndarray, "frequencies a a"]) -> Float[np.ndarray, "frequencies a"]:
+    return np.real(np.diagonal(x, axis1=1, axis2=2))
+
+
+def _adjoint(x: np.ndarray) -> np.ndarray:
+    return np.conj(np.swapaxes(x, 1, 2))
+
+
+_DOMINATED = 30.0  # ratio of input powers from which a window's side outweighs its centre
+_STEP = 1.3  # of the half-widths that are tried
+
+Grid = Float[np.ndarray, " frequencies"]
+
+
+def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -> Grid:
+    """Half-widths in rad/s up to which what excites stands about `omega`, `widest` at most.
+
+    Where a sweep has ended, a window that reaches back into its band takes the response from there:
+    smooth, with a small error, and wrong. The mean power of each of the `columns` on either side of
+    `centre` (half-width) must not outweigh that at the centre, unless both sides do: between the
+    lines of a multisine a response is interpolated.
+    """
+    running = np.cumsum(np.abs(bins.values[:, columns]) ** 2, axis=0)
+    running = np.concatenate([np.zeros((1, running.shape[1])), running])
+    inner = window_slices(omega, centre, bins)
+    middle = _mean(running, *inner)
+    far, going = np.minimum(centre, widest), np.ones(omega.size, bool)
+    while np.any(going):
+        wider = np.minimum(_STEP * far, widest)
+        first, last = window_slices(omega, wider, bins)
+        low, high = _mean(running, first, inner[0]), _mean(running, inner[1], last)
+        held = np.maximum(middle, np.minimum(low, high))
+        going &= np.all(np.maximum(low, high) <= _DOMINATED * held, axis=1)
+        far, going = np.where(going, wider, far), going & (wider < widest)
+    return far
+
+
+def _mean(
+    running: Float[np.ndarray, "sums columns"], first: np.ndarray, last: np.ndarray
+) -> Float[np.ndarray, "frequencies columns"]:
+    """Power per bin from `first` to before `last`; 0 where there is none."""
+    count = np.maximum(last - first, 1)[:, None]
+    return (running[last] - running[first]) / count
 
 
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
@@ -24,7 +116,6 @@ _SHARPER = 0.5  # of a residual's power, that noise alone seldom leaves of it
 _WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
 _PER_OCTAVE = 4  # frequencies that help to judge, beside those asked for
 
-Grid = Float[np.ndarray, " frequencies"]
 Method = Literal["direct", "joint"]
 
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jaxquad._core import require_x64
 from jaxquad.records import Record
 
-from ._lattice import lattice_windows
-from ._precision import require_x64
+from ._blocks import lattice_windows
+from ._estimators import Welch
 from ._transform import transform_windows
-from ._welch import Welch
 from ._window import segment_starts
 
 

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxquad.models._sincos import sincos
-from jaxquad.simulate import runge_kutta
-from jaxquad.simulate._chunks import run_ensemble
+from jaxquad.models._rotation import sincos
+from jaxquad.simulation import runge_kutta
+from jaxquad.simulation._run import run_ensemble
 
 
 HERE = pathlib.Path(__file__).parents[2]

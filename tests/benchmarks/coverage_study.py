@@ -2,7 +2,7 @@
 
     python tests/benchmarks/coverage_study.py --draws 1000
 
-Three cases, from time-domain records to parameters by `jq.LocalPolynomial` and maximum likelihood:
+Three cases, from time-domain records to parameters by `jq.spectra.LocalPolynomial` and maximum likelihood:
 a five-parameter airframe in open loop and in closed loop, and a state space of two inputs, three
 outputs and twelve parameters whose outputs share a gust. Over 1000 draws a coverage of 95 % is
 known to 0.7 %.
@@ -52,7 +52,7 @@ class Study(NamedTuple):
     """A way to fly and identify once, and what is true."""
 
     fly: Callable[[int], jq.Record]
-    identify: Callable[[jq.FrequencyResponse], jq.Fit]
+    identify: Callable[[jq.spectra.FrequencyResponse], jq.identify.Fit]
     names: tuple[str, ...]
     truth: np.ndarray
 
@@ -136,13 +136,15 @@ def two_inputs() -> Callable[[int], jq.Record]:
     return fly
 
 
-def fit_airframe(frf: jq.FrequencyResponse) -> jq.Fit:
+def fit_airframe(frf: jq.spectra.FrequencyResponse) -> jq.identify.Fit:
     start = jax.tree.map(lambda x: 1.2 * x, AIRFRAME)
-    return jq.fit(start, frf, cost=jq.MaximumLikelihood())
+    return jq.fit(start, frf, cost=jq.identify.MaximumLikelihood())
 
 
-def fit_lateral(frf: jq.FrequencyResponse) -> jq.Fit:
-    return jq.fit(LATERAL, frf, free=LATERAL_FREE, tied=LATERAL_TIED, cost=jq.MaximumLikelihood())
+def fit_lateral(frf: jq.spectra.FrequencyResponse) -> jq.identify.Fit:
+    return jq.fit(
+        LATERAL, frf, free=LATERAL_FREE, tied=LATERAL_TIED, cost=jq.identify.MaximumLikelihood()
+    )
 
 
 def studies() -> dict[str, Study]:

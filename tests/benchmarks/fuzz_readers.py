@@ -30,9 +30,10 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import numpy as np
 from hostile_files import damaged, sound_files
 
-from jaxquad.records import _isolated, channels, propose, ReadError, RecordError
-from jaxquad.records._child import answer, load_module
-from jaxquad.records._limits import allowance
+from jaxquad.records import channels, propose, ReadError, RecordError
+from jaxquad.records.formats import _isolated
+from jaxquad.records.formats._child import answer, load_module
+from jaxquad.records.formats._limits import allowance
 
 
 CASES = 500  # of one kind and one seed

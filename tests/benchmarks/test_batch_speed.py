@@ -15,7 +15,7 @@ import pytest
 from airframe import Airframe
 from scipy.optimize import least_squares
 
-from jaxquad.identify._batch import solve_batch
+from jaxquad.identify._fit_batch import solve_batch
 from jaxquad.identify._parameters import select_parameters
 
 

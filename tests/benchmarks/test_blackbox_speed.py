@@ -15,7 +15,7 @@ import blackbox_writer as writer
 import pytest
 from blackbox_rows import rows
 
-from jaxquad.records._betaflight import decode
+from jaxquad.records.formats._betaflight import decode
 
 
 ROWS = 1_000_000

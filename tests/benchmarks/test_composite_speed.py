@@ -34,7 +34,7 @@ def flight() -> jq.Record:
 
 
 RECORD = flight()
-ESTIMATOR = jq.Composite(windows=LENGTHS, overlap=0.5)
+ESTIMATOR = jq.spectra.Composite(windows=LENGTHS, overlap=0.5)
 COLUMNS = np.hstack([RECORD.inputs, RECORD.outputs])
 BAND = (LINEAR[0] / (2 * np.pi), LINEAR[-1] / (2 * np.pi))
 ZOOMS = {

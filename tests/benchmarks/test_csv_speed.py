@@ -10,7 +10,7 @@ import resource
 import numpy as np
 import pytest
 
-from jaxquad.records import _csv
+from jaxquad.records.formats import _csv
 
 
 ROWS, COLUMNS = 1_000_000, 43

@@ -21,7 +21,7 @@ import pytest
 
 from jaxquad.control import LADRC
 from jaxquad.models import DecoupledAxes
-from jaxquad.simulate import evaluate, Pulse, Saturation, scenario, Step
+from jaxquad.simulation import evaluate, Pulse, Saturation, scenario, Step
 
 
 MEMBERS, ROUNDS = 4096, {"forward": 8, "gradient": 3}

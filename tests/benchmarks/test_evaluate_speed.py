@@ -16,12 +16,12 @@ import pytest
 
 from jaxquad.control import LADRC
 from jaxquad.models import DecoupledAxes
-from jaxquad.simulate import evaluate, metrics, Pulse, Saturation, scenario, simulate, Step
-from jaxquad.simulate._evaluate import _run
-from jaxquad.simulate._loop import scan_loop
-from jaxquad.simulate._settings import loop_settings
-from jaxquad.simulate._simulate import _run as _run_stored
-from jaxquad.simulate._window import Window
+from jaxquad.simulation import evaluate, metrics, Pulse, Saturation, scenario, simulate, Step
+from jaxquad.simulation._delay import loop_settings
+from jaxquad.simulation._evaluate import _run
+from jaxquad.simulation._meter import Window
+from jaxquad.simulation._run import scan_loop
+from jaxquad.simulation._simulate import _run as _run_stored
 
 
 jax.config.update("jax_enable_x64", True)

@@ -16,7 +16,7 @@ from airframe import Airframe
 from scipy.optimize import least_squares
 
 import jaxquad as jq
-from jaxquad.identify._band import usable
+from jaxquad.identify._cost import usable
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._problem import make_problem
 from jaxquad.identify._solve import descend
@@ -42,12 +42,12 @@ def frf():
     noise = ERROR * (rng.standard_normal(60) + 1j * rng.standard_normal(60))
     shape = (60, 1, 1)
     response = _numpy_response(TRUTH) * (1 + noise)
-    return jq.FrequencyResponse(
+    return jq.spectra.FrequencyResponse(
         omega=jnp.asarray(OMEGA),
         response=jnp.asarray(response)[:, None, None],
         coherence=jnp.full(shape, 0.95),
         random_error=jnp.full(shape, ERROR),
-        errors=jq.independent_errors(
+        errors=jq.spectra.independent_errors(
             jnp.asarray(OMEGA), 2 * ERROR**2 * jnp.abs(jnp.asarray(response))[:, None, None] ** 2
         ),
         direct_coherence=jnp.full(shape, 0.95),
@@ -79,7 +79,7 @@ class _OneSolve(eqx.Module):
     """Maximum likelihood without the second solve under the model's own weights."""
 
     def weights(self, frf, used, ratio):
-        return jq.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
+        return jq.identify.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
 
 
 @pytest.mark.benchmark(group="fit")

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxquad._core._arrays import align
 from jaxquad.control import LADRC
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
-from jaxquad.models._parameters import align
-from jaxquad.simulate import MotorDrive, Saturation, Scenario, simulate
+from jaxquad.simulation import MotorDrive, Saturation, Scenario, simulate
 
 
 jax.config.update("jax_enable_x64", True)

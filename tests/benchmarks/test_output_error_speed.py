@@ -30,7 +30,7 @@ def record():
     rng = np.random.default_rng(0)
     u = np.repeat(rng.choice([-1.0, 1.0], SAMPLES // 50), 50)
     truth = jq.TransferFunction([8.0], [1.0, 3.0, 20.0], 0.03)
-    y = np.asarray(jq.simulate_linear(truth, u - u[0], DT))
+    y = np.asarray(jq.models.simulate_linear(truth, u - u[0], DT))
     return jq.Record(DT * np.arange(SAMPLES), u, y + 0.02 * rng.standard_normal(SAMPLES))
 
 

@@ -16,7 +16,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import jaxquad as jq
-from jaxquad.identify._band import usable
+from jaxquad.identify._cost import usable
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._problem import make_problem
 from jaxquad.identify._solve import descend
@@ -90,18 +90,18 @@ def model(values):
 
 class _OneSolve(eqx.Module):
     def weights(self, frf, used, ratio):
-        return jq.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
+        return jq.identify.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
 
 
 def problem():
     shape = MEASURED.shape
     omega, variance = jnp.asarray(OMEGA), 2 * ERROR**2 * np.abs(MEASURED) ** 2
-    frf = jq.FrequencyResponse(
+    frf = jq.spectra.FrequencyResponse(
         omega=omega,
         response=jnp.asarray(MEASURED),
         coherence=jnp.full(shape, 0.95),
         random_error=jnp.full(shape, ERROR),
-        errors=jq.independent_errors(omega, jnp.asarray(variance)),
+        errors=jq.spectra.independent_errors(omega, jnp.asarray(variance)),
         direct_coherence=jnp.full(shape, 0.95),
         multiple_coherence=jnp.full(shape[:2], 0.95),
         method="joint",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.signal import ZoomFFT
 
-from jaxquad.spectra._lattice import lattice_windows
+from jaxquad.spectra._blocks import lattice_windows
 from jaxquad.spectra._transform import transform_windows
 from jaxquad.spectra._window import window
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from tuning_case import ensemble, EVENTS, flight, objective, STARTS
 
-from jaxquad.tune import tune
-from jaxquad.tune._bounds import no_pull
-from jaxquad.tune._copies import copies
-from jaxquad.tune._cost import Aim, evaluate
-from jaxquad.tune._parameters import coordinates
-from jaxquad.tune._problem import problem_of
+from jaxquad.tuning import tune
+from jaxquad.tuning._copies import copies
+from jaxquad.tuning._cost import Aim, evaluate
+from jaxquad.tuning._parameters import coordinates
+from jaxquad.tuning._phases import no_pull
+from jaxquad.tuning._problem import problem_of
 
 
 KEY, START = jax.random.key(0), STARTS["certainty equivalence"]

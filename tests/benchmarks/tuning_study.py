@@ -26,7 +26,7 @@ from tuning_case import (  # noqa: E402
     STARTS,
 )
 
-from jaxquad.tune import certify, tune  # noqa: E402
+from jaxquad.tuning import certify, tune
 
 
 KEY = jax.random.key(0)

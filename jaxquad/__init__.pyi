@@ -1,0 +1,60 @@
+from . import (
+    control as control,
+    design as design,
+    ensembles as ensembles,
+    excitation as excitation,
+    export as export,
+    identify as identify,
+    loops as loops,
+    models as models,
+    plot as plot,
+    records as records,
+    report as report,
+    simulation as simulation,
+    spectra as spectra,
+    tuning as tuning,
+    workflows as workflows,
+)
+from ._core import enable_x64 as enable_x64
+from ._xla import engine as engine
+from .control import (
+    AdaptiveLADRC as AdaptiveLADRC,
+    LADRC as LADRC,
+    PID as PID,
+)
+from .ensembles import Ensemble as Ensemble
+from .excitation import multisine as multisine, sweep as sweep
+from .export import c_header as c_header
+from .identify import (
+    fit as fit,
+    fit_transfer_function as fit_transfer_function,
+    refine as refine,
+    verify as verify,
+)
+from .models import (
+    crazyflie as crazyflie,
+    DecoupledAxes as DecoupledAxes,
+    LaggedIntegrator as LaggedIntegrator,
+    quanser_hover as quanser_hover,
+    StateSpace as StateSpace,
+    TransferFunction as TransferFunction,
+)
+from .records import (
+    propose as propose,
+    read as read,
+    Record as Record,
+)
+from .simulation import (
+    evaluate as evaluate,
+    Pulse as Pulse,
+    scenario as scenario,
+    simulate as simulate,
+    Step as Step,
+)
+from .spectra import frequency_response as frequency_response
+from .tuning import (
+    certify as certify,
+    Limit as Limit,
+    Objective as Objective,
+    tune as tune,
+)

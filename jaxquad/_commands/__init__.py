@@ -1,1 +1,0 @@
-"""The commands of `jaxquad`, one module each: `add` declares it, its `run` returns an exit code."""

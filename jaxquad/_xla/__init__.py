@@ -1,0 +1,19 @@
+from ._common_subexpressions import once as once
+from ._devices import (
+    asked_devices as asked_devices,
+    Devices as Devices,
+    devices_for as devices_for,
+    gathered as gathered,
+    may_be_several as may_be_several,
+    movable as movable,
+    require_same as require_same,
+    where_put as where_put,
+)
+from ._engine import (
+    compiler_options as compiler_options,
+    Engine as Engine,
+    engine as engine,
+    Jit as Jit,
+)
+from ._kernel import as_one_kernel as as_one_kernel
+from ._no_fuse import apart as apart

@@ -1,0 +1,105 @@
+"""Expensive functions evaluated once: what the CPU compiler fuses, it also recomputes.
+
+Derivatives share exponentials and quotients with the response; fused into ten outputs, each of them
+evaluates them anew, which takes four times as long.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Literal
+
+from ._no_fuse import apart
+
+
+_COSTLY = {"exp", "log", "sin", "cos", "tan", "div", "atan2", "sqrt", "rsqrt", "pow", "tanh"}
+_INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
+_SMALL = 1024  # elements, below which a call costs more than recomputing
+
+
+def once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function, in which expensive operations on large arrays are not recomputed.
+
+    Complex quotients become products with one reciprocal, which loses them where a denominator's
+    square overflows or underflows (1e-154 to 1e154): the result is then not finite. On other
+    devices than the CPU, the function itself.
+    """
+    if jax.default_backend() != "cpu":
+        return function
+
+    def run(*args: Any) -> Any:
+        leaves, structure = jax.tree.flatten(args)
+        flat = lambda *xs: function(*jax.tree.unflatten(structure, xs))
+        closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        values = _evaluate(closed.jaxpr, closed.consts, leaves, {})
+        return jax.tree.unflatten(jax.tree.structure(shape), values)
+
+    return run
+
+
+def _evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], known: dict) -> list[Any]:
+    values = dict(zip(jaxpr.constvars, consts, strict=True))
+    values.update(zip(jaxpr.invars, args, strict=True))
+    read = lambda var: var.val if isinstance(var, Literal) else values[var]
+    for equation in jaxpr.eqns:
+        found = _apply(equation, [read(var) for var in equation.invars], known)
+        values.update(zip(equation.outvars, found, strict=True))
+    return [read(var) for var in jaxpr.outvars]
+
+
+def _apply(equation: Any, args: list[Any], known: dict) -> list[Any]:
+    name, params = equation.primitive.name, equation.params
+    if name in _INLINED:
+        inner = params[_INLINED[name]]
+        return _evaluate(inner.jaxpr, inner.consts, args, known)
+    if equation.primitive.multiple_results:
+        return _bind(equation, args)
+    return _remembered((name, str(params)), args, known, lambda: [_single(equation, args, known)])
+
+
+def _remembered(
+    what: tuple, args: Sequence[Any], known: dict, compute: Callable[[], list[Any]]
+) -> list[Any]:
+    """The slopes by each parameter were traced apart: what they share has to be found again."""
+    key = (*what, *(_identity(arg) for arg in args))
+    if key not in known:
+        known[key] = args, compute()  # holding the arguments keeps their ids their own
+    return known[key][1]
+
+
+def _identity(arg: Any) -> Any:
+    # Literals are new objects at every place where they stand.
+    is_number = isinstance(arg, np.ndarray | np.generic) and arg.ndim == 0
+    return (str(arg.dtype), repr(arg.item())) if is_number else id(arg)
+
+
+def _single(equation: Any, args: list[Any], known: dict) -> Any:
+    name, params = equation.primitive.name, equation.params
+    if equation.outvars[0].aval.size < _SMALL:
+        return _bind(equation, args)[0]
+    if name == "div" and jnp.iscomplexobj(args[1]):
+        return args[0] * _reciprocal_of(args[1], known)
+    if name == "integer_pow" and params["y"] < 0 and jnp.iscomplexobj(args[0]):
+        return jax.lax.integer_pow(_reciprocal_of(args[0], known), -params["y"])
+    if name in _COSTLY:
+        return apart(lambda *xs: _bind(equation, xs)[0], *args)
+    return _bind(equation, args)[0]
+
+
+def _bind(equation: Any, args: Sequence[Any]) -> list[Any]:
+    bound = equation.primitive.get_bind_params(equation.params)
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before jax 0.10, both
+    found = equation.primitive.bind(*functions, *args, **params)
+    return list(found) if equation.primitive.multiple_results else [found]
+
+
+def _reciprocal_of(value: Any, known: dict) -> Any:
+    return _remembered(("reciprocal",), [value], known, lambda: [apart(_reciprocal, value)])[0]
+
+
+def _reciprocal(value: Any) -> Any:
+    squared = jnp.real(value) ** 2 + jnp.imag(value) ** 2
+    return jax.lax.complex(jnp.real(value) / squared, -jnp.imag(value) / squared)

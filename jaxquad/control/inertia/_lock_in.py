@@ -1,0 +1,333 @@
+import functools as ft
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxquad._core import as_float, full_shape
+
+from ._estimate import (
+    doubted,
+    Held,
+    InertiaEstimate,
+    judged,
+    nothing_held,
+    plant_ensemble,
+    require_above_zero,
+    require_plant,
+)
+from ._filters import motion, no_past, Past
+from ._probe_tones import ProbeTones
+
+
+class LockInSolution(NamedTuple):
+    inertia: Float[Array, " axes *ensemble"]  # kg m^2
+    variance: Float[Array, " axes *ensemble"]  # (kg m^2)^2
+    stiffness: Float[Array, " axes *ensemble"]  # N m/rad
+    informed: Float[Array, " axes *ensemble"]  # 1 where enough tones stand out
+
+
+class _Tones(NamedTuple):
+    """What each tone says: [tones, axes, *ensemble]."""
+
+    ratio: Array  # real part of torque / acceleration, kg m^2
+    weight: Array  # 1 / variance of it, 0 where the tone does not stand out
+
+
+def solve(
+    acceleration: Float[Array, " parts tones places axes *ensemble"],
+    torque: Float[Array, " parts tones places axes *ensemble"],
+    square: Float[Array, " tones *ones"],
+    *,
+    contrast: float,
+    stiff: bool,
+) -> LockInSolution:
+    """Inertia from what torque and acceleration have in common with each tone.
+
+    The parts are a tone's cosine and sine; the places a frequency below it, its own, one above.
+    At a tone torque / acceleration = J - k / w^2 + j (damping, lag), with w^2 the `square`: the
+    real part counts. Beside it there is no tone: what the ratio leaves of the torque there is the
+    disturbance. Its power, of four degrees of freedom, gives the variance. A tone stands out when
+    its acceleration has `contrast` times the power of its neighbours'.
+    """
+    tones = _ratios(acceleration, torque, contrast)
+    return _stiff(tones, square) if stiff else _free(tones)
+
+
+def _ratios(acceleration, torque, contrast):
+    a, u = acceleration[:, :, 1], torque[:, :, 1]
+    power = jnp.sum(a**2, axis=0)
+    beside = jnp.sum(acceleration[:, :, ::2] ** 2, axis=(0, 2)) / 2
+    out = power > contrast * beside
+    inverse = jnp.where(out, 1 / jnp.where(out, power, 1), 0)
+    real = jnp.sum(a * u, axis=0) * inverse
+    imaginary = (a[0] * u[1] - a[1] * u[0]) * inverse
+    x, y = acceleration[:, :, ::2]
+    left = torque[:, :, ::2] - jnp.stack(
+        [real[:, None] * x - imaginary[:, None] * y, real[:, None] * y + imaginary[:, None] * x]
+    )
+    noise = jnp.sum(left**2, axis=(0, 2)) / 4
+    rounding = 1e-12 * jnp.sum(u**2, axis=0)  # keeps the weights of a perfect record finite
+    return _Tones(real, jnp.where(out, power / jnp.where(out, noise + rounding, 1), 0))
+
+
+def _free(tones):
+    total = jnp.sum(tones.weight, axis=0)
+    some = total > 0
+    inverse = jnp.where(some, 1 / jnp.where(some, total, 1), 0)
+    inertia = jnp.sum(tones.weight * tones.ratio, axis=0) * inverse
+    return LockInSolution(inertia, inverse, jnp.zeros_like(inertia), some.astype(inertia.dtype))
+
+
+def _stiff(tones, square):
+    """Weighted least squares of the ratios on 1 and -1/w^2."""
+    mean = _free(tones)
+    away = -1 / square - jnp.sum(tones.weight / -square, axis=0)[None] * mean.variance[None]
+    spread = jnp.sum(tones.weight * away**2, axis=0)
+    some = spread * mean.variance > 1e-9 / jnp.max(square) ** 2
+    inverse = jnp.where(some, 1 / jnp.where(some, spread, 1), 0)
+    stiffness = jnp.sum(tones.weight * away * tones.ratio, axis=0) * inverse
+    centre = jnp.sum(tones.weight / -square, axis=0) * mean.variance
+    return LockInSolution(
+        mean.inertia - centre * stiffness,
+        mean.variance + centre**2 * inverse,
+        stiffness,
+        some.astype(stiffness.dtype),
+    )
+
+
+BESIDE = 2  # periods a window: the nearest that a Hann window keeps apart from the tone
+
+
+class WindowSums(NamedTuple):
+    correlations: Float[Array, " windows parts lines signals axes *ensemble"]
+    whole: Float[Array, " windows axes *ensemble"]  # 1 while nothing was missing
+    index: Int[Array, ""]  # sample within the first window
+
+
+class LockInWindows(eqx.Module):
+    """Two staggered Hann windows and the sines that they correlate with, by counted samples."""
+
+    frequencies: tuple[float, ...] = eqx.field(static=True)  # Hz
+    window: float = eqx.field(static=True)  # s
+    dt: float = eqx.field(static=True)  # s
+
+    def __check_init__(self):
+        samples = self.window / self.dt
+        if abs(samples - round(samples)) > 1e-6 * samples or not 100 <= samples <= 40000:
+            raise ValueError(
+                f"a window of {self.window} s holds {samples:g} samples of {self.dt} s: give it "
+                "a whole number of samples from 100 to 40000"
+            )
+        for frequency in self.frequencies:
+            self._require_whole(frequency)
+        apart = np.diff(sorted(self.periods))
+        if np.any(apart < 2 * BESIDE):
+            raise ValueError(
+                f"tones of {self.frequencies} Hz are closer than {2 * BESIDE / self.window:g} Hz, "
+                f"what a window of {self.window} s can tell apart: give a longer window"
+            )
+
+    def _require_whole(self, frequency):
+        periods = frequency * self.window
+        if abs(periods - round(periods)) > 1e-6 * periods:
+            raise ValueError(
+                f"a tone of {frequency} Hz makes {periods:g} periods in a window of {self.window} "
+                f"s: give a whole number, such as {max(round(periods), 5) / self.window:g} Hz"
+            )
+        if not 5 <= round(periods) <= self.samples / 10:
+            raise ValueError(
+                f"a tone of {frequency} Hz makes {periods:g} periods in a window of {self.window} "
+                f"s: give it from 5 to {self.samples // 10}"
+            )
+
+    @property
+    def samples(self) -> int:
+        return round(self.window / self.dt)
+
+    @property
+    def periods(self) -> np.ndarray:
+        """Of each tone in a window."""
+        return np.array([round(f * self.window) for f in self.frequencies])
+
+    def phase(self, index: Int[Array, ""]) -> Float[Array, " tones"]:
+        """Of the tones in cycles."""
+        return _cycles(self.periods, index, self.samples)
+
+    def square(self, signal: Float[Array, " axes *ensemble"]) -> Float[Array, " tones *ones"]:
+        """w^2 in (rad/s)^2, as the second difference of a sampled sine shows it."""
+        w = 2 / self.dt * np.sin(np.pi * self.periods / self.samples)
+        return jnp.asarray(w**2, signal.dtype).reshape((-1,) + (1,) * signal.ndim)
+
+    def init(self, like: Float[Array, " axes *ensemble"]) -> WindowSums:
+        lines = 3 * len(self.frequencies)
+        correlations = jnp.zeros((2, 2, lines, 2, *like.shape), like.dtype)
+        whole = jnp.zeros((2, *like.shape), like.dtype)
+        return WindowSums(correlations, whole, jnp.zeros((), jnp.int32))
+
+    def add(
+        self,
+        sums: WindowSums,
+        signals: Float[Array, " signals axes *ensemble"],
+        heard: Float[Array, " axes *ensemble"],
+    ) -> WindowSums:
+        """One more sample, `heard` 0 where its window is not to count."""
+        place = self._place(sums.index)
+        going = _over((place > 0).astype(signals.dtype), sums.correlations)
+        weights = self._weights(sums.index, place).astype(signals.dtype)
+        weights = weights.reshape(weights.shape + (1,) * signals.ndim)
+        correlations = going * sums.correlations + weights * signals[None, None, None]
+        whole = jnp.where(_over(place == 0, sums.whole), 1, sums.whole) * heard[None]
+        return WindowSums(correlations, whole, (sums.index + 1) % self.samples)
+
+    def ends(self, sums: WindowSums) -> Bool[Array, ""]:
+        """Whether the last sample ended one of the windows."""
+        return jnp.any(self._place(sums.index) == 0)
+
+    def ended(self, sums: WindowSums) -> tuple[Array, Array]:
+        """Its correlations [parts, tones, places, signals, ...] and whether it counts."""
+        first = sums.index == 0
+        chosen, whole = (jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.whole))
+        return chosen.reshape(2, len(self.frequencies), 3, *chosen.shape[2:]), whole
+
+    def _place(self, index):
+        """Of the sample within each window."""
+        return (index + jnp.array([0, self.samples // 2], jnp.int32)) % self.samples
+
+    def _weights(self, index, place):
+        """Hann windows times cosine and sine of every line: [windows, parts, lines]."""
+        lines = (self.periods[:, None] + np.array([-BESIDE, 0, BESIDE])).reshape(-1)
+        angle = 2 * jnp.pi * _cycles(lines, index, self.samples)
+        hann = jnp.sin(jnp.pi * _ratio(place, self.samples)) ** 2
+        return hann[:, None, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])[None]
+
+
+def _cycles(periods, index, samples):
+    """Phases in cycles, exact however long the flight."""
+    return _ratio((jnp.asarray(periods, jnp.int32) * index) % samples, samples)
+
+
+def _ratio(count, samples):
+    return count.astype(jnp.result_type(float)) / samples
+
+
+def _over(x, like):
+    return x.reshape(x.shape + (1,) * (like.ndim - x.ndim))
+
+
+class LockInState(NamedTuple):
+    past: Past
+    sums: WindowSums
+    held: Held
+    stiffness: Float[Array, " axes *ensemble"]  # N m/rad
+    exciting: Float[Array, " axes *ensemble"]  # 1 while the tones are on
+
+
+class LockInInertia(eqx.Module):
+    """Inertia at the frequencies of its own test tones: torque over acceleration, in phase.
+
+    Both sides of the sampled equation of motion are correlated with each tone over Hann windows of
+    `window` seconds, one beginning each half window. A tone makes a whole number of periods in a
+    window. Whatever makes another whole number, such as a constant torque or the rig's 5 s sine,
+    drops out exactly; a motor's lag and damping fall in quadrature; the ends of a window, where
+    encoder noise would enter, do not count. A delay of d seconds costs 1 - cos(omega d). A
+    stiffness k leaves J - k / omega^2 at one tone; `nuisance=("angle",)` with two tones or more
+    takes it out. An encoder bends angles of a count or two by 0.5 to 4 %, unless noise stirs them.
+
+    The standard deviation is that of one window, from the disturbance two periods a window beside
+    its tones, with four degrees of freedom: it is known to a third, and assumes a spectrum that
+    is flat from there to the tone. Between windows the estimate is held and ages by `drift` in
+    relative deviation per root second. Only windows throughout which the tones were on count, and
+    tones of `contrast` times the power beside them; trust takes a relative deviation of `trust`.
+    A change of the inertia counts in full after the first window that begins after it, which is
+    one window and a half at the latest. Source: docs/control.md.
+    Raises `ValueError` for tones that do not fit the window or each other.
+    """
+
+    torque_gain: Float[Array, "..."] = eqx.field(converter=as_float)  # N m per unit of command
+    nominal: Float[Array, "..."] = eqx.field(converter=as_float)  # kg m^2
+    tones: ProbeTones = eqx.field(default_factory=ProbeTones)
+    window: float = eqx.field(static=True, default=5.0)  # s
+    nuisance: tuple[str, ...] = eqx.field(static=True, default=())
+    contrast: float = eqx.field(static=True, default=10.0)
+    trust: float = eqx.field(static=True, default=0.1)
+    drift: float = eqx.field(static=True, default=0.01)  # 1/sqrt(s)
+    dt: float = eqx.field(static=True, default=0.002)  # s
+
+    def __check_init__(self):
+        require_plant(self.torque_gain, self.nominal)
+        require_above_zero("s", dt=self.dt, window=self.window)
+        if self.nuisance not in ((), ("angle",)):
+            raise ValueError(f"nuisance is {self.nuisance}: give () or ('angle',)")
+        if self.nuisance and len(self.tones.frequencies) < 2:
+            raise ValueError(
+                f"one tone, {self.tones.frequencies} Hz, cannot tell stiffness from inertia: "
+                "give the probe two frequencies, or leave the nuisance 'angle' out"
+            )
+        self._windows()
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the parameters, () for one estimator."""
+        return plant_ensemble(self.torque_gain, self.nominal)
+
+    def _windows(self) -> LockInWindows:
+        return LockInWindows(self.tones.frequencies, self.window, self.dt)
+
+    def init(self, like: Float[Array, " axes *ensemble"]) -> LockInState:
+        """Before the first sample; shaped as the measurement `like` and as the ensemble."""
+        like = zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        held = nothing_held(self.nominal, like)
+        return LockInState(no_past(like), self._windows().init(like), held, zero, zero + 1)
+
+    def update(
+        self,
+        state: LockInState,
+        command: Float[Array, " axes *ensemble"],
+        measurement: Float[Array, " axes *ensemble"],
+    ) -> LockInState:
+        """Hear the command held during the last sample and the angle at its end."""
+        past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
+        windows = self._windows()
+        pair = now.valid * jnp.stack([now.acceleration, now.torque])
+        sums = windows.add(state.sums, pair, state.exciting)
+        aged = state.held._replace(age=state.held.age + self.drift**2 * self.dt)
+        held, stiffness = jax.lax.cond(
+            windows.ends(sums),
+            ft.partial(self._renewed, windows),
+            lambda sums, *kept: kept,
+            sums, aged, state.stiffness,
+        )  # fmt: skip
+        exciting = self.tones.switch(state.exciting, judged(held, self.nominal, self.trust))
+        return LockInState(past, sums, held, stiffness, exciting)
+
+    def _renewed(self, windows, sums, held, stiffness):
+        """The estimate of the window that has just ended, where it shows one."""
+        done, whole = windows.ended(sums)
+        solved = solve(
+            done[:, :, :, 0], done[:, :, :, 1], windows.square(whole),
+            contrast=self.contrast, stiff=bool(self.nuisance),
+        )  # fmt: skip
+        new = Held(solved.inertia, solved.variance, jnp.zeros_like(whole), solved.informed)
+        renew = ft.partial(jnp.where, (whole > 0) & (solved.informed > 0))
+        return jax.tree.map(renew, (new, solved.stiffness), (held, stiffness))
+
+    def estimate(self, state: LockInState) -> InertiaEstimate:
+        """That of the last whole window in which a tone stood out."""
+        return judged(state.held, self.nominal, self.trust)
+
+    def stiffness(self, state: LockInState) -> Float[Array, " axes *ensemble"]:
+        """In N m/rad beside the inertia; 0 unless the nuisance is "angle"."""
+        return state.stiffness
+
+    def probe(self, state: LockInState) -> Float[Array, " axes *ensemble"]:
+        """The test signal to add to the next command."""
+        phase = self._windows().phase(state.sums.index).astype(state.exciting.dtype)
+        return self.tones.wave(phase, state.exciting)
+
+    def excite(self, state: LockInState) -> LockInState:
+        """On demand: the estimate is in doubt from now on, which starts the tones."""
+        return state._replace(held=doubted(state.held))

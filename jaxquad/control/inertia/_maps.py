@@ -1,0 +1,170 @@
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxquad._core import (
+    as_float,
+    ensemble_shape,
+    fit,
+    is_concrete,
+    require_finite,
+    require_positive,
+    times,
+)
+
+
+class FuzzyMap(eqx.Module):
+    """b0' = b0 + db0(delta) by fuzzy inference, delta = J / nominal.
+
+    A triangular set stands on each of the `centres`, reaching to its neighbours, the outer ones
+    level beyond; "if delta is P_i then db0 is P_j" gives each set one of the `increments`, and
+    defuzzification is the weighted average. The memberships sum to 1, so that this is the straight
+    line between (centre, increment) points, and nothing else. Source: Eq. (25) and its text.
+    Raises `ValueError` for centres that do not rise and for increments that leave no b0 above 0.
+    """
+
+    nominal: Float[Array, "..."] = eqx.field(converter=as_float)  # kg m^2
+    b0: Float[Array, "..."] = eqx.field(converter=as_float)  # rad/s^2 per unit of command
+    centres: Float[Array, " sets"] = eqx.field(converter=as_float)  # of delta
+    increments: Float[Array, " sets"] = eqx.field(converter=as_float)  # of b0
+
+    def __check_init__(self):
+        require_positive("nominal", self.nominal, "give the inertia at which delta is 1")
+        require_positive("b0", self.b0, "give that of the controller")
+        require_finite("increments", self.increments)
+        rises = not is_concrete(self.centres) or np.all(np.diff(np.asarray(self.centres)) > 0)
+        if self.centres.ndim != 1 or self.centres.size < 2 or not rises:
+            raise ValueError(f"centres are {self.centres}: give two or more, each above the last")
+        if self.increments.shape != self.centres.shape:
+            raise ValueError(
+                f"increments have the shape {self.increments.shape}: give one for each of the "
+                f"{self.centres.size} sets"
+            )
+        if is_concrete(self.b0) and is_concrete(self.increments):
+            least = np.min(self.b0) + np.min(self.increments)
+            require_positive("b0 + increment", least, "raise b0 or the lowest increment")
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the map, () for one controller."""
+        return ensemble_shape({"nominal": self.nominal, "b0": self.b0})
+
+    def memberships(
+        self, delta: Float[Array, " axes *ensemble"]
+    ) -> Float[Array, " sets axes *ensemble"]:
+        """Of each set, from 0 to 1."""
+        centres = self.centres.astype(delta.dtype)
+        inside = jnp.clip(delta, centres[0], centres[-1])
+        rise = [jnp.ones_like(delta)]
+        for k in range(len(self.centres) - 1):
+            rise.append((inside - centres[k]) / (centres[k + 1] - centres[k]))
+        fall = [1 - up for up in rise[1:]] + [jnp.ones_like(delta)]
+        return jnp.stack(
+            [jnp.clip(jnp.minimum(a, b), 0, 1) for a, b in zip(rise, fall, strict=True)]
+        )
+
+    def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+        """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
+        weights = self.memberships(inertia / fit(self.nominal, inertia))
+        increments = self.increments.astype(weights.dtype)
+        increments = increments.reshape((-1,) + (1,) * inertia.ndim)
+        average = jnp.sum(weights * increments, axis=0) / jnp.sum(weights, axis=0)
+        return fit(self.b0, inertia) + average
+
+
+def printed_map(nominal: Float[Array, "..."] | float, *, b0: float = 3.0) -> FuzzyMap:
+    """The paper's map, to show what its printed ranges do; not for use.
+
+    Eight sets over 1 < delta < 22 and 0 <= db0 <= 24 can only raise b0, while the paper's own b0
+    falls from 3 to 1.6, which is delta = 1.875. There this map says 4.0, past the stability limit
+    of LADRC(10, 30) on the rig: the ITAE of a step over 10 s grows from 1.4 to 21. At delta = 22 it
+    says 27, and the loop diverges.
+    """
+    return FuzzyMap(nominal, b0, np.linspace(1.0, 22.0, 8), np.linspace(0.0, 24.0, 8))
+
+
+class InertiaMap(eqx.Module):
+    """From an inertia to the controller's gain b0: piecewise linear in ln J -> ln b0.
+
+    Straight between `knots`, constant beyond the first and the last. Slope -1 is certainty
+    equivalence, b0 = KT / J, which `certainty_equivalence` makes; knots and values are arrays, to
+    be tuned by gradient. Triangular fuzzy sets with averaged outputs are such a map, too: see
+    `jq.control.FuzzyMap`. Source: Eq. (25), with the map that replaces the printed one, docs/equations.md.
+    Raises `ValueError` for knots that do not rise and for shapes that do not fit.
+    """
+
+    nominal: Float[Array, "..."] = eqx.field(converter=as_float)  # kg m^2; axes *ensemble
+    knots: Float[Array, " knots"] = eqx.field(converter=as_float)  # ln(J / nominal)
+    values: Float[Array, " knots ..."] = eqx.field(converter=as_float)  # ln b0; axes *ensemble
+
+    def __check_init__(self):
+        require_positive("nominal", self.nominal, "give the design's inertia in kg m^2")
+        require_finite("knots", self.knots)
+        require_finite("values", self.values)
+        rises = not is_concrete(self.knots) or np.all(np.diff(np.asarray(self.knots)) > 0)
+        if self.knots.ndim != 1 or self.knots.size < 2 or not rises:
+            raise ValueError(f"knots are {self.knots}: give two or more, each above the last")
+        if self.values.ndim == 0 or self.values.shape[0] != self.knots.size:
+            raise ValueError(
+                f"values have the shape {self.values.shape}: give one for each of the "
+                f"{self.knots.size} knots, (knots,), (knots, axes) or (knots, axes, members)"
+            )
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the map, () for one controller."""
+        return ensemble_shape({"nominal": self.nominal, "values": self.values[0]})
+
+    def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+        """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
+        nominal = fit(self.nominal, inertia)
+        x = jnp.log(jnp.maximum(inertia / nominal, 1e-6))
+        return jnp.exp(interpolate(x, self.knots, self.values))
+
+    @property
+    def falls(self) -> Bool[Array, ""]:
+        """Whether more inertia never raises b0, as for a plant of gain KT / J it should be."""
+        return jnp.all(jnp.diff(self.values, axis=0) <= 0)
+
+
+def interpolate(
+    x: Float[Array, " axes *ensemble"],
+    knots: Float[Array, " knots"],
+    values: Float[Array, " knots ..."],
+) -> Float[Array, " axes *ensemble"]:
+    """Straight between the knots and constant beyond, without a search: a sum of clipped ramps."""
+    knots = knots.astype(x.dtype)
+    rows = [fit(row, x) for row in values]
+    y = jnp.broadcast_to(rows[0], x.shape)
+    for k in range(len(rows) - 1):
+        share = jnp.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0, 1)
+        y = y + (rows[k + 1] - rows[k]) * share
+    return y
+
+
+def certainty_equivalence(
+    torque_gain: Float[Array, "..."] | float,
+    nominal: Float[Array, "..."] | float,
+    *,
+    span: tuple[float, float] = (0.2, 5.0),
+    knots: int = 6,
+    factor: float = 1.0,
+) -> InertiaMap:
+    """b0 = `factor` KT / J for J from `span[0]` to `span[1]` times the `nominal`, held beyond.
+
+    `torque_gain` KT in N m per unit of command and `nominal` in kg m^2 are scalars, `[axes]` or
+    `[axes, *ensemble]`. With lag in the loop a `factor` above 1 is better: about 1.8 for 20 ms.
+    """
+    torque_gain, nominal = as_float(torque_gain), as_float(nominal)
+    require_positive("torque_gain", torque_gain, "give N m per unit of command, on the rig L Kf")
+    require_positive("factor", as_float(factor), "1 is certainty equivalence")
+    low, high = span
+    if not 0 < low < high < float("inf") or knots < 2:
+        raise ValueError(
+            f"span is {span} times the nominal inertia in {knots} knots: give 0 < low < high and "
+            "2 knots or more"
+        )
+    places = np.linspace(np.log(low), np.log(high), knots)
+    top = jnp.log(factor * times(torque_gain, 1 / nominal))
+    return InertiaMap(nominal, places, top[None] - places.reshape((-1,) + (1,) * top.ndim))

@@ -1,0 +1,302 @@
+"""What is known of a quantity before it is drawn."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+
+Numbers = Float[np.ndarray, "..."]  # [] or [axes]
+
+
+def as_numbers(given: ArrayLike | Sequence[Any]) -> Numbers:
+    """In double precision, outside JAX: members are drawn before anything is compiled."""
+    return np.asarray(given, dtype=float)
+
+
+def as_numbers_or_none(given: ArrayLike | Sequence[Any] | None) -> Numbers | None:
+    return None if given is None else as_numbers(given)
+
+
+def row(value: Numbers) -> Float[np.ndarray, "axes 1"]:
+    """`value` as a column that broadcasts over members."""
+    return np.atleast_1d(value)[:, None]
+
+
+def number(value: Numbers) -> str:
+    """For a table: one number, or one for each axis."""
+    return "/".join(f"{float(x):.4g}" for x in np.atleast_1d(value))
+
+
+def check_finite(**values: Numbers) -> None:
+    """Raise ValueError for the first of the named values that is not finite."""
+    for name, value in values.items():
+        if not np.all(np.isfinite(value)):
+            raise ValueError(f"{name} is {number(value)}: a law needs finite numbers")
+
+
+def check_above_zero(remedy: str, **values: Numbers) -> None:
+    """Raise ValueError for the first of the named values that is not above 0 and finite."""
+    for name, value in values.items():
+        if not np.all((value > 0) & np.isfinite(value)):
+            raise ValueError(f"{name} is {number(value)}, but it must be above 0: {remedy}")
+
+
+def check_axes(**values: Numbers) -> None:
+    """Raise ValueError for values of more than one dimension, or of different numbers of axes."""
+    shapes = {name: value.shape for name, value in values.items()}
+    if any(len(shape) > 1 for shape in shapes.values()) or len(set(shapes.values()) - {()}) > 1:
+        text = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise ValueError(
+            f"a law's numbers have the shapes {text}: give one for all axes, or one for each axis"
+        )
+
+
+def check_ends(low: Numbers, high: Numbers) -> None:
+    """Raise ValueError unless low < high, both finite."""
+    check_axes(low=low, high=high)
+    check_finite(low=low, high=high)
+    if not np.all(low < high):
+        raise ValueError(
+            f"a law from {number(low)} to {number(high)} is empty: give low < high, and a plain "
+            "number for what does not vary"
+        )
+
+
+def from_end_to_end(count: int) -> Float[np.ndarray, " count"]:
+    """Shares of the probability for a grid that holds both ends of a range."""
+    return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
+
+
+Shares = Float[np.ndarray, "rows members"]  # of the probability, 0 to 1
+Values = Float[np.ndarray, "axes members"]
+
+
+class Law(eqx.Module):
+    """What is known of a quantity before it is drawn; numbers are one for all axes, or `[axes]`.
+
+    All samplings share `quantile`, which makes values of shares of the probability, so that a law
+    never gives a value outside its `support`.
+    """
+
+    @abc.abstractmethod
+    def quantile(self, u: Shares) -> Values:
+        """The values below which lies the share `u` of the probability."""
+
+    @property
+    @abc.abstractmethod
+    def support(self) -> tuple[Numbers, Numbers]:
+        """The least and the greatest value that can be drawn."""
+
+    @property
+    def varies(self) -> bool:
+        """Whether members differ."""
+        return True
+
+    def levels(self, count: int) -> Float[np.ndarray, " count"]:
+        """Shares of the probability that a grid of `count` values stands on."""
+        return (np.arange(count) + 0.5) / count
+
+    def about(self, value: Numbers | None, name: str) -> "Law":
+        """The law where the quantity's own value is known: laws relative to it become absolute."""
+        return self
+
+    @property
+    @abc.abstractmethod
+    def text(self) -> str:
+        """In words, for a table."""
+
+
+class Fixed(Law):
+    """One value for all members."""
+
+    value: Numbers = eqx.field(converter=as_numbers)
+
+    def __check_init__(self):
+        check_axes(value=self.value)
+        check_finite(value=self.value)
+
+    def quantile(self, u: Shares) -> Values:
+        return row(self.value) + np.zeros_like(u)
+
+    @property
+    def support(self) -> tuple[Numbers, Numbers]:
+        return self.value, self.value
+
+    @property
+    def varies(self) -> bool:
+        return False
+
+    @property
+    def text(self) -> str:
+        return number(self.value)
+
+
+class Choice(Law):
+    """One of several `values`, each as likely as the others."""
+
+    values: Float[np.ndarray, "..."] = eqx.field(converter=as_numbers)  # one row
+
+    def __check_init__(self):
+        if self.values.ndim != 1 or self.values.size < 2:
+            raise ValueError(f"Choice has values {self.values}: give two or more in one row")
+        check_finite(values=self.values)
+
+    def quantile(self, u: Shares) -> Values:
+        count = self.values.size
+        return self.values[np.minimum((u * count).astype(int), count - 1)]
+
+    @property
+    def support(self) -> tuple[Numbers, Numbers]:
+        return np.asarray(self.values.min()), np.asarray(self.values.max())
+
+    @property
+    def text(self) -> str:
+        return "one of " + ", ".join(f"{x:.4g}" for x in self.values)
+
+
+def as_law(given: Law | ArrayLike | Sequence[Any]) -> Law:
+    """A law as it is; a number, or one for each axis, is known exactly."""
+    return given if isinstance(given, Law) else Fixed(given)
+
+
+def law_or_none(given: Law | ArrayLike | Sequence[Any] | None) -> Law | None:
+    return None if given is None else as_law(given)
+
+
+REACH = 4.0  # standard deviations at which normal laws end
+_TAIL = 3.167124183311998e-05  # of the normal distribution beyond the reach
+_DEVIATION = "it is a standard deviation; for what does not vary give a plain number"
+
+
+class Uniform(Law):
+    """Every value from `low` to `high` alike. Raises ValueError unless low < high."""
+
+    low: Numbers = eqx.field(converter=as_numbers)
+    high: Numbers = eqx.field(converter=as_numbers)
+
+    def __check_init__(self):
+        check_ends(self.low, self.high)
+
+    def quantile(self, u: Shares) -> Values:
+        low, high = row(self.low), row(self.high)
+        return np.clip(low + (high - low) * u, low, high)
+
+    @property
+    def support(self) -> tuple[Numbers, Numbers]:
+        return self.low, self.high
+
+    def levels(self, count: int) -> Float[np.ndarray, " count"]:
+        return from_end_to_end(count)
+
+    @property
+    def text(self) -> str:
+        return f"uniform {number(self.low)} .. {number(self.high)}"
+
+
+class LogUniform(Law):
+    """Every ratio alike, from `low` to `high`. Raises ValueError unless 0 < low < high."""
+
+    low: Numbers = eqx.field(converter=as_numbers)
+    high: Numbers = eqx.field(converter=as_numbers)
+
+    def __check_init__(self):
+        check_ends(self.low, self.high)
+        check_above_zero(
+            "a ratio needs it; use jq.ensembles.Uniform for a range with 0", low=self.low
+        )
+
+    def quantile(self, u: Shares) -> Values:
+        low, high = row(self.low), row(self.high)
+        return np.clip(low * (high / low) ** u, low, high)
+
+    @property
+    def support(self) -> tuple[Numbers, Numbers]:
+        return self.low, self.high
+
+    def levels(self, count: int) -> Float[np.ndarray, " count"]:
+        return from_end_to_end(count)
+
+    @property
+    def text(self) -> str:
+        return f"log-uniform {number(self.low)} .. {number(self.high)}"
+
+
+class Normal(Law):
+    """Normal with a standard `deviation`, cut off at 4 of them.
+
+    Without a `mean`, the deviation is relative to the quantity's own value: `Normal(0.05)` is 5 %
+    of it. Raises ValueError for a deviation that is not above 0.
+    """
+
+    deviation: Numbers = eqx.field(converter=as_numbers)
+    mean: Numbers | None = eqx.field(converter=as_numbers_or_none, default=None)
+
+    def __check_init__(self):
+        check_axes(deviation=self.deviation, mean=self._mean)
+        check_above_zero(_DEVIATION, deviation=self.deviation)
+        check_finite(mean=self._mean)
+
+    @property
+    def _mean(self) -> Numbers:
+        return np.asarray(1.0) if self.mean is None else self.mean
+
+    def quantile(self, u: Shares) -> Values:
+        return row(self._mean) + row(self.deviation) * scores(u)
+
+    @property
+    def support(self) -> tuple[Numbers, Numbers]:
+        reach = REACH * self.deviation
+        return np.asarray(self._mean - reach), np.asarray(self._mean + reach)
+
+    def about(self, value: Numbers | None, name: str) -> Law:
+        if self.mean is not None:
+            return self
+        if value is None:
+            raise ValueError(
+                f"{name} is Normal({number(self.deviation)}), relative to a value that is not known"
+                " here: say the mean, jq.ensembles.Normal(deviation, mean=...), both in its unit"
+            )
+        return Normal(self.deviation * np.abs(value), value)
+
+    @property
+    def text(self) -> str:
+        return f"normal {number(self._mean)} +- {number(self.deviation)}"
+
+
+class LogNormal(Law):
+    """Values around `median` whose logarithm is normal with `deviation`, cut off at 4 of them.
+
+    For spreads too wide for `jq.ensembles.Normal`, whose values would reach 0. Raises ValueError for a
+    deviation or median that is not above 0.
+    """
+
+    deviation: Numbers = eqx.field(converter=as_numbers)
+    median: Numbers = eqx.field(converter=as_numbers, default=1.0)
+
+    def __check_init__(self):
+        check_axes(deviation=self.deviation, median=self.median)
+        check_above_zero(_DEVIATION, deviation=self.deviation)
+        check_above_zero("logarithms need it", median=self.median)
+
+    def quantile(self, u: Shares) -> Values:
+        return row(self.median) * np.exp(row(self.deviation) * scores(u))
+
+    @property
+    def support(self) -> tuple[Numbers, Numbers]:
+        factor = np.exp(REACH * self.deviation)
+        return np.asarray(self.median / factor), np.asarray(self.median * factor)
+
+    @property
+    def text(self) -> str:
+        return f"log-normal {number(self.median)} */ exp({number(self.deviation)})"
+
+
+def scores(u: Shares) -> Shares:
+    """Standard normal values of shares of the probability, within 4 on both sides."""
+    from scipy.special import ndtri
+
+    return ndtri(_TAIL + (1 - 2 * _TAIL) * u)

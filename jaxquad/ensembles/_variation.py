@@ -1,0 +1,67 @@
+"""From drawn numbers to plants."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxquad._core import as_float
+from jaxquad.models import Allocation, Attitude, DecoupledAxes, MotorLag, Multirotor
+
+
+FACTORS = ("inertia", "torque_gain", "told")  # of what the plant has
+QUANTITIES = (*FACTORS, "lag", "delay", "damping", "stiffness", "coulomb", "noise", "gust")
+Numbers = Float[np.ndarray, "..."]
+Drawn = Mapping[str, Numbers]  # [axes] or [axes, members] of each quantity
+
+
+def own_value(plant: DecoupledAxes | Multirotor, name: str) -> Numbers | None:
+    """What a plant without members has for a quantity of an ensemble; None for nothing."""
+    body: Any = plant.attitude if isinstance(plant, Multirotor) else plant
+    if name == "lag" and isinstance(plant, Multirotor):
+        return None if plant.motor is None else np.asarray(plant.motor.time_constant)
+    value = getattr(body, name, None)
+    return None if value is None else np.asarray(value)
+
+
+def varied(plant: DecoupledAxes | Multirotor, drawn: Drawn) -> DecoupledAxes | Multirotor:
+    """The plant with drawn factors of inertia and torque gain, and the other quantities replaced.
+
+    Quantities that were not drawn keep the plant's value.
+    """
+    names = ("damping", "stiffness", "coulomb")
+    own: Any = {name: drawn.get(name, own_value(plant, name)) for name in names}
+    inertia = times(plant_inertia(plant), drawn["inertia"])
+    if isinstance(plant, DecoupledAxes):
+        gain = times(np.asarray(plant.torque_gain), drawn["torque_gain"])
+        return DecoupledAxes(gain, inertia, lag=drawn.get("lag", plant.lag), **own)
+    attitude = Attitude(inertia, rotor_inertia=plant.attitude.rotor_inertia, **own)
+    motor = MotorLag(drawn["lag"][0]) if "lag" in drawn else plant.motor
+    return Multirotor(attitude, _stronger(plant.allocation, drawn["torque_gain"][0]), motor)
+
+
+def _stronger(rotors: Allocation, factor: Numbers) -> Allocation:
+    """All three torques times a factor; the arm is as wide, since it tells the ensemble's shape."""
+    where = lambda r: (r.arm, r.thrust_coefficient, r.torque_coefficient)
+    factors = (np.ones_like(factor), factor, factor)
+    scaled = [as_float(np.asarray(x) * y) for x, y in zip(where(rotors), factors, strict=True)]
+    return eqx.tree_at(where, rotors, scaled)
+
+
+def plant_inertia(plant: DecoupledAxes | Multirotor) -> Numbers:
+    """[axes] or [axes, members], kg m^2."""
+    return np.asarray(plant.attitude.inertia if isinstance(plant, Multirotor) else plant.inertia)
+
+
+def axes_of(plant: DecoupledAxes | Multirotor) -> int:
+    """How many angles it turns by."""
+    return 3 if isinstance(plant, Multirotor) else plant.shape[0]
+
+
+def times(a: Numbers, b: Numbers) -> Numbers:
+    """The product; the one with fewer trailing axes holds for all members."""
+    rank = max(a.ndim, b.ndim)
+    a, b = (x.reshape(x.shape + (1,) * (rank - x.ndim)) for x in (a, b))
+    return a * b

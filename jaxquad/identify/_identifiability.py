@@ -1,0 +1,338 @@
+"""What a record can and cannot tell, decided from the Fisher information before any number."""
+
+from collections.abc import Callable
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ._accuracy import Matrix
+
+
+KINDS = ("product", "sum")
+
+
+class Combination(NamedTuple):
+    """A product of powers, or a weighted sum, of parameters, with its standard error."""
+
+    name: str
+    value: float
+    standard_error: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        reach = 1.96 * self.standard_error
+        return self.value - reach, self.value + reach
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return (
+            f"{self.name} = {self.value:.5g} +- {self.standard_error:.2g}  "
+            f"(95 %: {low:.5g} .. {high:.5g})"
+        )
+
+
+def echelon(rows: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Reduced row echelon form with full pivoting: the same space, with many zeros."""
+    rows, pivots = rows.copy(), []
+    for k in range(len(rows)):
+        rest = np.abs(rows[k:])
+        rest[:, pivots] = 0
+        i, j = np.unravel_index(np.argmax(rest), rest.shape)
+        rows[[k, k + i]] = rows[[k + i, k]]
+        rows[k] /= rows[k, j]
+        others = [m for m in range(len(rows)) if m != k]
+        rows[others] -= np.outer(rows[others, j], rows[k])
+        pivots.append(j)
+    return rows
+
+
+class Named(NamedTuple):
+    """What a combination is made of; `relative` is the covariance of changes over `units`."""
+
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " parameters"]
+    units: Float[np.ndarray, " parameters"]  # the value itself where its logarithm is fitted
+    relative: Matrix
+
+
+def combine(
+    weights: Float[np.ndarray, " parameters"],
+    named: Named,
+    kinds: tuple[str, ...] = KINDS,
+) -> Combination:
+    """The simplest product or sum that is as sharp as `weights` times the relative changes.
+
+    Whole exponents or coefficients are taken if they cost no more than a quarter in standard error;
+    where nothing simple is as sharp, the weights are printed as they are.
+    """
+    logarithmic = bool(np.all(named.units == named.values))
+    products = logarithmic and "product" in kinds
+    powers = _simple(weights) if products else None
+    sums = _simple(weights / named.units) if "sum" in kinds else None
+    if powers is not None and not _as_sharp(powers, weights, named):
+        powers = None
+    if sums is not None and not _as_sharp(sums * named.units, weights, named):
+        sums = None
+    if sums is not None and (powers is None or _simpler(sums, powers)):
+        return _sum(sums, named)
+    if powers is not None:
+        return _product(powers, named)
+    if products:
+        return _product(np.round(weights, 3), named)
+    scaled = weights / named.units
+    return _sum(np.round(scaled / np.max(np.abs(scaled)), 3), named)
+
+
+def _simpler(sums: np.ndarray, powers: np.ndarray) -> bool:
+    """Whether to take the sum of the two; times that only lower the response add up."""
+    return bool(np.abs(sums).max() < np.abs(powers).max() or np.all(powers <= 0))
+
+
+def is_vague(weights: Float[np.ndarray, " parameters"], named: Named, limit: float) -> bool:
+    """Whether the error of a combination is beyond `limit` times what it is made of.
+
+    Where all parts have one sign that is their sum, else the largest: of 0.02 + 0.02 an error of
+    0.01 is a quarter. One that ran to zero adds nothing, whatever its unit.
+    """
+    parts = weights * named.values / named.units
+    alike = np.all(parts >= 0) or np.all(parts <= 0)
+    size = np.sum(np.abs(parts)) if alike else np.max(np.abs(parts))
+    return _spread(weights, named) > limit * float(size)
+
+
+def _as_sharp(simple: np.ndarray, weights: np.ndarray, named: Named) -> bool:
+    limit = 1.25 * _spread(weights, named)
+    return _spread(simple, named) <= limit * _length(simple, weights)
+
+
+def _spread(weights: np.ndarray, named: Named) -> float:
+    return float(np.sqrt(max(weights @ named.relative @ weights, 0.0)))
+
+
+def _length(weights: np.ndarray, like: np.ndarray) -> float:
+    """Size of one combination beside another, along the latter's direction."""
+    return abs(float(weights @ like)) / float(like @ like)
+
+
+def _simple(weights: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"] | None:
+    """The nearest vector of small whole numbers, or None if there is none near."""
+    unit = weights / np.max(np.abs(weights))
+    parts = [Fraction(float(w)).limit_denominator(4) for w in unit]
+    exact = np.array([float(part) for part in parts])
+    whole = exact * np.lcm.reduce([part.denominator for part in parts])
+    near = np.max(np.abs(exact - unit)) < 0.25
+    return whole * np.sign(weights @ whole) if near and np.max(np.abs(whole)) <= 4 else None
+
+
+def _product(powers: Float[np.ndarray, " parameters"], named: Named) -> Combination:
+    value = float(np.prod(np.abs(named.values) ** powers))
+    above = [_power(n, p) for n, p in zip(named.names, powers, strict=True) if p > 0]
+    below = [_power(n, -p) for n, p in zip(named.names, powers, strict=True) if p < 0]
+    name = " ".join(above) or "1"
+    if below:
+        name += " / " + (below[0] if len(below) == 1 else f"({' '.join(below)})")
+    return Combination(name, value, value * _spread(powers, named))
+
+
+def _power(name: str, power: float) -> str:
+    return name if power == 1 else f"{name}^{power:g}"
+
+
+def _sum(weights: Float[np.ndarray, " parameters"], named: Named) -> Combination:
+    weights = weights * np.sign(weights[np.argmax(np.abs(weights * named.units))])
+    value = float(np.sum(weights * named.values))
+    name = ""
+    for w, n in zip(weights, named.names, strict=True):
+        if w:
+            sign = ("- " if w < 0 else "") if not name else (" - " if w < 0 else " + ")
+            name += sign + (n if abs(w) == 1 else f"{abs(w):g} {n}")
+    return Combination(name, value, _spread(weights * named.units, named))
+
+
+LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
+_MEMBER = 0.05  # share of a null direction from which a parameter takes part in it
+_MOVE = 0.4  # finite relative change along a null direction that has to change nothing
+_FLOOR = 1e-8  # of the largest singular value: below it lies rounding
+
+
+class NotIdentifiable(ValueError):
+    """The record holds no usable response, or fewer points than there are parameters."""
+
+
+class Identifiability(NamedTuple):
+    """Names, directions and combinations; `undetermined` is empty where all is well."""
+
+    undetermined: tuple[str, ...]
+    null_directions: tuple[dict[str, float], ...]  # unit vectors of relative changes
+    determined: tuple[Combination, ...]  # combinations of the undetermined ones
+    exact: Float[np.ndarray, "null parameters"]  # those null directions that no noise explains
+    alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
+    curved: tuple[str, ...]  # what is determined of these is no product and no sum
+
+
+class Information(NamedTuple):
+    """All that the decision rests on: free parameters first, then the fixed ones.
+
+    The fixed ones take part in names only: the arm L in L K_t / J_x. `root` holds derivatives of
+    ln-magnitudes and phases (alternate rows), in units of their random error, with respect to
+    relative changes; `covariance` is that of the free parameters' relative changes; `order` is
+    the model's own order of its parameters; `same` says whether other values of the free ones
+    give the same responses.
+    """
+
+    root: Float[np.ndarray, "rows all"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " all"]
+    units: Float[np.ndarray, " all"]
+    order: tuple[int, ...]
+    same: Callable[[Float[np.ndarray, " parameters"]], bool]
+
+
+class _Group(NamedTuple):
+    """Parameters that share null directions, and what they leave determined."""
+
+    members: np.ndarray
+    combinations: list[Combination]
+    alternatives: list[np.ndarray]
+    curved: bool
+
+
+def decide(information: Information) -> Identifiability:
+    """Null directions of the Fisher information, and what is left outside them."""
+    count = len(information.covariance)
+    _, singular, right = np.linalg.svd(information.root[:, :count], full_matrices=True)
+    singular = np.pad(singular, (0, count - len(singular)))
+    exact = singular <= _FLOOR * singular[0]
+    null = right[exact | (singular * LIMIT < 1)]
+    null = _sparse(null) if len(null) else null
+    lost = np.any(null, axis=0) | _blurred(information.covariance)
+    null = _explained(null, information.covariance)
+    sure = _sparse(right[exact]) if np.any(exact) else null[:0]
+    facts = information._replace(covariance=_opened(information.covariance, right[exact]))
+    groups = [_explore(null, sure, block, facts) for block in _blocks(null)]
+    names = information.names
+    return Identifiability(
+        tuple(names[k] for k in np.flatnonzero(lost)),
+        tuple({names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null),
+        tuple(combination for group in groups for combination in group.combinations),
+        right[exact],
+        tuple(values for group in groups for values in group.alternatives),
+        tuple(names[k] for group in groups if group.curved for k in group.members),
+    )
+
+
+def _blurred(covariance: np.ndarray) -> np.ndarray:
+    """Parameters with a standard error beyond the limit, whatever direction it comes from."""
+    return np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) > LIMIT
+
+
+def _explained(
+    null: Float[np.ndarray, "null parameters"], covariance: np.ndarray
+) -> Float[np.ndarray, "more parameters"]:
+    """With the direction that blurs each parameter that is blurred, but is in none of `null`."""
+    left = _blurred(covariance) & ~np.any(null, axis=0)
+    if not left.any():
+        return null
+    spread, directions = np.linalg.eigh(covariance)
+    most = {int(np.argmax(spread * directions[k] ** 2)) for k in np.flatnonzero(left)}
+    return _sparse(np.concatenate([null, directions.T[sorted(most)]]))
+
+
+def _sparse(null: Float[np.ndarray, "null parameters"]) -> Float[np.ndarray, "null parameters"]:
+    """Unit directions spanning the same space, with small shares left out."""
+    rows = echelon(null)
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.where(np.abs(rows) > _MEMBER, rows, 0.0)
+
+
+def _blocks(null: Float[np.ndarray, "null parameters"]) -> list[np.ndarray]:
+    """Groups of parameters that share null directions."""
+    groups: list[set[int]] = []
+    for row in null:
+        group = set(np.flatnonzero(row).tolist())
+        for other in [other for other in groups if other & group]:
+            groups.remove(other)
+            group |= other
+        groups.append(group)
+    return [np.array(sorted(group)) for group in groups]
+
+
+def _opened(covariance: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Covariance with a huge variance along exact null directions, where the inverse shows none."""
+    keep = np.eye(len(covariance)) - exact.T @ exact
+    return keep @ covariance @ keep + 1e4 * exact.T @ exact
+
+
+def _explore(
+    null: Float[np.ndarray, "null parameters"],
+    sure: Float[np.ndarray, "exact parameters"],
+    block: np.ndarray,
+    facts: Information,
+) -> _Group:
+    """One group: which kind of combination survives a finite move, and its determined ones."""
+    sure = sure[np.any(sure[:, block], axis=1)]
+    kept: list[tuple[str, np.ndarray]] = []
+    for kind in KINDS if len(sure) else ():
+        values = _moved(sure, kind, facts)
+        kept += [(kind, values)] if facts.same(values) else []
+    kinds = tuple(kind for kind, _ in kept) if len(sure) else KINDS
+    rows = _outside(null[:, block])
+    effects = facts.root[:, block] @ np.linalg.pinv(rows) if len(rows) else rows.T
+    found = [_named(row, block, effects[:, k], facts, kinds) for k, row in enumerate(rows) if kinds]
+    found = [one for one in found if one is not None]
+    return _Group(block, found, [values for _, values in kept], not kinds and len(rows) > 0)
+
+
+def _moved(
+    sure: Float[np.ndarray, "exact parameters"], kind: str, facts: Information
+) -> Float[np.ndarray, " parameters"]:
+    """Values a finite way along the null directions, at constant products or at constant sums."""
+    count = len(facts.covariance)
+    direction = _MOVE * np.sum(sure * np.arange(1, len(sure) + 1)[:, None] / len(sure), axis=0)
+    values, units = facts.values[:count], facts.units[:count]
+    return values * np.exp(direction) if kind == "product" else values + units * direction
+
+
+def _outside(null: Float[np.ndarray, "null members"]) -> Float[np.ndarray, "rows members"]:
+    """Combinations of the members that no null direction moves."""
+    _, singular, right = np.linalg.svd(null[np.any(null, axis=1)], full_matrices=True)
+    return echelon(right[int(np.sum(singular > 1e-6)) :])
+
+
+def _named(
+    row: np.ndarray,
+    block: np.ndarray,
+    effect: np.ndarray,
+    facts: Information,
+    kinds: tuple[str, ...],
+) -> Combination | None:
+    """None if the record does not determine it any better than its parts."""
+    weights = np.zeros(len(facts.values))
+    weights[block] = row
+    weights = _with_fixed(weights, effect, facts) if "product" in kinds else weights
+    used = np.array(sorted(np.flatnonzero(weights), key=lambda k: facts.order[k]))
+    count = len(facts.covariance)
+    relative = np.zeros((len(weights), len(weights)))
+    relative[:count, :count] = facts.covariance
+    names = tuple(facts.names[k] for k in used)
+    named = Named(names, facts.values[used], facts.units[used], relative[np.ix_(used, used)])
+    vague = is_vague(weights[used], named, LIMIT)
+    return None if vague else combine(weights[used], named, kinds)
+
+
+def _with_fixed(
+    weights: Float[np.ndarray, " all"], effect: np.ndarray, facts: Information
+) -> Float[np.ndarray, " all"]:
+    """Adds fixed parameters that act just as the combination does; signed to raise the response."""
+    weights = weights.copy()
+    for k in range(len(facts.covariance), len(weights)):
+        column = facts.root[:, k]
+        power = float(column @ effect) / max(float(effect @ effect), 1e-300)
+        rest = np.linalg.norm(column - power * effect)
+        if abs(power) > 0.1 and rest < 1e-6 * np.linalg.norm(column):
+            weights[k] = power
+    return -weights if np.sum(effect[::2]) < 0 else weights

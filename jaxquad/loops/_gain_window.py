@@ -1,0 +1,135 @@
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from jaxquad.control import LinearController
+from jaxquad.models import DecoupledAxes, Multirotor
+
+from ._case import Case, case_of
+from ._closed_loop import close
+from ._sampled_axis import SampledAxis
+from ._spectrum import abscissa, growth, powers, sharpest
+from .qualities._crossings import first
+
+
+_REACH = 1e4  # of the search, as a factor and its inverse
+_COARSE, _FINE, _ROUNDS = 121, 15, 2  # gains of the search, and of each closer look
+_SHARP = 1e-5  # 1/s, to which the edges of stability are known
+
+
+class GainWindow(NamedTuple):
+    """Between which values of b/b0 a loop is stable; `nan` where none is.
+
+    An end that the search does not reach, a ten-thousandth or ten thousand times the plant's own
+    gain, is 0 or infinite.
+    """
+
+    low: Float[Array, "*ensemble"]
+    high: Float[Array, "*ensemble"]
+
+    def __str__(self) -> str:
+        low, high = np.atleast_1d(self.low), np.atleast_1d(self.high)
+        if np.all(np.isnan(low)):
+            return "no gain makes the loop stable"
+        text = f"stable for gains of {np.nanmax(low):.4g} to {np.nanmin(high):.4g}"
+        return text if low.size == 1 else f"{text}, all of {np.sum(~np.isnan(low))} members"
+
+
+def gain_window(
+    controller: Any,
+    plant: DecoupledAxes | Multirotor,
+    *,
+    axis: int = 0,
+    member: int | tuple[int, ...] | None = None,
+    dt: float | None = None,
+    delay: Float[ArrayLike, "..."] = 0.0,
+    longest_delay: float | None = None,
+) -> GainWindow:
+    """The values of r = b/b0 for which `controller` keeps the plant stable, whatever its own gain.
+
+    b is the plant's gain, torque per unit of command over inertia, of which all values are tried
+    with the same lag, delay, damping/inertia and stiffness/inertia; b0 is the controller's. For a
+    controller without b0 the window is that of b itself, in rad/s^2 per unit of command. The edges
+    are roots of the abscissa, exact to 1e-5 1/s and differentiable. Of several windows it is the
+    one that holds the plant's own gain, else the one with the most stable loop. A window narrower
+    than a thousandth of its place may be missed. Arguments and errors as in `analyse_loop`.
+    """
+    case = case_of(plant, controller, axis, member, dt, delay, longest_delay)
+    return _windows(case)
+
+
+@eqx.filter_jit
+def _windows(case: Case) -> GainWindow:
+    if case.member is not None or not case.ensemble:
+        return _window(case, case.member or ())
+    places = jnp.unravel_index(jnp.arange(int(np.prod(case.ensemble))), case.ensemble)
+    flat = jax.vmap(lambda *place: _window(case, place))(*places)
+    return GainWindow(*(edge.reshape(case.ensemble) for edge in flat))
+
+
+def _window(case: Case, place: tuple) -> GainWindow:
+    plant, controller = case.parts(place)
+    sharp = sharpest(_SHARP, case.dt, plant.fresh.dtype)
+    ladder = lambda matrix: powers(matrix, case.dt, sharp)
+    held = jax.lax.stop_gradient((plant, controller))
+    grown = lambda factor: growth(ladder(_closed(*held, factor, case.memory)), case.dt)
+    rate = jax.vmap(grown)
+
+    def slowest(factor: Float[Array, ""]) -> Float[Array, ""]:
+        matrix = _closed(plant, controller, factor, case.memory)
+        return abscissa(matrix, ladder(matrix), case.dt, sharp)
+
+    factors = _candidates(rate, plant.fresh.dtype)
+    rates = rate(factors)
+    inside = _run(rates < 0, _anchor(factors, rates))
+    exists, ratio = jnp.any(inside), case.ratio(place)
+
+    crossed = jnp.stack([~inside[:-1] & inside[1:], inside[:-1] & ~inside[1:]])
+    found = jax.lax.stop_gradient(jax.vmap(lambda where: first(rate, factors, where))(crossed))
+    edges = jax.vmap(lambda root: _moved(root, slowest))(found)
+    is_open = jnp.stack([inside[0], inside[-1]])
+    edges = jnp.where(is_open, jnp.array([0.0, jnp.inf], edges.dtype), edges) * ratio
+    return GainWindow(*jnp.where(exists, edges, jnp.nan))
+
+
+def _moved(root: Float[Array, ""], rate: Callable[[Array], Array]) -> Float[Array, ""]:
+    """`root` a Newton step on, with its derivatives by the implicit function theorem."""
+    place = jnp.where(jnp.isnan(root), 1.0, root)
+    value, slope = jax.jvp(rate, (place,), (jnp.ones_like(place),))
+    slope = jax.lax.stop_gradient(slope)
+    return root - value / jnp.where(slope == 0, 1.0, slope)
+
+
+def _closed(
+    plant: SampledAxis, controller: LinearController, factor: Float[Array, ""], memory: int
+) -> Float[Array, "states states"]:
+    scaled = plant._replace(fresh=plant.fresh * factor, stale=plant.stale * factor)
+    return close(scaled, controller, memory).balanced().matrix
+
+
+def _candidates(rate: Callable[[Array], Array], dtype: Any) -> Float[Array, " points"]:
+    # Closer looks at the most stable gain, for windows that a coarse search steps over.
+    factors = jnp.asarray(np.geomspace(1 / _REACH, _REACH, _COARSE), dtype)
+    share = jnp.linspace(0, 1, _FINE + 2, dtype=dtype)[1:-1]
+    for _ in range(_ROUNDS):
+        best = jnp.argmin(rate(factors))
+        ends = [factors[jnp.clip(best + k, 0, factors.size - 1)] for k in (-1, 1)]
+        closer = ends[0] * (ends[1] / ends[0]) ** share
+        factors = jnp.sort(jnp.concatenate([factors, closer]))
+    return factors
+
+
+def _anchor(factors: Float[Array, " points"], rates: Float[Array, " points"]) -> Array:
+    own = jnp.argmin(jnp.abs(jnp.log(factors)))
+    return jnp.where(rates[own] < 0, own, jnp.argmin(rates))
+
+
+def _run(stable: Bool[Array, " points"], anchor: Array) -> Bool[Array, " points"]:
+    """The stable neighbours of `anchor`, and it."""
+    label = jnp.cumsum(~stable)
+    return stable & (label == label[anchor])

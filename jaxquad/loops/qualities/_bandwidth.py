@@ -1,0 +1,274 @@
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
+from ._crossings import crossed, first
+from ._curve import ambiguous, Curve, curve_of
+from ._text import degrees, lines, shown
+
+
+def missing_bandwidth(result: Any) -> list[str]:
+    """Why each number that is `nan` does not exist."""
+    basis = result.basis
+    reasons: list[str] = []
+    for name, angle in (("phase_bandwidth", -135), ("omega_180", -180)):
+        if not np.isfinite(getattr(result, name)) and bool(basis.finite):
+            below = np.degrees(float(basis.start_phase)) <= angle
+            how = (
+                f"starts at {degrees(basis.start_phase, None)} already,"
+                if below
+                else f"does not fall to {angle} deg"
+            )
+            reasons.append(f"no {name}: the phase {how} {_reach(basis)}")
+    if np.isfinite(result.omega_180) and not np.isfinite(result.gain_bandwidth):
+        reasons.append("no gain_bandwidth: below w180 the magnitude is never 6 dB above that there")
+    elif not np.isfinite(result.gain_bandwidth) and np.isfinite(result.phase_bandwidth):
+        reasons.append("without w180 the bandwidth is at most the phase bandwidth")
+    if np.isfinite(result.omega_180):
+        top = float(2 * result.omega_180)
+        if not np.isfinite(result.phase_delay):
+            reasons.append(f"no phase_delay: 2 w180 is {top:.4g} rad/s, not {_reach(basis)}")
+        elif not np.isfinite(result.phase_delay_fit):
+            reasons.append("no phase_delay_fit: fewer than 3 frequencies from w180 to 2 w180")
+    return reasons
+
+
+def _reach(basis: Basis) -> str:
+    unclear = float(basis.unclear)
+    if np.isinf(unclear):
+        return basis.where
+    return (
+        f"below {unclear:.4g} rad/s, from where it turns by more than 115 deg between neighbours: "
+        "give more frequencies there, or choose others with omega="
+    )
+
+
+def doubtful_bandwidth(result: Any) -> list[str]:
+    """What may be wrong with the numbers that exist."""
+    doubts, start = [], float(result.basis.start_phase)
+    given = start + (np.pi / 2 if result.quantity == "rate" else 0.0)
+    if result.branch != "as given" and (abs(given) > np.radians(150) or start > np.radians(90)):
+        doubts.append(
+            f"the phase starts at {np.degrees(start):.4g} deg: if that is a turn off, say so with "
+            "phase_at_start; if the sign of the input is opposite, turn it round"
+        )
+    if float(result.phase_crossings) > 1:
+        doubts.append(
+            f"the phase passes -135 or -180 deg {int(result.phase_crossings)} times: the lowest "
+            "crossing counts"
+        )
+    if float(result.gain_crossings) > 1:
+        doubts.append(
+            f"the magnitude falls through the 6 dB level {int(result.gain_crossings)} times below "
+            "w180: the gain bandwidth is the nearest, others are lower"
+        )
+    if bool(result.gain_bandwidth < result.phase_bandwidth):
+        doubts.append(
+            "gain-limited: ADS-33 warns of pilot-induced oscillation with attitude command"
+        )
+    apart = abs(float(result.gain_bandwidth) - float(result.phase_bandwidth))
+    errors = result.standard_errors
+    if apart < errors.get("gain_bandwidth", 0.0) + errors.get("phase_bandwidth", 0.0):
+        doubts.append(
+            "phase and gain bandwidth agree within their errors: the lesser is biased low"
+        )
+    return doubts
+
+
+_POINTS = 64  # of a model, even in frequency from w180 to 2 w180
+
+
+def known_to(curve: Curve, clear: Bool[Array, " intervals"]) -> Float[Array, ""]:
+    """Frequency in rad/s up to which the phase's branch is known: `clear` holds from the lowest."""
+    return jnp.where(jnp.all(clear), curve.omega[-1], curve.omega[jnp.argmin(clear)])
+
+
+def two_point_delay(
+    curve: Curve, phase: Float[Array, " frequencies"], w180: Float[Array, ""], top: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Phase lost from w180 to 2 w180, over 2 w180: in s, `nan` beyond `top`."""
+    exists = 2 * w180 <= top
+    start = jnp.where(exists, w180, curve.omega[0])
+    ends = _phase_at(curve, phase, jnp.stack([start, 2 * start]))
+    return jnp.where(exists, (ends[0] - ends[1]) / (2 * start), jnp.nan)
+
+
+def fitted_delay(
+    curve: Curve, phase: Float[Array, " frequencies"], w180: Float[Array, ""], top: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Half the slope of the straight line through the phase from w180 to 2 w180: s, `nan` past top.
+
+    A measured phase counts at its own frequencies with the coherence weight of Tischler & Remple,
+    eq. (11.4); a model's at 64 even ones.
+    """
+    exists = 2 * w180 <= top
+    start = jnp.where(exists, w180, curve.omega[0])
+    if curve.coherence is None:
+        points = start * jnp.linspace(1, 2, _POINTS, dtype=start.dtype)
+        weights = jnp.ones_like(points)
+    else:
+        points = curve.omega
+        inside = (points >= start) & (points <= 2 * start)
+        weights = jnp.where(inside, (1.58 * (1 - jnp.exp(-curve.coherence))) ** 2, 0.0)
+    slope = _slope(points / start, _phase_at(curve, phase, points), weights)
+    return jnp.where(exists & (jnp.sum(weights > 0) >= 3), -slope / (2 * start), jnp.nan)
+
+
+def _phase_at(
+    curve: Curve, phase: Float[Array, " frequencies"], omega: Float[Array, " points"]
+) -> Float[Array, " points"]:
+    """Unwrapped phase at `omega`, on the branch that `phase` has on the grid."""
+    branch = jnp.interp(jnp.log(omega), jnp.log(curve.omega), phase)
+    branch = jax.lax.stop_gradient(branch)
+    turned = curve(omega) * jnp.exp(jax.lax.complex(jnp.zeros_like(branch), -branch))
+    return branch + jnp.angle(turned)
+
+
+def _slope(
+    x: Float[Array, " points"], y: Float[Array, " points"], weights: Float[Array, " points"]
+) -> Float[Array, ""]:
+    total = jnp.maximum(jnp.sum(weights), jnp.finfo(x.dtype).tiny)
+    apart = x - jnp.sum(weights * x) / total
+    spread = jnp.sum(weights * apart**2)
+    return jnp.sum(weights * apart * y) / jnp.where(spread > 0, spread, 1.0)
+
+
+_PHASE_MARGIN = np.pi / 4
+_GAIN_MARGIN = 10 ** (6 / 20)
+_PLACES = ("phase_bandwidth", "gain_bandwidth", "omega_180")
+
+
+class Bandwidth(eqx.Module):
+    """Attitude bandwidth and phase delay of ADS-33; `str()` says why a number is missing (`nan`).
+
+    `bandwidth` is the lesser of the phase and the gain bandwidth, as for rate command; for
+    attitude command with attitude hold, ADS-33 takes the phase bandwidth alone.
+    """
+
+    bandwidth: Float[Array, ""]  # rad/s
+    phase_bandwidth: Float[Array, ""]  # rad/s, where the phase falls through -135 deg
+    gain_bandwidth: Float[Array, ""]  # rad/s, where the magnitude is 6 dB above that at w180
+    omega_180: Float[Array, ""]  # rad/s, where the phase falls through -180 deg
+    phase_delay: Float[Array, ""]  # s, from the phase at w180 and at 2 w180
+    phase_delay_fit: Float[Array, ""]  # s, from a straight line through the phase between them
+    gain_crossings: Float[Array, ""]  # how often the magnitude falls through that level below w180
+    phase_crossings: Float[Array, ""]  # how often the phase passes -135 or -180 deg
+    standard_errors: dict[str, Array]  # of a measured response, by the names above; else empty
+    basis: Basis
+    quantity: str = eqx.field(static=True)
+    branch: str = eqx.field(static=True)  # of the phase at the lowest frequency: whose choice
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader has to know before using the numbers."""
+        return tuple(missing_bandwidth(self) + doubtful_bandwidth(self) + self.basis.remarks)
+
+    def __str__(self) -> str:
+        names = ("bandwidth", *_PLACES, "phase_delay", "phase_delay_fit")
+        units = ["rad/s"] * 4 + ["s"] * 2
+        rows = [
+            (name, shown(getattr(self, name), self.standard_errors.get(name), unit))
+            for name, unit in zip(names, units, strict=True)
+        ]
+        phase = f"{degrees(self.basis.start_phase, None)} ({self.branch})"
+        rows.append(("phase at the lowest frequency", phase))
+        return "\n".join([f"attitude bandwidth, {self.basis.where}", lines(rows, [*self.remarks])])
+
+
+def attitude_bandwidth(
+    response: Any,
+    *,
+    quantity: str = "attitude",
+    omega: Float[ArrayLike, " frequencies"] | None = None,
+    phase_at_start: Float[ArrayLike, ""] | None = None,
+    output: str | int | None = None,
+    input: str | int | None = None,
+) -> Bandwidth:
+    """Bandwidth, phase delay and w180 of an attitude's response to the pilot's or tester's input.
+
+    `response` is a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase straight
+    in ln omega) and carry standard errors, or any model with `frequency_response(omega)`, whose
+    numbers are exact and differentiable, also under jit. `quantity` says what it is the response
+    of: the "attitude", or the "rate", which is divided by s. A model is searched at `omega`, rad/s,
+    by default 2000 log-spaced values from 0.01 to 1000; of a measured response, `omega` picks some
+    of its own frequencies.
+    The phase is unwrapped upwards from the lowest frequency, where it has its principal value, or
+    the one nearest to `phase_at_start` (rad, of the response as given): give it where the response
+    starts near -180 deg or behind a delay. The lowest crossings downwards count; for the gain
+    bandwidth the nearest below w180. Nothing is found where the phase turns by more than 115 deg
+    between neighbours. The standard errors are first-order, from the covariance of the measured
+    errors. Raises ValueError for an unknown quantity, channel or grid.
+    Source: ADS-33E-PRF fig. 2; Tischler & Remple, handling-qualities chapter.
+    """
+    if quantity not in ("attitude", "rate"):
+        raise ValueError(f'quantity is {quantity!r}: say "attitude" or "rate"')
+    curve = curve_of(response, omega, output, input, int(quantity == "rate"))
+    start = None if phase_at_start is None else jnp.asarray(phase_at_start, curve.omega.dtype)
+    values, basis, errors = found(_numbers, curve, start)
+    places = {name: values[name] for name in _PLACES}
+    return Bandwidth(
+        **values,
+        standard_errors=errors,
+        basis=with_coherence(basis, curve, places),
+        quantity=quantity,
+        branch="principal value" if start is None else "as given",
+    )
+
+
+def _numbers(curve: Curve, start: Float[Array, ""] | None) -> tuple[Numbers, Numbers, Basis]:
+    values = jax.lax.stop_gradient(curve(curve.omega))
+    phase = jax.lax.stop_gradient(curve.phase(start))
+    clear = jnp.cumsum(ambiguous(phase)) == 0
+    by_phase = _falls_through(curve, phase, clear, _PHASE_MARGIN - jnp.pi)
+    w180 = _falls_through(curve, phase, clear, -jnp.pi)
+    by_gain, crossings = _gain_bandwidth(curve, values, w180)
+    top = known_to(curve, clear)
+    targets = (-jnp.pi, _PHASE_MARGIN - jnp.pi)
+    passes = [jnp.sum(crossed(phase - target, "both") & clear) for target in targets]
+    numbers = {
+        "bandwidth": jnp.minimum(by_phase, by_gain),
+        "phase_bandwidth": by_phase,
+        "gain_bandwidth": by_gain,
+        "omega_180": w180,
+        "phase_delay": two_point_delay(curve, phase, w180, top),
+        "phase_delay_fit": fitted_delay(curve, phase, w180, top),
+    }
+    counts = {
+        "gain_crossings": crossings,
+        "phase_crossings": jnp.maximum(*passes).astype(w180.dtype),
+    }
+    finite = jnp.all(jnp.isfinite(values))
+    return only_finite(numbers, finite), counts, basis_of(curve, phase, finite)
+
+
+def _falls_through(
+    curve: Curve, phase: Float[Array, " frequencies"], clear: Array, target: float
+) -> Float[Array, ""]:
+    turn = complex(np.exp(-1j * target))
+
+    def beyond(omega):
+        return jnp.angle(curve(omega) * turn)
+
+    return first(beyond, curve.omega, crossed(phase - target, "falling") & clear)
+
+
+def _gain_bandwidth(
+    curve: Curve, values: Array, w180: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    exists = jnp.isfinite(w180)
+    # Derivatives of what does not exist must not reach what does: hence a finite stand-in.
+    place = jnp.where(exists, w180, curve.omega[-1])
+    level = jnp.log(jnp.abs(curve(place[None])))[0] + np.log(_GAIN_MARGIN)
+
+    def excess(omega):
+        return jnp.log(jnp.abs(curve(omega))) - level
+
+    grid = jnp.log(jnp.abs(values)) - jax.lax.stop_gradient(level)
+    where = crossed(grid, "falling") & (curve.omega[:-1] < place) & exists
+    nearest = -jnp.arange(where.size, dtype=place.dtype)
+    return first(excess, curve.omega, where, nearest), jnp.sum(where).astype(place.dtype)

@@ -1,0 +1,199 @@
+"""One response, measured or of a model, that can be asked at any frequency."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
+
+from jaxquad._core import is_concrete
+from jaxquad.models import imaginary
+from jaxquad.spectra import FrequencyResponse
+
+
+AMBIGUOUS = 2.0  # rad between neighbours, from which the sense of a turn is a guess
+_GRID = (0.01, 1000.0, 2000)  # rad/s, rad/s, points
+
+
+class Interpolated(eqx.Module):
+    """A measured response: ln|T| and the unwrapped phase run straight in ln(omega)."""
+
+    omega: Float[Array, " frequencies"]  # rad/s
+    log_magnitude: Float[Array, " frequencies"]
+    phase: Float[Array, " frequencies"]  # rad
+    covariance: Complex[Array, "frequencies frequencies"]  # of dT/T
+
+    def frequency_response(
+        self, omega: Float[Array, " points"]
+    ) -> Complex[Array, "points outputs inputs"]:
+        """Response at `omega` in rad/s, constant beyond the ends."""
+        knots = jnp.log(self.omega)
+        passed = jnp.searchsorted(knots, jnp.log(omega), side="right", method="compare_all")
+        k = jnp.clip(passed - 1, 0, knots.size - 2)
+        part = jnp.clip((jnp.log(omega) - knots[k]) / (knots[k + 1] - knots[k]), 0, 1)
+        straight = (y[k] + part * (y[k + 1] - y[k]) for y in (self.log_magnitude, self.phase))
+        return jnp.exp(jax.lax.complex(*straight))[:, None, None]
+
+    @property
+    def random_error(self) -> Float[Array, " frequencies"]:
+        """1 sigma of ln|T|, and of the phase in rad."""
+        return jnp.sqrt(jnp.real(jnp.diag(self.covariance)) / 2)
+
+
+class Curve(eqx.Module):
+    """One output to one input, divided by s `integrations` times, and the grid to search.
+
+    `coherence` is None for a model, which is exact at any frequency.
+    """
+
+    model: Any
+    omega: Float[Array, " frequencies"]  # rad/s
+    coherence: Float[Array, " frequencies"] | None
+    pair: tuple[int, int] = eqx.field(static=True)
+    integrations: int = eqx.field(static=True)
+    dropped: int = eqx.field(static=True)  # measured frequencies without a number
+
+    def __call__(self, omega: Float[Array, " points"]) -> Complex[Array, " points"]:
+        """Response at `omega` in rad/s."""
+        return self._given(omega) / imaginary(omega) ** self.integrations
+
+    def phase(self, start: Float[ArrayLike, ""] | None) -> Float[Array, " frequencies"]:
+        """Phase on the grid in rad, unwrapped upwards from the lowest frequency.
+
+        There the response as given, before the integrations, has its principal value, or the one
+        nearest to `start`.
+        """
+        phase = jnp.unwrap(jnp.angle(self._given(self.omega)))
+        if start is not None:
+            phase = phase + 2 * jnp.pi * jnp.round((start - phase[0]) / (2 * jnp.pi))
+        return phase - self.integrations * jnp.pi / 2
+
+    def _given(self, omega: Float[Array, " points"]) -> Complex[Array, " points"]:
+        output, source = self.pair
+        return self.model.frequency_response(omega)[:, output, source]
+
+
+class _Opaque:
+    """A model that is no pytree: new at every call, so that no compiled answer outlives it."""
+
+    def __init__(self, model: Any):
+        self.frequency_response = model.frequency_response
+
+
+def curve_of(
+    response: Any,
+    omega: Float[ArrayLike, " frequencies"] | None,
+    output: str | int | None,
+    input: str | int | None,
+    integrations: int = 0,
+) -> Curve:
+    """The curve of a `FrequencyResponse` or of a model, searched at `omega` in rad/s."""
+    if isinstance(response, FrequencyResponse):
+        return _measured(response, omega, output, input, integrations)
+    if not hasattr(response, "frequency_response"):
+        raise ValueError(
+            f"{type(response).__name__} is no frequency response: give a jq.spectra.FrequencyResponse, or "
+            "a model with a method frequency_response(omega)"
+        )
+    grid = np.geomspace(*_GRID) if omega is None else omega
+    _require_grid(grid)
+    grid = jnp.asarray(grid, jnp.result_type(float))
+    outputs, inputs = _channels(response, grid)
+    names = [tuple(f"{k}" for k in range(n)) for n in (outputs, inputs)]
+    pair = (_position("output", output, names[0]), _position("input", input, names[1]))
+    model = _Opaque(response) if jax.tree.leaves(response) == [response] else response
+    return Curve(model, grid, None, pair, integrations, 0)
+
+
+def ambiguous(phase: Float[Array, " frequencies"]) -> Bool[Array, " intervals"]:
+    """Between which neighbours a phase turns by so much that its sense is a guess."""
+    return ~(jnp.abs(jnp.diff(phase)) < AMBIGUOUS)
+
+
+def around(
+    omega: Float[Array, " frequencies"], place: Float[ArrayLike, ""]
+) -> Int[np.ndarray, "2"]:
+    """Indices of the grid points below and above a frequency; the same twice at a point."""
+    grid = np.asarray(omega)
+    above = np.clip(np.searchsorted(grid, place * (1 - 1e-12)), 0, grid.size - 1)
+    below = np.clip(np.searchsorted(grid, place * (1 + 1e-12), "right") - 1, 0, grid.size - 1)
+    return np.array([below, above])
+
+
+def _measured(
+    frf: FrequencyResponse,
+    omega: Float[ArrayLike, " frequencies"] | None,
+    output: str | int | None,
+    input: str | int | None,
+    integrations: int,
+) -> Curve:
+    o, i = _position("output", output, frf.output_names), _position("input", input, frf.input_names)
+    values, error = (np.asarray(x)[:, o, i] for x in (frf.response, frf.random_error))
+    wanted = _wanted(np.asarray(frf.omega), omega)
+    known = wanted & np.isfinite(values) & np.isfinite(error) & (values != 0)
+    grid = np.asarray(frf.omega)[known]
+    _require_grid(grid)
+    level, phase = np.log(np.abs(values[known])), np.unwrap(np.angle(values[known]))
+    with np.errstate(divide="ignore", invalid="ignore"):  # where there is no number
+        shared = frf.relative_covariance(o, i)[np.ix_(known, known)]
+    numbers = (jnp.asarray(x) for x in (grid, level, phase, shared))
+    coherence = jnp.asarray(np.asarray(frf.coherence)[known, o, i])
+    dropped = int(np.sum(wanted & ~known))
+    return Curve(
+        Interpolated(*numbers), jnp.asarray(grid), coherence, (0, 0), integrations, dropped
+    )
+
+
+def _wanted(
+    measured: Float[np.ndarray, " frequencies"], omega: Float[ArrayLike, " some"] | None
+) -> Bool[np.ndarray, " frequencies"]:
+    if omega is None:
+        return np.full(measured.shape, True)
+    chosen = np.asarray(omega)
+    unknown = chosen[~np.isin(chosen, measured)]
+    if unknown.size:
+        raise ValueError(
+            f"omega holds {unknown[0]:.6g} rad/s, at which nothing was measured: choose from the "
+            "omega of the response, as in frf.omega[5:60]"
+        )
+    return np.isin(measured, chosen)
+
+
+def _channels(model: Any, omega: Float[Array, " frequencies"]) -> tuple[int, int]:
+    shape = eqx.filter_eval_shape(lambda m, w: m.frequency_response(w), model, omega).shape
+    if len(shape) != 3 or shape[0] != omega.size:
+        raise ValueError(
+            f"{type(model).__name__}.frequency_response gave the shape {shape} for {omega.size} "
+            f"frequencies: it must be ({omega.size}, outputs, inputs)"
+        )
+    return shape[1], shape[2]
+
+
+def _position(kind: str, wanted: str | int | None, names: tuple[str, ...]) -> int:
+    if wanted is None and len(names) == 1:
+        return 0
+    if isinstance(wanted, int) and 0 <= wanted < len(names):
+        return wanted
+    if isinstance(wanted, str) and wanted in names:
+        return names.index(wanted)
+    raise ValueError(
+        f"{kind} is {wanted!r}, but the response has {len(names)}: choose {kind}= from "
+        f"{', '.join(names)}, or a number from 0"
+    )
+
+
+def _require_grid(omega: Float[ArrayLike, " frequencies"]) -> None:
+    if isinstance(omega, Array) and not is_concrete(omega):
+        return
+    grid = np.asarray(omega)
+    if grid.ndim != 1 or grid.size < 3:
+        raise ValueError(
+            f"omega has the shape {grid.shape}: it takes 3 usable frequencies at least, in one row"
+        )
+    if not (np.all(np.isfinite(grid)) and grid[0] > 0 and np.all(np.diff(grid) > 0)):
+        raise ValueError(
+            f"omega, from {grid[0]:.4g} to {grid[-1]:.4g} rad/s, must be finite, above 0 and "
+            "rising: use numpy.geomspace"
+        )

@@ -1,0 +1,193 @@
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
+from ._crossings import crossed, crossings
+from ._curve import Curve, curve_of
+from ._nyquist import remarks_on_roots, unstable_roots
+from ._text import decibels, degrees, lines, shown
+
+
+_LIMIT = 16
+_ZERO = 1e-12  # rad, a phase margin that differs from 0 by rounding
+
+
+class Margins(eqx.Module):
+    """Stability margins of a loop L, closed as 1 + L = 0; `str()` says why one is missing (`nan`).
+
+    A gain margin is the factor by which the loop's gain may change: `gain_margin` upwards,
+    `gain_reduction` downwards, which only conditionally stable loops have. The lists hold every
+    crossing, padded with `nan`; beyond 16, those nearest to -1.
+    """
+
+    phase_margin: Float[Array, ""]  # rad, the smallest; negative beyond -180 deg
+    crossover: Float[Array, ""]  # rad/s, of that phase margin
+    delay_margin: Float[Array, ""]  # s, the smallest
+    delay_crossover: Float[Array, ""]  # rad/s
+    gain_margin: Float[Array, ""]  # smallest factor above 1
+    phase_crossover: Float[Array, ""]  # rad/s
+    gain_reduction: Float[Array, ""]  # greatest factor below 1
+    reduction_crossover: Float[Array, ""]  # rad/s
+    crossovers: Float[Array, " crossings"]  # rad/s, where |L| = 1
+    phase_margins: Float[Array, " crossings"]  # rad, -pi to pi
+    delay_margins: Float[Array, " crossings"]  # s
+    phase_crossovers: Float[Array, " crossings"]  # rad/s, where L is real and negative
+    gain_margins: Float[Array, " crossings"]  # 1 / |L|
+    unstable_roots: Float[Array, ""]  # of the closed loop, by Nyquist's count; nan if unknown
+    left_out: Float[Array, ""]  # crossings beyond 16 of a kind
+    standard_errors: dict[str, Array]  # of a measured response, by the names above; else empty
+    basis: Basis
+    unstable_poles: int = eqx.field(static=True)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader has to know before using the numbers."""
+        roots = remarks_on_roots(float(self.unstable_roots), self.unstable_poles)
+        return tuple(_missing(self) + roots + _doubts(self) + self.basis.remarks)
+
+    def __str__(self) -> str:
+        error = self.standard_errors.get
+        named = (
+            ("phase margin", "phase_margin", "crossover", degrees),
+            ("delay margin", "delay_margin", "delay_crossover", lambda x, e: shown(x, e, "s")),
+            ("gain margin", "gain_margin", "phase_crossover", decibels),
+            ("gain reduction", "gain_reduction", "reduction_crossover", decibels),
+        )
+        rows = [
+            (
+                title,
+                f"{text(getattr(self, name), error(name))} at "
+                f"{shown(getattr(self, place), error(place), 'rad/s')}",
+            )
+            for title, name, place, text in named
+            if np.isfinite(getattr(self, name))
+        ]
+        rows.append(("crossovers", _listed(self.crossovers)))
+        rows.append(("crossings of -180 deg", _listed(self.phase_crossovers)))
+        return "\n".join([f"margins, {self.basis.where}", lines(rows, [*self.remarks])])
+
+
+def margins(
+    loop: Any,
+    *,
+    omega: Float[ArrayLike, " frequencies"] | None = None,
+    unstable_poles: int = 0,
+    output: str | int | None = None,
+    input: str | int | None = None,
+) -> Margins:
+    """Gain, phase and delay margins of a loop's response L, with negative feedback.
+
+    `loop` is a `jq.spectra.FrequencyResponse`, whose numbers are interpolated and carry standard errors, or
+    a model with `frequency_response(omega)`, whose numbers are exact and differentiable, also under
+    jit; it is searched at `omega`, rad/s, by default 2000 log-spaced values from 0.01 to 1000. A
+    missing crossing gives `nan`, not infinity: it may lie beyond the frequencies given. Two
+    crossings between the same neighbours of `omega` go unseen. Of a measured response, `omega`
+    picks some of its own frequencies.
+    Margins are distances to -1 in gain, phase and delay, whatever the branch of the phase, and mean
+    what their names say where the closed loop is stable. That is counted by Nyquist's criterion,
+    with `unstable_poles` of the loop. Raises ValueError for an unknown channel or grid.
+    Source: Tischler & Remple, broken-loop responses; delay margin = phase margin / crossover.
+    """
+    curve = curve_of(loop, omega, output, input)
+    values, basis, errors = found(_numbers, curve, jnp.asarray(unstable_poles, curve.omega.dtype))
+    places = {"crossover": values["crossover"], "phase_crossover": values["phase_crossover"]}
+    places["reduction_crossover"] = values["reduction_crossover"]
+    basis = with_coherence(basis, curve, places)
+    return Margins(**values, standard_errors=errors, basis=basis, unstable_poles=unstable_poles)
+
+
+def _numbers(curve: Curve, unstable_poles: Float[Array, ""]) -> tuple[Numbers, Numbers, Basis]:
+    values = jax.lax.stop_gradient(curve(curve.omega))
+    level, angle = jnp.log(jnp.abs(values)), jnp.angle(-values)
+    at_one, at_real = crossed(level, "both"), _crosses_negative_axis(angle)
+    rank = [jnp.minimum(jnp.abs(x[:-1]), jnp.abs(x[1:])) for x in (angle, level)]
+    numbers = _phase_margins(curve, at_one, rank[0]) | _gain_margins(curve, at_real, rank[1])
+    left_out = [jnp.maximum(jnp.sum(where) - _LIMIT, 0) for where in (at_one, at_real)]
+    counts = {
+        "left_out": (left_out[0] + left_out[1]).astype(level.dtype),
+        "unstable_roots": unstable_roots(curve.omega, values, unstable_poles),
+    }
+    finite = jnp.all(jnp.isfinite(values))
+    phase = jax.lax.stop_gradient(curve.phase(None))
+    # How a loop of small gain turns does not matter.
+    heard = jnp.maximum(level[:-1], level[1:]) > np.log(0.1)
+    basis = basis_of(curve, phase, finite, heard)
+    return only_finite(numbers, finite), counts, basis
+
+
+def _phase_margins(curve: Curve, where: Array, rank: Array) -> Numbers:
+    places = crossings(
+        lambda w: jnp.log(jnp.abs(curve(w))), curve.omega, where, rank=rank, limit=_LIMIT
+    )
+    stand_in = jnp.where(jnp.isfinite(places), places, curve.omega[0])
+    margin = jnp.where(jnp.isfinite(places), jnp.angle(-curve(stand_in)), jnp.nan)
+    ahead = jnp.where(margin > -_ZERO, jnp.maximum(margin, 0.0), margin + 2 * jnp.pi)
+    delay = ahead / places
+    sizes = (jnp.where(jnp.isfinite(places), jnp.abs(x), jnp.inf) for x in (margin, delay))
+    least, soonest = (jnp.argmin(size) for size in sizes)
+    return {
+        "phase_margin": margin[least],
+        "crossover": places[least],
+        "delay_margin": delay[soonest],
+        "delay_crossover": places[soonest],
+        "crossovers": places,
+        "phase_margins": margin,
+        "delay_margins": delay,
+    }
+
+
+def _gain_margins(curve: Curve, where: Array, rank: Array) -> Numbers:
+    places = crossings(lambda w: jnp.angle(-curve(w)), curve.omega, where, rank=rank, limit=_LIMIT)
+    stand_in = jnp.where(jnp.isfinite(places), places, curve.omega[0])
+    margin = jnp.where(jnp.isfinite(places), 1 / jnp.abs(curve(stand_in)), jnp.nan)
+    up = jnp.argmin(jnp.where(margin >= 1, margin, jnp.inf))
+    down = jnp.argmax(jnp.where(margin < 1, margin, 0.0))
+    rises, falls = margin[up] >= 1, margin[down] < 1
+    return {
+        "gain_margin": jnp.where(rises, margin[up], jnp.nan),
+        "phase_crossover": jnp.where(rises, places[up], jnp.nan),
+        "gain_reduction": jnp.where(falls, margin[down], jnp.nan),
+        "reduction_crossover": jnp.where(falls, places[down], jnp.nan),
+        "phase_crossovers": places,
+        "gain_margins": margin,
+    }
+
+
+def _crosses_negative_axis(angle: Float[Array, " frequencies"]) -> Array:
+    # Across the positive axis the angle of -L jumps by a turn.
+    return crossed(angle, "both") & (jnp.abs(jnp.diff(angle)) < jnp.pi)
+
+
+def _missing(result: Margins) -> list[str]:
+    if not bool(result.basis.finite):
+        return []
+    reasons, where = [], result.basis.where
+    if not np.any(np.isfinite(result.crossovers)):
+        reasons.append(f"no phase or delay margin: |L| does not pass 1 {where}")
+    if not np.any(np.isfinite(result.phase_crossovers)):
+        reasons.append(f"no gain margin: L does not cross -180 deg {where}")
+    elif not np.isfinite(result.gain_margin):
+        reasons.append(f"no gain margin upwards: |L| is above 1 at every -180 deg {where}")
+    return reasons
+
+
+def _doubts(result: Margins) -> list[str]:
+    doubts = []
+    if float(result.left_out) > 0:
+        doubts.append(f"{int(result.left_out)} crossings farther from -1 are not listed")
+    if np.isfinite(result.basis.unclear):
+        doubts.append(
+            f"from {float(result.basis.unclear):.4g} rad/s the loop turns by more than 115 deg "
+            "between neighbours: crossings may be missed, give more frequencies there"
+        )
+    return doubts
+
+
+def _listed(places: Float[Array, " crossings"]) -> str:
+    numbers = np.asarray(places)[np.isfinite(np.asarray(places))]
+    return ", ".join(f"{x:.4g}" for x in numbers) + " rad/s" if numbers.size else "none"

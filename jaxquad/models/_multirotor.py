@@ -1,0 +1,141 @@
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxquad._core import align, as_float, is_concrete, is_zero, require_positive
+
+from ._allocation import Allocation
+from ._attitude import Attitude
+from ._decoupled import added, DecoupledAxes
+from ._rotation import euler_from_quaternion, quaternion_derivative, quaternion_from_euler
+
+
+class MotorLag(eqx.Module):
+    """Motor and propeller as a first-order lag from the commanded to the effective input.
+
+    Raises ValueError for a time constant that is not positive: a motor without lag has no state.
+    """
+
+    time_constant: Float[Array, "..."] = eqx.field(converter=as_float)  # s
+
+    def __check_init__(self):
+        remedy = "to model a motor without lag, leave the lag out (motor=None, lag=None)"
+        require_positive("time_constant", self.time_constant, remedy)
+
+    def derivative(
+        self, state: Float[Array, " motors *ensemble"], command: Float[Array, " motors *ensemble"]
+    ) -> Float[Array, " motors *ensemble"]:
+        """Rate of change of the effective input, in units of `command` per s."""
+        return (command - state) / align(self.time_constant[None], state)
+
+    def step(
+        self,
+        state: Float[Array, " motors *ensemble"],
+        command: Float[Array, " motors *ensemble"],
+        dt: float | Float[Array, ""],
+    ) -> Float[Array, " motors *ensemble"]:
+        """The effective input after `dt` seconds of a held `command`, exactly."""
+        return command + (state - command) * jnp.exp(-dt / align(self.time_constant[None], state))
+
+
+class MultirotorState(eqx.Module):
+    """What a `Multirotor` remembers, or the time derivative of it."""
+
+    quaternion: Float[Array, " 4 *ensemble"]  # body to earth, scalar first; any length but 0
+    rate: Float[Array, " 3 *ensemble"]  # body axes, rad/s
+    motor: Float[Array, " 4 *ensemble"] | None  # effective motor inputs; None without a lag
+
+
+class Multirotor(eqx.Module):
+    """A multirotor's attitude from motor inputs to Euler angles: Eq. (1)-(10), as corrected.
+
+    Every parameter may have a trailing ensemble axis; then states, inputs and outputs have it too.
+    Raises ValueError for spinning rotors driven by voltages, which do not tell the rotor speeds.
+    """
+
+    attitude: Attitude
+    allocation: Allocation
+    motor: MotorLag | None = None
+
+    def __check_init__(self):
+        rotor_inertia = self.attitude.rotor_inertia
+        known = is_concrete(rotor_inertia) and not is_zero(rotor_inertia)
+        if known and self.allocation.input == "voltage":
+            raise ValueError(
+                f"rotor_inertia is {rotor_inertia}, but voltages do not tell the rotor speeds: "
+                'set it to 0, or use an Allocation with input="omega2".'
+            )
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the parameters, () for one vehicle."""
+        attitude, allocation = self.attitude, self.allocation
+        vectors = [attitude.inertia, attitude.damping]
+        scalars = [attitude.rotor_inertia, allocation.arm]
+        scalars += [allocation.thrust_coefficient, allocation.torque_coefficient]
+        vectors += [x for x in (attitude.stiffness, attitude.coulomb) if x is not None]
+        if self.motor is not None:
+            scalars.append(self.motor.time_constant)
+        return jnp.broadcast_shapes(*(v.shape[1:] for v in vectors), *(s.shape for s in scalars))
+
+    def init(
+        self, euler: ArrayLike | Sequence[Any] | None = None, *, ensemble: tuple[int, ...] = ()
+    ) -> MultirotorState:
+        """At rest at the Euler angles `euler` in rad (level if None), with the motors stopped.
+
+        The state is as wide as `ensemble`, the parameters and `euler` ask for together.
+        """
+        dtype = self.attitude.inertia.dtype
+        euler = jnp.zeros(3, dtype) if euler is None else jnp.asarray(euler, dtype)
+        shape = jnp.broadcast_shapes(self.ensemble, ensemble, euler.shape[1:])
+        rate = jnp.zeros((3, *shape), euler.dtype)
+        quaternion = quaternion_from_euler(jnp.broadcast_to(align(euler, rate), rate.shape))
+        motor = None if self.motor is None else jnp.zeros((4, *shape), euler.dtype)
+        return MultirotorState(quaternion, rate, motor)
+
+    def derivative(
+        self,
+        state: MultirotorState,
+        inputs: Float[Array, " 4 *ensemble"],
+        disturbance: Float[Array, " 3 *ensemble"],
+    ) -> MultirotorState:
+        """Time derivative of `state` under motor `inputs` and a `disturbance` torque in N m."""
+        motor = inputs if state.motor is None else state.motor
+        torque = self.allocation.torque(motor) + disturbance
+        if self.attitude.stiffness is not None:
+            torque = torque + self.attitude.restoring_torque(self.measure(state))
+        return MultirotorState(
+            quaternion_derivative(state.quaternion, state.rate),
+            self.attitude.acceleration(state.rate, torque, self.allocation.spin(motor)),
+            None if self.motor is None else self.motor.derivative(motor, inputs),
+        )
+
+    def measure(self, state: MultirotorState) -> Float[Array, " 3 *ensemble"]:
+        """Euler angles in rad: what the encoders of a rig, or an attitude filter, report."""
+        length = jnp.linalg.norm(state.quaternion, axis=0, keepdims=True)
+        return euler_from_quaternion(state.quaternion / length)
+
+    def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "Multirotor":
+        """The same vehicle carrying a known extra `inertia` in kg m^2, such as a payload."""
+        return eqx.tree_at(
+            lambda p: p.attitude.inertia, self, added(self.attitude.inertia, inertia)
+        )
+
+    def decoupled(self) -> DecoupledAxes:
+        """The three axes near level flight, driven by the allocation's differences.
+
+        Those are what a `jq.simulation.MotorDrive` makes voltages of, such as V4 - V2. Gyroscopic terms and
+        the coupling of the axes are of second order and left out.
+        """
+        attitude, allocation = self.attitude, self.allocation
+        return DecoupledAxes(
+            allocation.torque_per_difference,
+            attitude.inertia,
+            lag=None if self.motor is None else self.motor.time_constant[None],
+            damping=attitude.damping,
+            stiffness=0.0 if attitude.stiffness is None else attitude.stiffness,
+            coulomb=attitude.coulomb,
+        )

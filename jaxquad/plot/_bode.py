@@ -1,0 +1,191 @@
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from jaxquad.spectra import FrequencyResponse
+
+
+COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
+_LINES = ["-", "--", "-.", ":"]
+_MARKS = ["x", "+", "^", "s"]
+
+
+class _Curve(NamedTuple):
+    omega: Float[np.ndarray, " frequencies"]  # rad/s
+    magnitude: Float[np.ndarray, " frequencies"]  # dB
+    phase: Float[np.ndarray, " frequencies"]  # deg
+    coherence: Float[np.ndarray, " frequencies"]
+    error: Float[np.ndarray, " frequencies"]  # 1 sigma: relative, and in rad
+
+    @property
+    def good(self) -> Bool[np.ndarray, " frequencies"]:
+        return self.coherence >= COHERENT
+
+
+def bode(
+    frf: FrequencyResponse,
+    model: Any = None,
+    *,
+    others: Mapping[str, FrequencyResponse] | None = None,
+    pair: tuple[str, str] | None = None,
+    title: str = "",
+) -> Any:
+    """Magnitude, phase and coherence of a measured response with its 95 % band, beside models.
+
+    `model` has `frequency_response(omega)`, or is a mapping from legend texts to such models;
+    `others` are further estimates of the same response. `pair` is (output, input), by default
+    the first of each. Points whose coherence is below 0.6 are faint and have no band.
+    Returns a `matplotlib.figure.Figure`; ValueError for an unknown pair. Source: the paper's
+    Figure 5.
+    """
+    from matplotlib.figure import Figure
+
+    o, i = _position(frf, pair)
+    figure = Figure(figsize=(6.5, 7.0), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=[3, 3, 1.6])
+    measured = _curve(frf, o, i)
+    _draw_measured(axes, measured, f"{frf.method} estimate")
+    for k, (name, other) in enumerate((others or {}).items()):
+        _draw_other(axes, _beside(_curve(other, *_position(other, pair)), measured), name, k)
+    models = model if isinstance(model, Mapping) else {"model": model} if model else {}
+    for k, (name, each) in enumerate(models.items()):
+        _draw_model(axes, _beside(_model_curve(each, measured, o, i), measured), name, k)
+    _scale(axes, measured)
+    _label(figure, axes, f"{frf.output_names[o]} / {frf.input_names[i]}", title)
+    return figure
+
+
+def _position(frf: FrequencyResponse, pair: tuple[str, str] | None) -> tuple[int, int]:
+    if pair is None:
+        return 0, 0
+    output, source = pair
+    if output not in frf.output_names or source not in frf.input_names:
+        raise ValueError(
+            f"no response {pair}: outputs are {frf.output_names}, inputs {frf.input_names}"
+        )
+    return frf.output_names.index(output), frf.input_names.index(source)
+
+
+def _curve(frf: FrequencyResponse, o: int, i: int) -> _Curve:
+    coherence = np.asarray(frf.coherence)[:, o, i]
+    angle = np.angle(np.asarray(frf.response)[:, o, i])
+    omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)[:, o, i]
+    return _Curve(omega, frf.magnitude_db[:, o, i], _phase(angle, coherence), coherence, error)
+
+
+def _phase(
+    angle: Float[np.ndarray, " frequencies"], coherence: Float[np.ndarray, " frequencies"]
+) -> Float[np.ndarray, " frequencies"]:
+    """Degrees, unwrapped over coherent points only: one noisy point would turn all after it."""
+    place, good = np.arange(angle.size), coherence >= COHERENT
+    if not good.any():
+        return np.degrees(angle)
+    near = np.interp(place, place[good], np.unwrap(angle[good]))
+    phase = np.degrees(near + np.angle(np.exp(1j * (angle - near))))
+    return phase - 360 * np.round((np.median(phase[good]) + 180) / 360)
+
+
+def _model_curve(model: Any, measured: _Curve, o: int, i: int) -> _Curve:
+    omega = np.geomspace(measured.omega[0], measured.omega[-1], 300)
+    response = np.asarray(_response(model, jnp.asarray(omega)))[:, o, i]
+    phase = np.degrees(np.unwrap(np.angle(response)))
+    one, none = np.ones_like(omega), np.zeros_like(omega)
+    return _Curve(omega, 20 * np.log10(np.abs(response)), phase, one, none)
+
+
+@eqx.filter_jit
+def _response(
+    model: Any, omega: Float[Array, " frequencies"]
+) -> Complex[Array, "frequencies outputs inputs"]:
+    return model.frequency_response(omega)
+
+
+def _beside(curve: _Curve, measured: _Curve) -> _Curve:
+    """The curve on the same 360 deg branch as the measurement's coherent points."""
+    good = measured.good if measured.good.any() else slice(None)
+    omega = measured.omega[good]
+    apart = np.interp(omega, curve.omega, curve.phase) - measured.phase[good]
+    return curve._replace(phase=curve.phase - 360 * np.round(np.median(apart) / 360))
+
+
+def _draw_measured(axes: Any, curve: _Curve, name: str) -> None:
+    omega, good = curve.omega, curve.good
+    decibels = 20 / np.log(10) * curve.error
+    for axis, level, error in (
+        (axes[0], curve.magnitude, decibels),
+        (axes[1], curve.phase, np.degrees(curve.error)),
+    ):
+        if good.any():
+            reach = np.where(good, 1.96 * error, np.nan)
+            low, high = level - reach, level + reach
+            axis.fill_between(omega, low, high, color="0.75", lw=0, label="95 % band")
+            axis.plot(omega[good], level[good], "o", ms=3.5, color="0.15", label=name)
+        if not good.all():
+            label = f"{name}, coherence below {COHERENT}"
+            axis.plot(omega[~good], level[~good], "o", ms=3, mfc="none", mec="0.7", label=label)
+    axes[2].plot(omega, curve.coherence, "o-", ms=2.5, lw=0.8, color="0.15")
+
+
+def _draw_other(axes: Any, curve: _Curve, name: str, k: int) -> None:
+    mark, good = _MARKS[k % len(_MARKS)], curve.good
+    style = dict(ls="none", marker=mark, ms=5, mew=0.9, color="tab:red", label=name)
+    axes[0].plot(curve.omega[good], curve.magnitude[good], **style)
+    axes[1].plot(curve.omega[good], curve.phase[good], **style)
+    axes[2].plot(curve.omega, curve.coherence, ls=":", marker=mark, ms=3, lw=0.8, color="tab:red")
+
+
+def _draw_model(axes: Any, curve: _Curve, name: str, k: int) -> None:
+    style = dict(ls=_LINES[k % len(_LINES)], lw=1.6, color="tab:blue", label=name)
+    axes[0].plot(curve.omega, curve.magnitude, **style)
+    axes[1].plot(curve.omega, curve.phase, **style)
+
+
+def _scale(axes: Any, curve: _Curve) -> None:
+    """Axes that show every coherent point and the models, whatever the other points do."""
+    if not curve.good.any():
+        return
+    for axis, level in ((axes[0], curve.magnitude), (axes[1], curve.phase)):
+        lines = [line.get_ydata() for line in axis.get_lines() if line.get_linestyle() != "None"]
+        shown = np.concatenate([level[curve.good], *lines])
+        margin = 0.06 * np.ptp(shown) + 1
+        axis.set_ylim(shown.min() - margin, shown.max() + margin)
+
+
+def _label(figure: Any, axes: Any, name: str, title: str) -> None:
+    for axis, text in zip(axes, (f"|{name}|, dB", "phase, deg", "coherence"), strict=True):
+        axis.set_ylabel(text)
+        axis.grid(True, which="both", color="0.9", lw=0.5)
+    axes[2].axhline(COHERENT, color="0.4", lw=0.8, ls="--")
+    axes[2].text(0.995, COHERENT + 0.02, f"{COHERENT}", ha="right", va="bottom", fontsize=8,
+                 color="0.3", transform=axes[2].get_yaxis_transform())  # fmt: skip
+    axes[2].set(ylim=(0, 1.02), xscale="log", xlabel="frequency, rad/s")
+    hertz = axes[0].secondary_xaxis("top", functions=(_to_hertz, _to_rad))
+    hertz.set_xlabel("frequency, Hz")
+    for axis in (axes[2].xaxis, hertz.xaxis):
+        _number(axis)
+    handles, labels = axes[0].get_legend_handles_labels()
+    columns = min(len(labels), 3)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9)
+    if title:
+        figure.suptitle(title)
+
+
+def _number(axis: Any) -> None:
+    """Ticks at 1, 2, 5 of every decade as plain numbers, not as 2 x 10^1."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _to_hertz(omega: Any) -> Any:
+    return omega / (2 * np.pi)
+
+
+def _to_rad(hertz: Any) -> Any:
+    return hertz * 2 * np.pi

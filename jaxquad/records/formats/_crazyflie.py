@@ -1,0 +1,215 @@
+"""Crazyflie logs from the micro-SD deck: a table of events, then events with their values.
+
+The file describes itself. The layout, which Bitcraze's documentation of the deck does not spell
+out, is that of the logs: 0xBC, version (2 bytes), number of event types (2 bytes); for each an
+identifier (2 bytes), a name, the number of its variables (2 bytes) and their names with a type
+letter as `acc.x(f)`; then events of identifier, time stamp and values; CRC-32 of all that.
+"""
+
+import re
+import struct
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from .._clock import unwrapped
+from .._errors import ReadError
+from .._log import Log, Table
+
+
+_WINDOW = 60  # s: the most between the two events with which reading goes on
+_TRIES = 200_000  # places looked at after damage, in one file
+
+
+class Kind(NamedTuple):
+    """One type of event."""
+
+    number: int
+    name: str
+    layout: np.dtype  # event id, time stamp, then the variables in order
+
+
+class Events(NamedTuple):
+    """Where the events of each type begin, and the stretches (offset, bytes) in between."""
+
+    offsets: dict[int, Int[np.ndarray, " events"]]
+    skipped: list[tuple[int, int]]
+
+
+def events(data: bytes, kinds: dict[int, Kind], begin: int, end: int, per_second: float) -> Events:
+    """Walk from event to event up to `end`; after damage, on to the next two that fit together.
+
+    The event before a place where none of a known type begins has lost or gained bytes itself,
+    and is left out.
+    """
+    sizes = {number: kind.layout.itemsize for number, kind in kinds.items()}
+    found: dict[int, list[int]] = {number: [] for number in kinds}
+    skipped: list[tuple[int, int]] = []
+    last: list[int] = []
+    at, tries = begin, _TRIES
+    smallest = min(sizes.values())
+    while at + smallest <= end:
+        number = data[at] | data[at + 1] << 8
+        size = sizes.get(number)
+        if size is not None and at + size <= end:
+            last = found[number]
+            last.append(at)
+            at += size
+            continue
+        bad = last.pop() if size is None and last else at
+        at, tries = _next(data, kinds, bad, end, int(_WINDOW * per_second), tries)
+        skipped.append((bad, at - bad))
+        last = []
+    return Events({number: np.array(each, int) for number, each in found.items()}, skipped)
+
+
+def _next(
+    data: bytes, kinds: dict[int, Kind], at: int, end: int, window: int, tries: int
+) -> tuple[int, int]:
+    """Where two events follow each other with stamps that go on, else `end`; tries left."""
+    for place in range(at + 1, end):
+        if tries == 0:
+            break
+        tries -= 1
+        first = _stamp(data, kinds, place, end)
+        if first is None:
+            continue
+        size = kinds[data[place] | data[place + 1] << 8].layout.itemsize
+        second = _stamp(data, kinds, place + size, end)
+        if second is not None and first <= second <= first + window:
+            return place, tries
+    return end, tries
+
+
+def _stamp(data: bytes, kinds: dict[int, Kind], at: int, end: int) -> int | None:
+    """The time stamp of the event at `at`, None where there is no whole event of a known type."""
+    kind = kinds.get(data[at] | data[at + 1] << 8) if at + 1 < end else None
+    if kind is None or at + kind.layout.itemsize > end:
+        return None
+    return int.from_bytes(data[at + 2 : at + 2 + kind.layout["time stamp"].itemsize], "little")
+
+
+MAGIC = 0xBC
+_ID, _TIME = "event id", "time stamp"
+_TYPES = set("bBhHiIqQefd")  # of Python's struct
+_STAMP = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # by version: counts of ms, of us
+_VARIABLE = re.compile(r"([^()]+)\((.)\)")
+_MOST_KINDS, _MOST_VARIABLES, _LONGEST_NAME = 256, 1000, 256
+# The firmware logs these groups in these units; others differ from variable to variable.
+_UNITS = {"acc": "g", "gyro": "deg/s"}
+
+
+class _Description(NamedTuple):
+    """What the head of the file says of the events after it."""
+
+    kinds: dict[int, Kind]
+    begin: int  # offset of the first event
+    per_second: float
+
+
+def sniff(head: bytes, path: Path) -> bool:
+    return len(head) >= 9 and head[0] == MAGIC and head[1:3] in (b"\x01\0", b"\x02\0")
+
+
+def load(path: Path) -> Log:
+    """The events of a file, a table for each type; one type alone is the table `""`."""
+    return decode(path.read_bytes())
+
+
+def decode(data: bytes) -> Log:
+    """The events in the bytes of a file. Raises ReadError where its head is damaged."""
+    told = _description(data)
+    end, remarks = len(data) - 4, []
+    if zlib.crc32(memoryview(data)[:end]) != int.from_bytes(data[end:], "little"):
+        remarks.append("the checksum does not match: the log was cut off or damaged")
+        end = len(data)
+    found = events(data, told.kinds, told.begin, end, told.per_second)
+    tables = {
+        kind.name: _table(data, kind, found.offsets[number], told.per_second)
+        for number, kind in told.kinds.items()
+        if found.offsets[number].size
+    }
+    if not tables:
+        raise ReadError("the log holds no event of the types it describes.", offset=told.begin)
+    if len(told.kinds) == 1:
+        tables = {"": next(iter(tables.values()))}
+    return Log(tables, (*remarks, *_skipped(found.skipped)), "crazyflie")
+
+
+def _description(data: bytes) -> _Description:
+    version, count = struct.unpack_from("<HH", data, 1) if len(data) >= 9 else (0, 0)
+    if version not in _STAMP or data[0] != MAGIC:
+        raise ReadError("no Crazyflie log of version 1 or 2 (0xBC 01 00, 0xBC 02 00).", offset=0)
+    if not 0 < count <= _MOST_KINDS:
+        raise ReadError(f"{count} types of events: there are 1 .. {_MOST_KINDS}.", offset=3)
+    kinds: dict[int, Kind] = {}
+    at = 5
+    for _ in range(count):
+        kind, following = _kind(data, at, _STAMP[version][0])
+        if kind.number in kinds or kind.name in (each.name for each in kinds.values()):
+            raise ReadError(f"the event {kind.name!r} is described twice.", offset=at)
+        kinds[kind.number], at = kind, following
+    return _Description(kinds, at, _STAMP[version][1])
+
+
+def _kind(data: bytes, at: int, stamp: str) -> tuple[Kind, int]:
+    number, at = _short(data, at)
+    name, at = _text(data, at)
+    count, at = _short(data, at)
+    if count > _MOST_VARIABLES:
+        raise ReadError(
+            f"{count} variables of the event {name!r}: at most {_MOST_VARIABLES}.", offset=at - 2
+        )
+    layout = {_ID: "<u2", _TIME: stamp}
+    for _ in range(count):
+        begin = at
+        text, at = _text(data, at)
+        variable = _VARIABLE.fullmatch(text)
+        if variable is None or variable[2] not in _TYPES or variable[1] in layout:
+            raise ReadError(
+                f"variable {text[:60]!r} of the event {name!r} is no new name with a type in "
+                f"brackets, as in 'gyro.x(f)'.",
+                offset=begin,
+            )
+        layout[variable[1]] = np.dtype(variable[2]).newbyteorder("<").str
+    return Kind(number, name, np.dtype(list(layout.items()))), at
+
+
+def _short(data: bytes, at: int) -> tuple[int, int]:
+    if at + 2 > len(data):
+        raise ReadError("the file ends within its description of events.", offset=at)
+    return data[at] | data[at + 1] << 8, at + 2
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    end = data.find(b"\0", at, at + _LONGEST_NAME)
+    text = data[at : max(end, at)].decode("latin-1")
+    if end < 0 or not text.isascii() or not text.isprintable() or not text:
+        raise ReadError("a name in the description of events is damaged.", offset=at)
+    return text, end + 1
+
+
+def _table(data: bytes, kind: Kind, offsets: np.ndarray, per_second: float) -> Table:
+    size = kind.layout.itemsize
+    if (np.diff(offsets) == size).all():
+        rows = np.frombuffer(data, kind.layout, offsets.size, int(offsets[0]))
+    else:
+        raw = np.frombuffer(data, np.uint8)
+        rows = raw[offsets[:, None] + np.arange(size)].view(kind.layout)[:, 0]
+    names = [name for name in kind.layout.names or () if name not in (_ID, _TIME)]
+    units = {name: unit for name in names if (unit := _UNITS.get(name.partition(".")[0]))}
+    counter, _ = unwrapped(rows[_TIME])
+    return Table({name: rows[name] for name in names}, counter / per_second, units)
+
+
+def _skipped(stretches: list[tuple[int, int]]) -> list[str]:
+    if not stretches:
+        return []
+    size = sum(each for _, each in stretches)
+    return [
+        f"{size} bytes in {len(stretches)} places are no events of a known type and were "
+        f"skipped, the first at byte {stretches[0][0]}"
+    ]

@@ -1,0 +1,284 @@
+import csv
+import functools as ft
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .._errors import ReadError
+from .._log import Log, Table
+
+
+_WORTHWHILE = 1 << 20  # bytes: below, the import takes longer than the parsing
+_PART = 1 << 20  # bytes, of a thread; larger ones leave the cache
+_NUMBERS = b"0123456789+-.eEnNaAiIfF \t\n"  # with nan and inf
+
+
+def parsed_fast(
+    block: bytes, separator: str | None, into: Float[np.ndarray, "columns rows"]
+) -> int:
+    """Write the numbers of whole lines into the first rows; returns how many rows they were.
+
+    0 where they may be anything else, or without pyarrow. It gets no text but digits, signs and
+    separators, so it runs in this process.
+    """
+    if separator is None or len(block) < _WORTHWHILE:
+        return 0
+    if block.translate(None, _NUMBERS + separator.encode()):
+        return 0
+    csv = _csv()
+    if csv is None:
+        return 0
+    arrow, options = csv
+    names = [str(i) for i in range(len(into))]
+    try:
+        table = arrow.csv.read_csv(arrow.BufferReader(block), **options(separator, names))
+    except arrow.ArrowException:  # Says less of what is wrong than reading row by row does.
+        return 0
+    for row, column in zip(into, table.columns, strict=True):
+        place = 0
+        for chunk in column.chunks:
+            row[place : place + len(chunk)] = chunk.to_numpy()
+            place += len(chunk)
+    return table.num_rows
+
+
+@ft.cache
+def _csv() -> Any:
+    try:
+        import pyarrow
+        import pyarrow.csv
+    except ImportError:
+        return None
+
+    def options(separator: str, names: list[str]) -> dict[str, Any]:
+        types = dict.fromkeys(names, pyarrow.float64())
+        return {
+            "read_options": pyarrow.csv.ReadOptions(column_names=names, block_size=_PART),
+            "parse_options": pyarrow.csv.ParseOptions(
+                delimiter=separator, quote_char=False, double_quote=False
+            ),
+            "convert_options": pyarrow.csv.ConvertOptions(
+                column_types=types, null_values=[], check_utf8=False
+            ),
+        }
+
+    return pyarrow, options
+
+
+_PLAIN = np.zeros(256, dtype=bool)
+_PLAIN[list(b"0123456789+-.eEnNaAiIfF")] = True  # numbers, nan, inf
+
+
+def parsed(
+    block: bytes, separator: str | None, columns: int
+) -> Float[np.ndarray, "rows columns"] | None:
+    """The numbers of whole lines; None where they are not one plain number per cell."""
+    block = block.rstrip(b"\n")
+    if not block:
+        return np.empty((0, columns))
+    text = np.frombuffer(block, np.uint8)
+    blank = (text == ord(" ")) | (text == ord("\t"))
+    line_end = text == ord("\n")
+    mark = np.zeros_like(blank) if separator is None else text == ord(separator)
+    if not (_PLAIN[text] | blank | line_end | mark).all():
+        return None
+    if not _is_regular(blank & ~mark, line_end, mark, separator is None, columns):
+        return None
+    spaced = block if separator is None else block.replace(separator.encode(), b" ")
+    try:
+        numbers = np.fromstring(spaced.decode(), sep=" ")
+    except ValueError:  # Letters of numbers that make none.
+        return None
+    rows = int(line_end.sum()) + 1
+    return numbers.reshape(rows, columns) if numbers.size == rows * columns else None
+
+
+def _is_regular(
+    blank: Bool[np.ndarray, " bytes"],
+    line_end: Bool[np.ndarray, " bytes"],
+    mark: Bool[np.ndarray, " bytes"],
+    by_blanks: bool,
+    columns: int,
+) -> bool:
+    """Whether every line has so many cells, and each of them one word."""
+    solid = ~(blank | line_end | mark)
+    begins = solid & ~np.concatenate([[False], solid[:-1]])
+    words = np.cumsum(begins, dtype=np.int32)
+    stops = np.flatnonzero(line_end if by_blanks else line_end | mark)
+    per_cell = np.diff(words[stops], prepend=0, append=words[-1])
+    if (per_cell != (columns if by_blanks else 1)).any():
+        return False
+    line_words = np.diff(words[np.flatnonzero(line_end)], prepend=0, append=words[-1])
+    return bool((line_words == columns).all())
+
+
+Line = tuple[int, str]  # number in the file from 1, text
+_LONGEST_LINE = 1 << 20  # bytes
+_BLOCK = 1 << 22  # bytes parsed at once
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+
+
+def sniff(head: bytes, path: Path) -> bool:
+    return False  # Anything could be text: the name decides.
+
+
+def load(path: Path) -> Log:
+    """The columns of a text table by the names in its header row.
+
+    Cells are separated by commas, semicolons, tabs or blanks; lines with # are comments, the
+    last of which may be the header. Raises ReadError with the line and the column.
+    """
+    content = _as_utf8(path.read_bytes())
+    names, separator, place, number = _header(content)
+    values, rows = np.empty((len(names), _most_rows(content, place, len(names)))), 0
+    for begin, end in _blocks(content, place):
+        block = content[begin:end]
+        rows += _fill(values[:, rows:], block, number, names, separator)
+        number += block.count(b"\n")
+    if not rows:
+        raise ReadError(f"only a header ({', '.join(names)}), no row of numbers.")
+    return Log({"": Table(dict(zip(names, values[:, :rows], strict=True)))})
+
+
+def _most_rows(content: bytes, place: int, columns: int) -> int:
+    """A row takes two bytes for each cell at least, however many line ends there are."""
+    return min(content.count(b"\n", place) + 1, (len(content) - place + 1) // (2 * columns))
+
+
+def _fill(
+    values: Float[np.ndarray, "columns rows"],
+    block: bytes,
+    first: int,
+    names: list[str],
+    separator: str | None,
+) -> int:
+    """Write a block's rows by the fastest way that can be; returns their number."""
+    if rows := parsed_fast(block, separator, values):
+        return rows
+    table = parsed(block, separator, len(names))
+    table = _slowly(block, first, names, separator) if table is None else table
+    values[:, : len(table)] = table.T
+    return len(table)
+
+
+def _as_utf8(content: bytes) -> bytes:
+    """Text in UTF-8 with the line ends of Unix; other 8-bit text is taken as Latin-1."""
+    if content.startswith(_UTF16):
+        content = content.decode("utf-16", "replace").encode()
+    zero = content.find(b"\0")
+    if zero >= 0:
+        raise ReadError("it is no text: it holds a zero", offset=zero)
+    try:
+        if not content.isascii():
+            content.decode()
+    except UnicodeDecodeError:
+        content = content.decode("latin-1").encode()
+    content = content.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in content:
+        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return content
+
+
+def _header(content: bytes) -> tuple[list[str], str | None, int, int]:
+    """Names, separator, and the byte and line number where the numbers begin."""
+    comment = ""
+    for number, begin, end in _line_places(content):
+        text = content[begin:end].decode().strip(" ")
+        if not text.strip():
+            continue
+        if text.lstrip().startswith("#"):
+            comment = text.lstrip("# \t")
+            continue
+        separator = next((mark for mark in ";\t," if mark in text), None)
+        cells = split(text, separator)
+        if not all(map(_is_number, cells)):
+            return _distinct(cells), separator, end + 1, number + 1
+        names = split(comment, separator) if comment else []
+        if len(names) != len(cells):
+            raise ReadError(
+                f"line {number}: numbers where the header should be: "
+                f"put a row with the {len(cells)} channel names above them."
+            )
+        return _distinct(names), separator, begin, number
+    raise ReadError("the file holds no table: it needs a header row and numbers.")
+
+
+def _distinct(names: list[str]) -> list[str]:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise ReadError(f"the header names {name!r} twice: rename one of them.")
+        seen.add(name)
+    return names
+
+
+def _line_places(content: bytes) -> Iterator[tuple[int, int, int]]:
+    number, begin = 0, 0
+    while begin < len(content):
+        end = content.find(b"\n", begin)
+        end = len(content) if end < 0 else end
+        number += 1
+        if end - begin > _LONGEST_LINE:
+            raise ReadError(f"line {number} has {end - begin} bytes: it is no table", offset=begin)
+        yield number, begin, end
+        begin = end + 1
+
+
+def _blocks(content: bytes, place: int) -> Iterator[tuple[int, int]]:
+    while place < len(content):
+        end = content.find(b"\n", min(place + _BLOCK, len(content)))
+        end = len(content) if end < 0 else end + 1
+        yield place, end
+        place = end
+
+
+def split(text: str, separator: str | None) -> list[str]:
+    """The cells of one line, free of blanks and quotes."""
+    if separator is None:
+        return text.split()
+    if '"' in text:
+        cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True))
+    else:
+        cells = text.split(separator)
+    return [cell.strip() for cell in cells]
+
+
+def _slowly(
+    block: bytes, first: int, names: list[str], separator: str | None
+) -> Float[np.ndarray, "rows columns"]:
+    """Row by row, which finds what is wrong, and takes comments and quotes."""
+    rows = []
+    for number, text in enumerate(block.decode().split("\n"), start=first):
+        if text.strip() and not text.lstrip().startswith("#"):
+            rows.append(_numbers((number, text), names, separator))
+    return np.array(rows).reshape(-1, len(names))
+
+
+def _numbers(row: Line, header: list[str], separator: str | None) -> list[float]:
+    number, text = row
+    cells = split(text, separator)
+    if len(cells) != len(header):
+        raise ReadError(
+            f"line {number}: {len(cells)} cells for {len(header)} columns: "
+            f"is the file cut off, or does its separator change?"
+        )
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError as error:
+        i = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+        what = f"{cells[i][:40]!r} is no number" if cells[i] else "the cell is blank"
+        raise ReadError(
+            f"line {number}, column {i + 1} ({header[i]!r}): {what}: fill or drop the row, "
+            f"and write decimals with a point."
+        ) from error
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

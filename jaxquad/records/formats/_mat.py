@@ -1,0 +1,164 @@
+"""MATLAB files of versions 5 to 7 (MathWorks, "MAT-File Format"), read by their declared sizes.
+
+Version 7.3 is HDF5 and has a reader of its own; version 4 is told apart and refused.
+"""
+
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .._errors import ReadError
+from .._log import Log, Table
+from ._limits import check_size
+
+
+_HEADER = 128
+_TYPES = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
+_MATRIX, _COMPRESSED = 14, 15
+_STRUCT = 2
+_CLASSES = {
+    6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
+}  # fmt: skip
+_DEEPEST = 8  # structs within structs
+
+
+class _Element(NamedTuple):
+    """A typed piece of the file: its type, its bytes, and where it stands."""
+
+    kind: int
+    body: memoryview
+    offset: int
+
+
+def sniff(head: bytes, path: Path) -> bool:
+    return head[126:128] in (b"IM", b"MI") and head[124:126] in (b"\0\1", b"\1\0")
+
+
+def load(path: Path) -> Log:
+    """The real numeric variables, and those in scalar structs as `s.q`; others are left out."""
+    content = path.read_bytes()
+    if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
+        raise ReadError(
+            "it is no MATLAB file of version 5 to 7.3, or cut off: save it with save(..., '-v7')",
+            offset=0,
+        )
+    order = "<" if content[126:128] == b"IM" else ">"
+    arrays: dict[str, np.ndarray] = {}
+    for element in _elements(memoryview(content), order, _HEADER, 0):
+        variable = _inflated(element, order, len(content))
+        if variable.kind == _MATRIX:
+            arrays |= _variable(variable, order, "", 0)
+    return Log({"": Table(arrays)})
+
+
+def _elements(content: memoryview, order: str, place: int, base: int) -> Iterator[_Element]:
+    """The elements from `place` on; `base` is added to the offsets told of."""
+    while place + 8 <= len(content):
+        kind, size = (int(n) for n in np.frombuffer(content[place : place + 8], f"{order}u4"))
+        if kind >> 16:  # A small element keeps up to four bytes in its own tag.
+            kind, size, begin, after = kind & 0xFFFF, kind >> 16, place + 4, place + 8
+        else:
+            begin = place + 8
+            after = begin + size + (-size % 8 if kind != _COMPRESSED else 0)
+        if begin + size > len(content) or (after == place + 8 and size > 4):
+            raise ReadError(
+                f"an element of {size} bytes where {len(content) - begin} are left: "
+                f"it may be cut off",
+                offset=base + place,
+            )
+        yield _Element(kind, content[begin : begin + size], base + place)
+        place = after
+    if place < len(content):
+        raise ReadError(
+            f"{len(content) - place} bytes are no element: it may be cut off", offset=base + place
+        )
+
+
+def _inflated(element: _Element, order: str, stored: int) -> _Element:
+    if element.kind != _COMPRESSED:
+        return element
+    inflater = zlib.decompressobj()
+    try:
+        tag = inflater.decompress(element.body, 8)
+        if len(tag) < 8:
+            raise ReadError("a compressed variable is cut off", offset=element.offset)
+        kind, size = (int(n) for n in np.frombuffer(tag, f"{order}u4"))
+        check_size("a compressed variable", size, len(element.body), offset=element.offset)
+        body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
+        if inflater.decompress(inflater.unconsumed_tail, 1):
+            raise ReadError("a compressed variable holds too much", offset=element.offset)
+    except zlib.error as error:
+        raise ReadError(
+            f"a compressed variable is damaged ({error})", offset=element.offset
+        ) from error
+    if len(body) < size or not inflater.eof:
+        raise ReadError("a compressed variable is cut off", offset=element.offset)
+    return _Element(kind, memoryview(body), element.offset)
+
+
+def _variable(matrix: _Element, order: str, prefix: str, depth: int) -> dict[str, np.ndarray]:
+    """One variable as arrays by name: none if it holds no real numbers."""
+    parts = list(_elements(matrix.body, order, 0, matrix.offset))
+    if len(parts) < 3 or len(parts[0].body) < 8:
+        return {}
+    flags = int(np.frombuffer(parts[0].body[:4], f"{order}u4")[0])
+    shape = np.frombuffer(parts[1].body[: len(parts[1].body) // 4 * 4], f"{order}i4")
+    name = prefix + bytes(parts[2].body).decode("latin-1")
+    kind, is_complex = flags & 0xFF, flags & 0x0800
+    if kind == _STRUCT and depth < _DEEPEST and len(parts) >= 5 and (shape == 1).all():
+        return _struct(parts, order, name, depth)
+    if kind not in _CLASSES or is_complex or len(parts) < 4:
+        return {}
+    # Numbers are stored as small as they fit, whatever their class.
+    numbers = _numbers(parts[3], order, name).astype(_CLASSES[kind])
+    return {name: _squeezed(numbers, shape, name, matrix.offset)}
+
+
+def _struct(parts: list[_Element], order: str, name: str, depth: int) -> dict[str, np.ndarray]:
+    width = int(np.frombuffer(parts[3].body[:4], f"{order}i4")[0]) if len(parts[3].body) >= 4 else 0
+    if width <= 0:
+        return {}
+    table = bytes(parts[4].body)
+    names = [
+        table[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(table), width)
+    ]
+    arrays: dict[str, np.ndarray] = {}
+    for field, part in zip(names, parts[5:], strict=False):
+        if part.kind == _MATRIX:
+            # A field's matrix has no name of its own.
+            arrays |= _variable(part, order, f"{name}.{field}", depth + 1)
+    return arrays
+
+
+def _numbers(part: _Element, order: str, name: str) -> np.ndarray:
+    if part.kind not in _TYPES:
+        raise ReadError(f"the variable {name!r} is of unknown type {part.kind}", offset=part.offset)
+    dtype = np.dtype(order + _TYPES[part.kind])
+    if len(part.body) % dtype.itemsize:
+        raise ReadError(f"the variable {name!r} ends within a number", offset=part.offset)
+    return np.frombuffer(part.body, dtype)
+
+
+def _squeezed(values: np.ndarray, shape: np.ndarray, name: str, offset: int) -> np.ndarray:
+    count = int(np.prod(shape.astype(object))) if shape.size else 0
+    if count != values.size or (shape < 0).any() or shape.size > 32:
+        raise ReadError(
+            f"the variable {name!r} is declared as {shape[:32].tolist()}, and holds "
+            f"{values.size} numbers",
+            offset=offset,
+        )
+    return values.reshape(shape, order="F").squeeze()

@@ -1,0 +1,103 @@
+import functools as ft
+import operator
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._errors import ReadError
+from .._log import Log, Table
+from .._names import printable
+from ._limits import check_size
+
+
+_MAGIC = b"\x93NUMPY"
+
+
+def sniff(head: bytes, path: Path) -> bool:
+    return head.startswith((_MAGIC, b"PK\x03\x04"))
+
+
+def load(path: Path) -> Log:
+    """The arrays of a .npz archive, or the one of a .npy file, which is called `data`."""
+    with path.open("rb") as stream:
+        magic = stream.read(len(_MAGIC))
+        stream.seek(0)
+        if magic == _MAGIC:
+            return Log({"": Table(_named("data", read_array("data", stream, path.stat().st_size)))})
+        if not magic.startswith(b"PK"):
+            raise ReadError("it is neither a NumPy array nor an archive of them", offset=0)
+        size = path.stat().st_size
+        with _opened(stream, size) as archive:
+            members = [member for member in archive.infolist() if not member.filename.endswith("/")]
+            check_size("the archive", sum(member.file_size for member in members), size)
+            arrays = [_member(archive, member) for member in members]
+        return Log({"": Table(ft.reduce(operator.or_, arrays, {}))})
+
+
+def _opened(stream: Any, size: int) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(stream)
+    # On damaged archives zipfile raises almost anything, here and below.
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise ReadError(f"the archive is cut off or damaged ({reason})", offset=size) from error
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> dict[str, np.ndarray]:
+    name = member.filename.removesuffix(".npy")
+    try:
+        with archive.open(member) as stream:
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                return {}
+            stream.seek(0)
+            return _named(name, read_array(name, stream, member.file_size))
+    except ReadError:
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {printable(str(error))}"
+        raise ReadError(
+            f"the array {printable(name)!r} is cut off or damaged ({reason})",
+            offset=member.header_offset,
+        ) from error
+
+
+def _named(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
+    """A structured array is a table, and its fields are the channels."""
+    fields = array.dtype.names or ()
+    return {field: array[field] for field in fields} if fields else {name: array}
+
+
+def read_array(name: str, stream: Any, size: int) -> np.ndarray:
+    """The array of a .npy stream of `size` bytes, which holds at least what its header declares."""
+    shape, fortran, dtype = _header(name, stream)
+    if dtype.hasobject:
+        raise ReadError(f"the array {name!r} is pickled, which could run code: save it as numbers.")
+    declared = dtype.itemsize * int(np.prod([int(n) for n in shape], dtype=object))
+    if min(shape, default=0) < 0 or declared > size:
+        raise ReadError(
+            f"the array {name!r} is declared as {shape} of {dtype}, {declared:.6g} bytes, in "
+            f"{size} bytes: it may be cut off or damaged."
+        )
+    content = stream.read(declared)
+    if len(content) < declared:
+        raise ReadError(
+            f"the array {name!r} holds {len(content)} of {declared} bytes: it may be cut off."
+        )
+    stream.read(1)  # The end of an archive's member is where its checksum is looked at.
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _header(name: str, stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    read = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version in ((1, 0), (2, 0), (3, 0)):
+            return read[version[0] > 1](stream)
+    # The header is a piece of Python: what is wrong with it shows as almost anything.
+    except Exception as error:
+        raise ReadError(
+            f"the header of the array {name!r} is cut off or damaged ({type(error).__name__})"
+        ) from error
+    raise ReadError(f"the array {name!r} is of npy version {version}, only 1 to 3 are read.")

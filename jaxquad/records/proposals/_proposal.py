@@ -1,0 +1,210 @@
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._clock import FEWEST, native_rate
+from .._errors import RecordError
+from .._log import flattened, Log, Signals
+
+
+AXES: tuple[str, ...] = ("roll", "pitch", "yaw")
+SLOW = 100  # Hz: a command or rate logged more slowly resolves no actuator
+Mix = Mapping[str, float]
+
+
+class Injection(NamedTuple):
+    """A signal that was injected: when, and from which to which frequency (0: unknown)."""
+
+    start: float  # s
+    stop: float
+    low: float = 0.0  # Hz
+    high: float = 0.0
+
+
+class Setup(NamedTuple):
+    """What a vehicle's log offers for one axis.
+
+    `start` and `stop` are those of the longest injection, `segments` those of all of the same
+    kind, in the order of time.
+    """
+
+    axis: str
+    command: Mix  # a weighted sum of channels
+    rate: str
+    reference: str = ""  # of the outside; empty if there is none
+    start: float | None = None  # s
+    stop: float | None = None
+    band: tuple[float, float] | None = None  # Hz
+    excitation: str = "none is known to have been injected"
+    remarks: tuple[str, ...] = ()
+    segments: tuple[tuple[float, float], ...] = ()  # s
+
+
+class Proposal(NamedTuple):
+    """How to identify an axis from a log: a starting point to check, not a verdict.
+
+    `read(proposal.path, **proposal.options)` reads the record; where several injections were
+    found, that of the longest, and each of `proposal.segments` with `start` and `stop` replaced
+    the others. `str` shows the reasons and the line for the command line.
+    """
+
+    path: str
+    vehicle: str
+    setup: Setup
+    sample_rate: float  # Hz, the lowest of the channels' own
+    units: Mapping[str, str]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The keyword arguments of `read`."""
+        setup = self.setup
+        return {
+            "inputs": {self._command_name: dict(setup.command)},
+            "outputs": setup.rate,
+            "references": setup.reference or None,
+            "sample_rate": self.sample_rate,
+            "start": setup.start,
+            "stop": setup.stop,
+        }
+
+    @property
+    def segments(self) -> tuple[tuple[float, float], ...]:
+        """Start and stop of all injections of the kind, in s; empty where none is known."""
+        setup = self.setup
+        if setup.segments or setup.start is None or setup.stop is None:
+            return setup.segments
+        return ((setup.start, setup.stop),)
+
+    @property
+    def command_line(self) -> str:
+        """`jaxquad identify ...`, quoted for a shell."""
+        setup = self.setup
+        words = ["jaxquad", "identify", self.path, "--input", self._mix, "--output", setup.rate]
+        words += ["--reference", setup.reference] if setup.reference else []
+        words += ["--rate", f"{self.sample_rate:.6g}"]
+        if len(self.segments) > 1:
+            spans = [f"{start:.12g}:{stop:.12g}" for start, stop in self.segments]
+            words += [word for span in spans for word in ("--segment", span)]
+        else:
+            words += ["--start", f"{setup.start:.12g}"] if setup.start is not None else []
+            words += ["--stop", f"{setup.stop:.12g}"] if setup.stop is not None else []
+        words += ["--band", *(f"{f:.3g}" for f in setup.band)] if setup.band else []
+        return shlex.join(words)
+
+    @property
+    def _command_name(self) -> str:
+        lone = list(self.setup.command.values()) == [1.0]
+        return next(iter(self.setup.command)) if lone else self.setup.axis
+
+    @property
+    def _mix(self) -> str:
+        if self._command_name in self.setup.command:
+            return self._command_name
+        terms = (
+            f"{'-' if weight < 0 else '+'}{'' if abs(weight) == 1 else f'{abs(weight):.9g}*'}{name}"
+            for name, weight in self.setup.command.items()
+        )
+        return f"{self.setup.axis}={''.join(terms).removeprefix('+')}"
+
+    def __str__(self) -> str:
+        setup = self.setup
+        none = "none: the joint estimate is not possible, and feedback pulls the direct one"
+        lines = [
+            f"Proposal for the {setup.axis} axis of {self.path} ({self.vehicle})",
+            f"  excitation: {setup.excitation}",
+            f"  command: {self._mix}",
+            f"  rate: {setup.rate} [{self.units.get(setup.rate) or 'unit unknown'}]",
+            f"  outside reference: {setup.reference or none}",
+            *(f"  ! {remark}" for remark in setup.remarks),
+            f"  {self.command_line}",
+        ]
+        return "\n".join(lines)
+
+
+def injected(runs: Sequence[Injection], what: str) -> dict[str, Any]:
+    """The fields of a `Setup` that say when what was injected: all `runs` of one kind."""
+    best = max(runs, key=lambda run: run.stop - run.start)
+    known = [run for run in runs if 0 < run.low < run.high]
+    band = (min(r.low for r in known), max(r.high for r in known)) if known else None
+    lasted = " + ".join(f"{run.stop - run.start:.4g}" for run in runs)
+    times = f"{len(runs)} times: " if len(runs) > 1 else ""
+    swept = f"{band[0]:.4g} .. {band[1]:.4g} Hz, " if band else ""
+    return {
+        "start": best.start,
+        "stop": best.stop,
+        "band": band,
+        "excitation": f"{what}, {times}{swept}{lasted} s",
+        "segments": tuple((run.start, run.stop) for run in runs) if len(runs) > 1 else (),
+    }
+
+
+def finished(path: str, log: Log, setup: Setup) -> Proposal:
+    """With the rates and units of the channels that the set-up names."""
+    signals = flattened(log)
+    names = [*setup.command, setup.rate, *filter(None, (setup.reference,))]
+    rates = {name: channel_rate(signals, name) for name in names}
+    if min(rates.values()) <= 0:
+        raise RecordError(f"the clock of {min(rates, key=lambda name: rates[name])} stands still.")
+    slow = [f"{name} {rate:.3g} Hz" for name, rate in rates.items() if rate < SLOW]
+    remarks = setup.remarks
+    if slow:
+        remarks += (
+            f"logged slowly: {', '.join(slow)}; lag and delay of the actuators show only at "
+            f"higher rates: choose a faster logging profile",
+        )
+    units = {name: array_of(signals, name)[1] for name in names}
+    rate = float(f"{min(rates.values()):.3g}")
+    return Proposal(path, log.vehicle, setup._replace(remarks=remarks), rate, units)
+
+
+def channel_rate(signals: Signals, name: str) -> float:
+    """Samples per second, of a channel on a clock that the log knows."""
+    clock = signals.clocks[signals.arrays[array_of(signals, name)[0]].clock]
+    increasing = np.unique(clock[np.isfinite(clock)])
+    return native_rate(increasing) if increasing.size > 1 else 0.0
+
+
+def array_of(signals: Signals, name: str) -> tuple[str, str]:
+    """The array that holds a channel, and its unit."""
+    array = name if name in signals.arrays else name.rpartition("[")[0]
+    if array not in signals.arrays:
+        raise RecordError(f"no channel {name} in the log.")
+    return array, signals.arrays[array].unit
+
+
+def values_of(signals: Signals, name: str) -> np.ndarray:
+    """The values of a channel, empty where there is no such channel."""
+    if name in signals.arrays:
+        signal = signals.arrays[name]
+        return np.asarray(signal.values, np.float64) * signal.scale
+    array, _, column = name.rpartition("[")
+    if array not in signals.arrays or signals.arrays[array].values.ndim != 2:
+        return np.empty(0)
+    signal, i = signals.arrays[array], int(column.rstrip("]"))
+    inside = i < signal.values.shape[1]
+    return np.asarray(signal.values[:, i], np.float64) * signal.scale if inside else np.empty(0)
+
+
+def first_logged(signals: Signals, names: Sequence[str]) -> str:
+    """The first of the channels that the log holds with enough samples, or an empty string."""
+    return next((name for name in names if values_of(signals, name).size >= FEWEST), "")
+
+
+def moves(signals: Signals, name: str) -> bool:
+    """Whether a channel is logged and not constant."""
+    values = values_of(signals, name)
+    finite = values[np.isfinite(values)]
+    return finite.size >= FEWEST and float(np.ptp(finite)) > 0
+
+
+def busiest(signals: Signals, rates: Mapping[str, str]) -> str:
+    """The axis whose rate varies most; one of them has to have a name."""
+    spread = {axis: _spread(values_of(signals, name)) for axis, name in rates.items() if name}
+    return max(spread, key=lambda axis: spread[axis])
+
+
+def _spread(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.std()) if finite.size else 0.0

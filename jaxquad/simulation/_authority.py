@@ -1,0 +1,145 @@
+import warnings
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad._core import align, as_float, is_concrete
+
+from ._metrics_text import axis_names
+from ._scenario import Scenario
+
+
+_ALL = 1e6  # units of command, more than any drive gives
+
+
+class AuthorityWarning(UserWarning):
+    """A scenario asks for more torque than the drive has."""
+
+
+class Authority(eqx.Module):
+    """The torque that a drive can hold against a disturbance, one axis at a time."""
+
+    torque_gain: Float[Array, " axes *ensemble"]  # N m per unit of command
+    command: Float[Array, "axes ..."]  # greatest command, of the drive and the controller; or inf
+    torque: Float[Array, "axes ..."]  # N m, at the limit of the command; inf without one
+    forward: Float[Array, "axes ..."]  # N m, until a motor turns backwards; inf if none can
+
+    def __str__(self) -> str:
+        rows = []
+        for k, name in enumerate(axis_names(self.torque.shape[0])):
+            row = f"  {name}: {_span(self.torque[k])} N m"
+            if np.isfinite(self.forward[k]).all():
+                row += f", {_span(self.forward[k])} N m without a motor turning backwards"
+            rows.append(row)
+        return "\n".join(["torque authority", *rows])
+
+
+def authority(plant: Any, drive: Any = None, controller: Any = None) -> Authority:
+    """The torque in N m that `drive` gives on each axis of `plant` alone.
+
+    Limited by the drive's saturation and by the `limit` of a controller that has one. With motors
+    about a bias, such as `jq.simulation.MotorDrive`, `forward` is the torque at which the first of them would
+    have to turn backwards: 0.0936 N m in roll on the Quanser Hover at its bias of 2 V.
+    Raises ValueError for a plant whose torque per unit of command is not known.
+    """
+    found = eqx.filter_jit(find_authority)(plant, drive, controller)
+    if found is None:
+        raise ValueError(
+            f"a {type(plant).__name__} does not tell its torque per unit of command: give it a "
+            "torque_gain [axes] in N m per unit, as jq.DecoupledAxes has"
+        )
+    return found
+
+
+def find_authority(plant: Any, drive: Any, controller: Any) -> Authority | None:
+    """`authority`, or None for a plant whose torque per unit of command is not known."""
+    gain = _torque_gain(plant)
+    if gain is None:
+        return None
+    own = _controller_limit(controller)
+    axes = max(len(x) for x in (gain, own, jnp.atleast_1d(getattr(drive, "limit", 0.0))))
+    gain = jnp.broadcast_to(gain, (axes, *gain.shape[1:]))
+    command = jnp.minimum(*_same(_drive_limit(drive, gain), own))
+    limits = (command, _forward_limit(drive, gain))
+    return Authority(gain, command, *(jnp.multiply(*_same(gain, x)) for x in limits))
+
+
+def warn_beyond_authority(found: Authority | None, scenario: Scenario) -> None:
+    """Warn of disturbances that no controller can hold. Silent for traced values."""
+    if found is None or not (is_concrete(scenario.disturbance) and is_concrete(found.torque)):
+        return
+    torque = np.abs(np.asarray(scenario.disturbance))
+    limits = (
+        (found.torque, "that the drive has: no controller holds the angle there"),
+        (found.forward, "that the motors give without turning backwards"),
+    )
+    for k, name in enumerate(axis_names(torque.shape[1])):
+        for limit, what in limits:
+            least, asked = np.asarray(limit[min(k, len(limit) - 1)]), torque[:, k]
+            asked = asked.reshape(asked.shape + (1,) * (least.ndim + 1 - asked.ndim))
+            share = np.mean(asked > (1 + 1e-6) * least)
+            if share:
+                warnings.warn(
+                    f"the disturbance of {name} reaches {torque[:, k].max():.4g} N m: "
+                    f"{share:.1%} of the samples exceed the {_span(least)} N m {what}. Lower it, "
+                    "or raise the limit or the bias",
+                    AuthorityWarning,
+                    stacklevel=3,
+                )
+                break
+
+
+def _torque_gain(plant: Any) -> Float[Array, " axes *ensemble"] | None:
+    """N m per unit of command, where a plant says so."""
+    if hasattr(plant, "torque_gain"):
+        return jnp.atleast_1d(as_float(plant.torque_gain))
+    allocation = getattr(plant, "allocation", None)
+    return None if allocation is None else allocation.torque_per_difference
+
+
+def _drive_limit(drive: Any, like: Float[Array, " axes *ensemble"]) -> Float[Array, "axes ..."]:
+    """The most that the drive gives of the command of each axis alone, by asking it for all."""
+    if drive is None:
+        return jnp.full_like(like, jnp.inf)
+    members = jnp.shape(getattr(drive, "limit", 0.0))[1:]
+    wide = jnp.zeros((like.shape[0], *jnp.broadcast_shapes(like.shape[1:], members)), like.dtype)
+    given = []
+    for k, unit in enumerate(jnp.eye(like.shape[0], dtype=like.dtype)):
+        command = _ALL * jnp.broadcast_to(align(unit, wide), wide.shape)
+        both = [drive.achieved(drive.inputs(sign * command))[k] for sign in (1.0, -1.0)]
+        given.append(jnp.minimum(*(jnp.abs(x) for x in both)))
+    most = jnp.stack(given)
+    return jnp.where(most < 0.99 * _ALL, most, jnp.inf)
+
+
+def _forward_limit(drive: Any, like: Float[Array, " axes *ensemble"]) -> Float[Array, "axes ..."]:
+    """The command of each axis alone at which the first motor stops."""
+    if not (hasattr(drive, "bias") and hasattr(drive, "allocation")):
+        return jnp.full_like(like, jnp.inf)
+    units = jnp.eye(like.shape[0], dtype=like.dtype)
+    steepest = jnp.max(jnp.abs(drive.allocation.from_differences(units, 0.0)), axis=0)
+    return abs(drive.bias) / steepest
+
+
+def _controller_limit(controller: Any) -> Float[Array, "axes ..."]:
+    """That of a controller which has one, or of the LADRC in an adaptive one."""
+    for owner in (controller, getattr(controller, "ladrc", None)):
+        limit = getattr(owner, "limit", None)
+        if limit is not None:
+            return jnp.atleast_1d(as_float(limit))
+    return jnp.full((1,), jnp.inf)
+
+
+def _same(a: Array, b: Array) -> tuple[Array, Array]:
+    members = max(a.ndim, b.ndim)
+    a, b = (x.reshape(x.shape + (1,) * (members - x.ndim)) for x in (a, b))
+    shape = jnp.broadcast_shapes(a.shape, b.shape)
+    return jnp.broadcast_to(a, shape), jnp.broadcast_to(b, shape)
+
+
+def _span(values: Any) -> str:
+    low, high = np.min(values), np.max(values)
+    return f"{low:.4g}" if low == high else f"{low:.4g} .. {high:.4g}"

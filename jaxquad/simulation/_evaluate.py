@@ -1,0 +1,178 @@
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+from jaxquad._core import as_float
+from jaxquad._xla import Devices, gathered, Jit
+
+from ._authority import Authority, find_authority, warn_beyond_authority
+from ._check_loop import check_loop
+from ._delay import loop_settings, Settings
+from ._hardware import Encoder
+from ._meter import makes_step, Meter, share_beyond, Tally, wide, Window, window
+from ._metrics import Metrics, tallied
+from ._over_devices import loop_over_devices, placed
+from ._protocols import Controller, Drive, Plant
+from ._run import scan_loop
+from ._scenario import Scenario
+from ._simulate import Simulation
+
+
+class _Sample(NamedTuple):
+    """What a `Meter` needs of a stored sample; see `SampleResult`."""
+
+    index: Int[Array, ""]
+    angle: Float[Array, " axes *ensemble"]
+    reference: Float[Array, " axes *ensemble"]
+    disturbance: Float[Array, " axes *ensemble"]
+    command: Float[Array, " axes *ensemble"]
+    saturated: Bool[Array, " axes *ensemble"]
+    signals: dict[str, Float[Array, " axes *ensemble"]]
+
+
+def metrics(
+    simulation: Simulation,
+    *,
+    start: float = 0.0,
+    stop: float | None = None,
+    load_start: float | None = None,
+    torque_gain: ArrayLike | Sequence[Any] | None = None,
+) -> Metrics:
+    """The `Metrics` of a stored `jq.simulation.Simulation`, for start <= t < stop (in s; None: to the end).
+
+    ITAE counts time from `start`, which is best the instant of a step. Peak, rms and the error of
+    the disturbance's estimate count from `load_start` on (`start` if None), where the step's
+    overshoot, rise and settling end, if that is later than `start`. `torque_gain` is the N m
+    per unit of command [axes] that make a torque of the estimate, where the simulation does not
+    know it from its plant. Differentiable with respect to the simulation.
+    Raises ValueError for a window that does not lie in the simulation.
+    """
+    gain = None if torque_gain is None else jnp.atleast_1d(as_float(torque_gain))
+    dt, samples = simulation.dt, len(simulation.angle)
+    place = window(samples, dt, start=start, stop=stop, load_start=load_start)
+    numbers = _replay(simulation, Window(*map(jnp.asarray, place)), gain)
+    return _metrics(numbers, place, dt)
+
+
+def evaluate(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    dt: float = 0.002,
+    drive: Drive | None = None,
+    encoder: Encoder | None = None,
+    delay: Float[ArrayLike, "*ensemble"] = 0.0,
+    longest_delay: float | None = None,
+    substeps: int = 1,
+    bound: float = 100.0,
+    start: float = 0.0,
+    stop: float | None = None,
+    load_start: float | None = None,
+    devices: int | Sequence[Any] | None = None,
+) -> Metrics:
+    """The `Metrics` of a loop without its trajectories: what is kept does not grow with time.
+
+    The same numbers as `jq.simulation.metrics(jq.simulate(...), ...)`, whose options these are, in the memory
+    of one sample: about 0.5 kB per axis and member, and what the scenario holds for each member.
+    Where that is too much, `jq.simulation.in_slices`. Differentiable with respect to plant, controller,
+    scenario and delay; a gradient needs memory as the square root of the number of samples, and
+    `jq.simulation.over_devices` splits a cost of your own as `devices` splits this.
+    Raises ValueError as both of them do; warns of disturbances beyond the torque of the drive.
+    """
+    settings = loop_settings(
+        dt=dt, drive=drive, encoder=encoder, delay=delay, longest_delay=longest_delay,
+        substeps=substeps, bound=bound,
+    )  # fmt: skip
+    check_loop(plant, controller, scenario, settings)
+    place = window(len(scenario.reference), dt, start=start, stop=stop, load_start=load_start)
+    judged = Window(*map(jnp.asarray, place))
+    loop, places = placed(plant, controller, scenario, settings, devices)
+    found, numbers = gathered(_run(*loop, judged, places))
+    warn_beyond_authority(found, scenario)
+    return _metrics(numbers, place, dt)
+
+
+def _metrics(numbers: dict[str, Any], place: tuple[int, int, int, int], dt: float) -> Metrics:
+    first, last, loaded, _ = place
+    return Metrics(**numbers, start=first * dt, stop=(last + 1) * dt, load_start=loaded * dt)
+
+
+@Jit
+def _run(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    settings: Settings,
+    judged: Window,
+    devices: Devices | None = None,
+) -> tuple[Authority | None, dict[str, Array]]:
+    loop = (plant, controller, scenario, settings)
+    found = find_authority(plant, settings.drive, controller)
+    return found, loop_over_devices(_judge, loop, judged, devices)
+
+
+def _judge(loop: PyTree, judged: Window) -> dict[str, Array]:
+    plant, controller, scenario, settings = loop
+    found = find_authority(plant, settings.drive, controller)
+    gain = None if found is None else found.torque_gain
+    meter = make_meter(scenario, judged, settings.dt, found, gain)
+    tally, _, running = scan_loop(plant, controller, scenario, settings, meter.update, meter.begin)
+    return _numbers(meter, tally, ~running, scenario, found)
+
+
+@eqx.filter_jit
+def _replay(simulation: Simulation, judged: Window, gain: Array | None) -> dict[str, Array]:
+    scenario, found = simulation.scenario, simulation.authority
+    if gain is None and found is not None:
+        gain = found.torque_gain
+    meter = make_meter(scenario, judged, simulation.dt, found, gain)
+    like = jnp.zeros_like(simulation.angle[0])
+
+    def sample(tally: Tally, now: Any) -> tuple[Tally, None]:
+        index, reference, disturbance, angle, command, saturated, signals = now
+        parts = (angle, wide(reference, like), wide(disturbance, like), command, saturated)
+        return meter.update(tally, _Sample(index, *parts, signals))
+
+    index = jnp.arange(simulation.angle.shape[0])
+    stored = (simulation.angle, simulation.command, simulation.saturated, simulation.signals)
+    given = (index, scenario.reference, scenario.disturbance, *stored)
+    tally = jax.lax.scan(jax.checkpoint(sample), meter.begin(like), given)[0]
+    return _numbers(meter, tally, simulation.diverged, scenario, found)
+
+
+def make_meter(
+    scenario: Scenario,
+    judged: Window,
+    dt: float,
+    found: Authority | None,
+    torque_gain: Array | None,
+) -> Meter:
+    reference, first = scenario.reference, judged.first
+    limit = None if found is None else found.command
+    before = reference[jnp.maximum(first - 1, 0)]
+    return Meter(judged, dt, reference[judged.until], before, first == 0, torque_gain, limit)
+
+
+def _numbers(
+    meter: Meter,
+    tally: Tally,
+    diverged: Bool[Array, "*ensemble"],
+    scenario: Scenario,
+    found: Authority | None,
+) -> dict[str, Array]:
+    """What `Metrics` hold, of a finished tally and of what the scenario asks of the drive."""
+    values = tallied(meter, tally, makes_step(scenario.reference, meter.judged))
+    for name in ("settling_time", "settling_time_5"):
+        values[name] = jnp.where(diverged[None], jnp.nan, values[name])
+    like, torque = values["itae"], scenario.disturbance
+    shares = [jnp.full_like(like, jnp.nan)] * 2
+    if found is not None:
+        limits = (found.torque, found.forward)
+        shares = [wide(share_beyond(x, torque, meter.judged), like) for x in limits]
+    named = {"beyond_authority": shares[0], "reversing": shares[1], "diverged": diverged}
+    return values | named

@@ -1,0 +1,75 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad._core import align, as_float, is_concrete
+from jaxquad.models import Allocation, QUANSER_HOVER
+
+
+class Encoder(eqx.Module):
+    """An optical encoder: angles in steps of one count, with the gradient of the angle itself."""
+
+    counts: int = eqx.field(static=True, default=8192)  # per revolution
+
+    def __check_init__(self):
+        if self.counts < 1:
+            raise ValueError(f"counts is {self.counts}: an encoder has at least 1 per revolution")
+
+    def __call__(self, angle: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The counted angle in rad."""
+        step = 2 * jnp.pi / self.counts
+        counted = step * jnp.round(angle / step)
+        # Straight through: the derivative of the rounding itself is zero or infinite.
+        return angle + jax.lax.stop_gradient(counted - angle)
+
+
+class MotorDrive(eqx.Module):
+    """From roll, pitch and yaw commands in V to four motor voltages within their limits.
+
+    A command is the difference of voltages that Eq. (9) multiplies: V4 - V2 for roll, V1 - V3 for
+    pitch, V1 - V2 + V3 - V4 for yaw, about a common `bias`.
+    """
+
+    allocation: Allocation
+    bias: float = eqx.field(static=True, default=QUANSER_HOVER.bias_voltage)  # V
+    limit: float = eqx.field(static=True, default=QUANSER_HOVER.voltage_limit)  # V, either sign
+
+    def __check_init__(self):
+        if not abs(self.bias) < self.limit:
+            raise ValueError(f"bias {self.bias} V must lie within the limit of {self.limit} V")
+
+    def inputs(self, command: Float[Array, " 3 *ensemble"]) -> Float[Array, " 4 *ensemble"]:
+        """Motor voltages, clipped at the amplifier's limit."""
+        volts = self.allocation.from_differences(command, self.bias)
+        return jnp.clip(volts, -self.limit, self.limit)
+
+    def achieved(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
+        """The command that these voltages amount to: less than was asked for where they clip."""
+        return self.allocation.differences(inputs)
+
+
+class Saturation(eqx.Module):
+    """A drive that takes commands as they are, within a limit: for `jq.DecoupledAxes`.
+
+    Raises ValueError for a limit that is not above 0.
+    """
+
+    limit: Float[Array, "..."] = eqx.field(converter=as_float)  # of |u|; [], [axes] or with members
+
+    def __check_init__(self):
+        if is_concrete(self.limit) and not np.all(np.asarray(self.limit) > 0):
+            raise ValueError(
+                f"limit is {self.limit}, but it must be above 0: it bounds the command on both "
+                "sides, in the command's unit"
+            )
+
+    def inputs(self, command: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+        """The command within the limit."""
+        limit = align(self.limit, command).astype(command.dtype)
+        return jnp.clip(command, -limit, limit)
+
+    def achieved(self, inputs: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+        """The command that these inputs amount to: themselves."""
+        return inputs

@@ -1,0 +1,137 @@
+"""An ensemble computed on several devices, of one host or of several."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, PyTree
+
+from jaxquad._xla import (
+    asked_devices,
+    Devices,
+    devices_for,
+    may_be_several,
+    movable,
+    require_same,
+    where_put,
+)
+
+from ._members import count_members, members_of_loop
+
+
+_AXIS = "members"
+_PARTS = ("plant", "controller", "scenario", "settings")
+
+
+def over_devices(
+    function: Callable[[Any, Any], PyTree],
+    members: PyTree,
+    shared: PyTree = None,
+    *,
+    devices: int | Sequence[Any] | None = None,
+) -> PyTree:
+    """`function(members, shared)`, with each device computing its part of the members.
+
+    Every array of `members` and of the result has the members on its last axis; `shared` is the
+    same on every device. Members must not feel each other in the function: take means and quantiles
+    of its result. Differentiable; the gradient with respect to `shared` is the sum over devices.
+    To be called under `jax.jit`. `devices` are those of `jq.evaluate`. Where the members are no
+    multiple of the devices, the last member fills the gap, and its copies are dropped.
+
+    Raises ValueError for devices that JAX does not have, and for arrays that do not have the
+    members on the last axis.
+    """
+    count = _members_of(members, "members")
+    places = devices_for(count, asked_devices(devices))
+    if len(places) < 2:
+        return function(members, shared)
+    return _split(function, members, shared, count, places)
+
+
+def placed(
+    plant: Any, controller: Any, scenario: Any, settings: Any, devices: Any
+) -> tuple[tuple[Any, Any, Any, Any], Devices | None]:
+    """The parts of a loop, and the devices that are asked for, else those its data were put on."""
+    asked = asked_devices(devices)
+    loop = (plant, controller, scenario, settings)
+    if not may_be_several(asked):
+        return loop, asked
+    asked = where_put(loop) if asked is None else asked
+    require_same(dict(zip(_PARTS, loop, strict=True)), asked)
+    plant, controller, scenario, settings = movable(loop, asked)
+    return (plant, controller, scenario, settings), asked
+
+
+def loop_over_devices(
+    function: Callable[[PyTree, Any], PyTree], loop: PyTree, shared: Any, asked: Devices | None
+) -> PyTree:
+    """`function(loop, shared)` of (plant, controller, scenario, settings), as `over_devices`."""
+    if not may_be_several(asked):
+        return function(loop, shared)
+    count = count_members(loop)
+    places = devices_for(count, asked)
+    if min(count, len(places)) < 2:
+        return function(loop, shared)
+    own = members_of_loop(loop)
+    if own is not None:
+        theirs, common = eqx.partition(loop, own)
+        whole = lambda theirs, both: function(eqx.combine(theirs, both[0]), both[1])
+        return _split(whole, theirs, (common, shared), count, places)
+    if asked is None:
+        return function(loop, shared)
+    raise ValueError(
+        f"a loop of {count} members cannot be split among {len(places)} devices: which of its "
+        "arrays have a member on the last axis cannot be told; give devices=1, or another number "
+        "of members if it is the length of another axis, too"
+    )
+
+
+def _split(function: Any, members: PyTree, shared: PyTree, count: int, places: Devices) -> PyTree:
+    (members, shared), static = eqx.partition((members, shared), _is_array)
+    own = -(-count // len(places))
+    padded = jax.tree.map(lambda x: _lengthened(x, own * len(places) - count), members)
+    local = lambda *arrays: function(*eqx.combine(arrays, static))
+    few = jax.tree.map(lambda x: jax.ShapeDtypeStruct((*x.shape[:-1], own), x.dtype), members)
+    results = jax.eval_shape(local, few, shared)
+    if _members_of(results, "the result") != own:
+        raise ValueError("the result does not have the members of its arguments on the last axis")
+    mesh = Mesh(np.array(places), (_AXIS,))
+    run = jax.shard_map(
+        local,
+        mesh=mesh,
+        in_specs=(jax.tree.map(_on_last, members), PartitionSpec()),
+        out_specs=jax.tree.map(_on_last, results),
+        check_vma=False,  # A kernel's marks do not tell on which axes they vary.
+    )
+    out = run(padded, shared)
+    if any(place.process_index != places[0].process_index for place in places):
+        out = jax.lax.with_sharding_constraint(out, NamedSharding(mesh, PartitionSpec()))
+    return jax.tree.map(lambda x: x[..., :count], out)
+
+
+def _is_array(x: Any) -> bool:
+    return isinstance(x, jax.Array | np.ndarray)
+
+
+def _on_last(x: Any) -> PartitionSpec:
+    return PartitionSpec(*(None,) * (len(x.shape) - 1), _AXIS)
+
+
+def _lengthened(x: Array, more: int) -> Array:
+    """With the last member repeated `more` times."""
+    x = jnp.asarray(x)
+    return jnp.concatenate([x, *[x[..., -1:]] * more], axis=-1) if more else x
+
+
+def _members_of(tree: PyTree, name: str) -> int:
+    shapes = [x.shape for x in jax.tree.leaves(tree) if hasattr(x, "shape")]
+    if not shapes or len({shape[-1:] for shape in shapes}) > 1 or () in shapes:
+        raise ValueError(
+            f"the arrays of {name} have the shapes {', '.join(map(str, shapes))}: each needs the "
+            "members on its last axis; what all members share belongs into `shared`"
+        )
+    return shapes[0][-1]

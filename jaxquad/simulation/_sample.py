@@ -1,0 +1,208 @@
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+from jaxquad._core import align
+from jaxquad.control import Setpoint
+
+from ._delay import Settings
+from ._guard import are_numbers, are_resolved, are_tame, choose, within
+from ._protocols import Controller, Plant
+from ._scenario import Scenario
+
+
+def runge_kutta(
+    derivative: Callable[[PyTree], PyTree], state: PyTree, dt: Float[ArrayLike, "*ensemble"]
+) -> PyTree:
+    """One classical fourth-order step of an autonomous system: the inputs are held in it.
+
+    `dt` in s may differ between the members of an ensemble, the trailing axes of the state.
+    """
+    spans = jax.tree.map(lambda x: _over(dt, x), state)
+
+    def ahead(slope: PyTree, share: float) -> PyTree:
+        return jax.tree.map(lambda x, h, k: x + share * h * k, state, spans, slope)
+
+    k1 = derivative(state)
+    k2 = derivative(ahead(k1, 0.5))
+    k3 = derivative(ahead(k2, 0.5))
+    k4 = derivative(ahead(k3, 1.0))
+    return jax.tree.map(
+        lambda x, h, a, b, c, d: x + h / 6 * (a + 2 * b + 2 * c + d), state, spans, k1, k2, k3, k4
+    )
+
+
+def integrate(
+    derivative: Callable[[PyTree], PyTree],
+    state: PyTree,
+    duration: Float[ArrayLike, "*ensemble"],
+    substeps: int,
+) -> PyTree:
+    """`duration` seconds in `substeps` equal Runge-Kutta steps."""
+    if substeps == 1:
+        return runge_kutta(derivative, state, duration)
+
+    @jax.checkpoint
+    def substep(state: PyTree, _: None) -> tuple[PyTree, None]:
+        return runge_kutta(derivative, state, duration / substeps), None
+
+    return jax.lax.scan(substep, state, None, length=substeps)[0]
+
+
+def _over(dt: Float[ArrayLike, "*ensemble"], leaf: Array) -> Float[ArrayLike, "..."]:
+    rank = jnp.ndim(dt)
+    return dt if rank == 0 else jnp.reshape(dt, (1,) * (leaf.ndim - rank) + jnp.shape(dt))
+
+
+class SampleResult(NamedTuple):
+    """One sample of a loop, as wide as the ensemble."""
+
+    index: Int[Array, ""]
+    time: Float[Array, ""]  # s
+    angle: Float[Array, " axes *ensemble"]  # true, rad
+    measurement: Float[Array, " axes *ensemble"]  # rad
+    reference: Float[Array, " axes *ensemble"]  # rad
+    asked: Float[Array, " axes *ensemble"]  # of the drive, by controller and injection
+    command: Float[Array, " axes *ensemble"]  # achieved
+    saturated: Bool[Array, " axes *ensemble"]  # the drive gave less than was asked
+    injection: Float[Array, " axes *ensemble"]
+    disturbance: Float[Array, " axes *ensemble"]  # N m
+    signals: dict[str, Array]  # of the controller, [axes, *ensemble]
+    running: Bool[Array, "*ensemble"]  # not so from the sample on at which a member is held
+
+
+class Carry(NamedTuple):
+    """What a loop hands from sample to sample."""
+
+    state: PyTree  # of the plant
+    memory: PyTree  # of the controller
+    past: Float[Array, "past inputs *ensemble"] | None  # inputs on their way, newest first
+    running: Bool[Array, "*ensemble"]
+
+
+class Loop(eqx.Module):
+    """A plant, its controller and what is between them."""
+
+    plant: Plant
+    controller: Controller
+    settings: Settings
+    ensemble: tuple[int, ...] = eqx.field(static=True)
+
+    def begin(self, state: PyTree, like: Float[Array, " axes *ensemble"]) -> Carry:
+        """At rest: before the first command arrives, the inputs are those of none."""
+        line, inputs = self.settings.line, self._driven(like)[0]
+        past = None if line is None else line.init(inputs)
+        return Carry(state, self.controller.init(like), past, jnp.ones(self.ensemble, bool))
+
+    def sample(
+        self, carry: Carry, index: Int[Array, ""], happens: Scenario
+    ) -> tuple[Carry, SampleResult]:
+        """Measure, control, and hold the inputs until the next sample."""
+        angle = self.plant.measure(carry.state)
+        happens, bound = _wide(happens, angle), self.settings.bound
+        fine = carry.running & jnp.all(jnp.abs(angle) <= bound, axis=0)
+        angle = within(angle, bound)
+        measurement = self._measured(angle + happens.noise)
+        memory, asked, inputs, achieved, fine = self._answer(carry, measurement, happens, fine)
+        following = self._move(carry, memory, inputs, happens, fine)
+        return following, SampleResult(
+            index=index,
+            time=index.astype(angle.dtype) * self.settings.dt,
+            angle=angle,
+            measurement=measurement,
+            reference=happens.reference,
+            asked=asked,
+            command=jnp.where(fine, achieved, 0),
+            saturated=_falls_short(asked, achieved),
+            injection=happens.injection,
+            disturbance=happens.disturbance,
+            signals=getattr(self.controller, "signals", lambda _: {})(memory),
+            running=fine,
+        )
+
+    def _answer(
+        self,
+        carry: Carry,
+        measurement: Float[Array, " axes *ensemble"],
+        happens: Scenario,
+        fine: Bool[Array, "*ensemble"],
+    ) -> tuple[PyTree, Array, Array, Array, Array]:
+        """The controller's memory, what it asked for, what the drive makes of it, who is fine."""
+        memory, command = self.controller.step(carry.memory, _setpoint(happens), measurement)
+        fine = fine & are_tame(command, self.ensemble)
+        asked = jnp.where(fine, command, 0) + happens.injection
+        inputs, achieved = self._driven(asked)
+        told = getattr(self.controller, "applied", None)
+        memory = memory if told is None else told(memory, achieved)
+        fine = fine & are_numbers(memory, self.ensemble)
+        return choose(fine, memory, carry.memory, self.ensemble), asked, inputs, achieved, fine
+
+    def _move(
+        self, carry: Carry, memory: PyTree, inputs: Array, happens: Scenario, fine: Array
+    ) -> Carry:
+        """To the next sample, unless it leads out of what can be computed on."""
+        past, state = self._held(carry, inputs, happens)
+        runs = fine & are_tame(state, self.ensemble) & are_resolved(state, self.ensemble)
+        state, past = choose(runs, (state, past), (carry.state, carry.past), self.ensemble)
+        return Carry(state, memory, past, runs)
+
+    def _measured(self, angle: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+        encoder = self.settings.encoder
+        return angle if encoder is None else encoder(angle)
+
+    def _driven(self, command: Float[Array, " axes *ensemble"]) -> tuple[Array, Array]:
+        drive = self.settings.drive
+        if drive is None:
+            return command, command
+        inputs = drive.inputs(command)
+        return inputs, drive.achieved(inputs)
+
+    def _held(
+        self, carry: Carry, inputs: Float[Array, " inputs *ensemble"], happens: Scenario
+    ) -> tuple[Array | None, PyTree]:
+        """The inputs on their way and the plant's state, both at the next sample."""
+        plant: Any = self.plant
+        line, dt = self.settings.line, self.settings.dt
+        if happens.payload is not None:
+            plant = plant.with_added_inertia(happens.payload)
+
+        def hold(state: PyTree, inputs: Array, duration: Any) -> PyTree:
+            slope = lambda x: plant.derivative(x, inputs, happens.disturbance)
+            return integrate(slope, state, duration, self.settings.substeps)
+
+        if line is None or carry.past is None:
+            return None, hold(carry.state, inputs, dt)
+        past, early, late = line.step(carry.past, inputs)
+        if not line.splits:
+            return past, hold(carry.state, late, dt)
+        share = line.share(inputs)
+        return past, hold(hold(carry.state, early, share * dt), late, (1 - share) * dt)
+
+
+def _setpoint(happens: Scenario) -> Any:
+    if happens.rate is None and happens.acceleration is None:
+        return happens.reference
+    still = jnp.zeros_like(happens.reference)
+    rate, acceleration = (still if x is None else x for x in (happens.rate, happens.acceleration))
+    return Setpoint(happens.reference, rate, acceleration)
+
+
+def _wide(happens: Scenario, like: Float[Array, " axes *ensemble"]) -> Scenario:
+    """One scenario for all members of an ensemble."""
+    parts = {name: x for name, x in vars(happens).items() if x is not None}
+    wide = {name: widen(x, like) for name, x in parts.items()}
+    return eqx.tree_at(lambda h: [getattr(h, name) for name in wide], happens, list(wide.values()))
+
+
+def widen(x: Float[Array, "axes ..."], like: Float[Array, " axes *ensemble"]) -> Array:
+    """`x` for every member of the ensemble of `like`, in its precision."""
+    return jnp.broadcast_to(align(x, like), like.shape).astype(like.dtype)
+
+
+def _falls_short(asked: Array, achieved: Array) -> Bool[Array, " axes *ensemble"]:
+    rounding = 1e3 * float(jnp.finfo(asked.dtype).eps)
+    return jnp.abs(asked - achieved) > rounding * (1 + jnp.abs(asked))

@@ -1,0 +1,186 @@
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+
+from jaxquad._core import align
+from jaxquad._xla import Devices, gathered, Jit
+from jaxquad.records import Record
+
+from ._authority import Authority, find_authority, warn_beyond_authority
+from ._check_loop import check_loop
+from ._delay import loop_settings, Settings
+from ._hardware import Encoder
+from ._memory import require_memory, size_of
+from ._over_devices import loop_over_devices, placed
+from ._protocols import Controller, Drive, Plant
+from ._run import scan_loop
+from ._sample import SampleResult
+from ._scenario import AXES, Scenario
+
+
+class Simulation(eqx.Module):
+    """What a simulated loop did, sample by sample.
+
+    A member that left the angles that count as flown is held where it was, with command 0, and
+    `diverged` tells it apart: its numbers are finite, but they describe no flight.
+    """
+
+    time: Float[Array, " samples"]  # s
+    angle: Float[Array, " samples axes *ensemble"]  # true, rad
+    measurement: Float[Array, " samples axes *ensemble"]  # rad
+    command: Float[Array, " samples axes *ensemble"]  # achieved, V
+    saturated: Bool[Array, " samples axes *ensemble"]  # the drive gave less than was asked
+    signals: dict[str, Array]  # of the controller, [samples, axes, *ensemble]
+    diverged: Bool[Array, "*ensemble"]
+    scenario: Scenario  # as it was given
+    dt: float = eqx.field(static=True, default=0.002)  # s
+    authority: Authority | None = None  # None: of a plant that does not tell it
+
+    @property
+    def reference(self) -> Float[Array, " samples axes *ensemble"]:
+        """The set-point in rad."""
+        return self._wide(self.scenario.reference)
+
+    @property
+    def injection(self) -> Float[Array, " samples axes *ensemble"]:
+        """What was added to the controller's command, V."""
+        return self._wide(self.scenario.injection)
+
+    @property
+    def disturbance(self) -> Float[Array, " samples axes *ensemble"]:
+        """Torque in N m."""
+        return self._wide(self.scenario.disturbance)
+
+    def record(self, axis: str = "roll", *, member: int | None = None) -> Record:
+        """The axis as it would be logged: achieved command, measured angle, injected sweep.
+
+        `member` picks one of an ensemble. Raises `ValueError` for an axis that does not exist, and
+        for a member that diverged.
+        """
+        k = self._index(axis)
+        if member is None and self.angle.ndim > 2:
+            raise ValueError(
+                f"an ensemble of shape {self.angle.shape[2:]} has many records: pick one, member=0"
+            )
+        if np.asarray(self.diverged)[() if member is None else member]:
+            raise ValueError("the loop diverged, and what is not flown is no record: stabilise it")
+        place = (slice(None), k) if member is None else (slice(None), k, member)
+        command, angle, sweep = (
+            np.asarray(x[place]) for x in (self.command, self.measurement, self.injection)
+        )
+        excited = np.ptp(sweep) > 0
+        return Record(
+            np.asarray(self.time), command, angle, sweep if excited else None,
+            input_names=f"{axis}_command", output_names=f"{axis}_angle",
+            reference_names="sweep" if excited else None,
+            input_units="V", output_units="rad", reference_units="V" if excited else None,
+            source="simulation",
+        )  # fmt: skip
+
+    def _index(self, axis: str) -> int:
+        names = AXES[: self.angle.shape[1]]
+        if axis not in names:
+            raise ValueError(f"axis {axis!r}: choose one of {', '.join(names)}")
+        return names.index(axis)
+
+    def _wide(self, x: Float[Array, "samples axes ..."]) -> Array:
+        return jnp.broadcast_to(align(x, self.angle), self.angle.shape)
+
+
+def simulate(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    *,
+    dt: float = 0.002,
+    drive: Drive | None = None,
+    encoder: Encoder | None = None,
+    delay: Float[ArrayLike, "*ensemble"] = 0.0,
+    longest_delay: float | None = None,
+    substeps: int = 1,
+    bound: float = 100.0,
+    devices: int | Sequence[Any] | None = None,
+) -> Simulation:
+    """Run a sampled-data loop: measure, control, hold the inputs for `dt` seconds, repeat.
+
+    Between samples the plant is integrated by `substeps` fourth-order Runge-Kutta steps under
+    constant inputs. The injected signal is added to the controller's command, so that a sweep can
+    excite a plant that needs stabilising; `drive` makes motor inputs of the sum, as `jq.models.Multirotor`
+    needs. The inputs reach the plant `delay` seconds later, exactly: any delay of 0 or above, whole
+    samples or not, one for all or one per member. Under jit, vmap or grad with respect to the
+    delay, `longest_delay` says how long it can become.
+
+    One loop, or an ensemble along the last axis of the plant's parameters, of the controller's
+    gains, of the scenario, of the delay, or of several of them. A member whose angle leaves
+    +-`bound` rad, or whose numbers grow beyond 1e9, is held there and flagged in `diverged`, so
+    that values and gradients of the others, and its own, stay finite.
+
+    `devices` compute a part of the members each; the result is the same, on the default device.
+    None: those of this process, as many as have 32 members (4096 where they are no CPUs), or those
+    that the data were put on. A number: so many of them. A sequence of `jax.Device`: those, of
+    other processes too. A CPU is one device whatever its cores, which a loop uses one of, until
+    `jax.config.update("jax_num_cpu_devices", 2)`, before the first computation, makes it two.
+    After `jax.distributed.initialize` each process makes the same call of the whole ensemble with
+    `devices=jax.devices()`, and gets all of its members.
+
+    Raises `ValueError` for parts that do not fit together, such as a controller made for another
+    `dt`, ensembles of different sizes or a payload that the plant cannot carry; for devices that
+    JAX does not have; for processes with different ensembles (not under jit, vmap or grad); and for
+    a record that does not fit the memory: 25 B or more per sample, axis and member.
+    """
+    settings = loop_settings(
+        dt=dt, drive=drive, encoder=encoder, delay=delay, longest_delay=longest_delay,
+        substeps=substeps, bound=bound,
+    )  # fmt: skip
+    check_loop(plant, controller, scenario, settings)
+    loop, places = placed(plant, controller, scenario, settings, devices)
+    ((angle, *others), running), authority = gathered(_run(*loop, places))
+    warn_beyond_authority(authority, scenario)
+    time = jnp.asarray(dt * np.arange(angle.shape[0]), angle.dtype)
+    measurement, command, saturated, signals = others
+    return Simulation(
+        time=time,
+        angle=angle,
+        measurement=measurement,
+        command=command,
+        saturated=saturated,
+        signals=signals,
+        diverged=~running,
+        scenario=scenario,
+        dt=dt,
+        authority=authority,
+    )
+
+
+@Jit
+def _run(
+    plant: Plant,
+    controller: Controller,
+    scenario: Scenario,
+    settings: Settings,
+    devices: Devices | None = None,
+) -> tuple[tuple[PyTree, Bool[Array, "*ensemble"]], Authority | None]:
+    found = find_authority(plant, settings.drive, controller)
+    loop = (plant, controller, scenario, settings)
+    stored, running = loop_over_devices(_store, loop, None, devices)
+    samples, axes, *members = stored[0].shape
+    what = f"a record of {samples} samples of {axes} axes of {math.prod(members)} members"
+    require_memory(
+        what, size_of(stored), "take jq.evaluate, which stores none, or jq.simulation.in_slices"
+    )
+    return (stored, running), found
+
+
+def _store(
+    loop: tuple[Plant, Controller, Scenario, Settings], nothing: None
+) -> tuple[PyTree, Bool[Array, "*ensemble"]]:
+    return scan_loop(*loop, _keep, lambda like: None)[1:]
+
+
+def _keep(nothing: None, now: SampleResult) -> tuple[None, PyTree]:
+    return nothing, (now.angle, now.measurement, now.command, now.saturated, now.signals)

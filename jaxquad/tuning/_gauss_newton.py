@@ -1,0 +1,137 @@
+"""Least squares on the tracking errors themselves, through optimistix."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad.control import flown
+from jaxquad.simulation import scan_loop
+
+from ._cost import SMOOTHING
+from ._objective import is_gated, Mean, Objective, Penalty, stability_gate
+from ._parameters import Coordinates
+from ._problem import Problem, split
+from ._quantities import per_member
+
+
+_LEAST = 1e-12
+
+
+class GaussNewton(eqx.Module):
+    """Levenberg-Marquardt on sqrt(t) times the errors of all members: tracking counts as ITSE.
+
+    ITAE is no sum of squares; the integral of t error^2 is. Each member's counts in units of what
+    it is at the start, which stands for its logarithm, and penalties enter by their square roots.
+    Terms of the objective other than ITAE, risks other than the mean, and limits are not sums of
+    squares: they are refused. `stride` samples share a residual.
+    """
+
+    steps: int = 30
+    tolerance: float = 1e-4
+    stride: int = 10
+
+    def __check_init__(self):
+        if self.steps < 1 or self.stride < 1:
+            raise ValueError(f"steps is {self.steps} and stride {self.stride}: give 1 or more")
+
+
+class _Given(eqx.Module):
+    coordinates: Coordinates
+    problem: Problem
+    penalties: Sequence[Penalty]
+    scale: Float[Array, "axes members"]  # of the squared errors' sums
+    stride: int = eqx.field(static=True)
+
+
+def require_squares(objective: Objective, limits: Sequence[Any]) -> None:
+    """Raises ValueError for what is no sum of squares."""
+    odd = [name for name in objective.terms if name != "itae"]
+    odd += [f"limit on {limit.quantity}" for limit in limits]
+    if not isinstance(objective.risk, Mean):
+        odd.append(f"risk {getattr(objective.risk, 'text', 'of your own')}")
+    if odd:
+        raise ValueError(
+            f"GaussNewton needs sums of squares, which these are not: {', '.join(odd)}; take "
+            "LBFGS(), or the term itae with penalties and the mean risk"
+        )
+
+
+def least_squares(
+    coordinates: Coordinates,
+    problem: Problem,
+    objective: Objective,
+    start: Float[np.ndarray, " n"],
+    method: GaussNewton,
+) -> tuple[Float[np.ndarray, " n"], int, bool]:
+    """Where the descent ended, its steps, and whether it converged."""
+    import lineax as lx
+    import optimistix as optx
+
+    still = jnp.ones((problem.loops.inertia_told.shape[0], problem.members))
+    given = _Given(coordinates, problem, objective.penalties, still, method.stride)
+    own = jnp.sum(_errors(jnp.asarray(start), given) ** 2, axis=0)
+    given = eqx.tree_at(lambda g: g.scale, given, jnp.sum(own, axis=0, keepdims=True) + 0 * own)
+    solver = optx.LevenbergMarquardt(
+        rtol=method.tolerance, atol=method.tolerance, linear_solver=lx.Normal(lx.Cholesky())
+    )
+    with jax.numpy_dtype_promotion("standard"):
+        found = optx.least_squares(
+            _linearised, solver, jnp.asarray(start), given, max_steps=method.steps, throw=False
+        )
+    done = bool(found.result == optx.RESULTS.successful)
+    return np.asarray(found.value), int(found.stats["num_steps"]), done
+
+
+def _residuals(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
+    members = given.problem.members
+    tracking = _errors(z, given) / jnp.sqrt(given.scale + _LEAST)[None]
+    controller = given.coordinates.controller_at(z)
+    flights, linear = split({p.quantity for p in given.penalties} | {"abscissa"})
+    numbers = given.problem.loops.numbers(controller, linear, SMOOTHING)
+    if flights:
+        numbers |= given.problem.in_time(controller, flights)
+    gate = stability_gate(numbers["abscissa"])
+    costs = [
+        p(per_member(p.quantity, numbers[p.quantity]), gate if is_gated(p.quantity) else gate + 1)
+        for p in given.penalties
+    ]
+    bounds = jnp.sqrt(jnp.stack(costs) + _LEAST) if costs else jnp.zeros((0, members))
+    # ITSE goes as the square of ITAE: half of it, for the same change of the cost.
+    return tracking / np.sqrt(2 * members), bounds / np.sqrt(members)
+
+
+@eqx.filter_custom_jvp
+def _linearised(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
+    return _residuals(z, given)
+
+
+@_linearised.def_jvp
+def _with_columns(primals: Any, tangents: Any) -> Any:
+    # A column for each parameter, one flight after the other: linearised, the loop would store all.
+    (z, _), run = primals, lambda z: _residuals(z, primals[1])
+    column = lambda unit: jax.jvp(run, (z,), (unit,))[1]
+    columns = jax.lax.map(column, jnp.eye(z.size, dtype=z.dtype))
+    return run(z), jax.tree.map(lambda c: jnp.tensordot(tangents[0], c, 1), columns)
+
+
+def _errors(z: Float[Array, " n"], given: _Given) -> Float[Array, "points axes members"]:
+    """sqrt(t) error every few samples, t from the last event."""
+    problem, stride = given.problem, given.stride
+    law = flown(given.coordinates.controller_at(z), problem.loops.inertia_told)
+    keep = lambda nothing, now: (nothing, now.reference - now.angle)
+    stored = scan_loop(
+        problem.plant, law, problem.flight, problem.settings, keep, lambda like: None
+    )[1]
+    span, dt = problem.span, problem.settings.dt
+    index = np.arange(span.first, span.last + 1, stride)
+    since = np.min(
+        [np.where(index >= s, index - s, np.inf)
+         for s in [span.first, *(round(t / dt) for t in problem.events)]], axis=0,
+    )  # fmt: skip
+    weight = np.sqrt(since * dt * dt * stride)
+    return stored[index] * weight[:, None, None]

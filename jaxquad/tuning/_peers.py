@@ -1,0 +1,65 @@
+"""What a tuned design is held against."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
+from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
+
+from ._judge import axes_of
+
+
+WC, WO = 10.0, 30.0  # rad/s, the paper's
+PAPER_B0 = (3.0, 1.6)  # before and after the paper's adaptation, rad/s^2 per V
+# +u and -u on two motors: the one convention in which the paper's gains are stable
+RIG_GAIN = 2 * QUANSER_HOVER.arm * QUANSER_HOVER.thrust_coefficient / QUANSER_HOVER.inertia[0]
+
+
+def paper_designs(plant: Any, *, dt: float = 0.002) -> dict[str, LADRC]:
+    """The paper's LADRCs for a plant: 10 and 30 rad/s with b0 = 3, and with b0 = 1.6.
+
+    On the rig's roll axis (b = 0.848 rad/s^2 per V) b0 is exactly that; on another plant, or
+    another axis, it has the same ratio to b: 3.54 and 1.89. `plant` is the nominal
+    `jq.DecoupledAxes` or `jq.models.Multirotor`, without an ensemble.
+    Source: section 5 of the paper, docs/equations.md. Raises ValueError for an ensemble.
+    """
+    b = np.asarray(_nominal(plant).gain, float)
+    designs = {}
+    for b0 in PAPER_B0:
+        given = b0 * b / RIG_GAIN
+        on_rig = np.allclose(given, b0, rtol=2e-3)
+        name = f"paper b0 = {b0:g}" if on_rig else f"paper b0 = {b0 / RIG_GAIN:.3g} b"
+        designs[name] = LADRC(WC, WO, b0 * np.ones_like(b) if on_rig else given, dt=dt)
+    return designs
+
+
+def peers(plant: Any, *, pid: Any = None, dt: float = 0.002) -> dict[str, Any]:
+    """Designs to stand beside a tuned one in its certificate, by name.
+
+    The paper's two, the certainty-equivalence LADRC (10 and 30 rad/s, b0 = KT / J of the inertia
+    told), and `pid` if given: a PID tuned on the same ensemble, scheduled or not.
+    """
+    axes = _nominal(plant)
+    KT, J = jnp.broadcast_arrays(axes.torque_gain, axes.inertia)
+    # As a map of ln J, b0 = KT / J is straight: two knots, far apart, hold it everywhere.
+    map = certainty_equivalence(KT, J, span=(1e-3, 1e3), knots=2)
+    designs: dict[str, Any] = dict(paper_designs(plant, dt=dt))
+    designs["CE 10/30"] = ScheduledLADRC(LADRC(WC, WO, axes.gain, dt=dt), map)
+    return designs if pid is None else designs | {"tuned PID": pid}
+
+
+def _nominal(plant: Any) -> DecoupledAxes:
+    if not isinstance(plant, DecoupledAxes | Multirotor):
+        raise ValueError(
+            f"the plant is a {type(plant).__name__}: give the nominal jq.DecoupledAxes or "
+            "jq.models.Multirotor, such as ensemble.plant"
+        )
+    axes = axes_of(plant)
+    if len(axes.shape) > 1:
+        raise ValueError(
+            f"the plant is an ensemble of {axes.shape[1:]}: give the nominal one, whose gain the "
+            "designs are made for"
+        )
+    return axes

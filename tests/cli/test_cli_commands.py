@@ -1,0 +1,173 @@
+"""The commands around `jaxquad identify`: demo, report, verify, design, and proposals."""
+
+import json
+
+import numpy as np
+import pytest
+from log_writers import DataFlash
+
+import jaxquad as jq
+from jaxquad.cli._main import main
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    assert main(["demo", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_the_demo_finds_the_truth_of_its_log_within_its_error_bars(demo):
+    """The lag's mean over a sample and half a sample of hold are exact: no bias is allowed."""
+    rows = {row["name"]: row for row in result(demo)["fit"]["parameters"]}
+    for name, truth in {"gain": 280.0, "lag": 0.02, "delay": 0.008 + 0.002}.items():
+        assert abs(rows[name]["value"] - truth) < 3 * rows[name]["standard_error"] < 0.06 * truth
+    assert "identif" in (demo / "report.html").read_text().lower()
+
+
+def result(folder):
+    return json.loads((folder / "result.json").read_text())
+
+
+def test_a_report_is_written_again_from_the_same_log_only(demo, tmp_path, capsys):
+    assert main(["report", str(demo), "--out", str(tmp_path), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["fit"]["parameters"] == result(demo)["fit"]["parameters"]
+    assert (tmp_path / "report.html").exists() and (tmp_path / "bode.png").exists()
+    changed = tmp_path / "changed.csv"
+    changed.write_bytes((demo / "demo.csv").read_bytes() + b"\n")
+    assert main(["report", str(demo), "--log", str(changed)]) == 2
+    assert "not the log that was identified" in capsys.readouterr().err
+    assert main(["report", str(demo), "--log", str(tmp_path / "gone.csv")]) == 2
+    assert "the log is gone" in capsys.readouterr().err
+
+
+def test_a_stored_model_is_verified_on_another_record(demo, tmp_path, capsys):
+    """Held against `jq.verify` of the model that was printed."""
+    log, picture = str(demo / "demo.csv"), tmp_path / "verification.png"
+    words = ["verify", str(demo), log, "--start", "5", "--stop", "40", "--out", str(picture)]
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    values = [row["value"] for row in result(demo)["fit"]["parameters"]]
+    record = jq.read(log, inputs="M", outputs="q", start=5, stop=40)
+    check = jq.verify(jq.LaggedIntegrator(*values), record, band=tuple(found["band_rad_per_s"]))
+    assert found["fit_percent"] == pytest.approx(check.fit_percent) and check.fit_percent > 70
+    assert found["band_rad_per_s"] == pytest.approx([np.pi, 24 * np.pi], rel=0.01)
+    assert found["unit"] == "rad/s" and picture.stat().st_size > 10_000
+
+
+def test_what_holds_no_model_is_said(demo, tmp_path, capsys):
+    assert main(["verify", str(tmp_path), "x.csv"]) == 2
+    assert "run jaxquad identify first" in capsys.readouterr().err
+    content = result(demo)
+    del content["model"]
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    assert main(["verify", str(tmp_path), str(demo / "demo.csv")]) == 3
+    assert "holds no model" in capsys.readouterr().err
+    (tmp_path / "result.json").write_text("[1]")
+    assert main(["verify", str(tmp_path), "x.csv"]) == 2
+    assert "no result of" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["sweep", "multisine"])
+def test_an_excitation_is_designed_within_its_band(kind, tmp_path, capsys):
+    """Held against the transform of the file."""
+    out = tmp_path / "signal.csv"
+    words = ["design", kind, "--band", "0.5", "10", "--rate", "500", "--amplitude", "0.2"]
+    assert main([*words, "--out", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    time, signal = np.loadtxt(out, delimiter=",", skiprows=1, unpack=True)
+    assert told["ok"] and told["samples"] == time.size
+    np.testing.assert_allclose(np.diff(time), 0.002, atol=1e-9)
+    assert 0.15 < np.abs(signal).max() <= 0.2 + 1e-9
+    power = np.abs(np.fft.rfft(signal)) ** 2
+    hertz = np.fft.rfftfreq(time.size, 0.002)
+    inside = (hertz > 0.4) & (hertz < 10.5)
+    # The fades at its two ends take a few per cent of a sweep elsewhere.
+    assert power[inside].sum() > 0.95 * power.sum()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "complaint"),
+    [
+        (["--band", "0.5", "10", "--rate", "100"], 4, "BROKEN sample rate"),
+        (["--band", "10", "0.5", "--rate", "100"], 2, "has to rise"),
+        (["--band", "0.5", "10", "--rate", "0"], 2, "above 0"),
+    ],
+)
+def test_a_design_that_breaks_a_rule_says_so(words, code, complaint, tmp_path, capsys):
+    out = ["--amplitude", "1", "--out", str(tmp_path / "s.csv")]
+    assert main(["design", "sweep", *words, *out]) == code
+    printed = capsys.readouterr()
+    assert complaint in printed.out + printed.err
+
+
+def test_an_autopilots_log_needs_no_channels(tmp_path, capsys):
+    path, out = chirped(tmp_path), tmp_path / "out"
+    assert main(["identify", str(path), "--out", str(out), "--no-lag"]) == 0
+    assert "Proposal for the roll axis" in capsys.readouterr().out
+    gain = result(out)["fit"]["parameters"][0]
+    assert gain["value"] == pytest.approx(100.0, rel=0.02)
+    command = result(out)["provenance"]["command"]
+    assert "RATE.ROut" in command and "--axis" not in command
+    assert main(["identify", str(path), "--input", "RATE.ROut"]) == 2
+    assert "belong together" in capsys.readouterr().err
+
+
+def test_all_chirps_of_a_log_are_used_together(tmp_path, capsys):
+    path, out = chirped(tmp_path, starts=(22, 45)), tmp_path / "out"
+    assert main(["identify", str(path), "--out", str(out), "--no-lag"]) == 0
+    assert "2 times: 0.5 .. 6.5 Hz" in capsys.readouterr().out
+    assert np.allclose(result(out)["record"]["segments_s"], [(22, 42), (45, 65)], atol=0.02)
+    assert result(out)["fit"]["parameters"][0]["value"] == pytest.approx(100.0, rel=0.02)
+    # Of those, what lies where the user says to look.
+    assert main(["identify", str(path), "--out", str(out), "--no-lag", "--start", "43"]) == 0
+    assert np.allclose(result(out)["record"]["segments_s"], [(45, 65)], atol=0.02)
+
+
+def chirped(folder, starts=(22,)):
+    """ArduPilot's chirps of 20 s into the mixer of a roll axis 100 / s under feedback of the rate.
+
+    Between them the rate is disturbed, by what no channel shows.
+    """
+    log, time = DataFlash(), 20.0 + np.arange((starts[-1] + 2) * 100) / 100
+    log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
+    log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
+    log.define("RATE", "Qfff", "TimeUS,RDes,R,ROut", units="skk-", mults="F---")
+    log.write("PARM", 0, b"SID_AXIS", 10.0)
+    since = np.min([np.where(time < start, np.inf, time - start) for start in starts], axis=0)
+    run = since < 20
+    since = np.where(run, since, 0.0)
+    chirp = 0.2 * np.sin(2 * np.pi * (0.5 * since + 0.15 * since**2)) * run
+    idle = (time >= starts[0] + 20) & (time < starts[-1])
+    rate = np.random.default_rng(0).normal(0, 0.02, time.size)
+    output, moved = np.zeros(time.size), 0.0
+    for k in range(time.size):
+        rate[k] += moved
+        output[k] = -0.02 * rate[k]
+        moved += chirp[k] + output[k] + idle[k] * np.sin(9 * time[k])  # 100 / s for 10 ms
+    for k, t in enumerate(np.round(time * 1e6).astype(int).tolist()):
+        if run[k]:
+            if not run[k - 1]:
+                log.write("SIDS", t - 10, 10, 0.2, 0.5, 6.5)
+            log.write("SIDD", t, chirp[k], 1.0)
+        log.write("RATE", t, 0.0, rate[k], output[k])
+    path = folder / "log.bin"
+    path.write_bytes(log.content)
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["demo", "channels", "identify", "verify", "report", "tune", "design", "batch"]
+)
+def test_every_command_has_help_with_an_example(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    printed = capsys.readouterr().out
+    assert stop.value.code == 0 and f"  jaxquad {name}" in printed and "--json" in printed
+
+
+def test_channels_are_listed_as_json(demo, capsys):
+    assert main(["channels", str(demo / "demo.csv"), "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["q"]["rate"] == pytest.approx(250)

@@ -1,0 +1,82 @@
+"""The commands of docs/measured.md, typed where the measured flights lie, and their answers."""
+
+import json
+import re
+import shlex
+
+import pytest
+from conftest import ROOT
+
+from jaxquad.cli._main import main
+
+
+PAGE = (ROOT / "docs" / "measured.md").read_text()
+COMMANDS = [
+    shlex.split(block.replace("\\\n", " "))[1:]
+    for block in re.findall(r"```sh\n(.*?)```", PAGE, flags=re.S)
+]
+
+
+@pytest.fixture
+def identified(data, tmp_path, monkeypatch, capsys):
+    """Type the k-th command of the page for a file: exit code, printed text, result.json."""
+    monkeypatch.chdir(data)
+
+    def type_in(named, k=0):
+        words = [words for words in COMMANDS if words[1].endswith(named)][k]
+        code = main([*words, "--out", str(tmp_path)])
+        return code, capsys.readouterr().out, json.loads((tmp_path / "result.json").read_text())
+
+    return type_in
+
+
+def numbers(result):
+    return {row["name"]: row["value"] for row in result["fit"]["parameters"]}
+
+
+def test_the_pitch_rig_has_its_gain_and_the_sum_of_lag_and_delay(identified):
+    code, printed, result = identified("antx_log3_prbs.npz")
+    found = numbers(result)
+    assert code == 0 and 270 < found["gain"] < 295
+    assert 0.024 < found["lag"] + found["delay"] < 0.029  # s
+    assert "joint" in printed and "direct" in printed and "lag + delay" in printed
+
+
+@pytest.mark.parametrize(("file", "inertia"), [("log15", 1.1e-5), ("log15.npz", 1.3e-5)])
+def test_the_crazyflies_inertia_comes_from_its_thrust_curve(identified, file, inertia):
+    """README of the data: about 1.1e-5 in roll, 1.3e-5 in pitch, lag + delay about 70 ms."""
+    code, _, result = identified(file)
+    found = numbers(result)
+    assert code == 0
+    # 15 %: what two bands and the two structures of the page differ by.
+    assert 1 / found["gain"] == pytest.approx(inertia, rel=0.15)
+    assert found["lag"] + found["delay"] == pytest.approx(0.07, rel=0.15)
+
+
+def test_a_band_that_the_model_does_not_hold_over_is_told(identified):
+    code, printed, result = identified("log15", k=1)
+    assert code == 3 and "the model does not hold over the whole band" in printed
+    assert any("above 9.76 rad/s the gain" in remark for remark in result["fit"]["remarks"])
+    # The table's row of the upper two thirds holds what the thrust curve gives, too.
+    row = next(line for line in printed.splitlines() if line.startswith(" above 9.76"))
+    assert float(row.split("+-")[3].split()[1]) == pytest.approx(0.07, rel=0.15)
+
+
+def test_feedback_without_an_outside_reference_is_no_plant(identified):
+    code, printed, result = identified("LOG00037.BFL")
+    assert code == 3 and "! feedback-dominated: " in printed
+    assert not result["fit"]["identifiable"] and numbers(result)["lag"] is None
+
+
+def test_a_hover_is_not_identifiable(identified):
+    code, printed, result = identified("E8_log00")
+    assert code == 3 and "not identifiable from this record: coherence reaches 0.6" in printed
+    assert "parameters" not in result["fit"]
+
+
+def test_the_cessna_has_cifers_poles_at_a_lower_cost(identified):
+    code, printed, result = identified("sweep_data_2017_12_10_19_05.npy")
+    assert code == 0 and result["fit"]["cost"] < 1
+    [(zeta, omega)] = re.findall(r"\[(\S+) \+- \S+, (\S+) \+-", printed)
+    assert float(zeta) == pytest.approx(0.63, abs=0.02)
+    assert float(omega) == pytest.approx(6.11, rel=0.01)

@@ -1,0 +1,53 @@
+"""`jaxquad tune`: from the folder of an identification to certified gains in C."""
+
+import json
+
+import pytest
+
+from jaxquad.cli._main import main
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    assert main(["demo", "--out", str(folder)]) == 0
+    return folder
+
+
+PLANT = ["--inertia", "0.01", "--limit", "0.2"]
+SMALL = ["--noise", "0.05", "--members", "8", "--fresh", "32", "--duration", "1.6"]
+
+
+def test_a_result_becomes_gains_with_a_certificate(demo, capsys):
+    code = main(["tune", str(demo), *PLANT, *SMALL, "--json"])
+    told = json.loads(capsys.readouterr().out)
+    # Whichever way it falls, the code says what the certificate says.
+    assert code == (0 if told["holds"] else 4)
+    assert told["holds"] == told["certificate"]["holds"] and told["stabilised"]
+    assert {"ladrc.wc", "ladrc.wo"} <= {name.partition("[")[0] for name in told["values"]}
+    folder = demo / "tuned"
+    assert json.loads((folder / "tuned.json").read_text())["values"] == told["values"]
+    assert "attitude" in (folder / "attitude.h").read_text()
+    page = (folder / "report.html").read_text()
+    assert "Tuned gains" in page and "SHA-256" in page
+    assert (folder / "certificate.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [(["--spread", "3", "0.5"], "has to rise"), (["--step", "0"], "step is 0")],
+)
+def test_what_cannot_be_tuned_is_one_line(demo, capsys, more, complaint):
+    assert main(["tune", str(demo), *PLANT, *more]) == 2
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1 and complaint in printed
+
+
+def test_an_output_of_unknown_unit_is_refused(demo, tmp_path, capsys):
+    """Gains in the wrong unit would be 57 times too large or too small."""
+    content = json.loads((demo / "result.json").read_text())
+    origin = content["provenance"]
+    origin["command"] = origin["command"].replace("--unit q=rad/s", "")
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    assert main(["tune", str(tmp_path), *PLANT]) == 2
+    assert "the unit of q is not known" in capsys.readouterr().err

@@ -1,0 +1,105 @@
+"""The documents run: their Python and shell blocks, and what they print; their links resolve."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from conftest import ROOT
+from test_propose import ardupilot, px4
+from test_notebooks import words
+
+
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+RUN = ("comparison.md", "first_steps.md", "how_to.md", "limits.md", "measured.md", "own_log.md")
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
+BLOCK = re.compile(r"(?:<!-- (.*?) -->\n)?```(\w*)\n(.*?)```", flags=re.S)
+MARK = "--- printed by the next block ---"
+
+
+class Block(NamedTuple):
+    """Code, and what the plain block right after it says that it prints."""
+
+    kind: str
+    place: str  # the log it reads, or an empty string
+    code: str
+    printed: str
+
+
+def blocks(page):
+    """Those that run; a page's shell blocks come after its Python."""
+    found = BLOCK.findall((ROOT / "docs" / page).read_text())
+    kept = []
+    for k, (remark, kind, code) in enumerate(found):
+        if kind in ("python", "sh") and remark != "fragment":
+            place = remark.removeprefix("reads ") if remark else ""
+            follows = k + 1 < len(found) and found[k + 1][1] == ""
+            kept.append(Block(kind, place, code, found[k + 1][2] if follows else ""))
+    return kept
+
+
+CASES = [(page, place) for page in RUN for place in dict.fromkeys(b.place for b in blocks(page))]
+
+
+@pytest.mark.parametrize(("page", "place"), CASES)
+def test_the_blocks_of_a_page_run_and_print_what_it_shows(page, place, tmp_path, request):
+    mine = [block for block in blocks(page) if block.place == place]
+    lay_out(place, tmp_path, request)
+    python = [block for block in mine if block.kind == "python"]
+    parts = [f"print({MARK!r})\n{block.code}" for block in python]
+    printed = run([sys.executable, "-c", "\n".join(parts)], tmp_path).split(f"{MARK}\n")[1:]
+    shells = [block for block in mine if block.kind == "sh"]
+    printed += [run(["bash", "-ec", block.code], tmp_path) for block in shells]
+    for block, text in zip([*python, *shells], printed, strict=True):
+        if block.printed:
+            # Words, not digits: the last ones differ between processors.
+            assert words(text) == words(block.printed)
+
+
+def lay_out(place, folder, request):
+    """The log that the blocks read, by the name that they have for it."""
+    made = {
+        "a made ArduPilot log": lambda: ardupilot(folder, 10),
+        "a made PX4 log": lambda: px4(folder, state=2),
+    }
+    if place in made:
+        made[place]()
+    elif place:
+        for path in sorted((request.getfixturevalue("data") / place).iterdir()):
+            (folder / path.name).symlink_to(path.resolve())
+
+
+def run(command, folder):
+    scripts = Path(sys.executable).parent
+    environment = os.environ | {"PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+def test_links_resolve(page):
+    for target in LINK.findall(page.read_text()):
+        if not target.startswith(("http:", "https:", "mailto:")):
+            assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", RUN)
+def test_files_that_a_page_names_exist_and_are_no_place_of_one_machine(page):
+    text = (ROOT / "docs" / page).read_text()
+    for named in re.findall(r"`((?:docs|fits|notebooks|tests)/[\w/.]+\.\w+)`", text):
+        assert (ROOT / named).exists(), named
+    assert not re.search(r"(?<![\w.])/(?:work|tmp|home|root)/", text)
+
+
+@pytest.mark.parametrize("page", RUN)
+def test_every_block_of_code_runs_or_is_called_a_fragment(page):
+    found = BLOCK.findall((ROOT / "docs" / page).read_text())
+    assert all(kind in ("python", "sh", "") for _, kind, _ in found)
+    assert all(
+        remark == "fragment" or remark.startswith("reads ") for remark, *_ in found if remark
+    )
+    assert any(kind == "python" for _, kind, _ in found)

@@ -1,0 +1,250 @@
+"""What a record cannot tell is said before any number is read."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import response_of
+
+import jaxquad as jq
+
+
+ML = jq.identify.MaximumLikelihood()
+RIG = jq.models.AttitudeAxis(L=0.197, K_t=0.1188, J_x=0.0552, lag=0.02)
+GAIN = 0.197 * 0.1188 / 0.0552
+ADDED = 0.0276
+STARTS = [(0.05, 0.02), (0.3, 0.02), (0.05, 0.4), (0.9, 0.5)]
+
+
+def start(K_t=0.2, J_x=0.1, lag=0.03):
+    return jq.models.AttitudeAxis(L=0.197, K_t=K_t, J_x=J_x, lag=lag)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return jq.fit(start(), response_of(RIG, seed=0), free=("J_x", "K_t", "lag"), cost=ML)
+
+
+def test_inertia_and_thrust_are_refused_in_the_users_own_names(alone):
+    text = str(alone)
+    assert not alone.identifiable
+    assert text.splitlines()[0].startswith("NOT IDENTIFIABLE")
+    assert "only L K_t / J_x is determined by this record" in text
+    assert "+0.707 J_x" in text and "+0.707 K_t" in text
+    assert "jq.identify.Prior" in text and "second record" in text
+
+
+def test_no_number_is_given_for_what_is_not_determined(alone):
+    assert np.isnan(alone.values[:2]).all() and np.isinf(alone.standard_errors[:2]).all()
+    assert np.isfinite(alone.values[2]) and alone.values[2] == pytest.approx(0.02, rel=0.2)
+    row = next(line for line in str(alone).splitlines() if line.startswith("J_x "))
+    assert "not determined" in row and not any(c.isdigit() for c in row)
+
+
+def test_the_determined_combination_has_its_own_error_bar(alone):
+    (ratio,) = alone.combinations
+    assert ratio.name == "L K_t / J_x"
+    assert abs(ratio.value - GAIN) < 3 * ratio.standard_error < 0.1 * GAIN
+    gain = alone.derived(lambda m: m.gain, "gain")
+    assert gain.value == pytest.approx(ratio.value, rel=1e-9)
+    assert gain.standard_error == pytest.approx(ratio.standard_error, rel=1e-6)
+    low, high = ratio.interval
+    assert low < ratio.value < high and f"{ratio.value:.5g}" in str(ratio)
+
+
+def test_a_quantity_along_the_null_direction_is_refused(alone):
+    with pytest.raises(jq.identify.NotIdentifiable, match="J_x"):
+        alone.derived(lambda m: m.J_x, "J_x")
+
+
+def test_four_starts_give_four_pairs_and_one_ratio():
+    frf = response_of(RIG, seed=1)
+    fits = [jq.fit(start(*pair), frf, free=("J_x", "K_t", "lag"), cost=ML) for pair in STARTS]
+    pairs = np.array([(float(f.model.J_x), float(f.model.K_t)) for f in fits])
+    ratios = np.array([fit.combinations[0].value for fit in fits])
+    assert np.ptp(np.log(pairs[:, 0])) > 1
+    np.testing.assert_allclose(ratios, ratios[0], rtol=1e-6)
+    np.testing.assert_allclose([fit.cost for fit in fits], fits[0].cost, rtol=1e-9)
+
+
+def add_inertia(model):
+    return model.with_added_inertia(ADDED)
+
+
+def test_a_second_record_under_known_added_inertia_tells_them_apart():
+    frfs = response_of(RIG, seed=2), response_of(add_inertia(RIG), seed=3)
+    both = jq.fit(
+        start(), frfs, free=("J_x", "K_t", "lag"), conditions=(None, add_inertia), cost=ML
+    )
+    assert both.identifiable and both.condition < 100
+    np.testing.assert_array_less(
+        np.abs(both.values - [0.0552, 0.1188, 0.02]), 3 * both.standard_errors
+    )
+    # The error of the ratio is amplified by about (1 + J / dJ) sqrt(2).
+    gain = both.derived(lambda m: m.gain, "gain")
+    growth = (both.standard_errors[0] / both.values[0]) / (gain.standard_error / gain.value)
+    assert 2 < growth < 8
+
+
+def test_a_static_torque_tells_them_apart():
+    """Hanging a known mass on the arm gives L K_t, here to 1 %."""
+    prior = jq.identify.Prior(lambda m: m.L * m.K_t, 0.197 * 0.1188, 0.01 * 0.197 * 0.1188)
+    frf = response_of(RIG, seed=4)
+    fit = jq.fit(start(), frf, free=("J_x", "K_t", "lag"), cost=ML, priors=[prior])
+    assert fit.identifiable
+    np.testing.assert_allclose(fit.values[:2], [0.0552, 0.1188], rtol=0.03)
+    assert fit.standard_errors[1] / fit.values[1] == pytest.approx(0.01, rel=0.01)
+
+
+def test_along_the_null_direction_the_posterior_is_the_prior_and_is_called_so():
+    frf = response_of(RIG, seed=4)
+    prior = jq.identify.Prior("K_t", 0.1188, 0.006)
+    fit = jq.fit(start(), frf, free=("J_x", "K_t", "lag"), cost=ML, priors=[prior])
+    assert fit.identifiable
+    assert fit.values[1] == pytest.approx(0.1188, rel=1e-4)
+    assert fit.standard_errors[1] == pytest.approx(0.006, rel=1e-3)
+    assert any("told apart by the prior alone" in remark for remark in fit.remarks)
+
+
+@pytest.mark.parametrize("band", [(3.0, 12.0), (1.0, 6.0)], ids=["inside", "delay runs to zero"])
+def test_lag_and_delay_of_a_narrow_band_are_determined_as_a_sum(band):
+    truth = jq.LaggedIntegrator(280.0, 0.016, 0.011)
+    frf = response_of(truth, error=0.04, seed=0, omega=np.geomspace(band[0], band[1], 30))
+    fit = jq.fit(jq.LaggedIntegrator(280.0, 0.02, 0.02), frf, free=("lag", "delay"), cost=ML)
+    (total,) = fit.combinations
+    assert total.name == "lag + delay" and np.isnan(fit.values).all()
+    assert abs(total.value - 0.027) < 3 * total.standard_error < 0.01
+
+
+def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
+    truth = jq.TransferFunction([8.0], [1.0, 3.0, 9.0])
+    fit = jq.fit(truth, response_of(truth, seed=0), cost=ML, free=("numerator", "denominator"))
+    assert set(fit.identifiability.undetermined) == set(fit.names)
+    shares = np.array(list(fit.null_directions[0].values()))
+    np.testing.assert_allclose(np.abs(shares), 0.5, atol=1e-3)
+    assert len(fit.combinations) == 3
+
+
+def test_a_parameter_without_effect_is_named():
+    frf = response_of(RIG, seed=0)
+    fit = jq.fit(start(), frf, free=("K_t", "lag", jq.identify.Real("K_af", scale=1e-9)), cost=ML)
+    assert fit.identifiability.undetermined == ("K_af",)
+    assert "nothing about them is determined" in str(fit)
+    assert np.isfinite(fit.values[:2]).all()
+
+
+def test_a_well_posed_fit_says_nothing_of_the_kind():
+    fit = jq.fit(start(), response_of(RIG, seed=0), free=("K_t", "lag"), cost=ML)
+    assert fit.identifiable and not fit.null_directions and "NOT" not in str(fit)
+
+
+def test_what_is_fixed_takes_part_in_names_only_where_it_acts_alike():
+    """The arm acts as the thrust does; the lag does not."""
+    frf = response_of(RIG, seed=0)
+    fit = jq.fit(start(lag=0.02), frf, free=("J_x", "K_t"), cost=ML)
+    assert [c.name for c in fit.combinations] == ["L K_t / J_x"]
+
+
+class Sum(eqx.Module):
+    """A gain that is the sum of three, and one that is a product with a sum."""
+
+    a: jax.Array
+    b: jax.Array
+    c: jax.Array
+    product: bool = eqx.field(static=True, default=False)
+
+    def frequency_response(self, omega):
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
+        gain = self.a * (self.b + self.c) if self.product else self.a + self.b + self.c
+        return (gain.astype(s.dtype) / s)[:, None, None]
+
+
+def summed(values, product=False):
+    a, b, c = (jnp.asarray(float(value)) for value in values)
+    return Sum(a, b, c, product)
+
+
+@pytest.mark.parametrize("values", [(2, 2, 2), (1, 3, 5), (0.5, 0.5, 9)])
+def test_a_sum_is_never_taken_for_a_product(values):
+    """At equal values the two are alike to first order: only a finite move tells."""
+    fit = jq.fit(summed(values), response_of(summed((2, 2, 4)), seed=0), cost=ML)
+    (total,) = fit.combinations
+    assert total.name == "a + b + c" and abs(total.value - 8) < 3 * total.standard_error
+    with pytest.raises(jq.identify.NotIdentifiable):
+        fit.derived(lambda m: m.a * m.b * m.c, "a b c")
+
+
+def test_what_is_no_product_and_no_sum_is_not_named():
+    truth, start = summed((2, 2, 2), True), summed((1, 3, 5), True)
+    fit = jq.fit(start, response_of(truth, seed=0), cost=ML)
+    assert not fit.combinations and not fit.identifiable
+    assert "neither a product nor a sum" in str(fit)
+    with pytest.raises(jq.identify.NotIdentifiable):
+        fit.derived(lambda m: m.a**2 * m.b * m.c)
+
+
+def test_a_fit_from_the_wrong_sign_is_doubted_aloud():
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.1, 0.02), seed=0)
+    fit = jq.fit(jq.LaggedIntegrator(-8.0, 0.1, 0.02), frf, cost=ML)
+    assert not fit.identifiable
+    assert any("minimum" in remark and "starting values" in remark for remark in fit.remarks)
+
+
+def test_where_there_is_no_minimum_no_number_is_given():
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.1, 0.02), seed=0)
+    fit = jq.fit(jq.LaggedIntegrator(2.0, 0.4, 0.1), frf, cost=ML, max_steps=1)
+    assert not fit.identifiable and not fit.combinations
+    assert np.isnan(fit.values).all() and np.isinf(fit.standard_errors).all()
+    assert any(remark.startswith("no minimum") for remark in fit.remarks)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_number_has_an_error_of_more_than_half_its_size(seed):
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.02, 0.0), error=0.3, seed=seed)
+    fit = jq.fit(jq.LaggedIntegrator(8.0, 0.03), frf, free=("gain", "lag"), cost=ML)
+    determined = np.isfinite(fit.standard_errors)
+    sizes = np.maximum(np.abs(fit.values), np.abs(fit.units))[determined]
+    assert np.all(fit.standard_errors[determined] <= 0.5 * sizes)
+    assert set(np.array(fit.names)[~determined]) == set(fit.identifiability.undetermined)
+
+
+def narrow(noise, seed, low=0.5, high=6.0, duration=60.0, omega=None):
+    """Lag and delay of 20 ms each, from a sweep that ends far below 1 / lag."""
+    truth = jq.LaggedIntegrator(gain=80.0, lag=0.02, delay=0.02)
+    sweep = jq.sweep(low, high, duration=duration, sample_rate=100.0, amplitude=1.0)
+    clean = np.asarray(jq.models.simulate_linear(truth.transfer_function(), sweep.signal, 0.01))
+    rate = clean + np.random.default_rng(seed).normal(0, noise, clean.size)
+    record = jq.Record(sweep.time, sweep.signal, rate, input_names="u", output_names="q")
+    frf = jq.frequency_response(record, omega, estimator=jq.spectra.LocalPolynomial(integrators=1))
+    start = jq.LaggedIntegrator(gain=70.0, lag=0.02, delay=0.02)
+    return jq.fit(start, frf, cost=jq.identify.MaximumLikelihood())
+
+
+@pytest.mark.parametrize("seed", [0, 3, 4])
+def test_what_a_blurred_parameter_is_determined_with_is_named_whatever_direction_blurs_it(seed):
+    fit = narrow(2.0, seed)
+    assert "delay" in fit.identifiability.undetermined
+    (combination,) = fit.combinations
+    assert combination.name == "lag + delay"
+    assert abs(combination.value - 0.045) < 4 * combination.standard_error  # half a sample of hold
+    alone = set(fit.identifiability.undetermined) == {"lag", "delay"}
+    assert ("only lag + delay" in str(fit)) == alone and "lag + delay is determined" in str(fit)
+
+
+@pytest.mark.parametrize(
+    ("noise", "seed", "count"), [(15.0, 1, 1), (15.0, 2, 0), (20.0, 0, 0), (20.0, 2, 0)]
+)
+def test_a_combination_whose_error_is_half_its_size_is_not_called_determined(noise, seed, count):
+    fit = narrow(noise, seed, 1.0, 8.0, duration=20.0, omega=np.geomspace(1.5, 8.0, 40))
+    assert not fit.identifiable and len(fit.combinations) == count
+    for found in fit.combinations:
+        assert found.standard_error <= 0.5 * abs(found.value)
+
+
+def test_what_ran_to_zero_is_at_its_bound_and_takes_nothing_else_with_it():
+    fit = narrow(4.0, 1)
+    ran = [remark for remark in fit.remarks if "ran to zero" in remark]
+    assert ran and not any("no minimum" in remark for remark in fit.remarks)
+    assert "gain" not in fit.identifiability.undetermined
+    assert [one.name for one in fit.combinations] == ["lag + delay"]

@@ -1,0 +1,73 @@
+"""Normal equations from the structure of a state space against its derivative."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxquad as jq
+from jaxquad._core._levenberg_marquardt import normal_equations
+from jaxquad.identify._parameters import select_parameters
+from jaxquad.identify._problem import make_problem, residuals
+from jaxquad.identify._solve import problem_normal
+
+
+OMEGA = jnp.asarray(np.geomspace(0.2, 30.0, 12))
+MODEL = jq.StateSpace(
+    F=[[-0.4, 1.1, -9.8], [0.3, -2.0, 0.0], [0.0, 1.0, 0.0]],
+    G=[[0.1, 0.7], [4.0, -1.0], [0.0, 0.0]],
+    H0=[[1.0, 0.0, 0.0], [0.2, 1.5, 0.0]],
+    H1=[[0.0, 0.3, 0.0], [1.0, 0.0, 0.0]],
+    M=[[1.2, 0.1, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]],
+    input_delay=[0.02, 0.05],
+    output_delay=[0.01, 0.03],
+)
+ENTRIES = [
+    "F[0][1]", "F[1][1]", "G[1][0]", "G[0][1]", "H0[1][0]", "H0[0][0]", "H1[0][1]", "H1[1][0]",
+    "M[0][0]", "M[0][1]", "input_delay[1]", "output_delay[0]",
+]  # fmt: skip
+
+
+def measured(seed):
+    rng = np.random.default_rng(seed)
+    true = np.asarray(MODEL.frequency_response(OMEGA))
+    noise = rng.standard_normal((2, *true.shape))
+    response = jnp.asarray(true * np.exp(0.1 * (noise[0] + 1j * noise[1])))
+    shape = response.shape
+    return jq.spectra.FrequencyResponse(
+        omega=OMEGA,
+        response=response,
+        coherence=jnp.full(shape, 0.9),
+        random_error=jnp.full(shape, 0.1),
+        errors=jq.spectra.independent_errors(OMEGA, 0.02 * jnp.abs(response) ** 2),
+        direct_coherence=jnp.full(shape, 0.9),
+        multiple_coherence=jnp.full(shape[:2], 0.9),
+        method="direct",
+        input_names=("a", "b"),
+        output_names=("x", "y"),
+    )
+
+
+def problem(**options):
+    frfs = [measured(0), measured(1)]
+    parameters = select_parameters(MODEL, ENTRIES, options.pop("tied", None))
+    weights = np.random.default_rng(2).random((2, *frfs[0].response.shape, 2))
+    return make_problem(MODEL, parameters, frfs, **options).weighted(list(jnp.asarray(weights)))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"priors": [jq.identify.Prior("G[1][0]", 3.5, 0.2)]},
+        {"tied": {"F[2][1]": lambda m: -m.F[1, 1] / 2}},
+    ],
+    ids=["every kind of entry", "a prior", "a tie"],
+)
+def test_normal_equations_are_those_of_the_differentiated_residuals(options):
+    made = problem(**options)
+    z = made.parameters.start[: len(ENTRIES)] + 0.01
+    found = jax.jit(problem_normal)(z, made)
+    wanted = jax.jit(normal_equations, static_argnums=0)(residuals, z, made)
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.max(np.abs(other)))

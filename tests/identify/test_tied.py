@@ -1,0 +1,85 @@
+"""Tied parameters, and bands of single response pairs."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import OMEGA, response_of
+
+import jaxquad as jq
+from jaxquad.models._transfer_function import imaginary
+
+
+class Pair(eqx.Module):
+    """Two lags that share a gain, of opposite signs: K u / (T s + 1) and -K u / (S s + 1)."""
+
+    gains: jnp.ndarray
+    lags: jnp.ndarray
+
+    def frequency_response(self, omega):
+        s = imaginary(omega)[:, None]
+        gains, lags = (leaf.astype(s.dtype)[None, :] for leaf in (self.gains, self.lags))
+        return (gains / (lags * s + 1))[:, :, None]
+
+
+TRUTH = Pair(jnp.array([3.0, -3.0]), jnp.array([0.2, 0.05]))
+START = Pair(jnp.array([2.0, 1.0]), jnp.array([0.1, 0.1]))
+TIED = {"gains[1]": lambda m: -m.gains[0]}
+FREE = ("gains[0]", "lags[0]", "lags[1]")
+ML = jq.identify.MaximumLikelihood()
+
+
+def test_a_tied_number_follows_the_free_one():
+    fit = jq.fit(START, response_of(TRUTH), free=FREE, tied=TIED, cost=ML)
+    np.testing.assert_allclose(fit.values, [3.0, 0.2, 0.05], rtol=1e-7)
+    assert fit.model.gains[1] == -fit.model.gains[0]
+
+
+def test_a_tie_sharpens_what_both_outputs_determine():
+    frf = response_of(TRUTH, seed=0)
+    tied = jq.fit(START, frf, free=FREE, tied=TIED, cost=ML)
+    apart = jq.fit(TRUTH, frf, free=("gains[0]", "gains[1]", "lags[0]", "lags[1]"), cost=ML)
+    assert tied.standard_errors[0] < 0.8 * apart.standard_errors[0]
+
+
+def test_a_derived_quantity_moves_with_what_is_tied():
+    fit = jq.fit(START, response_of(TRUTH, seed=0), free=FREE, tied=TIED, cost=ML)
+    apart = fit.derived(lambda m: m.gains[0] - m.gains[1])
+    assert apart.standard_error == pytest.approx(2 * fit.standard_errors[0], rel=1e-9)
+
+
+def test_without_free_all_but_the_tied_numbers_are_free():
+    fit = jq.fit(START, response_of(TRUTH), tied=TIED, cost=ML)
+    assert fit.names == FREE
+
+
+@pytest.mark.parametrize(
+    "tied, message",
+    [
+        ({"gain": lambda m: m.gains[0]}, "no parameter 'gain' to tie; the model has: gains"),
+        ({"gains[0]": lambda m: -m.gains[1]}, "cannot be free and tied at once"),
+        ({"gains[1]": lambda m: m.gains}, r"tied to something of shape \(2,\): give one number"),
+    ],
+)
+def test_an_impossible_tie_is_refused(tied, message):
+    with pytest.raises(ValueError, match=message):
+        jq.fit(START, response_of(TRUTH), free=FREE, tied=tied)
+
+
+def test_each_pair_has_a_band_of_its_own():
+    frf = response_of(TRUTH)
+    fit = jq.fit(START, frf, tied=TIED, cost=ML, band={("y1", "u0"): (2.0, 10.0)})
+    assert fit.points == OMEGA.size + np.sum((OMEGA >= 2) & (OMEGA <= 10))
+    np.testing.assert_allclose(fit.values, [3.0, 0.2, 0.05], rtol=1e-7)
+
+
+def test_a_pair_can_be_left_out():
+    frf = response_of(TRUTH)
+    fit = jq.fit(START, frf, free=FREE[:2], tied=TIED, cost=ML, band={("y1", "u0"): None})
+    assert fit.points == OMEGA.size
+    np.testing.assert_allclose(fit.values, [3.0, 0.2], rtol=1e-7)
+
+
+def test_a_band_of_an_unknown_pair_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match=r"no response pair \('q', 'u0'\).*\('y0', 'u0'\)"):
+        jq.fit(START, response_of(TRUTH), band={("q", "u0"): (1.0, 2.0)})

@@ -1,0 +1,181 @@
+import shlex
+from typing import Any
+
+import numpy as np
+import pytest
+from log_writers import DataFlash, structured, ULog
+
+from jaxquad.records import propose, read, ReadError, RecordError
+
+
+RATE_HZ = 400
+TIME = 20.0 + np.arange(12 * RATE_HZ) / RATE_HZ
+CHIRP = np.sin(2 * np.pi * (0.5 * (TIME - 22) + 0.5 * (TIME - 22) ** 2))
+IN_RUN = (TIME >= 22) & (TIME < 30)
+WAVE = np.sin(5 * TIME)
+
+
+def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),)):
+    """A log with chirps of 0.5 Hz up to so many, from and to so many seconds."""
+    log = DataFlash()
+    log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
+    log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
+    log.define(
+        "RATE", "Qfffffffff", "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut",
+        units="skk-kk-kk-", mults="F---------",
+    )  # fmt: skip
+    log.write("PARM", 0, b"SID_AXIS", float(place))
+    log.write("PARM", 0, b"ATC_RAT_PIT_I", float(gain))
+    for k, t in enumerate(np.round(TIME * 1e6).astype(int).tolist()):
+        run = next((run for run in runs if run[0] <= TIME[k] < run[1]), None)
+        if sidd and run:
+            if TIME[k - 1] < run[0]:
+                log.write("SIDS", t - 10, place, 0.2, 0.5, run[2])
+            log.write("SIDD", t, CHIRP[k], 1.0)
+        w = float(WAVE[k])
+        log.write("RATE", t + 30, w, 2 * w, 0.1 * w, w, 3 * w, 0.2 * w, w, w, w)
+    path = folder / "log.bin"
+    path.write_bytes(log.content)
+    return path
+
+
+@pytest.mark.parametrize("place", range(1, 13))
+def test_ardupilot_chirps_are_found_with_axis_time_band_and_summing_point(tmp_path, place):
+    proposal = propose(ardupilot(tmp_path, place))
+    axis = ("roll", "pitch", "yaw")[(place - 1) % 3]
+    letter = axis[0].upper()
+    setup = proposal.setup
+    assert (setup.axis, setup.rate, setup.reference) == (axis, f"RATE.{letter}", "SIDD.Targ")
+    # Only what is added behind the controller is missing from its logged output.
+    added = {"SIDD.Targ": 1.0} if place >= 10 else {}
+    assert setup.command == {f"RATE.{letter}Out": 1.0} | added
+    assert setup.band == (0.5, 8.0)
+    assert (setup.start, setup.stop) == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
+    record = read(proposal.path, **proposal.options)
+    if place >= 10:
+        w = WAVE[IN_RUN] * {"roll": 0.1, "pitch": 0.2, "yaw": 1.0}[axis]
+        middle = slice(100, -100)
+        given = np.interp(record.time, TIME[IN_RUN], w + CHIRP[IN_RUN])
+        np.testing.assert_allclose(record.inputs[middle, 0], given[middle], atol=2e-2)
+
+
+def test_the_printed_line_is_what_the_command_line_takes(tmp_path):
+    from jaxquad.cli._main import _parser
+
+    proposal = propose(ardupilot(tmp_path, 10))
+    line = str(proposal).splitlines()[-1].strip()
+    words = shlex.split(line)
+    assert words[:2] == ["jaxquad", "identify"]
+    options = _parser().parse_args(words[1:])
+    assert options.input == {"roll": {"RATE.ROut": 1.0, "SIDD.Targ": 1.0}}
+    assert options.reference == {"SIDD.Targ": {"SIDD.Targ": 1.0}}
+    assert (options.rate, options.band) == (400.0, [0.5, 8.0])
+
+
+def test_an_integral_term_that_works_against_the_sweep_is_told(tmp_path):
+    assert "ATC_RAT_PIT_I = 0.1" in str(propose(ardupilot(tmp_path, 11, gain="0.1")))
+    assert "ATC_RAT" not in str(propose(ardupilot(tmp_path, 11)))
+
+
+def test_all_chirps_into_one_place_are_segments_of_the_printed_line(tmp_path):
+    from jaxquad.cli._main import _parser
+
+    proposal = propose(ardupilot(tmp_path, 10, runs=((21, 24, 6.0), (25.5, 30, 8.0))))
+    assert "2 times: 0.5 .. 8 Hz, 2.997 + 4.497 s" in str(proposal)
+    assert np.allclose(proposal.segments, [(21, 24), (25.5, 30)], atol=0.01)
+    # One record is that of the longest.
+    assert proposal.options["start"] == pytest.approx(25.5)
+    line = str(proposal).splitlines()[-1].strip()
+    options = _parser().parse_args(shlex.split(line)[1:])
+    np.testing.assert_allclose(options.segment, proposal.segments)
+    assert options.start is None and options.stop is None
+
+
+def test_without_a_chirp_the_loops_set_point_is_no_reference(tmp_path):
+    proposal = propose(ardupilot(tmp_path, 0, sidd=False), axis="pitch")
+    assert proposal.options["references"] is None
+    assert "RATE.PDes is computed by the attitude loop" in str(proposal)
+    assert "outside reference: none" in str(proposal) and "--reference" not in str(proposal)
+
+
+def px4(folder, *, state: Any = 0, nav_state=15):
+    log = ULog()
+    log.define("vehicle_angular_velocity:uint64_t timestamp;float[3] xyz;")
+    log.define("vehicle_torque_setpoint:uint64_t timestamp;float[3] xyz;")
+    log.define("vehicle_rates_setpoint:uint64_t timestamp;float roll;float pitch;float yaw;")
+    log.define(
+        "autotune_attitude_control_status:uint64_t timestamp;float[3] rate_sp;uint8_t state;"
+    )
+    log.define("vehicle_status:uint64_t timestamp;uint8_t nav_state;")
+    names = ("vehicle_angular_velocity", "vehicle_torque_setpoint", "vehicle_rates_setpoint",
+             "autotune_attitude_control_status", "vehicle_status")  # fmt: skip
+    stamps = np.round(TIME * 1e6).astype("<u8")
+    xyz = np.stack([WAVE, 2 * WAVE, 0.1 * WAVE], axis=1).astype("<f4")
+    states = np.where(IN_RUN, state, 0)
+    clock = {"timestamp": ("<u8", stamps)}
+    tables = [
+        clock | {"xyz": ("(3,)<f4", xyz)},
+        clock | {"xyz": ("(3,)<f4", xyz)},
+        clock | {name: ("<f4", xyz[:, i]) for i, name in enumerate(("roll", "pitch", "yaw"))},
+        clock | {"rate_sp": ("(3,)<f4", xyz), "state": ("u1", states)},
+        clock | {"nav_state": ("u1", np.full(stamps.size, nav_state))},
+    ]
+    for number, (name, table) in enumerate(zip(names, tables, strict=True)):
+        log.subscribe(number, name)
+        log.write_rows(number, structured(table))
+    (folder / "log.ulg").write_bytes(log.content)
+    return folder / "log.ulg"
+
+
+@pytest.mark.parametrize(("state", "axis", "i"), [(2, "roll", 0), (4, "pitch", 1), (6, "yaw", 2)])
+def test_px4_autotune_is_found_with_its_axis_and_time(tmp_path, state, axis, i):
+    setup = propose(px4(tmp_path, state=state)).setup
+    assert setup.axis == axis and setup.command == {f"vehicle_torque_setpoint.xyz[{i}]": 1.0}
+    assert setup.rate == f"vehicle_angular_velocity.xyz[{i}]"
+    assert setup.reference == f"autotune_attitude_control_status.rate_sp[{i}]"
+    assert (setup.start, setup.stop) == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
+
+
+def test_two_runs_of_autotune_are_two_segments(tmp_path):
+    twice = np.where((TIME > 24) & (TIME < 26), 0, 4)
+    proposal = propose(px4(tmp_path, state=twice))
+    assert np.allclose(proposal.segments, [(22, 24), (26, 30)], atol=0.01)
+    assert "--segment" in proposal.command_line and "--start" not in proposal.command_line
+
+
+def test_px4s_rate_set_point_is_of_the_outside_in_acro_alone(tmp_path):
+    acro, stabilised = propose(px4(tmp_path, nav_state=10)), propose(px4(tmp_path))
+    assert acro.setup.axis == "pitch"  # which moves most
+    assert acro.setup.reference == "vehicle_rates_setpoint.pitch"
+    assert not stabilised.setup.reference
+    assert "vehicle_rates_setpoint.pitch is computed by the attitude loop" in str(stabilised)
+    assert acro.units["vehicle_angular_velocity.xyz[1]"] == "rad/s"
+
+
+def test_betaflight_and_crazyflie_logs_get_what_their_readme_says(data):
+    proposal = propose(data / "betaflight_ar8/LOG00037.BFL", axis="yaw")
+    assert proposal.setup.command == {"axisSum[2]": 1.0}
+    assert (proposal.setup.rate, proposal.setup.reference) == ("gyroADC[2]", "setpoint[2]")
+    proposal = propose(data / "crazyflie_rollpitch/log15", axis="roll")
+    motors = dict(
+        zip(("motor.m1", "motor.m2", "motor.m3", "motor.m4"), (-1, -1, 1, 1), strict=True)
+    )
+    assert proposal.setup.command == motors and proposal.options["references"] is None
+    proposal = propose(data / "crazypad_hover/E8_log00")
+    assert proposal.setup.rate.endswith("controller.r_roll") and not proposal.setup.reference
+
+
+def test_files_of_no_known_vehicle_and_axes_that_are_none_are_refused(tmp_path):
+    np.savez(tmp_path / "log.npz", t=TIME, u=WAVE)
+    with pytest.raises(RecordError, match="no log of a known autopilot"):
+        propose(tmp_path / "log.npz")
+    with pytest.raises(RecordError, match="axis 'heave': it is one of roll, pitch, yaw"):
+        propose(tmp_path / "log.npz", axis="heave")
+    with pytest.raises(ReadError, match="no such file"):
+        propose(tmp_path / "none.bin")
+    log = DataFlash()
+    log.define("ATT", "Qf", "TimeUS,Roll")
+    log.write_rows("ATT", np.arange(50) * 10_000, np.arange(50.0))
+    (tmp_path / "log.bin").write_bytes(log.content)
+    with pytest.raises(RecordError, match="log.bin: no RATE messages: set LOG_BITMASK"):
+        propose(tmp_path / "log.bin")

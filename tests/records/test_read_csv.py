@@ -1,0 +1,92 @@
+"""A table of text read by pyarrow is the table, or the complaint, of the reader without it."""
+
+import sys
+
+import numpy as np
+import pytest
+from hostile_files import damaged, sound_files
+
+from jaxquad.records import ReadError
+from jaxquad.records.formats import _csv, _csv as _csv_arrow
+
+
+pytest.importorskip("pyarrow")
+ODD = (
+    "1.5,nan,-inf,2e-7", "+1,.5,7.,0", " 3 ,\t4,5 , 6", "1e400,-1e400,1e-400,-0", "1,2,3", "1,,3,4",
+    "1_0,2,3,4", '"1",2,3,4', "0x1,2,3,4", "1,2,3,4,", "n,2,3,4", "Infinity,NaN,INF,nAn",
+    "# 1,2,3,4", "", "   ", "1 2,3,4,5", "1e,2,3,4", "--1,2,3,4", "1.2.3,2,3,4",
+    "infinit,1,2,3", "e5,1,2,3",
+    "0.1000000000000000055511151231257827,1.7976931348623157e308,4.9e-324,9007199254740993",
+)  # fmt: skip
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """As a long file is read: in several blocks, each by pyarrow where it can be."""
+    monkeypatch.setattr(_csv_arrow, "_WORTHWHILE", 0)
+    monkeypatch.setattr(_csv, "_BLOCK", 200)
+
+
+def outcome(path):
+    """Names and bits of the columns, or what was said."""
+    try:
+        columns = _csv.load(path).tables[""].columns
+    except ReadError as error:
+        return str(error), error.offset
+    return {name: values.tobytes() for name, values in columns.items()}
+
+
+def agree(path, monkeypatch):
+    fast = outcome(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(_csv, "parsed_fast", lambda *_: 0)
+        return fast == outcome(path)
+
+
+@pytest.mark.parametrize("row", ODD)
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_odd_rows_are_what_they_are_without_it(tmp_path, monkeypatch, small_blocks, row, separator):
+    plain = [",".join(map(str, each)) for each in np.arange(200).reshape(-1, 4) / 8]
+    text = "\n".join(["t,a,b,c", *plain[:30], row, *plain[30:]])
+    path = tmp_path / "odd.csv"
+    path.write_text(text.replace(",", separator))
+    assert agree(path, monkeypatch)
+
+
+def test_every_double_comes_back_bit_by_bit(tmp_path, monkeypatch):
+    bits = np.random.default_rng(0).integers(0, 2**64, (20_000, 3), dtype=np.uint64)
+    numbers = bits.view(np.float64)
+    numbers[~np.isfinite(numbers)] = 1 / 3
+    rows = [",".join(map(repr, row)) for row in numbers.tolist()]
+    path = tmp_path / "doubles.csv"
+    path.write_text("\n".join(["a,b,c", *rows]))
+    monkeypatch.setattr(_csv, "parsed", lambda *_: pytest.fail("pyarrow did not take it"))
+    columns = _csv.load(path).tables[""].columns
+    np.testing.assert_array_equal(np.stack(list(columns.values()), axis=1), numbers)
+
+
+def test_damaged_tables_are_what_they_are_without_it(tmp_path, monkeypatch, small_blocks):
+    _, content = sound_files(["csv"])["csv"]
+    path = tmp_path / "damaged.csv"
+    for number in range(300):
+        path.write_bytes(damaged(content, np.random.default_rng([7, number])))
+        assert agree(path, monkeypatch), number
+
+
+def test_without_pyarrow_numpy_reads_the_same(tmp_path, monkeypatch, small_blocks):
+    path = tmp_path / "log.csv"
+    path.write_text("a,b\n" + "\n".join(f"{k},{k / 3!r}" for k in range(500)))
+    fast = outcome(path)
+    _csv_arrow._csv.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pyarrow", None)
+        assert outcome(path) == fast
+    _csv_arrow._csv.cache_clear()
+
+
+def test_a_header_of_many_names_above_blank_lines_takes_no_memory(tmp_path):
+    path = tmp_path / "wide.csv"
+    names = ",".join(f"c{k}" for k in range(100_000))
+    path.write_text(names + "\n" * 1_000_000)
+    with pytest.raises(ReadError, match="only a header"):
+        _csv.load(path)

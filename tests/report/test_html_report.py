@@ -1,0 +1,210 @@
+"""One page that tells all of a fit, and that nothing in a log can turn into something else."""
+
+import dataclasses
+import hashlib
+import re
+from datetime import datetime, UTC
+from importlib.metadata import version
+
+import equinox as eqx
+import numpy as np
+import pytest
+from html_pages import ERROR, HOSTILE, is_image, read_page, record_of, TRUTH, tuned_by_hand, UNSEEN
+from synthetic import response_of
+
+import jaxquad as jq
+from jaxquad.report import provenance, write_report
+from jaxquad.report._html_verdict import certified, checked, remarks_of, verdict_of
+
+
+@pytest.fixture(scope="module")
+def frf():
+    return response_of(TRUTH, error=ERROR, seed=0)
+
+
+@pytest.fixture(scope="module")
+def fit(frf):
+    return jq.fit(TRUTH, frf, cost=jq.identify.MaximumLikelihood())
+
+
+@pytest.fixture(scope="module")
+def record():
+    return record_of(("M", "q", "r"), ("V", "rad/s", ""))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "flight & <sweep>.csv"
+    path.write_bytes(bytes(range(256)) * 9)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, frf, fit, record, log):
+    """A page with everything in it."""
+    path = tmp_path_factory.mktemp("page") / "new" / "report.html"
+    assert path == write_report(
+        path,
+        fit=fit,
+        frf=frf,
+        others={"direct estimate": frf},
+        record=record,
+        checks={"other.csv": jq.verify(TRUTH, record)},
+        derived=[fit.derived(lambda m: m.lag + m.delay, "lag + delay")],
+        tuned=tuned_by_hand(),
+        provenance=provenance(log, command="jaxquad identify 'a & b.csv' --input M"),
+        formula="q / M = K e^(-delay s) / (s (lag s + 1))",
+    )
+    return path
+
+
+def test_the_page_is_well_formed_and_holds_every_section(whole):
+    page = read_page(whole)
+    assert page.errors == [] and page.of("html") == [{"lang": "en"}]
+    names = [attributes["id"] for attributes in page.of("section")]
+    assert names == [
+        "record", "response", "residuals", "parameters", "identifiability", "verification",
+        "tuned", "provenance",
+    ]  # fmt: skip
+    links = [attributes["href"] for attributes in page.of("a")]
+    assert links == [f"#{name}" for name in names]
+    assert len(page.of("h1")) == 1
+
+
+def test_the_verdict_is_the_first_that_is_read(whole, fit):
+    page = read_page(whole)
+    assert page.text().split()[:3] == ["\u2713", "IDENTIFIED", "y0"]
+    assert page.text("title").startswith("IDENTIFIED: y0 / u0")
+    first = page.text("header")
+    assert f"gain = {fit.values[0]:.4g}" in first and "VERIFIED other.csv" in first
+    assert "CERTIFICATE FAILS on 12 fresh members: Ms, worst, at most 1.5" in first
+
+
+def test_nothing_is_fetched_and_no_script_runs(whole):
+    page = read_page(whole)
+    assert whole.stat().st_size < 1_500_000
+    assert "script" not in {name for name, _ in page.elements}
+    for name, attributes in page.elements:
+        assert not any(key.startswith("on") for key in attributes), name
+        assert all(key not in attributes for key in ("srcset", "data", "action")), name
+    assert all(a["src"].startswith("data:image/") for a in page.of("img"))
+    assert all(a["href"].startswith("#") for a in page.of("a")) and not page.of("link")
+    assert not re.search(r"url\(|@import|https?:", whole.read_text())
+    [policy] = [a["content"] for a in page.of("meta") if "http-equiv" in a]
+    assert policy.startswith("default-src 'none'; img-src data:;")
+
+
+def test_figures_are_images_with_a_text_for_those_who_cannot_see_them(whole):
+    page = read_page(whole)
+    assert len(page.of("img")) == 6
+    assert all(is_image(*each) for each in page.figures())
+    assert all(len(attributes["alt"]) > 30 for attributes in page.of("img"))
+    assert "reference r, input M, output q" in page.of("img")[0]["alt"]
+
+
+def test_numbers_are_those_of_the_fit(whole, fit):
+    text = read_page(whole).text("section")
+    for k, name in enumerate(fit.names):
+        low, high = fit.interval(name)
+        assert (
+            f"{name}{fit.values[k]:.5g}{fit.standard_errors[k]:.2g}{low:.5g} .. {high:.5g}" in text
+        )
+        assert f"{fit.cramer_rao[k]:.2f}{fit.insensitivity[k]:.2f}" in text
+    assert f"lag{fit.correlation[1, 0]:.2f}1{fit.correlation[1, 2]:.2f}" in text
+
+
+def test_tuned_gains_stand_beside_their_certificate(whole):
+    text = read_page(whole).text("section")
+    assert "ladrc.wc5.25" in text and "a remark of the tuner" in text
+    assert "unstable, %found016.7" in text and "unstable, % (95 % confidence)at most" in text
+    assert "ITAE, deg s^2mean840" in text and "Ms, worst, at most 1.5: 2, missed by 0.5" in text
+
+
+def test_the_source_can_be_checked_and_made_again(whole, log):
+    text = read_page(whole).text("section")
+    assert f"{log.name}, 2304 bytes, SHA-256 {hashlib.sha256(log.read_bytes()).hexdigest()}" in text
+    assert "jaxquad identify 'a & b.csv' --input M" in text
+    assert f"jaxquad {version('jaxquad')}, jax {version('jax')}" in text
+    assert f"numpy {np.__version__}" in text
+
+
+def test_equal_results_give_equal_bytes(tmp_path, frf, log):
+    origin = provenance(log, date=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC))
+    assert origin.date == "2026-01-02T03:04:05+00:00"
+    error = jq.identify.NotIdentifiable("no")
+    pages = [write_report(tmp_path / name, fit=error, frf=frf, provenance=origin) for name in "ab"]
+    assert pages[0].read_bytes() == pages[1].read_bytes()
+
+
+def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
+    """Every name, unit, remark, file name and command is hostile, each in another way."""
+    u, y, r, unit, source, words = HOSTILE
+    record = record_of((u, y, r), (unit, source, words), source=source)
+    named = dataclasses.replace(frf, input_names=(u,), output_names=(y,), remarks=(words,))
+    outside = dataclasses.replace(fit, remarks=HOSTILE, names=(r, u, "delay"))
+    path = write_report(
+        tmp_path / "report.html", fit=outside, frf={unit: named}, others={source: named},
+        record=record, checks={words: jq.verify(TRUTH, record)}, title=r, formula=u,
+        derived=[jq.identify.Combination(unit, 1.0, 0.1)],
+        provenance=provenance(command=y, settings={words: source}),
+    )  # fmt: skip
+    page, known = read_page(path), read_page(whole)
+    assert page.errors == []
+    assert {name for name, _ in page.elements} <= {name for name, _ in known.elements}
+    assert len(page.of("img")) == 4 and all(is_image(*each) for each in page.figures())
+    assert not re.search(UNSEEN, path.read_bytes().decode())
+    shown = page.text("section")
+    assert all(name in shown for name in (u, y, unit))
+    assert "\ufffdcod.exe\u200f \u05d0\u05d1 \ufffdx" in page.text("h1")
+
+
+def test_not_identifiable_comes_first_and_shows_no_number(tmp_path, frf):
+    """One record tells L K_t / J_x of an attitude axis, and neither of the two."""
+    axis = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.02, delay=0.0)
+    response = response_of(axis, error=0.02, seed=1)
+    fit = jq.fit(axis, response, free=("J_x", "K_t", "lag"), cost=jq.identify.MaximumLikelihood())
+    page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=response))
+    assert page.text().split()[:3] == ["\u2717", "NOT", "IDENTIFIABLE"]
+    assert "each by itself: J_x, K_t; determined: L K_t / J_x = " in page.text("header")
+    tables, text = page.text("table"), page.text("section")
+    assert tables.count("not determined") == 2 and "nan" not in text
+    assert "Null directions" in text and "direction 1" in text and "jq.identify.Prior" in text
+
+
+def test_what_could_not_be_fitted_has_a_page_too(tmp_path, frf, record):
+    error = jq.identify.NotIdentifiable("no usable frequency: coherence is below 0.6")
+    weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence * 0.1)
+    blind = eqx.tree_at(
+        lambda f: (f.response, f.random_error),
+        weak,
+        (weak.response.at[3:].set(np.nan), weak.random_error.at[3:].set(np.inf)),
+    )
+    page = read_page(write_report(tmp_path / "r.html", fit=error, frf=blind, record=record))
+    assert page.errors == [] and all(is_image(*each) for each in page.figures())
+    assert page.text("header").startswith("\u2717 NOT IDENTIFIABLE y0 / u0no usable frequency")
+    assert "parameters" not in [attributes["id"] for attributes in page.of("section")]
+
+
+def test_a_misfit_and_a_failed_verification_are_in_the_verdict(frf, fit, record):
+    off = dataclasses.replace(fit, chi_squared=16.0, remarks=("the misfit is 4.0 times",))
+    check = jq.verify(jq.LaggedIntegrator(-280.0, 0.016, 0.011), record)
+    remarks = remarks_of(off, {"a": frf}, {"b": check})
+    assert remarks == ["the misfit is 4.0 times"]
+    found = verdict_of(off, 1)
+    assert found.level == "warn" and "BUT IT MISFITS by 4.0 times the random error" in found.word
+    assert checked("b", check)[:2] == ("bad", "VERIFICATION FAILS")
+    none = verdict_of(dataclasses.replace(fit, newton_decrement=fit.cost), 0)
+    assert none[:2] == ("bad", "NO RESULT")
+    assert verdict_of(fit, 2).word == "IDENTIFIED, with 2 remarks"
+    assert certified(dataclasses.replace(tuned_by_hand(), certificate=None)).word == "NOT CERTIFIED"
+
+
+def test_several_responses_have_a_part_each(tmp_path, frf, fit):
+    both = {"empty": frf, "loaded": frf}
+    models = {"loaded": jq.LaggedIntegrator(140.0, 0.016, 0.011)}
+    page = read_page(write_report(tmp_path / "r.html", fit=fit, frf=both, models=models))
+    assert len(page.of("img")) == 4
+    with pytest.raises(ValueError, match=r"models of no response: \['x'\]; .*'empty', 'loaded'"):
+        write_report(tmp_path / "r.html", fit=fit, frf=both, models={"x": TRUTH})
+    with pytest.raises(ValueError, match="frf is empty"):
+        write_report(tmp_path / "r.html", fit=fit, frf={})

@@ -1,0 +1,137 @@
+import numpy as np
+import pytest
+
+from jaxquad.spectra._blocks import lattice_windows
+from jaxquad.spectra._transform import transform_windows
+from jaxquad.spectra._window import segment_starts, window
+
+
+# Lengths of whole blocks and odd ones, short and very short; starts on and off blocks.
+WINDOWS = ((640, (0, 17, 320, 960)), (601, (0, 999)), (127, (0, 1473)), (9, (0, 1591)))
+SAMPLES = 1600
+# Out of order, negative, zero, next to zero and Nyquist's.
+ANGLE = np.concatenate([np.geomspace(3.0, 1e-3, 21), [0.0, -0.3, 1e-9, np.pi]])
+RECORD = np.random.default_rng(0).standard_normal((SAMPLES, 3))
+
+
+def direct_sums(x, angle, length, starts, shape="hann", detrend="constant", origin=0.0):
+    n = np.arange(length)
+    trends = {"none": [], "constant": [n**0], "linear": [n**0, n / length]}[detrend]
+    sums = []
+    for start in starts:
+        segment = x[start : start + length]
+        if trends:
+            fit = np.linalg.lstsq(np.stack(trends, 1), segment, rcond=None)[0]
+            segment = segment - np.stack(trends, 1) @ fit
+        waves = np.exp(-1j * np.multiply.outer(angle, origin + start + n))
+        sums.append(waves @ (window(shape, length)[:, None] * segment))
+    return np.stack(sums)
+
+
+def assert_sums(found, expected, relative):
+    assert found.shape == expected.shape
+    assert np.max(np.abs(found - expected)) <= relative * np.max(np.abs(expected))
+
+
+@pytest.mark.parametrize("detrend", ["none", "constant", "linear"])
+@pytest.mark.parametrize("shape", ["hann", "hamming", "rectangular"])
+def test_sums_equal_those_term_by_term(shape, detrend):
+    found = transform_windows(RECORD, ANGLE, WINDOWS, shape=shape, detrend=detrend, origin=12.5)
+    for (length, starts), sums in zip(WINDOWS, found, strict=True):
+        expected = direct_sums(RECORD, ANGLE, length, starts, shape, detrend, 12.5)
+        # The tolerance of the compression, 2e-13, with room for rounding.
+        assert_sums(np.asarray(sums), expected, 1e-12)
+
+
+def test_one_channel_at_one_frequency_far_from_the_origin():
+    found = transform_windows(RECORD[:, :1], np.array([0.02]), ((500, (3, 77)),), origin=1e5)
+    expected = direct_sums(RECORD[:, :1], np.array([0.02]), 500, (3, 77), origin=1e5)
+    # A phase of 2000 rad is known to 2e-13.
+    assert_sums(np.asarray(found[0]), expected, 2e-12)
+
+
+@pytest.mark.parametrize("length", [2, 8, 50, 100])
+def test_very_short_records_are_summed(length):
+    starts = segment_starts(100, length, 0.5)
+    found = transform_windows(RECORD[:100], ANGLE, ((length, starts),), detrend="none")
+    expected = direct_sums(RECORD[:100], ANGLE, length, starts, detrend="none")
+    assert_sums(np.asarray(found[0]), expected, 1e-12)
+
+
+@pytest.mark.parametrize("detrend", ["constant", "linear"])
+def test_a_large_offset_does_not_drown_the_signal(detrend):
+    found = transform_windows(RECORD + 1e6, ANGLE, WINDOWS, detrend=detrend)
+    for (length, starts), sums in zip(WINDOWS, found, strict=True):
+        expected = direct_sums(RECORD, ANGLE, length, starts, "hann", detrend)
+        # The sum 1e6 + x itself is rounded by 1e-10.
+        assert_sums(np.asarray(sums), expected, 1e-9)
+
+
+def test_a_linear_trend_leaves_nothing():
+    ramp = np.linspace(-5, 20, SAMPLES)[:, None] * np.ones(3)
+    found = transform_windows(ramp, ANGLE, WINDOWS, detrend="linear")
+    for (length, _), sums in zip(WINDOWS, found, strict=True):
+        assert np.max(np.abs(sums)) <= 1e-12 * 20 * length
+
+
+def test_a_second_record_of_the_same_layout_reuses_the_tables():
+    found = [transform_windows(gain * RECORD, ANGLE, WINDOWS)[1] for gain in (1.0, -2.0)]
+    assert_sums(np.asarray(found[1]), -2 * np.asarray(found[0]), 1e-15)
+
+
+@pytest.mark.parametrize("samples", [60_000, 60_123, 30_001])
+@pytest.mark.parametrize("overlap", [0.0, 0.5, 0.8])
+def test_lattice_windows_reach_both_ends_and_keep_their_overlap(samples, overlap):
+    lengths = (15_000, 9_999, 2500, 100)
+    windows = lattice_windows(samples, lengths, overlap, np.geomspace(6e-4, 0.2, 9))
+    for asked, (length, starts) in zip(lengths, windows, strict=True):
+        assert starts[0] == 0 and starts[-1] + length == samples
+        assert length == pytest.approx(asked, rel=0.1)
+        # A start moves by half a block, of at most an eighth of a window and a half, at each end.
+        assert np.max(np.diff(starts)) <= length * (1 - overlap + 3 / 16) + 1
+        assert np.all(np.diff(starts) > 0)
+
+
+@pytest.mark.parametrize("dt", [1 / 500, 1 / 400, 1 / 307])
+def test_lattice_windows_share_their_blocks(dt):
+    omega = np.geomspace(0.3, 100, 9)
+    lengths = [round(seconds / dt) for seconds in (30, 20, 12, 8, 5)]
+    windows = lattice_windows(round(121.3 / dt), lengths, 0.5, omega * dt)
+    lengths = [length for length, _ in windows]
+    # All but the first window of each length, which starts at the first sample.
+    shifts = [start - starts[-1] for _, starts in windows for start in starts[1:]]
+    assert np.gcd.reduce(lengths + shifts) >= 64
+
+
+def test_sums_on_a_lattice_equal_those_term_by_term():
+    x = RECORD[:1573]
+    windows = lattice_windows(1573, (1000, 700), 0.5, np.array([0.2]))
+    found = transform_windows(x, np.array([0.01, 0.2]), windows)
+    for (length, starts), sums in zip(windows, found, strict=True):
+        expected = direct_sums(x, np.array([0.01, 0.2]), length, starts)
+        assert_sums(np.asarray(sums), expected, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("angle", "windows", "options", "words"),
+    [
+        ([0.1], ((100, (0, 31)),), {}, "starts must lie between 0 and 30"),
+        ([0.1], ((100, ()),), {}, "do not fit"),
+        ([0.1], ((1, (0,)),), {}, "hold 2 samples"),
+        ([0.1], (), {}, "no windows"),
+        ([3.2], ((100, (0,)),), {}, "3.2 rad per sample"),
+        ([np.nan], ((100, (0,)),), {}, "nan rad per sample"),
+        ([], ((100, (0,)),), {}, "at least one frequency"),
+        ([0.1], ((100, (0,)),), {"detrend": "cubic"}, "'cubic'"),
+        ([0.1], ((100, (0,)),), {"shape": "flat"}, "no window 'flat'"),
+    ],
+)
+def test_unusable_input_is_named(angle, windows, options, words):
+    with pytest.raises(ValueError, match=words):
+        transform_windows(RECORD[:130], np.array(angle), windows, **options)
+
+
+@pytest.mark.parametrize(("length", "overlap", "words"), [(200, 0.5, "200"), (50, 1.0, "1.0")])
+def test_unusable_lattices_are_named(length, overlap, words):
+    with pytest.raises(ValueError, match=words):
+        lattice_windows(130, (length,), overlap, np.array([0.1]))

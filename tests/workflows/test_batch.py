@@ -1,0 +1,116 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import jaxquad as jq
+from jaxquad._xla._common_subexpressions import once
+from jaxquad.identify._fit_batch import solve_batch
+from jaxquad.identify._parameters import select_parameters
+from jaxquad.identify._problem import Problem, residuals, unchanged
+
+
+OMEGA = jnp.asarray(np.geomspace(0.6, 40.0, 30))
+START = jq.TransferFunction([8.0], [1.0, 4.0, 9.0], 0.02)
+FREE = ("numerator[0]", "denominator[1]", "denominator[2]", "delay")
+MEMBERS = 70  # more than one chunk, and not a multiple of it
+
+
+def measured(seed=0, noise=0.02):
+    """Responses of models that differ by 30 %, with noise."""
+    rng = np.random.default_rng(seed)
+    factors = np.exp(rng.uniform(-0.3, 0.3, (MEMBERS, 4)))
+    s = 1j * np.asarray(OMEGA)
+    truth = factors * [8.0, 4.0, 9.0, 0.02]
+    exact = np.array([b * np.exp(-d * s) / (s**2 + a1 * s + a0) for b, a1, a0, d in truth])
+    white = rng.standard_normal((*exact.shape, 2)) @ np.array([1.0, 1.0j])
+    return truth, jnp.asarray(exact * (1 + noise * white))[..., None, None]
+
+
+WEIGHTS = jnp.full((MEMBERS, OMEGA.size, 1, 1, 2), 50.0)
+
+
+def solved(responses, weights=WEIGHTS, **options):
+    parameters = select_parameters(START, FREE)
+    return solve_batch(START, parameters, OMEGA, responses, weights, **options)
+
+
+def one_by_one(response, weights):
+    """Optimistix' own Levenberg-Marquardt on one member."""
+    problem = Problem(
+        model=START,
+        parameters=select_parameters(START, FREE),
+        conditions=(unchanged,),
+        quantities=(),
+        omega=(OMEGA,),
+        measured=(response,),
+        weights=(weights,),
+        known=jnp.zeros((0, 2)),
+    )
+    solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+    z0 = problem.parameters.start[:4]
+    found = optx.least_squares(residuals, solver, z0, args=problem, max_steps=256)
+    return np.asarray(found.value), np.sum(np.asarray(residuals(found.value, problem)) ** 2)
+
+
+def test_every_member_is_at_the_minimum_that_optimistix_finds():
+    _, responses = measured()
+    found = solved(responses)
+    assert np.all(found.converged) and np.all(found.decrement < 1e-12 * found.cost)
+    for k in (0, 63, 69):
+        z, cost = one_by_one(responses[k], WEIGHTS[k])
+        np.testing.assert_allclose(found.z[k], z, atol=1e-8)
+        assert found.cost[k] == pytest.approx(cost, rel=1e-12)
+
+
+def test_without_noise_the_truth_comes_back():
+    truth, responses = measured(noise=0.0)
+    np.testing.assert_allclose(solved(responses).values, truth, rtol=1e-9)
+
+
+def test_points_of_no_weight_may_hold_anything():
+    _, responses = measured()
+    weights = WEIGHTS.at[:, 20:].set(0.0)
+    spoilt = responses.at[:, 20:].set(jnp.nan)
+    clean, dirty = solved(responses, weights), solved(spoilt, weights)
+    np.testing.assert_array_equal(dirty.z, clean.z)
+
+
+def test_a_member_that_is_no_minimum_says_so():
+    _, responses = measured()
+    short = solved(responses, max_steps=1)
+    assert not np.any(short.converged) and np.all(short.decrement > 1e-6 * short.cost)
+    spoilt = solved(responses.at[3, 5].set(jnp.nan))
+    assert not spoilt.converged[3] and np.sum(spoilt.converged) == MEMBERS - 1
+
+
+class Detrended(eqx.Module):
+    """A response that depends on which frequencies are asked for."""
+
+    gain: jax.Array
+
+    def frequency_response(self, omega):
+        return (self.gain * (omega - jnp.mean(omega))).astype(complex)[:, None, None]
+
+
+def test_input_that_means_nothing_is_refused():
+    _, responses = measured()
+    with pytest.raises(ValueError, match="weights with a last axis of two"):
+        solved(responses, WEIGHTS[:3])
+    model = Detrended(jnp.asarray(2.0))
+    with pytest.raises(ValueError, match="depends on the other frequencies"):
+        parameters = select_parameters(model, None)
+        solve_batch(model, parameters, OMEGA, responses, WEIGHTS)
+
+
+def test_expensive_functions_evaluated_once_are_the_same_functions():
+    x = jnp.asarray(np.random.default_rng(0).uniform(0.5, 2.0, (64, 32)))
+    y = jax.lax.complex(x, 3 - x)
+
+    def function(x, y):
+        return jnp.exp(-y) / y, jnp.arctan2(x, 1 + x) + jnp.sqrt(x), y**-2, jnp.abs(y), x[:3] / 3
+
+    for got, expected in zip(jax.jit(once(function))(x, y), function(x, y), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-14)
