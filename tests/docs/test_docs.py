@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pytest
 from conftest import ROOT
-from test_propose import ardupilot, px4
+from flight_logs import ardupilot, px4
 from test_notebooks import words
 
 
@@ -44,6 +44,7 @@ def blocks(page):
 CASES = [(page, place) for page in RUN for place in dict.fromkeys(b.place for b in blocks(page))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "place"), CASES)
 def test_the_blocks_of_a_page_run_and_print_what_it_shows(page, place, tmp_path, request):
     mine = [block for block in blocks(page) if block.place == place]

@@ -44,6 +44,7 @@ def test_every_name_has_a_sentence_and_a_source():
         assert (ROOT / "docs" / path).is_file(), name
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("pdoc") is None, reason="pdoc makes the HTML: [docs]")
 def test_it_becomes_html_without_warnings(tmp_path):
     done = subprocess.run(

@@ -8,6 +8,9 @@ import pytest
 from conftest import ROOT
 
 
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
 @pytest.fixture(scope="module")
 def script():
     spec = importlib.util.spec_from_file_location("hover_roll", ROOT / "fits" / "hover_roll.py")

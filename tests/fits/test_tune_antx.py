@@ -13,6 +13,9 @@ import pytest
 from conftest import ROOT
 
 
+pytestmark = pytest.mark.slow
+
+
 SCRIPT = ROOT / "fits" / "tune_antx.py"
 
 

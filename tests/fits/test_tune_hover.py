@@ -15,6 +15,9 @@ import tuning_case
 from conftest import ROOT
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def script():
     sys.path.insert(0, str(ROOT / "fits"))

@@ -1,42 +1,11 @@
 import shlex
-from typing import Any
 
 import numpy as np
 import pytest
-from log_writers import DataFlash, structured, ULog
+from flight_logs import ardupilot, CHIRP, IN_RUN, px4, TIME, WAVE
+from log_writers import DataFlash
 
 from jaxquad.records import propose, read, ReadError, RecordError
-
-
-RATE_HZ = 400
-TIME = 20.0 + np.arange(12 * RATE_HZ) / RATE_HZ
-CHIRP = np.sin(2 * np.pi * (0.5 * (TIME - 22) + 0.5 * (TIME - 22) ** 2))
-IN_RUN = (TIME >= 22) & (TIME < 30)
-WAVE = np.sin(5 * TIME)
-
-
-def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),)):
-    """A log with chirps of 0.5 Hz up to so many, from and to so many seconds."""
-    log = DataFlash()
-    log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
-    log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
-    log.define(
-        "RATE", "Qfffffffff", "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut",
-        units="skk-kk-kk-", mults="F---------",
-    )  # fmt: skip
-    log.write("PARM", 0, b"SID_AXIS", float(place))
-    log.write("PARM", 0, b"ATC_RAT_PIT_I", float(gain))
-    for k, t in enumerate(np.round(TIME * 1e6).astype(int).tolist()):
-        run = next((run for run in runs if run[0] <= TIME[k] < run[1]), None)
-        if sidd and run:
-            if TIME[k - 1] < run[0]:
-                log.write("SIDS", t - 10, place, 0.2, 0.5, run[2])
-            log.write("SIDD", t, CHIRP[k], 1.0)
-        w = float(WAVE[k])
-        log.write("RATE", t + 30, w, 2 * w, 0.1 * w, w, 3 * w, 0.2 * w, w, w, w)
-    path = folder / "log.bin"
-    path.write_bytes(log.content)
-    return path
 
 
 @pytest.mark.parametrize("place", range(1, 13))
@@ -96,35 +65,6 @@ def test_without_a_chirp_the_loops_set_point_is_no_reference(tmp_path):
     assert proposal.options["references"] is None
     assert "RATE.PDes is computed by the attitude loop" in str(proposal)
     assert "outside reference: none" in str(proposal) and "--reference" not in str(proposal)
-
-
-def px4(folder, *, state: Any = 0, nav_state=15):
-    log = ULog()
-    log.define("vehicle_angular_velocity:uint64_t timestamp;float[3] xyz;")
-    log.define("vehicle_torque_setpoint:uint64_t timestamp;float[3] xyz;")
-    log.define("vehicle_rates_setpoint:uint64_t timestamp;float roll;float pitch;float yaw;")
-    log.define(
-        "autotune_attitude_control_status:uint64_t timestamp;float[3] rate_sp;uint8_t state;"
-    )
-    log.define("vehicle_status:uint64_t timestamp;uint8_t nav_state;")
-    names = ("vehicle_angular_velocity", "vehicle_torque_setpoint", "vehicle_rates_setpoint",
-             "autotune_attitude_control_status", "vehicle_status")  # fmt: skip
-    stamps = np.round(TIME * 1e6).astype("<u8")
-    xyz = np.stack([WAVE, 2 * WAVE, 0.1 * WAVE], axis=1).astype("<f4")
-    states = np.where(IN_RUN, state, 0)
-    clock = {"timestamp": ("<u8", stamps)}
-    tables = [
-        clock | {"xyz": ("(3,)<f4", xyz)},
-        clock | {"xyz": ("(3,)<f4", xyz)},
-        clock | {name: ("<f4", xyz[:, i]) for i, name in enumerate(("roll", "pitch", "yaw"))},
-        clock | {"rate_sp": ("(3,)<f4", xyz), "state": ("u1", states)},
-        clock | {"nav_state": ("u1", np.full(stamps.size, nav_state))},
-    ]
-    for number, (name, table) in enumerate(zip(names, tables, strict=True)):
-        log.subscribe(number, name)
-        log.write_rows(number, structured(table))
-    (folder / "log.ulg").write_bytes(log.content)
-    return folder / "log.ulg"
 
 
 @pytest.mark.parametrize(("state", "axis", "i"), [(2, "roll", 0), (4, "pitch", 1), (6, "yaw", 2)])
