@@ -31,8 +31,12 @@ from ._levenberg_marquardt import (
     STALLED as STALLED,
     TOLERANCE as TOLERANCE,
 )
-from ._per_axis import (
+from ._members import (
     ensemble_shape as ensemble_shape,
+    mark_members as mark_members,
+    per_member as per_member,
+)
+from ._per_axis import (
     fit as fit,
     full_shape as full_shape,
     matched as matched,

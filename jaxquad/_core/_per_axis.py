@@ -1,6 +1,6 @@
 """Gains given once, per axis `[axes]`, or per axis and member `[axes, *ensemble]`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._arrays import align, is_concrete
+from ._members import ensemble_shape
 
 
 def fit(gain: Float[Array, "..."], signal: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -37,19 +38,10 @@ def times(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]
     return a * b
 
 
-def ensemble_shape(gains: Mapping[str, Array]) -> tuple[int, ...]:
-    """The members that all gains together ask for, () for a single controller."""
-    return _common([gain.shape[1:] for gain in gains.values()])
-
-
 def full_shape(like: Float[Array, " axes ..."], ensemble: tuple[int, ...]) -> tuple[int, ...]:
     """Of a signal as wide as `like` and as the `ensemble` of the gains."""
-    return like.shape[:1] + _common([like.shape[1:], ensemble])
-
-
-def _common(shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    rank = max(map(len, shapes))
-    return np.broadcast_shapes(*(shape + (1,) * (rank - len(shape)) for shape in shapes))
+    gains = jax.ShapeDtypeStruct((1, *ensemble), like.dtype)
+    return like.shape[:1] + ensemble_shape(like, gains, rank=1)
 
 
 def pick(
@@ -85,7 +77,7 @@ def require_shapes(gains: Mapping[str, Array]) -> None:
     if len({shape[0] for shape in shapes.values()}) > 1:
         raise ValueError(f"The gains are for different numbers of axes, {text}: {remedy}.")
     try:
-        ensemble_shape(gains)
+        ensemble_shape(gains, rank=1)
     except ValueError:
         raise ValueError(f"The gains are for different ensembles, {text}: {remedy}.") from None
 

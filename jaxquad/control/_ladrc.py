@@ -237,7 +237,7 @@ class LADRC(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of the gains, () for one controller."""
-        return ensemble_shape(_gains(self))
+        return ensemble_shape(_gains(self), rank=1)
 
     def prepared(self) -> LADRCLaw:
         """The same law with its gains computed: what to run in a loop, once outside of it."""

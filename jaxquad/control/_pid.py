@@ -227,7 +227,7 @@ class PID(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of the gains, () for one controller."""
-        return ensemble_shape(_gains(self))
+        return ensemble_shape(_gains(self), rank=1)
 
     def prepared(self) -> PIDLaw:
         """The same law with its filter of the measurement computed: what to run in a loop."""

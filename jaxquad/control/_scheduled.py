@@ -101,7 +101,7 @@ def gain_at(map: InertiaToGain, inertia: Float[ArrayLike, "..."]) -> Array:
         raise ValueError(f"the inertia told is {inertia}: give one value per axis, in kg m^2.")
     arrays = _arrays(map)
     require_shapes({"inertia": inertia} | arrays)
-    ensemble = ensemble_shape({"inertia": inertia} | arrays)
+    ensemble = ensemble_shape({"inertia": inertia} | arrays, rank=1)
     wide = inertia.reshape(inertia.shape + (1,) * (1 + len(ensemble) - inertia.ndim))
     return as_float(map(jnp.broadcast_to(wide, (len(inertia), *ensemble))))
 

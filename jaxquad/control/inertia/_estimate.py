@@ -69,7 +69,7 @@ def doubted(held: Held) -> Held:
 
 
 def plant_ensemble(torque_gain: Array, nominal: Array) -> tuple[int, ...]:
-    return ensemble_shape({"torque_gain": torque_gain, "nominal": nominal})
+    return ensemble_shape({"torque_gain": torque_gain, "nominal": nominal}, rank=1)
 
 
 def require_plant(torque_gain: Array, nominal: Array) -> None:

@@ -48,7 +48,7 @@ class FuzzyMap(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of the map, () for one controller."""
-        return ensemble_shape({"nominal": self.nominal, "b0": self.b0})
+        return ensemble_shape({"nominal": self.nominal, "b0": self.b0}, rank=1)
 
     def memberships(
         self, delta: Float[Array, " axes *ensemble"]
@@ -114,7 +114,7 @@ class InertiaMap(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of the map, () for one controller."""
-        return ensemble_shape({"nominal": self.nominal, "values": self.values[0]})
+        return ensemble_shape({"nominal": self.nominal, "values": self.values[0]}, rank=1)
 
     def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
