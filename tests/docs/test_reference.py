@@ -1,65 +1,106 @@
-"""The reference names everything public, once, in the words of its docstring."""
+"""The reference holds everything public, in the words of its docstring."""
 
 import importlib
-import importlib.util
+import inspect
+import os
 import re
-import runpy
 import subprocess
 import sys
 
 import pytest
+import yaml
 from conftest import ROOT
 
 import jaxquad as jq
 
 
-SCRIPT = ROOT / "docs" / "reference.py"
-REFERENCE = runpy.run_path(str(SCRIPT))
-ROOMS, public = REFERENCE["ROOMS"], REFERENCE["public"]
-ENTRY = re.compile(r"^- \[`(\w+)`\]\((.+?)\): (.*)$", flags=re.M)
+DOCS = ROOT / "docs"
+FOLDERS = sorted(path.parent.name for path in (ROOT / "jaxquad").glob("[a-z]*/__init__.py"))
+ROOMS = [room for room in FOLDERS if room != "cli"]
+ROW = re.compile(r"^\| \[`jq\.(\w+)`\]\((\w+)\.md#jaxquad\.(\w+)\.(\w+)\) \| (.+) \|$", flags=re.M)
 
 
-def test_the_page_says_what_the_docstrings_say():
-    page = REFERENCE["page"]()
-    written = (ROOT / "docs" / "reference.md").read_text()
-    assert written == page, "run: python docs/reference.py > docs/reference.md"
+def public(room):
+    """What the face of a room exports, by name."""
+    module = importlib.import_module(f"jaxquad.{room}")
+    found = {n: v for n, v in vars(module).items() if not n.startswith("_")}
+    return {n: v for n, v in found.items() if not inspect.ismodule(v)}
 
 
-def test_every_public_name_stands_in_it_once():
-    names = [name for name, *_ in ENTRY.findall(REFERENCE["page"]())]
-    assert len(names) == len(set(names))
-    rooms = [public(importlib.import_module(f"jaxquad.{room}")) for room in ROOMS]
-    assert set(names) == set(public(jq)).union(*rooms)
+def pages(entry):
+    """The files of a part of the navigation."""
+    if isinstance(entry, str):
+        return [entry]
+    parts = entry.values() if isinstance(entry, dict) else entry
+    return [page for part in parts for page in pages(part)]
 
 
-def test_every_room_has_a_part():
-    folders = {path.parent.name for path in (ROOT / "jaxquad").glob("[a-z]*/__init__.py")}
-    assert folders == set(ROOMS)
+@pytest.fixture(scope="module")
+def navigation():
+    return pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
 
 
-def test_every_name_has_a_sentence_and_a_source():
-    for name, path, text in ENTRY.findall(REFERENCE["page"]()):
-        assert re.search(r"([.?]|`)$", text) and len(text) <= 120, name
-        assert not text.startswith(f"{name}("), f"{name} has no docstring of its own"
-        assert (ROOT / "docs" / path).is_file(), name
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("pdoc") is None, reason="pdoc makes the HTML: [docs]")
-def test_it_becomes_html_without_warnings(tmp_path):
-    done = subprocess.run(
-        [sys.executable, SCRIPT, tmp_path], capture_output=True, text=True, cwd=ROOT
-    )
-    assert done.returncode == 0 and not done.stderr, done.stderr
+def test_every_room_has_a_page_made_of_its_docstrings():
+    assert {path.stem for path in (DOCS / "reference").glob("*.md")} == {*ROOMS, "index"}
     for room in ROOMS:
-        html = (tmp_path / "jaxquad" / f"{room}.html").read_text()
-        for name in public(importlib.import_module(f"jaxquad.{room}")):
-            assert f'id="{name}"' in html, name
-        assert "jaxlib" not in html
+        assert f"\n::: jaxquad.{room}\n" in (DOCS / "reference" / f"{room}.md").read_text()
+
+
+def test_the_names_at_the_top_are_listed_with_their_rooms():
+    rows = ROW.findall((DOCS / "reference" / "index.md").read_text())
+    rest = {"enable_x64", "engine"}  # of no room
+    assert [name for name, *_ in rows] == sorted(set(jq.__all__) - {*ROOMS} - rest, key=str.lower)
+    for name, page, room, original, _ in rows:
+        assert page == room and name == original
+        assert getattr(jq, name) is getattr(importlib.import_module(f"jaxquad.{room}"), name)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_everything_public_has_a_docstring_that_begins_with_a_sentence(room):
+    missing = []
+    for name, value in public(room).items():
+        if not (inspect.isclass(value) or inspect.isfunction(inspect.unwrap(value))):
+            continue
+        first = (inspect.getdoc(value) or "").split("\n")[0]
+        inherited = inspect.isclass(value) and "__doc__" not in vars(value)
+        if inherited or first.startswith(f"{name}(") or not re.search(r"([.?:]|`)$", first):
+            missing.append(name)
+    assert not missing
+
+
+def test_the_navigation_names_every_page_and_notebook(navigation):
+    expected = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
+    expected |= {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert len(navigation) == len(set(navigation)) and set(navigation) == expected
 
 
 def test_the_index_leads_to_every_page_and_notebook():
-    index = (ROOT / "docs" / "index.md").read_text()
-    linked = set(re.findall(r"\]\((?:\.\./notebooks/)?([\w.]+)\)", index))
-    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    assert linked == pages | {path.name for path in (ROOT / "notebooks").glob("*.ipynb")}
+    linked = set(re.findall(r"\]\(([\w./]+)\)", (DOCS / "index.md").read_text()))
+    own = {path.name for path in DOCS.glob("*.md")} - {"index.md"}
+    notebooks = {f"../notebooks/{path.name}" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert linked == own | notebooks | {"reference/index.md"}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site, built with every warning as an error."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "--site-dir", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_public_name_stands_on_the_page_of_its_room(site, room):
+    html = (site / "reference" / room / "index.html").read_text()
+    shown = set(re.findall(rf'id="jaxquad\.{room}\.(\w+)"', html))
+    assert not set(public(room)) - shown
+
+
+@pytest.mark.slow
+def test_the_site_loads_nothing_from_elsewhere(site):
+    loading = re.compile(r'(?:src|href)="https?://[^"]+\.(?:js|css|woff2?)"')
+    for page in site.rglob("*.html"):
+        assert not loading.search(page.read_text()), page

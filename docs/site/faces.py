@@ -1,0 +1,27 @@
+"""How the reference reads the package: a room exports what its face imports, comments tell units."""
+
+import re
+from typing import Any
+
+import griffe
+
+
+COMMENT = re.compile(r"#\s+(?!fmt:|type:|pyright:|noqa)(.+)$")
+
+
+class Faces(griffe.Extension):
+    """For `X as X` exports, and for fields whose meaning stands in a comment behind them."""
+
+    def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
+        """`from ._file import X as X` makes X public, as if `__all__` named it."""
+        for room in pkg.modules.values():
+            room.exports = [n for n, m in room.members.items() if m.is_alias and n[0] != "_"]
+
+    def on_attribute_instance(self, *, attr: griffe.Attribute, agent: Any, **_: Any) -> None:
+        """The comment behind a field or a constant becomes its docstring."""
+        if attr.docstring or attr.lineno is None:
+            return
+        lines = agent.code.splitlines()[attr.lineno - 1 : attr.endlineno]
+        found = COMMENT.search(lines[-1]) if lines else None
+        if found:
+            attr.docstring = griffe.Docstring(found[1], parent=attr, lineno=attr.endlineno)
