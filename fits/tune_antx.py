@@ -91,8 +91,8 @@ def case_of(fit: jq.identify.Fit, activity: float) -> Case:
 def crossovers(found: Study, plant: Any, fit: jq.identify.Fit) -> tuple[float, float]:
     """Of the tuned loop without errors, rad/s: |L| = 1, and the peak of |S|."""
     delay = max(float(fit.model.delay) - DT / 2, 0.0)
-    controller = found.ladrc.controller.told(plant.inertia)
-    loop = jq.loops.analyse_loop(plant, controller, delay=delay, dt=DT)
+    controller = found.ladrc.controller.scheduled_at(plant.inertia)
+    loop = jq.analyse(jq.Loop(plant, controller, delay=delay, dt=DT))
     return float(loop.crossover), float(loop.sensitivity_frequency)
 
 

@@ -160,7 +160,7 @@ def in_jax(name, precision, *, flight=PLAIN, fused=False, b0=None):
 
 
 def _scan(controller, now, flight):
-    law = controller.told(NOMINAL) if flight.told else controller.prepared()
+    law = controller.scheduled_at(NOMINAL) if flight.told else controller.prepared()
 
     def sample(carry, now):
         state, angle, rate = carry
@@ -169,7 +169,7 @@ def _scan(controller, now, flight):
             state, command = law.step_with(state, reference, measurement, now[6])
         else:
             here: Any = ScheduledPID(controller.pid, lambda _: now[6]) if flight.told else law
-            here = here.told(now[5]) if flight.told else here
+            here = here.scheduled_at(now[5]) if flight.told else here
             state, command = here.step(state, reference, measurement)
         given = flight.share * command
         push = DT * ((now[4] + given) / now[5])

@@ -2,11 +2,6 @@ from ._adaptive_ladrc import (
     AdaptiveLADRC as AdaptiveLADRC,
     AdaptiveLADRCState as AdaptiveLADRCState,
 )
-from ._anti_windup import (
-    AntiWindup as AntiWindup,
-    BackCalculation as BackCalculation,
-    Clamping as Clamping,
-)
 from ._ladrc import (
     LADRC as LADRC,
     LADRCGains as LADRCGains,
@@ -16,33 +11,46 @@ from ._ladrc import (
 from ._observers import (
     CurrentObserver as CurrentObserver,
     EulerObserver as EulerObserver,
-    Observer as Observer,
     PredictiveObserver as PredictiveObserver,
 )
-from ._pd import PD as PD, place_pd as place_pd
-from ._pid import PID as PID, PIDLaw as PIDLaw, PIDState as PIDState
+from ._pid import (
+    BackCalculation as BackCalculation,
+    Clamping as Clamping,
+    PD as PD,
+    PID as PID,
+    PIDLaw as PIDLaw,
+    PIDState as PIDState,
+    place_pd as place_pd,
+)
 from ._protocols import (
+    AntiWindup as AntiWindup,
     as_setpoint as as_setpoint,
-    LinearController as LinearController,
-    Setpoint as Setpoint,
-)
-from ._scheduled import (
-    flown as flown,
-    ScheduledLADRC as ScheduledLADRC,
-    ScheduledPID as ScheduledPID,
-    told as told,
-)
-from .inertia._estimate import (
+    find_transform as find_transform,
     InertiaEstimate as InertiaEstimate,
     InertiaEstimator as InertiaEstimator,
+    LinearController as LinearController,
+    LinearisableController as LinearisableController,
+    Observer as Observer,
+    ObserverController as ObserverController,
+    ProbingEstimator as ProbingEstimator,
+    Reference as Reference,
+    schedule_for_analysis as schedule_for_analysis,
+    schedule_for_flight as schedule_for_flight,
+    ScheduledController as ScheduledController,
+    Setpoint as Setpoint,
+    Transform as Transform,
+    Tunable as Tunable,
 )
-from .inertia._lock_in import LockInInertia as LockInInertia
-from .inertia._maps import (
+from ._scheduled import ScheduledLADRC as ScheduledLADRC, ScheduledPID as ScheduledPID
+from .inertia import (
     certainty_equivalence as certainty_equivalence,
+    Falling as Falling,
     FuzzyMap as FuzzyMap,
     InertiaMap as InertiaMap,
+    LockInInertia as LockInInertia,
+    NoProbe as NoProbe,
     printed_map as printed_map,
+    ProbeTones as ProbeTones,
+    RecursiveInertia as RecursiveInertia,
+    WindowedInertia as WindowedInertia,
 )
-from .inertia._probe_tones import NoProbe as NoProbe, ProbeTones as ProbeTones
-from .inertia._recursive import RecursiveInertia as RecursiveInertia
-from .inertia._windowed import WindowedInertia as WindowedInertia

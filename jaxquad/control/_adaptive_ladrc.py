@@ -1,18 +1,17 @@
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import fit
+from jaxquad._core import check_positive, ensemble_shape, fit, full_shape
 
 from ._ladrc import LADRC, LADRCLaw, LADRCState
-from ._scheduled import gain_at
-from .inertia._estimate import InertiaEstimator, require_above_zero
+from ._protocols import InertiaEstimator, ProbingEstimator, Reference, Transform
+from ._scheduled import gain_at, names_within, tunable_bandwidths, tunable_of
 
 
 class AdaptiveLADRCState(NamedTuple):
@@ -22,15 +21,32 @@ class AdaptiveLADRCState(NamedTuple):
     estimator: PyTree
 
 
-class AdaptiveLADRC(eqx.Module):
-    """A `LADRC` of order 2 whose b0 follows the inertia that an estimator hears.
+@runtime_checkable
+class _Sampled(Protocol):
+    @property
+    def dt(self) -> float: ...
 
-    b0 starts as the `ladrc`'s. While the estimate is trusted, it moves towards `map(inertia)` by a
+
+class AdaptiveLADRC(eqx.Module):
+    """A `LADRC` of order 2 whose b0 follows the inertia that an estimator finds in flight.
+
+    b0 starts as the `ladrc`'s. While the estimate is trusted, b0 moves towards `map(inertia)` by a
     first-order filter of time constant `settling`; otherwise it stays where it is. The estimator
-    hears what was applied, saturated and with any test signal, and its own probe is added to
-    the command within the ladrc's limit. A b0 that moves does not move the command: the estimate
-    of the disturbance moves instead (`LADRC.step_with`). Source: section 4.2 and Eq. (25).
-    Raises `ValueError` for an estimator made for another `dt` and for a ladrc of order 1.
+    gets what was applied, saturated and with any test signal; its own test signal is added to the
+    command within the ladrc's limit. A change of b0 does not change the command: the estimate of
+    the disturbance changes instead (`LADRC.step_with`).
+    Source: section 4.2 and Eq. (25) of the paper, docs/equations.md.
+
+    **Arguments:**
+
+    - `ladrc`: of order 2.
+    - `estimator`: any `InertiaEstimator`, such as `LockInInertia`.
+    - `map`: from an inertia in kg m^2 to b0, such as `certainty_equivalence(..)`.
+    - `settling`: in s.
+
+    **Raises:**
+
+    - `ValueError`: the estimator was made for another `dt`, or the ladrc is of order 1.
     """
 
     ladrc: LADRC | LADRCLaw
@@ -39,16 +55,22 @@ class AdaptiveLADRC(eqx.Module):
     settling: float = eqx.field(static=True, default=0.5)  # s
 
     def __check_init__(self):
-        require_above_zero("s", settling=self.settling)
-        if getattr(self.ladrc, "order", 2) != 2:
+        check_positive(settling=self.settling)
+        if not isinstance(self.estimator, InertiaEstimator):
             raise ValueError(
-                f"the ladrc's order is {getattr(self.ladrc, 'order', None)}: b0 = KT/J belongs to "
-                "an angle, take order 2"
+                f"estimator is {self.estimator!r}: give an object with the methods init, update "
+                "and estimate, as jq.control.InertiaEstimator describes them."
             )
-        made_for = getattr(self.estimator, "dt", self.dt)
+        if self.ladrc.order != 2:
+            raise ValueError(
+                f"The ladrc is of order {self.ladrc.order}, but b0 = KT/J is the gain to an angle: "
+                "take order=2."
+            )
+        made_for = self.estimator.dt if isinstance(self.estimator, _Sampled) else self.dt
         if not math.isclose(made_for, self.dt, rel_tol=1e-6):
             raise ValueError(
-                f"the estimator was made for samples of {made_for} s, the ladrc for {self.dt} s"
+                f"The estimator was made for samples of {made_for} s, the ladrc for {self.dt} s: "
+                "give both the same dt."
             )
 
     @property
@@ -58,24 +80,49 @@ class AdaptiveLADRC(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of all gains, () for one controller."""
-        parts = (self.ladrc, self.estimator, self.map)
-        return np.broadcast_shapes(*(getattr(part, "ensemble", ()) for part in parts))
+        return ensemble_shape(self)
 
-    def prepared(self) -> Any:
+    def prepared(self) -> "AdaptiveLADRC":
         """The same controller with the gains of its ladrc computed: what to run in a loop."""
         if isinstance(self.ladrc, LADRCLaw):
             return self
         return AdaptiveLADRC(self.ladrc.prepared(), self.estimator, self.map, self.settling)
 
-    def told(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
-        """The LADRC that it is while its estimate is `inertia`, kg m^2: for a linear analysis.
+    def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
+        """The LADRC that it is while its estimate is `inertia`, for a linear analysis.
 
-        Raises ValueError for an inertia that is not above 0 or does not fit the map's axes, and
-        for a controller that is already prepared.
+        **Arguments:**
+
+        - `inertia`: in kg m^2, one value per axis, or `[axes, *ensemble]`.
+
+        **Raises:**
+
+        - `ValueError`: the inertia is not above 0 or does not fit the axes of the map, or the
+            controller has been prepared.
         """
         if isinstance(self.ladrc, LADRCLaw):
-            raise ValueError("a prepared controller has no wc and wo: tell the one it was made of")
+            raise ValueError(
+                "A prepared controller has no wc and wo: schedule the one that it was made of."
+            )
         return dataclasses.replace(self.ladrc, b0=gain_at(self.map, inertia))
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The bandwidths of the `ladrc` and what the map says."""
+        return tunable_bandwidths("ladrc", self.ladrc) | tunable_of("map", self.map)
+
+    def observer_instability(self) -> str:
+        """As `LADRC.observer_instability`; a prepared controller is not looked at."""
+        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_instability()
+
+    def observer_slowness(self) -> str:
+        """As `LADRC.observer_slowness`; a prepared controller is not looked at."""
+        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_slowness()
+
+    def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
+        """As `LADRC.observer_barrier`."""
+        if isinstance(self.ladrc, LADRCLaw):
+            return jnp.zeros(())
+        return self.ladrc.observer_barrier(names_within("ladrc", free))
 
     def init(
         self,
@@ -83,49 +130,53 @@ class AdaptiveLADRC(eqx.Module):
         measurement: Float[Array, " axes *ensemble"] | None = None,
     ) -> AdaptiveLADRCState:
         """At rest at angle 0, or at `measurement` in rad; shaped as `like` and the ensemble."""
-        full = jnp.zeros(like.shape[:1] + self._members(like), like.dtype)
+        full = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
         return AdaptiveLADRCState(self.ladrc.init(full, measurement), self.estimator.init(full))
-
-    def _members(self, like: Float[Array, " axes *ensemble"]) -> tuple[int, ...]:
-        return np.broadcast_shapes(like.shape[1:], self.ensemble)
 
     def step(
         self,
         state: AdaptiveLADRCState,
-        reference: Any,
+        reference: Reference,
         measurement: Float[Array, " axes *ensemble"],
     ) -> tuple[AdaptiveLADRCState, Float[Array, " axes *ensemble"]]:
-        """One sample: the command to hold until the next one, with the probe in it."""
+        """One sample: the command to hold until the next one, with the test signal in it."""
         memory = self.estimator.update(state.estimator, state.ladrc.command, measurement)
-        b0 = self._moved(state.ladrc.b0, memory)
+        b0 = self._adapt(state.ladrc.b0, memory)
         ladrc, command = self.ladrc.step_with(state.ladrc, reference, measurement, b0)
-        limit = fit(self.ladrc.limit, command)
-        command = jnp.clip(command + self.estimator.probe(memory), -limit, limit)
-        return AdaptiveLADRCState(self.ladrc.applied(ladrc, command), memory), command
+        if isinstance(self.estimator, ProbingEstimator):
+            limit = fit(self.ladrc.limit, command)
+            command = jnp.clip(command + self.estimator.probe(memory), -limit, limit)
+            ladrc = self.ladrc.applied(ladrc, command)
+        return AdaptiveLADRCState(ladrc, memory), command
 
-    def _moved(
+    def _adapt(
         self, b0: Float[Array, " axes *ensemble"], memory: PyTree
     ) -> Float[Array, " axes *ensemble"]:
-        found = self.estimator.estimate(memory)
-        share = found.trusted * -math.expm1(-self.dt / self.settling)
-        known = jnp.where(found.trusted > 0, found.inertia, jnp.ones_like(found.inertia))
-        return b0 + share * (self.map(known) - b0)
+        estimate = self.estimator.estimate(memory)
+        share = estimate.trusted * -math.expm1(-self.dt / self.settling)
+        inertia = jnp.where(estimate.trusted > 0, estimate.inertia, jnp.ones_like(estimate.inertia))
+        return b0 + share * (self.map(inertia) - b0)
 
     def applied(
         self, state: AdaptiveLADRCState, achieved: Float[Array, " axes *ensemble"]
     ) -> AdaptiveLADRCState:
-        """What the drive really gave since the last `step`: ladrc and estimator go by it."""
+        """What the drive really gave since the last `step`, for ladrc and estimator."""
         return state._replace(ladrc=self.ladrc.applied(state.ladrc, achieved))
 
     def excite(self, state: AdaptiveLADRCState) -> AdaptiveLADRCState:
-        """On demand, as after a payload: the inertia is in doubt and the probe starts."""
+        """Put the estimate in doubt, as after a change of payload: the test signal starts."""
+        if not isinstance(self.estimator, ProbingEstimator):
+            raise ValueError(
+                f"A {type(self.estimator).__name__} has no test signal: give an estimator with the "
+                "methods probe and excite, as jq.control.ProbingEstimator describes them."
+            )
         return state._replace(estimator=self.estimator.excite(state.estimator))
 
     def signals(self, state: AdaptiveLADRCState) -> dict[str, Array]:
         """ "disturbance" as `LADRC.signals`; "b0" in force; "inertia" and its deviation, kg m^2."""
-        found = self.estimator.estimate(state.estimator)
+        estimate = self.estimator.estimate(state.estimator)
         return self.ladrc.signals(state.ladrc) | {
             "b0": state.ladrc.b0,
-            "inertia": found.inertia,
-            "inertia_deviation": found.deviation,
+            "inertia": estimate.inertia,
+            "inertia_deviation": estimate.deviation,
         }

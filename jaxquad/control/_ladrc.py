@@ -1,8 +1,10 @@
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxquad._core import (
@@ -12,6 +14,7 @@ from jaxquad._core import (
     fit,
     full_shape,
     matched,
+    per_member,
     pick,
     require_below,
     require_limit,
@@ -22,19 +25,27 @@ from jaxquad._core import (
 )
 from jaxquad.models import TransferFunction
 
-from ._observers import continuous_gains, CurrentObserver, Observer
-from ._protocols import LinearController, Setpoint
+from ._observers import (
+    barrier,
+    continuous_gains,
+    CurrentObserver,
+    error_dynamics,
+    instability_in_words,
+    list_range,
+    slowness_in_words,
+)
+from ._protocols import LinearController, Member, Observer, Reference, Setpoint, Transform
 
 
 Placement = Literal["discrete", "continuous"]
 
 
-class LADRCGains(NamedTuple):
+class LADRCGains(eqx.Module):
     """What multiplies errors of the angle, of the rate and of the observer, half gains included."""
 
-    proportional: Float[Array, "..."]  # 1/s^2; order 1: 1/s
-    derivative: Float[Array, "..."] | None  # 1/s; None for order 1
-    correction: Float[Array, "states ..."]  # of the observer's prediction
+    proportional: Float[Array, "..."] = per_member(1)  # 1/s^2; order 1: 1/s
+    derivative: Float[Array, "..."] | None = per_member(1)  # 1/s; None for order 1
+    correction: Float[Array, "states ..."] = per_member(2)  # of the observer's prediction
 
 
 def feedback_gains(
@@ -70,11 +81,19 @@ class LADRCLaw(eqx.Module):
     """A `LADRC` with its gains computed: what a loop runs, sample by sample."""
 
     gains: LADRCGains
-    b0: Float[Array, "..."]
-    limit: Float[Array, "..."]
-    ensemble: tuple[int, ...] = eqx.field(static=True)
+    b0: Float[Array, "..."] = per_member(1)
+    limit: Float[Array, "..."] = per_member(1)
     observer: Observer
     dt: float = eqx.field(static=True)
+
+    @property
+    def order(self) -> int:
+        return len(self.gains.correction) - 1
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the gains, () for one controller."""
+        return ensemble_shape(self)
 
     def init(
         self,
@@ -87,14 +106,14 @@ class LADRCLaw(eqx.Module):
         return LADRCState(estimate, zero, zero + fit(self.b0, zero))
 
     def step(
-        self, state: LADRCState, reference: Any, measurement: Float[Array, " axes *ensemble"]
+        self, state: LADRCState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
     ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
         return self._advance(state, state.estimate[-1], reference, measurement, self.b0)
 
     def step_with(
         self,
         state: LADRCState,
-        reference: Any,
+        reference: Reference,
         measurement: Float[Array, " axes *ensemble"],
         b0: Float[Array, "..."],
     ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
@@ -122,7 +141,7 @@ class LADRCLaw(eqx.Module):
         command = jnp.clip(command, -limit, limit)
         return LADRCState(jnp.stack(corrected), command, b0), command
 
-    def _feedback(self, estimate: Sequence[Array], reference: Any) -> Array:
+    def _feedback(self, estimate: Sequence[Array], reference: Reference) -> Array:
         """What b0 u is to be, in rad/s^2; order 1 in rad/s."""
         ahead = isinstance(reference, Setpoint)
         angle = reference.angle if ahead else reference
@@ -142,7 +161,8 @@ def linear_ladrc(
     unit, zero = jnp.eye(states, dtype=b0.dtype), jnp.zeros(states, b0.dtype)
     transition = jnp.stack(observer.predict(list(unit), zero, dt))
     drive = jnp.stack(observer.predict(list(zero), jnp.ones_like(b0), dt))
-    feedback = jnp.stack([x for x in (*gains[:2], jnp.ones_like(b0)) if x is not None])
+    rows = (gains.proportional, gains.derivative, jnp.ones_like(b0))
+    feedback = jnp.stack([x for x in rows if x is not None])
     keep = unit.at[:, 0].add(-gains.correction)
     # b0 u = kp r - late x - direct y
     late = _dot(feedback, keep) if observer.current else feedback
@@ -200,15 +220,15 @@ class LADRC(eqx.Module):
     for `dt`, and for an unknown order, placement or observer.
     """
 
-    wc: Float[Array, "..."] = eqx.field(converter=as_float)  # rad/s
-    wo: Float[Array, "..."] = eqx.field(converter=as_float)  # rad/s
-    b0: Float[Array, "..."] = eqx.field(converter=as_float)  # rad/s^2 (order 1: rad/s) per unit
+    wc: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s
+    wo: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s
+    b0: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s^2 (order 1: rad/s) per unit
     order: int = eqx.field(static=True, default=2)
     observer: Observer = CurrentObserver()
     placement: Placement = eqx.field(static=True, default="discrete")
-    feedback_factor: Float[Array, "..."] = eqx.field(converter=as_float, default=1.0)
-    observer_factor: Float[Array, "..."] = eqx.field(converter=as_float, default=1.0)
-    limit: Float[Array, "..."] = eqx.field(converter=as_float, default=float("inf"))  # of |u|
+    feedback_factor: Float[Array, "..."] = per_member(1, converter=as_float, default=1.0)
+    observer_factor: Float[Array, "..."] = per_member(1, converter=as_float, default=1.0)
+    limit: Float[Array, "..."] = per_member(1, converter=as_float, default=float("inf"))  # of |u|
     dt: float = eqx.field(static=True, default=0.002)  # s
 
     def __check_init__(self):
@@ -241,7 +261,7 @@ class LADRC(eqx.Module):
 
     def prepared(self) -> LADRCLaw:
         """The same law with its gains computed: what to run in a loop, once outside of it."""
-        return LADRCLaw(self.gains, self.b0, self.limit, self.ensemble, self.observer, self.dt)
+        return LADRCLaw(self.gains, self.b0, self.limit, self.observer, self.dt)
 
     def init(
         self,
@@ -252,7 +272,7 @@ class LADRC(eqx.Module):
         return self.prepared().init(like, measurement)
 
     def step(
-        self, state: LADRCState, reference: Any, measurement: Float[Array, " axes *ensemble"]
+        self, state: LADRCState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
     ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
         """One sample: the command to hold until the next one.
 
@@ -263,7 +283,7 @@ class LADRC(eqx.Module):
     def step_with(
         self,
         state: LADRCState,
-        reference: Any,
+        reference: Reference,
         measurement: Float[Array, " axes *ensemble"],
         b0: Float[Array, "..."],
     ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
@@ -282,16 +302,58 @@ class LADRC(eqx.Module):
         """ "disturbance" f/b0 in units of the command: times the torque per unit, it is in N m."""
         return self.prepared().signals(state)
 
-    def linear(self, axis: int = 0, member: Any = None) -> LinearController:
+    def linear(self, axis: int = 0, member: Member = None) -> LinearController:
         """One axis without its limit, exactly; `member` picks one of an ensemble."""
         at = lambda gain: pick(gain, axis, member)
-        kp, kd, correction = self.gains
-        correction = jnp.stack([at(row) for row in correction])
-        gains = LADRCGains(at(kp), None if kd is None else at(kd), correction)
+        whole = self.gains
+        correction = jnp.stack([at(row) for row in whole.correction])
+        slope = None if whole.derivative is None else at(whole.derivative)
+        gains = LADRCGains(at(whole.proportional), slope, correction)
         return linear_ladrc(gains, at(self.b0), self.observer, self.dt)
 
+    def tunable(self) -> dict[str, Transform | None]:
+        """The bandwidths and the gain of the plant."""
+        return {"wc": None, "wo": None, "b0": None}
+
+    def observer_instability(self) -> str:
+        """Why the observer alone is unstable; empty if it is stable.
+
+        The feedback can hold an observer that diverges as soon as the command stays at its limit.
+        Only half-gain factors bring that about.
+        """
+        return "" if _full_gains(self) else instability_in_words(self._error, self._named_gains)
+
+    def observer_slowness(self) -> str:
+        """Why the observer alone is slower than the feedback; empty if it is not.
+
+        After each saturation the feedback would act on an estimate that is still wrong.
+        """
+        if _full_gains(self):
+            return ""
+        return slowness_in_words(self._error, self.wc, self.dt, self._named_gains)
+
+    def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
+        """-ln of the room that Jury's conditions leave the observer, until it is as slow as wc.
+
+        0 unless `observer_factor` is `free`, because with all of the gains the observer has the
+        poles that wo says.
+        """
+        if not any(name.partition("[")[0] == "observer_factor" for name in free):
+            return jnp.zeros(())
+        whole = dataclasses.replace(self, observer_factor=jnp.ones(()))
+        return barrier(self._error, whole._error, self.wc, self.dt)
+
+    @property
+    def _error(self) -> Float[Array, "... states states"]:
+        return error_dynamics(self.observer, self.gains.correction, self.dt)
+
+    @property
+    def _named_gains(self) -> str:
+        factor = list_range(self.observer_factor)
+        return f"wo = {list_range(self.wo)} rad/s and an observer_factor of {factor}"
+
     def transfer_functions(
-        self, axis: int = 0, member: Any = None
+        self, axis: int = 0, member: Member = None
     ) -> tuple[TransferFunction, TransferFunction]:
         """C and F of u = F r - C y in continuous time, which is LADRC as `dt` goes to 0.
 
@@ -310,9 +372,15 @@ _REMEDIES = {
 }
 
 
+def _full_gains(ladrc: LADRC) -> bool:
+    return not np.any(np.asarray(ladrc.observer_factor) != 1)
+
+
 def _gains(ladrc: LADRC) -> dict[str, Array]:
-    names = ("wc", "wo", "b0", "feedback_factor", "observer_factor", "limit")
-    return {name: getattr(ladrc, name) for name in names}
+    return {
+        "wc": ladrc.wc, "wo": ladrc.wo, "b0": ladrc.b0, "feedback_factor": ladrc.feedback_factor,
+        "observer_factor": ladrc.observer_factor, "limit": ladrc.limit,
+    }  # fmt: skip
 
 
 def _require_choices(ladrc: LADRC) -> None:

@@ -1,35 +1,14 @@
 import math
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from jaxquad._core import times
 
-@runtime_checkable
-class Observer(Protocol):
-    """An extended state observer of y'' = u0 + f (order 2) or y' = u0 + f (order 1), sampled.
-
-    At a sample it predicts the states [y, y', f] (or [y, f]) from the last estimate and the
-    acceleration (or rate) `drive` = b0 u held since, and adds `correction` times the error of the
-    predicted y. `current` tells whether the feedback uses this corrected estimate or still the
-    prediction. `gains` are those of the textbook form, `fastest` is the highest wo dt.
-    """
-
-    @property
-    def current(self) -> bool: ...
-    @property
-    def fastest(self) -> float: ...
-    def gains(
-        self, wo: Float[Array, "..."], dt: float, order: int
-    ) -> Float[Array, "states ..."]: ...
-    def correction(
-        self, wo: Float[Array, "..."], dt: float, order: int
-    ) -> Float[Array, "states ..."]: ...
-    def predict(
-        self, estimate: Sequence[Float[Array, "..."]], drive: Float[Array, "..."], dt: float
-    ) -> list[Float[Array, "..."]]: ...
+from ._protocols import Observer
 
 
 class CurrentObserver(eqx.Module):
@@ -158,3 +137,83 @@ def _held(
     y, rate, unknown = estimate
     push = dt * (unknown + drive)
     return [y + dt * (rate + 0.5 * push), rate + push, unknown]
+
+
+def error_dynamics(
+    observer: Observer, correction: Float[Array, "states ..."], dt: float
+) -> Float[Array, "... states states"]:
+    """(I - l C) Ad: the matrix that takes an error of the estimate to the next sample."""
+    rows = jnp.moveaxis(correction, 0, -1)
+    unit = jnp.eye(len(correction), dtype=rows.dtype)
+    predict = jnp.stack(observer.predict(list(unit), jnp.zeros_like(unit[0]), dt))
+    shape = (*rows.shape, len(unit))
+    seen = rows[..., None] * jnp.broadcast_to(predict[0], shape)
+    return jnp.broadcast_to(predict, shape) - seen
+
+
+_STABLE = 1 - 1e-9  # the spectral radius below which an error of the observer decays
+
+
+def instability_in_words(error: Float[Array, "... states states"], named: str) -> str:
+    """Empty for an observer whose error decays; `named` are its gains."""
+    if (radius := float(np.max(_radius(error)))) < _STABLE:
+        return ""
+    return (
+        f"The observer alone is unstable at {named} (spectral radius {radius:.4g} per sample): it "
+        "would diverge while the command saturates. Raise observer_factor or lower wo."
+    )
+
+
+def slowness_in_words(
+    error: Float[Array, "... states states"], wc: Float[Array, "..."], dt: float, named: str
+) -> str:
+    """Empty for an observer whose error decays at least as fast as exp(-wc t)."""
+    ratio = np.asarray(times(1 / wc, jnp.asarray(-np.log(_radius(error)) / dt)))
+    if np.all(ratio >= 1):
+        return ""
+    return (
+        f"The observer alone decays at {ratio.min():.3g} wc at {named}, slower than the feedback: "
+        "after saturation its estimate would mislead. Raise observer_factor or wo."
+    )
+
+
+def barrier(
+    error: Float[Array, "... states states"],
+    full: Float[Array, "... states states"],
+    wc: Float[Array, "..."],
+    dt: float,
+) -> Float[Array, ""]:
+    """-ln of the room left to an observer before it is as slow as wc; near 0 for a fast one.
+
+    The room is that of Jury's conditions on the polynomial of the observer's `error`, its roots
+    scaled so that those of wc come to 1, over the room that the observer with `full` gains has to
+    where it is unstable. NaN for a slower observer.
+    """
+    pairs = zip(_room(error, wc, dt), _room(full, 0 * wc, dt), strict=True)
+    share = [times(x, 1 / whole) for x, whole in pairs]
+    return sum((jnp.mean(0.5 * jnp.log1p(x**2) - jnp.log(x)) for x in share), jnp.zeros(()))
+
+
+def _room(
+    error: Float[Array, "... states states"], decay: Float[Array, "..."], dt: float
+) -> list[Float[Array, "..."]]:
+    """What is above 0 while every root of the error's polynomial is within exp(-decay dt)."""
+    states, closer = error.shape[-1], jnp.exp(decay * dt)
+    trace = times(jnp.trace(error, axis1=-2, axis2=-1), closer)
+    determinant = times(jnp.linalg.det(error), closer**states)
+    if states == 2:
+        return [1 - trace + determinant, 1 - determinant]
+    square = times(jnp.trace(error @ error, axis1=-2, axis2=-1), closer**2)
+    minors = 0.5 * (trace**2 - square)
+    real = 1 - trace + minors - determinant
+    return [real, 1 - minors + determinant * (trace - determinant)]
+
+
+def _radius(error: Float[Array, "... states states"]) -> Float[np.ndarray, "..."]:
+    return np.max(np.abs(np.linalg.eigvals(np.asarray(error))), axis=-1)
+
+
+def list_range(values: Float[Array, "..."]) -> str:
+    """One number, or the lowest and the highest of several."""
+    each = np.unique(np.asarray(values))
+    return f"{each[0]:.4g}" if each.size == 1 else f"{each[0]:.4g} .. {each[-1]:.4g}"

@@ -1,9 +1,10 @@
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import (
     align,
@@ -13,6 +14,7 @@ from jaxquad._core import (
     fit,
     full_shape,
     matched,
+    per_member,
     pick,
     require_below,
     require_finite,
@@ -22,8 +24,45 @@ from jaxquad._core import (
     require_shapes,
 )
 
-from ._anti_windup import AntiWindup, Clamping
-from ._protocols import LinearController, Setpoint
+from ._protocols import AntiWindup, LinearController, Member, Reference, Setpoint, Transform
+
+
+class Clamping(eqx.Module):
+    """Stops the integral while it would drive a saturated command further into its limit."""
+
+    def __call__(
+        self,
+        growth: Float[Array, " axes *ensemble"],
+        wanted: Float[Array, " axes *ensemble"],
+        given: Float[Array, " axes *ensemble"],
+        dt: float,
+    ) -> Float[Array, " axes *ensemble"]:
+        return jnp.where((wanted - given) * growth > 0, jnp.zeros_like(growth), growth)
+
+
+class BackCalculation(eqx.Module):
+    """Lets the integral follow the bounded command with the tracking time `time` in s.
+
+    Source: Åström & Hägglund, Advanced PID Control, section 3.5. Raises ValueError for a time that
+    is not above 0.
+    """
+
+    time: Float[Array, "..."] = per_member(
+        1, converter=as_float
+    )  # s; usually between kd/kp and kp/ki
+
+    def __check_init__(self):
+        require_positive("The tracking time", self.time, "give seconds, usually kd/kp to kp/ki")
+
+    def __call__(
+        self,
+        growth: Float[Array, " axes *ensemble"],
+        wanted: Float[Array, " axes *ensemble"],
+        given: Float[Array, " axes *ensemble"],
+        dt: float,
+    ) -> Float[Array, " axes *ensemble"]:
+        follow = -jnp.expm1(-dt / fit(self.time, given))  # a sample's part, whatever the time
+        return growth + follow * (given - wanted)
 
 
 Transition = Float[Array, "2 2 ..."]
@@ -66,11 +105,15 @@ class PIDLaw(eqx.Module):
     Without that filter the state's integral is ahead by half a sample, by the trapezoidal rule.
     """
 
-    gains: Mapping[str, Float[Array, "..."]]
-    transition: Transition | None
+    gains: Mapping[str, Float[Array, "..."]] = per_member(1)
+    transition: Transition | None = per_member(3)
     anti_windup: AntiWindup | None
-    ensemble: tuple[int, ...] = eqx.field(static=True)
     dt: float = eqx.field(static=True)
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the gains, () for one controller."""
+        return ensemble_shape(self)
 
     def init(
         self,
@@ -83,7 +126,7 @@ class PIDLaw(eqx.Module):
         return PIDState(zero, zero, jnp.zeros((), like.dtype), smooth)
 
     def step(
-        self, state: PIDState, reference: Any, measurement: Float[Array, " axes *ensemble"]
+        self, state: PIDState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
     ) -> tuple[PIDState, Float[Array, " axes *ensemble"]]:
         reference = matched(reference, measurement, state.integral)
         gain = lambda name: fit(self.gains[name], measurement)
@@ -192,17 +235,17 @@ class PID(eqx.Module):
     or dt that is not above 0.
     """
 
-    kp: Float[Array, "..."] = eqx.field(converter=as_float)  # per rad
-    ki: Float[Array, "..."] = eqx.field(converter=as_float)  # per rad s
-    kd: Float[Array, "..."] = eqx.field(converter=as_float)  # per rad/s
-    filter: Float[Array, "..."] = eqx.field(converter=as_float, default=125.0)  # rad/s: 20 Hz
-    proportional_weight: Float[Array, "..."] = eqx.field(converter=as_float, default=1.0)
-    derivative_weight: Float[Array, "..."] = eqx.field(converter=as_float, default=0.0)
-    feedforward: Float[Array, "..."] = eqx.field(converter=as_float, default=0.0)  # per rad/s^2
-    measurement_filter: Float[Array, "..."] | None = eqx.field(  # rad/s
-        converter=as_float_or_none, default=None
+    kp: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad
+    ki: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad s
+    kd: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad/s
+    filter: Float[Array, "..."] = per_member(1, converter=as_float, default=125.0)  # rad/s: 20 Hz
+    proportional_weight: Float[Array, "..."] = per_member(1, converter=as_float, default=1.0)
+    derivative_weight: Float[Array, "..."] = per_member(1, converter=as_float, default=0.0)
+    feedforward: Float[Array, "..."] = per_member(1, converter=as_float, default=0.0)  # per rad/s^2
+    measurement_filter: Float[Array, "..."] | None = per_member(  # rad/s
+        1, converter=as_float_or_none, default=None
     )
-    limit: Float[Array, "..."] = eqx.field(converter=as_float, default=float("inf"))  # of |u|
+    limit: Float[Array, "..."] = per_member(1, converter=as_float, default=float("inf"))  # of |u|
     anti_windup: AntiWindup | None = Clamping()  # None: the integral winds up
     dt: float = eqx.field(static=True, default=0.002)  # s
 
@@ -233,7 +276,7 @@ class PID(eqx.Module):
         """The same law with its filter of the measurement computed: what to run in a loop."""
         smooth = self.measurement_filter
         transition = None if smooth is None else butterworth(smooth, self.dt)
-        return PIDLaw(_gains(self), transition, self.anti_windup, self.ensemble, self.dt)
+        return PIDLaw(_gains(self), transition, self.anti_windup, self.dt)
 
     def init(
         self,
@@ -247,7 +290,7 @@ class PID(eqx.Module):
         return self.prepared().init(like, measurement)
 
     def step(
-        self, state: PIDState, reference: Any, measurement: Float[Array, " axes *ensemble"]
+        self, state: PIDState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
     ) -> tuple[PIDState, Float[Array, " axes *ensemble"]]:
         """One sample: the command to hold until the next one.
 
@@ -256,10 +299,17 @@ class PID(eqx.Module):
         """
         return self.prepared().step(state, reference, measurement)
 
-    def linear(self, axis: int = 0, member: Any = None) -> LinearController:
+    def linear(self, axis: int = 0, member: Member = None) -> LinearController:
         """One axis without its limit, exactly; `member` picks one of an ensemble."""
         gains = {name: pick(gain, axis, member) for name, gain in _gains(self).items()}
         return linear_pid(gains, self.dt)
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The gains of the three terms, their filters and the weight, where they are not 0."""
+        names = ("kp", "ki", "kd", "filter", "proportional_weight", "measurement_filter")
+        gains = _gains(self)
+        chosen = [name for name in names if name in gains and np.all(np.asarray(gains[name]) != 0)]
+        return dict.fromkeys(chosen)
 
 
 _FASTEST = 1.0  # filter's rad/s times dt: its rate is 8 % low there, and 0 far beyond
@@ -270,7 +320,72 @@ _BANDWIDTHS = {
 
 
 def _gains(pid: PID) -> dict[str, Array]:
-    names = ("kp", "ki", "kd", "filter", "proportional_weight", "derivative_weight")
-    names = (*names, "feedforward", "measurement_filter", "limit")
-    found = {name: getattr(pid, name) for name in names}
-    return {name: gain for name, gain in found.items() if gain is not None}
+    smooth = pid.measurement_filter
+    return {
+        "kp": pid.kp, "ki": pid.ki, "kd": pid.kd, "filter": pid.filter,
+        "proportional_weight": pid.proportional_weight,
+        "derivative_weight": pid.derivative_weight, "feedforward": pid.feedforward,
+        **({} if smooth is None else {"measurement_filter": smooth}), "limit": pid.limit,
+    }  # fmt: skip
+
+
+class PDState(NamedTuple):
+    """The last measurement and the filtered derivative of the measurements."""
+
+    measurement: Float[Array, " axes *ensemble"]
+    rate: Float[Array, " axes *ensemble"]
+    started: Float[Array, ""]  # 0 before the first sample, then 1
+
+
+class PD(eqx.Module):
+    """Proportional feedback and filtered-derivative damping: holds a rig while it is excited.
+
+    `command = proportional (reference - measurement) - derivative rate`, with the rate from a
+    first-order filter of `bandwidth` (rad/s) at the sample interval `dt` (s).
+    """
+
+    proportional: Float[Array, " axes"] = per_member(1, converter=as_float)  # V/rad
+    derivative: Float[Array, " axes"] = per_member(1, converter=as_float)  # V s/rad
+    bandwidth: float = eqx.field(static=True, default=125.0)  # 20 Hz
+    dt: float = eqx.field(static=True, default=0.002)
+
+    def __check_init__(self):
+        if not (self.dt > 0 and self.bandwidth > 0):
+            raise ValueError(
+                f"dt {self.dt} s and bandwidth {self.bandwidth} rad/s must both be positive"
+            )
+
+    def init(self, like: Float[Array, " axes *ensemble"]) -> PDState:
+        """At rest, with arrays shaped as the measurement `like`."""
+        zero = jnp.zeros_like(like)
+        return PDState(zero, zero, jnp.zeros((), like.dtype))
+
+    def step(
+        self,
+        state: PDState,
+        reference: Float[Array, " axes *ensemble"],
+        measurement: Float[Array, " axes *ensemble"],
+    ) -> tuple[PDState, Float[Array, " axes *ensemble"]]:
+        """One sample: the command to hold until the next one."""
+        keep = jnp.exp(jnp.asarray(-self.bandwidth * self.dt, measurement.dtype))
+        slope = (measurement - state.measurement) * (state.started / self.dt)
+        rate = keep * state.rate + (1 - keep) * slope
+        shape = (-1,) + (1,) * (measurement.ndim - 1)
+        proportional, derivative = self.proportional.reshape(shape), self.derivative.reshape(shape)
+        command = proportional * (reference - measurement) - derivative * rate
+        return PDState(measurement, rate, jnp.ones_like(state.started)), command
+
+
+def place_pd(
+    gain: ArrayLike | Sequence[float],
+    *,
+    natural_frequency: float,
+    damping: float,
+    dt: float = 0.002,
+) -> PD:
+    """The `PD` that gives gain/s^2 per axis this natural frequency (rad/s) and damping ratio.
+
+    `gain` in rad/s^2 per unit of command.
+    """
+    gain = as_float(gain)
+    return PD(natural_frequency**2 / gain, 2 * damping * natural_frequency / gain, dt=dt)

@@ -1,29 +1,28 @@
-"""Controllers whose gains follow from the inertia that they are told."""
+"""Controllers whose gains follow from an inertia that they are given."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Collection
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._core import as_float, ensemble_shape, require_positive, require_shapes, times
+from jaxquad._core import as_float, ensemble_shape, full_shape, require_positive, times
 
 from ._ladrc import LADRC
 from ._pid import PID
-from .inertia._maps import FuzzyMap, InertiaMap
+from ._protocols import Transform, Tunable
 
 
 InertiaToGain = Callable[[Array], Array]  # kg m^2 to b0 in rad/s^2 per unit of command
 
 
 class ScheduledLADRC(eqx.Module):
-    """A `LADRC` whose b0 is `map(inertia)` of an inertia that it is told, in kg m^2.
+    """A `LADRC` whose b0 is `map(inertia)` of an inertia in kg m^2 that it is given.
 
-    The `ladrc`'s own b0 has no effect. It flies and is analysed as `told(inertia)`; exported to C,
-    it is told in flight. Source: Eq. (25) with the map of docs/control.md.
+    The `ladrc`'s own b0 has no effect. A loop flies and analyses `scheduled_at(inertia)`; exported
+    to C, the controller is given its inertia in flight. Source: Eq. (25) of docs/equations.md, with
+    the map of docs/control.md.
     """
 
     ladrc: LADRC
@@ -36,22 +35,44 @@ class ScheduledLADRC(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of all gains, () for one controller."""
-        return _ensemble(self.ladrc, self.map)
+        return ensemble_shape(self)
 
-    def told(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
-        """The LADRC of each member at the `inertia` that it is told, in kg m^2.
+    def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
+        """The LADRC at this `inertia`, with b0 fixed.
 
-        Raises ValueError for an inertia that is not above 0 or does not fit the map's axes.
+        **Arguments:**
+
+        - `inertia`: in kg m^2, one value per axis, or `[axes, *ensemble]`.
+
+        **Raises:**
+
+        - `ValueError`: the inertia is not above 0, or does not fit the axes of the map.
         """
         return dataclasses.replace(self.ladrc, b0=gain_at(self.map, inertia))
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The bandwidths of the `ladrc` and what its map says."""
+        return tunable_bandwidths("ladrc", self.ladrc) | tunable_of("map", self.map)
+
+    def observer_instability(self) -> str:
+        """As `LADRC.observer_instability`."""
+        return self.ladrc.observer_instability()
+
+    def observer_slowness(self) -> str:
+        """As `LADRC.observer_slowness`."""
+        return self.ladrc.observer_slowness()
+
+    def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
+        """As `LADRC.observer_barrier`."""
+        return self.ladrc.observer_barrier(names_within("ladrc", free))
 
 
 class ScheduledPID(eqx.Module):
     """A `PID` of the acceleration: its gains are divided by `map(inertia)`, as a LADRC's by b0.
 
-    kp, ki and kd of `pid` are those of b u: rad/s^2 per rad, per rad s and per rad/s; its
-    feedforward is the share of the reference's acceleration, 1 for all of it. The filters, weights,
-    limit and anti-windup are what they are. It flies and is analysed as `told(inertia)`.
+    kp, ki and kd of `pid` are those of b u, in rad/s^2 per rad, per rad s and per rad/s; its
+    feedforward is the share of the reference's acceleration, 1 for all of it. Filters, weights,
+    limit and anti-windup do not change. A loop flies and analyses `scheduled_at(inertia)`.
     """
 
     pid: PID
@@ -64,56 +85,56 @@ class ScheduledPID(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of all gains, () for one controller."""
-        return _ensemble(self.pid, self.map)
+        return ensemble_shape(self)
 
-    def told(self, inertia: Float[ArrayLike, "..."]) -> PID:
-        """The PID of each member at the `inertia` that it is told, in kg m^2.
+    def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> PID:
+        """The PID at this `inertia`, with its gains fixed.
 
-        Raises ValueError for an inertia that is not above 0 or does not fit the map's axes.
+        **Arguments:**
+
+        - `inertia`: in kg m^2, one value per axis, or `[axes, *ensemble]`.
+
+        **Raises:**
+
+        - `ValueError`: the inertia is not above 0, or does not fit the axes of the map.
         """
-        per_gain = 1 / gain_at(self.map, inertia)
-        names = ("kp", "ki", "kd", "feedforward")
-        scaled = {name: times(getattr(self.pid, name), per_gain) for name in names}
-        return dataclasses.replace(self.pid, **scaled)
+        per_gain, pid = 1 / gain_at(self.map, inertia), self.pid
+        return dataclasses.replace(
+            pid, kp=times(pid.kp, per_gain), ki=times(pid.ki, per_gain),
+            kd=times(pid.kd, per_gain), feedforward=times(pid.feedforward, per_gain),
+        )  # fmt: skip
 
+    def tunable(self) -> dict[str, Transform | None]:
+        """What the `pid` and its map say, but not kd where the map is tuned.
 
-def told(controller: Any, inertia: Float[ArrayLike, "..."]) -> Any:
-    """`controller.told(inertia)` if there is such a method, else the controller: what to linearise.
-
-    An adaptive controller becomes the one that it is once its estimate has reached `inertia`.
-    """
-    return controller.told(inertia) if hasattr(controller, "told") else controller
-
-
-def flown(controller: Any, inertia: Float[ArrayLike, "..."]) -> Any:
-    """What to simulate of `controller`: a scheduled one as told, any that can step as it is."""
-    return controller if hasattr(controller, "step") else told(controller, inertia)
+        The size of the map and that of all gains are one number; kd fixes it.
+        """
+        gains, of_map = tunable_of("pid", self.pid), tunable_of("map", self.map)
+        return {name: x for name, x in gains.items() if name != "pid.kd" or not of_map} | of_map
 
 
 def gain_at(map: InertiaToGain, inertia: Float[ArrayLike, "..."]) -> Array:
-    """b0 at an inertia in kg m^2, for all the members of `map` and inertia.
-
-    Raises ValueError for an inertia that is not above 0 or does not fit the map's axes.
-    """
+    """b0 at an inertia in kg m^2, for all the members of `map` and `inertia`."""
     inertia = as_float(inertia)
-    require_positive("the inertia told", inertia, "give kg m^2")
+    require_positive("inertia", inertia, "give kg m^2")
     if inertia.ndim == 0:
-        raise ValueError(f"the inertia told is {inertia}: give one value per axis, in kg m^2.")
-    arrays = _arrays(map)
-    require_shapes({"inertia": inertia} | arrays)
-    ensemble = ensemble_shape({"inertia": inertia} | arrays, rank=1)
-    wide = inertia.reshape(inertia.shape + (1,) * (1 + len(ensemble) - inertia.ndim))
-    return as_float(map(jnp.broadcast_to(wide, (len(inertia), *ensemble))))
+        raise ValueError(f"inertia is {inertia}: give one value per axis, in kg m^2.")
+    shape = full_shape(inertia, ensemble_shape(map))
+    wide = inertia.reshape(inertia.shape + (1,) * (len(shape) - inertia.ndim))
+    return as_float(map(jnp.broadcast_to(wide, shape)))
 
 
-def _arrays(map: InertiaToGain) -> dict[str, Array]:
-    """What one of the library's maps has per axis; nothing of any other function."""
-    if isinstance(map, InertiaMap):
-        return {"nominal": map.nominal, "values": map.values[0]}
-    return {"nominal": map.nominal, "b0": map.b0} if isinstance(map, FuzzyMap) else {}
+def tunable_of(owner: str, part: object) -> dict[str, Transform | None]:
+    """What `part` says, named as seen from the controller whose field `owner` it is."""
+    found = part.tunable() if isinstance(part, Tunable) else {}
+    return {f"{owner}.{name}": transform for name, transform in found.items()}
 
 
-def _ensemble(controller: LADRC | PID, map: InertiaToGain) -> tuple[int, ...]:
-    shapes = controller.ensemble, getattr(map, "ensemble", ())
-    rank = max(len(shape) for shape in shapes)
-    return np.broadcast_shapes(*(shape + (1,) * (rank - len(shape)) for shape in shapes))
+def tunable_bandwidths(owner: str, ladrc: object) -> dict[str, Transform | None]:
+    """What a LADRC says, without its b0, which a map gives."""
+    return {k: x for k, x in tunable_of(owner, ladrc).items() if k != f"{owner}.b0"}
+
+
+def names_within(owner: str, names: Collection[str]) -> list[str]:
+    """The names of what is in the field `owner`, as seen from there."""
+    return [name.removeprefix(f"{owner}.") for name in names if name.startswith(f"{owner}.")]

@@ -149,9 +149,10 @@ def _gains_of(
     if type(ladrc.observer) not in _OBSERVERS:
         known = ", ".join(f"{kind.__name__}()" for kind in _OBSERVERS)
         raise ValueError(f"observer is {ladrc.observer!r}: in C there are {known}.")
-    kp, kd, correction = ladrc.gains
-    values = {"kp": kp} | ({} if kd is None else {"kd": kd})
-    values |= {f"l{k + 1}": row for k, row in enumerate(correction)}
+    gains = ladrc.gains
+    values = {"kp": gains.proportional}
+    values |= {} if gains.derivative is None else {"kd": gains.derivative}
+    values |= {f"l{k + 1}": row for k, row in enumerate(gains.correction)}
     values |= {"b0": ladrc.b0, "limit": ladrc.limit, **more}
     require_precision(values, precision)
     return per_axis(values, axes)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad.control import flown
+from jaxquad.control import schedule_for_flight
 from jaxquad.simulation import scan_loop
 
 from ._cost import SMOOTHING
@@ -122,12 +122,11 @@ def _with_columns(primals: Any, tangents: Any) -> Any:
 def _errors(z: Float[Array, " n"], given: _Given) -> Float[Array, "points axes members"]:
     """sqrt(t) error every few samples, t from the last event."""
     problem, stride = given.problem, given.stride
-    law = flown(given.coordinates.controller_at(z), problem.loops.inertia_told)
+    law = schedule_for_flight(given.coordinates.controller_at(z), problem.loops.inertia_told)
     keep = lambda nothing, now: (nothing, now.reference - now.angle)
-    stored = scan_loop(
-        problem.plant, law, problem.flight, problem.settings, keep, lambda like: None
-    )[1]
-    span, dt = problem.span, problem.settings.dt
+    loop = problem.loop.with_controller(law)
+    stored = scan_loop(loop, problem.flight, keep, lambda like: None)[1]
+    span, dt = problem.span, loop.dt
     index = np.arange(span.first, span.last + 1, stride)
     since = np.min(
         [np.where(index >= s, index - s, np.inf)

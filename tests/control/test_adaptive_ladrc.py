@@ -15,6 +15,7 @@ from jaxquad.control import (
     ProbeTones,
     RecursiveInertia,
 )
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Saturation, Scenario, simulate
 
@@ -39,7 +40,7 @@ def fly(controller, *, inertia=SPREAD, drive=1e3, **parts):
     scenario = Scenario(
         column("reference"), zero, column("disturbance"), zero, payload=column("payload")
     )
-    return simulate(plant, controller, scenario, drive=Saturation(drive))
+    return simulate(Loop(plant, controller, drive=Saturation(drive)), scenario)
 
 
 @pytest.fixture(scope="module")

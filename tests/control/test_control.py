@@ -5,6 +5,7 @@ import pytest
 from scipy import signal
 
 from jaxquad.control import PD, place_pd
+from jaxquad.loops import Loop
 from jaxquad.simulation import Scenario, simulate
 
 
@@ -32,7 +33,7 @@ def step_response(bandwidth, dt=DT, axis=0):
     samples = round(4.0 / dt)
     nothing = jnp.zeros((samples, 3))
     step = nothing.at[:, axis].set(0.1)
-    return simulate(Axes(), pilot, Scenario(step, nothing, nothing, nothing), dt=dt)
+    return simulate(Loop(Axes(), pilot, dt=dt), Scenario(step, nothing, nothing, nothing))
 
 
 def second_order(time):

@@ -67,7 +67,8 @@ def test_gains_are_herbsts_closed_forms(dt):
     found = PredictiveObserver().gains(wo, dt, 2)
     second = (1 - zo) ** 2 * (5 + zo) / (2 * dt)
     np.testing.assert_allclose(found, np.array([3 * (1 - zo), second, l3], float), rtol=1e-12)
-    kp, kd, _ = LADRC(WC, WO, 1.0, dt=dt).gains
+    gains = LADRC(WC, WO, 1.0, dt=dt).gains
+    kp, kd = gains.proportional, gains.derivative
     assert kd is not None
     assert float(kp) == pytest.approx(float((1 - zc) ** 2 / dt**2), rel=1e-12)
     assert float(kd) == pytest.approx(float((1 - zc) * (3 + zc) / (2 * dt)), rel=1e-12)

@@ -187,5 +187,5 @@ def test_what_makes_no_pid_is_refused_with_its_value(wrong, message):
 
 
 def test_a_tracking_time_must_be_positive():
-    with pytest.raises(ValueError, match="between kd/kp and kp/ki"):
+    with pytest.raises(ValueError, match="usually kd/kp to kp/ki"):
         BackCalculation(0.0)

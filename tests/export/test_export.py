@@ -132,7 +132,7 @@ def broken(gain, value):
 @pytest.mark.parametrize(
     "controller, message",
     [
-        (lambda: SCHEDULED["scheduled LADRC"].told(jnp.ones((AXES, 4))), "ensemble"),
+        (lambda: SCHEDULED["scheduled LADRC"].scheduled_at(jnp.ones((AXES, 4))), "ensemble"),
         (lambda: broken("b0", [1.0, np.nan, 1.0]), "b0 is nan, which no float"),
         (lambda: broken("b0", [1.0, 1e300, 1.0]), r"b0 is 1e\+300, which no float"),
         (lambda: PID([1.0] * 3, 1.0, 1.0, anti_windup=OWN), "anti_windup is .*Clamping"),

@@ -41,7 +41,7 @@ def test_the_papers_gains_are_3_and_1_6_on_the_rig_and_in_proportion_elsewhere()
 
 
 def test_certainty_equivalence_is_the_gain_over_the_inertia_told():
-    law = peers(RIG)["CE 10/30"].told(jnp.array([[0.01, 0.0552, 0.5]]))
+    law = peers(RIG)["CE 10/30"].scheduled_at(jnp.array([[0.01, 0.0552, 0.5]]))
     np.testing.assert_allclose(law.b0, 0.0468 / np.array([[0.01, 0.0552, 0.5]]), rtol=1e-12)
 
 

@@ -1,39 +1,28 @@
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+"""What all inertia estimators of this folder have in common."""
 
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxquad._core import ensemble_shape, fit, require_positive, require_shapes
+from jaxquad._core import (
+    as_float,
+    check_positive,
+    ensemble_shape,
+    fit,
+    per_member,
+    require_positive,
+    require_shapes,
+)
+
+from .._protocols import InertiaEstimate
 
 
 PLAUSIBLE = 10.0  # times the nominal inertia, or a share of it
 
 
-class InertiaEstimate(NamedTuple):
-    """What an estimator holds of the inertia, and how sure of it it is."""
-
-    inertia: Float[Array, " axes *ensemble"]  # kg m^2; the nominal one before any excitation
-    deviation: Float[Array, " axes *ensemble"]  # kg m^2, standard deviation
-    trusted: Float[Array, " axes *ensemble"]  # 1 where excited and precise enough, else 0
-
-
-@runtime_checkable
-class InertiaEstimator(Protocol):
-    """What `jq.AdaptiveLADRC` asks of an estimator.
-
-    `update` hears once a sample the command that the plant received since the last sample and the
-    angle just measured. `probe` is the test signal to add to the next command; `excite`
-    demands one.
-    """
-
-    def init(self, like: Any) -> Any: ...
-    def update(self, state: Any, command: Any, measurement: Any) -> Any: ...
-    def estimate(self, state: Any) -> InertiaEstimate: ...
-    def probe(self, state: Any) -> Float[Array, " axes *ensemble"]: ...
-    def excite(self, state: Any) -> Any: ...
-
-
-class Held(NamedTuple):
+class LastEstimate(NamedTuple):
     """An estimate between the samples or windows that renew it."""
 
     inertia: Float[Array, " axes *ensemble"]  # kg m^2
@@ -42,43 +31,58 @@ class Held(NamedTuple):
     informed: Float[Array, " axes *ensemble"]  # 1 once there was excitation
 
 
-def nothing_held(nominal: Float[Array, "..."], like: Float[Array, " axes *ensemble"]) -> Held:
-    zero = jnp.zeros_like(like)
-    return Held(jnp.broadcast_to(fit(nominal, like), like.shape), zero, zero, zero)
+State = TypeVar("State", bound=Any)  # a NamedTuple with the field `last`, a LastEstimate
 
 
-def judged(held: Held, nominal: Float[Array, "..."], trust: float) -> InertiaEstimate:
-    """The estimate with its deviation: 100 % before any excitation, growing while it is held.
+class AbstractInertia(eqx.Module):
+    """The plant and the rules of trust that all estimators share.
 
-    Trusted with a relative deviation of `trust` and within a factor of 10 of the `nominal`.
+    A plant of the inertia J answers a command u with J angle'' = `torque_gain` u + disturbances.
     """
-    spread = held.variance + held.age * held.inertia**2
-    some = spread > 0
-    deviation = jnp.where(some, jnp.sqrt(jnp.where(some, spread, 1)), 0)
-    informed = held.informed > 0
-    deviation = jnp.where(informed, deviation, jnp.abs(held.inertia))
-    ratio = held.inertia / fit(nominal, held.inertia)
-    plausible = (ratio > 1 / PLAUSIBLE) & (ratio < PLAUSIBLE)
-    sure = informed & plausible & (deviation <= trust * held.inertia)
-    return InertiaEstimate(held.inertia, deviation, sure.astype(deviation.dtype))
 
+    torque_gain: Float[Array, "..."] = per_member(1, converter=as_float)  # N m per unit of command
+    nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2
+    trust: float = eqx.field(static=True, default=0.1, kw_only=True)
+    drift: float = eqx.field(static=True, default=0.01, kw_only=True)  # 1/sqrt(s)
+    dt: float = eqx.field(static=True, default=0.002, kw_only=True)  # s
 
-def doubted(held: Held) -> Held:
-    """As unsure as at the start, with the inertia kept."""
-    return held._replace(age=jnp.ones_like(held.age))
+    def __check_init__(self):
+        remedy = "give N m per unit of command: L Kf of the Hover"
+        require_positive("torque_gain", self.torque_gain, remedy)
+        require_positive("nominal", self.nominal, "give the design's inertia in kg m^2")
+        require_shapes({"torque_gain": self.torque_gain, "nominal": self.nominal})
+        check_positive(dt=self.dt)
 
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the parameters, () for one estimator."""
+        return ensemble_shape(self)
 
-def plant_ensemble(torque_gain: Array, nominal: Array) -> tuple[int, ...]:
-    return ensemble_shape({"torque_gain": torque_gain, "nominal": nominal}, rank=1)
+    def estimate(self, state: Any) -> InertiaEstimate:
+        """The last estimate, with the standard deviation that it has by this sample."""
+        return self._assess(state.last)
 
+    def excite(self, state: State) -> State:
+        """Put the estimate in doubt, which starts the test signal; the inertia is kept."""
+        last = state.last
+        return state._replace(last=last._replace(age=jnp.ones_like(last.age)))
 
-def require_plant(torque_gain: Array, nominal: Array) -> None:
-    require_positive("torque_gain", torque_gain, "give N m per unit of command, on the rig L Kf")
-    require_positive("nominal", nominal, "give the design's inertia in kg m^2")
-    require_shapes({"torque_gain": torque_gain, "nominal": nominal})
+    def _start(self, like: Float[Array, " axes *ensemble"]) -> LastEstimate:
+        """The nominal inertia, before any excitation."""
+        zero = jnp.zeros_like(like)
+        return LastEstimate(jnp.broadcast_to(fit(self.nominal, like), like.shape), zero, zero, zero)
 
+    def _assess(self, last: LastEstimate) -> InertiaEstimate:
+        """100 % of deviation before any excitation; it grows while the estimate ages.
 
-def require_above_zero(unit: str, **values: float) -> None:
-    for name, value in values.items():
-        if not 0 < value < float("inf"):
-            raise ValueError(f"{name} is {value} {unit}: give a positive, finite number")
+        Trusted with a relative deviation of `trust` and within a factor of 10 of the `nominal`.
+        """
+        variance = last.variance + last.age * last.inertia**2
+        some = variance > 0
+        deviation = jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 0)
+        informed = last.informed > 0
+        deviation = jnp.where(informed, deviation, jnp.abs(last.inertia))
+        ratio = last.inertia / fit(self.nominal, last.inertia)
+        plausible = (ratio > 1 / PLAUSIBLE) & (ratio < PLAUSIBLE)
+        sure = informed & plausible & (deviation <= self.trust * last.inertia)
+        return InertiaEstimate(last.inertia, deviation, sure.astype(deviation.dtype))

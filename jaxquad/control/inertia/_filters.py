@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxquad._core import as_float, fit, require_positive
+from jaxquad._core import as_float, fit, per_member, require_positive
 
 
 class Past(NamedTuple):
@@ -26,7 +26,7 @@ class Equation(NamedTuple):
     valid: Float[Array, ""]  # 0 for the first two samples, whose differences have no past
 
 
-def no_past(like: Float[Array, " axes *ensemble"]) -> Past:
+def empty_past(like: Float[Array, " axes *ensemble"]) -> Past:
     zero = jnp.zeros_like(like)
     return Past(zero, zero, zero, jnp.zeros((), jnp.int32))
 
@@ -64,11 +64,11 @@ class MatchedFilters(eqx.Module):
     `order` equal stages (1 - a) / (1 - a/z), a = exp(-bandwidth dt), so that the filtered equation
     is as exact as the sampled one. The terms are 1, rate, angle (if `angle`), acceleration and
     torque; the filtered 1 carries a constant disturbance through the start.
-    Source: Eq. (19), discretised exactly; a filter of the rate under zero-order hold with
-    q0' = bandwidth (rate - q0) would bias the inertia by bandwidth dt / 2.
+    Source: Eq. (19) of the paper, discretised exactly (docs/equations.md). A filter of the rate
+    under zero-order hold, q0' = bandwidth (rate - q0), would bias the inertia by bandwidth dt / 2.
     """
 
-    torque_gain: Float[Array, "..."] = eqx.field(converter=as_float)  # N m per unit of command
+    torque_gain: Float[Array, "..."] = per_member(1, converter=as_float)  # N m per unit of command
     bandwidth: Float[Array, ""] = eqx.field(converter=as_float)  # rad/s
     order: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
@@ -78,7 +78,7 @@ class MatchedFilters(eqx.Module):
         require_positive("bandwidth", self.bandwidth, "give rad/s, 10 for an encoder of 8192")
         if self.order not in (1, 2, 3):
             raise ValueError(
-                f"order is {self.order}: filter by 1, 2 or 3 stages; an encoder asks for 3"
+                f"order is {self.order}: filter by 1, 2 or 3 stages; behind an encoder take 3."
             )
 
     @property
@@ -87,7 +87,7 @@ class MatchedFilters(eqx.Module):
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> FilterState:
         stage = jnp.zeros((self.signals, *like.shape), like.dtype)
-        return FilterState(no_past(like), (stage,) * self.order)
+        return FilterState(empty_past(like), (stage,) * self.order)
 
     def __call__(
         self,
@@ -108,12 +108,12 @@ class MatchedFilters(eqx.Module):
         return FilterState(past, tuple(stages)), out
 
 
-def settled(
+def has_settled(
     terms: Float[Array, " signals axes *ensemble"],
 ) -> Float[Array, " axes *ensemble"]:
     """1 once the filter has forgotten its start, 0 before.
 
     The first difference of a counted angle is wrong by up to a count per sample interval, which
-    the filter takes for a jump of the rate, 0.4 rad/s on the rig.
+    the filter takes for a jump of the rate, 0.4 rad/s on the Hover.
     """
     return (terms[0] > 0.999).astype(terms.dtype)

@@ -7,19 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxquad._core import as_float, full_shape
+from jaxquad._core import check_positive, full_shape
 
-from ._estimate import (
-    doubted,
-    Held,
-    InertiaEstimate,
-    judged,
-    nothing_held,
-    plant_ensemble,
-    require_above_zero,
-    require_plant,
-)
-from ._filters import motion, no_past, Past
+from ._estimate import AbstractInertia, LastEstimate
+from ._filters import empty_past, motion, Past
 from ._probe_tones import ProbeTones
 
 
@@ -172,15 +163,15 @@ class LockInWindows(eqx.Module):
         self,
         sums: WindowSums,
         signals: Float[Array, " signals axes *ensemble"],
-        heard: Float[Array, " axes *ensemble"],
+        counts: Float[Array, " axes *ensemble"],
     ) -> WindowSums:
-        """One more sample, `heard` 0 where its window is not to count."""
+        """One more sample, `counts` 0 where its window is not to count."""
         place = self._place(sums.index)
         going = _over((place > 0).astype(signals.dtype), sums.correlations)
         weights = self._weights(sums.index, place).astype(signals.dtype)
         weights = weights.reshape(weights.shape + (1,) * signals.ndim)
         correlations = going * sums.correlations + weights * signals[None, None, None]
-        whole = jnp.where(_over(place == 0, sums.whole), 1, sums.whole) * heard[None]
+        whole = jnp.where(_over(place == 0, sums.whole), 1, sums.whole) * counts[None]
         return WindowSums(correlations, whole, (sums.index + 1) % self.samples)
 
     def ends(self, sums: WindowSums) -> Bool[Array, ""]:
@@ -221,12 +212,12 @@ def _over(x, like):
 class LockInState(NamedTuple):
     past: Past
     sums: WindowSums
-    held: Held
+    last: LastEstimate
     stiffness: Float[Array, " axes *ensemble"]  # N m/rad
     exciting: Float[Array, " axes *ensemble"]  # 1 while the tones are on
 
 
-class LockInInertia(eqx.Module):
+class LockInInertia(AbstractInertia):
     """Inertia at the frequencies of its own test tones: torque over acceleration, in phase.
 
     Both sides of the sampled equation of motion are correlated with each tone over Hann windows of
@@ -247,19 +238,13 @@ class LockInInertia(eqx.Module):
     Raises `ValueError` for tones that do not fit the window or each other.
     """
 
-    torque_gain: Float[Array, "..."] = eqx.field(converter=as_float)  # N m per unit of command
-    nominal: Float[Array, "..."] = eqx.field(converter=as_float)  # kg m^2
     tones: ProbeTones = eqx.field(default_factory=ProbeTones)
     window: float = eqx.field(static=True, default=5.0)  # s
     nuisance: tuple[str, ...] = eqx.field(static=True, default=())
     contrast: float = eqx.field(static=True, default=10.0)
-    trust: float = eqx.field(static=True, default=0.1)
-    drift: float = eqx.field(static=True, default=0.01)  # 1/sqrt(s)
-    dt: float = eqx.field(static=True, default=0.002)  # s
 
     def __check_init__(self):
-        require_plant(self.torque_gain, self.nominal)
-        require_above_zero("s", dt=self.dt, window=self.window)
+        check_positive(dt=self.dt, window=self.window)
         if self.nuisance not in ((), ("angle",)):
             raise ValueError(f"nuisance is {self.nuisance}: give () or ('angle',)")
         if self.nuisance and len(self.tones.frequencies) < 2:
@@ -269,19 +254,14 @@ class LockInInertia(eqx.Module):
             )
         self._windows()
 
-    @property
-    def ensemble(self) -> tuple[int, ...]:
-        """The trailing shape of the parameters, () for one estimator."""
-        return plant_ensemble(self.torque_gain, self.nominal)
-
     def _windows(self) -> LockInWindows:
         return LockInWindows(self.tones.frequencies, self.window, self.dt)
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> LockInState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
-        held = nothing_held(self.nominal, like)
-        return LockInState(no_past(like), self._windows().init(like), held, zero, zero + 1)
+        sums = self._windows().init(like)
+        return LockInState(empty_past(like), sums, self._start(like), zero, zero + 1)
 
     def update(
         self,
@@ -289,35 +269,31 @@ class LockInInertia(eqx.Module):
         command: Float[Array, " axes *ensemble"],
         measurement: Float[Array, " axes *ensemble"],
     ) -> LockInState:
-        """Hear the command held during the last sample and the angle at its end."""
+        """Add the command held during the last sample and the angle at its end."""
         past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
         windows = self._windows()
         pair = now.valid * jnp.stack([now.acceleration, now.torque])
         sums = windows.add(state.sums, pair, state.exciting)
-        aged = state.held._replace(age=state.held.age + self.drift**2 * self.dt)
-        held, stiffness = jax.lax.cond(
+        aged = state.last._replace(age=state.last.age + self.drift**2 * self.dt)
+        last, stiffness = jax.lax.cond(
             windows.ends(sums),
-            ft.partial(self._renewed, windows),
-            lambda sums, *kept: kept,
+            ft.partial(self._renew, windows),
+            lambda sums, *unchanged: unchanged,
             sums, aged, state.stiffness,
         )  # fmt: skip
-        exciting = self.tones.switch(state.exciting, judged(held, self.nominal, self.trust))
-        return LockInState(past, sums, held, stiffness, exciting)
+        exciting = self.tones.switch(state.exciting, self._assess(last))
+        return LockInState(past, sums, last, stiffness, exciting)
 
-    def _renewed(self, windows, sums, held, stiffness):
+    def _renew(self, windows, sums, last, stiffness):
         """The estimate of the window that has just ended, where it shows one."""
         done, whole = windows.ended(sums)
         solved = solve(
             done[:, :, :, 0], done[:, :, :, 1], windows.square(whole),
             contrast=self.contrast, stiff=bool(self.nuisance),
         )  # fmt: skip
-        new = Held(solved.inertia, solved.variance, jnp.zeros_like(whole), solved.informed)
+        new = LastEstimate(solved.inertia, solved.variance, jnp.zeros_like(whole), solved.informed)
         renew = ft.partial(jnp.where, (whole > 0) & (solved.informed > 0))
-        return jax.tree.map(renew, (new, solved.stiffness), (held, stiffness))
-
-    def estimate(self, state: LockInState) -> InertiaEstimate:
-        """That of the last whole window in which a tone stood out."""
-        return judged(state.held, self.nominal, self.trust)
+        return jax.tree.map(renew, (new, solved.stiffness), (last, stiffness))
 
     def stiffness(self, state: LockInState) -> Float[Array, " axes *ensemble"]:
         """In N m/rad beside the inertia; 0 unless the nuisance is "angle"."""
@@ -327,7 +303,3 @@ class LockInInertia(eqx.Module):
         """The test signal to add to the next command."""
         phase = self._windows().phase(state.sums.index).astype(state.exciting.dtype)
         return self.tones.wave(phase, state.exciting)
-
-    def excite(self, state: LockInState) -> LockInState:
-        """On demand: the estimate is in doubt from now on, which starts the tones."""
-        return state._replace(held=doubted(state.held))

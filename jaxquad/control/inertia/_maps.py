@@ -1,4 +1,5 @@
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -8,10 +9,14 @@ from jaxquad._core import (
     ensemble_shape,
     fit,
     is_concrete,
+    per_member,
     require_finite,
     require_positive,
+    require_shapes,
     times,
 )
+
+from .._protocols import Transform
 
 
 class FuzzyMap(eqx.Module):
@@ -24,8 +29,8 @@ class FuzzyMap(eqx.Module):
     Raises `ValueError` for centres that do not rise and for increments that leave no b0 above 0.
     """
 
-    nominal: Float[Array, "..."] = eqx.field(converter=as_float)  # kg m^2
-    b0: Float[Array, "..."] = eqx.field(converter=as_float)  # rad/s^2 per unit of command
+    nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2
+    b0: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s^2 per unit of command
     centres: Float[Array, " sets"] = eqx.field(converter=as_float)  # of delta
     increments: Float[Array, " sets"] = eqx.field(converter=as_float)  # of b0
 
@@ -66,11 +71,16 @@ class FuzzyMap(eqx.Module):
 
     def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
+        require_shapes({"inertia": inertia, "nominal": self.nominal, "b0": self.b0})
         weights = self.memberships(inertia / fit(self.nominal, inertia))
         increments = self.increments.astype(weights.dtype)
         increments = increments.reshape((-1,) + (1,) * inertia.ndim)
         average = jnp.sum(weights * increments, axis=0) / jnp.sum(weights, axis=0)
         return fit(self.b0, inertia) + average
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """b0; the increments may cross 0, so they need `jq.identify.Real`."""
+        return {"b0": None}
 
 
 def printed_map(nominal: Float[Array, "..."] | float, *, b0: float = 3.0) -> FuzzyMap:
@@ -84,19 +94,39 @@ def printed_map(nominal: Float[Array, "..."] | float, *, b0: float = 3.0) -> Fuz
     return FuzzyMap(nominal, b0, np.linspace(1.0, 22.0, 8), np.linspace(0.0, 24.0, 8))
 
 
+_SHARPNESS = 20.0
+_FLATTEST = 0.05  # nepers from row to row at the start of a tune: a flat start has no gradient
+
+
+class Falling(eqx.Module):
+    """Coordinates for an array whose rows fall from one to the next: a `Transform`.
+
+    The first row is its own coordinate; each further row is softplus(20 z) / 20 below the last.
+    """
+
+    def forward(self, z: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
+        drops = jax.nn.softplus(_SHARPNESS * z[1:]) / _SHARPNESS
+        return z[:1] - jnp.concatenate([jnp.zeros_like(z[:1]), jnp.cumsum(drops, axis=0)])
+
+    def inverse(self, values: Float[np.ndarray, "rows ..."]) -> Float[np.ndarray, "rows ..."]:
+        """Coordinates of the falling rows nearest to `values`; rows fall by 0.05 at least."""
+        drops = np.maximum(values[:-1] - values[1:], _FLATTEST)
+        return np.concatenate([values[:1], np.log(np.expm1(_SHARPNESS * drops)) / _SHARPNESS])
+
+
 class InertiaMap(eqx.Module):
     """From an inertia to the controller's gain b0: piecewise linear in ln J -> ln b0.
 
     Straight between `knots`, constant beyond the first and the last. Slope -1 is certainty
     equivalence, b0 = KT / J, which `certainty_equivalence` makes; knots and values are arrays, to
     be tuned by gradient. Triangular fuzzy sets with averaged outputs are such a map, too: see
-    `jq.control.FuzzyMap`. Source: Eq. (25), with the map that replaces the printed one, docs/equations.md.
+    `jq.control.FuzzyMap`. Source: Eq. (25) of the paper, docs/equations.md, with another map.
     Raises `ValueError` for knots that do not rise and for shapes that do not fit.
     """
 
-    nominal: Float[Array, "..."] = eqx.field(converter=as_float)  # kg m^2; axes *ensemble
+    nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2; axes *ensemble
     knots: Float[Array, " knots"] = eqx.field(converter=as_float)  # ln(J / nominal)
-    values: Float[Array, " knots ..."] = eqx.field(converter=as_float)  # ln b0; axes *ensemble
+    values: Float[Array, " knots ..."] = per_member(2, converter=as_float)  # ln b0; axes *ensemble
 
     def __check_init__(self):
         require_positive("nominal", self.nominal, "give the design's inertia in kg m^2")
@@ -118,9 +148,14 @@ class InertiaMap(eqx.Module):
 
     def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
+        require_shapes({"inertia": inertia, "nominal": self.nominal, "values": self.values[0]})
         nominal = fit(self.nominal, inertia)
         x = jnp.log(jnp.maximum(inertia / nominal, 1e-6))
         return jnp.exp(interpolate(x, self.knots, self.values))
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The values, which keep falling."""
+        return {"values": Falling()}
 
     @property
     def falls(self) -> Bool[Array, ""]:

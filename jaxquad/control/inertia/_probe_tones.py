@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxquad._core import as_float, fit, require_nonnegative
+from jaxquad._core import as_float, fit, per_member, require_nonnegative
 
-from ._estimate import InertiaEstimate
+from .._protocols import InertiaEstimate
 
 
 class ProbeState(NamedTuple):
@@ -27,7 +27,7 @@ class ProbeTones(eqx.Module):
     """
 
     frequencies: tuple[float, ...] = eqx.field(static=True, default=(2.0,))  # Hz
-    amplitude: Float[Array, "..."] = eqx.field(converter=as_float, default=0.3)  # of each sine
+    amplitude: Float[Array, "..."] = per_member(1, converter=as_float, default=0.3)  # of each sine
     above: float = eqx.field(static=True, default=0.08)
     below: float = eqx.field(static=True, default=0.04)
 
