@@ -1,4 +1,4 @@
-"""How the reference reads the package: a room exports what its face imports, comments tell units."""
+"""How the reference reads the package: the exports of a room, and the units in comments."""
 
 import re
 from typing import Any
