@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad.identify import fit, MaximumLikelihood, NotIdentifiable
+from jaxquad.identify import fit, MaximumLikelihood
 from jaxquad.models import LaggedIntegrator
 from jaxquad.simulation import Simulation
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial, Periodic
@@ -56,10 +56,9 @@ def _estimate(
         omega = np.geomspace(low, high, _POINTS)
         spectra = LocalPolynomial(integrators=2, delay=0.02)
         response = frequency_response(record, omega, estimator=JointInputOutput(spectra))
-    try:
-        found = fit(start, response, free=("gain", "lag"), cost=MaximumLikelihood())
-    except NotIdentifiable:
+    found = fit(start, response, free=("gain", "lag"), cost=MaximumLikelihood())
+    if not found.verdict.fitted:
         return _LOST
     gain = found.derived(lambda axis: axis.gain, "b")
-    rank = 2.0 - len(found.identifiability.undetermined)
+    rank = 2.0 - len(found.verdict.undetermined)
     return float(gain.value), float(gain.standard_error), rank

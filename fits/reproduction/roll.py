@@ -44,7 +44,7 @@ def claims(roll: Roll) -> list[Claim]:
 
 
 def _separate(roll: Roll) -> Claim:
-    lost = roll.joint.identifiability.undetermined
+    lost = roll.joint.verdict.undetermined
     reading = Reading(
         "one sweep, J_x and K_t free",
         {"undetermined, of 2": float(len(lost))},

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ._options import add_json, command, stdout_for_json
+from ._options import add_json, command, require_identifiable, stdout_for_json
 
 
 RATE_HZ, GAIN, LAG, DELAY = 250.0, 280.0, 0.02, 0.008  # Hz, rad/s^2 per unit of M, s, s
@@ -80,13 +80,12 @@ def run(options: argparse.Namespace) -> int:
     words = ["--input", "M", "--output", "q", "--reference", "x0", "--unit", "q=rad/s"]
     words += ["--band", *(f"{f:g}" for f in BAND), "--out", str(options.out)]
     with stdout_for_json(options):
-        path, failure = report_identification(options_of(["identify", str(log), *words]))
+        path, verdict = report_identification(options_of(["identify", str(log), *words]))
         delay = DELAY + 0.5 / RATE_HZ  # An input that is held is half a sample late.
         report = path.with_name("report.html")
         truth = {"gain": GAIN, "lag": LAG, "delay": delay, "sum": LAG + delay}
         print(_NEXT.format(report=report, **truth))
     if options.json:
         print(path.read_text(), end="")
-    if failure is not None:
-        raise failure
+    require_identifiable(verdict)
     return 0

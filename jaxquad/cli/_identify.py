@@ -2,7 +2,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ._options import add_log, command, read_mix, read_segment, read_unit, SECONDS, stdout_for_json
+from ._options import (
+    add_log,
+    command,
+    read_mix,
+    read_segment,
+    read_unit,
+    require_identifiable,
+    SECONDS,
+    stdout_for_json,
+)
 
 
 EXAMPLES = """examples:
@@ -39,11 +48,10 @@ def run(options: argparse.Namespace) -> int:
     from jaxquad.workflows import report_identification
 
     with stdout_for_json(options):
-        path, failure = report_identification(options)
+        path, verdict = report_identification(options)
     if options.json:
         print(path.read_text(), end="")
-    if failure is not None:
-        raise failure
+    require_identifiable(verdict)
     return 0
 
 

@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaxquad.identify import NotIdentifiable
+    from jaxquad.identify import UndeterminedError
     from jaxquad.records import RecordWarning
 
     with warnings.catch_warnings():
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return options.run(options)
         except (ValueError, OSError) as error:
             print("jaxquad: error:", *str(error).split(), file=sys.stderr)
-            return _NOT_IDENTIFIABLE if isinstance(error, NotIdentifiable) else _UNUSABLE
+            return _NOT_IDENTIFIABLE if isinstance(error, UndeterminedError) else _UNUSABLE
         except KeyboardInterrupt:
             print("jaxquad: interrupted", file=sys.stderr)
             return _INTERRUPTED

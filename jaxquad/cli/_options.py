@@ -9,9 +9,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from jaxquad.records import Mix, parse_mix
+
+
+if TYPE_CHECKING:
+    from jaxquad.identify import Verdict
 
 
 class Bar:
@@ -103,6 +107,14 @@ def stdout_for_json(options: argparse.Namespace) -> Iterator[None]:
     """With --json, stdout belongs to the JSON alone, and what is printed goes to stderr."""
     with contextlib.redirect_stdout(sys.stderr if options.json else sys.stdout):
         yield
+
+
+def require_identifiable(verdict: "Verdict") -> None:
+    """Raise `UndeterminedError`, which `main` turns into its exit code, for any other verdict."""
+    from jaxquad.identify import UndeterminedError
+
+    if not verdict.identifiable:
+        raise UndeterminedError(verdict.summary)
 
 
 def print_json(content: Any) -> None:

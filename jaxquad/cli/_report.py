@@ -2,7 +2,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ._options import add_json, command, stdout_for_json
+from ._options import add_json, command, require_identifiable, stdout_for_json
 
 
 EXAMPLES = """example:
@@ -31,9 +31,8 @@ def run(options: argparse.Namespace) -> int:
     folder = options.result if options.result.is_dir() else options.result.parent
     again.out = options.out or folder
     with stdout_for_json(options):
-        path, failure = report_identification(again)
+        path, verdict = report_identification(again)
     if options.json:
         print(path.read_text(), end="")
-    if failure is not None:
-        raise failure
+    require_identifiable(verdict)
     return 0

@@ -2,7 +2,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ._options import add_json, command, print_json, SECONDS, stdout_for_json
+from ._options import (
+    add_json,
+    command,
+    print_json,
+    require_identifiable,
+    SECONDS,
+    stdout_for_json,
+)
 
 
 EXAMPLES = """examples:
@@ -52,8 +59,8 @@ def run(options: argparse.Namespace) -> int:
     content = stored(options.result)
     again = options_again(content, options.log)
     record, frf, found = identified(again)
-    if isinstance(found, Exception):
-        raise found
+    if not found.verdict.fitted:
+        require_identifiable(found.verdict)
     low, high = options.spread
     case = Case(
         inertia=options.inertia, limit=options.limit, spread=(low, high), told=options.told,

@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
     check = verify(model, _record(options, content["setup"]), band=(band[0], band[1]))
     with stdout_for_json(options):
         print(check)
-        for remark in () if content["fit"]["identifiable"] else content["fit"]["remarks"]:
+        for remark in () if content["fit"]["identifiable"] else _doubts(content["fit"]):
             print(f"! {remark}")
         if options.out:
             options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -53,6 +53,10 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print_json(verification_content(check))
     return 0
+
+
+def _doubts(fit: dict[str, Any]) -> list[str]:
+    return [fit["verdict"]["summary"], *fit["remarks"]]
 
 
 def _record(options: argparse.Namespace, setup: dict[str, Any]):

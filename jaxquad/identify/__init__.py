@@ -12,7 +12,6 @@ from ._draws import (
 from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
-from ._identifiability import Combination as Combination, NotIdentifiable as NotIdentifiable
 from ._output_error import refine as refine
 from ._parameters import (
     Free as Free,
@@ -31,4 +30,9 @@ from ._result import Fit as Fit
 from ._starts import Minimum as Minimum
 from ._transfer_function_fit import fit_transfer_function as fit_transfer_function
 from ._transfer_function_guess import guess_transfer_function as guess_transfer_function
+from ._verdict import (
+    Combination as Combination,
+    UndeterminedError as UndeterminedError,
+    Verdict as Verdict,
+)
 from ._verify import Agreement as Agreement, Verification as Verification, verify as verify

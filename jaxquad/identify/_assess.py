@@ -1,10 +1,11 @@
 """From a solver's stop to a result that states what it is worth."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, PyTree
 
 from jaxquad.spectra import FrequencyResponse
 
@@ -24,8 +25,8 @@ from ._accuracy import (
     Record,
     scaled_inverse,
 )
-from ._identifiability import decide, Identifiability, Information
-from ._parameters import Place
+from ._identifiability import decide, Information, LIMIT
+from ._parameters import Parameters, Place
 from ._problem import Problem
 from ._remarks import (
     FAILED,
@@ -34,10 +35,12 @@ from ._remarks import (
     remarks_on_fit,
     remarks_on_leakage,
     remarks_on_priors,
+    runaways,
 )
 from ._result import Fit
 from ._solve import same_responses, Solution
 from ._starts import Minimum, remarks_on_minima
+from ._verdict import Verdict, without_numbers
 
 
 def assess(
@@ -60,22 +63,23 @@ def assess(
     inflation = misfit if misfit > MISFIT**2 else 1.0
     covariance = calibrated_covariance(bread, noise, inflation)
     decrement = _decrement(bread, gradient, ran_to_zero(problem, solution))
-    verdict = by_data = Identifiability(parameters.names, (), (), np.eye(count), (), ())
-    if decrement <= FAILED * max(cost, 1e-9):
+    if decrement > FAILED * max(cost, 1e-9):
+        verdict = by_data = no_minimum(parameters.names, decrement, cost)
+    else:
         facts = _information(problem, solution, blocks, covariance, units, inflation)
         verdict, by_data = _identifiability(facts, known)
     values, slopes = np.asarray(solution.values)[:count], units[:count]
-    lost = np.array([name in verdict.undetermined for name in parameters.names])
-    physical = covariance * np.outer(slopes, slopes)
-    physical[lost, :] = physical[:, lost] = np.nan
+    physical, unbounded = physical_covariance(covariance, slopes, parameters.names, verdict)
     percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
+    if runaways(problem, solution):
+        verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
     return Fit(
         model=solution.model,
         names=parameters.names,
-        values=np.where(lost, np.nan, values),
-        standard_errors=np.where(lost, np.inf, np.sqrt(np.diagonal(physical))),
+        values=values,
+        standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
         covariance=physical,
-        cramer_rao=np.where(lost, np.inf, cramer_rao(bread) * percent),
+        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
         insensitivity=insensitivity(bread) * percent,
         cost=cost,
         average_cost=cost / len(blocks),
@@ -85,7 +89,7 @@ def assess(
         condition=condition_number(bread),
         points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in blocks),
         steps=solution.steps,
-        identifiability=verdict,
+        verdict=verdict,
         remarks=(
             *dict.fromkeys(remark for frf in frfs for remark in frf.remarks),
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
@@ -97,6 +101,69 @@ def assess(
         units=units[:count],
         relative_covariance=covariance,
         minima=minima,
+    )
+
+
+def no_minimum(names: tuple[str, ...], decrement: float, cost: float) -> Verdict:
+    """The verdict on a stop from which a step would still lower the cost."""
+    return without_numbers(
+        "no minimum",
+        names,
+        f"one more Gauss-Newton step would lower the cost by {decrement:.3g} of {cost:.4g}",
+        "start from other values",
+        "try many starts at once (starts=20)",
+    )
+
+
+def physical_covariance(
+    relative: Float[np.ndarray, "parameters parameters"],
+    slopes: Float[np.ndarray, " parameters"],
+    names: tuple[str, ...],
+    verdict: Verdict,
+) -> tuple[Float[np.ndarray, "parameters parameters"], Bool[np.ndarray, " parameters"]]:
+    """The covariance in physical units, nan where it is unbounded, and of which parameters.
+
+    A pseudo-inverse shows no variance along a null direction: there it is unbounded.
+    """
+    rows = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
+    hidden = [row for row in np.array(rows) if row @ relative @ row < (0.5 * LIMIT) ** 2]
+    lost = np.array([name in verdict.undetermined for name in names])
+    unbounded = lost & np.any(
+        np.abs(np.reshape([*hidden, *verdict.exact], (-1, len(names)))) > 1e-6, axis=0
+    )
+    physical = relative * np.outer(slopes, slopes)
+    physical[unbounded, :] = physical[:, unbounded] = np.nan
+    return physical, unbounded
+
+
+def unfitted(
+    model: PyTree, parameters: Parameters, verdict: Verdict, remarks: tuple[str, ...] = ()
+) -> Fit:
+    """What a fit returns where there is nothing to fit: the starting values, all marked."""
+    count = parameters.count
+    infinite = np.full(count, np.inf)
+    values = np.asarray(parameters.values(parameters.start[:count]))
+    return Fit(
+        model=model,
+        names=parameters.names,
+        values=values,
+        standard_errors=infinite,
+        covariance=np.full((count, count), np.nan),
+        cramer_rao=infinite,
+        insensitivity=infinite,
+        cost=np.nan,
+        average_cost=np.nan,
+        information=np.nan,
+        chi_squared=np.nan,
+        newton_decrement=np.nan,
+        condition=np.inf,
+        points=0,
+        steps=0,
+        verdict=verdict,
+        remarks=remarks,
+        parameters=parameters,
+        units=np.asarray(parameters.slopes(parameters.start[:count])),
+        relative_covariance=np.full((count, count), np.nan),
     )
 
 
@@ -171,7 +238,7 @@ def _information(
     )
 
 
-def _identifiability(facts: Information, known: Known) -> tuple[Identifiability, Identifiability]:
+def _identifiability(facts: Information, known: Known) -> tuple[Verdict, Verdict]:
     """What data and priors determine together, and what the data determine alone."""
     if not len(known.misfit):
         verdict = decide(facts)

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ._accuracy import Matrix
-from ._identifiability import NotIdentifiable
 from ._parameters import Parameters
+from ._verdict import UndeterminedError
 
 
 def draw_models(
@@ -19,7 +19,7 @@ def draw_models(
     """The models at standard normal `scores`; leaves with free or tied numbers get a last axis.
 
     Parameters that keep their sign are drawn as logarithms, so they keep it. Raises ValueError and
-    NotIdentifiable as `Fit.ensemble` does.
+    UndeterminedError as `Fit.ensemble` does.
     """
     values = drawn_values(fit, scores, hold_undetermined=hold_undetermined)
     replaced = _replaced(fit.parameters, fit.model, values)
@@ -45,13 +45,15 @@ def drawn_values(
     """Physical values of the free parameters."""
     check_drawable(fit, hold_undetermined)
     moves = jnp.asarray(_root(known_covariance(fit))) @ scores
-    here, units = jnp.asarray(fit._fitted())[:, None], jnp.asarray(fit.units)[:, None]
+    here, units = jnp.asarray(fit.values)[:, None], jnp.asarray(fit.units)[:, None]
     logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])[:, None]
     return jnp.where(logarithmic, here * jnp.exp(moves), here + units * moves)
 
 
 def check_drawable(fit: Any, hold_undetermined: bool) -> None:
-    """Raise ValueError for a fit that says nothing to draw from, NotIdentifiable for a part."""
+    """Raise ValueError for a fit that says nothing to draw from, UndeterminedError for a part."""
+    if not fit.verdict.fitted:
+        raise UndeterminedError(f"there is nothing to draw from: {fit.verdict.summary}")
     zeros = _ran_to_zero(fit)
     if zeros:
         raise ValueError(
@@ -63,7 +65,7 @@ def check_drawable(fit: Any, hold_undetermined: bool) -> None:
         raise ValueError(
             f"the fit did not converge, so there is nothing to draw from: {stopped[0]}"
         )
-    lost = fit.identifiability.undetermined
+    lost = fit.verdict.undetermined
     known = [fit.standard_errors[k] for k, name in enumerate(fit.names) if name not in lost]
     if not (np.all(np.isfinite(fit.relative_covariance)) and np.all(np.isfinite(known))):
         raise ValueError(
@@ -71,7 +73,7 @@ def check_drawable(fit: Any, hold_undetermined: bool) -> None:
             "response with random errors, and fit again"
         )
     if lost and not hold_undetermined:
-        raise NotIdentifiable(_refusal(fit, lost))
+        raise UndeterminedError(_refusal(fit, lost))
 
 
 def known_covariance(fit: Any) -> Matrix:
@@ -86,7 +88,7 @@ def known_covariance(fit: Any) -> Matrix:
 
 def held_directions(fit: Any) -> Float[np.ndarray, "held parameters"]:
     """Orthonormal relative changes that the fit calls undetermined, exactly or by its noise."""
-    verdict, names = fit.identifiability, fit.names
+    verdict, names = fit.verdict, fit.names
     shares = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
     null = np.array(shares).reshape(-1, len(names))
     open_ones = np.array([name in verdict.undetermined for name in names])
@@ -106,8 +108,8 @@ def _root(covariance: Matrix) -> Matrix:
 def _ran_to_zero(fit: Any) -> list[str]:
     """Parameters that keep their sign, whose errors are no longer relative to themselves."""
     logarithmic = fit.parameters.logarithmic[: len(fit.names)]
-    apart = ~np.isclose(np.abs(fit.units), np.abs(fit._fitted()), rtol=1e-6)
-    lost = fit.identifiability.undetermined
+    apart = ~np.isclose(np.abs(fit.units), np.abs(fit.values), rtol=1e-6)
+    lost = fit.verdict.undetermined
     rows = zip(fit.names, logarithmic, apart, strict=True)
     return [name for name, log, far in rows if log and far and name not in lost]
 

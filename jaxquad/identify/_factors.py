@@ -8,9 +8,9 @@ from jaxtyping import Complex, Float
 
 from jaxquad.models import TransferFunction
 
-from ._identifiability import Combination, LIMIT, NotIdentifiable
-from ._remarks import FEWER
+from ._identifiability import LIMIT
 from ._result import Fit
+from ._verdict import Combination, UndeterminedError
 
 
 def factors_text(factors: Any) -> str:
@@ -95,7 +95,7 @@ def factors(fit: Fit) -> Factors:
     """Factor the transfer function of a fit; errors by first-order propagation.
 
     A coefficient that moves by dc_j moves a root r of P by -r^j dc_j / P'(r). Raises ValueError
-    if the model is no `jq.TransferFunction`, `NotIdentifiable` if no coefficient is determined.
+    if the model is no `jq.TransferFunction`, `UndeterminedError` if no coefficient is determined.
     """
     model = fit.model
     if not isinstance(model, TransferFunction):
@@ -103,11 +103,11 @@ def factors(fit: Fit) -> Factors:
             f"factors of a {type(model).__name__}: only a fit of a jq.TransferFunction has them; "
             "see jq.fit_transfer_function"
         )
-    if np.all(np.isnan(fit.values)):
-        reasons = [remark for remark in fit.remarks if FEWER in remark]
-        advice = "; ".join(reasons) or "fit fewer zeros and poles, or excite a wider band"
-        raise NotIdentifiable(f"no factors, for no coefficient is determined: {advice}")
-    spread = _Spread(fit.relative_covariance, fit.identifiability.exact, fit.identifiable)
+    if not np.any(fit.determined):
+        reasons = "; ".join(fit.verdict.reasons)
+        advice = reasons or "fit fewer zeros and poles, or excite a wider band"
+        raise UndeterminedError(f"no factors, for no coefficient is determined: {advice}")
+    spread = _Spread(fit.relative_covariance, fit.verdict.exact, fit.identifiable)
     above, below = (np.asarray(c) for c in (model.numerator, model.denominator))
     gain_slope = (
         _slopes(fit, "numerator", 1)[0] / below[0]

@@ -9,15 +9,15 @@ from jaxquad._core import require_x64
 from jaxquad.models import LaggedIntegrator
 from jaxquad.spectra import FrequencyResponse
 
-from ._assess import assess
+from ._assess import assess, unfitted
 from ._checks import check_finite, check_knowledge, check_options, check_priors, checked_responses
 from ._cost import Band, CoherenceWeighted, Cost, Mask, Ratio, usable, Weights
-from ._identifiability import NotIdentifiable
 from ._parameters import Free, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem
 from ._result import Fit
 from ._solve import Solution, solve
 from ._starts import Minimum, solve_from_many, spread_starts
+from ._verdict import Verdict, without_numbers
 
 
 def guess_lagged_integrator(frf: FrequencyResponse, integrators: int) -> LaggedIntegrator:
@@ -68,8 +68,9 @@ def fit(
     side, and `Fit.minima` lists all distinct stops with their costs.
     `solver` is any optimistix least-squares solver, Levenberg-Marquardt by default.
 
-    Raises `NotIdentifiable` where too few frequencies are usable, `ValueError` for names that
-    the model does not have and for a solver that diverged, `PrecisionError` in 32 bits.
+    What the record does not determine is said by `Fit.verdict`; where too few frequencies are
+    usable to fit anything, the result holds the starting values. Raises `ValueError` for names
+    that the model does not have and for a solver that diverged, `PrecisionError` in 32 bits.
     Source: Eq. (14), corrected.
     """
     require_x64("a fit")
@@ -77,8 +78,11 @@ def fit(
     check_options(cost, band, min_coherence, max_steps)
     parameters = select_parameters(model, free, tied)
     used = [usable(one, band, min_coherence) for one in frfs]
-    _check_points(frfs, used, parameters, min_coherence, band)
     check_knowledge(model, priors, cost)
+    too_few = _too_few_points(frfs, used, parameters, min_coherence, band)
+    if too_few is not None:
+        remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
+        return unfitted(model, parameters, too_few, tuple(remarks))
     problem = make_problem(model, parameters, frfs, conditions, priors)
     problem, solution, minima = _solved(problem, frfs, used, cost, (starts, solver, max_steps))
     check_finite(solution)
@@ -86,25 +90,26 @@ def fit(
     return assess(problem, frfs, solution, minima)
 
 
-def _check_points(
+def _too_few_points(
     frfs: Sequence[FrequencyResponse],
     used: Sequence[Mask],
     parameters: Parameters,
     least: float,
     band: Band,
-) -> None:
+) -> Verdict | None:
     points = sum(int(mask.sum()) for mask in used)
     needed = parameters.count + 2
-    if points < needed:
-        best = max(float(np.max(np.asarray(frf.coherence))) for frf in frfs)
-        total = sum(mask.size for mask in used)
-        reasons = " ".join(remark for frf in frfs for remark in frf.remarks)
-        raise NotIdentifiable(
-            f"not identifiable from this record: coherence reaches {least:g} at {points} of "
-            f"{total} frequencies{f' (band {band} rad/s)' if band else ''}, its maximum is "
-            f"{best:.2f}, and {parameters.count} parameters need at least {needed}. Excite the "
-            f"axis (jq.sweep), record longer, or use a longer window. {reasons}".rstrip()
-        )
+    if points >= needed:
+        return None
+    best = max(float(np.max(np.asarray(frf.coherence))) for frf in frfs)
+    total = sum(mask.size for mask in used)
+    reason = (
+        f"coherence reaches {least:g} at {points} of {total} frequencies"
+        f"{f' (band {band} rad/s)' if band else ''}, its maximum is {best:.2f}, and "
+        f"{parameters.count} parameters need at least {needed}"
+    )
+    remedy = "excite the axis (jq.sweep), record longer, or use a longer window"
+    return without_numbers("too few points", parameters.names, reason, remedy)
 
 
 def _solved(

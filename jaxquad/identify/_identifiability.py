@@ -8,30 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ._accuracy import Matrix
+from ._verdict import Combination, remedies_for, Verdict
 
 
 KINDS = ("product", "sum")
-
-
-class Combination(NamedTuple):
-    """A product of powers, or a weighted sum, of parameters, with its standard error."""
-
-    name: str
-    value: float
-    standard_error: float
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """The 95 % interval."""
-        reach = 1.96 * self.standard_error
-        return self.value - reach, self.value + reach
-
-    def __str__(self) -> str:
-        low, high = self.interval
-        return (
-            f"{self.name} = {self.value:.5g} +- {self.standard_error:.2g}  "
-            f"(95 %: {low:.5g} .. {high:.5g})"
-        )
 
 
 def echelon(rows: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
@@ -158,21 +138,6 @@ _MOVE = 0.4  # finite relative change along a null direction that has to change 
 _FLOOR = 1e-8  # of the largest singular value: below it lies rounding
 
 
-class NotIdentifiable(ValueError):
-    """The record holds no usable response, or fewer points than there are parameters."""
-
-
-class Identifiability(NamedTuple):
-    """Names, directions and combinations; `undetermined` is empty where all is well."""
-
-    undetermined: tuple[str, ...]
-    null_directions: tuple[dict[str, float], ...]  # unit vectors of relative changes
-    determined: tuple[Combination, ...]  # combinations of the undetermined ones
-    exact: Float[np.ndarray, "null parameters"]  # those null directions that no noise explains
-    alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
-    curved: tuple[str, ...]  # what is determined of these is no product and no sum
-
-
 class Information(NamedTuple):
     """All that the decision rests on: free parameters first, then the fixed ones.
 
@@ -201,7 +166,7 @@ class _Group(NamedTuple):
     curved: bool
 
 
-def decide(information: Information) -> Identifiability:
+def decide(information: Information) -> Verdict:
     """Null directions of the Fisher information, and what is left outside them."""
     count = len(information.covariance)
     _, singular, right = np.linalg.svd(information.root[:, :count], full_matrices=True)
@@ -215,13 +180,19 @@ def decide(information: Information) -> Identifiability:
     facts = information._replace(covariance=_opened(information.covariance, right[exact]))
     groups = [_explore(null, sure, block, facts) for block in _blocks(null)]
     names = information.names
-    return Identifiability(
-        tuple(names[k] for k in np.flatnonzero(lost)),
-        tuple({names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null),
-        tuple(combination for group in groups for combination in group.combinations),
-        right[exact],
-        tuple(values for group in groups for values in group.alternatives),
-        tuple(names[k] for group in groups if group.curved for k in group.members),
+    undetermined = tuple(names[k] for k in np.flatnonzero(lost))
+    return Verdict(
+        kind="not identifiable" if undetermined else "identifiable",
+        undetermined=undetermined,
+        combinations=tuple(each for group in groups for each in group.combinations),
+        null_directions=tuple(
+            {names[k]: float(row[k]) for k in np.flatnonzero(row)} for row in null
+        ),
+        reasons=(),
+        remedies=remedies_for(undetermined) if undetermined else (),
+        exact=right[exact],
+        alternatives=tuple(values for group in groups for values in group.alternatives),
+        curved=tuple(names[k] for group in groups if group.curved for k in group.members),
     )
 
 

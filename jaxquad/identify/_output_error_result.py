@@ -1,5 +1,6 @@
 """From the stop of an output-error fit to a result that states what it is worth."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,15 +21,24 @@ from ._accuracy import (
     Noise,
     scaled_inverse,
 )
-from ._assess import _identifiability, _known, _ranks, _rescale, _units
+from ._assess import (
+    _identifiability,
+    _known,
+    _ranks,
+    _rescale,
+    _units,
+    no_minimum,
+    physical_covariance,
+)
 from ._coloured import orthonormal, projected_noise
-from ._identifiability import Identifiability, Information
+from ._identifiability import Information
 from ._output_error_descent import Descent, with_fixed_slopes
 from ._output_error_trial import Found, found_at, OutputError, Trial
 from ._problem import Problem
-from ._remarks import _runaways, remarks_on_priors
+from ._remarks import remarks_on_priors, runaways
 from ._result import Fit
 from ._solve import Solution
+from ._verdict import Verdict
 
 
 _LEFT = 1e-2  # share of what the noise moves that a step may still save
@@ -38,7 +48,7 @@ def remarks_on_output_error(
     base: Problem, solution: Solution, records: Sequence[Record], decrement: float, taken: float
 ) -> list[str]:
     """Runaway parameters, missing convergence, and feedback."""
-    remarks, no_minimum = _runaways(base, solution), decrement > _LEFT * max(taken, 1.0)
+    remarks, no_minimum = runaways(base, solution), decrement > _LEFT * max(taken, 1.0)
     if not solution.converged and (no_minimum or not remarks):
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
@@ -169,23 +179,24 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     covariance = calibrated_covariance(bread, noise)
     taken = float(np.trace(scaled_inverse(bread) @ noise.data))
     decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
-    verdict = by_data = Identifiability(parameters.names, (), (), np.eye(count), (), ())
     # In units of what the noise moves: a share of the cost would grow with the record.
-    if decrement <= count * max(taken, 1.0):
+    if decrement > count * max(taken, 1.0):
+        verdict = by_data = no_minimum(parameters.names, decrement, cost)
+    else:
         verdict, by_data = _verdict(descent, reduced, known, covariance, units)
     values, slopes = np.asarray(solution.values)[:count], units[:count]
-    lost = np.array([name in verdict.undetermined for name in parameters.names])
-    physical = covariance * np.outer(slopes, slopes)
-    physical[lost, :] = physical[:, lost] = np.nan
+    if runaways(base, solution):
+        verdict = dataclasses.replace(verdict, remedies=())
+    physical, unbounded = physical_covariance(covariance, slopes, parameters.names, verdict)
     percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
     fitted = count + sum(one.nuisance.shape[2] for one in seen)
     return Fit(
         model=solution.model,
         names=parameters.names,
-        values=np.where(lost, np.nan, values),
-        standard_errors=np.where(lost, np.inf, np.sqrt(np.diagonal(physical))),
+        values=values,
+        standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
         covariance=physical,
-        cramer_rao=np.where(lost, np.inf, cramer_rao(bread) * percent),
+        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
         insensitivity=insensitivity(bread) * percent,
         cost=cost,
         average_cost=cost / sum(one.misfit.shape[1] for one in seen),
@@ -195,7 +206,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         condition=condition_number(bread),
         points=rows,
         steps=solution.steps,
-        identifiability=verdict,
+        verdict=verdict,
         remarks=(
             *remarks_on_output_error(base, solution, records, decrement, taken),
             *remarks_on_colour([one.misfit for one in seen], bread, covariance),
@@ -213,7 +224,7 @@ def _verdict(
     known: Known,
     covariance: Float[np.ndarray, "parameters parameters"],
     units: Float[np.ndarray, " all"],
-) -> tuple[Identifiability, Identifiability]:
+) -> tuple[Verdict, Verdict]:
     """What data and priors determine; fixed parameters are looked at for names alone."""
     problem, solution, count = descent.problem, descent.solution, len(covariance)
     free = known._replace(slopes=known.slopes[:, :count])

@@ -93,7 +93,7 @@ def reduce_structure(
         )
     first = best = _fitted(model, frf, kinds, options)
     steps, needed = [], set()
-    while len(best.names) > 1:
+    while len(best.names) > 1 and best.verdict.fitted:
         worst = _worst(best, needed, insensitivity, cramer_rao)
         if worst is None:
             break
@@ -131,7 +131,7 @@ def _worst(
     """The parameter to try without, and why: insensitivity comes first."""
     for label, values, limit in (
         ("I", best.insensitivity, insensitivity),
-        ("CR", best.cramer_rao, cramer_rao),
+        ("CR", np.where(best.determined, best.cramer_rao, np.inf), cramer_rao),
     ):
         open_ = [k for k, name in enumerate(best.names) if name not in needed]
         if open_ and (k := max(open_, key=lambda k: values[k])) is not None and values[k] > limit:

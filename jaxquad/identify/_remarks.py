@@ -7,14 +7,13 @@ from jaxtyping import Float
 
 from jaxquad.spectra import FrequencyResponse
 
-from ._identifiability import Identifiability
 from ._problem import Problem
 from ._solve import Solution
+from ._verdict import Verdict
 
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 FAILED = 1e-2  # share of the cost that a step would still save, from which nothing is a result
-FEWER = "fit those orders"  # the advice where a pole and a zero do nothing
 _POOR = 10.0  # ratio from which a wrong minimum is likely
 _LOCAL = ", or this is a local minimum: try other starting values"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
@@ -24,7 +23,7 @@ def remarks_on_fit(
     problem: Problem, solution: Solution, cost: float, decrement: float, chi_squared: float
 ) -> list[str]:
     """Runaway parameters, missing convergence, misfit beyond the noise."""
-    remarks, no_minimum = _runaways(problem, solution), decrement > 1e-3 * max(cost, 1e-9)
+    remarks, no_minimum = runaways(problem, solution), decrement > 1e-3 * max(cost, 1e-9)
     if not solution.converged and (no_minimum or not remarks):
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
@@ -53,7 +52,7 @@ def _opposite(problem: Problem, solution: Solution) -> str:
 
 
 def remarks_on_priors(
-    pulls: Float[np.ndarray, " priors"], verdict: Identifiability, by_data: Identifiability
+    pulls: Float[np.ndarray, " priors"], verdict: Verdict, by_data: Verdict
 ) -> list[str]:
     """What rests on the priors alone, and which of them the data contradict."""
     remarks = [
@@ -64,7 +63,7 @@ def remarks_on_priors(
     ]
     resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
     if resolved:
-        known = ", ".join(combination.name for combination in by_data.determined)
+        known = ", ".join(combination.name for combination in by_data.combinations)
         remarks.append(
             f"{' and '.join(resolved)}: told apart by the prior alone; the record by itself "
             f"determines only {known or 'none of them'}"
@@ -110,7 +109,7 @@ def _moved(problem: Problem, solution: Solution) -> Float[np.ndarray, " paramete
     return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
 
 
-def _runaways(problem: Problem, solution: Solution) -> list[str]:
+def runaways(problem: Problem, solution: Solution) -> list[str]:
     names, low = problem.parameters.names, ran_to_zero(problem, solution)
     remarks = [
         f"{names[k]} ran to zero: leave it out, or let its sign change with jq.identify.Real({names[k]!r})"

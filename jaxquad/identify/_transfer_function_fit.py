@@ -13,24 +13,26 @@ from jaxquad._core import require_x64
 from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
+from ._assess import unfitted
 from ._checks import check_options
 from ._cost import Band, CoherenceWeighted, Cost, MaximumLikelihood
 from ._fit import fit
-from ._identifiability import Identifiability
-from ._parameters import Real
+from ._parameters import name_places, Parameters, Real
 from ._rational import descend, Rational, Samples
-from ._remarks import FEWER
 from ._result import Fit
 from ._transfer_function_guess import (
     checked_response,
     checked_structure,
     Delay,
+    MORE_POINTS,
     one_pair,
     search,
     Structure,
+    too_few_points,
     transfer_function,
     usable_samples,
 )
+from ._verdict import without_numbers
 
 
 # A pair takes two numbers, but may settle on any frequency: noise alone, at 30 or 100 points,
@@ -46,8 +48,8 @@ def idle_pair(
     best: Rational,
     band: Band,
     min_coherence: float,
-) -> str | None:
-    """What to say where one zero and one pole fewer explain the response within its noise."""
+) -> tuple[str, str] | None:
+    """Reason and remedy where one zero and one pole fewer explain the response within its noise."""
     if structure.zeros == 0 or structure.poles == structure.integrators:
         return None
     smaller = structure._replace(zeros=structure.zeros - 1, poles=structure.poles - 1)
@@ -61,42 +63,64 @@ def idle_pair(
     gained = (less.cost - full.cost) / noise
     if gained > _CHANCE:
         return None
-    return (
-        f"a zero and a pole cancel: zeros={smaller.zeros}, poles={smaller.poles} explain the "
-        f"response as well (the pair lowers the misfit by {max(gained, 0.0):.2g} squared random "
-        f"errors; noise alone gives up to {_CHANCE:g}): {FEWER}"
+    orders = f"zeros={smaller.zeros}, poles={smaller.poles}"
+    reason = (
+        f"a zero and a pole cancel: {orders} explain the response as well (the pair lowers the "
+        f"misfit by {max(gained, 0.0):.2g} squared random errors; noise alone gives up to "
+        f"{_CHANCE:g})"
     )
+    return reason, f"fit {orders}"
 
 
-def far_pole(fit: Fit, highest: float) -> str | None:
-    """What to say of a fit that is not identifiable because a pole left the band (rad/s)."""
+def far_pole(fit: Fit, highest: float) -> tuple[str, str] | None:
+    """Reason and remedy for a fit that is not identifiable as a pole left the band (rad/s)."""
     poles = fit.model.poles
     if fit.identifiable or not poles.size or np.max(np.abs(poles)) < _BEYOND * highest:
         return None
     far = poles[np.argmax(np.abs(poles))]
-    zeros = len(fit.model.zeros)
-    return (
+    orders = f"zeros={min(len(fit.model.zeros), poles.size - 1)}, poles={poles.size - 1}"
+    reason = (
         f"a pole at {far.real:.2g} rad/s is so far above the highest frequency, {highest:.3g} "
-        f"rad/s, that it cannot be told from a gain: zeros={min(zeros, poles.size - 1)}, "
-        f"poles={poles.size - 1} are enough: {FEWER}"
+        f"rad/s, that it cannot be told from a gain: {orders} are enough"
     )
+    return reason, f"fit {orders}"
 
 
-def refused(fit: Fit, reason: str) -> Fit:
-    """The same fit with no number for any parameter."""
-    verdict, lost = fit.identifiability, np.full(len(fit.names), np.inf)
-    names = fit.names
-    return dataclasses.replace(
-        fit,
-        values=np.full(len(names), np.nan),
-        standard_errors=lost,
-        covariance=np.full(fit.covariance.shape, np.nan),
-        cramer_rao=lost,
-        identifiability=Identifiability(
-            names, verdict.null_directions, (), verdict.exact, verdict.alternatives, names
-        ),
-        remarks=(reason, *fit.remarks),
+def _refused(fit: Fit, reason: str, remedy: str) -> Fit:
+    """The same fit with none of its coefficients called determined."""
+    verdict = dataclasses.replace(
+        fit.verdict,
+        kind="not identifiable",
+        undetermined=fit.names,
+        combinations=(),
+        reasons=(reason,),
+        remedies=(remedy,),
+        curved=fit.names,
     )
+    return dataclasses.replace(fit, verdict=verdict)
+
+
+def _with_reason(fit: Fit, reason: str, remedy: str) -> Fit:
+    verdict = dataclasses.replace(fit.verdict, reasons=(reason,), remedies=(remedy,))
+    return dataclasses.replace(fit, verdict=verdict)
+
+
+def _unfitted(structure: Structure, reason: str, remarks: tuple[str, ...]) -> Fit:
+    """The result where there are fewer usable frequencies than coefficients: no number at all."""
+    below = np.eye(structure.poles + 1)[0]
+    delay = structure.delay or 0.0
+    model = TransferFunction(np.zeros(structure.zeros + 1), below, delay)
+    places = name_places(model)
+    last = structure.poles - structure.integrators
+    names = [f"numerator[{k}]" for k in range(structure.zeros + 1)]
+    names += [f"denominator[{k}]" for k in range(1, last + 1)]
+    names += ["delay"] if structure.delay is None else []
+    chosen = tuple(place for place in places if place.name in names)
+    count = len(chosen)
+    nothing = jnp.full(count, jnp.nan)
+    parameters = Parameters(chosen, (), (False,) * count, count, jnp.ones(count), nothing)
+    verdict = without_numbers("too few points", parameters.names, reason, MORE_POINTS)
+    return unfitted(parameters.replace(model, nothing), parameters, verdict, remarks)
 
 
 def _without_nearest(model: Rational) -> Rational:
@@ -147,6 +171,9 @@ def fit_transfer_function(
     check_options(cost, band, min_coherence, max_steps)
     structure = checked_structure(zeros, poles, integrators, delay)
     pair = one_pair(checked_response(frf), output, input)
+    too_few = too_few_points(pair, structure, band, min_coherence)
+    if too_few is not None:
+        return _unfitted(structure, too_few, pair.remarks)
     samples = usable_samples(pair, structure, cost, band, min_coherence)
     best = search(samples, structure)
     result = _refined(
@@ -155,13 +182,9 @@ def fit_transfer_function(
     )  # fmt: skip
     idle = idle_pair(pair, samples, structure, best, band, min_coherence)
     if idle is not None:
-        return refused(result, idle)
+        return _refused(result, *idle)
     far = far_pole(result, float(samples.omega[-1]) * samples.unit)
-    return result if far is None else _with_remark(result, far)
-
-
-def _with_remark(result: Fit, remark: str) -> Fit:
-    return dataclasses.replace(result, remarks=(*result.remarks, remark))
+    return result if far is None else _with_reason(result, *far)
 
 
 def _refined(
@@ -183,7 +206,8 @@ def _refined(
         result = solve(start, pair, free=_free(start, structure, samples))
     if not ran_to_zero:
         return result
-    return _with_remark(result, "the delay ran to zero: it is fixed at 0")
+    remark = "the delay ran to zero: it is fixed at 0"
+    return dataclasses.replace(result, remarks=(*result.remarks, remark))
 
 
 def _free(start: TransferFunction, structure: Structure, samples: Samples) -> list[Real]:

@@ -12,11 +12,12 @@ from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
 from ._checks import check_options, checked_responses
-from ._cost import Band, CoherenceWeighted, Cost, usable
-from ._identifiability import NotIdentifiable
+from ._cost import Band, CoherenceWeighted, Cost, Mask, usable
 from ._rational import descend, Rational, Samples, sanathanan_koerner
+from ._verdict import UndeterminedError
 
 
+MORE_POINTS = "lower the orders, or measure more frequencies"
 _DELAY_STEP = 0.7  # rad at the highest frequency
 _MOST_DELAYS = 60
 _PLACES = 5  # frequencies at which an idle pair is tried
@@ -166,13 +167,16 @@ def guess_transfer_function(
     of the imaginary axis. `poles` counts the `integrators`, which stay at 0. `delay` in s, or
     "free". Options as in `jq.fit`; frequencies below `min_coherence` are left out.
 
-    Raises `NotIdentifiable` where too few frequencies are left, `ValueError` for orders that
+    Raises `UndeterminedError` where too few frequencies are left, `ValueError` for orders that
     make no proper transfer function or that no start fits, `PrecisionError` in 32 bits.
     """
     require_x64("a transfer function")
     check_options(cost, band, min_coherence, 1)
     structure = checked_structure(zeros, poles, integrators, delay)
     pair = one_pair(checked_response(frf), output, input)
+    reason = too_few_points(pair, structure, band, min_coherence)
+    if reason is not None:
+        raise UndeterminedError(f"no transfer function from this record: {reason}; {MORE_POINTS}")
     samples = usable_samples(pair, structure, cost, band, min_coherence)
     return transfer_function(search(samples, structure), samples, structure)
 
@@ -213,16 +217,7 @@ def usable_samples(
     min_coherence: float,
 ) -> Samples:
     """The coherent points, in frequencies over the geometric mean of the lowest and highest."""
-    used = usable(pair, band, min_coherence) & (np.abs(np.asarray(pair.response)) > 0)
-    points, needed = int(used.sum()), structure.unknowns + 2
-    # Magnitude and phase are two numbers, but half as many points leave nothing to judge by.
-    if points < needed:
-        best = float(np.max(np.asarray(pair.coherence)))
-        raise NotIdentifiable(
-            f"not identifiable from this record: coherence reaches {min_coherence:g} at {points} "
-            f"of {used.size} frequencies, its maximum is {best:.2f}, and {structure.unknowns} "
-            f"coefficients need at least {needed}: lower the orders, or measure more frequencies"
-        )
+    used = _usable(pair, band, min_coherence)
     mask = used[:, 0, 0]
     weights = cost.weights(pair, used, np.ones(used.shape))[mask, 0, 0]
     omega = np.asarray(pair.omega)[mask]
@@ -230,6 +225,26 @@ def usable_samples(
     s = 1j * omega / unit
     response = np.asarray(pair.response)[mask, 0, 0] * s**structure.integrators
     return Samples(s, response, weights, unit)
+
+
+def too_few_points(
+    pair: FrequencyResponse, structure: Structure, band: Band, min_coherence: float
+) -> str | None:
+    """Why a structure cannot be fitted, where fewer frequencies are usable than it needs."""
+    used = _usable(pair, band, min_coherence)
+    points, needed = int(used.sum()), structure.unknowns + 2
+    # Magnitude and phase are two numbers, but half as many points leave nothing to judge by.
+    if points >= needed:
+        return None
+    best = float(np.max(np.asarray(pair.coherence)))
+    return (
+        f"coherence reaches {min_coherence:g} at {points} of {used.size} frequencies, its maximum "
+        f"is {best:.2f}, and {structure.unknowns} coefficients need at least {needed}"
+    )
+
+
+def _usable(pair: FrequencyResponse, band: Band, min_coherence: float) -> Mask:
+    return usable(pair, band, min_coherence) & (np.abs(np.asarray(pair.response)) > 0)
 
 
 def search(samples: Samples, structure: Structure, extra: tuple[Rational, ...] = ()) -> Rational:

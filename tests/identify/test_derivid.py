@@ -111,4 +111,4 @@ def test_gain_and_mass_together_are_refused_as_a_ratio():
     frf = response_of(truth, error=0.01, seed=0, omega=OMEGA)
     fit = jq.fit(truth, frf, free=("M[0][0]", "F[0][0]", "G[0][0]"), cost=ML)
     assert not fit.identifiable
-    assert set(fit.identifiability.undetermined) == {"M[0][0]", "F[0][0]", "G[0][0]"}
+    assert set(fit.verdict.undetermined) == {"M[0][0]", "F[0][0]", "G[0][0]"}

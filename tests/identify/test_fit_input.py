@@ -55,12 +55,15 @@ def test_an_empty_band_says_where_the_response_is(frf):
 
 def test_zero_coherence_is_not_identifiable(frf):
     silent = eqx.tree_at(lambda f: f.coherence, frf, jnp.zeros_like(frf.coherence))
-    refuse(
-        "not identifiable from this record: coherence reaches 0.6 at 0 of 30 frequencies, its "
-        "maximum is 0.00",
-        silent,
-        error=jq.identify.NotIdentifiable,
-    )
+    fit = jq.fit(START, silent)
+    assert fit.verdict.kind == "too few points" and not fit.identifiable
+    assert "coherence reaches 0.6 at 0 of 30 frequencies, its maximum is 0.00" in str(fit)
+    np.testing.assert_allclose(fit.values, [150.0, 0.03, 0.02], rtol=1e-12)
+    assert np.isinf(fit.standard_errors).all() and not fit.determined.any()
+    with pytest.raises(jq.identify.UndeterminedError, match="gain has no value"):
+        fit.derived(lambda m: m.gain, "gain")
+    with pytest.raises(jq.identify.UndeterminedError, match="nothing to draw from"):
+        fit.ensemble(3, jax.random.key(0), hold_undetermined=True)
 
 
 def test_a_prior_needs_a_cost_with_noise(frf):

@@ -53,7 +53,7 @@ def test_all_stops_are_listed_by_cost_and_say_what_they_are(many):
     assert costs == sorted(costs) and len(costs) > 1
     assert sum(len(point.starts) for point in many.minima) == 24
     assert many.minima[0].is_minimum
-    assert f"24 starts led to {len(costs)} points:" in str(many)
+    assert f"24 starts, {len(costs)} optima:" in str(many)
 
 
 class Even(eqx.Module):

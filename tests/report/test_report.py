@@ -34,6 +34,12 @@ def check():
     return jq.verify(jq.LaggedIntegrator(250.0, 0.016, 0.011), record)
 
 
+def silent_fit():
+    """Of a response that is coherent nowhere."""
+    frf = response_of(TRUTH, error=0.05, seed=0)
+    return jq.fit(TRUTH, eqx.tree_at(lambda f: f.coherence, frf, 0.1 * frf.coherence))
+
+
 def lines(axis):
     return {line.get_label(): line for line in axis.get_lines()}
 
@@ -102,13 +108,15 @@ def test_a_result_file_holds_the_numbers_of_the_fit(tmp_path, fit, frf, check):
     assert [file.name for file in path.parent.iterdir()] == ["result.json"]
 
 
-def test_what_is_not_determined_is_null(tmp_path):
+def test_what_is_not_determined_keeps_its_number_and_is_marked(tmp_path):
     rig = jq.models.AttitudeAxis(0.197, 0.1188, 0.0552, 0.02)
     fit = jq.fit(
         rig, response_of(rig, seed=0), free=("J_x", "K_t"), cost=jq.identify.MaximumLikelihood()
     )
     content = json.loads(write_results(tmp_path, fit=fit).read_text())["fit"]
-    assert content["parameters"][0]["value"] is None and not content["identifiable"]
+    row = content["parameters"][0]
+    assert row["value"] == float(fit.values[0]) and row["standard_error"] is None
+    assert row["determined"] is False and content["verdict"]["kind"] == "not identifiable"
     assert content["combinations"][0]["name"] == "L K_t / J_x"
 
 
@@ -121,7 +129,7 @@ def test_a_failed_write_leaves_the_old_result(tmp_path, fit):
 
 
 def test_fits_stand_side_by_side_and_what_is_missing_says_so(fit):
-    nothing = jq.identify.NotIdentifiable("not identifiable from this record")
+    nothing = silent_fit()
     late = {"lag + delay": lambda model: model.lag + model.delay}
     head, joint, direct = comparison({"joint": fit, "direct": nothing}, late).splitlines()
     assert head.split() == "gain lag delay lag + delay misfit / error".split()
@@ -130,7 +138,7 @@ def test_fits_stand_side_by_side_and_what_is_missing_says_so(fit):
     assert direct.split() == ["direct", "not", "identifiable"]
 
 
-def test_an_exception_stands_for_the_fit_that_there_is_not(tmp_path, frf):
-    path = write_results(tmp_path, fit=jq.identify.NotIdentifiable("no excitation"), frf=frf)
-    fit = json.loads(path.read_text())["fit"]
-    assert fit == {"identifiable": False, "remarks": ["no excitation"]}
+def test_where_nothing_was_fitted_there_is_no_number(tmp_path, frf):
+    content = json.loads(write_results(tmp_path, fit=silent_fit(), frf=frf).read_text())["fit"]
+    assert not content["identifiable"] and "parameters" not in content
+    assert "coherence reaches 0.6 at 0 of" in content["verdict"]["summary"]

@@ -1,0 +1,146 @@
+"""What a record determines of a model's parameters, in numbers and in words."""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+
+Kind = Literal["identifiable", "not identifiable", "no minimum", "too few points"]
+
+
+class UndeterminedError(ValueError):
+    """A number was asked for that the record does not determine."""
+
+
+class Combination(NamedTuple):
+    """A product of powers, or a weighted sum, of parameters, with its standard error."""
+
+    name: str
+    value: float
+    standard_error: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        reach = 1.96 * self.standard_error
+        return self.value - reach, self.value + reach
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return (
+            f"{self.name} = {self.value:.5g} +- {self.standard_error:.2g}  "
+            f"(95 %: {low:.5g} .. {high:.5g})"
+        )
+
+
+class Verdict(eqx.Module):
+    """Which free parameters a record determines; true if it determines each of them by itself.
+
+    `kind` is "identifiable", "not identifiable" (the numbers are those of the best fit, but some
+    could be changed together without changing the responses), "no minimum" (the solver stopped
+    before one) or "too few points" (nothing was fitted). `str(verdict)` says what to do.
+    """
+
+    kind: Kind = eqx.field(static=True)
+    undetermined: tuple[str, ...] = eqx.field(static=True)  # parameters
+    combinations: tuple[Combination, ...]  # what is determined of the undetermined ones
+    null_directions: tuple[dict[str, float], ...]  # unit vectors of relative changes
+    reasons: tuple[str, ...] = eqx.field(static=True)
+    remedies: tuple[str, ...] = eqx.field(static=True)
+    exact: Float[np.ndarray, "null parameters"]  # null directions that no noise explains
+    alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
+    curved: tuple[str, ...] = eqx.field(static=True)  # determined as neither a product nor a sum
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the record determines every free parameter by itself."""
+        return self.kind == "identifiable"
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there was anything to fit; if not, the numbers are the starting values."""
+        return self.kind != "too few points"
+
+    @property
+    def summary(self) -> str:
+        """The verdict in one line."""
+        if self.identifiable:
+            return "identifiable: the record determines every free parameter by itself"
+        if not self.fitted:
+            return f"not identifiable from this record: {'; '.join(self.reasons)}"
+        if self.kind == "no minimum":
+            return f"no minimum was found, so no parameter is determined: {'; '.join(self.reasons)}"
+        known = ", ".join(str(combination) for combination in self.combinations)
+        rest = f"only {known}" if known else "nothing of them is determined"
+        lost = " and ".join(self.undetermined)
+        return f"not identifiable from this record, each by itself: {lost}; {rest}"
+
+    def __bool__(self) -> bool:
+        return self.identifiable
+
+    def __str__(self) -> str:
+        if self.identifiable:
+            return self.summary
+        if self.kind != "not identifiable":
+            head = "not identifiable" if self.kind == "too few points" else self.kind
+            lines = [self.summary.replace(head, head.upper(), 1)]
+        else:
+            lines = [
+                f"NOT IDENTIFIABLE from this record, each by itself: {', '.join(self.undetermined)}",
+                *self._determined(),
+                *(f"  {reason}" for reason in self.reasons),
+            ]
+        return "\n".join([*lines, *self._remedied()])
+
+    def _determined(self) -> list[str]:
+        lines = ["  nothing about them is determined by this record"]
+        if self.combinations:
+            known = " and ".join(combination.name for combination in self.combinations)
+            rows = self.null_directions
+            every = all(name in self.undetermined for row in rows for name in row)
+            only = "only " if every else ""  # else a parameter in it is determined by itself, too
+            lines = [f"  {only}{known} is determined by this record"]
+        elif self.curved and not self.reasons:
+            curved = ", ".join(self.curved)
+            lines = [f"  what it determines of {curved} is neither a product nor a sum of them"]
+        lines += [f"    {combination}" for combination in self.combinations]
+        for direction in self.null_directions:
+            parts = ", ".join(f"{share:+.3f} {name}" for name, share in direction.items())
+            lines.append(
+                f"  null direction (relative changes that leave the responses alike): {parts}"
+            )
+        return lines
+
+    def _remedied(self) -> list[str]:
+        if not self.remedies:
+            return []
+        first, *others = self.remedies
+        return [f"  to resolve it: {first}", *(f"  or {other}" for other in others)]
+
+
+def remedies_for(lost: tuple[str, ...]) -> tuple[str, ...]:
+    """What determines parameters that one record leaves open."""
+    names = " or ".join(lost)
+    return (
+        f"fix {names} at a measured value (leave it out of free=)",
+        "give what a data sheet or a static test says of it: "
+        "priors=[jq.identify.Prior(name or function, value, standard error)]",
+        f"fit a second record under a known change of {names} (conditions=)",
+    )
+
+
+def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: str) -> Verdict:
+    """A verdict under which no parameter, and no combination of them, is determined."""
+    return Verdict(
+        kind=kind,
+        undetermined=names,
+        combinations=(),
+        null_directions=(),
+        reasons=(reason,),
+        remedies=remedies,
+        exact=np.eye(len(names)),
+        alternatives=(),
+        curved=(),
+    )
