@@ -51,7 +51,7 @@ def fly(signals: np.ndarray, added: np.ndarray, key: jax.Array) -> jq.simulation
         jq.simulation.MotorDrive(allocation),
         jq.simulation.Encoder(SHEET.encoder_counts),
     )
-    return jq.simulate(rig, pilot, scenario, dt=DT, drive=drive, encoder=encoder)
+    return jq.simulate(jq.Loop(rig, pilot, dt=DT, drive=drive, encoder=encoder), scenario)
 
 
 def experiments(seed: int) -> list[jq.Record]:

@@ -31,6 +31,7 @@ from .identify import (
     refine as refine,
     verify as verify,
 )
+from .loops import analyse as analyse, Loop as Loop
 from .models import (
     crazyflie as crazyflie,
     DecoupledAxes as DecoupledAxes,

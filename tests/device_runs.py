@@ -13,9 +13,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxquad._xla._devices import devices_for, where_put
 from jaxquad.control import LADRC, PD
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import evaluate, Pulse, Saturation, scenario, simulate, Step, WhiteNoise
-from jaxquad.simulation._delay import loop_settings
 from jaxquad.simulation._evaluate import _run
 from jaxquad.simulation._meter import Window
 from jaxquad.simulation._over_devices import over_devices
@@ -45,14 +45,14 @@ def plant(inertia=INERTIA):
 def one_axis(run, devices, b0=0.0468 / INERTIA):
     """Some members leave the bound."""
     controller, drive = LADRC([10.0], [30.0], b0), Saturation([20.0])
-    return run(plant(), controller, happens(), drive=drive, devices=devices, **OPTIONS)
+    return run(Loop(plant(), controller, drive=drive, **OPTIONS), happens(), devices=devices)
 
 
 def cost(gains, devices):
     """Of gains that the members share, and of the inertia that each has for itself."""
     shared, inertia = gains
     controller = PD(shared[:1], shared[1:])
-    found = evaluate(plant(inertia), controller, happens(), devices=devices)
+    found = evaluate(Loop(plant(inertia), controller), happens(), devices=devices)
     return jnp.mean(found.itae) + jnp.mean(found.rms)
 
 
@@ -87,7 +87,7 @@ def drawn(gains, devices):
 def kernels(devices):
     """Whether the loop of each device is one kernel."""
     judged = Window(*(jnp.asarray(k) for k in (0, SAMPLES - 1, 0, SAMPLES - 1)))
-    loop = (plant(), LADRC([10.0], [30.0], [0.85]), happens(), loop_settings())
+    loop = (Loop(plant(), LADRC([10.0], [30.0], [0.85])), happens())
     return "xla_cpu_small_call" in _run.lower(*loop, judged, devices).as_text()
 
 

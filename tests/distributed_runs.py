@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxquad.control import PD
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import evaluate, scenario, Step, WhiteNoise
 
@@ -29,7 +30,7 @@ def itae(devices, gains=GAINS, inertia=INERTIA):
         key=jax.random.key(1),
     )
     plant, controller = DecoupledAxes([0.0468], inertia), PD([gains[0]], [gains[1]])
-    return evaluate(plant, controller, happens, devices=devices)
+    return evaluate(Loop(plant, controller), happens, devices=devices)
 
 
 def cost(gains, devices):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxquad.control import LADRC
-from jaxquad.loops import analyse_loop, gain_window
+from jaxquad.loops import analyse, gain_window, Loop
 from jaxquad.models import DecoupledAxes
 
 
@@ -47,11 +47,11 @@ def analysed(*members):
     c = columns(members)
     plant, controller = parts(c)
     if c["lag"][0] is None:
-        return analyse_loop(plant, controller)
-    return analyse_loop(plant, controller, delay=c["delay"], longest_delay=LONGEST)
+        return analyse(Loop(plant, controller))
+    return analyse(Loop(plant, controller, delay=c["delay"], longest_delay=LONGEST))
 
 
 def windows(*members):
     """The edges of the gain windows of the members, two rows."""
     plant, controller = parts(columns(members))
-    return np.stack(gain_window(controller, plant))[:, : len(members)]
+    return np.stack(gain_window(Loop(plant, controller)))[:, : len(members)]

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxquad.loops import Loop
 from jaxquad.simulation import AuthorityWarning, simulate, Simulation
 
 from .data import Case, Members, members_of, Numbers
@@ -93,12 +94,11 @@ def flown(
     )  # fmt: skip
     axes = len(truth.torque_gain)
     happening = scenario_of(case, chunk, dt=suite["dt"], axes=axes, key=key)
+    bound = np.radians(suite["lost"])
+    loop = Loop(truth.plant, law, dt=suite["dt"], bound=bound, **truth.options)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AuthorityWarning)  # the verdict says it
-        return simulate(
-            truth.plant, law, happening, dt=suite["dt"], bound=np.radians(suite["lost"]),
-            **truth.options,
-        )  # fmt: skip
+        return simulate(loop, happening)
 
 
 def chunk_of(members: Members, first: int) -> Members:

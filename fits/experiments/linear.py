@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxquad.control import LinearController
-from jaxquad.loops import analyse_loop, gain_window, LoopAnalysis
+from jaxquad.loops import analyse, gain_window, Loop, LoopAnalysis
 from jaxquad.models import DecoupledAxes
 
 
@@ -40,15 +40,15 @@ class Late(NamedTuple):
 
 
 def analysed(axis: DecoupledAxes, law: Any, late: Late) -> LoopAnalysis:
-    """`jq.loops.analyse_loop` of a law [1, members]."""
+    """`jq.analyse` of a law [1, members]."""
     laws = LinearLaws(_stack(law))
-    return analyse_loop(axis, laws, delay=late.delay, longest_delay=late.longest)
+    return analyse(Loop(axis, laws, delay=late.delay, longest_delay=late.longest))
 
 
 def stable_gains(axis: DecoupledAxes, law: Any, late: Late) -> tuple[np.ndarray, np.ndarray]:
     """The gains b in rad/s^2 per unit of command between which each loop is stable; nan if none."""
     laws = LinearLaws(_stack(law))
-    found = gain_window(laws, axis, delay=late.delay, longest_delay=late.longest)
+    found = gain_window(Loop(axis, laws, delay=late.delay, longest_delay=late.longest))
     return np.asarray(found.low), np.asarray(found.high)
 
 

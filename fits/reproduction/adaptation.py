@@ -66,7 +66,7 @@ def fly(seed: int) -> Flight:
     )  # fmt: skip
     law = jq.AdaptiveLADRC(jq.LADRC(WC, WO, np.array([START]), dt=DT), heard["lock-in"], MAP)
     encoder = jq.simulation.Encoder(SHEET.encoder_counts)
-    done = jq.simulate(rig([2 * LEVER] * DRAWS), law, happening, dt=DT, encoder=encoder)
+    done = jq.simulate(jq.Loop(rig([2 * LEVER] * DRAWS), law, dt=DT, encoder=encoder), happening)
     before = jnp.concatenate([jnp.zeros_like(done.command[:1]), done.command[:-1]])
     inertia = {
         name: np.asarray(_listen(one, before, done.measurement))[:, 0]

@@ -58,7 +58,7 @@ def loaded_loops() -> Loaded:
     gains, b0s = np.array(values).T
     signal = np.stack([torques[torque] for *_, torque in names], axis=1)
     happening = jq.scenario(duration=DURATION, dt=DT, axes=1, disturbance={0: signal})
-    done = jq.simulate(rig(gains), ladrc(b0s), happening, dt=DT)
+    done = jq.simulate(jq.Loop(rig(gains), ladrc(b0s), dt=DT), happening)
     command = np.asarray(done.signals["disturbance"])[:, 0]  # z3 / b0
     scaled = {RIGHT: gains * command, WRONG: INERTIA * b0s * command}
     angle = np.asarray(done.angle)[:, 0]

@@ -51,7 +51,7 @@ def _adapts() -> Claim:
 
 def _robust() -> Claim:
     """Stable ranges of the inertia, in units of the manual's."""
-    window = jq.loops.gain_window(ladrc(1.0), rig(1.0), member=0)
+    window = jq.loops.gain_window(jq.Loop(rig(1.0), ladrc(1.0)), member=0)
     low, high = float(window.low), float(window.high)
     gain = 2 * LEVER / INERTIA
     fixed = {b0: (gain / b0 / high, gain / b0 / low) for b0 in (END, START)}

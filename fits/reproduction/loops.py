@@ -53,7 +53,7 @@ def run_step(
     """10 s after a step of `size` rad, one or one for each member."""
     sizes = np.atleast_1d(np.asarray(size, float))
     happening = jq.scenario(duration=10.0, dt=DT, axes=1, reference=jq.Step(sizes))
-    return jq.simulate(plant, controller, happening, dt=DT, **options)
+    return jq.simulate(jq.Loop(plant, controller, dt=DT, **options), happening)
 
 
 def responses(done: jq.simulation.Simulation) -> list[Response]:

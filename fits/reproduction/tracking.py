@@ -19,7 +19,8 @@ def claims(linear: Steps, pid: Steps, rough: Steps, moving: dict[str, Response])
 def _holds() -> Claim:
     """Windows of b/b0 on b / s^2, and behind a motor lag."""
     windows = {
-        lag: jq.loops.gain_window(ladrc(1.0), rig(1.0, lag=lag), member=0) for lag in (None, LAG)
+        lag: jq.loops.gain_window(jq.Loop(rig(1.0, lag=lag), ladrc(1.0)), member=0)
+        for lag in (None, LAG)
     }
     readings = []
     for name, gain in TORQUE_GAINS.items():

@@ -1,12 +1,24 @@
 from ._analysis import (
-    analyse_loop as analyse_loop,
+    analyse as analyse,
     loop_qualities as loop_qualities,
     LoopAnalysis as LoopAnalysis,
     LoopResponse as LoopResponse,
 )
-from ._case import without_idle_states as without_idle_states
-from ._closed_loop import close as close, join as join, SampledLoop as SampledLoop
+from ._closed_loop import close as close, join as join, OpenLoop as OpenLoop
 from ._gain_window import gain_window as gain_window, GainWindow as GainWindow
+from ._linear_parts import without_idle_states as without_idle_states
+from ._loop import Loop as Loop
+from ._protocols import (
+    after_drive as after_drive,
+    CarriesPayload as CarriesPayload,
+    Controller as Controller,
+    Drive as Drive,
+    Plant as Plant,
+    prepared as prepared,
+    sample_interval as sample_interval,
+    Sensor as Sensor,
+    signals_of as signals_of,
+)
 from ._sampled_axis import AxisParameters as AxisParameters, sampled as sampled
 from ._spectrum import (
     abscissa as abscissa,

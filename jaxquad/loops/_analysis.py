@@ -1,15 +1,12 @@
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
-from jaxquad.models import DecoupledAxes, Multirotor
-
-from ._case import Case, case_of
-from ._closed_loop import close, ClosedLoop, join, SampledLoop
+from ._closed_loop import close, ClosedLoopMatrix, join, OpenLoop
+from ._linear_parts import linear_parts, LinearParts
+from ._loop import Loop
 from ._spectrum import abscissa, noise_gain, powers, sharpest
 from .qualities._margins import margins
 from .qualities._rejection import disturbance_rejection
@@ -19,7 +16,7 @@ from .qualities._text import decibels, degrees, lines, shown
 class LoopResponse(eqx.Module):
     """One response of a closed sampled loop, for `jq.loops.attitude_bandwidth`, plots and the like."""
 
-    loop: SampledLoop
+    loop: OpenLoop
     kind: str = eqx.field(static=True)
 
     def frequency_response(
@@ -37,11 +34,11 @@ class LoopResponse(eqx.Module):
 
 
 class LoopAnalysis(eqx.Module):
-    """What a closed loop is worth, from `jq.loops.analyse_loop`; ensembles have arrays of their shape.
+    """What a closed loop is worth, from `jq.analyse`; ensembles have arrays of their shape.
 
     `abscissa` is the real part of the slowest pole, found without eigenvalues; `stable` means that
     it is below 0. Where poles coincide, as LADRC places them, the gradient of a pole is infinite;
-    the abscissa then lies above them, by less than the `smoothing` of `analyse_loop` (1e-5 1/s
+    the abscissa then lies above them, by less than the `smoothing` of `analyse` (1e-5 1/s
     unless given) or by what rounding does to them (at 2 ms 1e-4 1/s for two poles, 1 1/s for five).
     Its gradient grows as 1 / smoothing there: tune with 0.1 or 1.
     Margins are those of the loop broken at the command. In an unstable loop they are `nan`, and
@@ -59,8 +56,8 @@ class LoopAnalysis(eqx.Module):
     crossover: Float[Array, "*ensemble"]  # rad/s, of the phase margin
     delay_margin: Float[Array, "*ensemble"]  # s, from the phase margin at its crossover
     noise_gain: Float[Array, "*ensemble"]  # rms of the command per rms of white measurement noise
-    closed: ClosedLoop
-    loop: SampledLoop
+    closed: ClosedLoopMatrix
+    loop: OpenLoop
     dt: float = eqx.field(static=True)  # s
 
     @property
@@ -155,15 +152,11 @@ _NOTHING = 1e-9  # a static gain margin that is rounding: the loop integrates
 _STABLE = 1.0  # 1/s, what an unstable loop is made to decay at where only its gradient must exist
 
 
-def analyse_loop(
-    plant: DecoupledAxes | Multirotor,
-    controller: Any,
+def analyse(
+    loop: Loop,
+    axis: int | str = "roll",
     *,
-    axis: int = 0,
     member: int | tuple[int, ...] | None = None,
-    dt: float | None = None,
-    delay: Float[ArrayLike, "..."] = 0.0,
-    longest_delay: float | None = None,
     smoothing: float = 1e-5,
 ) -> LoopAnalysis:
     """Stability, margins and noise of one axis with its sampled controller, exactly.
@@ -171,39 +164,52 @@ def analyse_loop(
     The plant is discretised under a held command that acts `delay` seconds late, whatever part of a
     sample that is, and joined with `controller.linear(axis, member)`: no continuous approximation,
     no Pade. Limits, encoder and dry friction have no linear part and are left out; a
-    `jq.models.Multirotor` is taken near level flight. Every number is differentiable (abscissa and noise
-    gain once) with respect to plant, controller and delay, and works under jit and vmap. An
-    ensemble in any of the three gives arrays of its shape, from one compile; `member` picks one.
-    `dt` is the controller's unless it has none. A traced `delay` needs `longest_delay`, in s, and
-    gives `nan` beyond it. `smoothing`, in 1/s, says how sharp the abscissa is, see `LoopAnalysis`.
-    Raises ValueError for parts that do not fit together.
+    `jq.models.Multirotor` is taken near level flight. Every number is differentiable (abscissa and
+    noise gain once) with respect to plant, controller and delay, and works under jit and vmap. An
+    ensemble in any of the three gives arrays of its shape, from one compile. A delay traced by them
+    that exceeds `longest_delay` gives `nan`.
+
+        print(jq.analyse(jq.Loop(plant, jq.LADRC(10.0, 30.0, 0.85), delay=0.004), "roll"))
+
+    **Arguments:**
+
+    - `loop`: see `jq.Loop`.
+    - `axis`: by name (roll, pitch, yaw) or number.
+    - `member`: the index of one member of an ensemble; None analyses all.
+    - `smoothing`: 1/s, how sharp the abscissa is, see `LoopAnalysis`.
+
+    **Returns:** a `LoopAnalysis`.
+
+    **Raises:** ValueError for a plant or controller without a linear form, an axis or member that
+    does not exist, and ensembles that do not match.
+
     Source: Franklin, Powell & Workman, Digital Control of Dynamic Systems, section 4.3.
     """
     if not 0 < smoothing < float("inf"):
         raise ValueError(
             f"smoothing is {smoothing} 1/s: give a rate above 0, as 1e-5 or, to tune, 0.1."
         )
-    return _analysed(case_of(plant, controller, axis, member, dt, delay, longest_delay), smoothing)
+    return _analysed(linear_parts(loop, axis, member), smoothing)
 
 
 @eqx.filter_jit
-def _analysed(case: Case, smoothing: float) -> LoopAnalysis:
-    if case.member is not None or not case.ensemble:
-        return _one(case, case.member or (), smoothing)
-    places = jnp.unravel_index(jnp.arange(int(np.prod(case.ensemble))), case.ensemble)
-    flat = jax.vmap(lambda *place: _one(case, place, smoothing))(*places)
-    return jax.tree.map(lambda x: x.reshape(case.ensemble + x.shape[1:]), flat)
+def _analysed(parts: LinearParts, smoothing: float) -> LoopAnalysis:
+    if parts.member is not None or not parts.ensemble:
+        return _one(parts, parts.member or (), smoothing)
+    places = jnp.unravel_index(jnp.arange(int(np.prod(parts.ensemble))), parts.ensemble)
+    flat = jax.vmap(lambda *place: _one(parts, place, smoothing))(*places)
+    return jax.tree.map(lambda x: x.reshape(parts.ensemble + x.shape[1:]), flat)
 
 
-def _one(case: Case, place: tuple, smoothing: float) -> LoopAnalysis:
-    plant, controller = case.parts(place)
-    loop, closed = join(plant, controller), close(plant, controller, case.memory).balanced()
-    smoothing = sharpest(smoothing, case.dt, closed.matrix.dtype)
-    ladder = powers(closed.matrix, case.dt, smoothing)
-    slowest = abscissa(closed.matrix, ladder, case.dt, smoothing)
+def _one(parts: LinearParts, place: tuple, smoothing: float) -> LoopAnalysis:
+    plant, controller = parts.of_member(place)
+    loop, closed = join(plant, controller), close(plant, controller, parts.memory).balanced()
+    smoothing = sharpest(smoothing, parts.dt, closed.matrix.dtype)
+    ladder = powers(closed.matrix, parts.dt, smoothing)
+    slowest = abscissa(closed.matrix, ladder, parts.dt, smoothing)
     rate = jax.lax.stop_gradient(slowest)
     stable = rate < 0
-    shift = jnp.where(stable, 0.0, (rate + _STABLE) * case.dt)
+    shift = jnp.where(stable, 0.0, (rate + _STABLE) * parts.dt)
     noise = noise_gain(closed.matrix, closed.noise, closed.command, closed.through, ladder, shift)
     return LoopAnalysis(
         abscissa=slowest,
@@ -212,11 +218,11 @@ def _one(case: Case, place: tuple, smoothing: float) -> LoopAnalysis:
         **loop_qualities(loop, stable),
         closed=closed,
         loop=loop,
-        dt=case.dt,
+        dt=parts.dt,
     )
 
 
-def loop_qualities(loop: SampledLoop, stable: Bool[Array, ""]) -> dict[str, Array]:
+def loop_qualities(loop: OpenLoop, stable: Bool[Array, ""]) -> dict[str, Array]:
     grid = np.geomspace(_LOWEST, _BEYOND, _POINTS) * np.pi / loop.dt
     omega = jnp.asarray(grid, loop.shift.dtype)
     margin, rejection = margins(loop, omega=omega), disturbance_rejection(loop, omega=omega)

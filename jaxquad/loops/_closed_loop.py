@@ -59,7 +59,7 @@ def _dot(a: Array, b: Array) -> Array:
     return jnp.dot(a, b, precision="highest")
 
 
-class SampledLoop(eqx.Module):
+class OpenLoop(eqx.Module):
     """One axis and its controller, broken at the command.
 
     `frequency_response` is that of the loop L, closed as 1 + L = 0, at frequencies below pi / dt;
@@ -105,7 +105,7 @@ class SampledLoop(eqx.Module):
         return jnp.where(crosses, below / jnp.where(above == 0, 1.0, above), jnp.nan)
 
 
-def join(plant: SampledAxis, controller: LinearController) -> SampledLoop:
+def join(plant: SampledAxis, controller: LinearController) -> OpenLoop:
     """Frequency responses of the loop."""
     inputs = jnp.stack([plant.fresh, plant.stale, plant.push], axis=1)
     first = jnp.zeros_like(plant.fresh).at[0].set(1)
@@ -113,10 +113,10 @@ def join(plant: SampledAxis, controller: LinearController) -> SampledLoop:
     inward = jnp.stack([controller.measurement_in, controller.reference_in], axis=1)
     through = jnp.stack([controller.measurement_through, controller.reference_through])
     command = rational(controller.A, inward, controller.C, through)
-    return SampledLoop(angle, command, plant.shift.astype(first.dtype), controller.dt)
+    return OpenLoop(angle, command, plant.shift.astype(first.dtype), controller.dt)
 
 
-class ClosedLoop(eqx.Module):
+class ClosedLoopMatrix(eqx.Module):
     """x+ = matrix x + noise n, u = command x + through n, with measurement noise n.
 
     x holds the states of the axis, the commands on their way, and those of the controller; scaled.
@@ -127,14 +127,14 @@ class ClosedLoop(eqx.Module):
     command: Float[Array, " states"]
     through: Float[Array, ""]
 
-    def balanced(self) -> "ClosedLoop":
+    def balanced(self) -> "ClosedLoopMatrix":
         """The same loop in states whose units do not matter."""
         scale = balance(self.matrix)
         matrix = self.matrix * scale[None] / scale[:, None]
-        return ClosedLoop(matrix, self.noise / scale, self.command * scale, self.through)
+        return ClosedLoopMatrix(matrix, self.noise / scale, self.command * scale, self.through)
 
 
-def close(plant: SampledAxis, controller: LinearController, memory: int) -> ClosedLoop:
+def close(plant: SampledAxis, controller: LinearController, memory: int) -> ClosedLoopMatrix:
     """The closed loop in state space, with room for `memory` commands on their way."""
     states, inner = len(plant.fresh), len(controller.C)
     dtype = plant.fresh.dtype
@@ -156,4 +156,4 @@ def close(plant: SampledAxis, controller: LinearController, memory: int) -> Clos
     matrix = jnp.concatenate([body, queue, mind]) + entry[:, None] * sent[None]
     heard = jnp.concatenate([zeros(states + memory), controller.measurement_in])
     through = controller.measurement_through
-    return ClosedLoop(matrix, entry * through + heard, sent, through)
+    return ClosedLoopMatrix(matrix, entry * through + heard, sent, through)

@@ -5,13 +5,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxquad.control import LinearController
-from jaxquad.models import DecoupledAxes, Multirotor
 
-from ._case import Case, case_of
 from ._closed_loop import close
+from ._linear_parts import linear_parts, LinearParts
+from ._loop import Loop
 from ._sampled_axis import SampledAxis
 from ._spectrum import abscissa, growth, powers, sharpest
 from .qualities._crossings import first
@@ -41,63 +41,61 @@ class GainWindow(NamedTuple):
 
 
 def gain_window(
-    controller: Any,
-    plant: DecoupledAxes | Multirotor,
-    *,
-    axis: int = 0,
-    member: int | tuple[int, ...] | None = None,
-    dt: float | None = None,
-    delay: Float[ArrayLike, "..."] = 0.0,
-    longest_delay: float | None = None,
+    loop: Loop, axis: int | str = "roll", *, member: int | tuple[int, ...] | None = None
 ) -> GainWindow:
-    """The values of r = b/b0 for which `controller` keeps the plant stable, whatever its own gain.
+    """The values of r = b/b0 for which the controller keeps the plant stable, whatever its own gain.
 
     b is the plant's gain, torque per unit of command over inertia, of which all values are tried
     with the same lag, delay, damping/inertia and stiffness/inertia; b0 is the controller's. For a
     controller without b0 the window is that of b itself, in rad/s^2 per unit of command. The edges
     are roots of the abscissa, exact to 1e-5 1/s and differentiable. Of several windows it is the
     one that holds the plant's own gain, else the one with the most stable loop. A window narrower
-    than a thousandth of its place may be missed. Arguments and errors as in `analyse_loop`.
+    than a thousandth of its place may be missed.
+
+    **Arguments:** those of `jq.analyse`.
+
+    **Returns:** a `GainWindow`, in the shape of the loop's ensemble.
+
+    **Raises:** ValueError as `jq.analyse` does.
     """
-    case = case_of(plant, controller, axis, member, dt, delay, longest_delay)
-    return _windows(case)
+    return _windows(linear_parts(loop, axis, member))
 
 
 @eqx.filter_jit
-def _windows(case: Case) -> GainWindow:
-    if case.member is not None or not case.ensemble:
-        return _window(case, case.member or ())
-    places = jnp.unravel_index(jnp.arange(int(np.prod(case.ensemble))), case.ensemble)
-    flat = jax.vmap(lambda *place: _window(case, place))(*places)
-    return GainWindow(*(edge.reshape(case.ensemble) for edge in flat))
+def _windows(parts: LinearParts) -> GainWindow:
+    if parts.member is not None or not parts.ensemble:
+        return _window(parts, parts.member or ())
+    places = jnp.unravel_index(jnp.arange(int(np.prod(parts.ensemble))), parts.ensemble)
+    flat = jax.vmap(lambda *place: _window(parts, place))(*places)
+    return GainWindow(*(edge.reshape(parts.ensemble) for edge in flat))
 
 
-def _window(case: Case, place: tuple) -> GainWindow:
-    plant, controller = case.parts(place)
-    sharp = sharpest(_SHARP, case.dt, plant.fresh.dtype)
-    ladder = lambda matrix: powers(matrix, case.dt, sharp)
+def _window(parts: LinearParts, place: tuple) -> GainWindow:
+    plant, controller = parts.of_member(place)
+    sharp = sharpest(_SHARP, parts.dt, plant.fresh.dtype)
+    ladder = lambda matrix: powers(matrix, parts.dt, sharp)
     held = jax.lax.stop_gradient((plant, controller))
-    grown = lambda factor: growth(ladder(_closed(*held, factor, case.memory)), case.dt)
+    grown = lambda factor: growth(ladder(_closed(*held, factor, parts.memory)), parts.dt)
     rate = jax.vmap(grown)
 
     def slowest(factor: Float[Array, ""]) -> Float[Array, ""]:
-        matrix = _closed(plant, controller, factor, case.memory)
-        return abscissa(matrix, ladder(matrix), case.dt, sharp)
+        matrix = _closed(plant, controller, factor, parts.memory)
+        return abscissa(matrix, ladder(matrix), parts.dt, sharp)
 
     factors = _candidates(rate, plant.fresh.dtype)
     rates = rate(factors)
     inside = _run(rates < 0, _anchor(factors, rates))
-    exists, ratio = jnp.any(inside), case.ratio(place)
+    exists, ratio = jnp.any(inside), parts.ratio(place)
 
     crossed = jnp.stack([~inside[:-1] & inside[1:], inside[:-1] & ~inside[1:]])
-    found = jax.lax.stop_gradient(jax.vmap(lambda where: first(rate, factors, where))(crossed))
-    edges = jax.vmap(lambda root: _moved(root, slowest))(found)
+    roots = jax.lax.stop_gradient(jax.vmap(lambda where: first(rate, factors, where))(crossed))
+    edges = jax.vmap(lambda root: _newton_step(root, slowest))(roots)
     is_open = jnp.stack([inside[0], inside[-1]])
     edges = jnp.where(is_open, jnp.array([0.0, jnp.inf], edges.dtype), edges) * ratio
     return GainWindow(*jnp.where(exists, edges, jnp.nan))
 
 
-def _moved(root: Float[Array, ""], rate: Callable[[Array], Array]) -> Float[Array, ""]:
+def _newton_step(root: Float[Array, ""], rate: Callable[[Array], Array]) -> Float[Array, ""]:
     """`root` a Newton step on, with its derivatives by the implicit function theorem."""
     place = jnp.where(jnp.isnan(root), 1.0, root)
     value, slope = jax.jvp(rate, (place,), (jnp.ones_like(place),))

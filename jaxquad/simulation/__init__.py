@@ -4,9 +4,8 @@ from ._authority import (
     AuthorityWarning as AuthorityWarning,
     find_authority as find_authority,
 )
-from ._check_loop import check_loop as check_loop
+from ._check_run import check_run as check_run
 from ._compose import scenario as scenario
-from ._delay import loop_settings as loop_settings, Settings as Settings
 from ._disturbances import (
     ceti_gust as ceti_gust,
     gauss_markov as gauss_markov,
@@ -26,7 +25,6 @@ from ._meter import (
 )
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
 from ._over_devices import loop_over_devices as loop_over_devices, over_devices as over_devices
-from ._protocols import Drive as Drive
 from ._references import (
     Ramp as Ramp,
     ReferenceModel as ReferenceModel,

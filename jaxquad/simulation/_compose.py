@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from jaxquad._core import as_float, check_positive, whole_samples
+from jaxquad.records import AXES
 
 from ._memory import require_memory
-from ._scenario import AXES, Scenario
+from ._scenario import Scenario
 from ._signal import as_signal, Clock, fit, Motion, Signal
 
 

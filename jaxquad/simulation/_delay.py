@@ -1,14 +1,10 @@
 import functools as ft
-import math
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from ._hardware import Encoder
-from ._protocols import Drive
+from jaxquad.loops import Loop
 
 
 class DelayLine(eqx.Module):
@@ -48,65 +44,15 @@ def _of_age(queue: Float[Array, "ages ..."], age: Array) -> Array:
     return ft.reduce(jnp.add, chosen)
 
 
-def delay_line(
-    delay: Float[ArrayLike, "*members"], dt: float, longest: float | None
-) -> DelayLine | None:
-    """None for no delay. Raises ValueError for a delay that is negative, not finite or untold."""
-    if isinstance(delay, Tracer):
-        return _traced(delay, dt, longest)
-    samples = np.asarray(delay, dtype=float) / dt
-    if not np.all(np.isfinite(samples) & (samples >= 0)):
-        raise ValueError(f"delay is {delay} s: it is 0 or above and finite")
-    if longest is not None and np.any(samples > longest / dt * (1 + 1e-9)):
-        raise ValueError(f"delay is {delay} s, above longest_delay = {longest} s: raise that")
-    nearest = np.round(samples)
-    whole = bool(np.all(np.abs(samples - nearest) < 1e-9 * np.maximum(nearest, 1)))
-    if not np.any(nearest if whole else samples):
+def delay_line(loop: Loop) -> DelayLine | None:
+    """That of a loop; None without a delay."""
+    length, splits, traced = loop.queue
+    if length == 0:
         return None
-    samples = nearest if whole else samples
-    length = int(np.max(nearest)) if whole else int(np.floor(np.max(samples))) + 1
-    return DelayLine(jnp.asarray(samples, dtype=float), length, not whole)
-
-
-def _traced(delay: Array, dt: float, longest: float | None) -> DelayLine:
-    if longest is None or not 0 < longest < np.inf:
-        raise ValueError(
-            "the delay is traced by jit, vmap or grad, so how many inputs to keep is not known: "
-            f"longest_delay is {longest}; give the longest delay in s that can occur"
-        )
-    wrong = (delay < 0) | (delay > longest * (1 + 1e-9)) | ~jnp.isfinite(delay)
-    message = f"delay is outside 0 to longest_delay = {longest} s: raise longest_delay"
-    delay = eqx.error_if(delay, wrong, message)
-    return DelayLine(delay / dt, int(np.floor(longest / dt * (1 + 1e-9))) + 1, True)
-
-
-class Settings(eqx.Module):
-    """How a loop is run."""
-
-    dt: float = eqx.field(static=True)  # s
-    drive: Drive | None
-    encoder: Encoder | None
-    line: DelayLine | None
-    substeps: int = eqx.field(static=True)
-    bound: float = eqx.field(static=True)  # rad
-
-
-def loop_settings(
-    *,
-    dt: float = 0.002,
-    drive: Drive | None = None,
-    encoder: Encoder | None = None,
-    delay: Float[ArrayLike, "*ensemble"] = 0.0,
-    longest_delay: float | None = None,
-    substeps: int = 1,
-    bound: float = 100.0,
-) -> Settings:
-    """The options of `simulate`, checked. Raises ValueError for what makes no sense."""
-    if not (dt > 0 and math.isfinite(dt)):
-        raise ValueError(f"dt is {dt} s: give a positive sample interval")
-    if not (isinstance(substeps, int | np.integer) and substeps >= 1):
-        raise ValueError(f"substeps is {substeps}: give a whole number of steps, 1 or more")
-    if not (bound > 0 and math.isfinite(bound)):
-        raise ValueError(f"bound is {bound} rad: give the largest angle that still counts as flown")
-    line = delay_line(delay, dt, longest_delay)
-    return Settings(dt, drive, encoder, line, int(substeps), float(bound))
+    delay, longest = loop.delay, loop.longest_delay
+    if traced:
+        wrong = (delay < 0) | (delay > longest * (1 + 1e-9)) | ~jnp.isfinite(delay)
+        message = f"delay is outside 0 to longest_delay = {longest} s: raise longest_delay"
+        delay = eqx.error_if(delay, wrong, message)
+    samples = delay / loop.dt
+    return DelayLine(samples if splits else jnp.round(samples), length, splits)

@@ -4,19 +4,17 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxquad._core import as_float
 from jaxquad._xla import Devices, gathered, Jit
+from jaxquad.loops import Loop
 
 from ._authority import Authority, find_authority, warn_beyond_authority
-from ._check_loop import check_loop
-from ._delay import loop_settings, Settings
-from ._hardware import Encoder
+from ._check_run import check_run
 from ._meter import makes_step, Meter, share_beyond, Tally, wide, Window, window
 from ._metrics import Metrics, tallied
-from ._over_devices import loop_over_devices, placed
-from ._protocols import Controller, Drive, Plant
+from ._over_devices import loop_over_devices, placed, Run
 from ._run import scan_loop
 from ._scenario import Scenario
 from ._simulate import Simulation
@@ -59,17 +57,9 @@ def metrics(
 
 
 def evaluate(
-    plant: Plant,
-    controller: Controller,
+    loop: Loop,
     scenario: Scenario,
     *,
-    dt: float = 0.002,
-    drive: Drive | None = None,
-    encoder: Encoder | None = None,
-    delay: Float[ArrayLike, "*ensemble"] = 0.0,
-    longest_delay: float | None = None,
-    substeps: int = 1,
-    bound: float = 100.0,
     start: float = 0.0,
     stop: float | None = None,
     load_start: float | None = None,
@@ -77,24 +67,32 @@ def evaluate(
 ) -> Metrics:
     """The `Metrics` of a loop without its trajectories: what is kept does not grow with time.
 
-    The same numbers as `jq.simulation.metrics(jq.simulate(...), ...)`, whose options these are, in the memory
-    of one sample: about 0.5 kB per axis and member, and what the scenario holds for each member.
-    Where that is too much, `jq.simulation.in_slices`. Differentiable with respect to plant, controller,
+    The same numbers as `jq.simulation.metrics(jq.simulate(loop, scenario), ...)` in the memory of
+    one sample: about 0.5 kB per axis and member, and what the scenario holds for each member. Where
+    that is too much, `jq.simulation.in_slices`. Differentiable with respect to plant, controller,
     scenario and delay; a gradient needs memory as the square root of the number of samples, and
     `jq.simulation.over_devices` splits a cost of your own as `devices` splits this.
-    Raises ValueError as both of them do; warns of disturbances beyond the torque of the drive.
+
+        loop = jq.Loop(plant, jq.LADRC(10.0, 30.0, 0.85), delay=0.004)
+        print(jq.evaluate(loop, scenario, start=1.0, load_start=5.0))
+
+    **Arguments:**
+
+    - `loop`, `scenario`, `devices`: as in `jq.simulate`.
+    - `start`, `stop`, `load_start`: s, as in `jq.simulation.metrics`.
+
+    **Returns:** `jq.simulation.Metrics` of each axis and member.
+
+    **Raises:** ValueError as `jq.simulate` and `jq.simulation.metrics` do. Warns of disturbances
+    beyond the torque of the drive.
     """
-    settings = loop_settings(
-        dt=dt, drive=drive, encoder=encoder, delay=delay, longest_delay=longest_delay,
-        substeps=substeps, bound=bound,
-    )  # fmt: skip
-    check_loop(plant, controller, scenario, settings)
-    place = window(len(scenario.reference), dt, start=start, stop=stop, load_start=load_start)
+    check_run(loop, scenario)
+    place = window(len(scenario.reference), loop.dt, start=start, stop=stop, load_start=load_start)
     judged = Window(*map(jnp.asarray, place))
-    loop, places = placed(plant, controller, scenario, settings, devices)
-    found, numbers = gathered(_run(*loop, judged, places))
+    run, places = placed(loop, scenario, devices)
+    found, numbers = gathered(_run(*run, judged, places))
     warn_beyond_authority(found, scenario)
-    return _metrics(numbers, place, dt)
+    return _metrics(numbers, place, loop.dt)
 
 
 def _metrics(numbers: dict[str, Any], place: tuple[int, int, int, int], dt: float) -> Metrics:
@@ -104,24 +102,18 @@ def _metrics(numbers: dict[str, Any], place: tuple[int, int, int, int], dt: floa
 
 @Jit
 def _run(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    settings: Settings,
-    judged: Window,
-    devices: Devices | None = None,
+    loop: Loop, scenario: Scenario, judged: Window, devices: Devices | None = None
 ) -> tuple[Authority | None, dict[str, Array]]:
-    loop = (plant, controller, scenario, settings)
-    found = find_authority(plant, settings.drive, controller)
-    return found, loop_over_devices(_judge, loop, judged, devices)
+    found = find_authority(loop.plant, loop.drive, loop.controller)
+    return found, loop_over_devices(_judge, (loop, scenario), judged, devices)
 
 
-def _judge(loop: PyTree, judged: Window) -> dict[str, Array]:
-    plant, controller, scenario, settings = loop
-    found = find_authority(plant, settings.drive, controller)
+def _judge(run: Run, judged: Window) -> dict[str, Array]:
+    loop, scenario = run
+    found = find_authority(loop.plant, loop.drive, loop.controller)
     gain = None if found is None else found.torque_gain
-    meter = make_meter(scenario, judged, settings.dt, found, gain)
-    tally, _, running = scan_loop(plant, controller, scenario, settings, meter.update, meter.begin)
+    meter = make_meter(scenario, judged, loop.dt, found, gain)
+    tally, _, running = scan_loop(loop, scenario, meter.update, meter.begin)
     return _numbers(meter, tally, ~running, scenario, found)
 
 

@@ -4,8 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from jaxquad.records import AXES
+
 from ._disturbances import gauss_markov
-from ._scenario import AXES, Scenario
+from ._scenario import Scenario
 
 
 def excite(

@@ -10,23 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._delay import Settings
-from ._protocols import Controller, Plant
-from ._sample import Loop
+from jaxquad.loops import Controller, Loop, Plant
+
+from ._sample import step_of
 from ._scenario import Scenario
 
 
-def common_ensemble(
-    plant: Plant, controller: Controller, scenario: Scenario, settings: Settings
-) -> tuple[int, ...]:
+def common_ensemble(loop: Loop, scenario: Scenario) -> tuple[int, ...]:
     """The trailing shape that all parts of a loop ask for together. Raises ValueError for none."""
     axes = scenario.reference.shape[1]
-    line = settings.line
     shapes = {
-        "plant": jax.eval_shape(lambda: plant.measure(plant.init())).shape[1:],
-        "controller": _of_controller(controller, axes),
+        "plant": jax.eval_shape(lambda: loop.plant.measure(loop.plant.init())).shape[1:],
+        "controller": _of_controller(loop.controller, axes),
         "scenario": scenario.ensemble,
-        "delay": () if line is None else line.samples.shape,
+        "delay": loop.delay.shape,
     }
     try:
         return np.broadcast_shapes(*shapes.values())
@@ -78,28 +75,27 @@ _MOST = 5  # groups of arrays that are tried together
 _OTHER = 7919  # a number of members that no other axis has
 
 
-def count_members(loop: PyTree) -> int:
-    """How many (plant, controller, scenario, settings) have on the last axis of the ensemble."""
-    return (1, *common_ensemble(*loop))[-1]
+def count_members(run: tuple[Loop, Scenario]) -> int:
+    """How many a loop and its scenario have on the last axis of the ensemble."""
+    return (1, *common_ensemble(*run))[-1]
 
 
-def members_of_loop(loop: PyTree) -> PyTree | None:
-    """`per_member` of (plant, controller, scenario, settings).
+def members_of_run(run: tuple[Loop, Scenario]) -> PyTree | None:
+    """`per_member` of a loop and its scenario.
 
     None, too, for a controller that holds its number of members fixed.
     """
-    return per_member(_one_sample, loop, count_members(loop))
+    return per_member(_one_sample, run, count_members(run))
 
 
 def _one_sample(parts: PyTree) -> Array:
     """Who runs after the first sample: a number for each member, by all that is in the loop."""
-    plant, controller, scenario, settings = parts
-    ensemble = common_ensemble(plant, controller, scenario, settings)
-    state, like = start_of(plant, scenario, ensemble)
-    prepared = getattr(controller, "prepared", lambda: controller)
-    loop = Loop(plant, prepared(), settings, ensemble)
-    carry = loop.begin(state, like)
-    return loop.sample(carry, jnp.zeros((), int), jax.tree.map(lambda x: x[0], scenario))[0].running
+    loop, scenario = parts
+    ensemble = common_ensemble(loop, scenario)
+    state, like = start_of(loop.plant, scenario, ensemble)
+    step = step_of(loop, ensemble)
+    carry = step.begin(state, like)
+    return step.sample(carry, jnp.zeros((), int), jax.tree.map(lambda x: x[0], scenario))[0].running
 
 
 def per_member(run: Callable[[PyTree], Array], tree: PyTree, members: int) -> PyTree | None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ._scenario import AXES
+from jaxquad.records import AXES
 
 
 _NOTHING = 1e-9  # in every unit of the table

@@ -19,12 +19,15 @@ from jaxquad._xla import (
     require_same,
     where_put,
 )
+from jaxquad.loops import Loop
 
-from ._members import count_members, members_of_loop
+from ._members import count_members, members_of_run
+from ._scenario import Scenario
 
 
 _AXIS = "members"
-_PARTS = ("plant", "controller", "scenario", "settings")
+_PARTS = ("plant", "controller", "drive", "encoder", "delay")
+Run = tuple[Loop, Scenario]
 
 
 def over_devices(
@@ -52,37 +55,34 @@ def over_devices(
     return _split(function, members, shared, count, places)
 
 
-def placed(
-    plant: Any, controller: Any, scenario: Any, settings: Any, devices: Any
-) -> tuple[tuple[Any, Any, Any, Any], Devices | None]:
-    """The parts of a loop, and the devices that are asked for, else those its data were put on."""
+def placed(loop: Loop, scenario: Scenario, devices: Any) -> tuple[Run, Devices | None]:
+    """Loop and scenario, and the devices that are asked for, else those their data were put on."""
     asked = asked_devices(devices)
-    loop = (plant, controller, scenario, settings)
+    run = (loop, scenario)
     if not may_be_several(asked):
-        return loop, asked
-    asked = where_put(loop) if asked is None else asked
-    require_same(dict(zip(_PARTS, loop, strict=True)), asked)
-    plant, controller, scenario, settings = movable(loop, asked)
-    return (plant, controller, scenario, settings), asked
+        return run, asked
+    asked = where_put(run) if asked is None else asked
+    require_same({name: getattr(loop, name) for name in _PARTS} | {"scenario": scenario}, asked)
+    return movable(run, asked), asked
 
 
 def loop_over_devices(
-    function: Callable[[PyTree, Any], PyTree], loop: PyTree, shared: Any, asked: Devices | None
+    function: Callable[[Run, Any], PyTree], run: Run, shared: Any, asked: Devices | None
 ) -> PyTree:
-    """`function(loop, shared)` of (plant, controller, scenario, settings), as `over_devices`."""
+    """`function((loop, scenario), shared)`, each device with its members, as `over_devices`."""
     if not may_be_several(asked):
-        return function(loop, shared)
-    count = count_members(loop)
+        return function(run, shared)
+    count = count_members(run)
     places = devices_for(count, asked)
     if min(count, len(places)) < 2:
-        return function(loop, shared)
-    own = members_of_loop(loop)
+        return function(run, shared)
+    own = members_of_run(run)
     if own is not None:
-        theirs, common = eqx.partition(loop, own)
+        theirs, common = eqx.partition(run, own)
         whole = lambda theirs, both: function(eqx.combine(theirs, both[0]), both[1])
         return _split(whole, theirs, (common, shared), count, places)
     if asked is None:
-        return function(loop, shared)
+        return function(run, shared)
     raise ValueError(
         f"a loop of {count} members cannot be split among {len(places)} devices: which of its "
         "arrays have a member on the last axis cannot be told; give devices=1, or another number "

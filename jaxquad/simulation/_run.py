@@ -10,12 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._xla import as_one_kernel
+from jaxquad.loops import Loop
 
-from ._delay import Settings
 from ._guard import are_sound, guarded
-from ._members import common_ensemble, members_of_loop, start_of
-from ._protocols import Controller, Plant
-from ._sample import Carry, Loop, SampleResult
+from ._members import common_ensemble, members_of_run, start_of
+from ._sample import Carry, LoopStep, SampleResult, step_of
 from ._scenario import Scenario
 
 
@@ -163,10 +162,8 @@ Collect = Callable[[PyTree, SampleResult], tuple[PyTree, PyTree]]
 
 
 def scan_loop(
-    plant: Plant,
-    controller: Controller,
+    loop: Loop,
     scenario: Scenario,
-    settings: Settings,
     collect: Collect,
     begin: Callable[[Float[Array, " axes *ensemble"]], PyTree],
 ) -> tuple[PyTree, PyTree, Bool[Array, "*ensemble"]]:
@@ -174,12 +171,12 @@ def scan_loop(
 
     `collect(accumulated, now)` returns what is accumulated and what is stored of a sample;
     `begin(like)` is what it starts from, with `like` zeros `[axes, *ensemble]`. To be jitted by the
-    caller, after `check_loop`.
+    caller, after `check_run`.
     """
-    ensemble = common_ensemble(plant, controller, scenario, settings)
-    state, like = start_of(plant, scenario, ensemble)
-    carry = (_loop(plant, controller, settings, ensemble).begin(state, like), begin(like))
-    given = ((plant, controller, scenario, settings), carry, collect)
+    ensemble = common_ensemble(loop, scenario)
+    state, like = start_of(loop.plant, scenario, ensemble)
+    carry = (step_of(loop, ensemble).begin(state, like), begin(like))
+    given = ((loop, scenario), carry, collect)
     own = _of_members(given, ensemble)
     if own is None:
         return _run(given)
@@ -195,22 +192,15 @@ def _of_members(given: PyTree, ensemble: tuple[int, ...]) -> PyTree | None:
     if len(ensemble) != 1 or ensemble[0] <= most_at_once():
         return None
     parts, *others = given
-    own = members_of_loop(parts)
+    own = members_of_run(parts)
     last = lambda x: eqx.is_array(x) and x.shape[-1:] == ensemble
     return None if own is None else (own, *jax.tree.map(last, others))
 
 
-def _loop(
-    plant: Plant, controller: Controller, settings: Settings, ensemble: tuple[int, ...]
-) -> Loop:
-    prepared = getattr(controller, "prepared", lambda: controller)
-    return Loop(plant, prepared(), settings, ensemble)
-
-
 def _run(given: PyTree) -> tuple[PyTree, PyTree, Bool[Array, "*ensemble"]]:
-    (plant, controller, scenario, settings), carry, collect = given
-    loop = _loop(plant, controller, settings, carry[0].running.shape)
-    arrays, rest = eqx.partition((loop, carry, scenario, collect), eqx.is_array)
+    (loop, scenario), carry, collect = given
+    step = step_of(loop, carry[0].running.shape)
+    arrays, rest = eqx.partition((step, carry, scenario, collect), eqx.is_array)
     carried, stored = as_one_kernel(ft.partial(_scan, rest), arrays)
     return carried[1], stored, carried[0].running
 
@@ -223,7 +213,7 @@ def _scan(rest: PyTree, arrays: PyTree) -> tuple[PyTree, PyTree]:
     carry = (carry[0]._replace(running=carry[0].running & sound), carry[1])
     at_rest = jax.lax.stop_gradient(carry[0])
 
-    def sample(inner: Carry, parts: Loop, now: PyTree) -> tuple[Carry, SampleResult]:
+    def sample(inner: Carry, parts: LoopStep, now: PyTree) -> tuple[Carry, SampleResult]:
         return eqx.combine(parts, static).sample(inner, *now)
 
     def step(carry: PyTree, now: PyTree) -> tuple[PyTree, PyTree]:

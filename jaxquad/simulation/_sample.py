@@ -8,10 +8,20 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._core import align
 from jaxquad.control import Setpoint
+from jaxquad.loops import (
+    after_drive,
+    CarriesPayload,
+    Controller,
+    Drive,
+    Loop,
+    Plant,
+    prepared,
+    Sensor,
+    signals_of,
+)
 
-from ._delay import Settings
+from ._delay import delay_line, DelayLine
 from ._guard import are_numbers, are_resolved, are_tame, choose, within
-from ._protocols import Controller, Plant
 from ._scenario import Scenario
 
 
@@ -84,17 +94,22 @@ class Carry(NamedTuple):
     running: Bool[Array, "*ensemble"]
 
 
-class Loop(eqx.Module):
-    """A plant, its controller and what is between them."""
+class LoopStep(eqx.Module):
+    """A loop ready to be run: one sample after the other."""
 
     plant: Plant
     controller: Controller
-    settings: Settings
+    drive: Drive | None
+    encoder: Sensor | None
+    line: DelayLine | None
+    dt: float = eqx.field(static=True)  # s
+    substeps: int = eqx.field(static=True)
+    bound: float = eqx.field(static=True)  # rad
     ensemble: tuple[int, ...] = eqx.field(static=True)
 
     def begin(self, state: PyTree, like: Float[Array, " axes *ensemble"]) -> Carry:
         """At rest: before the first command arrives, the inputs are those of none."""
-        line, inputs = self.settings.line, self._driven(like)[0]
+        line, inputs = self.line, self._driven(like)[0]
         past = None if line is None else line.init(inputs)
         return Carry(state, self.controller.init(like), past, jnp.ones(self.ensemble, bool))
 
@@ -103,7 +118,7 @@ class Loop(eqx.Module):
     ) -> tuple[Carry, SampleResult]:
         """Measure, control, and hold the inputs until the next sample."""
         angle = self.plant.measure(carry.state)
-        happens, bound = _wide(happens, angle), self.settings.bound
+        happens, bound = _wide(happens, angle), self.bound
         fine = carry.running & jnp.all(jnp.abs(angle) <= bound, axis=0)
         angle = within(angle, bound)
         measurement = self._measured(angle + happens.noise)
@@ -111,7 +126,7 @@ class Loop(eqx.Module):
         following = self._move(carry, memory, inputs, happens, fine)
         return following, SampleResult(
             index=index,
-            time=index.astype(angle.dtype) * self.settings.dt,
+            time=index.astype(angle.dtype) * self.dt,
             angle=angle,
             measurement=measurement,
             reference=happens.reference,
@@ -120,7 +135,7 @@ class Loop(eqx.Module):
             saturated=_falls_short(asked, achieved),
             injection=happens.injection,
             disturbance=happens.disturbance,
-            signals=getattr(self.controller, "signals", lambda _: {})(memory),
+            signals=signals_of(self.controller, memory),
             running=fine,
         )
 
@@ -136,8 +151,7 @@ class Loop(eqx.Module):
         fine = fine & are_tame(command, self.ensemble)
         asked = jnp.where(fine, command, 0) + happens.injection
         inputs, achieved = self._driven(asked)
-        told = getattr(self.controller, "applied", None)
-        memory = memory if told is None else told(memory, achieved)
+        memory = after_drive(self.controller, memory, achieved)
         fine = fine & are_numbers(memory, self.ensemble)
         return choose(fine, memory, carry.memory, self.ensemble), asked, inputs, achieved, fine
 
@@ -151,28 +165,25 @@ class Loop(eqx.Module):
         return Carry(state, memory, past, runs)
 
     def _measured(self, angle: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
-        encoder = self.settings.encoder
-        return angle if encoder is None else encoder(angle)
+        return angle if self.encoder is None else self.encoder(angle)
 
     def _driven(self, command: Float[Array, " axes *ensemble"]) -> tuple[Array, Array]:
-        drive = self.settings.drive
-        if drive is None:
+        if self.drive is None:
             return command, command
-        inputs = drive.inputs(command)
-        return inputs, drive.achieved(inputs)
+        inputs = self.drive.inputs(command)
+        return inputs, self.drive.achieved(inputs)
 
     def _held(
         self, carry: Carry, inputs: Float[Array, " inputs *ensemble"], happens: Scenario
     ) -> tuple[Array | None, PyTree]:
         """The inputs on their way and the plant's state, both at the next sample."""
-        plant: Any = self.plant
-        line, dt = self.settings.line, self.settings.dt
-        if happens.payload is not None:
+        plant, line, dt = self.plant, self.line, self.dt
+        if happens.payload is not None and isinstance(plant, CarriesPayload):
             plant = plant.with_added_inertia(happens.payload)
 
         def hold(state: PyTree, inputs: Array, duration: Any) -> PyTree:
             slope = lambda x: plant.derivative(x, inputs, happens.disturbance)
-            return integrate(slope, state, duration, self.settings.substeps)
+            return integrate(slope, state, duration, self.substeps)
 
         if line is None or carry.past is None:
             return None, hold(carry.state, inputs, dt)
@@ -181,6 +192,21 @@ class Loop(eqx.Module):
             return past, hold(carry.state, late, dt)
         share = line.share(inputs)
         return past, hold(hold(carry.state, early, share * dt), late, (1 - share) * dt)
+
+
+def step_of(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
+    """What runs `loop`, for members of the shape `ensemble`."""
+    return LoopStep(
+        plant=loop.plant,
+        controller=prepared(loop.controller),
+        drive=loop.drive,
+        encoder=loop.encoder,
+        line=delay_line(loop),
+        dt=loop.dt,
+        substeps=loop.substeps,
+        bound=loop.bound,
+        ensemble=ensemble,
+    )
 
 
 def _setpoint(happens: Scenario) -> Any:

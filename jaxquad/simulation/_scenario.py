@@ -4,9 +4,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-AXES = ("roll", "pitch", "yaw")
-
-
 class Scenario(eqx.Module):
     """What happens to a loop, sample by sample; a trailing axis makes an ensemble.
 

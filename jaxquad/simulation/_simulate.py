@@ -5,22 +5,20 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._core import align
 from jaxquad._xla import Devices, gathered, Jit
-from jaxquad.records import Record
+from jaxquad.loops import Loop
+from jaxquad.records import AXES, Record
 
 from ._authority import Authority, find_authority, warn_beyond_authority
-from ._check_loop import check_loop
-from ._delay import loop_settings, Settings
-from ._hardware import Encoder
+from ._check_run import check_run
 from ._memory import require_memory, size_of
-from ._over_devices import loop_over_devices, placed
-from ._protocols import Controller, Drive, Plant
+from ._over_devices import loop_over_devices, placed, Run
 from ._run import scan_loop
 from ._sample import SampleResult
-from ._scenario import AXES, Scenario
+from ._scenario import Scenario
 
 
 class Simulation(eqx.Module):
@@ -93,55 +91,41 @@ class Simulation(eqx.Module):
 
 
 def simulate(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    *,
-    dt: float = 0.002,
-    drive: Drive | None = None,
-    encoder: Encoder | None = None,
-    delay: Float[ArrayLike, "*ensemble"] = 0.0,
-    longest_delay: float | None = None,
-    substeps: int = 1,
-    bound: float = 100.0,
-    devices: int | Sequence[Any] | None = None,
+    loop: Loop, scenario: Scenario, *, devices: int | Sequence[Any] | None = None
 ) -> Simulation:
     """Run a sampled-data loop: measure, control, hold the inputs for `dt` seconds, repeat.
 
-    Between samples the plant is integrated by `substeps` fourth-order Runge-Kutta steps under
-    constant inputs. The injected signal is added to the controller's command, so that a sweep can
-    excite a plant that needs stabilising; `drive` makes motor inputs of the sum, as `jq.models.Multirotor`
-    needs. The inputs reach the plant `delay` seconds later, exactly: any delay of 0 or above, whole
-    samples or not, one for all or one per member. Under jit, vmap or grad with respect to the
-    delay, `longest_delay` says how long it can become.
+    Between samples the plant is integrated by the loop's `substeps` fourth-order Runge-Kutta steps
+    under constant inputs. The injected signal is added to the controller's command, so that a sweep
+    can excite a plant that needs stabilising. Inputs reach the plant `delay` seconds later, exactly.
+    A member whose angle leaves +-`bound` rad, or whose numbers grow beyond 1e9, is held there and
+    flagged in `diverged`, so that values and gradients of the others, and its own, stay finite.
 
-    One loop, or an ensemble along the last axis of the plant's parameters, of the controller's
-    gains, of the scenario, of the delay, or of several of them. A member whose angle leaves
-    +-`bound` rad, or whose numbers grow beyond 1e9, is held there and flagged in `diverged`, so
-    that values and gradients of the others, and its own, stay finite.
+    **Arguments:**
 
-    `devices` compute a part of the members each; the result is the same, on the default device.
-    None: those of this process, as many as have 32 members (4096 where they are no CPUs), or those
-    that the data were put on. A number: so many of them. A sequence of `jax.Device`: those, of
-    other processes too. A CPU is one device whatever its cores, which a loop uses one of, until
-    `jax.config.update("jax_num_cpu_devices", 2)`, before the first computation, makes it two.
-    After `jax.distributed.initialize` each process makes the same call of the whole ensemble with
-    `devices=jax.devices()`, and gets all of its members.
+    - `loop`: one, or an ensemble along the last axis of the plant's parameters, of the controller's
+        gains, of the scenario, of the delay, or of several of them.
+    - `scenario`: what happens, see `jq.scenario`.
+    - `devices`: compute a part of the members each; the result is the same, on the default device.
+        None: those of this process, as many as have 32 members (4096 where they are no CPUs), or
+        those that the data were put on. A number: so many of them. A sequence of `jax.Device`:
+        those, of other processes too. A CPU is one device whatever its cores, which a loop uses one
+        of, until `jax.config.update("jax_num_cpu_devices", 2)`, before the first computation, makes
+        it two. After `jax.distributed.initialize` each process makes the same call of the whole
+        ensemble with `devices=jax.devices()`, and gets all of its members.
 
-    Raises `ValueError` for parts that do not fit together, such as a controller made for another
-    `dt`, ensembles of different sizes or a payload that the plant cannot carry; for devices that
-    JAX does not have; for processes with different ensembles (not under jit, vmap or grad); and for
-    a record that does not fit the memory: 25 B or more per sample, axis and member.
+    **Returns:** a `jq.simulation.Simulation` with all samples of all members.
+
+    **Raises:** ValueError for parts that do not fit together, such as ensembles of different sizes
+    or a payload that the plant cannot carry; for devices that JAX does not have; for processes with
+    different ensembles (not under jit, vmap or grad); and for a record that does not fit the
+    memory: 25 B or more per sample, axis and member.
     """
-    settings = loop_settings(
-        dt=dt, drive=drive, encoder=encoder, delay=delay, longest_delay=longest_delay,
-        substeps=substeps, bound=bound,
-    )  # fmt: skip
-    check_loop(plant, controller, scenario, settings)
-    loop, places = placed(plant, controller, scenario, settings, devices)
-    ((angle, *others), running), authority = gathered(_run(*loop, places))
+    check_run(loop, scenario)
+    run, places = placed(loop, scenario, devices)
+    ((angle, *others), running), authority = gathered(_run(*run, places))
     warn_beyond_authority(authority, scenario)
-    time = jnp.asarray(dt * np.arange(angle.shape[0]), angle.dtype)
+    time = jnp.asarray(loop.dt * np.arange(angle.shape[0]), angle.dtype)
     measurement, command, saturated, signals = others
     return Simulation(
         time=time,
@@ -152,22 +136,17 @@ def simulate(
         signals=signals,
         diverged=~running,
         scenario=scenario,
-        dt=dt,
+        dt=loop.dt,
         authority=authority,
     )
 
 
 @Jit
 def _run(
-    plant: Plant,
-    controller: Controller,
-    scenario: Scenario,
-    settings: Settings,
-    devices: Devices | None = None,
+    loop: Loop, scenario: Scenario, devices: Devices | None = None
 ) -> tuple[tuple[PyTree, Bool[Array, "*ensemble"]], Authority | None]:
-    found = find_authority(plant, settings.drive, controller)
-    loop = (plant, controller, scenario, settings)
-    stored, running = loop_over_devices(_store, loop, None, devices)
+    found = find_authority(loop.plant, loop.drive, loop.controller)
+    stored, running = loop_over_devices(_store, (loop, scenario), None, devices)
     samples, axes, *members = stored[0].shape
     what = f"a record of {samples} samples of {axes} axes of {math.prod(members)} members"
     require_memory(
@@ -176,10 +155,8 @@ def _run(
     return (stored, running), found
 
 
-def _store(
-    loop: tuple[Plant, Controller, Scenario, Settings], nothing: None
-) -> tuple[PyTree, Bool[Array, "*ensemble"]]:
-    return scan_loop(*loop, _keep, lambda like: None)[1:]
+def _store(run: Run, nothing: None) -> tuple[PyTree, Bool[Array, "*ensemble"]]:
+    return scan_loop(*run, _keep, lambda like: None)[1:]
 
 
 def _keep(nothing: None, now: SampleResult) -> tuple[None, PyTree]:

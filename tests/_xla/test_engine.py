@@ -13,6 +13,7 @@ import pytest
 
 from jaxquad._xla import _engine as _compile, compiler_options, engine
 from jaxquad.control import LADRC
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.models._rotation import sincos
 from jaxquad.simulation import (
@@ -25,7 +26,6 @@ from jaxquad.simulation import (
     simulate,
     Step,
 )
-from jaxquad.simulation._delay import loop_settings
 from jaxquad.simulation._run import in_chunks, scan_in_blocks, scan_loop
 
 
@@ -141,7 +141,7 @@ def rig(inertia):
 
 def flown(inertia, gains):
     controller = LADRC(*(gain[None] for gain in gains))
-    return evaluate(rig(inertia), controller, HAPPENS, drive=Saturation(20.0))
+    return evaluate(Loop(rig(inertia), controller, drive=Saturation(20.0)), HAPPENS)
 
 
 def test_members_of_a_large_ensemble_fly_as_in_a_small_one():
@@ -154,20 +154,18 @@ def test_members_of_a_large_ensemble_fly_as_in_a_small_one():
 
 def test_a_record_of_a_large_ensemble_has_every_member_in_its_place():
     controller, drive = LADRC([10.0], [30.0], [0.8478]), Saturation(20.0)
-    record = simulate(rig(INERTIA), controller, HAPPENS, drive=drive)
-    alone = simulate(rig(INERTIA[:, -1]), controller, HAPPENS, drive=drive)
+    record = simulate(Loop(rig(INERTIA), controller, drive=drive), HAPPENS)
+    alone = simulate(Loop(rig(INERTIA[:, -1]), controller, drive=drive), HAPPENS)
     close(record.angle[..., -1], alone.angle)
-    close(metrics(record).itae, evaluate(rig(INERTIA), controller, HAPPENS, drive=drive).itae)
+    close(metrics(record).itae, evaluate(Loop(rig(INERTIA), controller, drive=drive), HAPPENS).itae)
 
 
 def test_what_collects_may_hold_numbers_of_members_that_nobody_sees():
     hidden = jnp.arange(float(MEMBERS))[None]
     collect = lambda total, now: (total + hidden * now.angle, None)
-    settings = loop_settings(drive=Saturation(20.0))
-    controller = LADRC([10.0], [30.0], [0.8478])
-    run = eqx.filter_jit(lambda: scan_loop(rig(INERTIA), controller, HAPPENS, settings, collect,
-                                           jnp.zeros_like)[0])  # fmt: skip
-    record = simulate(rig(INERTIA), controller, HAPPENS, drive=Saturation(20.0))
+    loop = Loop(rig(INERTIA), LADRC([10.0], [30.0], [0.8478]), drive=Saturation(20.0))
+    run = eqx.filter_jit(lambda: scan_loop(loop, HAPPENS, collect, jnp.zeros_like)[0])
+    record = simulate(loop, HAPPENS)
     close(run(), hidden * jnp.sum(record.angle, axis=0), rtol=1e-9)
 
 

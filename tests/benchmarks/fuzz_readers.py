@@ -31,9 +31,9 @@ import numpy as np
 from hostile_files import damaged, sound_files
 
 from jaxquad.records import channels, propose, ReadError, RecordError
+from jaxquad.records._log import allowance
 from jaxquad.records.formats import _isolated
 from jaxquad.records.formats._child import answer, load_module
-from jaxquad.records.formats._limits import allowance
 
 
 CASES = 500  # of one kind and one seed
@@ -42,8 +42,7 @@ ISOLATED = ("hdf5", "parquet", "mcap", "db3")
 SLOW = 5  # s
 FOLDER = Path(_isolated.__file__).parent
 MODULES = {
-    name: load_module(str(FOLDER / f"{name}.py"))
-    for name in ("_hdf5_tables", "_parquet_tables", "_rosbag_tables")
+    name: load_module(str(FOLDER / name)) for name in ("_hdf5.py", "_parquet.py", "_rosbag.py")
 }
 MEMORY = 3 * 2**30  # bytes above what the worker has
 
@@ -125,9 +124,9 @@ def _work(
             print(f"BAD {kind} seed {seed} case {number}: {text}", flush=True)
 
 
-def _in_this_process(module: str, path: Path, kind: str, stored: int, patience: float) -> bytes:
+def _in_this_process(script: Path, path: Path, kind: str, stored: int, patience: float) -> bytes:
     stream = io.BytesIO()
-    answer(MODULES[module], str(path), allowance(stored), stream)
+    answer(MODULES[script.name], str(path), allowance(stored), stream)
     return stream.getvalue()
 
 
@@ -144,7 +143,7 @@ def _outcome(name: str, content: bytes, rng: np.random.Generator) -> tuple[str, 
             channels(path)
             _propose(path)
         except ReadError as error:
-            return "net" if "as it should be (" in str(error) else "refused", str(error)
+            return "net" if "cannot be read as " in str(error) else "refused", str(error)
         except RecordError as error:
             return "BAD", f"RecordError: {error}"
         except Exception:
@@ -156,7 +155,7 @@ def _propose(path: Path) -> None:
     try:
         str(propose(path))
     except RecordError as error:
-        assert "its channels are not those of" not in str(error), error
+        assert "the channels are not those that" not in str(error), error
 
 
 def _death(status: int) -> str:

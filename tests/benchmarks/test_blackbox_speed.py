@@ -14,8 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import blackbox_writer as writer
 import pytest
 from blackbox_rows import rows
-
-from jaxquad.records.formats._betaflight import decode
+from log_writers import decode
 
 
 ROWS = 1_000_000
@@ -38,5 +37,5 @@ def data():
 
 
 def test_decode(benchmark, data):
-    log = benchmark.pedantic(decode, (data,), rounds=3)
+    log = benchmark.pedantic(decode, ("betaflight", data), rounds=3)
     assert log.tables[""].time.size == ROWS and log.remarks == ()

@@ -10,7 +10,7 @@ import resource
 import numpy as np
 import pytest
 
-from jaxquad.records.formats import _csv
+from jaxquad.records.formats import load_log
 
 
 ROWS, COLUMNS = 1_000_000, 43
@@ -32,7 +32,7 @@ def table(tmp_path_factory):
 
 def test_read(benchmark, table):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    log = benchmark.pedantic(_csv.load, (table,), rounds=1)
+    log = benchmark.pedantic(load_log, (table,), rounds=1)
     assert all(column.size == ROWS for column in log.tables[""].columns.values())
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert after - before < 800_000  # kB; the package itself takes less than 200,000

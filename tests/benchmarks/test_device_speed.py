@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import evaluate, Pulse, Saturation, scenario, Step
 
@@ -30,7 +31,7 @@ GAINS = np.array([10.0, 30.0, 0.8478])
 
 def itae(gains, plant, happens, devices):
     controller = LADRC(gains[:1], gains[1:2], gains[2:])
-    found = evaluate(plant, controller, happens, drive=Saturation(20.0), devices=devices)
+    found = evaluate(Loop(plant, controller, drive=Saturation(20.0)), happens, devices=devices)
     return jnp.mean(found.itae)
 
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import evaluate, metrics, Pulse, Saturation, scenario, simulate, Step
-from jaxquad.simulation._delay import loop_settings
 from jaxquad.simulation._evaluate import _run
 from jaxquad.simulation._meter import Window
 from jaxquad.simulation._run import scan_loop
@@ -55,40 +55,35 @@ def rig(request):
 @pytest.mark.benchmark(group="evaluate")
 def test_evaluate(benchmark, rig):
     found = benchmark(
-        lambda: jax.block_until_ready(evaluate(rig, CONTROLLER, HAPPENS, drive=DRIVE))
+        lambda: jax.block_until_ready(evaluate(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS))
     )
-    settings = loop_settings(drive=DRIVE)
-    compiled = _run.lower(rig, CONTROLLER, HAPPENS, settings, WINDOW).compile()
+    compiled = _run.lower(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS, WINDOW).compile()
     benchmark.extra_info["MB"] = reserved(compiled)
     assert np.isfinite(found.itae).all()
 
 
 @pytest.mark.benchmark(group="evaluate")
 def test_simulate_then_metrics(benchmark, rig):
-    run = lambda: metrics(simulate(rig, CONTROLLER, HAPPENS, drive=DRIVE))
+    run = lambda: metrics(simulate(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS))
     found = benchmark(lambda: jax.block_until_ready(run()))
-    compiled = _run_stored.lower(rig, CONTROLLER, HAPPENS, loop_settings(drive=DRIVE)).compile()
+    compiled = _run_stored.lower(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS).compile()
     benchmark.extra_info["MB"] = reserved(compiled)
-    exact = evaluate(rig, CONTROLLER, HAPPENS, drive=DRIVE)
+    exact = evaluate(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS)
     np.testing.assert_allclose(found.itae, exact.itae, rtol=1e-12)
 
 
 @pytest.mark.benchmark(group="evaluate")
 def test_alone(benchmark, rig):
-    keep, settings = lambda angle, now: (now.angle, None), loop_settings(drive=DRIVE)
-    run = eqx.filter_jit(
-        lambda rig, controller, happens: scan_loop(
-            rig, controller, happens, settings, keep, lambda like: like
-        )[0]
-    )
-    benchmark(lambda: jax.block_until_ready(run(rig, CONTROLLER, HAPPENS)))
+    keep = lambda angle, now: (now.angle, None)
+    run = eqx.filter_jit(lambda loop, happens: scan_loop(loop, happens, keep, lambda like: like)[0])
+    benchmark(lambda: jax.block_until_ready(run(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS)))
 
 
 @pytest.mark.benchmark(group="gradient of the mean ITAE, 3 gains")
 def test_gradient(benchmark, rig):
     def itae(gains, rig, happens):
         wc, wo, b0 = (x[None] for x in gains)
-        return jnp.mean(evaluate(rig, LADRC(wc, wo, b0), happens, drive=DRIVE).itae)
+        return jnp.mean(evaluate(Loop(rig, LADRC(wc, wo, b0), drive=DRIVE), happens).itae)
 
     gains = jnp.asarray([10.0, 30.0, 0.8478])
     slope = eqx.filter_jit(eqx.filter_grad(itae))

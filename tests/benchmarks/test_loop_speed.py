@@ -23,6 +23,7 @@ import pytest
 
 from jaxquad._core._arrays import align
 from jaxquad.control import LADRC
+from jaxquad.loops import Loop
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import MotorDrive, Saturation, Scenario, simulate
 
@@ -70,7 +71,7 @@ def scenario(samples=SAMPLES) -> Scenario:
 def as_c(inertia, samples=SAMPLES):
     law = LADRC(WC, WO, 1 / INERTIA, placement="continuous", dt=DT)
     drive, case = Saturation(1.5), scenario(samples)
-    return lambda: simulate(Quadrotor(inertia), law, case, dt=DT, drive=drive)
+    return lambda: simulate(Loop(Quadrotor(inertia), law, dt=DT, drive=drive), case)
 
 
 def rig(inertia):
@@ -81,7 +82,7 @@ def rig(inertia):
     law = LADRC([4.0, 4.0, 2.0], [40.0, 40.0, 20.0], 1.8 * gain / INERTIA, dt=DT)
     case = eqx.tree_at(lambda s: s.disturbance, scenario(), 0.01 * scenario().disturbance)
     drive = MotorDrive(allocation)
-    return lambda: simulate(plant, law, case, dt=DT, drive=drive)
+    return lambda: simulate(Loop(plant, law, dt=DT, drive=drive), case)
 
 
 INERTIAS = INERTIA[:, None] * SPREAD
@@ -114,7 +115,7 @@ def test_ours_rig_gradient(benchmark):
     @jax.jit
     @jax.grad
     def slope(gains):
-        found = simulate(plant, LADRC(*gains, dt=DT), case, dt=DT, drive=drive)
+        found = simulate(Loop(plant, LADRC(*gains, dt=DT), dt=DT, drive=drive), case)
         return jnp.sum((found.angle - STEP) ** 2)
 
     gains = (jnp.array([4.0, 4.0, 2.0]), jnp.array([40.0, 40.0, 20.0]), 1.8 * gain / INERTIA)

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from jaxquad.control import AdaptiveLADRC, InertiaMap, LADRC, PD, RecursiveInertia
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
 from jaxquad.simulation import evaluate, MotorDrive, scenario, simulate, Step, WhiteNoise
-from jaxquad.simulation._delay import loop_settings
-from jaxquad.simulation._members import members_of_loop, per_member
+from jaxquad.simulation._members import members_of_run, per_member
 from jaxquad.simulation._memory import free_memory, require_memory
 from jaxquad.simulation._over_devices import over_devices
 from jaxquad.simulation._slices import in_slices
@@ -91,32 +91,31 @@ HAPPENS = scenario(duration=0.2, axes=1, reference={0: Step(0.1)})
 @pytest.mark.parametrize("count", [0, 2])
 def test_devices_that_jax_does_not_have_are_refused(count):
     with pytest.raises(ValueError, match=rf"devices is {count}, .* 1 here \(cpu\).*num_cpu"):
-        evaluate(PLANT, PD([40.0], [8.0]), HAPPENS, devices=count)
+        evaluate(Loop(PLANT, PD([40.0], [8.0])), HAPPENS, devices=count)
 
 
 def test_no_devices_are_refused():
     with pytest.raises(ValueError, match="give a number, some of jax.devices"):
-        simulate(PLANT, PD([40.0], [8.0]), HAPPENS, devices=[])
+        simulate(Loop(PLANT, PD([40.0], [8.0])), HAPPENS, devices=[])
 
 
 def test_one_device_is_asked_for_in_any_way():
     numbers = [
-        evaluate(PLANT, PD([40.0], [8.0]), HAPPENS, devices=devices).itae
+        evaluate(Loop(PLANT, PD([40.0], [8.0])), HAPPENS, devices=devices).itae
         for devices in (None, 1, jax.devices())
     ]
     np.testing.assert_array_equal(numbers[0], numbers[1])
     np.testing.assert_array_equal(numbers[0], numbers[2])
 
 
-def split(*loop, **options):
+def split(plant, controller, happens, **options):
     """The arrays of a loop that are split, by name."""
-    parts = (*loop, loop_settings(**options))
-    own = members_of_loop(parts)
+    own = members_of_run((Loop(plant, controller, **options), happens))
     if own is None:
         return None
     paths = jax.tree_util.tree_leaves_with_path(own)
     name = ft.partial(jax.tree_util.keystr, simple=True, separator=".")
-    room = ("plant", "controller", "scenario", "settings")
+    room = ("loop", "scenario")
     return {f"{room[path[0].idx]}.{name(path[1:])}" for path, is_own in paths if is_own is True}
 
 
@@ -130,13 +129,13 @@ def test_what_members_do_not_have_for_themselves_is_not_split():
     gains = LADRC([10.0], [30.0], [[0.8] * 50])
     plant = DecoupledAxes([0.05], [[0.06] * 50], lag=[0.01])
     found = split(plant, gains, noisy(1, 50), delay=np.array([0.002, 0.001] * 25))
-    named = {"plant.inertia", "controller.b0", "scenario.noise", "settings.line.samples"}
+    named = {"loop.plant.inertia", "loop.controller.b0", "scenario.noise", "loop.delay"}
     assert found == named
 
 
 def test_an_ensemble_of_two_axes_is_split_on_the_last():
     plant = DecoupledAxes([0.05], 0.06 * np.ones((1, 5, 50)), lag=0.01 * np.ones((1, 5)))
-    assert split(plant, PD([40.0], [8.0]), noisy(1, ())) == {"plant.inertia"}
+    assert split(plant, PD([40.0], [8.0]), noisy(1, ())) == {"loop.plant.inertia"}
 
 
 def test_one_loop_has_no_members():
@@ -148,7 +147,7 @@ def test_three_members_are_told_from_three_axes_and_three_knots():
     estimator = RecursiveInertia([0.0468] * 3, [0.0552] * 3)
     controller = AdaptiveLADRC(LADRC([10.0] * 3, [30.0] * 3, [0.85] * 3), estimator, b0)
     plant = DecoupledAxes([0.0468] * 3, 0.05 * np.ones((3, 3)))
-    assert split(plant, controller, noisy(3, 3)) == {"plant.inertia", "scenario.noise"}
+    assert split(plant, controller, noisy(3, 3)) == {"loop.plant.inertia", "scenario.noise"}
 
 
 def test_a_parameter_in_one_dimension_is_split():
@@ -157,7 +156,7 @@ def test_a_parameter_in_one_dimension_is_split():
     vehicle = eqx.tree_at(lambda v: v.allocation.arm, hover, arms)
     controller = LADRC([8.0] * 3, [30.0] * 3, [0.4, 0.4, 0.2])
     drive = MotorDrive(hover.allocation)
-    assert split(vehicle, controller, noisy(3, ()), drive=drive) == {"plant.allocation.arm"}
+    assert split(vehicle, controller, noisy(3, ()), drive=drive) == {"loop.plant.allocation.arm"}
 
 
 class Table(eqx.Module):
@@ -209,7 +208,9 @@ def test_slices_join_to_the_whole(at_once):
 
 def test_metrics_join_to_those_of_all_members():
     inertia = np.linspace(0.05, 0.08, 4)
-    fly = lambda k: evaluate(DecoupledAxes([0.0468], inertia[None, k]), PD([40.0], [8.0]), HAPPENS)
+    fly = lambda k: evaluate(
+        Loop(DecoupledAxes([0.0468], inertia[None, k]), PD([40.0], [8.0])), HAPPENS
+    )
     parts = in_slices(fly, 4, at_once=2)
     whole = fly(np.arange(4))
     np.testing.assert_allclose(parts.itae, whole.itae, rtol=ROUNDING)
@@ -238,6 +239,6 @@ def test_a_record_that_the_memory_does_not_hold_is_refused():
     from jaxquad.simulation._simulate import _run
 
     plant = eqx.filter_eval_shape(lambda: DecoupledAxes([0.05], jnp.ones((1, 10**9))))
-    loop = (plant, PD([40.0], [8.0]), HAPPENS, loop_settings())
+    loop = (Loop(plant, PD([40.0], [8.0])), HAPPENS)
     with pytest.raises(ValueError, match="100 samples of 1 axes of 1000000000 members needs"):
         eqx.filter_eval_shape(_run, *loop)

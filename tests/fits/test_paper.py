@@ -117,7 +117,7 @@ def test_disturbances_are_those_of_an_independent_recursion(loaded, loops):
 
 def test_the_paper_s_loop_has_the_stated_window_and_margins(loops):
     ratios = np.array([1.0, 0.53, 0.283])
-    analysis = jq.loops.analyse_loop(loops.rig(ratios * loops.INERTIA), loops.ladrc(np.ones(3)))
+    analysis = jq.analyse(jq.Loop(loops.rig(ratios * loops.INERTIA), loops.ladrc(np.ones(3))))
     np.testing.assert_allclose(analysis.sensitivity_peak, [1.76, 2.1, 7.1], rtol=0.03)
     margins = np.degrees(np.asarray(analysis.phase_margin))
     np.testing.assert_allclose(margins[[0, 2]], [36, 9], atol=1)

@@ -5,7 +5,7 @@ import pytest
 from loop_members import analysed, windows
 
 from jaxquad.control import PID
-from jaxquad.loops import gain_window
+from jaxquad.loops import gain_window, Loop
 from jaxquad.models import DecoupledAxes
 
 
@@ -88,7 +88,7 @@ def test_the_printed_pid_needs_a_gain_above_33_and_an_unstable_plant_one_that_ho
     # Over a stiffness of -2, kp b has to exceed 2: there a pole passes z = 1.
     axis = DecoupledAxes(1.0, 1.0, stiffness=[[0.0, -2.0]])
     law = PID([[0.01, 10.0]], [[0.05, 0.0]], [[0.15, 1.0]], filter=1e4, dt=1e-4)
-    low, high = gain_window(law, axis)
+    low, high = gain_window(Loop(axis, law))
     assert low[0] == pytest.approx(0.05 / (0.01 * 0.15), rel=0.01)  # its filter, its samples
     assert low[1] == pytest.approx(2.0 / 10.0, rel=1e-6)
     assert np.all(np.asarray(high) > 1e3)

@@ -91,7 +91,7 @@ def test_a_users_own_vehicle_takes_a_dozen_lines():
     still = jnp.zeros((2000, 1))
     push = still.at[200:].set(0.01)  # N m
     hold = jq.control.PD(jnp.array([20.0]), jnp.array([4.0]))
-    run = jq.simulate(Seesaw(), hold, jq.simulation.Scenario(still, still, push, still))
+    run = jq.simulate(jq.Loop(Seesaw(), hold), jq.simulation.Scenario(still, still, push, still))
     angle = float(run.angle[-1, 0])
     command = -20.0 * angle
     balance = 0.01 * command * abs(command) - 0.05 * np.sin(angle) + 0.01

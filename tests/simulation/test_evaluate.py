@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC, PD
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
 from jaxquad.simulation import (
     authority,
@@ -54,19 +55,17 @@ def ensemble():
         key=KEY,
     )
     controller, drive = ladrc([3.0, 1.6, GAIN / INERTIA, 1.0]), Saturation([LIMITS])
-    return PLANT, controller, happens, {"drive": drive, "delay": 0.003, "bound": 3.0}
+    return Loop(PLANT, controller, drive=drive, delay=0.003, bound=3.0), happens
 
 
 @pytest.fixture(scope="module")
 def running(ensemble):
-    *loop, options = ensemble
-    return evaluate(*loop, **options, start=1.0, load_start=5.0)
+    return evaluate(*ensemble, start=1.0, load_start=5.0)
 
 
 @pytest.fixture(scope="module")
 def stored(ensemble):
-    *loop, options = ensemble
-    return simulate(*loop, **options)
+    return simulate(*ensemble)
 
 
 def test_a_loop_is_judged_alike_while_it_runs_and_from_its_record(running, stored):
@@ -107,7 +106,7 @@ def three(reference, disturbance=None):
 @pytest.fixture(scope="module")
 def paper():
     """A unit step by the paper's controllers: b0 = 3, 1.6 and b."""
-    return evaluate(PLANT, ladrc([3.0, 1.6, GAIN / INERTIA]), three(Step(1.0)))
+    return evaluate(Loop(PLANT, ladrc([3.0, 1.6, GAIN / INERTIA])), three(Step(1.0)))
 
 
 def test_steps_have_the_numbers_of_an_independent_simulation(paper):
@@ -126,7 +125,7 @@ def test_without_a_mismatch_the_step_is_the_critically_damped_one(paper):
 
 def test_a_linear_loop_has_the_same_normalised_numbers_for_every_step(paper):
     happens = three(Step([0.01, 0.1, -0.3]))
-    found = evaluate(PLANT, ladrc([3.0, 1.6, GAIN / INERTIA]), happens).normalised()
+    found = evaluate(Loop(PLANT, ladrc([3.0, 1.6, GAIN / INERTIA])), happens).normalised()
     for name in ("itae", "iae", "ise", "overshoot", "settling_time", "rise_time"):
         np.testing.assert_allclose(
             getattr(found, name), getattr(paper, name), rtol=1e-9, atol=1e-9, err_msg=name
@@ -136,17 +135,17 @@ def test_a_linear_loop_has_the_same_normalised_numbers_for_every_step(paper):
 def test_the_estimate_of_a_matched_controller_is_the_torque_but_for_its_lag():
     """The observer's f is (wo / (s + wo))^3 of the torque: the error of a 5 s sine is 3 w / wo."""
     happens = three(Step(0.0), Sine(0.3, period=5.0))
-    found = evaluate(PLANT, ladrc([GAIN / INERTIA] * 3), happens, load_start=5.0)
+    found = evaluate(Loop(PLANT, ladrc([GAIN / INERTIA] * 3)), happens, load_start=5.0)
     lag = 3 * (2 * np.pi / 5) / 30
     assert found.disturbance_rmse[0, 0] == pytest.approx(0.3 / np.sqrt(2) * lag, rel=0.02)
 
 
 def test_the_gradient_is_that_of_central_differences(ensemble):
-    plant, _, happens, options = ensemble
+    loop, happens = ensemble
 
     def cost(wc):
         controller = LADRC([wc], [30.0], jnp.asarray([[3.0, 1.6, GAIN / INERTIA, 1.0]]))
-        found = evaluate(plant, controller, happens, **options, start=1.0)
+        found = evaluate(loop.with_controller(controller), happens, start=1.0)
         return jnp.sum(jnp.log(found.itae)) + jnp.sum(found.rms) + jnp.sum(found.disturbance_rmse)
 
     exact, h = jax.grad(cost)(10.0), 1e-5
@@ -159,7 +158,7 @@ def test_evaluate_runs_under_jit_and_vmap(paper):
 
     @jax.jit
     def itae(b0):
-        return evaluate(PLANT, LADRC([10.0], [30.0], b0[None]), happens).itae[0]
+        return evaluate(Loop(PLANT, LADRC([10.0], [30.0], b0[None])), happens).itae[0]
 
     together = jax.vmap(itae)(jnp.asarray([3.0, 1.6, GAIN / INERTIA]))
     np.testing.assert_allclose(together, paper.itae[0], rtol=1e-12)
@@ -171,7 +170,7 @@ def test_float32_loops_are_judged_in_float32(paper):
     )
     happens = scenario(duration=10.0, axes=1, reference={0: Step(1.0)})
     controller = ladrc([3.0, 1.6, GAIN / INERTIA])
-    found = evaluate(single(PLANT), single(controller), single(happens))
+    found = evaluate(Loop(single(PLANT), single(controller)), single(happens))
     assert found.itae.dtype == jnp.float32
     np.testing.assert_allclose(found.itae, paper.itae, rtol=2e-3)
 
@@ -210,10 +209,10 @@ def test_the_authority_of_axes_is_that_of_the_nearest_limit():
 @pytest.mark.parametrize(("torque", "share"), [(0.2, 0.5), (0.3, 0.5), (0.09, 0.0)])
 def test_a_disturbance_beyond_the_authority_is_reported(torque, share):
     happens = three(Step(0.0), Pulse(torque, period=5.0, share=0.5))
-    loop = (PLANT, ladrc([GAIN / INERTIA] * 3), happens)
+    loop = Loop(PLANT, ladrc([GAIN / INERTIA] * 3), drive=Saturation(2.0))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = evaluate(*loop, drive=Saturation(2.0))
+        found = evaluate(loop, happens)
     assert np.array_equal(found.beyond_authority, np.full((1, 3), share))
     told = [str(w.message) for w in caught if issubclass(w.category, AuthorityWarning)]
     assert len(told) == (share > 0)
@@ -230,12 +229,12 @@ def test_the_warning_counts_the_members_of_a_plant():
 
 
 def test_parts_of_one_loop_may_be_narrower_than_its_ensemble(ensemble, running):
-    plant, controller, happens, options = ensemble
+    loop, happens = ensemble
     wide = jax.tree.map(
         lambda x: jnp.broadcast_to(x.reshape(*x.shape[:2], -1), (*x.shape[:2], 4)), happens
     )
     assert happens.reference.ndim == 2 and happens.noise.ndim == 3
-    found = evaluate(plant, controller, wide, **options, start=1.0, load_start=5.0)
+    found = evaluate(loop, wide, start=1.0, load_start=5.0)
     np.testing.assert_allclose(found.itae, running.itae, rtol=1e-12)
 
 
@@ -247,6 +246,6 @@ def test_a_payload_doubles_the_inertia_and_halves_the_answer():
         payload={0: Pulse(INERTIA, at=2.0, width=2.0)},
     )
     still = PD([1e-9], [1e-9])
-    rate = np.diff(np.asarray(simulate(PLANT, still, happens).angle)[:, 0]) / 0.002
+    rate = np.diff(np.asarray(simulate(Loop(PLANT, still), happens).angle)[:, 0]) / 0.002
     assert rate[60] == pytest.approx(0.1 * GAIN / INERTIA, rel=1e-6)
     assert rate[1060] - rate[990] == pytest.approx(0.05 * GAIN / INERTIA, rel=1e-6)

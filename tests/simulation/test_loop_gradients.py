@@ -11,9 +11,9 @@ import pytest
 from loop_members import analysed, columns, DT, FRICTION, MEMBERS, parts, windows
 
 from jaxquad.control import LADRC
-from jaxquad.loops import analyse_loop, gain_window
-from jaxquad.loops._case import case_of
+from jaxquad.loops import analyse, gain_window, Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
+from jaxquad.simulation import MotorDrive
 
 
 ss, feedback = (getattr(control, name) for name in ("ss", "feedback"))
@@ -29,7 +29,7 @@ def slope_of():
     def total(x, weights):
         plant = DecoupledAxes([0.6], [1.0], lag=x[3:4], **FRICTION)
         controller = LADRC(x[:1], x[1:2], x[2:3], dt=DT)
-        found = analyse_loop(plant, controller, delay=x[4], longest_delay=0.01)
+        found = analyse(Loop(plant, controller, delay=x[4], longest_delay=0.01))
         return jnp.dot(weights, jnp.stack([getattr(found, name) for name in NUMBERS]))
 
     return jax.jit(jax.value_and_grad(total))
@@ -64,7 +64,7 @@ def test_gradients_stay_finite_in_an_unstable_loop():
 def test_a_traced_delay_needs_its_bound_and_beyond_it_nothing_is_claimed():
     axis, controller = DecoupledAxes(1.0, 1.0), LADRC([10.0], [30.0], [1.0])
     with pytest.raises(ValueError, match="traced.*longest_delay"):
-        jax.jit(lambda d: analyse_loop(axis, controller, delay=d).abscissa)(0.1)
+        jax.jit(lambda d: analyse(Loop(axis, controller, delay=d)).abscissa)(0.1)
     far = slope_of()(np.array([8.0, 35.0, 1.1, 0.02, 0.1]), np.eye(7)[0])[0]
     assert np.isnan(far)
 
@@ -93,7 +93,7 @@ def test_the_edges_of_the_gain_window_are_where_poles_cross_and_its_gradient_is_
 
     def edges(x):
         axis = DecoupledAxes([0.7], [1.0], lag=x[1:])
-        return jnp.stack(gain_window(LADRC(x[:1], [30.0], [1.0], dt=DT), axis))
+        return jnp.stack(gain_window(Loop(axis, LADRC(x[:1], [30.0], [1.0], dt=DT))))
 
     place = np.array(list(point.values()))
     exact = np.asarray(jax.jit(jax.jacfwd(edges))(place)) * place
@@ -103,27 +103,38 @@ def test_the_edges_of_the_gain_window_are_where_poles_cross_and_its_gradient_is_
 def test_ensembles_of_any_shape_keep_their_members():
     c = columns(MEMBERS)
     pick = lambda shape: {name: value[:6].reshape(shape) for name, value in c.items()}
-    case = lambda shape: case_of(*parts(pick(shape)), 0, None, None, pick(shape)["delay"], None)
-    both = eqx.filter_jit(lambda a, b: (a.parts((1, 2)), b.parts((5,))))
-    jax.tree.map(np.testing.assert_array_equal, *both(case((2, 3)), case((6,))))
-    analysis = lambda *both: analyse_loop(*both, delay=pick((2, 3))["delay"])
-    shapes = eqx.filter_eval_shape(analysis, *parts(pick((2, 3))))
+    loop = lambda shape: Loop(*parts(pick(shape)), delay=pick(shape)["delay"])
+    one, among_all = analyse(loop((2, 3)), member=(1, 2)), analysed(*MEMBERS).member(5)
+    np.testing.assert_allclose(one.abscissa, among_all.abscissa, rtol=1e-9)
+    np.testing.assert_allclose(one.phase_margin, among_all.phase_margin, rtol=1e-9)
+    shapes = eqx.filter_eval_shape(analyse, loop((2, 3)))
     assert shapes.abscissa.shape == (2, 3) and shapes.closed.matrix.shape[:2] == (2, 3)
+
+
+class Silent(eqx.Module):
+    """A controller without a linear form."""
+
+    def init(self, like):
+        return like
+
+    def step(self, state, reference, measurement):
+        return state, reference - measurement
 
 
 def test_parts_that_do_not_fit_are_refused_with_a_remedy():
     axis, controller = parts(columns(MEMBERS))
-    with pytest.raises(ValueError, match="object has no method linear"):
-        analyse_loop(axis, object())
+    drive = MotorDrive(quanser_hover().allocation)
+    with pytest.raises(ValueError, match="Silent has no method linear"):
+        analyse(Loop(axis, Silent()))
     with pytest.raises(ValueError, match="made for samples of 0.002 s, not 0.01 s"):
-        analyse_loop(axis, controller, dt=0.01)
+        analyse(Loop(axis, controller, dt=0.01))
     with pytest.raises(ValueError, match="axis is 3.*0 to 2"):
-        analyse_loop(quanser_hover(), LADRC(10.0, 30.0, 1.0), axis=3)
+        analyse(Loop(quanser_hover(), LADRC(10.0, 30.0, 1.0), drive=drive), axis=3)
     with pytest.raises(ValueError, match=r"member is \(99,\).*\(20,\)"):
-        analyse_loop(axis, controller, member=99)
+        analyse(Loop(axis, controller), member=99)
     with pytest.raises(ValueError, match="ensembles.*do not match"):
-        analyse_loop(axis, controller, delay=jnp.zeros(4))
+        analyse(Loop(axis, controller, delay=jnp.zeros(4)))
     with pytest.raises(ValueError, match="delay is -0.001 s"):
-        analyse_loop(axis, controller, delay=-0.001)
+        analyse(Loop(axis, controller, delay=-0.001))
     with pytest.raises(ValueError, match="smoothing is 0.0"):
-        analyse_loop(axis, controller, smoothing=0.0)
+        analyse(Loop(axis, controller), smoothing=0.0)

@@ -7,6 +7,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 
 from jaxquad.control import PD, place_pd
+from jaxquad.loops import Loop
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import Encoder, excite, MotorDrive, runge_kutta, Scenario, simulate
 
@@ -61,7 +62,7 @@ def independent(plant, inputs, disturbance):
 
 def test_between_samples_the_loop_agrees_with_scipy_under_the_same_held_inputs():
     plant, case = rig(), scenario()
-    found = simulate(plant, PILOT, case, dt=DT, drive=DRIVE)
+    found = simulate(Loop(plant, PILOT, dt=DT, drive=DRIVE), case)
     inputs = jax.vmap(DRIVE.inputs)(found.command)
     expected = independent(plant, inputs, case.disturbance)
     # One fourth-order step a sample: (dt / lag)^5 / 120 = 1e-9 of the motor's lag at a step.
@@ -72,7 +73,7 @@ def test_the_error_falls_as_the_fourth_power_of_the_step():
     def final(steps):
         held = quiet(steps + 1, injection=(3.0, -2.0, 4.0), disturbance=(0.05, 0.02, -0.02))
         idle, dt = PD(np.zeros(3), np.zeros(3), dt=0.8 / steps), 0.8 / steps
-        return np.asarray(simulate(rig(), idle, held, dt=dt, drive=DRIVE).angle[-1])
+        return np.asarray(simulate(Loop(rig(), idle, dt=dt, drive=DRIVE), held).angle[-1])
 
     exact = final(1600)
     coarse, fine = (np.linalg.norm(final(steps) - exact) for steps in (40, 80))
@@ -92,7 +93,7 @@ INERTIAS = np.array(SHEET.inertia)[:, None] * np.array([0.7, 1.0, 1.6])
 
 def fleet():
     case = scenario(1, (3,))
-    return simulate(rig(INERTIAS), PILOT, case, dt=DT, drive=DRIVE, encoder=ENCODER)
+    return simulate(Loop(rig(INERTIAS), PILOT, dt=DT, drive=DRIVE, encoder=ENCODER), case)
 
 
 def test_an_ensemble_is_as_many_single_runs():
@@ -100,7 +101,9 @@ def test_an_ensemble_is_as_many_single_runs():
     assert together.angle.shape == (SAMPLES, 3, 3)
     for k in range(3):
         single = jax.tree.map(lambda x, k=k: x[..., k], case)
-        alone = simulate(rig(INERTIAS[:, k]), PILOT, single, dt=DT, drive=DRIVE, encoder=ENCODER)
+        alone = simulate(
+            Loop(rig(INERTIAS[:, k]), PILOT, dt=DT, drive=DRIVE, encoder=ENCODER), single
+        )
         for name in ("angle", "measurement", "command", "injection"):
             # Sums over axes may be ordered differently, and the loop forgets it.
             np.testing.assert_allclose(
@@ -111,7 +114,7 @@ def test_an_ensemble_is_as_many_single_runs():
 def test_one_scenario_serves_an_ensemble_of_plants():
     one, wide = scenario(2), jax.tree.map(lambda x: jnp.stack([x] * 3, axis=-1), scenario(2))
     found, expected = (
-        simulate(rig(INERTIAS), PILOT, case, dt=DT, drive=DRIVE) for case in (one, wide)
+        simulate(Loop(rig(INERTIAS), PILOT, dt=DT, drive=DRIVE), case) for case in (one, wide)
     )
     np.testing.assert_array_equal(found.angle, expected.angle)
     assert found.injection.shape == (SAMPLES, 3, 3)
@@ -119,7 +122,7 @@ def test_one_scenario_serves_an_ensemble_of_plants():
 
 def test_the_measurement_is_the_counted_angle_with_its_noise():
     case = scenario()
-    found = simulate(rig(), PILOT, case, dt=DT, drive=DRIVE, encoder=ENCODER)
+    found = simulate(Loop(rig(), PILOT, dt=DT, drive=DRIVE, encoder=ENCODER), case)
     step = 2 * np.pi / SHEET.encoder_counts
     noisy = np.asarray(found.angle) + np.asarray(case.noise)
     np.testing.assert_allclose(found.measurement, step * np.round(noisy / step), rtol=1e-12)
@@ -127,13 +130,13 @@ def test_the_measurement_is_the_counted_angle_with_its_noise():
 
 def test_the_injected_signal_is_added_to_the_command():
     case = quiet(injection=(1.0, -2.0, 0.5))
-    found = simulate(rig(), PILOT, case, dt=DT, drive=DRIVE)
+    found = simulate(Loop(rig(), PILOT, dt=DT, drive=DRIVE), case)
     np.testing.assert_allclose(found.command[0], [1.0, -2.0, 0.5], rtol=1e-13)
     np.testing.assert_array_equal(found.injection, case.injection)
 
 
 def cost(inertia):
-    found = simulate(rig(inertia), PILOT, scenario(), dt=DT, drive=DRIVE)
+    found = simulate(Loop(rig(inertia), PILOT, dt=DT, drive=DRIVE), scenario())
     return jnp.sum(found.angle**2) + 1e-3 * jnp.sum(found.command**2)
 
 
@@ -151,7 +154,7 @@ def test_single_precision_stays_single():
         narrow = Scenario(*(jnp.zeros((5, 3), jnp.float32) for _ in range(4)))
         plant, pilot = rig(), place_pd(GAIN, natural_frequency=4.0, damping=0.7, dt=DT)
         drive = MotorDrive(allocation())
-        found = simulate(plant, pilot, narrow, dt=DT, drive=drive, encoder=ENCODER)
+        found = simulate(Loop(plant, pilot, dt=DT, drive=drive, encoder=ENCODER), narrow)
     kinds = {leaf.dtype for leaf in jax.tree.leaves(found)}
     assert kinds == {jnp.dtype("float32"), jnp.dtype(bool)}
 
@@ -161,7 +164,7 @@ def with_injection(found, signal):
 
 
 def test_a_record_of_a_flight_names_its_channels_and_units():
-    found = simulate(rig(), PILOT, quiet(injection=(0.0, 1.0, 0.0)), dt=DT, drive=DRIVE)
+    found = simulate(Loop(rig(), PILOT, dt=DT, drive=DRIVE), quiet(injection=(0.0, 1.0, 0.0)))
     wavy = with_injection(found, found.injection * jnp.sin(found.time)[:, None])
     record = wavy.record("pitch")
     assert record.names == ("pitch_command", "pitch_angle", "sweep")
@@ -172,7 +175,7 @@ def test_a_record_of_a_flight_names_its_channels_and_units():
 
 
 def test_without_an_injection_a_record_has_no_reference():
-    found = simulate(rig(), PILOT, scenario(), dt=DT, drive=DRIVE)
+    found = simulate(Loop(rig(), PILOT, dt=DT, drive=DRIVE), scenario())
     idle = with_injection(found, jnp.zeros_like(found.injection))
     assert idle.record("roll").reference_names == ()
 
@@ -196,9 +199,9 @@ def test_a_scenario_of_unequal_shapes_is_refused():
 
 def test_a_controller_made_for_another_sample_interval_is_refused():
     with pytest.raises(ValueError, match="made for samples of 0.002 s, not 0.004 s"):
-        simulate(rig(), PILOT, scenario(), dt=0.004)
+        simulate(Loop(rig(), PILOT, dt=0.004), scenario())
     with pytest.raises(ValueError, match="dt is 0.0 s"):
-        simulate(rig(), PILOT, scenario(), dt=0.0)
+        simulate(Loop(rig(), PILOT, dt=0.0), scenario())
 
 
 @pytest.mark.parametrize(

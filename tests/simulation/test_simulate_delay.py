@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Scenario, simulate
 
@@ -43,7 +44,7 @@ def double_integral(command, delay):
 
 def test_a_delay_of_any_length_is_exact_and_each_member_has_its_own():
     case = pushed()
-    found = simulate(PLANT, Idle(), case, delay=DELAYS)
+    found = simulate(Loop(PLANT, Idle(), delay=DELAYS), case)
     assert found.angle.shape == (SAMPLES, 2, len(DELAYS))
     for k, delay in enumerate(DELAYS):
         exact = double_integral(np.asarray(case.injection), delay)
@@ -53,7 +54,7 @@ def test_a_delay_of_any_length_is_exact_and_each_member_has_its_own():
 
 @pytest.mark.parametrize("delay", [0.0, 0.0053, 0.008])
 def test_one_delay_for_all_is_as_a_member_with_it(delay):
-    found = simulate(PLANT, Idle(), pushed(), delay=delay)
+    found = simulate(Loop(PLANT, Idle(), delay=delay), pushed())
     exact = double_integral(np.asarray(pushed().injection), delay)
     np.testing.assert_allclose(found.angle, exact, rtol=0, atol=1e-13)
 
@@ -65,12 +66,14 @@ def ladrc():
 @eqx.filter_jit
 def final(delay):
     case = eqx.tree_at(lambda c: c.reference, pushed(), jnp.full((SAMPLES, 2), 0.1))
-    return jnp.sum(simulate(PLANT, ladrc(), case, delay=delay, longest_delay=0.012).angle ** 2)
+    return jnp.sum(
+        simulate(Loop(PLANT, ladrc(), delay=delay, longest_delay=0.012), case).angle ** 2
+    )
 
 
 def test_a_traced_delay_gives_the_same_and_its_gradient_is_that_of_differences():
     case = eqx.tree_at(lambda c: c.reference, pushed(), jnp.full((SAMPLES, 2), 0.1))
-    concrete = simulate(PLANT, ladrc(), case, delay=0.0053)
+    concrete = simulate(Loop(PLANT, ladrc(), delay=0.0053), case)
     assert float(final(0.0053)) == pytest.approx(float(jnp.sum(concrete.angle**2)), rel=1e-12)
     h, slope = 1e-5, jax.jit(jax.grad(final))
     for delay in (0.0053, 0.0105):
@@ -86,26 +89,28 @@ def test_the_loop_is_smooth_where_the_delay_passes_a_whole_sample():
 
 
 def test_delays_under_vmap_are_those_of_an_ensemble():
-    together = simulate(PLANT, Idle(), pushed(), delay=DELAYS).angle
-    one = lambda delay: simulate(PLANT, Idle(), pushed(), delay=delay, longest_delay=0.01).angle
+    together = simulate(Loop(PLANT, Idle(), delay=DELAYS), pushed()).angle
+    one = lambda delay: (
+        simulate(Loop(PLANT, Idle(), delay=delay, longest_delay=0.01), pushed()).angle
+    )
     mapped = jax.vmap(one, out_axes=-1)(jnp.asarray(DELAYS))
     np.testing.assert_allclose(mapped, together, rtol=0, atol=1e-13)
 
 
 def test_before_the_first_command_arrives_nothing_pushes():
-    found = simulate(PLANT, Idle(), pushed(), delay=0.008)
+    found = simulate(Loop(PLANT, Idle(), delay=0.008), pushed())
     np.testing.assert_array_equal(found.angle[:5], 0.0)
     assert np.all(np.asarray(found.angle[5]) != 0)
 
 
 @pytest.mark.parametrize("bad", [-0.001, np.nan, np.inf])
 def test_a_delay_that_cannot_be_is_refused(bad):
-    with pytest.raises(ValueError, match="delay is .* s: it is 0 or above and finite"):
-        simulate(PLANT, Idle(), pushed(), delay=bad)
+    with pytest.raises(ValueError, match="delay is .* s, but it must be 0 or above and finite"):
+        simulate(Loop(PLANT, Idle(), delay=bad), pushed())
 
 
 def test_a_traced_delay_needs_to_know_how_long_it_can_become():
-    run = lambda delay, **more: simulate(PLANT, Idle(), pushed(), delay=delay, **more).angle
+    run = lambda delay, **more: simulate(Loop(PLANT, Idle(), delay=delay, **more), pushed()).angle
     with pytest.raises(ValueError, match="longest_delay is None; give the longest delay"):
         jax.jit(run)(0.004)
     with pytest.raises(ValueError, match="above longest_delay = 0.004 s"):

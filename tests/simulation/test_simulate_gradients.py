@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC, PID
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Encoder, Saturation, Scenario, simulate
 
@@ -38,10 +39,15 @@ def run(law, scale, noise, encoder=None):
     ahead = [jnp.asarray(part) for part in (2 * np.exp(-40 * TIME), -80 * np.exp(-40 * TIME))]
     load = still.at[200:].set(0.004)
     case = Scenario(jnp.asarray(STEP), still, load, noise, *ahead)  # noise may be wider
-    return simulate(
-        plant, controller, case, dt=DT, drive=Saturation(given["limit"]), encoder=encoder,
-        delay=given["delay"], longest_delay=0.006,
-    )  # fmt: skip
+    loop = Loop(
+        plant,
+        controller,
+        drive=Saturation(given["limit"]),
+        encoder=encoder,
+        delay=given["delay"],
+        longest_delay=0.006,
+    )
+    return simulate(loop, case)
 
 
 @eqx.filter_jit

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC
+from jaxquad.loops import Loop
 from jaxquad.models import Allocation, Attitude, DecoupledAxes, MotorLag, Multirotor
 from jaxquad.simulation import Scenario, simulate
 
@@ -47,13 +48,13 @@ def gradients(plant, law, case, **options):
     @jax.grad
     def slope(free):
         plant, law = eqx.combine(free, fixed)
-        return cost(simulate(plant, law, case, **options))
+        return cost(simulate(Loop(plant, law, **options), case))
 
     return floats(slope(free))
 
 
 def test_an_unstable_member_is_held_and_flagged_and_all_stays_finite():
-    found = simulate(axes(), LAW, step(), bound=5.0)
+    found = simulate(Loop(axes(), LAW, bound=5.0), step())
     np.testing.assert_array_equal(found.diverged, ~STABLE)
     assert all(np.all(np.isfinite(x)) for x in floats(trajectories(found)))
     assert np.max(np.abs(found.angle)) == 5.0
@@ -64,7 +65,7 @@ def test_an_unstable_member_is_held_and_flagged_and_all_stays_finite():
 
 def test_what_a_neighbour_does_changes_neither_a_member_nor_its_gradient():
     likes = axes(INERTIA[:, [1, 1, 1]])
-    together, among_likes = (simulate(p, LAW, step(), bound=5.0) for p in (axes(), likes))
+    together, among_likes = (simulate(Loop(p, LAW, bound=5.0), step()) for p in (axes(), likes))
     np.testing.assert_allclose(
         together.angle[..., 1], among_likes.angle[..., 1], rtol=0, atol=1e-13
     )
@@ -148,14 +149,16 @@ RUNAWAYS = {
 @pytest.mark.parametrize("name", RUNAWAYS)
 def test_no_runaway_makes_values_or_gradients_infinite(name):
     plant, law, options = RUNAWAYS[name]
-    found = simulate(plant, law, step(), **options)
+    found = simulate(Loop(plant, law, **options), step())
     assert bool(found.diverged)
     assert all(np.all(np.isfinite(x)) for x in floats(trajectories(found)))
     assert all(np.all(np.isfinite(x)) for x in gradients(plant, law, step(), **options))
 
 
 def test_under_vmap_and_jit_nothing_is_raised():
-    run = lambda b0: simulate(axes(INERTIA[:, 0]), eqx.tree_at(lambda c: c.b0, LAW, b0), step())
+    run = lambda b0: simulate(
+        Loop(axes(INERTIA[:, 0]), eqx.tree_at(lambda c: c.b0, LAW, b0)), step()
+    )
     found = jax.jit(jax.vmap(run))(jnp.asarray([[0.4] * 3, [0.2] * 3, [0.03] * 3]))
     np.testing.assert_array_equal(found.diverged, [False, False, True])
     assert np.all(np.isfinite(found.angle))
@@ -163,12 +166,12 @@ def test_under_vmap_and_jit_nothing_is_raised():
 
 def test_a_parameter_that_is_nan_is_flagged_from_the_start():
     broken = eqx.tree_at(lambda p: p.inertia, axes(INERTIA[:, 1]), jnp.full(3, jnp.nan))
-    found = simulate(broken, LAW, step())
+    found = simulate(Loop(broken, LAW), step())
     assert bool(found.diverged) and np.all(np.isfinite(found.angle))
 
 
 def test_a_diverged_member_gives_no_record():
-    found = simulate(axes(), LAW, step())
+    found = simulate(Loop(axes(), LAW), step())
     assert found.record("roll", member=1).dt == pytest.approx(0.002, rel=1e-9)
     with pytest.raises(ValueError, match="the loop diverged"):
         found.record("roll", member=2)

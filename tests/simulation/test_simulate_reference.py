@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC
+from jaxquad.loops import Loop
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import MotorDrive, Scenario, simulate
 
@@ -71,7 +72,7 @@ def exact():
 
 
 def test_ten_seconds_of_the_rig_with_lag_delay_and_saturation_agree_to_1e_8(exact):
-    found = simulate(PLANT, LAW, manoeuvre(), dt=DT, drive=DRIVE, delay=DELAY)
+    found = simulate(Loop(PLANT, LAW, dt=DT, drive=DRIVE, delay=DELAY), manoeuvre())
     assert 0.05 < np.mean(found.saturated) < 0.5 and np.ptp(found.angle) > 0.35
     # One Runge-Kutta step a piece: (dt / lag)^4 / 120 of what the motors lag behind.
     np.testing.assert_allclose(found.angle, exact, rtol=0, atol=1e-9)
@@ -80,7 +81,9 @@ def test_ten_seconds_of_the_rig_with_lag_delay_and_saturation_agree_to_1e_8(exac
 def test_substeps_take_the_rest_of_the_error_away(exact):
     errors = []
     for substeps in (1, 2):
-        run = simulate(PLANT, LAW, manoeuvre(), dt=DT, drive=DRIVE, delay=DELAY, substeps=substeps)
+        run = simulate(
+            Loop(PLANT, LAW, dt=DT, drive=DRIVE, delay=DELAY, substeps=substeps), manoeuvre()
+        )
         errors.append(np.max(np.abs(np.asarray(run.angle) - exact)))
     # The order is four; rounding and the reference's own tolerance are 1e-13.
     assert 10 < errors[0] / errors[1] < 25

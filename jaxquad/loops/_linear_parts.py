@@ -1,23 +1,24 @@
 """What a loop is analysed from, checked once, for one member or an ensemble."""
 
 import dataclasses
-import math
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxquad.control import LinearController
 from jaxquad.models import DecoupledAxes, Multirotor
+from jaxquad.records import AXES
 
+from ._loop import Loop
+from ._protocols import HasLinear
 from ._sampled_axis import AxisParameters, parameters_of, sampled, SampledAxis
 
 
-class Case(eqx.Module):
+class LinearParts(eqx.Module):
     """One axis with its controller and delay; every part may have the shape of an ensemble."""
 
     axis: AxisParameters
@@ -29,7 +30,7 @@ class Case(eqx.Module):
     memory: int = eqx.field(static=True)  # samples that a command may be on its way
     dt: float = eqx.field(static=True)
 
-    def parts(self, place: Any) -> tuple[SampledAxis, LinearController]:
+    def of_member(self, place: Any) -> tuple[SampledAxis, LinearController]:
         """Plant and controller of the member with the indices `place`."""
         axis = jax.tree.map(lambda x: _at(x, place), self.axis)
         delay = None if self.delay is None else _at(self.delay, place)
@@ -54,32 +55,32 @@ class Case(eqx.Module):
         return self.controller.linear(self.index, place[:own] if own else None)
 
 
-def case_of(
-    plant: DecoupledAxes | Multirotor,
-    controller: Any,
-    axis: int,
-    member: int | tuple[int, ...] | None,
-    dt: float | None,
-    delay: Any,
-    longest_delay: float | None,
-) -> Case:
-    """The checked case. Raises ValueError for parts that do not fit together."""
+def linear_parts(loop: Loop, axis: int | str, member: int | tuple[int, ...] | None) -> LinearParts:
+    """The checked parts of one axis. Raises ValueError for what has no linear form."""
+    plant, controller = loop.plant, loop.controller
     plant = plant.decoupled() if isinstance(plant, Multirotor) else plant
     _require_parts(plant, controller)
-    dt = _interval(controller, dt)
-    axes = max(plant.shape[0], axis + 1) if plant.shape[0] == 1 else plant.shape[0]
-    if not 0 <= axis < axes:
-        raise ValueError(f"axis is {axis}, but the plant has axes 0 to {axes - 1}.")
-    # NumPy keeps a constant's value under jit.
-    late = delay if isinstance(delay, Array) else np.asarray(delay, plant.inertia.dtype)
-    memory = _memory(late, longest_delay, dt)
-    shapes = (plant.shape[1:], getattr(controller, "ensemble", ()), late.shape)
+    axis = _index_of(axis, plant)
+    memory = loop.memory
+    shapes = (plant.shape[1:], getattr(controller, "ensemble", ()), loop.delay.shape)
     ensemble = _common(shapes)
     if member is not None:
         member = member if isinstance(member, tuple) else (member,)
         _require_member(member, ensemble)
-    late = None if memory == 0 else jnp.asarray(late, plant.inertia.dtype)
-    return Case(parameters_of(plant, axis), controller, late, ensemble, member, axis, memory, dt)
+    delay = None if memory == 0 else loop.delay.astype(plant.inertia.dtype)
+    parameters = parameters_of(plant, axis)
+    return LinearParts(parameters, controller, delay, ensemble, member, axis, memory, loop.dt)
+
+
+def _index_of(axis: int | str, plant: DecoupledAxes) -> int:
+    if isinstance(axis, str):
+        if axis not in AXES:
+            raise ValueError(f"axis is {axis!r}: choose one of {', '.join(AXES)}, or a number")
+        axis = AXES.index(axis)
+    axes = max(plant.shape[0], axis + 1) if plant.shape[0] == 1 else plant.shape[0]
+    if not 0 <= axis < axes:
+        raise ValueError(f"axis is {axis}, but the plant has axes 0 to {axes - 1}.")
+    return axis
 
 
 def _require_parts(plant: Any, controller: Any) -> None:
@@ -87,41 +88,11 @@ def _require_parts(plant: Any, controller: Any) -> None:
         raise ValueError(
             f"the plant is a {type(plant).__name__}: give jq.DecoupledAxes or a jq.models.Multirotor."
         )
-    if not isinstance(controller, LinearController) and not hasattr(controller, "linear"):
+    if not isinstance(controller, LinearController | HasLinear):
         raise ValueError(
             f"{type(controller).__name__} has no method linear(axis, member) that returns a "
             "jq.control.LinearController: give it one, or pass the LinearController itself."
         )
-
-
-def _interval(controller: Any, dt: float | None) -> float:
-    made_for = getattr(controller, "dt", None)
-    given = made_for if dt is None else dt
-    if given is None or not (given > 0 and math.isfinite(given)):
-        raise ValueError(f"dt is {given} s: give the sample interval, above 0 and finite.")
-    if made_for is not None and not math.isclose(made_for, given, rel_tol=1e-6):
-        raise ValueError(f"the controller was made for samples of {made_for} s, not {given} s.")
-    return float(given)
-
-
-def _memory(delay: Any, longest: float | None, dt: float) -> int:
-    traced = isinstance(delay, Tracer)
-    if traced and not (longest is not None and longest > 0):
-        raise ValueError(
-            f"the delay is traced, so its length is unknown, and longest_delay is {longest}: give "
-            "one above 0, in s."
-        )
-    if longest is None:
-        longest = float(np.max(np.asarray(delay), initial=0.0))
-    if not traced:
-        values = np.asarray(delay)
-        if not np.all((values >= 0) & np.isfinite(values)):
-            raise ValueError(f"delay is {values} s, but it must be 0 or above and finite.")
-        if np.max(values, initial=0.0) > longest:
-            raise ValueError(f"delay is {values} s, above longest_delay, which is {longest} s.")
-    if not 0 <= longest < math.inf:
-        raise ValueError(f"longest_delay is {longest} s, but it must be 0 or above and finite.")
-    return math.floor(longest / dt + 1e-9) + 1 if longest > 0 else 0
 
 
 def _common(shapes: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:

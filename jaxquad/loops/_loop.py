@@ -1,0 +1,151 @@
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxquad.control import LinearController
+from jaxquad.models import Multirotor
+
+from ._protocols import Controller, Drive, HasLinear, Plant, sample_interval, Sensor
+
+
+_DEFAULT_DT = 0.002  # s
+
+
+class DelayQueue(NamedTuple):
+    """How many past inputs a delay needs, fixed when the loop is built."""
+
+    length: int
+    splits: bool  # whether a delay may end within a sample interval
+    traced: bool  # its value was not known when the loop was built
+
+
+class Loop(eqx.Module):
+    """A plant, its sampled controller, and all that is between them.
+
+        loop = jq.Loop(plant, controller, drive=jq.simulation.Saturation(20.0), delay=0.004)
+        flight, numbers = jq.simulate(loop, scenario), jq.analyse(loop, "roll")
+
+    Every `dt` seconds the controller measures through the `encoder` and its command, made inputs by
+    the `drive`, is held; it reaches the plant `delay` seconds later. Plant, controller, drive and
+    delay may each be one or an ensemble, along the last axis of their arrays.
+
+    **Arguments:**
+
+    - `plant`: the vehicle, see `jq.loops.Plant`. A `jq.models.Multirotor` needs a `drive`.
+    - `controller`: see `jq.loops.Controller`; a `jq.control.LinearController` can be analysed only.
+    - `drive`: from commands to inputs; None hands commands to the plant as they are.
+    - `encoder`: from angles to measured angles; None measures exactly.
+    - `delay`: s, 0 or above, whole samples or not, one for all or one per member. The loop is
+        differentiable with respect to it where `longest_delay` is given and the delay is traced.
+    - `dt`: sample interval in s; None is the controller's, or 0.002 if it has none.
+    - `substeps`: Runge-Kutta steps of the plant in a sample interval.
+    - `bound`: rad, the largest angle that still counts as flown.
+    - `longest_delay`: s, the most that a `delay` traced by jit, vmap or grad can become.
+
+    **Raises:** ValueError for a value out of range, for a controller made for another `dt`, and for
+    a `jq.models.Multirotor` without a drive.
+    """
+
+    plant: Any  # Plant; or one with `linearise` alone, to analyse
+    controller: Controller | HasLinear | LinearController
+    drive: Drive | None
+    encoder: Sensor | None
+    delay: Float[Array, "..."]  # s
+    dt: float = eqx.field(static=True)  # s
+    substeps: int = eqx.field(static=True)
+    bound: float = eqx.field(static=True)  # rad
+    longest_delay: float | None = eqx.field(static=True)  # s
+    queue: DelayQueue = eqx.field(static=True)
+
+    def __init__(
+        self,
+        plant: Plant,
+        controller: Controller | HasLinear | LinearController,
+        *,
+        drive: Drive | None = None,
+        encoder: Sensor | None = None,
+        delay: Float[ArrayLike, "..."] = 0.0,
+        dt: float | None = None,
+        substeps: int = 1,
+        bound: float = 100.0,
+        longest_delay: float | None = None,
+    ):
+        dt = (sample_interval(controller) or _DEFAULT_DT) if dt is None else dt
+        _require_positive_number(dt, f"dt is {dt} s: give a sample interval above 0")
+        self.plant, self.controller, self.drive, self.encoder = plant, controller, drive, encoder
+        self.dt, self.substeps, self.bound = float(dt), substeps, float(bound)
+        self.queue, self.longest_delay = _queue_of(delay, self.dt, longest_delay), longest_delay
+        self.delay = jnp.asarray(delay, dtype=float)
+
+    def __check_init__(self):
+        if not (isinstance(self.substeps, int | np.integer) and self.substeps >= 1):
+            raise ValueError(f"substeps is {self.substeps}: give a whole number, 1 or more")
+        message = f"bound is {self.bound} rad: give the largest angle that still counts as flown"
+        _require_positive_number(self.bound, message)
+        made_for = sample_interval(self.controller)
+        if made_for is not None and not math.isclose(made_for, self.dt, rel_tol=1e-6):
+            raise ValueError(
+                f"the controller was made for samples of {made_for} s, not {self.dt} s"
+            )
+        if isinstance(self.plant, Multirotor) and self.drive is None:
+            raise ValueError(
+                "drive is None, but a Multirotor turns by four motor inputs: give "
+                "drive=jq.simulation.MotorDrive(plant.allocation)"
+            )
+
+    @property
+    def memory(self) -> int:
+        """Samples that a command may be on its way, 0 without a delay."""
+        longest, (length, splits, _) = self.longest_delay, self.queue
+        if longest is not None:
+            return math.floor(longest / self.dt + 1e-9) + 1 if longest > 0 else 0
+        return length + (0 < length and not splits)
+
+    def with_controller(self, controller: Controller | HasLinear | LinearController) -> "Loop":
+        """The same loop with another controller. Raises ValueError for one of another `dt`."""
+        loop = eqx.tree_at(lambda x: x.controller, self, controller)
+        loop.__check_init__()
+        return loop
+
+    def with_plant(self, plant: Plant) -> "Loop":
+        """The same loop around another plant."""
+        loop = eqx.tree_at(lambda x: x.plant, self, plant)
+        loop.__check_init__()
+        return loop
+
+
+def _require_positive_number(value: float, message: str) -> None:
+    if not (value > 0 and math.isfinite(value)):
+        raise ValueError(message)
+
+
+def _queue_of(delay: Any, dt: float, longest: float | None) -> DelayQueue:
+    """The queue of a delay in s. Raises ValueError for a delay that makes no sense."""
+    if isinstance(delay, Tracer):
+        if longest is None or not 0 < longest < math.inf:
+            raise ValueError(
+                "the delay is traced by jit, vmap or grad, so how many inputs to keep is not "
+                f"known: longest_delay is {longest}; give the longest delay in s that can occur"
+            )
+        return DelayQueue(math.floor(longest / dt * (1 + 1e-9)) + 1, True, True)
+    values = np.asarray(delay, dtype=float)
+    if not np.all(np.isfinite(values) & (values >= 0)):
+        raise ValueError(f"delay is {delay} s, but it must be 0 or above and finite")
+    greatest = float(np.max(values, initial=0.0))
+    if longest is not None and not 0 <= longest < math.inf:
+        raise ValueError(f"longest_delay is {longest} s, but it must be 0 or above and finite")
+    if longest is not None and greatest > longest * (1 + 1e-9):
+        raise ValueError(f"delay is {delay} s, above longest_delay = {longest} s: raise that")
+    return _queue_for(np.asarray(values / dt))
+
+
+def _queue_for(samples: Float[np.ndarray, "..."]) -> DelayQueue:
+    nearest = np.round(samples)
+    whole = bool(np.all(np.abs(samples - nearest) < 1e-9 * np.maximum(nearest, 1)))
+    most = np.max(nearest if whole else samples, initial=0.0)
+    return DelayQueue(int(most) if whole else int(np.floor(most)) + 1, not whole, False)

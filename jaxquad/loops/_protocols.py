@@ -1,0 +1,112 @@
+"""What the parts of a loop need: methods, and nothing else. Optional ones are asked for here."""
+
+from typing import Any, Protocol, runtime_checkable
+
+from jaxtyping import Array, Float, PyTree
+
+from jaxquad.control import LinearController
+
+
+Vector = Float[Array, " axes *ensemble"]
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """What a loop is closed around: `jq.models.Multirotor`, `jq.DecoupledAxes`, or a user's own module.
+
+    `init` gives the state at rest at the angles `euler` in rad, as wide as `ensemble` and the
+    plant's own arrays ask for; `derivative` its rate of change under held inputs and a disturbance
+    torque in N m; `measure` the angles in rad. With `with_added_inertia(inertia)` a plant can carry
+    a scenario's payload.
+    """
+
+    def init(self, euler: Any = None, *, ensemble: tuple[int, ...] = ()) -> PyTree: ...
+    def derivative(self, state: Any, inputs: Any, disturbance: Any) -> PyTree: ...
+    def measure(self, state: Any) -> Vector: ...
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """What closes a loop, one step a sample.
+
+    `init(like)` gives its state at rest, for measurements shaped as `like`; `step` the next state
+    and the command to hold. Further members are used where a controller has them:
+
+    - `dt`: the sample interval in s that it was made for;
+    - `applied(state, achieved)`: told what the drive really gave, before the next sample;
+    - `signals(state)`: a dict of arrays `[axes, *ensemble]` to record;
+    - `prepared()`: the controller to run, with what is the same for all samples computed;
+    - `linear(axis, member)`: a `jq.control.LinearController` to analyse.
+    """
+
+    def init(self, like: Any) -> PyTree: ...
+    def step(self, state: Any, reference: Any, measurement: Any) -> tuple[PyTree, Array]: ...
+
+
+@runtime_checkable
+class Drive(Protocol):
+    """From a command to what the plant's inputs can be: `jq.simulation.MotorDrive`, `jq.simulation.Saturation`."""
+
+    def inputs(self, command: Any) -> Float[Array, " inputs *ensemble"]: ...
+    def achieved(self, inputs: Any) -> Vector: ...
+
+
+@runtime_checkable
+class Sensor(Protocol):
+    """From true angles to measured ones, rad: `jq.simulation.Encoder`."""
+
+    def __call__(self, angle: Any) -> Vector: ...
+
+
+@runtime_checkable
+class HasLinear(Protocol):
+    """A controller that can be analysed."""
+
+    def linear(self, axis: int, member: Any) -> LinearController: ...
+
+
+@runtime_checkable
+class _HasSampleInterval(Protocol):
+    dt: float
+
+
+@runtime_checkable
+class _HasApplied(Protocol):
+    def applied(self, state: Any, achieved: Any) -> PyTree: ...
+
+
+@runtime_checkable
+class _HasSignals(Protocol):
+    def signals(self, state: Any) -> dict[str, Array]: ...
+
+
+@runtime_checkable
+class _HasPrepared(Protocol):
+    def prepared(self) -> Controller: ...
+
+
+@runtime_checkable
+class CarriesPayload(Protocol):
+    """A plant that can carry a scenario's payload."""
+
+    def with_added_inertia(self, inertia: Any) -> Plant: ...
+
+
+def sample_interval(controller: object) -> float | None:
+    """The interval in s that a controller was made for; None where it has no `dt`."""
+    return controller.dt if isinstance(controller, _HasSampleInterval) else None
+
+
+def prepared(controller: Controller) -> Controller:
+    """The controller to run sample by sample."""
+    return controller.prepared() if isinstance(controller, _HasPrepared) else controller
+
+
+def after_drive(controller: Controller, state: PyTree, achieved: Vector) -> PyTree:
+    """The controller's state once it knows what the drive really gave."""
+    return controller.applied(state, achieved) if isinstance(controller, _HasApplied) else state
+
+
+def signals_of(controller: Controller, state: PyTree) -> dict[str, Array]:
+    """What a controller gives to record."""
+    return controller.signals(state) if isinstance(controller, _HasSignals) else {}
