@@ -49,6 +49,7 @@ from .inertia import (
     InertiaMap as InertiaMap,
     LockInInertia as LockInInertia,
     NoProbe as NoProbe,
+    paper_inertia as paper_inertia,
     printed_map as printed_map,
     ProbeTones as ProbeTones,
     RecursiveInertia as RecursiveInertia,

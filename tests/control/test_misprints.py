@@ -1,5 +1,6 @@
 """What the paper prints and what must stand there: docs/equations.md lists every case."""
 
+import ast
 import re
 from itertools import permutations
 from types import SimpleNamespace
@@ -201,9 +202,31 @@ def test_the_papers_pid_is_stable_from_a_gain_of_33_3_and_damped_by_none(gain, d
 
 def test_every_test_that_the_list_of_misprints_names_exists():
     named = re.findall(r"`(test_\w+)::(test_\w+)`", (ROOT / "docs" / "equations.md").read_text())
-    lost = [
-        f"{file}::{name}"
-        for file, name in named
-        if f"def {name}(" not in (ROOT / "tests" / f"{file}.py").read_text()
-    ]
+    files = {path.stem: path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
+    lost = [f"{file}::{name}" for file, name in named if f"def {name}(" not in files.get(file, "")]
     assert len(named) > 40 and lost == []
+
+
+def test_every_equation_is_at_the_place_that_its_table_names():
+    table = (ROOT / "docs" / "equations.md").read_text().partition("Symbols: ")[0]
+    for number in range(1, 30):
+        inside = [low <= number <= high for low, high in numbers(table)]
+        assert any(inside), number
+    places = re.findall(r"`([\w/]+\.py):([\w.]+)`", table)
+    assert len(places) > 20
+    for file, name in places:
+        scope = ast.parse((ROOT / "jaxquad" / file).read_text()).body
+        for part in name.split("."):
+            found = [x for x in scope if isinstance(x, DEFINITION) and x.name == part]
+            assert found, f"{file}:{name}"
+            scope = found[0].body
+
+
+DEFINITION = (ast.FunctionDef, ast.ClassDef)
+
+
+def numbers(table):
+    """First and last equation of each range such as (5)-(7) and of each single number."""
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| (")]
+    pairs = re.findall(r"\((\d+)\)(?:-\((\d+)\))?", " ".join(rows))
+    return [(int(first), int(last or first)) for first, last in pairs]

@@ -7,11 +7,21 @@ from ladrc_loop import loop
 from scipy.integrate import solve_ivp
 
 import jaxquad as jq
+from jaxquad.control.inertia import (
+    disturbance_slope,
+    disturbed_axis,
+    estimate_disturbance,
+    expected_disturbance,
+    filter_signals,
+    observe_disturbance,
+    paper_inertia,
+)
 
 
 J, DRAG, LOAD = 0.0552, 0.004, 0.03  # kg m^2, N m s/rad, N m
 NOMINAL, POLE = 0.04, 20.0  # J_n and lambda
 CHANGE = J - NOMINAL
+LOADS = {"dJ": CHANGE, "K_afx": DRAG, "M_g": LOAD, "lam": POLE}
 
 
 def torque(time):
@@ -20,16 +30,12 @@ def torque(time):
 
 def observer(time, state):
     """Derivatives of the rate under drag and load, of z in Eq. (17), of q0 and q1 in (19)."""
-    rate, z, q0, q1 = state
-    u = torque(time)
-    return np.stack(
-        [
-            (u - DRAG * rate - LOAD) / J,
-            -POLE * z + POLE * NOMINAL * rate + u,
-            -POLE * q0 + POLE * rate,
-            -POLE * q1 + POLE * u,
-        ]
-    )
+    rate, z, q0, q1 = jnp.asarray(state)
+    u = jnp.asarray(torque(time))
+    A, B, _ = disturbed_axis(J)
+    acceleration = A[0, 1] * (-DRAG * rate - LOAD) + B[0] * u
+    z_dot, _ = observe_disturbance(z, rate, u, J_n=NOMINAL, lam=POLE)
+    return np.stack([acceleration, z_dot, *filter_signals(q0, q1, rate, u, lam=POLE)])
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +47,8 @@ def run():
 
 def estimate(state):
     """M_c, the second line of Eq. (17)."""
-    return POLE * (NOMINAL * state[0] - state[1])
+    rate, z = jnp.asarray(state[:2])
+    return np.asarray(observe_disturbance(z, rate, 0 * z, J_n=NOMINAL, lam=POLE)[1])
 
 
 def same(found, expected):
@@ -68,7 +75,10 @@ def test_the_observer_of_eq_17_finds_a_constant_load_with_its_pole(run):
 
 def test_the_transform_of_eq_18_lacks_a_filter_on_its_first_term(run):
     _, state, slope = run
-    assert same(estimate(state), NOMINAL * slope[2] - state[3])  # lambda s / (s + lambda) J_n rate
+    right = estimate_disturbance(jnp.asarray(slope[2]), jnp.asarray(state[3]), J_n=NOMINAL)
+    assert same(
+        estimate(state), right
+    )  # lambda s / (s + lambda) J_n rate - lambda / (s + lambda) u
     assert not same(estimate(state), POLE * NOMINAL * state[0] - state[3])
     assert not same(estimate(state), NOMINAL * slope[3] - state[2])  # text after (19)
 
@@ -76,16 +86,16 @@ def test_the_transform_of_eq_18_lacks_a_filter_on_its_first_term(run):
 def test_eq_20_drives_the_estimate_by_the_acceleration_and_the_rate(run):
     _, state, slope = run
     left = POLE * (NOMINAL * slope[0] - slope[1])
-    drive = lambda *terms: -POLE * (estimate(state) + sum(terms) + LOAD)
-    assert same(left, drive(CHANGE * slope[0], DRAG * state[0]))
-    assert not same(left, drive(CHANGE * state[0], DRAG * J))
+    signals = map(jnp.asarray, (estimate(state), state[0], slope[0]))
+    assert same(left, disturbance_slope(*signals, **LOADS))
+    assert not same(left, -POLE * (estimate(state) + CHANGE * state[0] + DRAG * J + LOAD))
 
 
 def test_eq_21_holds_the_derivative_of_q0_and_a_rising_load(run):
     time, state, slope = run
     _, _, q0, q1 = state
-    rising = 1 - np.exp(-POLE * time)
-    assert same(estimate(state), -CHANGE * slope[2] - DRAG * q0 - LOAD * rising)
+    signals = map(jnp.asarray, (q0, slope[2], time))
+    assert same(estimate(state), expected_disturbance(*signals, **LOADS))
     assert not same(estimate(state), -CHANGE * q0 - DRAG * q0 + LOAD * q1)
 
 
@@ -137,6 +147,10 @@ def test_eq_23_needs_a_square_below_and_a_minus(nominal):
     assert nominal + right == pytest.approx(J, rel=1e-9)
     # Eq. (24) is a regression: the nominal inertia has left it.
     assert nominal + right == pytest.approx(regression(1.0), rel=1e-12)
+    time, q0, _, q1 = (jnp.asarray(x) for x in steady(1.0))
+    middle = jnp.concatenate([q1[:1], (q1[1:] + q1[:-1]) / 2])  # where the differences of q0 are
+    found = paper_inertia(q0, middle, J_n=nominal, dt=float(time[1]))
+    assert float(found) == pytest.approx(J, rel=1e-7)
 
 
 def test_with_the_printed_plus_the_error_doubles_every_period():

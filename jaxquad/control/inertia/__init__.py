@@ -6,6 +6,15 @@ from ._maps import (
     InertiaMap as InertiaMap,
     printed_map as printed_map,
 )
+from ._paper import (
+    disturbance_slope as disturbance_slope,
+    disturbed_axis as disturbed_axis,
+    estimate_disturbance as estimate_disturbance,
+    expected_disturbance as expected_disturbance,
+    filter_signals as filter_signals,
+    observe_disturbance as observe_disturbance,
+    paper_inertia as paper_inertia,
+)
 from ._probe_tones import NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._regression import (
     RecursiveInertia as RecursiveInertia,

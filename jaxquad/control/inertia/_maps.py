@@ -72,11 +72,11 @@ class FuzzyMap(eqx.Module):
     def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
         require_shapes({"inertia": inertia, "nominal": self.nominal, "b0": self.b0})
-        weights = self.memberships(inertia / fit(self.nominal, inertia))
-        increments = self.increments.astype(weights.dtype)
-        increments = increments.reshape((-1,) + (1,) * inertia.ndim)
-        average = jnp.sum(weights * increments, axis=0) / jnp.sum(weights, axis=0)
-        return fit(self.b0, inertia) + average
+        delta = inertia / fit(self.nominal, inertia)
+        P = self.memberships(delta)
+        increments = self.increments.astype(P.dtype).reshape((-1,) + (1,) * inertia.ndim)
+        db0 = jnp.sum(P * increments, axis=0) / jnp.sum(P, axis=0)  # the average weight method
+        return fit(self.b0, inertia) + db0
 
     def tunable(self) -> dict[str, Transform | None]:
         """b0; the increments may cross 0, so they need `jq.identify.Real`."""
