@@ -10,7 +10,6 @@ import os
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 
 import jaxquad as jq
@@ -18,7 +17,7 @@ from jaxquad.plot import bode, overlay
 from jaxquad.report import write_results
 
 
-jax.config.update("jax_enable_x64", True)
+jq.enable_x64()
 
 BAND = (2 * np.pi * 0.7, 2 * np.pi * 12.0)  # rad/s
 OMEGA = np.geomspace(*BAND, 80)

@@ -9,7 +9,6 @@ import os
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 
 import jaxquad as jq
@@ -18,7 +17,7 @@ from jaxquad.plot import bode
 from jaxquad.report import write_results
 
 
-jax.config.update("jax_enable_x64", True)
+jq.enable_x64()
 
 RATE = 40.0  # Hz; the record has 41.8 on average
 BAND = (1.0, 30.0)  # rad/s

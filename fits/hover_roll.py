@@ -17,7 +17,7 @@ from jaxquad.plot import bode, overlay
 from jaxquad.report import provenance, write_report, write_results
 
 
-jax.config.update("jax_enable_x64", True)
+jq.enable_x64()
 
 DT = 0.002  # s
 ADDED = 0.0276  # kg m^2, known weights on the arms in the second run: half the rig's inertia

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -24,7 +23,7 @@ from jaxquad import design as jd
 from jaxquad._core._arrays import as_float
 
 
-jax.config.update("jax_enable_x64", True)
+jq.enable_x64()
 
 RATE = 200.0  # Hz
 BAND = (0.5, 40.0)  # rad/s

@@ -10,8 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
-
+import jaxquad as jq
 from experiments import figures
 from experiments.data import Case, cases, load
 from experiments.flights import fly
@@ -21,7 +20,7 @@ from experiments.rows import markdown, matching_table, printed, require_judged, 
 from jaxquad.report import write_json
 
 
-jax.config.update("jax_enable_x64", True)
+jq.enable_x64()
 
 LEGEND = """\
 A star marks a nominal loop that is not matched to the others. Activity is the rms of the command

@@ -33,7 +33,7 @@ from experiments.tuning import (
 )
 
 
-jax.config.update("jax_enable_x64", True)
+jq.enable_x64()
 
 DT = 0.004  # s: M changes at every sample of the log
 SPAN = (0.5, 2.0)  # of the inertia that was flown

@@ -31,7 +31,7 @@ from hover_roll import DT, ESTIMATORS, fly, gain_of, identify, OMEGA, SHEET, SWE
 from jaxquad.tuning import paper_designs
 
 
-jax.config.update("jax_enable_x64", True)
+jq.enable_x64()
 
 SPAN = (0.5, 3.0)  # of the inertia
 LIMIT = 10.0  # V

@@ -2,14 +2,13 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
 import jaxquad as jq
 
 
-jax.config.update("jax_enable_x64", True)  # before the first array of any script that imports this
+jq.enable_x64()  # before the first array of any script that imports this
 
 DT = 0.002  # s
 SHEET = jq.models.QUANSER_HOVER
