@@ -1,9 +1,13 @@
 """Small writers of autopilot logs, from the formats' public descriptions, for the tests."""
 
 import struct
+import tempfile
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
+
+from jaxquad.records.formats import Log, READERS
 
 
 CODES = {
@@ -94,3 +98,11 @@ def structured(columns: Mapping[str, tuple[str, np.ndarray]]) -> np.ndarray:
     for name, (_, values) in columns.items():
         rows[name] = values
     return rows
+
+
+def decode(kind: str, data: bytes) -> Log:
+    """What the reader of this kind makes of the bytes of a file, with nothing caught."""
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(data)
+        file.flush()
+        return READERS[kind].load(Path(file.name))

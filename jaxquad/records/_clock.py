@@ -1,4 +1,4 @@
-"""What a vector of time stamps says: its order, its rate, how uniform it is."""
+"""Time stamps: their order, rate and uniformity, and the repair of glitches and overflows."""
 
 from typing import NamedTuple
 
@@ -16,10 +16,10 @@ GAP = 1.5  # nominal samples: a longer step is a gap
 
 def check_increasing(label: str, time: Times) -> None:
     """Raise RecordError where the stamps of `label` are not finite, repeat or go back."""
-    stuck = np.flatnonzero(~np.isfinite(time))
-    if stuck.size:
+    bad = np.flatnonzero(~np.isfinite(time))
+    if bad.size:
         raise RecordError(
-            f"{label}: time stamp {stuck[0]} is {time[stuck[0]]}: drop such rows before reading."
+            f"{label}: time stamp {bad[0]} is {time[bad[0]]}: delete such rows from the file."
         )
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
@@ -27,33 +27,34 @@ def check_increasing(label: str, time: Times) -> None:
         verb = "repeats" if time[i] == time[i - 1] else "goes back"
         raise RecordError(
             f"{label}: time {verb} at sample {i}, from {time[i - 1]:.9g} s to {time[i]:.9g} s "
-            f"({back.size} such places): time has to increase strictly; drop or sort these rows."
+            f"(in {back.size} places). Time must increase strictly: delete or sort these rows."
         )
 
 
 def native_rate(time: Times) -> float:
-    """Samples per second of jittered stamps, gaps not counted."""
+    """Samples per second of jittered time stamps, without the gaps."""
     step = np.diff(time)
     whole = step[step <= GAP * np.median(step)]
     return float(whole.size / whole.sum())
 
 
-def departure(time: Times) -> float:
-    """Largest distance of the stamps from the uniform grid between their ends, in samples."""
+def nonuniformity(time: Times) -> float:
+    """Largest distance of the time stamps from a uniform grid between their ends, in samples."""
     grid = np.linspace(time[0], time[-1], time.size)
     return float(np.abs(time - grid).max() * (time.size - 1) / (time[-1] - time[0]))
 
 
 def check_uniform(time: Times) -> None:
-    """Raise RecordError for stamps that are not on a uniform grid within 2 % of a sample."""
-    worst = departure(time)
+    """Raise RecordError for time stamps more than 2 % of a sample off a uniform grid."""
+    worst = nonuniformity(time)
     if worst > JITTER:
         step = np.diff(time)
         i = int(np.abs(step - np.median(step)).argmax())
         raise RecordError(
-            f"time is not uniformly sampled: stamps lie up to {worst:.3g} samples off the uniform "
-            f"grid (limit {JITTER}); the oddest step is {step[i]:.6g} s at t = {time[i]:.6g} s, "
-            f"the median {np.median(step):.6g} s. Use jq.read(..., sample_rate=) or jq.records.resample."
+            f"time is not uniformly sampled: the time stamps lie up to {worst:.3g} samples off a "
+            f"uniform grid (limit {JITTER}); the most unusual step is {step[i]:.6g} s at "
+            f"t = {time[i]:.6g} s, the median step {np.median(step):.6g} s. "
+            f"Resample the record with jq.read(..., sample_rate=) or jq.records.resample."
         )
 
 
@@ -64,36 +65,36 @@ def window(time: Times, start: float | int | None, stop: float | int | None) -> 
     end = time[-1] if stop is None else stop
     extent = f"the record covers {time[0]:.6g} .. {time[-1]:.6g} s"
     if not begin < end:
-        raise RecordError(f"start {begin:.6g} s is not before stop {end:.6g} s: {extent}.")
+        raise RecordError(f"start {begin:.6g} s is not before stop {end:.6g} s; {extent}.")
     if begin < time[0] - slack or end > time[-1] + slack:
-        raise RecordError(f"{begin:.6g} .. {end:.6g} s is out of range: {extent}.")
+        raise RecordError(f"{begin:.6g} .. {end:.6g} s is out of range; {extent}.")
     first = int(np.searchsorted(time, begin - slack))
     last = int(np.searchsorted(time, end + slack, side="right"))
     if last - first < FEWEST:
         raise RecordError(
-            f"{begin:.6g} .. {end:.6g} s holds {last - first} samples, at least {FEWEST} are "
-            f"needed: {extent}."
+            f"{begin:.6g} .. {end:.6g} s holds {last - first} samples: at least {FEWEST} are "
+            f"needed; {extent}."
         )
     return slice(first, last)
 
 
-MOST_DROPPED = 0.01  # of the stamps; more is no glitch, and the record is refused
+MOST_DROPPED = 0.01  # of the time stamps; more is not a glitch, and the record is refused
 _WRAP = 2.0**32
 
 
-class Mended(NamedTuple):
-    """Stamps that increase, which of the rows they are, and what was done."""
+class RepairedTime(NamedTuple):
+    """Increasing time stamps, the rows that they belong to, and what was repaired."""
 
     time: np.ndarray
     kept: Bool[np.ndarray, " samples"] | None  # None: all
     remark: str
 
 
-def unwrapped(counter: np.ndarray) -> tuple[np.ndarray, int]:
-    """A counter with its overflows taken out, and how many there were.
+def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
+    """A counter with its overflows undone, and how many there were.
 
-    A 32-bit counter shows by its dtype, or by stepping from the last hundredth of its range to
-    the first; an int16 or uint16 by its dtype alone.
+    A 32-bit counter is recognised by its dtype, or by a step from the last hundredth of its range
+    to the first; an int16 or uint16 by its dtype alone.
     """
     if counter.dtype.kind in "iu" and counter.dtype.itemsize <= 4:
         span = float(2 ** (8 * counter.dtype.itemsize))
@@ -109,33 +110,33 @@ def unwrapped(counter: np.ndarray) -> tuple[np.ndarray, int]:
     return counter.astype(np.float64) + span * turns, int(wraps.sum())
 
 
-def mended(time: Float[np.ndarray, " samples"]) -> Mended:
-    """Drops stamps that repeat, go back, stand out or are not finite, if they are few.
+def repair(time: Times) -> RepairedTime:
+    """Drop time stamps that repeat, go back, jump ahead or are not finite, if they are few.
 
-    Where more than 1 % would go, nothing is dropped: `Channel` then refuses the record.
+    Where more than 1 % would have to go, nothing is dropped: `Channel` then refuses the record.
     """
     good = np.isfinite(time)
     if time.size < FEWEST or (good.all() and (np.diff(time) > 0).all()):
-        return Mended(time, None, "")
+        return RepairedTime(time, None, "")
     kept = np.flatnonzero(good)
     kept = kept[~_spikes(time[kept])]
     highest = np.maximum.accumulate(time[kept])
     kept = kept[np.concatenate([[True], time[kept][1:] > highest[:-1]])] if kept.size else kept
     dropped = time.size - kept.size
     if dropped > MOST_DROPPED * time.size:
-        return Mended(time, None, "")
+        return RepairedTime(time, None, "")
     mask = np.zeros(time.size, dtype=bool)
     mask[kept] = True
     first = int(np.flatnonzero(~mask)[0])
     remark = (
-        f"{dropped} of {time.size} time stamps repeat or go back and were dropped with their "
-        f"rows, the first at row {first} (stamp {time[first]:.9g} s)"
+        f"{dropped} of {time.size} time stamps repeat or go back; these rows were dropped, the "
+        f"first of them row {first} ({time[first]:.9g} s)"
     )
-    return Mended(time[mask], mask, remark)
+    return RepairedTime(time[mask], mask, remark)
 
 
-def _spikes(time: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-    """Stamps ahead of what follows although their neighbours are in order."""
+def _spikes(time: Times) -> Bool[np.ndarray, " samples"]:
+    """Time stamps that jump ahead although their neighbours are in order."""
     spike = np.zeros(time.size, dtype=bool)
     if time.size > 2:
         spike[1:-1] = (time[1:-1] > time[2:]) & (time[:-2] < time[2:])

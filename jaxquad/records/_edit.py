@@ -18,18 +18,40 @@ _ROLES = ("input", "output", "reference")
 def trim(
     record: Record, start: float | int | None = None, stop: float | int | None = None
 ) -> Record:
-    """The part from `start` to `stop`, both in s of the record's own time and included.
+    """The part of a record from `start` to `stop`.
 
-    Raises RecordError if that leaves the record's range or fewer than 16 samples.
+    **Arguments:**
+
+    - `record`: a `Record`.
+    - `start`, `stop`: first and last time in s of the record's own time, both included; `None` is
+        the end of the record.
+
+    **Returns:** a `Record` with the same channels.
+
+    **Raises:**
+
+    - `RecordError`: where the range leaves the record or holds fewer than 16 samples.
     """
     kept = window(record.time, start, stop)
     return _rebuilt(record, record.time[kept], lambda channels: channels[kept])
 
 
 def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
-    """Every channel less its mean (`order` 0) or its least-squares line (`order` 1)."""
+    """Subtract the mean or the least-squares line from every channel.
+
+    **Arguments:**
+
+    - `record`: a `Record`.
+    - `order`: 0 for the mean, 1 for the line.
+
+    **Returns:** a `Record` with the same channels.
+
+    **Raises:**
+
+    - `RecordError`: for another `order`.
+    """
     if order not in (0, 1):
-        raise RecordError(f"order {order}: 0 takes away the mean, 1 the line.")
+        raise RecordError(f"order is {order}: use 0 to remove the mean, 1 to remove a line.")
     centred = np.linspace(-1.0, 1.0, record.samples)[:, None]
 
     def flatten(channels: Channels) -> Channels:
@@ -47,7 +69,19 @@ def select(
     outputs: str | Sequence[str],
     references: str | Sequence[str] = (),
 ) -> Record:
-    """Give the named channels, whatever their role was, new roles; drop the others."""
+    """Assign new roles to channels, and drop the others.
+
+    **Arguments:**
+
+    - `record`: a `Record`.
+    - `inputs`, `outputs`, `references`: names of channels of the record, whatever their role was.
+
+    **Returns:** a `Record` of the named channels, with their units.
+
+    **Raises:**
+
+    - `RecordError`: for a name that the record lacks or that is given twice.
+    """
     roles = [as_tuple(names) for names in (inputs, outputs, references)]
     return _assembled(record, roles, record.channel, record.unit)
 
@@ -59,12 +93,31 @@ def mix(
     *,
     role: Literal["input", "output", "reference"] = "input",
 ) -> Record:
-    """Add the channel `name`, a weighted sum of others, such as motors to a roll command.
+    """Add a channel that is a weighted sum of others, such as a roll command of four motors.
 
-    Its unit is that of the summed channels where they agree, else unknown.
+    **Arguments:**
+
+    - `record`: a `Record`.
+    - `name`: of the new channel.
+    - `weights`: channel name -> weight.
+    - `role`: what the new channel is.
+
+    **Returns:** the `Record` with one channel more. Its unit is that of the summed channels where
+    they agree, else unknown.
+
+    **Raises:**
+
+    - `RecordError`: for no weight, a weight that is not finite, a channel that the record lacks, or
+        a `name` that it has.
+
+    !!! Example
+
+        ```python
+        record = jq.records.mix(record, "roll", {"m1": -1, "m2": -1, "m3": 1, "m4": 1})
+        ```
     """
     if role not in _ROLES:
-        raise RecordError(f"role {role!r}: it is one of {', '.join(_ROLES)}.")
+        raise RecordError(f"role is {role!r}: use one of {', '.join(_ROLES)}.")
     column = combine(name, weights, record.channel)
     shared = {record.unit(source) for source in weights}
     unit = shared.pop() if len(shared) == 1 else ""
@@ -83,12 +136,14 @@ def combine(
     weights: Mapping[str, float | int],
     values: Callable[[str], Float[np.ndarray, " samples"]],
 ) -> Float[np.ndarray, " samples"]:
-    """The weighted sum that makes the channel `name`; a lone weight of 1 changes no bit."""
+    """The weighted sum that makes the channel `name`; a single weight of 1 changes no bit."""
     if not weights:
-        raise RecordError(f"the mix {name!r} is empty: give it channels with their weights.")
+        raise RecordError(f"the sum {name!r} is empty: give it channels and their weights.")
     for source, weight in weights.items():
         if not np.isfinite(weight):
-            raise RecordError(f"the mix {name!r} weighs {source!r} by {weight}: use a number.")
+            raise RecordError(
+                f"the weight of {source!r} in the sum {name!r} is {weight}: use a finite number."
+            )
     return ft.reduce(np.add, (weight * values(source) for source, weight in weights.items()))
 
 

@@ -2,11 +2,17 @@ from pathlib import Path
 
 
 class RecordError(ValueError):
-    """A record that cannot be used as it is: says what was wrong, the value and what to do."""
+    """A record that cannot be used: the message says what is wrong, the value and what to do."""
 
 
 class ReadError(RecordError):
-    """A file that cannot be read as a record; `offset` is the byte where that showed, if known."""
+    """A file that cannot be read.
+
+    **Arguments:**
+
+    - `reason`: what is wrong, and what to do.
+    - `offset`: the byte of the file where the fault shows, if known.
+    """
 
     def __init__(self, reason: str, *, offset: int | None = None):
         super().__init__(reason)
@@ -14,11 +20,11 @@ class ReadError(RecordError):
 
     def __str__(self) -> str:
         where = "" if self.offset is None else f" (at byte {self.offset})"
-        return f"{self.args[0]}{where}"
+        return f"{str(self.args[0]).rstrip('.')}{where}."
 
 
 class RecordWarning(UserWarning):
-    """A record that can be used, with a doubt worth knowing."""
+    """A record can be used, but something in it was repaired, left out or looks wrong."""
 
 
 def located(error: ReadError, path: Path | str) -> ReadError:

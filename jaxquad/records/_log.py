@@ -1,4 +1,4 @@
-"""What every reader hands over: tables of signals, each table on one clock."""
+"""What every reader returns: tables of signals, each on one clock, and remarks on damage."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from ._errors import ReadError
 from ._names import printable
 
 
@@ -13,9 +14,9 @@ from ._names import printable
 class Table:
     """Signals that were logged together, a row per time stamp.
 
-    A column has one or two dimensions and any real dtype; a strided view is welcome. Its values
-    times its `scale` (1 by default) are in its `unit`. Without a `time` the table's clock is
-    found by its name, as `read` describes.
+    A column has one or two dimensions and any real dtype, and may be a strided view. Its values
+    times its `scale` (1 by default) are in its `unit`. Without a `time` the time stamps are found
+    by their name, as `read` describes.
     """
 
     columns: Mapping[str, np.ndarray]
@@ -28,7 +29,7 @@ class Table:
 class Log:
     """The tables of a file by name; the channels of the table `""` have no prefix.
 
-    Each of the `remarks` says what was skipped or mended, and becomes a RecordWarning.
+    Each of the `remarks` says what was skipped or repaired, and becomes a RecordWarning.
     """
 
     tables: Mapping[str, Table]
@@ -49,16 +50,16 @@ class Signal:
 
 @dataclasses.dataclass(frozen=True)
 class Signals:
-    """All numeric arrays of a log, and the clocks (s) that it is sure of."""
+    """All numeric arrays of a log, and the time bases (s) that its format defines."""
 
     arrays: Mapping[str, Signal]
     clocks: Mapping[str, Float[np.ndarray, " samples"]]
 
 
 def flattened(log: Log) -> Signals:
-    """The log's numeric columns of one or two dimensions, as long as their clock if they have one.
+    """The numeric columns of a log with one or two dimensions, by their full names.
 
-    A lone number, such as a parameter, is no channel of a table that has a clock.
+    In a table with a clock, columns of another length, such as parameters, are left out.
     """
     arrays, clocks = {}, {}
     for table_name, table in log.tables.items():
@@ -76,3 +77,43 @@ def flattened(log: Log) -> Signals:
 def is_data(array: np.ndarray) -> bool:
     """Real numbers in one or two dimensions."""
     return array.dtype.kind in "fiub" and array.ndim in (1, 2)
+
+
+LARGEST = 4 * 2**30  # bytes of decoded arrays
+_DENSEST = 250  # decoded bytes per byte of the file: real logs stay far below
+_HARMLESS = 64 * 2**20  # bytes that any file may hold
+
+
+def allowance(stored: int) -> int:
+    """How many bytes `stored` ones may decode to."""
+    return min(LARGEST, max(_HARMLESS, _DENSEST * stored))
+
+
+def check_size(what: str, declared: int, stored: int, *, offset: int | None = None) -> None:
+    """Raise ReadError where `stored` bytes declare that they unfold to too many."""
+    if declared > allowance(stored):
+        raise ReadError(oversize(what, declared, stored), offset=offset)
+
+
+def oversize(what: str, declared: int, stored: int) -> str:
+    """What the error says."""
+    return (
+        f"{what} declares {declared:.4g} bytes of numbers in {stored:.4g} bytes of file (limit "
+        f"{allowance(stored):.4g}): it is probably damaged; if it is not, cut it into parts"
+    )
+
+
+def describe_skips(skipped: list[tuple[int, int]], place: int, end: int) -> list[str]:
+    """Remarks on damaged blocks (first byte, byte after the last) and on a file that is cut off."""
+    remarks = []
+    if skipped:
+        lost = sum(after - before for before, after in skipped)
+        first = ", ".join(f"{before} .. {after - 1}" for before, after in skipped[:4])
+        more = ", ..." if len(skipped) > 4 else ""
+        blocks = "damaged block" if len(skipped) == 1 else "damaged blocks"
+        remarks.append(f"{len(skipped)} {blocks} ({lost} bytes) skipped: bytes {first}{more}")
+    if place < end:
+        remarks.append(
+            f"the file is cut off: the last {end - place} bytes, from byte {place} on, were ignored"
+        )
+    return remarks

@@ -9,16 +9,16 @@ _MOST = 40
 
 
 def unknown_name(name: str, known: Iterable[str]) -> str:
-    """The sentence for a `name` that is not among the `known` ones, with the nearest of them."""
+    """What an error says of a `name` that is not among the `known` ones, with the nearest."""
     known = list(known)
     plain = {each.lower(): each for each in known}
     near = difflib.get_close_matches(name.lower(), plain, n=1)
     guess = f" Did you mean {plain[near[0]]!r}?" if near else ""
-    return f"no channel {name!r}.{guess} There are: {listed(known)}."
+    return f"there is no channel {name!r}.{guess} The channels are: {listed(known)}."
 
 
 def listed(names: Iterable[str]) -> str:
-    """The names, of many the first."""
+    """The names, separated by commas; of many, the first 40."""
     names = list(names)
     more = f", and {len(names) - _MOST} more" if len(names) > _MOST else ""
     return f"{', '.join(names[:_MOST]) or 'none'}{more}"
@@ -30,7 +30,9 @@ def as_names(names: Names, letter: str, count: int) -> tuple[str, ...]:
         return (letter,) if count == 1 else tuple(f"{letter}{i + 1}" for i in range(count))
     names = as_tuple(names)
     if len(names) != count:
-        raise RecordError(f"{len(names)} names {names} for {count} channels: give one name each.")
+        raise RecordError(
+            f"{len(names)} names {names} for {count} channels: give one name for each channel."
+        )
     return names
 
 
@@ -40,12 +42,14 @@ def as_units(units: Names, names: Sequence[str]) -> tuple[str, ...]:
         return ("",) * len(names)
     units = as_tuple(units)
     if len(units) != len(names):
-        raise RecordError(f"{len(units)} units {units} for the channels {tuple(names)}: one each.")
+        raise RecordError(
+            f"{len(units)} units {units} for the channels {tuple(names)}: give one unit for each."
+        )
     return units
 
 
 def as_tuple(names: str | Iterable[str]) -> tuple[str, ...]:
-    """A lone string is one name, not a sequence of letters."""
+    """A single string is one name, not a sequence of letters."""
     return (names,) if isinstance(names, str) else tuple(names)
 
 
@@ -55,10 +59,10 @@ def check_distinct(names: Sequence[str]) -> None:
     if twice:
         raise RecordError(
             f"the channel name {twice[0]!r} occurs {names.count(twice[0])} times among "
-            f"{', '.join(names)}: every channel of a record needs a name of its own."
+            f"{', '.join(names)}: give each channel of the record a different name."
         )
 
 
 def printable(text: str) -> str:
-    """What a file says, free of what would steer a terminal, and of moderate length."""
+    """Text from a file without terminal control characters, cut to 500 characters."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text[:500])

@@ -6,22 +6,22 @@ import numpy as np
 from jaxtyping import Float
 
 from ._channel import Channel
-from ._clock import departure, JITTER, window
+from ._clock import JITTER, nonuniformity, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError
 from ._names import as_tuple, check_distinct, unknown_name
 from ._record import Record
 from ._resample import resample
 from ._timebase import signal_names, Timebases, TimeUnit
-from .formats._readers import load_signals
+from .formats import load_signals
 
 
 class ChannelSummary(NamedTuple):
-    """What a file holds of one channel; NaN where it has no usable time base."""
+    """One channel of a file: NaN for its rate and times where it has no usable time base."""
 
     name: str
     samples: int
-    rate: float  # Hz, gaps not counted
+    rate: float  # Hz, without gaps
     start: float  # s
     stop: float  # s
     minimum: float
@@ -37,7 +37,19 @@ class ChannelSummary(NamedTuple):
 def channels(
     path: str | Path, *, time: str | None = None, time_unit: TimeUnit | None = None
 ) -> list[ChannelSummary]:
-    """List the channels that `read` can take from a file. Raises ReadError."""
+    """List the channels that `read` can take from a file.
+
+    **Arguments:**
+
+    - `path`: the file, of any format that `read` knows.
+    - `time`, `time_unit`: as in `read`.
+
+    **Returns:** a `ChannelSummary` for each channel, which prints as one line.
+
+    **Raises:**
+
+    - `ReadError`: where the file is missing, damaged or of an unknown format.
+    """
     signals = load_signals(path)
     timebases = Timebases(signals, time, time_unit)
     return [_summary(timebases, name) for name in signal_names(signals, time)]
@@ -50,7 +62,7 @@ def _summary(timebases: Timebases, name: str) -> ChannelSummary:
     try:
         channel = timebases.channel(name)
         clock = channel.rate, float(channel.time[0]), float(channel.time[-1])
-    except RecordError:  # A listing is how one finds out what is wrong with a file.
+    except RecordError:  # A list of channels is also for finding out what is wrong with a file.
         clock = np.nan, np.nan, np.nan
     return ChannelSummary(name, len(values), *clock, low, high, timebases.unit(name))
 
@@ -75,32 +87,48 @@ def read(
 ) -> Record:
     """Read a record from a log: ArduPilot, PX4, Betaflight, Crazyflie, or a table of arrays.
 
-    The first bytes say which kind of file it is, else its name: DataFlash .bin and .log, ULog,
-    blackbox .bbl and .bfl or what blackbox_decode makes of them, Crazyflie uSD, ROS 2 bags, MAT
-    of versions 5 to 7.3, HDF5, Parquet, .npz, .npy, .csv. `channels` lists what a file holds.
+    The format is recognised by the first bytes of the file, else by its name: DataFlash .bin and
+    .log, ULog, blackbox .bbl and .bfl or the tables of blackbox_decode, Crazyflie uSD, ROS 2 bags,
+    MAT of versions 5 to 7.3, HDF5, Parquet, .npz, .npy, .csv. `channels` lists what a file holds.
 
-    `inputs`, `outputs` and `references` are channel names, or new names with the weighted sums
-    that make them: `{"roll": {"motor[0]": -1, "motor[1]": 1}}`. The columns of a 2-D array `x`
-    are `x[0]`, `x[1]`, ... Where the log does not say, the time base of `x` is `t_x`, else the
-    array that `time` names, else t, time, time_s or timestamp; `time_unit` None means s and
-    refuses steps of 1 s and more. Counters that wrap go on, and up to 1 % of stamps that repeat or
-    go back are dropped with their rows, both with a RecordWarning.
+    **Arguments:**
 
-    `start` and `stop` are in s of the file's own time, which the record keeps. Without a
-    `sample_rate` (Hz), channels that share one uniform time base are passed on bit by bit;
-    others come to the lowest of their own rates, rounded to three digits. See `resample` for how,
-    and for `max_gap` (s). `units` by the record's own channel names, else those of the log, go
-    onto figures and tables.
+    - `path`: the file; for a ROS 2 bag also its folder.
+    - `inputs`, `outputs`, `references`: channel names, or new names with weighted sums of channels,
+        as `{"roll": {"motor[0]": -1, "motor[1]": 1}}`. The columns of a 2-D array `x` are `x[0]`,
+        `x[1]`, ...
+    - `sample_rate`: of the record, in Hz. By default channels that share one uniform time base
+        are kept bit by bit; others are resampled (see `resample`) to the lowest of their own rates,
+        rounded to three digits.
+    - `start`, `stop`: first and last time in s of the file's own time, which the record keeps.
+    - `time`: the array with the time stamps, where the format does not define them. The time
+        stamps of `x` are `t_x`, else those that `time` names, else t, time, time_s or timestamp.
+    - `time_unit`: of the time stamps. `None` means s, and refuses steps of 1 s and more.
+    - `max_gap`: the longest gap that is interpolated, in s; see `resample`.
+    - `units`: channel name of the record -> unit, for figures and tables; by default those of the
+        log.
 
-    Raises ReadError for what is wrong with the file, RecordError for what is wrong with the data.
+    **Returns:** a `Record`. Overflows of the time counter are undone, and up to 1 % of time
+    stamps that repeat or go back are dropped with their rows, both with a `RecordWarning`.
+
+    **Raises:**
+
+    - `ReadError`: where the file is missing, damaged or of an unknown format, or lacks a channel.
+    - `RecordError`: where the data are unusable: gaps, NaN, an empty range.
+
+    !!! Example
+
+        ```python
+        record = jq.read("log15.npz", inputs="M", outputs="q", references="x0", start=50, stop=76)
+        ```
     """
     roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
     channels = _channels(path, names, time, time_unit)
-    kept = _shared_grid(channels, start, stop) if sample_rate is None else None
-    if kept is not None:
-        stamps = channels[0].time[kept]
-        values = np.stack([channel.values[kept] for channel in channels], axis=1)
+    span = _shared_grid(channels, start, stop) if sample_rate is None else None
+    if span is not None:
+        stamps = channels[0].time[span]
+        values = np.stack([channel.values[span] for channel in channels], axis=1)
     else:
         rate = _slowest(channels) if sample_rate is None else sample_rate
         stamps, values = resample(channels, rate, start=start, stop=stop, max_gap=max_gap)
@@ -127,7 +155,7 @@ def _all_units(
     mixes = {name: mix for role in roles for name, mix in role.items()}
     for name in given:
         if name not in mixes:
-            raise RecordError(f"a unit for {name!r}: {unknown_name(name, mixes)}")
+            raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, mixes)}")
     units = {name: {logged[source] for source in mix} for name, mix in mixes.items()}
     agreed = {name: unit.pop() if len(unit) == 1 else "" for name, unit in units.items()}
     return agreed | dict(given)
@@ -146,7 +174,9 @@ def _channels(
 ) -> list[Channel]:
     signals = load_signals(path)
     if not names:
-        raise ReadError(f"{path}: no channels were asked for: name inputs and outputs.")
+        raise ReadError(
+            f"{path}: no channels are named. Name them (inputs=, outputs=; --input, --output)."
+        )
     try:
         timebases = Timebases(signals, time, time_unit)
         return [timebases.channel(name) for name in names]
@@ -164,8 +194,8 @@ def _shared_grid(
     time = channels[0].time
     if not all(np.array_equal(time, channel.time) for channel in channels):
         return None
-    kept = window(time, start, stop)
-    return kept if departure(time[kept]) <= JITTER else None
+    span = window(time, start, stop)
+    return span if nonuniformity(time[span]) <= JITTER else None
 
 
 def _blend(

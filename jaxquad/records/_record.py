@@ -11,12 +11,23 @@ from ._names import as_names, as_units, check_distinct, Names, unknown_name
 
 
 class Record(eqx.Module):
-    """Uniformly sampled inputs, outputs and outside references of one run.
+    """Uniformly sampled inputs, outputs and references of one run.
 
-    Time is in s, the channels in the units given beside them. `references` are signals that
-    nothing in the loop feeds back to, such as an injected sweep; a record may have none.
+    **Arguments:**
 
-    Raises RecordError, and warns with RecordWarning of a channel that never moves.
+    - `time`: time stamps in s, uniform within 2 % of a sample; at least 16.
+    - `inputs`, `outputs`: shape `(samples, channels)`, or `(samples,)` for a single channel.
+    - `references`: likewise; external signals that no feedback changes, such as an injected sweep.
+        A record may have none.
+    - `input_names`, `output_names`, `reference_names`: by default `u`, `y`, `r`, with numbers from
+        1 where there are several.
+    - `input_units`, `output_units`, `reference_units`: empty where unknown.
+    - `source`: where the data come from, such as a path.
+
+    **Raises:**
+
+    - `RecordError`: for arrays of unequal length, NaN, time stamps that are not uniform, and names
+        that occur twice. A channel that never changes gives a `RecordWarning`.
     """
 
     time: Float[np.ndarray, " samples"]  # s
@@ -63,7 +74,7 @@ class Record(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All channels: inputs, outputs, references."""
+        """Names of all channels: inputs, outputs, references."""
         return self.input_names + self.output_names + self.reference_names
 
     @property
@@ -72,7 +83,7 @@ class Record(eqx.Module):
 
     @property
     def duration(self) -> float:
-        """From the first to the last sample, in s."""
+        """Time from the first to the last sample, in s."""
         return float(self.time[-1] - self.time[0])
 
     @property
@@ -82,7 +93,7 @@ class Record(eqx.Module):
 
     @property
     def sample_rate(self) -> float:
-        """In Hz."""
+        """Samples per second, in Hz."""
         return (self.samples - 1) / self.duration
 
     def channel(self, name: str) -> Float[np.ndarray, " samples"]:
@@ -121,7 +132,7 @@ def _position(record: Record, name: str) -> int:
 def _stamps(time: ArrayLike) -> Float[np.ndarray, " samples"]:
     stamps = _float64("time", time)
     if stamps.ndim != 1:
-        raise RecordError(f"time has shape {stamps.shape}: it is one value per sample.")
+        raise RecordError(f"time has shape {stamps.shape}: give one value for each sample.")
     if stamps.size < FEWEST:
         raise RecordError(f"{stamps.size} samples: a record needs at least {FEWEST}.")
     check_increasing("time", stamps)
@@ -133,12 +144,12 @@ def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samp
     array = _float64(role, values)
     array = array[:, None] if array.ndim == 1 else array
     if array.ndim != 2:
-        raise RecordError(f"{role} has shape {array.shape}: it is (samples, channels).")
+        raise RecordError(f"{role} has shape {array.shape}: it must be (samples, channels).")
     if array.shape[0] != rows:
-        hint = "transpose it" if array.shape[1] == rows else "cut or resample one of them"
+        hint = "Transpose it." if array.shape[1] == rows else "Cut or resample one of the two."
         raise RecordError(
-            f"{role} has {array.shape[0]} rows for {rows} time stamps: "
-            f"arrays are (samples, channels), so {hint}."
+            f"{role} has {array.shape[0]} rows for {rows} time stamps; the shape must be "
+            f"(samples, channels). {hint}"
         )
     if array.shape[1] == 0 and role != "references":
         raise RecordError(f"{role} has no channel: a record needs at least one input and output.")
@@ -147,7 +158,7 @@ def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samp
 
 def _float64(label: str, values: ArrayLike) -> np.ndarray:
     if np.iscomplexobj(values):
-        raise RecordError(f"{label} is complex: a record holds real samples.")
+        raise RecordError(f"{label} is complex: a record holds real numbers.")
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -161,13 +172,13 @@ def _check_channels(record: Record) -> None:
         if bad.size:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
-                f"{np.isinf(values).sum()} inf, first at t = {record.time[bad[0]]:.6g} s: "
-                f"cut them off (start=, stop=) or repair them first."
+                f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s. "
+                f"Choose a range without them (start=, stop=; --start, --stop), or repair them."
             )
         if np.ptp(values) == 0:
             warnings.warn(
                 f"channel {name!r} is constant at {values[0]:.6g}: nothing can be identified from "
-                f"it; check that it was excited and logged.",
+                f"it. Check that it was excited and logged.",
                 RecordWarning,
                 stacklevel=4,
             )

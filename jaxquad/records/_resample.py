@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ._channel import Channel, gaps, usable
+from ._channel import Channel, contiguous_part, gaps
 from ._clock import FEWEST
 from ._errors import RecordError, RecordWarning
 
@@ -29,11 +29,11 @@ def lowpass(
     sample_rate: float | int,
     fastest: float,
 ) -> Samples:
-    """`curve` at the instants `time` (s, at `sample_rate` in Hz), rid of what would alias.
+    """`curve` at the times `time` (s, at `sample_rate` in Hz), low-passed against aliasing.
 
-    The curve is known over `span` (s) and goes on beyond it by reflection about its end
-    points, which keeps a straight line straight. `fastest` (Hz) is the highest native rate: the
-    filter runs on a grid twice as fine as that, the same for all channels.
+    The curve is known over `span` (s) and is continued by reflection about its end points, which
+    keeps a straight line straight. `fastest` (Hz) is the highest native rate: the filter runs on a
+    grid twice as fine, the same for all channels.
     """
     fold = int(np.ceil(2 * fastest / sample_rate))
     taps = _taps(fold)
@@ -68,23 +68,36 @@ def resample(
     stop: float | int | None = None,
     max_gap: float | int | None = None,
 ) -> tuple[Samples, Float[np.ndarray, "samples channels"]]:
-    """Bring channels with time bases of their own to one uniform grid at `sample_rate` (Hz).
-
-    The grid begins at `start` (s) and ends at or before `stop` (s), by default where all
-    channels overlap. Returns its time in s and the values.
+    """Resample channels with different time stamps to one uniform grid.
 
     Where a channel is faster than the grid, every channel passes the same linear-phase filter,
-    whose delay is taken off: what is above half the `sample_rate` is down by 70 dB, what is
-    below 0.3 of it is untouched, and so is the phase between channels. Between samples runs a
-    spline of degree 7: to a quarter of a channel's own rate a cubic would be off by 2 %.
+    whose delay is compensated: frequencies above half the `sample_rate` are attenuated by 70 dB,
+    those below 0.3 of it are unchanged, and so is the phase between channels. It is designed with a
+    Kaiser window (Oppenheim and Schafer, "Discrete-Time Signal Processing", 3rd ed., section 7.5).
+    Between samples a spline of degree 7 interpolates: at a quarter of a channel's own rate a cubic
+    would be off by 2 %.
 
-    Gaps up to `max_gap` (s; by default 10 nominal samples or 0.05 s, the longer) are bridged
-    with a RecordWarning; a longer one raises RecordError.
+    **Arguments:**
+
+    - `channels`: the `Channel`s.
+    - `sample_rate`: of the grid, in Hz.
+    - `start`: where the grid begins, in s; by default where all channels overlap.
+    - `stop`: in s; the grid ends at or before it. By default where the channels cease to overlap.
+    - `max_gap`: the longest gap that is interpolated, in s; by default 10 nominal samples or
+        0.05 s, whichever is longer.
+
+    **Returns:** the time of the grid in s, and the values, shape `(samples, channels)`. Gaps that
+    were interpolated, and channels slower than the grid, give a `RecordWarning`.
+
+    **Raises:**
+
+    - `RecordError`: for a longer gap or a value that is not finite within the range, and where the
+        channels do not overlap.
     """
     begin, end = _extent(channels, start, stop)
     time = _grid(begin, end, sample_rate)
     margin = half_width(sample_rate) + 20 / min(channel.rate for channel in channels)
-    pieces = [usable(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
+    pieces = [contiguous_part(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
     _warn_of_gaps(pieces, begin, end)
     _warn_of_slow(channels, sample_rate)
     fastest = max(channel.rate for channel in channels)
@@ -103,7 +116,7 @@ def _extent(
     channels: Sequence[Channel], start: float | int | None, stop: float | int | None
 ) -> tuple[float, float]:
     if not channels:
-        raise RecordError("no channels to resample: name at least one.")
+        raise RecordError("there are no channels to resample: give at least one.")
     latest = max(channels, key=lambda channel: channel.time[0])
     earliest = min(channels, key=lambda channel: channel.time[-1])
     first, last = float(latest.time[0]), float(earliest.time[-1])
@@ -114,23 +127,24 @@ def _extent(
         f"to {last:.6g} s ({earliest.name!r} ends)"
     )
     if not first < last:
-        raise RecordError(f"no common time: {overlap}.")
+        raise RecordError(f"the channels have no common time: {overlap}.")
     if not begin < end:
-        raise RecordError(f"start {begin:.6g} s is not before stop {end:.6g} s: {overlap}.")
+        raise RecordError(f"start {begin:.6g} s is not before stop {end:.6g} s; {overlap}.")
     slack = 1e-9 * (1 + abs(last))
     if begin < first - slack or end > last + slack:
-        raise RecordError(f"{begin:.6g} .. {end:.6g} s is out of range: {overlap}.")
+        raise RecordError(f"{begin:.6g} .. {end:.6g} s is out of range; {overlap}.")
     return max(begin, first), min(end, last)
 
 
 def _grid(begin: float, end: float, sample_rate: float | int) -> Samples:
     if not (np.isfinite(sample_rate) and sample_rate > 0):
-        raise RecordError(f"sample_rate {sample_rate} Hz: it has to be positive.")
+        raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
     steps = (end - begin) * sample_rate
     if not FEWEST - 1 <= steps + 1e-6 < _MOST:
         raise RecordError(
-            f"sample_rate {sample_rate:.6g} Hz over {begin:.6g} .. {end:.6g} s makes "
-            f"{steps + 1:.6g} samples, not {FEWEST} .. {_MOST}: choose another rate or range."
+            f"a sample rate of {sample_rate:.6g} Hz over {begin:.6g} .. {end:.6g} s makes "
+            f"{steps + 1:.6g} samples; {FEWEST} .. {_MOST} are allowed. Choose another rate or "
+            f"range."
         )
     return begin + np.arange(int(steps + 1e-6) + 1) / sample_rate
 
@@ -143,7 +157,7 @@ def _curve(piece: Channel) -> Curve:
 
 
 def _bridged(piece: Channel) -> tuple[Samples, Samples]:
-    """Fills gaps by a cubic, because a spline of degree 7 swings where knots are far apart."""
+    """Gaps filled by a cubic, because a spline of degree 7 oscillates where knots are far apart."""
     from scipy.interpolate import CubicSpline
 
     holes = gaps(piece, -np.inf, np.inf)
@@ -168,7 +182,7 @@ def _warn_of_gaps(pieces: Sequence[Channel], begin: float, end: float) -> None:
             texts.append(f"{piece.name!r} {holes.size}, {longest}")
     if texts:
         warnings.warn(
-            f"gaps bridged by interpolation: {'; '.join(texts)}.", RecordWarning, stacklevel=3
+            f"gaps filled by interpolation: {'; '.join(texts)}.", RecordWarning, stacklevel=3
         )
 
 
@@ -177,8 +191,8 @@ def _warn_of_slow(channels: Sequence[Channel], sample_rate: float | int) -> None
     if slow:
         listed = ", ".join(f"{c.name!r} {c.rate:.6g} Hz" for c in slow)
         warnings.warn(
-            f"resampled to {sample_rate:.6g} Hz, faster than {listed}: above half of its own rate "
-            f"such a channel holds nothing; keep the analysis below it.",
+            f"resampled to {sample_rate:.6g} Hz, faster than {listed}: such a channel holds no "
+            f"information above half its own rate. Keep the frequency band below that.",
             RecordWarning,
             stacklevel=3,
         )

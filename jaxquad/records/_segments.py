@@ -1,10 +1,11 @@
-"""Records of a file, one for each segment, from mixes that may hold powers of channels."""
+"""Records of the segments of a file, from weighted sums of channels and of their powers."""
 
+import functools as ft
 import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -12,19 +13,28 @@ from jaxtyping import Float
 from ._errors import RecordError
 from ._read import read
 from ._record import Record
+from ._timebase import TimeUnit
 
 
 Mix = dict[str, dict[str, float]]  # name -> channel, or its power `m1^2`, -> weight
 
-_NAME = r"(?![\d.])(?:\[[^\]]*\]|[^\s+*\[\]^-])+"  # a channel; within brackets anything goes
+_NAME = r"(?![\d.])(?:\[[^\]]*\]|[^\s+*\[\]^-])+"  # a channel; brackets may hold anything
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _TERM = re.compile(rf"\s*([+-]?)\s*(?:({_NUMBER})\s*\*\s*)?({_NAME})\s*(\^\s*[2-9](?![\d.]))?\s*")
 
 
 def parse_mix(text: str) -> Mix:
-    """`M`, or a sum of weighted channels and of their powers: name -> channel -> weight.
+    """Parse the name of a channel, or a weighted sum of channels and of their powers.
 
-    `roll=-m1-m2+0.5*m[4]`, `thrust=0.02*m1+0.1*m1^2`. Raises ValueError for what is neither.
+    **Arguments:**
+
+    - `text`: `M`, `roll=-m1-m2+0.5*m[4]` or `thrust=0.02*m1+0.1*m1^2`.
+
+    **Returns:** name -> channel -> weight, as `read_segments` takes it.
+
+    **Raises:**
+
+    - `ValueError`: for anything else.
     """
     name, sign, terms = (part.strip() for part in text.partition("="))
     weights: dict[str, float] = {} if sign or not name else {name: 1.0}
@@ -40,12 +50,12 @@ def parse_mix(text: str) -> Mix:
         weights[channel] = weights.get(channel, 0.0) + weight
         place = term.end()
     if not name or not weights:
-        raise ValueError(f"{text!r} names no channel; write NAME=-a+b+0.5*c")
+        raise ValueError(f"{text!r} names no channel; write CHANNEL, or NAME=-a+b+0.5*c")
     return {name: weights}
 
 
 def power_of(term: str) -> tuple[str, int]:
-    """The channel and the power of a term of a mix: `m1^2` is `m1` and 2."""
+    """The channel and the power in a term of a sum: `m1^2` is `m1` and 2."""
     channel, sign, power = term.rpartition("^")
     return (channel, int(power)) if sign and channel and power in set("23456789") else (term, 1)
 
@@ -53,6 +63,14 @@ def power_of(term: str) -> tuple[str, int]:
 Number = float | int
 Segment = tuple[Number | None, Number | None]  # start and stop in the file's time, s
 Term = tuple[str, int, float]  # channel, power, weight
+
+
+class _Options(NamedTuple):
+    """What `read` is told of a file."""
+
+    time: str | None
+    time_unit: TimeUnit | None
+    units: Mapping[str, str]
 
 
 def read_segments(
@@ -64,17 +82,30 @@ def read_segments(
     references: Mix | None = None,
     sample_rate: Number | None = None,
     time: str | None = None,
-    time_unit: Any = None,
+    time_unit: TimeUnit | None = None,
     units: Mapping[str, str] | None = None,
 ) -> list[Record]:
-    """The segments of a file, at one sample rate; a remark on the file is made once.
+    """Read several segments of a file as records with one sample rate.
 
-    `references` and the rest are as `jq.read` takes them. Raises RecordError for segments that
-    overlap, are empty or leave the file's time, and what `jq.read` raises.
+    **Arguments:**
+
+    - `path`: the file.
+    - `segments`: pairs of start and stop in s of the file's own time.
+    - `inputs`, `outputs`, `references`: name -> channel or its power (`m1^2`) -> weight, as
+        `parse_mix` returns it.
+    - `sample_rate`: in Hz; by default that of the slowest segment.
+    - `time`, `time_unit`, `units`: as in `read`.
+
+    **Returns:** a `Record` for each segment. Each warning about the file is given once.
+
+    **Raises:**
+
+    - `RecordError`: for segments that overlap, are empty or leave the file's time.
+    - `ReadError`: as `read` raises it.
     """
     _check(segments)
     roles = (inputs, outputs, references or {})
-    options = {"time": time, "time_unit": time_unit, "units": units}
+    options = _Options(time, time_unit, units or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         records = [_mixed(path, roles, each, sample_rate, options) for each in segments]
@@ -92,13 +123,15 @@ def _check(segments: Sequence[Segment]) -> None:
         return
     for start, stop in segments:
         if start is None or stop is None or not start < stop:
-            raise RecordError(f"the segment {start} .. {stop} s does not rise: give START:STOP.")
+            raise RecordError(
+                f"the segment {start} .. {stop} s is empty: give START:STOP with START before STOP."
+            )
     ordered = sorted((start, stop) for start, stop in segments if start is not None)
     for (start, stop), (after, end) in zip(ordered, ordered[1:], strict=False):
         if stop is not None and after < stop:
             raise RecordError(
-                f"the segments {start:.6g} .. {stop:.6g} s and {after:.6g} .. {end:.6g} s overlap: "
-                f"what they share would count twice."
+                f"the segments {start:.6g} .. {stop:.6g} s and {after:.6g} .. {end:.6g} s overlap, "
+                f"so samples would count twice. Choose segments that do not overlap."
             )
 
 
@@ -107,24 +140,31 @@ def _mixed(
     roles: Sequence[Mix],
     segment: Segment,
     rate: Number | None,
-    options: Mapping[str, Any],
+    options: _Options,
 ) -> Record:
     """One segment. Powers are taken of the channels as they are read, after resampling."""
-    span: dict[str, Any] = {"sample_rate": rate, "start": segment[0], "stop": segment[1]}
+    select = ft.partial(
+        read,
+        path,
+        sample_rate=rate,
+        start=segment[0],
+        stop=segment[1],
+        time=options.time,
+        time_unit=options.time_unit,
+    )
     terms = [{name: _terms(name, mix) for name, mix in role.items()} for role in roles]
     each = [term for role in terms for terms_of in role.values() for term in terms_of]
     if all(power == 1 for _, power, _ in each):
-        named = dict(zip(("inputs", "outputs", "references"), roles, strict=True))
-        return read(path, **named, **span, **options)
+        inputs, outputs, references = roles
+        return select(inputs=inputs, outputs=outputs, references=references, units=options.units)
     names = {channel: {channel: 1.0} for channel, _, _ in each}
     any_output = {"any output": dict.fromkeys(list(names)[:1], 1.0)}  # A record needs one.
-    clock = {name: options[name] for name in ("time", "time_unit")}
-    raw = read(path, inputs=names, outputs=any_output, **span, **clock)
-    return _assembled(raw, terms, options["units"] or {})
+    raw = select(inputs=names, outputs=any_output)
+    return _assembled(raw, terms, options.units)
 
 
 def _terms(name: str, mix: Mapping[str, float]) -> list[Term]:
-    """A channel by itself may have any name, one that looks like a power too."""
+    """A single channel may have any name, even one that looks like a power."""
     if mix == {name: 1.0}:
         return [(name, 1, 1.0)]
     return [(*power_of(term), weight) for term, weight in mix.items()]
@@ -135,7 +175,9 @@ def _assembled(
 ) -> Record:
     units = {name: _unit(raw, each) for role in terms for name, each in role.items()}
     if unknown := set(given) - set(units):
-        raise RecordError(f"a unit for {unknown.pop()!r}: the channels are {', '.join(units)}.")
+        raise RecordError(
+            f"a unit is given for {unknown.pop()!r}, but the channels are {', '.join(units)}."
+        )
     units |= given
     columns = [
         np.stack([_sum(raw, each) for each in role.values()], axis=1)
@@ -158,7 +200,7 @@ def _assembled(
 
 
 def _unit(raw: Record, terms: Sequence[Term]) -> str:
-    """That of a plain sum, where its channels agree."""
+    """The unit of a sum without powers whose channels agree."""
     found = {raw.unit(channel) if power == 1 else "" for channel, power, _ in terms}
     return found.pop() if len(found) == 1 else ""
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._channel import Channel
-from ._clock import Mended, mended, unwrapped
+from ._clock import repair, RepairedTime, unwrap
 from ._errors import ReadError, RecordWarning
 from ._log import Signal, Signals
 from ._names import listed, unknown_name
@@ -34,21 +34,21 @@ def _columns_of(name: str, signal: Signal) -> dict[str, tuple[str, int | None]]:
 
 
 class Timebases:
-    """The clocks of a log, each put in order once."""
+    """The time bases of a log, each repaired once."""
 
     def __init__(self, signals: Signals, time: str | None, time_unit: TimeUnit | None):
         if time_unit is not None and time_unit not in _PER_SECOND:
-            raise ReadError(f"time_unit {time_unit!r}: it is one of {', '.join(_PER_SECOND)}.")
+            raise ReadError(f"time_unit is {time_unit!r}: use one of {', '.join(_PER_SECOND)}.")
         self._signals, self._time = signals, time
         self._unit: TimeUnit | None = time_unit
         self._names = signal_names(signals, time)
-        self._mended: dict[str, Mended] = {}
+        self._repaired: dict[str, RepairedTime] = {}
 
     def channel(self, name: str) -> Channel:
-        """The named channel with its time base, in s.
+        """The named channel with its time stamps, in s.
 
         Raises ReadError for an unknown channel and for one without a time base of its length,
-        and warns with RecordWarning of stamps that had to be mended.
+        and warns with RecordWarning of time stamps that had to be repaired.
         """
         values, array = self.values(name), self._names[name][0]
         base = self._base(array)
@@ -56,14 +56,15 @@ class Timebases:
         whole = stamps.time.size if stamps.kept is None else stamps.kept.size
         if whole != len(values):
             raise ReadError(
-                f"channel {name!r} has {len(values)} samples, its time base {base!r} "
-                f"{whole}: name another with time=, or save its own as {'t_' + array!r}."
+                f"channel {name!r} has {len(values)} samples, but its time base {base!r} has "
+                f"{whole}. Name another time base (time=, --time), or save the channel's own as "
+                f"{'t_' + array!r}."
             )
         kept = values if stamps.kept is None else values[stamps.kept]
         return Channel(name, stamps.time, kept, self._signals.arrays[array].unit)
 
     def values(self, name: str) -> np.ndarray:
-        """What the file holds of a channel, in its unit, whatever its time."""
+        """The values of a channel in its unit, without its time stamps."""
         if name not in self._names:
             raise ReadError(unknown_name(name, self._names))
         array, column = self._names[name]
@@ -77,27 +78,27 @@ class Timebases:
         if known and self._time is None:
             if self._unit not in (None, "s"):
                 raise ReadError(
-                    f"time_unit {self._unit!r}: the time of {array!r} is known and in s: leave "
-                    f"time_unit out, or name another time base with time=."
+                    f"time_unit is {self._unit!r}, but the log gives the time of {array!r} in s: "
+                    f"leave the unit out, or name another time base (time=, --time)."
                 )
             return known
         return time_array(self._signals, array, self._time)
 
-    def _stamps(self, base: str) -> Mended:
-        if base not in self._mended:
+    def _stamps(self, base: str) -> RepairedTime:
+        if base not in self._repaired:
             clock = self._signals.clocks.get(base)
             stamps, wraps = (clock, 0) if clock is not None else self._counted(base)
-            self._mended[base] = mended(stamps)
-            remark = self._mended[base].remark
+            self._repaired[base] = repair(stamps)
+            remark = self._repaired[base].remark
             times = "once" if wraps == 1 else f"{wraps} times"
-            turned = f"the counter wraps {times}, which was undone" if wraps else ""
-            for text in filter(None, (turned, remark)):
+            overflow = f"the counter overflowed {times}; this was undone" if wraps else ""
+            for text in filter(None, (overflow, remark)):
                 warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
-        return self._mended[base]
+        return self._repaired[base]
 
     def _counted(self, base: str) -> tuple[Float[np.ndarray, " samples"], int]:
         array, column = _all_names(self._signals)[base]
-        counter, wraps = unwrapped(column_values(self._signals.arrays[array], column, raw=True))
+        counter, wraps = unwrap(column_values(self._signals.arrays[array], column, raw=True))
         return _seconds(base, counter, self._unit), wraps
 
 
@@ -110,24 +111,26 @@ def column_values(signal: Signal, column: int | None, *, raw: bool = False) -> n
 def time_array(signals: Signals, array: str, time: str | None) -> str:
     """The name of the time stamps that belong to `array`.
 
-    Its own, `t_<array>`, comes first; then the one asked for; then the first of t, time,
-    time_s, timestamp, ... beside it (in the same struct) or in the file.
+    The first that exists of: its own, `t_<array>`; the one named `time`; t, time, time_s,
+    timestamp, ... in the same struct; and the same in the whole file.
     """
     struct, dot, field = array.rpartition(".")
     if time is not None and time not in signals.arrays and time not in _all_names(signals):
-        raise ReadError(f"time={time!r}: {unknown_name(time, signals.arrays)}")
+        raise ReadError(f"time base {time!r}: {unknown_name(time, signals.arrays)}")
     own = f"{struct}{dot}t_{field}"
     asked = [] if time is None else [time]
     shared = asked or [f"{struct}{dot}{name}" for name in _SHARED] + list(_SHARED)
     found = [name for name in (own, *shared) if name in signals.arrays or name == time]
     if not found:
         raise ReadError(
-            f"no time base for {array!r}: none of {own}, {', '.join(_SHARED)} is among "
-            f"{listed(signals.arrays)}: say which it is with time=."
+            f"no time base for {array!r}: none of {own}, {', '.join(_SHARED)} is among the arrays "
+            f"{listed(signals.arrays)}. Name the array with the time stamps (time=, --time)."
         )
     matrix = signals.arrays.get(found[0])
     if matrix is not None and matrix.values.ndim != 1:
-        raise ReadError(f"the time base {found[0]!r} has shape {matrix.values.shape}, not 1-D.")
+        raise ReadError(
+            f"the time base {found[0]!r} has shape {matrix.values.shape}: it must be one column."
+        )
     return found[0]
 
 
@@ -147,7 +150,8 @@ def _seconds(name: str, stamps: np.ndarray, unit: TimeUnit | None) -> Float[np.n
     seconds = stamps.astype(np.float64) / _PER_SECOND[unit or "s"]
     if unit is None and stamps.size > 1 and np.median(np.abs(np.diff(seconds))) >= 1:
         raise ReadError(
-            f"the time base {name!r} steps by {np.median(np.diff(seconds)):.6g}, too much for "
-            f"seconds: say time_unit='ms', 'us' or 'ns', or 's' if it is really that slow."
+            f"the time base {name!r} steps by {np.median(np.diff(seconds)):.6g}, which is probably "
+            f"not in seconds. Give its unit (time_unit=, --time-unit): ms, us or ns, or s if the "
+            f"log really is that slow."
         )
     return seconds

@@ -2,13 +2,10 @@ import blackbox_writer as writer
 import numpy as np
 import pytest
 from blackbox_rows import clock, decoded, log, rows, table
+from log_writers import decode
 
-from jaxquad.records import channels, read, ReadError
-from jaxquad.records._log import Table
-from jaxquad.records.formats._betaflight import decode, load
-from jaxquad.records.formats._betaflight_frames import block, fields, SLACK
-from jaxquad.records.formats._betaflight_header import Frame, Group
-from jaxquad.records.proposals._betaflight import Chirp, chirps
+from jaxquad.records import channels, propose, read, ReadError
+from jaxquad.records.formats import load_log
 
 
 AR8 = "betaflight_ar8/LOG00037"
@@ -18,7 +15,7 @@ LARGEST = {0: 2**31 - 1, 3: 8191, 6: 2**31 - 1, 7: 2**31 - 1, 8: 32767, 10: 2**3
 @pytest.mark.parametrize("largest", [40, 3000, 2**20])
 def test_what_was_written_is_read_back_whatever_the_size_of_the_steps(largest):
     written = rows(200, largest=largest)
-    result = decode(log(written))
+    result = decode("betaflight", log(written))
     np.testing.assert_array_equal(decoded(result.tables[""]), table(written))
     assert result.remarks == () and result.vehicle == "betaflight"
 
@@ -32,14 +29,21 @@ def test_every_encoding_gives_back_numbers_of_every_width(encoding):
     numbers = (sizes * random.choice([-1, 0, 1], (400, count))).astype(np.int64)
     numbers[:3] = np.array([[top], [-top], [-top - (encoding not in (1, 3))]])
     numbers = np.abs(numbers) if encoding == 1 else numbers
-    coded = [b"P" + writer.ENCODERS[encoding](row.tolist()) for row in numbers]
-    starts = np.cumsum([0] + [len(each) for each in coded])
-    raw = np.frombuffer(b"".join(coded) + bytes(SLACK), np.uint8)
-    names = tuple(map(str, range(count)))
-    frame = Frame("P", names, np.ones(count, bool), np.zeros(count), (Group(encoding, 0, count),))
-    values, ends = fields(block(raw), frame, starts[:-1])
+    # Key frames only, with so many fields after iteration and time.
+    names = ["loopIteration", "time", *(f"x{i}" for i in range(count))]
+    zeros = ",".join("0" * len(names))
+    lines = {"Field I name": ",".join(names), "Field I signed": ",".join("00" + "1" * count)}
+    lines |= dict.fromkeys(("Field I predictor", "Field P predictor", "Field P encoding"), zeros)
+    lines["Field I encoding"] = ",".join(["1", "1", *[str(encoding)] * count])
+    frames = [
+        b"I" + writer.unsigned(32 * k) + writer.unsigned(4000 * k)
+        + writer.ENCODERS[encoding](row.tolist())
+        for k, row in enumerate(numbers)
+    ]  # fmt: skip
+    header = writer.header(logged="0", changed=lines)
+    main = decode("betaflight", header + b"".join(frames) + writer.END).tables[""]
+    values = np.stack([main.columns[name] for name in names[2:]], axis=1)
     np.testing.assert_array_equal(values, numbers)
-    np.testing.assert_array_equal(ends, starts[1:])
 
 
 def test_the_writer_agrees_with_the_examples_of_the_documentation():
@@ -58,14 +62,14 @@ def test_iterations_follow_the_logging_rate_of_the_header(logged, numerator, den
     every = range(32 * 8)
     chosen = [i for i in every if i % 32 == 0 or (i % 32 + numerator - 1) % denominator < numerator]
     written = rows(0, iterations=chosen)
-    result = decode(log(written, logged=logged))
+    result = decode("betaflight", log(written, logged=logged))
     np.testing.assert_array_equal(decoded(result.tables[""]), table(written))
     assert result.remarks == ()
 
 
 def test_time_goes_on_where_the_counter_of_32_bits_overflows():
     written = rows(200, start=2**32 - 12_345)
-    main = decode(log(written)).tables[""]
+    main = decode("betaflight", log(written)).tables[""]
     np.testing.assert_array_equal(decoded(main), table(written))
     assert (np.diff(clock(main)) > 0).all() and clock(main)[-1] > 2**32 / 1e6
 
@@ -73,7 +77,7 @@ def test_time_goes_on_where_the_counter_of_32_bits_overflows():
 def test_logs_in_one_file_become_tables_of_their_own():
     first, second = rows(64), rows(96, seed=1)
     broken = writer.header(interval=0) + b"Psome bytes"
-    result = decode(b"noise" + log(first) + b"more noise" + broken + log(second))
+    result = decode("betaflight", b"noise" + log(first) + b"more noise" + broken + log(second))
     np.testing.assert_array_equal(decoded(result.tables["log1"]), table(first))
     np.testing.assert_array_equal(decoded(result.tables["log3"]), table(second))
     assert len(result.tables) == 2 and len(result.remarks) == 1
@@ -98,7 +102,7 @@ def test_slow_and_gps_frames_are_stamped_and_refer_to_home():
     home = b"H" + writer.signed(500_000_000) + writer.signed(-70_000_000)
     slow = b"S" + writer.unsigned(3) + writer.unsigned(9)
     payload = [slow, *frames[:9], position, home, slow, *frames[9:20], position, *frames[20:]]
-    tables = decode(writer.header(extra=extra) + b"".join(payload)).tables
+    tables = decode("betaflight", writer.header(extra=extra) + b"".join(payload)).tables
     np.testing.assert_array_equal(decoded(tables[""]), table(written))
     assert tables["slow"].columns["flightModeFlags"].tolist() == [3, 3]
     assert clock(tables["slow"]).tolist() == [written[i]["time"] / 1e6 for i in (0, 8)]
@@ -115,7 +119,8 @@ def test_events_between_frames_are_understood_and_the_log_ends_at_its_end():
     scaled = b"E\x0d\x85\0\0\x80?"
     mode = b"E\x1e" + writer.unsigned(3) + writer.unsigned(1)
     payload = [beep, *frames[:7], adjustment, *frames[7:40], scaled, mode, *frames[40:]]
-    result = decode(writer.header() + b"".join(payload) + writer.END + b"IIIPPP\xff" * 9)
+    after = writer.END + b"IIIPPP\xff" * 9
+    result = decode("betaflight", writer.header() + b"".join(payload) + after)
     np.testing.assert_array_equal(decoded(result.tables[""]), table(written))
     assert len(result.remarks) == 1 and "2 settings changed in flight" in result.remarks[0]
 
@@ -124,14 +129,14 @@ def test_frames_between_a_pause_and_its_resumption_are_believed():
     before, after = rows(43), rows(0, iterations=range(320, 400), seed=1)
     resume = b"E\x0e" + writer.unsigned(320) + writer.unsigned(after[0]["time"])
     frames = [*writer.frames(before), resume, *writer.frames(after)]
-    main = decode(writer.header() + b"".join(frames)).tables[""]
+    main = decode("betaflight", writer.header() + b"".join(frames)).tables[""]
     np.testing.assert_array_equal(decoded(main), table([*before, *after]))
 
 
 def test_units_follow_the_header_and_axis_sums_are_added():
     written = rows(40)
     changed = {"gyro_scale": "0x3d79c190", "blackbox_high_resolution": "1"}
-    main = decode(log(written, changed=changed)).tables[""]
+    main = decode("betaflight", log(written, changed=changed)).tables[""]
     scale = 0.1 * np.frombuffer(bytes.fromhex("3d79c190"), ">f4")[0]
     assert main.scales["gyroADC[1]"] == pytest.approx(scale) and main.units["gyroADC[1]"] == "deg/s"
     assert main.scales["setpoint[0]"] == 0.1 and main.units["setpoint[0]"] == "deg/s"
@@ -140,7 +145,7 @@ def test_units_follow_the_header_and_axis_sums_are_added():
 
 
 def test_the_real_log_equals_its_decoded_copy(data):
-    main = load(data / f"{AR8}.BFL").tables[""]
+    main = load_log(data / f"{AR8}.BFL").tables[""]
     copy = np.load(data / f"{AR8}.npz")
     np.testing.assert_allclose(clock(main), copy["t"], rtol=1e-15)  # 1e-6 times, not 1e6 divided
     groups = {"gyroADC": "gyro_dps", "setpoint": "setpoint_dps", "axisSum": "pid_sum"}
@@ -157,7 +162,7 @@ def test_the_real_log_is_listed_and_read_by_its_channels(data):
     assert rate == pytest.approx(985, abs=1) and record.unit("gyroADC[0]") == "deg/s"
 
 
-def test_a_chirp_shows_in_the_debug_channels_of_its_mode():
+def test_a_chirp_shows_in_the_debug_channels_of_its_mode(tmp_path):
     time = np.arange(4000) / 1000
     active = (time >= 1) & (time < 3)
     debug = [
@@ -165,14 +170,24 @@ def test_a_chirp_shows_in_the_debug_channels_of_its_mode():
         np.where(active, 10 * (1 + 20 * (time - 1)), 0).astype(int),
         np.where(active, 1000 * np.sin(50 * time**2), 0),
     ]  # fmt: skip
-    columns = {f"debug[{i}]": column for i, column in enumerate(debug)}
-    assert chirps(Table(columns, time)) == [Chirp(1, 1.0, 2.999, 1.0, 40.9)]
-    assert chirps(Table({**columns, "debug[1]": 7 * active}, time)) == []
-    assert chirps(Table({**columns, "debug[2]": 10 + 5 * np.sin(time)}, time)) == []
+
+    def said(**changed):
+        columns = {f"debug[{i}]": column for i, column in enumerate(debug)} | changed
+        columns |= {"axisP[1]": 10 * np.sin(20 * time), "gyroADC[1]": np.sin(20 * time)}
+        names = ["loopIteration", "time (us)", *columns]
+        table = np.column_stack([np.arange(4000), np.round(1e6 * time), *columns.values()])
+        path = tmp_path / "log.csv"
+        np.savetxt(path, table, delimiter=",", header=", ".join(names), comments="", fmt="%.9g")
+        setup = propose(path, axis="pitch").setup
+        return setup.start, setup.stop, setup.band
+
+    assert said() == (1.0, 2.999, (1.0, 40.9))
+    assert said(**{"debug[1]": 7 * active}) == (None, None, None)
+    assert said(**{"debug[2]": 10 + 5 * np.sin(time)}) == (None, None, None)
 
 
 def test_a_file_without_a_log_says_so(tmp_path):
     path = tmp_path / "empty.bbl"
     path.write_bytes(b"no log in here")
-    with pytest.raises(ReadError, match="empty.bbl: there is no blackbox log"):
+    with pytest.raises(ReadError, match="empty.bbl: the file holds no blackbox log"):
         channels(path)

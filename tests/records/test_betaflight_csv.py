@@ -4,9 +4,10 @@ from blackbox_rows import clock
 from hypothesis import given, settings, strategies as st
 
 from jaxquad.records import channels, read, ReadError
-from jaxquad.records.formats._betaflight_csv import load
+from jaxquad.records.formats import READERS
 
 
+load = READERS["betaflight_csv"].load
 HEADER = "loopIteration, time (us), axisP[0], axisI[0], gyroADC[0] (deg/s), flightModeFlags (flags)"
 GYRO = [k % 17 - 8 for k in range(100)]
 LINES = [f"{8 * k}, {5_000_000 + 1000 * k}, {k}, {-2 * k}, {g}, 0" for k, g in enumerate(GYRO)]
@@ -49,7 +50,7 @@ def test_rows_cut_off_have_nan_and_rows_without_a_time_are_left_out(tmp_path):
     assert clock(table).size == 98
     assert np.isnan(table.columns["gyroADC[0]"]).sum() == 1
     np.testing.assert_array_equal(table.columns["axisP[0]"][[49, 50, 51]], [49, 50, 53])
-    assert result.remarks == ("2 lines have no time and were left out, first line 53",)
+    assert result.remarks == ("2 lines without a time were left out, first line 53",)
 
 
 def test_the_table_of_blackbox_explorer_brings_its_settings(tmp_path):
@@ -69,7 +70,7 @@ def test_read_takes_the_table_for_what_it_is(tmp_path):
 @pytest.mark.parametrize(
     ("header", "reason"),
     [
-        ("loopIteration, axisP[0]", "'time' among them"),
+        ("loopIteration, axisP[0]", "one must be 'time'"),
         ("loopIteration, time (us), axisP[0], axisP[0]", "none twice"),
         ("loopIteration, time (parsec), x, y, z", "'parsec'"),
         ("loopIteration, time" + ", x" * 3000, "3002 names"),

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from blackbox_rows import decoded, log, rows, table
 from hypothesis import given, settings, strategies as st
+from log_writers import decode
 
 from jaxquad.records import ReadError
-from jaxquad.records.formats._betaflight import decode
 
 
 ROWS = rows(320)
@@ -19,7 +19,7 @@ FUZZ = settings(max_examples=500, deadline=None, derandomize=True, database=None
 
 def true_rows(data):
     """How many rows come out, after a check that each is one that was written."""
-    result = decode(data)
+    result = decode("betaflight", data)
     found = decoded(result.tables[""])
     written = dict(zip(TRUTH[:, 1].tolist(), TRUTH, strict=True))
     for row in found:
@@ -29,7 +29,7 @@ def true_rows(data):
 
 def only_read_errors(data):
     try:
-        result = decode(data)
+        result = decode("betaflight", data)
     except ReadError as error:
         assert error.offset is None or 0 <= error.offset <= len(data)
         return
@@ -83,10 +83,10 @@ def test_a_key_frame_with_a_damaged_time_is_left_out_with_its_frames():
 
 def test_frames_at_other_intervals_than_the_header_says_are_kept_and_doubted():
     every_second = rows(0, iterations=range(0, 320, 2))
-    result = decode(log(every_second, logged="1/1"))
+    result = decode("betaflight", log(every_second, logged="1/1"))
     found = decoded(result.tables[""])
     np.testing.assert_array_equal(found[:, 1:], table(every_second)[:, 1:])
-    assert len(result.remarks) == 1 and "loopIteration is not to be trusted" in result.remarks[0]
+    assert len(result.remarks) == 1 and "loopIteration is not reliable" in result.remarks[0]
 
 
 BAD_HEADERS = {
@@ -113,22 +113,22 @@ BAD_HEADERS = {
 def test_a_header_that_makes_no_sense_is_refused_with_its_place(name, text):
     data = b"xyz" + writer.header(changed={name: text}) + BODY
     with pytest.raises(ReadError) as caught:
-        decode(data)
+        decode("betaflight", data)
     assert caught.value.offset == 3 and str(caught.value)
 
 
 def test_huge_declarations_are_refused_before_they_take_memory():
     names = ",".join(["loopIteration", "time", *(f"x{i}" for i in range(600))])
     with pytest.raises(ReadError, match="602 fields"):
-        decode(writer.header(changed={"Field I name": names}) + BODY)
+        decode("betaflight", writer.header(changed={"Field I name": names}) + BODY)
     with pytest.raises(ReadError, match="more than 1000 blackbox logs"):
-        decode(writer.MARKER.encode() * 1001)
+        decode("betaflight", writer.MARKER.encode() * 1001)
 
 
 def test_a_header_alone_and_frames_without_a_key_hold_nothing():
     for payload in (b"", writer.END, b"".join(FRAMES[1:20]), bytes(5000), b"P" * 5000):
-        with pytest.raises(ReadError, match="no frame that can be read"):
-            decode(HEADER + payload)
+        with pytest.raises(ReadError, match="no readable frame"):
+            decode("betaflight", HEADER + payload)
 
 
 @FUZZ

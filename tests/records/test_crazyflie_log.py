@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from blackbox_rows import clock
 from hypothesis import given, settings, strategies as st
+from log_writers import decode
 
 from jaxquad.records import channels, read, ReadError
-from jaxquad.records.formats._crazyflie import decode, load
+from jaxquad.records.formats import load_log
 
 
 FIXED = (0xFFFF, "fixedFrequency", [("gyro.x", "f"), ("motor.m1", "H"), ("pm.state", "b")])
@@ -38,7 +39,7 @@ SIZE = (len(PLAIN) - HEAD - 4) // 60
 
 
 def test_events_of_one_type_are_read_back_bit_by_bit():
-    result = decode(PLAIN)
+    result = decode("crazyflie", PLAIN)
     table = result.tables[""]
     assert result.remarks == () and result.vehicle == "crazyflie" and list(result.tables) == [""]
     np.testing.assert_array_equal(table.time, np.arange(60) / 1e3)
@@ -50,7 +51,7 @@ def test_events_of_one_type_are_read_back_bit_by_bit():
 
 
 def test_events_of_several_types_come_apart_with_clocks_of_their_own():
-    tables = decode(MIXED).tables
+    tables = decode("crazyflie", MIXED).tables
     assert list(tables) == ["fixedFrequency", "estTDOA"]
     np.testing.assert_array_equal(tables["fixedFrequency"].columns["gyro.x"], np.arange(60) / 8)
     np.testing.assert_array_equal(tables["estTDOA"].time, 3700 * np.arange(15) / 1e6)
@@ -58,13 +59,13 @@ def test_events_of_several_types_come_apart_with_clocks_of_their_own():
 
 
 def test_version_1_counts_milliseconds():
-    table = decode(log([FIXED], EVENTS, version=1)).tables[""]
+    table = decode("crazyflie", log([FIXED], EVENTS, version=1)).tables[""]
     np.testing.assert_array_equal(table.time, np.arange(60.0))
 
 
 def test_a_log_cut_off_anywhere_gives_its_whole_events_and_says_so():
     for stop in range(HEAD + SIZE, len(PLAIN) - 4):
-        result = decode(PLAIN[:stop])
+        result = decode("crazyflie", PLAIN[:stop])
         count = (stop - HEAD) // SIZE
         np.testing.assert_array_equal(result.tables[""].columns["motor.m1"], 500 + np.arange(count))
         assert "checksum" in result.remarks[0]
@@ -73,7 +74,7 @@ def test_a_log_cut_off_anywhere_gives_its_whole_events_and_says_so():
 @pytest.mark.parametrize("lost", [1, 7, 30])
 def test_after_lost_bytes_reading_goes_on_with_the_next_events(lost):
     cut = HEAD + 20 * SIZE + 5
-    result = decode(PLAIN[:cut] + PLAIN[cut + lost :])
+    result = decode("crazyflie", PLAIN[:cut] + PLAIN[cut + lost :])
     table = result.tables[""]
     truth = np.array([*range(20), *range(20 + -(-(lost + 5) // SIZE), 60)])
     np.testing.assert_array_equal(table.columns["motor.m1"], 500 + truth)
@@ -89,8 +90,8 @@ def test_after_lost_bytes_reading_goes_on_with_the_next_events(lost):
         (b"\xbc\2\0\xff\xff" + PLAIN[5:], 3, "65535 types"),
         (b"\xbc\2\0\0\0" + PLAIN[5:], 3, "0 types"),
         (log([FIXED, FIXED], []), HEAD, "described twice"),
-        (log([(1, "a", [("x", "z")])], []), 11, "no new name with a type"),
-        (log([(1, "a", [("x", "f"), ("x", "f")])], []), 16, "no new name with a type"),
+        (log([(1, "a", [("x", "z")])], []), 11, "not a new name with a type"),
+        (log([(1, "a", [("x", "f"), ("x", "f")])], []), 16, "not a new name with a type"),
         (PLAIN[:7] + b"\0" + PLAIN[8:], 7, "a name in the description"),
         (PLAIN[:22] + b"\xff\xff" + PLAIN[24:], 22, "65535 variables"),
         (PLAIN[:15], 7, "a name in the description"),
@@ -99,7 +100,7 @@ def test_after_lost_bytes_reading_goes_on_with_the_next_events(lost):
 )
 def test_a_damaged_head_is_refused_with_its_place(data, offset, reason):
     with pytest.raises(ReadError, match=reason) as caught:
-        decode(data)
+        decode("crazyflie", data)
     assert caught.value.offset == offset
 
 
@@ -114,7 +115,7 @@ def test_damage_raises_nothing_but_read_errors(data, changes, cut):
     for place, byte in changes:
         data[int(place * len(data))] = byte
     try:
-        result = decode(bytes(data))
+        result = decode("crazyflie", bytes(data))
     except ReadError as error:
         assert error.offset is not None and 0 <= error.offset <= len(data)
         return
@@ -123,7 +124,7 @@ def test_damage_raises_nothing_but_read_errors(data, changes, cut):
 
 
 def test_the_real_log_equals_its_decoded_copy(data):
-    table = load(data / "crazyflie_rollpitch/log15").tables[""]
+    table = load_log(data / "crazyflie_rollpitch/log15").tables[""]
     copy = np.load(data / "crazyflie_rollpitch/log15.npz")
     np.testing.assert_allclose(clock(table), copy["t"], rtol=1e-15)  # 1e-6 times, not 1e6 divided
     names = {"acc_g": "acc.{}", "gyro_dps": "gyro.{}", "motor_u16": "motor.m{}"}

@@ -22,7 +22,7 @@ KINDS = (
 PACKAGES = {"hdf5": "h5py", "parquet": "pyarrow", "mcap": "rosbags", "db3": "rosbags"}
 OWN = tuple(kind for kind in KINDS if kind not in PACKAGES)
 CASES = {kind: 180 for kind in KINDS} | {kind: 6 for kind in PACKAGES}  # a process each
-NET = "not as it should be ("  # said where the library that reads a kind raised what it liked
+NET = "cannot be read as "  # where a library raised whatever it raises
 
 
 def outcome(path: Path) -> str:

@@ -64,7 +64,7 @@ def test_without_a_chirp_the_loops_set_point_is_no_reference(tmp_path):
     proposal = propose(ardupilot(tmp_path, 0, sidd=False), axis="pitch")
     assert proposal.options["references"] is None
     assert "RATE.PDes is computed by the attitude loop" in str(proposal)
-    assert "outside reference: none" in str(proposal) and "--reference" not in str(proposal)
+    assert "external reference: none" in str(proposal) and "--reference" not in str(proposal)
 
 
 @pytest.mark.parametrize(("state", "axis", "i"), [(2, "roll", 0), (4, "pitch", 1), (6, "yaw", 2)])
@@ -107,9 +107,9 @@ def test_betaflight_and_crazyflie_logs_get_what_their_readme_says(data):
 
 def test_files_of_no_known_vehicle_and_axes_that_are_none_are_refused(tmp_path):
     np.savez(tmp_path / "log.npz", t=TIME, u=WAVE)
-    with pytest.raises(RecordError, match="no log of a known autopilot"):
+    with pytest.raises(RecordError, match="not a log of a known autopilot"):
         propose(tmp_path / "log.npz")
-    with pytest.raises(RecordError, match="axis 'heave': it is one of roll, pitch, yaw"):
+    with pytest.raises(RecordError, match="axis is 'heave': use one of roll, pitch, yaw"):
         propose(tmp_path / "log.npz", axis="heave")
     with pytest.raises(ReadError, match="no such file"):
         propose(tmp_path / "none.bin")
@@ -117,5 +117,5 @@ def test_files_of_no_known_vehicle_and_axes_that_are_none_are_refused(tmp_path):
     log.define("ATT", "Qf", "TimeUS,Roll")
     log.write_rows("ATT", np.arange(50) * 10_000, np.arange(50.0))
     (tmp_path / "log.bin").write_bytes(log.content)
-    with pytest.raises(RecordError, match="log.bin: no RATE messages: set LOG_BITMASK"):
+    with pytest.raises(RecordError, match="log.bin: the log has no RATE messages. Set LOG_BITMASK"):
         propose(tmp_path / "log.bin")

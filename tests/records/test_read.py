@@ -103,7 +103,9 @@ def test_time_units_become_seconds(tmp_path, unit, scale):
 
 def test_time_that_cannot_be_seconds_is_refused(tmp_path):
     path = npz(tmp_path, t=(TIME * 1e6).astype(np.int64), u=U, y=Y)
-    with pytest.raises(ReadError, match="steps by 10000, too much for seconds: say time_unit="):
+    with pytest.raises(
+        ReadError, match="steps by 10000, which is probably not in seconds.*time_unit="
+    ):
         read(path, inputs="u", outputs="y[0]")
 
 
@@ -127,14 +129,17 @@ def test_a_look_lists_what_can_be_read(tmp_path):
     [
         (dict(outputs="Y[1]"), r"no channel 'Y\[1\]'. Did you mean 'y\[1\]'.*u, y\[0\], y\[1\]"),
         (dict(outputs="t"), "no channel 't'"),
-        (dict(outputs="stray"), "channel 'stray' has 9 samples, its time base 't' 400"),
-        (dict(time="clock"), "time='clock': no channel 'clock'.*There are: t, u, y, stray"),
+        (dict(outputs="stray"), "channel 'stray' has 9 samples, but its time base 't' has 400"),
+        (
+            dict(time="clock"),
+            "time base 'clock': .*no channel 'clock'.*channels are: t, u, y, stray",
+        ),
         (dict(time="y"), r"time base 'y' has shape \(400, 2\)"),
         (dict(inputs="y[0]"), r"'y\[0\]' occurs 2 times"),
         (dict(inputs=["u", "u"]), "'u' occurs 2 times"),
         (dict(inputs=[]), "inputs has no channel"),
-        (dict(start=4.0), "4 .. 8.99 s is out of range: the record covers 5 .. 8.99 s"),
-        (dict(sample_rate=0.0), "sample_rate 0.0 Hz"),
+        (dict(start=4.0), "4 .. 8.99 s is out of range; the record covers 5 .. 8.99 s"),
+        (dict(sample_rate=0.0), "sample rate is 0.0 Hz"),
         (dict(sample_rate=100.0, stop=9.5), "5 .. 9.5 s is out of range"),
     ],
 )
@@ -145,7 +150,9 @@ def test_read_refuses(tmp_path, options, said):
 
 
 def test_a_file_without_time_is_refused_with_what_it_has(tmp_path):
-    with pytest.raises(ReadError, match="no time base for 'u': .*among u, y: say .* time="):
+    with pytest.raises(
+        ReadError, match="no time base for 'u': .*among the arrays u, y. Name .*time="
+    ):
         read(npz(tmp_path, u=U, y=Y), inputs="u", outputs="y[0]")
 
 
@@ -155,13 +162,13 @@ def test_a_file_without_time_is_refused_with_what_it_has(tmp_path):
         ("", "the file is empty"),
         ("# nothing but words\n", "holds no table"),
         ("t,u,y\n", r"only a header \(t, u, y\)"),
-        ("0,1,2\n1,2,3\n", "line 1: numbers where the header should be.*3 channel names"),
+        ("0,1,2\n1,2,3\n", "line 1 has numbers where the header should be.*3 channel names"),
         ("t,u,y\n0,1,2\n# gust\n1,,3\n", r"line 4, column 2 \('u'\): the cell is blank"),
-        ("t,u,y\n0,1,2\n1,2,off\n", r"line 3, column 3 \('y'\): 'off' is no number"),
-        ("t;u;y\n0;1;2,5\n", r"line 2, column 3 \('y'\): '2,5' is no number.*with a point"),
-        ("t,u,y\n0,1,2\n1,2\n", "line 3: 2 cells for 3 columns"),
+        ("t,u,y\n0,1,2\n1,2,off\n", r"line 3, column 3 \('y'\): 'off' is not a number"),
+        ("t;u;y\n0;1;2,5\n", r"line 2, column 3 \('y'\): '2,5' is not a number.*with a point"),
+        ("t,u,y\n0,1,2\n1,2\n", "line 3 has 2 cells for 3 columns"),
         ("t,u,u\n0,1,2\n", "names 'u' twice"),
-        ("t,u,y\n0,1,2\n", "has 1 samples, at least 16"),
+        ("t,u,y\n0,1,2\n", "has 1 samples: at least 16"),
     ],
 )
 def test_csv_refuses(tmp_path, content, said):
@@ -172,7 +179,7 @@ def test_csv_refuses(tmp_path, content, said):
 def test_csv_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(bytes(range(256)))
-    with pytest.raises(ReadError, match="it is no text: it holds a zero .at byte 0"):
+    with pytest.raises(ReadError, match="not text: it holds a zero byte .at byte 0"):
         channels(path)
 
 
@@ -180,7 +187,7 @@ def test_a_missing_file_and_an_unknown_kind_are_refused(tmp_path):
     with pytest.raises(ReadError, match="there is no such file"):
         channels(tmp_path / "log.npz")
     (tmp_path / "log.xyz").write_bytes(b"what is this?")
-    with pytest.raises(ReadError, match=r"neither its first bytes nor its ending '.xyz' .*.npz"):
+    with pytest.raises(ReadError, match=r"neither the first bytes nor the ending '.xyz' .*.npz"):
         channels(tmp_path / "log.xyz")
 
 
@@ -214,7 +221,9 @@ def test_a_mat_file_of_version_7_3_needs_more_than_its_head(tmp_path):
     path = tmp_path / "log.mat"
     head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
     path.write_bytes(head + bytes(512))
-    with pytest.raises(ReadError, match="an HDF5 or MATLAB v7.3 file that is cut off or damaged"):
+    with pytest.raises(
+        ReadError, match="an HDF5 or MATLAB v7.3 file: the file is cut off or damaged"
+    ):
         channels(path)
 
 
@@ -281,5 +290,5 @@ def test_units_are_given_by_name_and_refused_for_channels_that_are_not_read(tmp_
     np.savez(path, t=time, M=np.sin(time), q=np.cos(time))
     record = read(path, inputs="M", outputs="q", units={"q": "rad/s"})
     assert record.unit("q") == "rad/s" and record.unit("M") == ""
-    with pytest.raises(RecordError, match="a unit for 'p'.*There are: M, q"):
+    with pytest.raises(RecordError, match="a unit is given for 'p'.*The channels are: M, q"):
         read(path, inputs="M", outputs="q", units={"p": "rad/s"})

@@ -77,20 +77,29 @@ def spoilt(values, value):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (dict(inputs=U[:-1]), r"inputs has 100 rows for 101 time stamps.*cut or resample"),
-        (dict(outputs=np.stack([Y, Y])), "outputs has 2 rows for 101 time stamps.*transpose it"),
+        (dict(inputs=U[:-1]), r"inputs has 100 rows for 101 time stamps.*Cut or resample"),
+        (dict(outputs=np.stack([Y, Y])), "outputs has 2 rows for 101 time stamps.*Transpose it"),
         (dict(inputs=np.empty((101, 0))), "inputs has no channel"),
         (dict(inputs=U[:, None, None]), r"inputs has shape \(101, 1, 1\)"),
         (dict(inputs=U + 0j), "inputs is complex"),
         (dict(inputs=["a"] * 101), "inputs is not an array of numbers"),
         (dict(time=TIME[:, None]), r"time has shape \(101, 1\)"),
         (dict(time=swapped(TIME)), "time goes back at sample 31, from 0.62 s to 0.6 s"),
-        (dict(time=np.minimum(TIME, 1.0)), "time repeats at sample 51, from 1 s to 1 s .50 such"),
+        (
+            dict(time=np.minimum(TIME, 1.0)),
+            "time repeats at sample 51, from 1 s to 1 s .in 50 places",
+        ),
         (dict(time=spoilt(TIME, np.nan)), "time stamp 20 is nan"),
         (dict(time=np.delete(TIME, 50), inputs=U[1:], outputs=Y[1:]), "step is 0.04 s at t = 0.98"),
-        (dict(time=TIME**1.01), "up to .* samples off the uniform.*jq.read.*jq.records.resample"),
-        (dict(inputs=spoilt(U, np.nan)), "channel 'u' holds 2 NaN and 0 inf, first at t = 0.4 s"),
-        (dict(outputs=spoilt(Y, -np.inf)), "channel 'y' holds 0 NaN and 2 inf, first at t = 0.4"),
+        (dict(time=TIME**1.01), "up to .* samples off a uniform.*jq.read.*jq.records.resample"),
+        (
+            dict(inputs=spoilt(U, np.nan)),
+            "channel 'u' holds 2 NaN and 0 inf, the first at t = 0.4 s",
+        ),
+        (
+            dict(outputs=spoilt(Y, -np.inf)),
+            "channel 'y' holds 0 NaN and 2 inf, the first at t = 0.4",
+        ),
         (dict(input_names="y1"), "name 'y1' occurs 2 times"),
         (dict(output_names="q"), r"1 names \('q',\) for 2 channels"),
         (dict(output_units="rad/s"), "1 units"),
@@ -122,10 +131,10 @@ def test_trim_keeps_samples_and_their_time():
 @pytest.mark.parametrize(
     ("start", "stop", "said"),
     [
-        (-1.0, 1.0, r"-1 .. 1 s is out of range: the record covers 0 .. 2 s"),
-        (1.0, 3.0, r"1 .. 3 s is out of range: the record covers 0 .. 2 s"),
+        (-1.0, 1.0, r"-1 .. 1 s is out of range; the record covers 0 .. 2 s"),
+        (1.0, 3.0, r"1 .. 3 s is out of range; the record covers 0 .. 2 s"),
         (1.0, 0.5, r"start 1 s is not before stop 0.5 s"),
-        (1.0, 1.2, r"holds 11 samples, at least 16 are needed: the record covers 0 .. 2 s"),
+        (1.0, 1.2, r"holds 11 samples: at least 16 are needed; the record covers 0 .. 2 s"),
     ],
 )
 def test_trim_refuses(start, stop, said):
@@ -169,8 +178,8 @@ def test_mix_adds_a_weighted_sum_in_the_asked_role(role):
     ("name", "weights", "said"),
     [
         ("roll", {"m1": 1.0}, "no channel 'm1'"),
-        ("roll", {}, "the mix 'roll' is empty"),
-        ("roll", {"u": np.nan}, "the mix 'roll' weighs 'u' by nan"),
+        ("roll", {}, "the sum 'roll' is empty"),
+        ("roll", {"u": np.nan}, "weight of 'u' in the sum 'roll' is nan"),
         ("u", {"y1": 1.0}, "'u' occurs 2 times"),
     ],
 )

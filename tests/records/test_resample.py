@@ -114,7 +114,7 @@ def test_a_bridge_over_noise_stays_within_it():
     noise = np.random.default_rng(0).standard_normal(2000)
     channel = Channel("x", np.arange(2000) / 200.0, noise)
     holed = without(channel, np.r_[0:1000, 1009:2000])
-    with pytest.warns(RecordWarning, match="gaps bridged"):
+    with pytest.warns(RecordWarning, match="gaps filled"):
         _, values = resample([holed], 200.0)
     assert np.abs(values).max() < 2 * np.abs(noise).max()
 
@@ -153,9 +153,9 @@ def test_stamps_out_of_order_are_refused(stamp, said):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (dict(sample_rate=-5.0), "sample_rate -5.0 Hz"),
-        (dict(sample_rate=np.nan), "sample_rate nan Hz"),
-        (dict(sample_rate=1.0), "makes 8.99 samples, not 16"),
+        (dict(sample_rate=-5.0), "sample rate is -5.0 Hz"),
+        (dict(sample_rate=np.nan), "sample rate is nan Hz"),
+        (dict(sample_rate=1.0), "makes 8.99 samples; 16"),
         (dict(sample_rate=1e9), "makes 7.99e.09 samples"),
         (dict(sample_rate=50.0, start=-1.0), "-1 .. 7.99 s is out of range.*from 0 s .'x' begins"),
         (dict(sample_rate=50.0, stop=9.0), "0 .. 9 s is out of range.* to 7.99 s .'x' ends"),
@@ -174,5 +174,5 @@ def test_channels_without_common_time_are_refused():
 
 
 def test_no_channel_is_refused():
-    with pytest.raises(RecordError, match="name at least one"):
+    with pytest.raises(RecordError, match="give at least one"):
         resample([], 50.0)

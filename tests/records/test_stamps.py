@@ -28,7 +28,7 @@ def test_a_counter_that_wraps_goes_on(tmp_path, kind, unit, scale, end):
     ticks = np.round((TIME - TIME[0]) * scale).astype(np.int64) + end - 2500
     wrapped = np.where(ticks < end, ticks, ticks - (2**16 if kind == "u2" else 2**32))
     path = saved(tmp_path, wrapped.astype(kind))
-    with pytest.warns(RecordWarning, match="time base 't': the counter wraps once"):
+    with pytest.warns(RecordWarning, match="time base 't': the counter overflowed once"):
         record = read(path, inputs="u", outputs="y", time_unit=unit)
     np.testing.assert_allclose(np.diff(record.time), 0.01, rtol=1e-6)
     np.testing.assert_array_equal(record.inputs[:, 0], U)
@@ -52,8 +52,8 @@ def test_a_few_wrong_stamps_are_dropped_with_their_rows(tmp_path, rows, stamp):
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         record = read(path, inputs="u", outputs="y", sample_rate=100, start=2.5, stop=6.5)
-    said = f"{len(rows)} of 500 time stamps repeat or go back and were dropped"
-    assert said in str(told[0].message) and f"first at row {rows[0]}" in str(told[0].message)
+    said = f"{len(rows)} of 500 time stamps repeat or go back; these rows were dropped"
+    assert said in str(told[0].message) and f"first of them row {rows[0]} " in str(told[0].message)
     # A cubic bridges the hole.
     np.testing.assert_allclose(record.inputs[:, 0], np.sin(3 * record.time), atol=1e-5)
 
@@ -61,7 +61,7 @@ def test_a_few_wrong_stamps_are_dropped_with_their_rows(tmp_path, rows, stamp):
 def test_many_wrong_stamps_are_refused(tmp_path):
     time = TIME.copy()
     time[1::20] = time[::20]
-    with pytest.raises(RecordError, match="time repeats at sample 1, .*25 such places"):
+    with pytest.raises(RecordError, match="time repeats at sample 1, .*in 25 places"):
         read(saved(tmp_path, time), inputs="u", outputs="y")
 
 

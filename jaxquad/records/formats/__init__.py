@@ -1,0 +1,2 @@
+from .._log import Log as Log, Table as Table
+from ._readers import load_log as load_log, load_signals as load_signals, READERS as READERS

@@ -11,11 +11,9 @@ from jaxtyping import Float, Int
 
 from .._errors import ReadError
 from .._log import Log, Table
-from ._betaflight_events import ADJUSTMENT
-from ._betaflight_frames import Found, Payload, payload
-from ._betaflight_header import Frame, Header, headers, MARKER
+from ._betaflight_frames import ADJUSTMENT, Found, Payload, payload
+from ._betaflight_header import Frame, Header, headers, MARKER, scaled, with_axis_sums
 from ._betaflight_predict import add_constants, believed, constants, elapsed, predicted, segments
-from ._betaflight_units import scaled, with_axis_sums
 
 
 def slow_tables(
@@ -23,7 +21,7 @@ def slow_tables(
 ) -> dict[str, Table]:
     """The tables `slow` (flight modes) and `gps`, stamped with the last main frame before.
 
-    GPS frames that no home position precedes are left out, as nothing is known from them.
+    GPS frames that no home position precedes are left out, as they are relative to it.
     """
     tables = {}
     for letter, name in (("S", "slow"), ("G", "gps")):
@@ -81,15 +79,15 @@ def sniff(head: bytes, path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """All logs of a file; of several, those without frames are left out."""
+    """All logs of a file that have frames."""
     return decode(path.read_bytes())
 
 
 def decode(data: bytes) -> Log:
     """The logs in the bytes of a blackbox file.
 
-    A lone log has the tables `""`, `slow` and `gps`; of several, the second is `log2`,
-    `log2.slow`, `log2.gps`. Raises ReadError where there is no log with frames.
+    A single log has the tables `""`, `slow` and `gps`; of several, the second is `log2`,
+    `log2.slow`, `log2.gps`. Raises ReadError where no log has frames.
     """
     tables, remarks, settings, failures = {}, [], {}, []
     found = headers(data)
@@ -107,7 +105,7 @@ def decode(data: bytes) -> Log:
         remarks += [f"{label or 'log'}: {each}" for each in said]
         settings |= {f"{label} {k}".lstrip(): v for k, v in header.settings.items()}
     if not tables:
-        raise failures[0] if failures else ReadError("there is no blackbox log in it.", offset=0)
+        raise failures[0] if failures else ReadError("the file holds no blackbox log", offset=0)
     return Log(tables, tuple(remarks), "betaflight", settings)
 
 
@@ -117,7 +115,7 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
     predicted(held.main, header, parts)
     rows, as_scheduled = believed(held.main, header, parts, held.events)
     if not rows.size:
-        raise ReadError("the log holds no frame that can be read.", offset=header.payload)
+        raise ReadError("the log holds no readable frame", offset=header.payload)
     left_out = held.main.offsets.size - rows.size
     main = Found(*(part[rows] for part in held.main)) if left_out else held.main
     time = _seconds(main.coded[:, 1])
@@ -125,8 +123,8 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
     remarks = _remarks(held, rows)
     if not as_scheduled:
         remarks.append(
-            "between key frames are other frames than the header's I and P intervals say: "
-            "loopIteration is not to be trusted, and lost frames do not show"
+            "the frames between key frames differ from the I and P intervals of the header: "
+            "loopIteration is not reliable, and lost frames cannot be detected"
         )
     return tables, remarks
 
@@ -148,25 +146,26 @@ def _remarks(held: Payload, rows: np.ndarray) -> list[str]:
     if held.damage:
         size = sum(each.size for each in held.damage)
         remarks.append(
-            f"{_count(len(held.damage), 'stretch', 'es')} of {size} bytes in all hold no frames "
-            f"and were skipped, the first at byte {held.damage[0].offset}"
+            f"{_count(len(held.damage), 'damaged block')} ({size} bytes) without frames skipped, "
+            f"the first at byte {held.damage[0].offset}"
         )
     left_out = held.main.offsets.size - rows.size
     if left_out:
         mask = np.ones(held.main.offsets.size, bool)
         mask[rows] = False
         remarks.append(
-            f"{left_out} of {mask.size} frames refer to lost or damaged ones or are out of order "
-            f"and were left out, the first at byte {held.main.offsets[mask.argmax()]}"
+            f"{left_out} of {mask.size} frames were left out, because they refer to lost or "
+            f"damaged ones or are out of order, the first at byte "
+            f"{held.main.offsets[mask.argmax()]}"
         )
     changed = [each for each in held.events if each.name == ADJUSTMENT]
     if changed:
         remarks.append(
             f"{_count(len(changed), 'setting')} changed in flight, first at byte "
-            f"{changed[0].offset}: the gains of the header do not hold throughout"
+            f"{changed[0].offset}: the gains in the header do not hold for the whole log"
         )
     return remarks
 
 
-def _count(number: int, noun: str, plural: str = "s") -> str:
-    return f"{number} {noun}{plural if number > 1 else ''}"
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number > 1 else ''}"

@@ -8,10 +8,10 @@ from typing import NamedTuple, TextIO
 import numpy as np
 from jaxtyping import Float
 
-from .._clock import unwrapped
+from .._clock import unwrap
 from .._errors import ReadError
 from .._log import Log, Table
-from ._betaflight_units import with_axis_sums
+from ._betaflight_header import with_axis_sums
 
 
 Values = Float[np.ndarray, "rows columns"]
@@ -48,11 +48,11 @@ def load(path: Path) -> Log:
         values, remarks = _rows(file, wanted, clock, header.lines)
     unit = header.units[wanted[clock]]
     if unit not in _PER_SECOND:
-        raise ReadError(f"time is in {unit[:20]!r}, not in one of us, ms, s.")
+        raise ReadError(f"the unit of time is {unit[:20]!r}: us, ms and s are known")
     numeric = [k for k in range(len(wanted)) if not np.isnan(values[:, k]).all() and k != clock]
     columns = {header.names[wanted[k]]: values[:, k] for k in numeric}
     units = {name: unit for name, unit in zip(header.names, header.units, strict=True) if unit}
-    counter, _ = unwrapped(values[:, clock])
+    counter, _ = unwrap(values[:, clock])
     table = Table(with_axis_sums(columns), counter / _PER_SECOND[unit], units)
     return Log({"": table}, tuple(remarks), "betaflight", header.settings)
 
@@ -61,17 +61,17 @@ def _header(file: TextIO) -> _Header:
     settings, lines = {}, 0
     while (cells := _cells(file))[:1] != ["loopIteration"]:
         if not cells or (lines := lines + 1) > _MOST_SETTINGS:
-            raise ReadError("no line begins with loopIteration, as in every blackbox table.")
+            raise ReadError("no line begins with loopIteration: the header of the table is missing")
         settings[cells[0]] = ",".join(cells[1:])
     parts = [match.groups() if (match := _HEADED.fullmatch(c)) else (c, "") for c in cells]
     names = [name for name, _ in parts]
     if len(names) > _MOST_COLUMNS or len(set(names)) < len(names) or "time" not in names:
         raise ReadError(
-            f"the header has {len(names)} names: at most {_MOST_COLUMNS} may be there, none "
-            f"twice, and 'time' among them."
+            f"the header has {len(names)} names: at most {_MOST_COLUMNS} are allowed, none "
+            f"twice, and one must be 'time'"
         )
     if not all(name.isprintable() for name in names):
-        raise ReadError("a name in the header has characters that cannot be shown.")
+        raise ReadError("a name in the header has characters that cannot be printed")
     return _Header(names, [unit.strip() for _, unit in parts], settings, lines + 1)
 
 
@@ -88,20 +88,20 @@ def _rows(file: TextIO, wanted: list[int], clock: int, above: int) -> tuple[Valu
         parts.append(np.full((len(chunk), len(wanted)), np.nan))
         for count in np.unique(commas[commas > 0]):
             rows = np.flatnonzero(commas == count)
-            parts[-1][rows] = _alike([chunk[i] for i in rows], wanted, int(count) + 1)
+            parts[-1][rows] = _parse_equal([chunk[i] for i in rows], wanted, int(count) + 1)
     values = np.concatenate(parts) if parts else np.empty((0, len(wanted)))
     timed = np.isfinite(values[:, clock])
     remarks = []
     if not timed.all():
         first = above + 1 + int((~timed).argmax())
-        remarks.append(f"{(~timed).sum()} lines have no time and were left out, first line {first}")
+        remarks.append(f"{(~timed).sum()} lines without a time were left out, first line {first}")
         values = values[timed]
     if not values.size:
-        raise ReadError(f"no line after line {above} begins with an iteration and a time.")
+        raise ReadError(f"no line after line {above} has an iteration and a time")
     return values, remarks
 
 
-def _alike(lines: list[str], wanted: list[int], cells: int) -> Values:
+def _parse_equal(lines: list[str], wanted: list[int], cells: int) -> Values:
     """The wanted columns of lines with equally many cells."""
     there = [k for k, i in enumerate(wanted) if i < cells]
     values = np.full((len(lines), len(wanted)), np.nan)

@@ -4,6 +4,8 @@ Source: "Blackbox logging internals" of the Betaflight documentation.
 """
 
 import re
+import struct
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -69,7 +71,7 @@ def _starts(data: bytes) -> list[int]:
     while at >= 0:
         starts.append(at)
         if len(starts) > MOST_LOGS:
-            raise ReadError(f"more than {MOST_LOGS} blackbox logs in one file.", offset=at)
+            raise ReadError(f"the file holds more than {MOST_LOGS} blackbox logs", offset=at)
         at = data.find(MARKER, at + len(MARKER))
     return starts
 
@@ -87,7 +89,7 @@ def _header(data: bytes, start: int, stop: int) -> Header:
         settings[line[1].decode(errors="replace")] = line[2].decode(errors="replace").strip()
         at = line.end()
     if settings.get("Data version", "2") != "2":
-        raise ReadError(f"blackbox data version {settings['Data version']!r}: only 2 is read.")
+        raise ReadError(f"blackbox data version {settings['Data version']!r}: only 2 is read")
     frames = {letter: _frame(settings, letter) for letter in "IP"}
     slow = [letter for letter in "SGH" if f"Field {letter} name" in settings]
     frames |= {letter: _frame(settings, letter) for letter in slow}
@@ -98,23 +100,25 @@ def _header(data: bytes, start: int, stop: int) -> Header:
 def _frame(settings: dict[str, str], letter: str) -> Frame:
     names = tuple(_setting(settings, f"Field {'I' if letter == 'P' else letter} name").split(","))
     if len(names) > MOST_FIELDS or len(set(names)) < len(names):
-        raise ReadError(f"{len(names)} fields in frame {letter}: at most {MOST_FIELDS}, no twins.")
+        raise ReadError(
+            f"frame {letter} has {len(names)} fields: at most {MOST_FIELDS} are allowed, none twice"
+        )
     if not all(name.isascii() and name.isprintable() and 0 < len(name) < 80 for name in names):
-        raise ReadError(f"a field name of frame {letter} is empty, too long or no plain text.")
+        raise ReadError(f"a field name of frame {letter} is empty, too long or not plain text")
     if letter in "IP" and names[:2] != ("loopIteration", "time"):
-        raise ReadError(f"frame {letter} begins with {names[:2]}, not with loopIteration, time.")
+        raise ReadError(f"frame {letter} begins with {names[:2]}, not with loopIteration, time")
     signs = f"Field {'I' if letter == 'P' else letter} signed"
     signed = _integers(settings, signs, len(names)) if signs in settings else [0] * len(names)
     predictors = _integers(settings, f"Field {letter} predictor", len(names))
     strange = set(predictors) - _PREDICTORS.get(letter, _SLOW_PREDICTORS)
     if strange:
-        raise ReadError(f"frame {letter} uses predictor {min(strange)}, which it cannot have.")
+        raise ReadError(f"frame {letter} cannot have predictor {min(strange)}")
     if 5 in predictors and "motor[0]" not in names[: predictors.index(5)]:
-        raise ReadError(f"predictor 5 in frame {letter} needs motor[0] before it.")
+        raise ReadError(f"predictor 5 in frame {letter} needs motor[0] before it")
     encodings = _integers(settings, f"Field {letter} encoding", len(names))
     groups = _groups(encodings, letter)
     if encodings.count(9) > 4 and letter in "IP":
-        raise ReadError(f"{encodings.count(9)} fields of frame {letter} take no room (limit 4).")
+        raise ReadError(f"{encodings.count(9)} fields of frame {letter} are empty (limit 4)")
     return Frame(letter, names, np.array(signed) != 0, np.array(predictors), groups)
 
 
@@ -124,14 +128,14 @@ def _groups(encodings: list[int], letter: str) -> tuple[Group, ...]:
         encoding = encodings[at]
         if encoding not in _GROUP:
             raise ReadError(
-                f"encoding {encoding} of field {at} in frame {letter} is not one of "
-                f"{', '.join(map(str, _GROUP))}."
+                f"encoding {encoding} of field {at} in frame {letter} is unknown: "
+                f"{', '.join(map(str, _GROUP))} are known"
             )
         size, count = _GROUP[encoding], 1
         while count < size and encodings[at + count : at + count + 1] == [encoding]:
             count += 1
         if encoding != 6 and count < size:
-            raise ReadError(f"encoding {encoding} in frame {letter} takes {size} fields together.")
+            raise ReadError(f"encoding {encoding} in frame {letter} needs {size} fields together")
         groups.append(Group(encoding, at, count))
         at += count
     return tuple(groups)
@@ -140,7 +144,7 @@ def _groups(encodings: list[int], letter: str) -> tuple[Group, ...]:
 def _interval(settings: dict[str, str]) -> int:
     text = settings.get("I interval", "32")
     if not (text.isascii() and text.isdecimal() and 0 < int(text[:9]) <= MOST_INTERVAL):
-        raise ReadError(f"I interval {text[:20]!r}: it is 1 .. {MOST_INTERVAL} loop iterations.")
+        raise ReadError(f"I interval {text[:20]!r}: 1 .. {MOST_INTERVAL} loop iterations are valid")
     return int(text)
 
 
@@ -149,21 +153,84 @@ def _logged(settings: dict[str, str]) -> tuple[int, int]:
     text = settings.get("P interval", "1/1")
     parts = text.split("/") if "/" in text else ["1", text]
     if len(parts) != 2 or not all(p.isascii() and p.isdecimal() and len(p) < 7 for p in parts):
-        raise ReadError(f"P interval {text[:20]!r}: it is a whole number or a fraction.")
+        raise ReadError(f"P interval {text[:20]!r}: an integer or a fraction is valid")
     logged, every = map(int, parts)
     if logged > every > 0 or (logged == 0 and every > 0):
-        raise ReadError(f"P interval {text[:20]!r}: it is a fraction of at most 1.")
+        raise ReadError(f"P interval {text[:20]!r}: a fraction of at most 1 is valid")
     return logged, every
 
 
 def _setting(settings: dict[str, str], name: str) -> str:
     if name not in settings:
-        raise ReadError(f"the blackbox header has no line {name!r}.")
+        raise ReadError(f"the blackbox header has no line {name!r}")
     return settings[name]
 
 
 def _integers(settings: dict[str, str], name: str, count: int) -> list[int]:
     cells = _setting(settings, name).split(",")
     if len(cells) != count or not all(c.isascii() and c.isdecimal() and len(c) < 4 for c in cells):
-        raise ReadError(f"{name!r} has {len(cells)} cells for {count} fields, or no numbers.")
+        raise ReadError(
+            f"header line {name!r} needs {count} numbers, one for each field; it has {len(cells)} "
+            f"cells"
+        )
     return [int(cell) for cell in cells]
+
+
+_FINE = ("gyroADC", "gyroUnfilt", "rcCommand", "setpoint")  # tenths in high-resolution logs
+
+
+def scaled(names: tuple[str, ...], settings: dict[str, str]) -> dict[str, tuple[float, str]]:
+    """Factor and unit of the fields for which the header gives them.
+
+    Rates come in deg/s: gyro by `gyro_scale`, set-points as they are. Accelerations come in g by
+    `acc_1G`. Where `blackbox_high_resolution` is set, gyro, set-points and sticks are tenths.
+    """
+    fine = 0.1 if settings.get("blackbox_high_resolution", "0").strip() == "1" else 1.0
+    gyro = _gyro_scale(settings)
+    one_g = _number(settings.get("acc_1G", ""))
+    known = {}
+    for name in names:
+        kind, index = name.partition("[")[::2]
+        tenth = fine if kind in _FINE else 1.0
+        if kind in ("gyroADC", "gyroUnfilt") and gyro:
+            known[name] = gyro * tenth, "deg/s"
+        elif (kind == "setpoint" and index != "3]") or kind == "axisRate":
+            known[name] = tenth, "deg/s"
+        elif kind == "accSmooth" and one_g > 0:
+            known[name] = 1 / one_g, "g"
+        elif kind == "GPS_coord":
+            known[name] = 1e-7, "deg"
+        elif tenth != 1.0:
+            known[name] = tenth, ""
+    return known
+
+
+def with_axis_sums(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns, and `axisSum[i]`: the output of the controller of axis i before its limit.
+
+    It is the sum of the P, I, D, feed-forward (F) and S terms that were logged.
+    """
+    sums = {}
+    for axis in range(3):
+        terms = [f"axis{term}[{axis}]" for term in "PIDFS"]
+        logged = [columns[term] for term in terms if term in columns]
+        if logged and f"axisSum[{axis}]" not in columns:
+            sums[f"axisSum[{axis}]"] = sum(logged[1:], start=logged[0])
+    return {**columns, **sums}
+
+
+def _gyro_scale(settings: dict[str, str]) -> float:
+    """deg/s per count, 0 where the header gives none that a gyro could have."""
+    text = settings.get("gyro_scale", settings.get("gyro.scale", "")).strip()
+    try:
+        if text.lower().startswith("0x"):
+            [scale] = struct.unpack(">f", int(text, 16).to_bytes(4, "big"))
+        else:
+            scale = float(text)
+    except (ValueError, OverflowError):
+        return 0.0
+    return scale if np.isfinite(scale) and 1e-4 < scale < 10 else 0.0
+
+
+def _number(text: str) -> float:
+    return float(text) if text.isascii() and text.isdecimal() and len(text) < 9 else 0.0

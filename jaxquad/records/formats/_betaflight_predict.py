@@ -1,7 +1,7 @@
-"""From coded frames to values: adds what the predictors foretold, drops what cannot be right.
+"""From coded frames to values: add the predictions, and drop frames that cannot be right.
 
 Source: "Blackbox logging internals" of the Betaflight documentation, field predictors and
-log validation. The documentation has the straight line (2) with its sign turned round.
+log validation. The documentation gives the straight line (2) with the wrong sign.
 """
 
 from typing import NamedTuple
@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int, Integer
 
 from .._errors import ReadError
-from ._betaflight_events import Event, RESUME
-from ._betaflight_frames import Damage, Found
+from ._betaflight_frames import Damage, Event, Found, RESUME
 from ._betaflight_header import Frame, Header
 
 
@@ -121,7 +120,7 @@ def setting(header: Header, name: str, predictor: int) -> int:
     digits = text.removeprefix("-")
     if not (digits.isascii() and digits.isdecimal() and len(digits) < 10):
         raise ReadError(
-            f"predictor {predictor} needs the header line {name!r}, which is {text[:20]!r}.",
+            f"predictor {predictor} needs a number in the header line {name!r}, not {text[:20]!r}",
             offset=header.offset,
         )
     return int(text)

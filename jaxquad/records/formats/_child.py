@@ -4,10 +4,12 @@ Loads the file MODULE, lets its `tables` read PATH, and writes what that returns
 of JSON (names, dtypes, shapes, units, remarks; or what was wrong), then the bytes of the arrays.
 """
 
+import importlib
 import importlib.util
 import json
 import sys
-from typing import Any
+from types import ModuleType
+from typing import BinaryIO
 
 import numpy as np
 
@@ -19,7 +21,7 @@ class Oversize(Exception):
     """What declares how many bytes too many."""
 
 
-def answer(module: Any, path: str, limit: int, stream: Any) -> None:
+def answer(module: ModuleType, path: str, limit: int, stream: BinaryIO) -> None:
     """Write the tables of a file, which may declare up to `limit` bytes."""
 
     def check(what: str, declared: int) -> None:
@@ -48,12 +50,18 @@ def answer(module: Any, path: str, limit: int, stream: Any) -> None:
         stream.write(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
 
 
-def load_module(path: str) -> Any:
-    """The module in a file, which need not be on the path nor in a package."""
+def load_module(path: str) -> ModuleType:
+    """The module in a file, which need not be in a package, with the libraries that it needs.
+
+    The libraries are imported here, before memory is limited: some reserve gigabytes of
+    addresses when they are loaded.
+    """
     spec = importlib.util.spec_from_file_location("reader", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    for library in module.LIBRARIES:
+        importlib.import_module(library)
     return module
 
 

@@ -1,7 +1,7 @@
 """Crazyflie logs from the micro-SD deck: a table of events, then events with their values.
 
-The file describes itself. The layout, which Bitcraze's documentation of the deck does not spell
-out, is that of the logs: 0xBC, version (2 bytes), number of event types (2 bytes); for each an
+The file describes itself. The layout, which Bitcraze's documentation of the deck leaves open, was
+found from logs: 0xBC, version (2 bytes), number of event types (2 bytes); for each an
 identifier (2 bytes), a name, the number of its variables (2 bytes) and their names with a type
 letter as `acc.x(f)`; then events of identifier, time stamp and values; CRC-32 of all that.
 """
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from .._clock import unwrapped
+from .._clock import unwrap
 from .._errors import ReadError
 from .._log import Log, Table
 
@@ -121,20 +121,20 @@ def load(path: Path) -> Log:
 
 def decode(data: bytes) -> Log:
     """The events in the bytes of a file. Raises ReadError where its head is damaged."""
-    told = _description(data)
+    head = _description(data)
     end, remarks = len(data) - 4, []
     if zlib.crc32(memoryview(data)[:end]) != int.from_bytes(data[end:], "little"):
-        remarks.append("the checksum does not match: the log was cut off or damaged")
+        remarks.append("the checksum is wrong: the log was cut off or damaged")
         end = len(data)
-    found = events(data, told.kinds, told.begin, end, told.per_second)
+    found = events(data, head.kinds, head.begin, end, head.per_second)
     tables = {
-        kind.name: _table(data, kind, found.offsets[number], told.per_second)
-        for number, kind in told.kinds.items()
+        kind.name: _table(data, kind, found.offsets[number], head.per_second)
+        for number, kind in head.kinds.items()
         if found.offsets[number].size
     }
     if not tables:
-        raise ReadError("the log holds no event of the types it describes.", offset=told.begin)
-    if len(told.kinds) == 1:
+        raise ReadError("the log holds no event of the types it describes", offset=head.begin)
+    if len(head.kinds) == 1:
         tables = {"": next(iter(tables.values()))}
     return Log(tables, (*remarks, *_skipped(found.skipped)), "crazyflie")
 
@@ -142,15 +142,19 @@ def decode(data: bytes) -> Log:
 def _description(data: bytes) -> _Description:
     version, count = struct.unpack_from("<HH", data, 1) if len(data) >= 9 else (0, 0)
     if version not in _STAMP or data[0] != MAGIC:
-        raise ReadError("no Crazyflie log of version 1 or 2 (0xBC 01 00, 0xBC 02 00).", offset=0)
+        raise ReadError("not a Crazyflie log of version 1 or 2 (0xBC 01 00, 0xBC 02 00)", offset=0)
     if not 0 < count <= _MOST_KINDS:
-        raise ReadError(f"{count} types of events: there are 1 .. {_MOST_KINDS}.", offset=3)
+        raise ReadError(
+            f"{count} types of events: 1 .. {_MOST_KINDS} are possible, so the head of the file is "
+            f"damaged",
+            offset=3,
+        )
     kinds: dict[int, Kind] = {}
     at = 5
     for _ in range(count):
         kind, following = _kind(data, at, _STAMP[version][0])
         if kind.number in kinds or kind.name in (each.name for each in kinds.values()):
-            raise ReadError(f"the event {kind.name!r} is described twice.", offset=at)
+            raise ReadError(f"the event {kind.name!r} is described twice", offset=at)
         kinds[kind.number], at = kind, following
     return _Description(kinds, at, _STAMP[version][1])
 
@@ -161,7 +165,8 @@ def _kind(data: bytes, at: int, stamp: str) -> tuple[Kind, int]:
     count, at = _short(data, at)
     if count > _MOST_VARIABLES:
         raise ReadError(
-            f"{count} variables of the event {name!r}: at most {_MOST_VARIABLES}.", offset=at - 2
+            f"the event {name!r} has {count} variables: at most {_MOST_VARIABLES} are possible",
+            offset=at - 2,
         )
     layout = {_ID: "<u2", _TIME: stamp}
     for _ in range(count):
@@ -170,8 +175,8 @@ def _kind(data: bytes, at: int, stamp: str) -> tuple[Kind, int]:
         variable = _VARIABLE.fullmatch(text)
         if variable is None or variable[2] not in _TYPES or variable[1] in layout:
             raise ReadError(
-                f"variable {text[:60]!r} of the event {name!r} is no new name with a type in "
-                f"brackets, as in 'gyro.x(f)'.",
+                f"variable {text[:60]!r} of the event {name!r} is not a new name with a type in "
+                f"brackets, as in 'gyro.x(f)'",
                 offset=begin,
             )
         layout[variable[1]] = np.dtype(variable[2]).newbyteorder("<").str
@@ -180,7 +185,7 @@ def _kind(data: bytes, at: int, stamp: str) -> tuple[Kind, int]:
 
 def _short(data: bytes, at: int) -> tuple[int, int]:
     if at + 2 > len(data):
-        raise ReadError("the file ends within its description of events.", offset=at)
+        raise ReadError("the file ends within its description of events", offset=at)
     return data[at] | data[at + 1] << 8, at + 2
 
 
@@ -188,7 +193,7 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
     end = data.find(b"\0", at, at + _LONGEST_NAME)
     text = data[at : max(end, at)].decode("latin-1")
     if end < 0 or not text.isascii() or not text.isprintable() or not text:
-        raise ReadError("a name in the description of events is damaged.", offset=at)
+        raise ReadError("a name in the description of events is damaged", offset=at)
     return text, end + 1
 
 
@@ -201,7 +206,7 @@ def _table(data: bytes, kind: Kind, offsets: np.ndarray, per_second: float) -> T
         rows = raw[offsets[:, None] + np.arange(size)].view(kind.layout)[:, 0]
     names = [name for name in kind.layout.names or () if name not in (_ID, _TIME)]
     units = {name: unit for name in names if (unit := _UNITS.get(name.partition(".")[0]))}
-    counter, _ = unwrapped(rows[_TIME])
+    counter, _ = unwrap(rows[_TIME])
     return Table({name: rows[name] for name in names}, counter / per_second, units)
 
 
@@ -210,6 +215,6 @@ def _skipped(stretches: list[tuple[int, int]]) -> list[str]:
         return []
     size = sum(each for _, each in stretches)
     return [
-        f"{size} bytes in {len(stretches)} places are no events of a known type and were "
+        f"{size} bytes in {len(stretches)} places are not events of a known type and were "
         f"skipped, the first at byte {stretches[0][0]}"
     ]

@@ -2,7 +2,7 @@ import csv
 import functools as ft
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,13 +28,22 @@ def parsed_fast(
         return 0
     if block.translate(None, _NUMBERS + separator.encode()):
         return 0
-    csv = _csv()
-    if csv is None:
+    arrow = _pyarrow()
+    if arrow is None:
         return 0
-    arrow, options = csv
     names = [str(i) for i in range(len(into))]
+    csv = arrow.csv
     try:
-        table = arrow.csv.read_csv(arrow.BufferReader(block), **options(separator, names))
+        table = csv.read_csv(
+            arrow.BufferReader(block),
+            csv.ReadOptions(column_names=names, block_size=_PART),
+            csv.ParseOptions(delimiter=separator, quote_char=False, double_quote=False),
+            csv.ConvertOptions(
+                column_types=dict.fromkeys(names, arrow.float64()),
+                null_values=[],
+                check_utf8=False,
+            ),
+        )
     except arrow.ArrowException:  # Says less of what is wrong than reading row by row does.
         return 0
     for row, column in zip(into, table.columns, strict=True):
@@ -46,26 +55,13 @@ def parsed_fast(
 
 
 @ft.cache
-def _csv() -> Any:
+def _pyarrow() -> ModuleType | None:
     try:
         import pyarrow
         import pyarrow.csv
     except ImportError:
         return None
-
-    def options(separator: str, names: list[str]) -> dict[str, Any]:
-        types = dict.fromkeys(names, pyarrow.float64())
-        return {
-            "read_options": pyarrow.csv.ReadOptions(column_names=names, block_size=_PART),
-            "parse_options": pyarrow.csv.ParseOptions(
-                delimiter=separator, quote_char=False, double_quote=False
-            ),
-            "convert_options": pyarrow.csv.ConvertOptions(
-                column_types=types, null_values=[], check_utf8=False
-            ),
-        }
-
-    return pyarrow, options
+    return pyarrow
 
 
 _PLAIN = np.zeros(256, dtype=bool)
@@ -122,7 +118,7 @@ _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 def sniff(head: bytes, path: Path) -> bool:
-    return False  # Anything could be text: the name decides.
+    return False  # Any bytes could be text: the name decides.
 
 
 def load(path: Path) -> Log:
@@ -139,7 +135,7 @@ def load(path: Path) -> Log:
         rows += _fill(values[:, rows:], block, number, names, separator)
         number += block.count(b"\n")
     if not rows:
-        raise ReadError(f"only a header ({', '.join(names)}), no row of numbers.")
+        raise ReadError(f"the file has only a header ({', '.join(names)}) and no row of numbers")
     return Log({"": Table(dict(zip(names, values[:, :rows], strict=True)))})
 
 
@@ -159,7 +155,7 @@ def _fill(
     if rows := parsed_fast(block, separator, values):
         return rows
     table = parsed(block, separator, len(names))
-    table = _slowly(block, first, names, separator) if table is None else table
+    table = _parse_rows(block, first, names, separator) if table is None else table
     values[:, : len(table)] = table.T
     return len(table)
 
@@ -170,7 +166,7 @@ def _as_utf8(content: bytes) -> bytes:
         content = content.decode("utf-16", "replace").encode()
     zero = content.find(b"\0")
     if zero >= 0:
-        raise ReadError("it is no text: it holds a zero", offset=zero)
+        raise ReadError("the file is not text: it holds a zero byte", offset=zero)
     try:
         if not content.isascii():
             content.decode()
@@ -199,18 +195,18 @@ def _header(content: bytes) -> tuple[list[str], str | None, int, int]:
         names = split(comment, separator) if comment else []
         if len(names) != len(cells):
             raise ReadError(
-                f"line {number}: numbers where the header should be: "
-                f"put a row with the {len(cells)} channel names above them."
+                f"line {number} has numbers where the header should be: "
+                f"add a line with the {len(cells)} channel names above it"
             )
         return _distinct(names), separator, begin, number
-    raise ReadError("the file holds no table: it needs a header row and numbers.")
+    raise ReadError("the file holds no table: it needs a line of names and lines of numbers")
 
 
 def _distinct(names: list[str]) -> list[str]:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise ReadError(f"the header names {name!r} twice: rename one of them.")
+            raise ReadError(f"the header names {name!r} twice: rename one of them")
         seen.add(name)
     return names
 
@@ -222,7 +218,9 @@ def _line_places(content: bytes) -> Iterator[tuple[int, int, int]]:
         end = len(content) if end < 0 else end
         number += 1
         if end - begin > _LONGEST_LINE:
-            raise ReadError(f"line {number} has {end - begin} bytes: it is no table", offset=begin)
+            raise ReadError(
+                f"line {number} has {end - begin} bytes: the file is not a table", offset=begin
+            )
         yield number, begin, end
         begin = end + 1
 
@@ -246,7 +244,7 @@ def split(text: str, separator: str | None) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _slowly(
+def _parse_rows(
     block: bytes, first: int, names: list[str], separator: str | None
 ) -> Float[np.ndarray, "rows columns"]:
     """Row by row, which finds what is wrong, and takes comments and quotes."""
@@ -262,17 +260,17 @@ def _numbers(row: Line, header: list[str], separator: str | None) -> list[float]
     cells = split(text, separator)
     if len(cells) != len(header):
         raise ReadError(
-            f"line {number}: {len(cells)} cells for {len(header)} columns: "
-            f"is the file cut off, or does its separator change?"
+            f"line {number} has {len(cells)} cells for {len(header)} columns: the file is cut off, "
+            f"or its separator changes"
         )
     try:
         return [float(cell) for cell in cells]
     except ValueError as error:
         i = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        what = f"{cells[i][:40]!r} is no number" if cells[i] else "the cell is blank"
+        what = f"{cells[i][:40]!r} is not a number" if cells[i] else "the cell is blank"
         raise ReadError(
-            f"line {number}, column {i + 1} ({header[i]!r}): {what}: fill or drop the row, "
-            f"and write decimals with a point."
+            f"line {number}, column {i + 1} ({header[i]!r}): {what}. Correct or delete the row; "
+            f"write decimals with a point"
         ) from error
 
 

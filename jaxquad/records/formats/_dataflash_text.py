@@ -10,7 +10,7 @@ import numpy as np
 
 from .._errors import ReadError
 from .._log import Log, Table
-from ._dataflash_format import Format, Scaling, tables_of
+from ._dataflash import Format, Scaling, tables_of
 
 
 _ABOUT = ("FMT", "FMTU", "UNIT", "MULT", "PARM")
@@ -27,7 +27,11 @@ def load(path: Path) -> Log:
     lines, skipped = _by_name(path.read_bytes())
     formats = _formats(lines.get("FMT", []))
     if not formats:
-        raise ReadError("no usable FMT line: it is no DataFlash log, or its head is lost", offset=0)
+        raise ReadError(
+            "there is no valid FMT line: the file is not a DataFlash log, or its beginning is "
+            "missing",
+            offset=0,
+        )
     scaled = _scaling(lines, {each.kind: each.name for each in formats})
     tables: dict[str, Table] = {}
     for each in formats:
@@ -35,7 +39,7 @@ def load(path: Path) -> Log:
             columns, odd = _columns(lines[each.name], each)
             skipped += odd
             tables |= tables_of(each, columns, scaled, applied=True)
-    remarks = [f"{skipped} lines that fit no format were left out"] if skipped else []
+    remarks = [f"{skipped} lines that match no format were left out"] if skipped else []
     settings = {cells[-2]: cells[-1] for cells in _split(lines.get("PARM", [])) if len(cells) >= 2}
     return Log(tables, tuple(remarks), "ardupilot", settings)
 

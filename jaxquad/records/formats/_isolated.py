@@ -1,52 +1,67 @@
-"""Files that other libraries decode, read in a process of its own.
+"""Formats that another library decodes, read in a process of its own.
 
-Compiled libraries can loop for ever or crash on a damaged file, and a bomb within it unfolds before
-anyone has seen its size. The other process has limits of time, memory and file size.
+Compiled libraries can loop for ever or crash on a damaged file, and a compressed file can unfold to
+fill the memory before anyone has seen its size. The other process has limits of time, memory and
+file size. It loads the format's file by its path, without the package, so such a format imports
+nothing of the package, and its libraries (`LIBRARIES`) within its functions only.
 """
 
+import functools as ft
 import json
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
 from .._errors import ReadError
-from .._log import Log, Table
+from .._log import allowance, Log, oversize, Table
 from .._names import printable
-from ._limits import allowance, oversize
 
 
 _CHILD = Path(__file__).with_name("_child.py")
 PATIENCE = 20.0  # s, beside what the size of the file allows
+_Listed = tuple[str, str, str, Sequence[int], str]  # table, column, dtype, shape, unit
 
 
-def read_isolated(path: Path, *, module: str, kind: str, per_megabyte: float = 0.1) -> Log:
-    """The tables that `tables` of the file `module`, beside this one, finds in `path`.
+def in_child(module: ModuleType, kind: str, *, per_megabyte: float = 0.1) -> Callable[[Path], Log]:
+    """A `load` function that runs `module.tables(path, check)` in a child process.
 
-    A column `time` of a table with a name is its clock, in s. It has `per_megabyte` s for each
-    megabyte. Raises ReadError.
+    A column `time` of a table with a name is its clock, in s. The process may take `per_megabyte`
+    s for each megabyte of the file beside `PATIENCE`.
     """
+    assert module.__file__ is not None
+    return ft.partial(_load, Path(module.__file__), kind, per_megabyte)
+
+
+def _load(script: Path, kind: str, per_megabyte: float, path: Path) -> Log:
     stored = sum(each.stat().st_size for each in _files(path))
-    header, _, content = _answer(module, path, kind, stored, per_megabyte).partition(b"\n")
+    header, _, content = _answer(script, path, kind, stored, per_megabyte).partition(b"\n")
     found = json.loads(header)
     if "missing" in found:
-        raise ReadError(f'{kind} needs more: pip install "jaxquad[logs]" ({found["missing"]})')
+        raise ReadError(
+            f"reading {kind} needs a further library ({found['missing']}): "
+            f'pip install "jaxquad[logs]"'
+        )
     if "oversize" in found:
         what, declared = found["oversize"]
         raise ReadError(oversize(what, declared, stored))
     if "error" in found:
-        raise ReadError(f"{kind} that is cut off or damaged ({printable(found['error'])})")
-    return Log(_tables(found["arrays"], content), tuple(found["remarks"]))
+        raise ReadError(
+            f"cannot be read as {kind}: the file is cut off or damaged "
+            f"({printable(found['error'])})"
+        )
+    arrays = [tuple(each) for each in found["arrays"]]
+    return Log(_tables(arrays, content), tuple(found["remarks"]))
 
 
 def _files(path: Path) -> list[Path]:
     return [each for each in path.iterdir() if each.is_file()] if path.is_dir() else [path]
 
 
-def _answer(module: str, path: Path, kind: str, stored: int, per_megabyte: float) -> bytes:
-    script = Path(__file__).with_name(f"{module}.py")
+def _answer(script: Path, path: Path, kind: str, stored: int, per_megabyte: float) -> bytes:
     words = [str(_CHILD), str(script), str(path.absolute()), str(allowance(stored))]
     patience = PATIENCE + per_megabyte * stored / 1e6
     try:
@@ -54,15 +69,21 @@ def _answer(module: str, path: Path, kind: str, stored: int, per_megabyte: float
             [sys.executable, "-P", *words], capture_output=True, timeout=patience, check=False
         )
     except subprocess.TimeoutExpired as error:
-        raise ReadError(f"{kind} does not come to an end within {patience:.0f} s") from error
+        raise ReadError(
+            f"cannot be read as {kind}: reading did not end within {patience:.0f} s. The file is "
+            f"probably damaged"
+        ) from error
     if child.returncode:
         last = child.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2]
         said = f", {printable(last)}" if last else ""
-        raise ReadError(f"{kind} broke its reader down (exit {child.returncode}{said})")
+        raise ReadError(
+            f"cannot be read as {kind}: the library that decodes it crashed (exit status "
+            f"{child.returncode}{said}). The file is probably damaged"
+        )
     return child.stdout
 
 
-def _tables(arrays: list[list[Any]], content: bytes) -> dict[str, Table]:
+def _tables(arrays: Sequence[_Listed], content: bytes) -> dict[str, Table]:
     columns: dict[str, dict[str, np.ndarray]] = {}
     units: dict[str, dict[str, str]] = {}
     place = 0

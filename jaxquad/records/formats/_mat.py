@@ -1,6 +1,6 @@
 """MATLAB files of versions 5 to 7 (MathWorks, "MAT-File Format"), read by their declared sizes.
 
-Version 7.3 is HDF5 and has a reader of its own; version 4 is told apart and refused.
+Version 7.3 is HDF5 and has its own reader; version 4 is recognised and refused.
 """
 
 import zlib
@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._errors import ReadError
-from .._log import Log, Table
-from ._limits import check_size
+from .._log import check_size, Log, Table
 
 
 _HEADER = 128
@@ -53,7 +52,7 @@ def load(path: Path) -> Log:
     content = path.read_bytes()
     if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
         raise ReadError(
-            "it is no MATLAB file of version 5 to 7.3, or cut off: save it with save(..., '-v7')",
+            "not a MATLAB file of version 5 to 7.3, or cut off: save it with save(..., '-v7')",
             offset=0,
         )
     order = "<" if content[126:128] == b"IM" else ">"
@@ -66,7 +65,7 @@ def load(path: Path) -> Log:
 
 
 def _elements(content: memoryview, order: str, place: int, base: int) -> Iterator[_Element]:
-    """The elements from `place` on; `base` is added to the offsets told of."""
+    """The elements from `place` on; `base` is added to the offsets in errors."""
     while place + 8 <= len(content):
         kind, size = (int(n) for n in np.frombuffer(content[place : place + 8], f"{order}u4"))
         if kind >> 16:  # A small element keeps up to four bytes in its own tag.
@@ -76,15 +75,17 @@ def _elements(content: memoryview, order: str, place: int, base: int) -> Iterato
             after = begin + size + (-size % 8 if kind != _COMPRESSED else 0)
         if begin + size > len(content) or (after == place + 8 and size > 4):
             raise ReadError(
-                f"an element of {size} bytes where {len(content) - begin} are left: "
-                f"it may be cut off",
+                f"an element declares {size} bytes, but {len(content) - begin} are left: the "
+                f"file is cut off or damaged",
                 offset=base + place,
             )
         yield _Element(kind, content[begin : begin + size], base + place)
         place = after
     if place < len(content):
         raise ReadError(
-            f"{len(content) - place} bytes are no element: it may be cut off", offset=base + place
+            f"the last {len(content) - place} bytes are not an element: the file is cut off or "
+            f"damaged",
+            offset=base + place,
         )
 
 
@@ -100,7 +101,9 @@ def _inflated(element: _Element, order: str, stored: int) -> _Element:
         check_size("a compressed variable", size, len(element.body), offset=element.offset)
         body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
         if inflater.decompress(inflater.unconsumed_tail, 1):
-            raise ReadError("a compressed variable holds too much", offset=element.offset)
+            raise ReadError(
+                "a compressed variable holds more than it declares", offset=element.offset
+            )
     except zlib.error as error:
         raise ReadError(
             f"a compressed variable is damaged ({error})", offset=element.offset
@@ -146,7 +149,9 @@ def _struct(parts: list[_Element], order: str, name: str, depth: int) -> dict[st
 
 def _numbers(part: _Element, order: str, name: str) -> np.ndarray:
     if part.kind not in _TYPES:
-        raise ReadError(f"the variable {name!r} is of unknown type {part.kind}", offset=part.offset)
+        raise ReadError(
+            f"the variable {name!r} has the unknown type {part.kind}", offset=part.offset
+        )
     dtype = np.dtype(order + _TYPES[part.kind])
     if len(part.body) % dtype.itemsize:
         raise ReadError(f"the variable {name!r} ends within a number", offset=part.offset)
@@ -157,7 +162,7 @@ def _squeezed(values: np.ndarray, shape: np.ndarray, name: str, offset: int) -> 
     count = int(np.prod(shape.astype(object))) if shape.size else 0
     if count != values.size or (shape < 0).any() or shape.size > 32:
         raise ReadError(
-            f"the variable {name!r} is declared as {shape[:32].tolist()}, and holds "
+            f"the variable {name!r} declares the shape {shape[:32].tolist()}, but holds "
             f"{values.size} numbers",
             offset=offset,
         )

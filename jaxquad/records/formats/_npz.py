@@ -1,18 +1,25 @@
 import functools as ft
+import io
 import operator
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from .._errors import ReadError
-from .._log import Log, Table
+from .._log import check_size, Log, Table
 from .._names import printable
-from ._limits import check_size
 
 
 _MAGIC = b"\x93NUMPY"
+
+
+@runtime_checkable
+class Stream(Protocol):
+    """A binary file that can be read."""
+
+    def read(self, size: int = -1, /) -> bytes: ...
 
 
 def sniff(head: bytes, path: Path) -> bool:
@@ -27,7 +34,7 @@ def load(path: Path) -> Log:
         if magic == _MAGIC:
             return Log({"": Table(_named("data", read_array("data", stream, path.stat().st_size)))})
         if not magic.startswith(b"PK"):
-            raise ReadError("it is neither a NumPy array nor an archive of them", offset=0)
+            raise ReadError("not a NumPy array, nor an archive of arrays", offset=0)
         size = path.stat().st_size
         with _opened(stream, size) as archive:
             members = [member for member in archive.infolist() if not member.filename.endswith("/")]
@@ -36,7 +43,7 @@ def load(path: Path) -> Log:
         return Log({"": Table(ft.reduce(operator.or_, arrays, {}))})
 
 
-def _opened(stream: Any, size: int) -> zipfile.ZipFile:
+def _opened(stream: io.BufferedIOBase, size: int) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(stream)
     # On damaged archives zipfile raises almost anything, here and below.
@@ -69,27 +76,27 @@ def _named(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
     return {field: array[field] for field in fields} if fields else {name: array}
 
 
-def read_array(name: str, stream: Any, size: int) -> np.ndarray:
+def read_array(name: str, stream: Stream, size: int) -> np.ndarray:
     """The array of a .npy stream of `size` bytes, which holds at least what its header declares."""
     shape, fortran, dtype = _header(name, stream)
     if dtype.hasobject:
-        raise ReadError(f"the array {name!r} is pickled, which could run code: save it as numbers.")
+        raise ReadError(
+            f"the array {name!r} is pickled, and reading it could run code: save it as numbers"
+        )
     declared = dtype.itemsize * int(np.prod([int(n) for n in shape], dtype=object))
     if min(shape, default=0) < 0 or declared > size:
         raise ReadError(
-            f"the array {name!r} is declared as {shape} of {dtype}, {declared:.6g} bytes, in "
-            f"{size} bytes: it may be cut off or damaged."
+            f"the array {name!r} declares the shape {shape} of {dtype} ({declared:.6g} bytes), but "
+            f"has {size} bytes: it is cut off or damaged"
         )
     content = stream.read(declared)
     if len(content) < declared:
-        raise ReadError(
-            f"the array {name!r} holds {len(content)} of {declared} bytes: it may be cut off."
-        )
+        raise ReadError(f"the array {name!r} has {len(content)} of {declared} bytes: it is cut off")
     stream.read(1)  # The end of an archive's member is where its checksum is looked at.
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
 
 
-def _header(name: str, stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _header(name: str, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:
     read = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
     try:
         version = np.lib.format.read_magic(stream)
@@ -100,4 +107,4 @@ def _header(name: str, stream: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
         raise ReadError(
             f"the header of the array {name!r} is cut off or damaged ({type(error).__name__})"
         ) from error
-    raise ReadError(f"the array {name!r} is of npy version {version}, only 1 to 3 are read.")
+    raise ReadError(f"the array {name!r} has npy version {version}: only 1 to 3 are read")

@@ -1,7 +1,12 @@
-"""Which reader takes a file: by what its first bytes say, else by its name."""
+"""The file formats that can be read, and which of them a file is.
+
+A format is one file of this folder with two functions: `sniff(head, path) -> bool` and
+`load(path) -> Log`. To add one, write that file and enter it in `READERS`. A format that another
+library decodes has `tables(path, check)` in the place of `load`, which a child process runs.
+"""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +27,7 @@ from . import (
     _rosbag,
     _ulog,
 )
+from ._isolated import in_child
 
 
 HEAD = 4096  # bytes that `sniff` gets
@@ -32,7 +38,8 @@ class Reader(NamedTuple):
     """A file format.
 
     `sniff` says from the first 4096 bytes and the path whether a file is of this format, and
-    never raises. `load` raises ReadError, with the offset where it knows one.
+    never raises. `load` raises ReadError, with the offset where it knows one. `suffixes` decide
+    where no format recognises the first bytes.
     """
 
     kind: str
@@ -41,20 +48,39 @@ class Reader(NamedTuple):
     suffixes: tuple[str, ...] = ()
 
 
-READERS = (
-    Reader("a NumPy archive", _npz.sniff, _npz.load, (".npz", ".npy")),
-    Reader("a MATLAB file", _mat.sniff, _mat.load, (".mat",)),
-    Reader("an ArduPilot DataFlash log", _dataflash.sniff, _dataflash.load, (".bin",)),
-    Reader("an ArduPilot text log", _dataflash_text.sniff, _dataflash_text.load, (".log",)),
-    Reader("a PX4 ULog", _ulog.sniff, _ulog.load, (".ulg", ".ulog")),
-    Reader("a Betaflight blackbox log", _betaflight.sniff, _betaflight.load, (".bbl", ".bfl")),
-    Reader("a table of blackbox_decode", _betaflight_csv.sniff, _betaflight_csv.load),
-    Reader("a Crazyflie log", _crazyflie.sniff, _crazyflie.load),
-    Reader("HDF5 or MATLAB v7.3", _hdf5.sniff, _hdf5.load, (".h5", ".hdf5", ".hdf")),
-    Reader("a Parquet table", _parquet.sniff, _parquet.load, (".parquet", ".pq")),
-    Reader("a ROS 2 bag", _rosbag.sniff, _rosbag.load, (".mcap", ".db3")),
-    Reader("a text table", _csv.sniff, _csv.load, (".csv", ".tsv", ".txt")),
-)
+READERS: Mapping[str, Reader] = {
+    "npz": Reader("a NumPy archive", _npz.sniff, _npz.load, (".npz", ".npy")),
+    "mat": Reader("a MATLAB file", _mat.sniff, _mat.load, (".mat",)),
+    "dataflash": Reader(
+        "an ArduPilot DataFlash log", _dataflash.sniff, _dataflash.load, (".bin",)
+    ),
+    "dataflash_text": Reader(
+        "an ArduPilot text log", _dataflash_text.sniff, _dataflash_text.load, (".log",)
+    ),
+    "ulog": Reader("a PX4 ULog", _ulog.sniff, _ulog.load, (".ulg", ".ulog")),
+    "betaflight": Reader(
+        "a Betaflight blackbox log", _betaflight.sniff, _betaflight.load, (".bbl", ".bfl")
+    ),
+    "betaflight_csv": Reader(
+        "a table of blackbox_decode", _betaflight_csv.sniff, _betaflight_csv.load
+    ),
+    "crazyflie": Reader("a Crazyflie log", _crazyflie.sniff, _crazyflie.load),
+    "hdf5": Reader(
+        "an HDF5 or MATLAB v7.3 file",
+        _hdf5.sniff,
+        in_child(_hdf5, "an HDF5 or MATLAB v7.3 file"),
+        (".h5", ".hdf5", ".hdf"),
+    ),
+    "parquet": Reader(
+        "a Parquet table", _parquet.sniff, in_child(_parquet, "a Parquet table"),
+        (".parquet", ".pq"),
+    ),
+    "rosbag": Reader(
+        "a ROS 2 bag", _rosbag.sniff, in_child(_rosbag, "a ROS 2 bag", per_megabyte=2.0),
+        (".mcap", ".db3"),
+    ),
+    "csv": Reader("a text table", _csv.sniff, _csv.load, (".csv", ".tsv", ".txt")),
+}  # fmt: skip
 
 
 def load_signals(path: str | Path) -> Signals:
@@ -72,26 +98,28 @@ def load_signals(path: str | Path) -> Signals:
 def load_log(path: str | Path) -> Log:
     """The tables of a file, as its reader finds them. Raises ReadError, warns RecordWarning."""
     path = Path(path)
-    log = _guarded(_chosen(path), path)
+    log = _load_guarded(_choose_reader(path), path)
     remarks = list(log.remarks[:_LISTED])
     if len(log.remarks) > _LISTED:
-        remarks.append(f"{len(log.remarks) - _LISTED} more remarks like these")
+        remarks.append(f"{len(log.remarks) - _LISTED} more remarks of this kind")
     for remark in remarks:
         warnings.warn(f"{path}: {remark}.", RecordWarning, stacklevel=3)
     return log
 
 
-def _chosen(path: Path) -> Reader:
+def _choose_reader(path: Path) -> Reader:
+    """By the first bytes of the file, else by the ending of its name."""
     head = _head(path)
     suffix = path.suffix.lower()
-    by_content = (reader for reader in READERS if reader.sniff(head, path))
-    by_name = (reader for reader in READERS if suffix in reader.suffixes)
+    by_content = (reader for reader in READERS.values() if reader.sniff(head, path))
+    by_name = (reader for reader in READERS.values() if suffix in reader.suffixes)
     reader = next(by_content, None) or next(by_name, None)
     if reader is None:
-        known = ", ".join(each for reader in READERS for each in reader.suffixes)
+        known = ", ".join(each for reader in READERS.values() for each in reader.suffixes)
+        ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
         raise ReadError(
-            f"{path}: neither its first bytes nor its ending {suffix or 'nothing'!r} are of a "
-            f"kind that is read ({known}): convert it, or give its arrays to jq.Record."
+            f"{path}: unknown file format: neither the first bytes nor the {ending} are those of "
+            f"a known one ({known}). Convert the file, or build a jq.Record from its arrays."
         )
     return reader
 
@@ -101,18 +129,18 @@ def _head(path: Path) -> bytes:
         return b""
     if not path.is_file():
         missing = f"there is no such file in {path.resolve().parent}"
-        raise ReadError(f"{path}: {'it is no regular file' if path.exists() else missing}.")
+        raise ReadError(f"{path}: {'it is not a regular file' if path.exists() else missing}.")
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)
     except OSError as error:
-        raise ReadError(f"{path}: cannot be opened ({error}).") from error
+        raise ReadError(f"{path}: the file cannot be opened ({error}).") from error
     if not head:
         raise ReadError(f"{path}: the file is empty.", offset=0)
     return head
 
 
-def _guarded(reader: Reader, path: Path) -> Log:
+def _load_guarded(reader: Reader, path: Path) -> Log:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -122,6 +150,6 @@ def _guarded(reader: Reader, path: Path) -> Log:
     # A damaged file makes zipfile, zlib, numpy, HDF5 and their like raise almost anything.
     except Exception as error:
         raise ReadError(
-            f"{path}: {reader.kind} that is cut off or damaged, not as it should be "
+            f"{path}: cannot be read as {reader.kind}: the file is cut off or damaged "
             f"({type(error).__name__}: {printable(str(error))})."
         ) from error

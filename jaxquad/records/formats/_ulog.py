@@ -1,14 +1,67 @@
 """PX4 ULog (.ulg), after the description at docs.px4.io, "ULog File Format"."""
 
-from collections.abc import Sequence
+import dataclasses
+import re
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from .._errors import ReadError
-from .._log import Log, Table
-from ._skips import describe_skips
-from ._ulog_messages import interpret, Messages, Topic
+from .._log import describe_skips, Log, Table
+
+
+LARGEST = 65_535  # bytes of a message: its length is a 16-bit number
+_DEEPEST = 16  # formats within formats
+_MOST_COLUMNS = 50_000  # of all topics together; a large log has some 8000
+_WIDEST = 5000  # columns of one topic; the widest of PX4 has some 400
+_MOST_NOTES = 100
+
+
+class Field(NamedTuple):
+    """One field of a format: a basic type or another format, alone or `count` times."""
+
+    kind: str
+    count: int | None
+    name: str
+
+
+Formats = Mapping[str, tuple[Field, ...]]
+
+
+@dataclasses.dataclass
+class Topic:
+    """One subscription: how its messages are laid out, and where their bytes begin."""
+
+    label: str
+    dtype: np.dtype
+    units: dict[str, str]
+    offsets: list[int] = dataclasses.field(default_factory=list)
+
+    def __post_init__(self):
+        self.length = self.dtype.itemsize
+
+
+@dataclasses.dataclass
+class Messages:
+    """What the messages of a log have said so far."""
+
+    formats: dict[str, tuple[Field, ...]] = dataclasses.field(default_factory=dict)
+    current: dict[int, Topic] = dataclasses.field(default_factory=dict)  # by message number
+    topics: dict[str, Topic] = dataclasses.field(default_factory=dict)  # by label
+    layouts: dict[str, np.dtype] = dataclasses.field(default_factory=dict)  # by format
+    appended: list[int] = dataclasses.field(default_factory=list)  # offsets of further parts
+    dropouts: list[int] = dataclasses.field(default_factory=list)  # ms
+    settings: dict[str, str] = dataclasses.field(default_factory=dict)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    stray: int = 0  # messages without a subscription
+    columns_left: int = _MOST_COLUMNS
+
+    def limit(self, place: int, end: int) -> int:
+        """Where the part of the file that holds `place` ends."""
+        return min((each for each in self.appended if place < each < end), default=end)
 
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -26,10 +79,10 @@ def load(path: Path) -> Log:
     """The topics of a ULog file as tables: `sensor_gyro`, of further sensors `sensor_gyro[1]`."""
     data = path.read_bytes()
     if len(data) < _BEGIN:
-        raise ReadError("cut off within the file header", offset=len(data))
+        raise ReadError("the file is cut off within its header", offset=len(data))
     messages, skipped, place = _scan(data)
     if not messages.topics:
-        raise ReadError("it logs no topic: it is cut off or damaged", offset=place)
+        raise ReadError("the file logs no topic: it is cut off or damaged", offset=place)
     remarks = describe_skips(skipped, place, len(data)) + _remarks(messages)
     tables = {name: _table(data, each) for name, each in messages.topics.items() if each.offsets}
     return Log(tables, tuple(remarks), "px4", messages.settings)
@@ -70,7 +123,7 @@ def _follows(data: bytes, after: int, kind: int) -> bool:
 
 
 def _resumed(data: bytes, place: int, messages: Messages) -> int:
-    """Where a data message begins whose length fits its topic and that another one follows."""
+    """Where the next data message begins that fits its topic and that another one follows."""
     while (kind := data.find(b"D", place + 2)) >= 0 and kind + 3 <= len(data):
         place = kind - 2
         size, number = (data[at] | data[at + 1] << 8 for at in (place, kind + 1))
@@ -93,11 +146,182 @@ def _table(data: bytes, topic: Topic) -> Table:
 def _remarks(messages: Messages) -> list[str]:
     remarks = list(messages.notes)
     if messages.stray:
-        remarks.append(f"{messages.stray} messages belong to no topic that could be read")
+        remarks.append(f"{messages.stray} messages of unknown topics were left out")
     lost: Sequence[int] = messages.dropouts
     if lost:
         remarks.append(
-            f"{len(lost)} dropouts of the logger, {sum(lost)} ms together, the longest "
+            f"the logger lost data {len(lost)} times, {sum(lost)} ms in all, the longest dropout "
             f"{max(lost)} ms: samples are missing there"
         )
     return remarks
+
+
+_BASIC = {
+    "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
+    "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
+    "bool": "u1", "char": "S1",
+}  # fmt: skip
+_FIELD = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w+)", re.ASCII)
+
+
+def parse_format(text: str, offset: int) -> tuple[str, tuple[Field, ...]]:
+    """`name:type field;type[4] field;` as the name and the fields. Raises ReadError."""
+    name, colon, body = text.partition(":")
+    parts = [part.strip() for part in body.split(";") if part.strip()]
+    matches = [_FIELD.fullmatch(part) for part in parts]
+    if not name or not colon or not parts or not all(matches):
+        raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=offset)
+    fields = [Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m]
+    return name, tuple(fields)
+
+
+def layout(name: str, formats: Formats, offset: int, *, most: int = LARGEST) -> np.dtype:
+    """The bytes of one message as columns; those of a nested format are `field.column`.
+
+    Padding at the end is left out, as the logger leaves it out. Raises ReadError, also for
+    more than `most` columns.
+    """
+    fields: list[tuple[str, str]] = []
+    size = 0
+    for column, kind in _columns(name, "", formats, offset, 0):
+        fields.append((column, kind))
+        size += np.dtype(kind).itemsize
+        if size > LARGEST or len(fields) > most:
+            raise ReadError(f"the format {name!r} is implausibly long", offset=offset)
+    while fields and fields[-1][0].rpartition(".")[2].startswith("_padding"):
+        fields.pop()
+    if len({column for column, _ in fields}) < max(1, len(fields)):
+        raise ReadError(
+            f"the format {name!r} has no field, or two with the same name", offset=offset
+        )
+    return np.dtype(fields)
+
+
+def _columns(
+    name: str, prefix: str, formats: Formats, offset: int, depth: int
+) -> Iterator[tuple[str, str]]:
+    if name not in formats or depth > _DEEPEST:
+        why = "contains itself" if name in formats else "is not defined"
+        raise ReadError(f"the format {name!r} {why}", offset=offset)
+    for field in formats[name]:
+        if (field.count or 0) > LARGEST:
+            raise ReadError(f"{name}.{field.name} has {field.count} elements", offset=offset)
+        column = prefix + field.name
+        if field.kind in _BASIC:
+            shape = "" if field.count is None else f"({field.count},)"
+            yield column, shape + _BASIC[field.kind]
+        elif field.count is None:
+            yield from _columns(field.kind, f"{column}.", formats, offset, depth + 1)
+        else:
+            for i in range(field.count):
+                yield from _columns(field.kind, f"{column}[{i}].", formats, offset, depth + 1)
+
+
+_RATES = ("roll", "pitch", "yaw")
+_KNOWN = {
+    "vehicle_angular_velocity": {"xyz": "rad/s", "xyz_derivative": "rad/s^2"},
+    "vehicle_angular_acceleration": {"xyz": "rad/s^2"},
+    "vehicle_rates_setpoint": dict.fromkeys(_RATES, "rad/s"),
+    "vehicle_attitude": {"rollspeed": "rad/s", "pitchspeed": "rad/s", "yawspeed": "rad/s"},
+    "vehicle_attitude_setpoint": {"roll_body": "rad", "pitch_body": "rad", "yaw_body": "rad"},
+    "vehicle_acceleration": {"xyz": "m/s^2"},
+    "sensor_combined": {"gyro_rad": "rad/s", "accelerometer_m_s2": "m/s^2"},
+    "sensor_gyro": {"x": "rad/s", "y": "rad/s", "z": "rad/s"},
+    "sensor_accel": {"x": "m/s^2", "y": "m/s^2", "z": "m/s^2"},
+    "autotune_attitude_control_status": {"rate_sp": "rad/s"},
+    "vehicle_local_position": dict.fromkeys("xyz", "m") | dict.fromkeys(("vx", "vy", "vz"), "m/s"),
+    "vehicle_local_position_setpoint": dict.fromkeys("xyz", "m"),
+}
+_ENDINGS = {"_m_s2": "m/s^2", "_m_s": "m/s", "_rad": "rad", "_rad_s": "rad/s", "_v": "V", "_a": "A"}
+
+
+def units_of(topic: str, columns: Iterable[str]) -> dict[str, str]:
+    """The unit of each column whose unit is known, by topic or by the ending of its name."""
+    known = dict(_KNOWN.get(topic, {}))
+    for name in columns:
+        for ending, unit in _ENDINGS.items():
+            if name.endswith(ending):
+                known.setdefault(name, unit)
+    return known
+
+
+_APPENDED = 1  # the one incompatible flag that is understood
+_NUMBERS = {"float": "<f", "int32_t": "<i", "uint32_t": "<I", "uint64_t": "<Q", "double": "<d"}
+
+
+def interpret(kind: int, body: bytes, place: int, messages: Messages) -> None:
+    """Interpret one message that is not data; a damaged one is left out with a remark.
+
+    Raises ReadError for a file that needs a newer reader.
+    """
+    letter = chr(kind)
+    if letter == "B":
+        _flags(body, place, messages)
+        return
+    try:
+        if letter == "F":
+            _define(body, place, messages)
+        elif letter == "A":
+            _subscribe(body, place, messages)
+        elif letter == "R":
+            messages.current.pop(*struct.unpack_from("<H", body), None)
+        elif letter in "IP":
+            _setting(body, messages)
+        elif letter == "O":
+            messages.dropouts += struct.unpack_from("<H", body)
+        elif letter == "D":
+            messages.stray += 1
+    except (ReadError, UnicodeDecodeError, struct.error) as error:
+        if len(messages.notes) < _MOST_NOTES:
+            reason = str(error).rstrip(".")
+            messages.notes.append(f"message {letter} at byte {place} was left out: {reason}")
+
+
+def _flags(body: bytes, place: int, messages: Messages) -> None:
+    if len(body) < 40:
+        raise ReadError("the flags of the file are cut off", offset=place)
+    incompatible = int.from_bytes(body[8:16], "little")
+    if incompatible & ~_APPENDED:
+        raise ReadError(
+            f"the file needs a newer reader: its incompatible flags are {incompatible:#x}",
+            offset=place,
+        )
+    if incompatible & _APPENDED:
+        messages.appended += sorted(filter(None, struct.unpack_from("<3Q", body, 16)))
+
+
+def _define(body: bytes, place: int, messages: Messages) -> None:
+    name, fields = parse_format(body.decode(), place)
+    if messages.formats.setdefault(name, fields) != fields:
+        raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
+
+
+def _subscribe(body: bytes, place: int, messages: Messages) -> None:
+    instance, number = struct.unpack_from("<BH", body)
+    messages.current.pop(number, None)
+    name = body[3:].decode()
+    if name in messages.formats and name not in messages.layouts:
+        most = min(_WIDEST, messages.columns_left)
+        messages.columns_left -= most  # What fails has cost as much time as what is too wide.
+        dtype = layout(name, messages.formats, place, most=most)
+        messages.columns_left += most - len(dtype.names or ())
+        messages.layouts[name] = dtype
+    if name not in messages.layouts:
+        raise ReadError(f"the format {name!r} is not defined", offset=place)
+    dtype = messages.layouts[name]
+    if "timestamp" not in (dtype.names or ()) or dtype["timestamp"] != np.dtype("<u8"):
+        raise ReadError(f"the format {name!r} has no timestamp", offset=place)
+    label = f"{name}[{instance}]" if instance else name
+    topic = messages.topics.setdefault(
+        label, Topic(label, dtype, units_of(name, dtype.names or ()))
+    )
+    messages.current[number] = topic
+
+
+def _setting(body: bytes, messages: Messages) -> None:
+    kind, _, name = body[1 : 1 + body[0]].decode().partition(" ")
+    value = body[1 + body[0] :]
+    if kind.startswith("char["):
+        messages.settings[name] = value.decode("utf-8", "replace")
+    elif kind in _NUMBERS:
+        messages.settings[name] = f"{struct.unpack_from(_NUMBERS[kind], value)[0]:.9g}"

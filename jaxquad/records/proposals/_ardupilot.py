@@ -9,13 +9,13 @@ from .._errors import RecordError
 from .._log import flattened, Log, Signals, Table
 from ._proposal import (
     AXES,
-    busiest,
     channel_rate,
     first_logged,
-    injected,
     Injection,
+    most_active_axis,
     Setup,
     values_of,
+    with_injections,
 )
 
 
@@ -42,14 +42,16 @@ class _Run(NamedTuple):
 
 
 def ardupilot_setup(log: Log, axis: str | None) -> Setup:
-    """The longest chirp, on the `axis` if one is given; without a chirp the bare loop."""
+    """The set-up for the longest chirp, on the `axis` if given; else for the loop without one."""
     signals = flattened(log)
     rates = {each: first_logged(signals, [f"RATE.{_LETTERS[each]}"]) for each in AXES}
     if not any(rates.values()):
-        raise RecordError("no RATE messages: set LOG_BITMASK to log fast attitude (ATTITUDE_FAST).")
+        raise RecordError(
+            "the log has no RATE messages. Set LOG_BITMASK to log fast attitude (ATTITUDE_FAST)."
+        )
     runs = [run for run in _runs(log, signals) if axis in (None, _axis(run))]
     if not runs:
-        return _bare(signals, axis or busiest(signals, rates), rates)
+        return _without_chirp(signals, axis or most_active_axis(signals, rates), rates)
     best = max(runs, key=lambda run: run.stop - run.start)
     alike = [run for run in runs if run.place == best.place]
     remarks = [
@@ -103,25 +105,28 @@ def _number(value: object) -> float:
 
 
 def _chirped(log: Log, run: _Run, alike: list[_Run], remarks: list[str]) -> Setup:
-    """By all chirps into the place of `run`, of those with RATE messages."""
+    """The set-up for all chirps into the place of `run` that have RATE messages."""
     axis = _axis(run)
     letter = _LETTERS[axis]
     command = {f"RATE.{letter}Out": 1.0}
     if run.place in _MIXER:
         command["SIDD.Targ"] = 1.0
         remarks.append(
-            "the chirp is added behind the controller: the command is the sum of both, once"
+            "the chirp is added after the controller, so the command is the sum of the two"
         )
     if run.place <= 3:
-        remarks.append("the chirp passes the input shaping, which is not linear at large steps")
+        remarks.append("the chirp passes the input shaping, which is nonlinear for large steps")
     rate = f"RATE.{letter}"
-    remarks.append(f"{rate} is behind the gyro filter, whose lag is in the model")
+    remarks.append(f"{rate} is measured after the gyro filter, so the model includes its lag")
     remarks += _gains(log, axis)
     found = [each for each in map(ft.partial(_common, log), alike) if each]
     if not found:
-        raise RecordError(f"no RATE messages during the chirp at t = {run.start:.6g} s.")
+        raise RecordError(
+            f"the log has no RATE messages during the chirp at t = {run.start:.6g} s."
+        )
     what = f"SystemID chirp into {_PLACES[run.place]} (SID_AXIS {run.place})"
-    return Setup(axis, command, rate, "SIDD.Targ", remarks=tuple(remarks), **injected(found, what))
+    setup = Setup(axis, command, rate, "SIDD.Targ", remarks=tuple(remarks))
+    return with_injections(setup, found, what)
 
 
 def _common(log: Log, run: _Run) -> Injection | None:
@@ -134,29 +139,29 @@ def _common(log: Log, run: _Run) -> Injection | None:
 
 
 def _gains(log: Log, axis: str) -> list[str]:
-    """What works against the sweep at low frequencies, by the parameters."""
+    """A remark on parameters that counteract the sweep at low frequencies."""
     short = {"roll": "RLL", "pitch": "PIT", "yaw": "YAW"}[axis]
     harmful = (f"ATC_RAT_{short}_I", "ATC_RATE_FF_ENAB")
     on = [f"{name} = {log.settings[name]}" for name in harmful if _number(log.settings.get(name))]
-    why = "0 is better in a sweep: they work against it, or add to it, at low frequencies"
+    why = "set to 0 during a sweep, because they change it at low frequencies"
     return [f"{', '.join(on)}: {why}"] if on else []
 
 
-def _bare(signals: Signals, axis: str, rates: dict[str, str]) -> Setup:
+def _without_chirp(signals: Signals, axis: str, rates: dict[str, str]) -> Setup:
     letter = _LETTERS[axis]
     command = f"RATE.{letter}Out"
     if not rates[axis] or values_of(signals, command).size == 0:
-        raise RecordError(f"no {command} or RATE.{letter} in the log.")
+        raise RecordError(f"the log has no {command} or no RATE.{letter}.")
     remarks = [
-        f"RATE.{letter}Des is computed by the attitude loop from the attitude: it contains "
-        f"feedback and is no outside reference",
-        "fly the SystemID mode (SID_AXIS 10 to 12) for a reference of the outside",
+        f"RATE.{letter}Des is computed by the attitude loop: it contains feedback and cannot be "
+        f"the external reference",
+        "for an external reference, fly the SystemID mode (SID_AXIS 10 to 12)",
     ]
     if "RCIN.C1" in signals.arrays:
         stick = f"RCIN.C{AXES.index(axis) + 1 if axis != 'yaw' else 4}"
         if stick in signals.arrays:
             remarks.append(
-                f"the stick, {stick} at {channel_rate(signals, stick):.3g} Hz, is of the outside: "
-                f"--reference {stick}, if it moved enough"
+                f"the stick ({stick}, {channel_rate(signals, stick):.3g} Hz) is not affected by "
+                f"feedback: use --reference {stick} if it moved enough"
             )
     return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))

@@ -6,7 +6,15 @@ import numpy as np
 
 from .._errors import RecordError
 from .._log import flattened, Log, Table
-from ._proposal import AXES, busiest, first_logged, injected, Injection, Setup, values_of
+from ._proposal import (
+    AXES,
+    first_logged,
+    Injection,
+    most_active_axis,
+    Setup,
+    values_of,
+    with_injections,
+)
 
 
 _AXES = (0, 1, 2)
@@ -15,7 +23,7 @@ _MOST_EDGES = 10_000
 
 
 class Chirp(NamedTuple):
-    """A sweep that Betaflight's chirp mode injected: roll 0, pitch 1, yaw 2."""
+    """A sweep that Betaflight's chirp mode injected, on axis 0 (roll), 1 (pitch) or 2 (yaw)."""
 
     axis: int
     start: float  # s
@@ -29,7 +37,7 @@ def chirps(table: Table) -> list[Chirp]:
 
     There, debug[1] is the axis (-1 when idle), debug[2] the frequency in 0.1 Hz and debug[3] the
     excitation (betaflight pull request 15113). The number of that mode depends on the version, so
-    the data have to speak: a frequency that only rises while the axis stays the same.
+    the data decide: a frequency that only rises while the axis stays the same.
     """
     debug = [table.columns.get(f"debug[{i}]") for i in range(4)]
     if table.time is None or any(each is None for each in debug):
@@ -54,20 +62,23 @@ _SELF_LEVELLING = 0b110  # ANGLE and HORIZON in the flight mode flags
 
 
 def betaflight_setup(log: Log, axis: str | None) -> Setup:
-    """The longest chirp of the longest log; without one, the set-point in acro, else the stick."""
+    """The set-up for the longest chirp of the longest log.
+
+    Without a chirp the reference is the set-point if flown in acro, else the stick.
+    """
     prefix, table = _longest(log)
     signals = flattened(log)
     rates = {each: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, each in enumerate(AXES)}
     if not any(rates.values()):
-        raise RecordError("no gyroADC in the log.")
+        raise RecordError("the log has no gyroADC.")
     sweeps = [each for each in chirps(table) if axis in (None, AXES[each.axis])]
     best = max(sweeps, key=lambda each: each.stop - each.start, default=None)
-    axis = axis or (busiest(signals, rates) if best is None else AXES[best.axis])
+    axis = axis or (most_active_axis(signals, rates) if best is None else AXES[best.axis])
     i = AXES.index(axis)
     command = first_logged(signals, [f"{prefix}axisSum[{i}]"])
     if not command or not rates[axis]:
-        raise RecordError(f"no PID terms or gyro for {axis} in the log.")
-    remarks = [f"{rates[axis]} is behind the gyro filters, whose delay is in the model"]
+        raise RecordError(f"the log has no PID terms or no gyro for {axis}.")
+    remarks = [f"{rates[axis]} is measured after the gyro filters, so the model includes their lag"]
     remarks += _limited(log, prefix, axis, values_of(signals, command))
     if best is not None:
         others = [each for each in sweeps if each.axis != best.axis]
@@ -77,18 +88,18 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
             for each in others
         ]
         alike = [Injection(*each[1:]) for each in sweeps if each.axis == best.axis]
-        return Setup(
-            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", remarks=tuple(remarks),
-            **injected(alike, "chirp on the rate set-point"),
-        )  # fmt: skip
+        setup = Setup(
+            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", remarks=tuple(remarks)
+        )
+        return with_injections(setup, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
     if setpoint and not _levelled(log, prefix):
-        remarks.append("flown in acro: there the set-point is the pilot's alone")
+        remarks.append("flown in acro, where the set-point comes from the pilot only")
         return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=tuple(remarks))
     if setpoint:
         remarks.append(
-            f"self-levelling was on, or is not known: {setpoint} is then computed from the "
-            f"attitude, contains feedback and is no outside reference"
+            f"self-levelling was on or is unknown: {setpoint} is then computed from the attitude, "
+            f"contains feedback and cannot be the external reference"
         )
     stick = first_logged(signals, [f"{prefix}rcCommand[{i}]"])
     reference = stick if stick and np.ptp(values_of(signals, stick)) else ""
@@ -103,7 +114,7 @@ def _longest(log: Log) -> tuple[str, Table]:
         if not name.endswith(("slow", "gps")) and table.time is not None and table.time.size
     }
     if not main:
-        raise RecordError("no main frames in the log.")
+        raise RecordError("the log has no main frames.")
     name = max(main, key=lambda each: np.ptp(np.asarray(main[each].time)))
     return f"{name}." if name else "", main[name]
 
@@ -118,9 +129,9 @@ def _levelled(log: Log, prefix: str) -> bool:
 
 
 def _limited(log: Log, prefix: str, axis: str, command: np.ndarray) -> list[str]:
-    """The share of the samples where the firmware cuts the PID sum off."""
+    """A remark on samples where the firmware limits the PID sum."""
     name = "pidsum_limit_yaw" if axis == "yaw" else "pidsum_limit"
     text = log.settings.get(f"{prefix.rstrip('.')} {name}".lstrip(), "")
     beyond = int((np.abs(command) > int(text)).sum()) if text.isdecimal() and len(text) < 9 else 0
     share = f"{beyond} of {command.size} samples of the command"
-    return [f"{share} lie beyond {name} = {text}, where it saturates"] if beyond else []
+    return [f"{share} exceed {name} = {text}, where it saturates"] if beyond else []

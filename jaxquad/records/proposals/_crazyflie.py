@@ -2,7 +2,7 @@
 
 from .._errors import RecordError
 from .._log import flattened, Log, Signals
-from ._proposal import AXES, busiest, first_logged, moves, Setup
+from ._proposal import AXES, first_logged, most_active_axis, moves, Setup
 
 
 _MOTORS = {"roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}
@@ -10,7 +10,7 @@ _GYRO: dict[str, str] = dict(zip(AXES, "xyz", strict=True))
 
 
 def crazyflie_setup(log: Log, axis: str | None) -> Setup:
-    """Command and rate of the axis that moves most; the log holds no outside reference."""
+    """The set-up for the axis that moves most; the log of the stock firmware has no reference."""
     signals = flattened(log)
     prefixes = [f"{name}." if name else "" for name in log.tables]
     found = {
@@ -18,25 +18,32 @@ def crazyflie_setup(log: Log, axis: str | None) -> Setup:
         for each in AXES
     }
     if not any(found.values()):
-        raise RecordError("no gyro.x, gyro.y, gyro.z or controller.r_roll, ... in the log.")
-    axis = axis or busiest(signals, found)
+        raise RecordError("the log has no gyro.x, gyro.y, gyro.z or controller.r_roll, ...")
+    axis = axis or most_active_axis(signals, found)
     command = next(filter(None, (_command(signals, prefix, axis) for prefix in prefixes)), None)
     if not found[axis] or command is None:
-        raise RecordError(f"no controller.cmd_{axis} or motor.m1 .. m4, or no rate, for {axis}.")
+        raise RecordError(
+            f"the log has no command (controller.cmd_{axis}, or motor.m1 .. m4) or no rate for "
+            f"{axis}."
+        )
     remarks = [
-        "no channel of the stock firmware is an outside reference: its rate set-points are "
+        "no channel of the stock firmware can be the external reference: the rate set-points are "
         "computed by the attitude loop and contain feedback",
-        "log a signal that your own code injects, and name it with --reference",
+        "for an external reference, log a signal that your own code injects, and name it with "
+        "--reference",
     ]
     target = next(
         (f"{p}ctrltarget.{axis}" for p in prefixes if moves(signals, f"{p}ctrltarget.{axis}")), ""
     )
     if target:
-        remarks.append(f"in manual flight the pilot's {target} is of the outside: --reference it")
+        remarks.append(
+            f"in manual flight the pilot's {target} is not affected by feedback: use --reference "
+            f"{target}"
+        )
     if len(command) > 1:
         remarks.append(
-            "the motors' numbers are not linear in thrust: where its curve is known, use powers "
-            "(--input 'NAME=0.1*a^2')"
+            "the motor commands are not linear in thrust: where the thrust curve is known, use "
+            "powers (--input 'NAME=0.1*a^2')"
         )
     return Setup(axis, command, found[axis], remarks=tuple(remarks))
 

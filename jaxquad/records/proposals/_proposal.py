@@ -10,7 +10,7 @@ from .._log import flattened, Log, Signals
 
 
 AXES: tuple[str, ...] = ("roll", "pitch", "yaw")
-SLOW = 100  # Hz: a command or rate logged more slowly resolves no actuator
+SLOW = 100  # Hz: a command or rate logged more slowly does not resolve the actuator
 Mix = Mapping[str, float]
 
 
@@ -24,30 +24,30 @@ class Injection(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What a vehicle's log offers for one axis.
+    """The channels and excitation of one axis in a vehicle's log.
 
-    `start` and `stop` are those of the longest injection, `segments` those of all of the same
-    kind, in the order of time.
+    `start` and `stop` are those of the longest injection, `segments` those of all injections of the
+    same kind, in the order of time.
     """
 
     axis: str
     command: Mix  # a weighted sum of channels
     rate: str
-    reference: str = ""  # of the outside; empty if there is none
+    reference: str = ""  # external signal; empty if there is none
     start: float | None = None  # s
     stop: float | None = None
     band: tuple[float, float] | None = None  # Hz
-    excitation: str = "none is known to have been injected"
+    excitation: str = "no injected excitation found"
     remarks: tuple[str, ...] = ()
     segments: tuple[tuple[float, float], ...] = ()  # s
 
 
 class Proposal(NamedTuple):
-    """How to identify an axis from a log: a starting point to check, not a verdict.
+    """How to identify an axis from a log: a starting point to be checked.
 
-    `read(proposal.path, **proposal.options)` reads the record; where several injections were
-    found, that of the longest, and each of `proposal.segments` with `start` and `stop` replaced
-    the others. `str` shows the reasons and the line for the command line.
+    `jq.read(proposal.path, **proposal.options)` reads the record. Where several injections were
+    found it is that of the longest; replace `start` and `stop` by each of `proposal.segments` for
+    the others. `str(proposal)` gives the reasons and the command line.
     """
 
     path: str
@@ -71,7 +71,7 @@ class Proposal(NamedTuple):
 
     @property
     def segments(self) -> tuple[tuple[float, float], ...]:
-        """Start and stop of all injections of the kind, in s; empty where none is known."""
+        """Start and stop of all injections of the same kind, in s; empty where none was found."""
         setup = self.setup
         if setup.segments or setup.start is None or setup.stop is None:
             return setup.segments
@@ -95,8 +95,8 @@ class Proposal(NamedTuple):
 
     @property
     def _command_name(self) -> str:
-        lone = list(self.setup.command.values()) == [1.0]
-        return next(iter(self.setup.command)) if lone else self.setup.axis
+        single = list(self.setup.command.values()) == [1.0]
+        return next(iter(self.setup.command)) if single else self.setup.axis
 
     @property
     def _mix(self) -> str:
@@ -110,48 +110,50 @@ class Proposal(NamedTuple):
 
     def __str__(self) -> str:
         setup = self.setup
-        none = "none: the joint estimate is not possible, and feedback pulls the direct one"
+        none = "none: feedback biases the direct estimate, and the joint one needs a reference"
         lines = [
             f"Proposal for the {setup.axis} axis of {self.path} ({self.vehicle})",
             f"  excitation: {setup.excitation}",
             f"  command: {self._mix}",
             f"  rate: {setup.rate} [{self.units.get(setup.rate) or 'unit unknown'}]",
-            f"  outside reference: {setup.reference or none}",
+            f"  external reference: {setup.reference or none}",
             *(f"  ! {remark}" for remark in setup.remarks),
             f"  {self.command_line}",
         ]
         return "\n".join(lines)
 
 
-def injected(runs: Sequence[Injection], what: str) -> dict[str, Any]:
-    """The fields of a `Setup` that say when what was injected: all `runs` of one kind."""
+def with_injections(setup: Setup, runs: Sequence[Injection], what: str) -> Setup:
+    """The `setup` with what was injected and when: all `runs` of one kind."""
     best = max(runs, key=lambda run: run.stop - run.start)
     known = [run for run in runs if 0 < run.low < run.high]
     band = (min(r.low for r in known), max(r.high for r in known)) if known else None
     lasted = " + ".join(f"{run.stop - run.start:.4g}" for run in runs)
     times = f"{len(runs)} times: " if len(runs) > 1 else ""
     swept = f"{band[0]:.4g} .. {band[1]:.4g} Hz, " if band else ""
-    return {
-        "start": best.start,
-        "stop": best.stop,
-        "band": band,
-        "excitation": f"{what}, {times}{swept}{lasted} s",
-        "segments": tuple((run.start, run.stop) for run in runs) if len(runs) > 1 else (),
-    }
+    return setup._replace(
+        start=best.start,
+        stop=best.stop,
+        band=band,
+        excitation=f"{what}, {times}{swept}{lasted} s",
+        segments=tuple((run.start, run.stop) for run in runs) if len(runs) > 1 else (),
+    )
 
 
-def finished(path: str, log: Log, setup: Setup) -> Proposal:
-    """With the rates and units of the channels that the set-up names."""
+def complete(path: str, log: Log, setup: Setup) -> Proposal:
+    """The proposal, with the rates and units of the channels that the set-up names."""
     signals = flattened(log)
     names = [*setup.command, setup.rate, *filter(None, (setup.reference,))]
     rates = {name: channel_rate(signals, name) for name in names}
     if min(rates.values()) <= 0:
-        raise RecordError(f"the clock of {min(rates, key=lambda name: rates[name])} stands still.")
+        raise RecordError(
+            f"the time stamps of {min(rates, key=lambda name: rates[name])} do not increase."
+        )
     slow = [f"{name} {rate:.3g} Hz" for name, rate in rates.items() if rate < SLOW]
     remarks = setup.remarks
     if slow:
         remarks += (
-            f"logged slowly: {', '.join(slow)}; lag and delay of the actuators show only at "
+            f"logged slowly: {', '.join(slow)}. Lag and delay of the actuators are visible only at "
             f"higher rates: choose a faster logging profile",
         )
     units = {name: array_of(signals, name)[1] for name in names}
@@ -170,7 +172,7 @@ def array_of(signals: Signals, name: str) -> tuple[str, str]:
     """The array that holds a channel, and its unit."""
     array = name if name in signals.arrays else name.rpartition("[")[0]
     if array not in signals.arrays:
-        raise RecordError(f"no channel {name} in the log.")
+        raise RecordError(f"the log has no channel {name}.")
     return array, signals.arrays[array].unit
 
 
@@ -199,7 +201,7 @@ def moves(signals: Signals, name: str) -> bool:
     return finite.size >= FEWEST and float(np.ptp(finite)) > 0
 
 
-def busiest(signals: Signals, rates: Mapping[str, str]) -> str:
+def most_active_axis(signals: Signals, rates: Mapping[str, str]) -> str:
     """The axis whose rate varies most; one of them has to have a name."""
     spread = {axis: _spread(values_of(signals, name)) for axis, name in rates.items() if name}
     return max(spread, key=lambda axis: spread[axis])

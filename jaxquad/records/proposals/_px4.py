@@ -4,7 +4,15 @@ import numpy as np
 
 from .._errors import RecordError
 from .._log import flattened, Log, Signals
-from ._proposal import AXES, busiest, first_logged, injected, Injection, moves, Setup
+from ._proposal import (
+    AXES,
+    first_logged,
+    Injection,
+    most_active_axis,
+    moves,
+    Setup,
+    with_injections,
+)
 
 
 _STATES = {2: "roll", 4: "pitch", 6: "yaw"}  # of autotune
@@ -20,26 +28,28 @@ _STICKS = {
 
 
 def px4_setup(log: Log, axis: str | None) -> Setup:
-    """Autotune's excitation where it ran; else the set-point in acro, or the stick to look at."""
+    """The set-up for autotune's excitation; without it, with the set-point if flown in acro."""
     signals = flattened(log)
     rates = {each: _rate(signals, i) for i, each in enumerate(AXES)}
     if not any(rates.values()):
-        raise RecordError("no vehicle_angular_velocity in the log: choose a profile that logs it.")
+        raise RecordError(
+            "the log has no vehicle_angular_velocity. Choose a logging profile that has it."
+        )
     tuned = {each: span for each, span in _autotuned(log).items() if axis in (None, each)}
     if tuned:
         axis = max(tuned, key=lambda each: max(run.stop - run.start for run in tuned[each]))
-    axis = axis or busiest(signals, rates)
+    axis = axis or most_active_axis(signals, rates)
     i = AXES.index(axis)
     command = first_logged(
         signals, [f"vehicle_torque_setpoint.xyz[{i}]", f"actuator_controls_0.control[{i}]"]
     )
     if not command or not rates[axis]:
-        raise RecordError(f"no torque set-point (vehicle_torque_setpoint) or rate for {axis}.")
+        raise RecordError(
+            f"the log has no torque set-point (vehicle_torque_setpoint) or no rate for {axis}."
+        )
     if axis in tuned:
-        return Setup(
-            axis, {command: 1.0}, rates[axis], f"{_AUTOTUNE}.rate_sp[{i}]",
-            **injected(tuned[axis], "autotune's steps on the rate set-point"),
-        )  # fmt: skip
+        setup = Setup(axis, {command: 1.0}, rates[axis], f"{_AUTOTUNE}.rate_sp[{i}]")
+        return with_injections(setup, tuned[axis], "autotune's steps on the rate set-point")
     return _untuned(log, signals, axis, command, rates[axis])
 
 
@@ -70,16 +80,19 @@ def _autotuned(log: Log) -> dict[str, list[Injection]]:
 def _untuned(log: Log, signals: Signals, axis: str, command: str, rate: str) -> Setup:
     setpoint = f"{_RATE_SETPOINT}.{axis}"
     if _always_acro(log) and moves(signals, setpoint):
-        remark = "flown in acro throughout: there the rate set-point is the pilot's alone"
+        remark = "flown in acro throughout, where the rate set-point comes from the pilot only"
         return Setup(axis, {command: 1.0}, rate, setpoint, remarks=(remark,))
     remarks = [
-        f"{setpoint} is computed by the attitude loop: it contains feedback and is no outside "
-        f"reference",
-        "run autotune, or inject a sweep and log it, for a reference of the outside",
+        f"{setpoint} is computed by the attitude loop: it contains feedback and cannot be the "
+        f"external reference",
+        "for an external reference, run autotune, or inject a sweep and log it",
     ]
     stick = first_logged(signals, _STICKS[axis])
     if stick and moves(signals, stick):
-        remarks.append(f"in manual flight the stick is one: --reference {stick}, if it moved")
+        remarks.append(
+            f"in manual flight the stick is not affected by feedback: use --reference {stick} if "
+            f"it moved enough"
+        )
     return Setup(axis, {command: 1.0}, rate, remarks=tuple(remarks))
 
 
