@@ -13,7 +13,7 @@ from flight_logs import ardupilot, px4
 from test_notebooks import words
 
 
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
 RUN = ("comparison.md", "first_steps.md", "how_to.md", "limits.md", "measured.md", "own_log.md")
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
 BLOCK = re.compile(r"(?:<!-- (.*?) -->\n)?```(\w*)\n(.*?)```", flags=re.S)
@@ -81,19 +81,11 @@ def run(command, folder):
     return done.stdout
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda page: page.stem)
 def test_links_resolve(page):
     for target in LINK.findall(page.read_text()):
         if not target.startswith(("http:", "https:", "mailto:")):
             assert (page.parent / target).exists(), target
-
-
-@pytest.mark.parametrize("page", RUN)
-def test_files_that_a_page_names_exist_and_are_no_place_of_one_machine(page):
-    text = (ROOT / "docs" / page).read_text()
-    for named in re.findall(r"`((?:docs|fits|notebooks|tests)/[\w/.]+\.\w+)`", text):
-        assert (ROOT / named).exists(), named
-    assert not re.search(r"(?<![\w.])/(?:work|tmp|home|root)/", text)
 
 
 @pytest.mark.parametrize("page", RUN)
