@@ -23,6 +23,7 @@ from ._levenberg_marquardt import (
     decrement as decrement,
     Descent as Descent,
     minimise as minimise,
+    minimise_on_host as minimise_on_host,
     Normal as Normal,
     normal_equations as normal_equations,
     RUNNING as RUNNING,

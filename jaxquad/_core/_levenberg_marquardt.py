@@ -4,7 +4,7 @@ Built without LAPACK: `vmap` over LAPACK calls inside a loop can hang on few cor
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -129,6 +129,69 @@ def _aimed(state: Descent, tolerance: float) -> Descent:
         predicted=predicted,
         status=jnp.where(last, CONVERGED, state.status),
     )
+
+
+@runtime_checkable
+class Point(Protocol):
+    """Where a descent on the host stands: a cost and its slopes."""
+
+    @property
+    def z(self) -> Float[np.ndarray, " parameters"]:
+        """What steps are relative to, as 1 + |z|."""
+        ...
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squares; infinite where something is not finite."""
+        ...
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient J'r and Gauss-Newton Hessian J'J, asked for only where a step has led."""
+        ...
+
+
+P = TypeVar("P", bound=Point)
+
+
+def minimise_on_host(
+    start: P,
+    move: Callable[[P, Float[np.ndarray, " parameters"]], P],
+    max_steps: int,
+    *,
+    tolerance: float = 1e-6,
+    saving: float = 1e-12,
+) -> tuple[P, int, int]:
+    """The descent of `minimise` for one problem, as a loop of Python; also its status and steps.
+
+    `move` makes the next point from a point and a step, whose coordinates may be those of that
+    point alone. For a few steps whose evaluation is compiled already, or is NumPy: compiling the loop would
+    take longer than running it. It ends at a step below `tolerance` relative to 1 + |z|, or one
+    that would save less than `saving` of the cost. RUNNING means that the steps are used up.
+    """
+    here, damping, growth = start, 1e-3, 2.0
+    gradient, hessian = here.slopes()
+    for step in range(max_steps):
+        extra = damping * max(np.max(np.diagonal(hessian)), 1e-300)
+        damped = hessian + extra * np.eye(gradient.size)
+        change = -np.linalg.lstsq(damped, gradient, rcond=None)[0]
+        predicted = 0.5 * change @ (extra * change - gradient)
+        short = np.max(np.abs(change) / (1 + np.abs(here.z))) <= tolerance
+        last = damping <= 1e-2 and (short or predicted <= saving * here.cost)
+        there = move(here, change)
+        saved = here.cost - there.cost
+        # The last step may lose what rounding makes of it.
+        better = saved > 1e-3 * predicted or last and saved >= -1e-12 * here.cost
+        ratio = saved / max(predicted, 1e-300)
+        if better:
+            here = there
+            gradient, hessian = here.slopes()
+        if last:
+            return here, CONVERGED, step + 1
+        damping *= float(np.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0)) if better else growth
+        damping, growth = max(damping, 1e-14), 2.0 if better else 2 * growth
+        if damping > 1e16:
+            return here, STALLED, step + 1
+    return here, RUNNING, max_steps
 
 
 def _relative(

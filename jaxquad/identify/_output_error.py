@@ -12,9 +12,8 @@ from jaxquad._core import require_x64
 from jaxquad.records import Record
 
 from ._checks import check_priors
-from ._output_error_descent import relaxed
+from ._output_error_problem import found_at, OutputError, relaxed, Trial
 from ._output_error_result import assess_output_error
-from ._output_error_trial import found_at, OutputError, Trial
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of
 from ._result import Fit

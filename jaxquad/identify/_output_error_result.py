@@ -32,8 +32,7 @@ from ._assess import (
 )
 from ._coloured import orthonormal, projected_noise
 from ._identifiability import Information
-from ._output_error_descent import Descent, with_fixed_slopes
-from ._output_error_trial import Found, found_at, OutputError, Trial
+from ._output_error_problem import Descent, Found, found_at, OutputError, Trial, with_fixed_slopes
 from ._problem import Problem
 from ._remarks import remarks_on_priors, runaways
 from ._result import Fit

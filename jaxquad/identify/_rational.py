@@ -1,10 +1,13 @@
 """Rational functions with a delay on a frequency grid, and their linear least squares."""
 
+import functools as ft
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.polynomial.polynomial import polyval
+
+from jaxquad._core import minimise_on_host
 
 
 Grid = Complex[np.ndarray, " frequencies"]
@@ -116,7 +119,6 @@ def _linear_fit(
 
 
 _CONVERGED = 1e-11  # largest relative change of the response that a step still makes
-_STUCK = 1e10  # damping from which no step helps any more
 
 
 class _Tangent(NamedTuple):
@@ -127,30 +129,40 @@ class _Tangent(NamedTuple):
     jacobian: Float[np.ndarray, "residuals unknowns"]
 
 
-def descend(samples: Samples, start: Rational, *, steps: int, free_delay: bool) -> Rational:
-    """Lower the cost of `start` by damped Gauss-Newton; a delay stops at 0.
+class _Point:
+    """A model on the way down, in coordinates made for it alone.
 
-    The unknowns are polynomials orthonormal over the grid, made afresh at each step: dP/P for the
-    numerator P, dQ/Q for the denominator Q. High orders and many decades then cost no digits.
+    The unknowns are polynomials orthonormal over the grid: dP/P for the numerator P, dQ/Q for the
+    denominator Q, and the delay. High orders and many decades then cost no digits.
     """
-    best, damping = assessed(samples, start), 1e-2
-    tangent = None
-    for _ in range(steps):
-        if not np.isfinite(best.cost) or damping > _STUCK:
-            break
-        if tangent is None:
-            tangent = _tangent(samples, best, free_delay)
-            if not np.all(np.isfinite(tangent.jacobian)):
-                break
-        step = _step(samples, best, tangent, damping)
-        trial = assessed(samples, _moved(samples, best, tangent, step))
-        if not trial.cost < best.cost:
-            if np.max(np.abs(step)) < _CONVERGED * np.sqrt(2 * samples.s.size):
-                break
-            damping *= 8
-            continue
-        best, damping, tangent = trial, max(damping / 10, 1e-12), None
-    return best
+
+    def __init__(self, samples: Samples, model: Rational, free_delay: bool):
+        self.samples, self.model, self.free_delay = samples, model, free_delay
+        unknowns = model.above.size + model.below.size - 1 + free_delay
+        self.z, self.cost = np.zeros(unknowns), 0.5 * model.cost
+
+    @ft.cached_property
+    def tangent(self) -> _Tangent:
+        return _tangent(self.samples, self.model, self.free_delay)
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        jacobian = np.nan_to_num(self.tangent.jacobian)
+        gradient = jacobian.T @ misfit(self.samples, self.model).reshape(-1)
+        if self.free_delay and self.model.delay == 0 and gradient[-1] > 0:
+            jacobian = jacobian * (np.arange(gradient.size) < gradient.size - 1)  # held at 0
+        return jacobian.T @ misfit(self.samples, self.model).reshape(-1), jacobian.T @ jacobian
+
+    def moved(self, change: Float[np.ndarray, " unknowns"]) -> "_Point":
+        model = _changed(self.samples, self.model, self.tangent, change)
+        return _Point(self.samples, assessed(self.samples, model), self.free_delay)
+
+
+def descend(samples: Samples, start: Rational, *, steps: int, free_delay: bool) -> Rational:
+    """Lower the cost of `start` by Levenberg-Marquardt; a delay stops at 0."""
+    point = _Point(samples, assessed(samples, start), free_delay)
+    if not (np.isfinite(point.cost) and np.all(np.isfinite(point.tangent.jacobian))):
+        return point.model
+    return minimise_on_host(point, _Point.moved, steps, tolerance=_CONVERGED, saving=1e-14)[0].model
 
 
 def _tangent(samples: Samples, model: Rational, free_delay: bool) -> _Tangent:
@@ -166,36 +178,11 @@ def _tangent(samples: Samples, model: Rational, free_delay: bool) -> _Tangent:
     return _Tangent(from_over, from_under, parts.reshape(2 * s.size, -1))
 
 
-def _step(
-    samples: Samples, model: Rational, tangent: _Tangent, damping: float
-) -> Float[np.ndarray, " unknowns"]:
-    residual, jacobian = misfit(samples, model).reshape(-1), tangent.jacobian
-    step, others = _damped(jacobian, residual, damping), _known(tangent)
-    if model.delay == 0 and np.any(step[others:] < 0):
-        held = _damped(jacobian[:, :others], residual, damping)
-        step = np.append(held, 0.0)
-    return step
-
-
-def _known(tangent: _Tangent) -> int:
-    return tangent.over.shape[1] + tangent.under.shape[1]
-
-
-def _damped(
-    jacobian: Float[np.ndarray, "residuals unknowns"],
-    residual: Float[np.ndarray, " residuals"],
-    damping: float,
-) -> Float[np.ndarray, " unknowns"]:
-    size = np.linalg.norm(jacobian, axis=0)
-    size = np.maximum(size, 1e-12 * size.max())
-    rows = np.concatenate([jacobian / size, np.sqrt(damping) * np.eye(size.size)])
-    return np.linalg.lstsq(rows, -np.pad(residual, (0, size.size)), rcond=None)[0] / size
-
-
-def _moved(
+def _changed(
     samples: Samples, model: Rational, tangent: _Tangent, step: Float[np.ndarray, " unknowns"]
 ) -> Rational:
-    over, under, late = np.split(step, [tangent.over.shape[1], _known(tangent)])
+    parts = [tangent.over.shape[1], tangent.over.shape[1] + tangent.under.shape[1]]
+    over, under, late = np.split(step, parts)
     below = model.below.copy()
     below[:-1] += (tangent.under @ under)[: below.size - 1]
     delay = model.delay + float(late.sum()) / float(samples.omega[-1])

@@ -1,4 +1,4 @@
-"""One record of an output-error fit: the outputs that a model would have had, and their misfit."""
+"""The least-squares problem of an output-error fit, and the descent to its minimum."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._core import Normal, solve_definite
+from jaxquad._core import minimise_on_host, Normal, RUNNING, solve_definite, STALLED
 
 from ._problem import prior_misfits, Problem
 from ._simulated import filtered, forced, free, integrated, linear_model, Motions
+from ._solve import describe, Solution
 
 
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
@@ -141,3 +142,132 @@ def found_at(z: Float[Array, " n"], problem: OutputError) -> Found:
     r = jnp.concatenate([one.reshape(-1) for one in (*left, *rest)])
     J = jnp.concatenate([one.reshape(-1, z.size) for one in (*slopes, *others)])
     return Found(left, slopes, columns, Normal(0.5 * jnp.sum(r**2), J.T @ r, J.T @ J))
+
+
+_PASSES = 4  # of noise level and parameters by turns
+_LEVEL = 0.01  # change of the noise level that no longer matters
+
+
+class Descent(NamedTuple):
+    """Where the descent ended, and all that the result is made from."""
+
+    problem: OutputError  # under the final noise level
+    z: Float[Array, " n"]  # free parameters and initial states
+    solution: Solution
+    found: Found
+
+
+class _Point(NamedTuple):
+    """Where the descent stands. Changes of z below 1e-6 count as none: errors are far larger."""
+
+    problem: OutputError
+    z: Float[np.ndarray, " n"]
+    found: Found
+
+    @property
+    def cost(self) -> float:
+        finite = all(np.all(np.isfinite(np.asarray(part))) for part in self.found.normal)
+        return float(self.found.normal.cost) if finite else np.inf
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.asarray(self.found.normal.gradient), np.asarray(self.found.normal.hessian)
+
+    def moved(self, change: Float[np.ndarray, " n"]) -> "_Point":
+        return _point(self.problem, self.z + change)
+
+
+def _point(problem: OutputError, z: Float[np.ndarray, " n"]) -> _Point:
+    return _Point(problem, z, found_at(jnp.asarray(z), problem))
+
+
+def relaxed(problem: OutputError, max_steps: int) -> Descent:
+    """Parameters and noise level by turns: the maximum of the likelihood of both."""
+    base, steps = problem.base, 0
+    count = base.parameters.count
+    z = np.concatenate([np.asarray(base.parameters.start)[:count], np.zeros(problem.unknown)])
+    # A factor common to all residuals moves no minimum.
+    common = len(problem.trials) == problem.trials[0].weights.size == 1
+    common = common and not base.quantities and not problem.unknown
+    for turn in range(_PASSES):
+        stop, status, taken = _descend(problem, z, max_steps)
+        z, steps, found, message = stop.z, steps + taken, stop.found, _message(status, taken)
+        sizes = _sizes(problem, found)
+        changed = max(float(np.max(np.abs(np.log(size)))) for size in sizes)
+        problem = problem.reweighted(sizes)
+        if common or changed < _LEVEL or message or turn == _PASSES - 1:
+            break
+    at = jnp.asarray(z)
+    (model, values, slopes), derivatives = _describe(at[:count], base)
+    solution = Solution(at[:count], model, values, slopes, message, not message, steps, derivatives)
+    return Descent(problem, at, solution, found.reweighted(sizes))
+
+
+_describe = eqx.filter_jit(describe)
+
+
+def _sizes(problem: OutputError, found: Found) -> list[Float[np.ndarray, " outputs"]]:
+    """Standard deviations of the weighted residuals."""
+    sizes = []
+    for trial, misfit in zip(problem.trials, found.misfits, strict=True):
+        size = np.sqrt(np.mean(np.asarray(misfit) ** 2, axis=0))
+        least = 1e-9 * np.std(np.asarray(trial.y), axis=0) * np.asarray(trial.weights)
+        sizes.append(np.maximum(size, least))
+    return sizes
+
+
+def _descend(
+    problem: OutputError, z: Float[np.ndarray, " n"], max_steps: int
+) -> tuple[_Point, int, int]:
+    start = _point(problem, z)
+    if not np.isfinite(start.cost):
+        raise ValueError(
+            "the simulated output of the model, or its derivative, is not finite at the starting "
+            "values: the model is unstable over so long a record, or a value has the wrong size. "
+            "Start from other values, cut the record with jq.records.trim, or fit in the "
+            "frequency domain with jq.fit"
+        )
+    return minimise_on_host(start, _Point.moved, max_steps)
+
+
+def _message(status: int, steps: int) -> str:
+    """Why the descent stopped before a minimum; empty at one."""
+    if status == RUNNING:
+        return f"the maximum of {steps} steps was reached"
+    if status == STALLED:
+        return (
+            "every shorter step fails too: the simulation is not finite or not smooth nearby "
+            f"(after {steps} steps)"
+        )
+    return ""
+
+
+_STEP_FIXED_SLOPES = 1e-5  # relative; its square is the error
+
+
+def with_fixed_slopes(descent: Descent) -> Found:
+    """The misfits' slopes by the free parameters, then the fixed, then the initial states.
+
+    Central differences: they serve for names alone, and compile nothing anew.
+    """
+    parameters, found = descent.problem.base.parameters, descent.found
+    count, values = parameters.count, np.asarray(descent.solution.values)
+    fixed = [_slopes(descent, k, values) for k in range(count, values.size)]
+    slopes = [
+        jnp.concatenate([mine[:, :, :count], jnp.stack(others, axis=2), mine[:, :, count:]], axis=2)
+        for mine, *others in zip(found.slopes, *fixed, strict=True)
+    ]
+    return found._replace(slopes=slopes)
+
+
+def _slopes(descent: Descent, k: int, values: np.ndarray) -> list:
+    problem = descent.problem
+    ends = []
+    for step in (_STEP_FIXED_SLOPES, -_STEP_FIXED_SLOPES):
+        moved = values.copy()
+        moved[k] *= np.exp(step)
+        model = problem.base.parameters.replace(problem.base.model, jnp.asarray(moved))
+        base = dataclasses.replace(problem.base, model=model)
+        ends.append(found_at(descent.z, dataclasses.replace(problem, base=base)).misfits)
+    return [
+        (after - before) / (2 * _STEP_FIXED_SLOPES) for after, before in zip(*ends, strict=True)
+    ]
