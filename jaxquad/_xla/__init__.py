@@ -17,3 +17,4 @@ from ._engine import (
 )
 from ._kernel import as_one_kernel as as_one_kernel
 from ._no_fuse import apart as apart
+from ._swap import swap_row as swap_row

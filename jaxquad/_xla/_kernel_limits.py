@@ -1,7 +1,6 @@
 """What a kernel can hold, read from the StableHLO that XLA is about to compile."""
 
 import functools as ft
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,40 +8,48 @@ from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func, stablehlo
 
 
-def shield(call: Any) -> None:
-    """Hide from XLA which operands are constants: it would put them in the arguments' place."""
-    with ir.InsertionPoint(call):
-        shielded = stablehlo.OptimizationBarrierOp(list(call.operands)).results
-    for k, operand in enumerate(shielded):
-        call.operands[k] = operand
+ATTRIBUTE = "mhlo.frontend_attributes"
 
 
-def using_all(call: Any, module: Any, symbols: Any) -> ir.Attribute:
-    """The name of a new function that does what `call` does, and reads all that it is given.
+def hold_in_kernel(call: Any, module: Any, symbols: Any, attributes: Any) -> None:
+    """Turn a plain call into one of a function that calls a kernel which does the same.
 
-    The sum of one number of each argument takes the place of a result where it is both above 1
-    and below 0: never, but XLA does not know that.
+    The kernel is given its operands behind a barrier, for XLA would put constants in the arguments'
+    place, and it returns the sum of one number of each argument as a last result, for an argument
+    that is not read ends the process. With two results its last operation is no arithmetic either:
+    XLA would divide that among threads, which a kernel does not have.
     """
-    results = [x.type for x in call.results]
-    kind = ir.FunctionType.get([x.type for x in call.operands], results)
-    with call.location, ir.InsertionPoint(module.body):
-        whole = func.FuncOp("kernel", kind, visibility="private")
-    name = symbols.insert(whole)
+    kinds = [x.type for x in call.results]
+    given = [x.type for x in call.operands]
+    single = ir.RankedTensorType.get((), ir.F32Type.get())
+    made = []
     try:
+        kernel, name = _new_function("kernel", given, [*kinds, single], call, module, symbols)
+        made.append(kernel)
+        with call.location, ir.InsertionPoint(kernel.add_entry_block()):
+            arguments = list(kernel.arguments)
+            found = func.CallOp(kinds, call.attributes["callee"], arguments).results
+            func.ReturnOp([*found, _sum_of_firsts(arguments)])
+        whole, outer = _new_function("in_kernel", given, kinds, call, module, symbols)
+        made.append(whole)
         with call.location, ir.InsertionPoint(whole.add_entry_block()):
-            arguments = list(whole.arguments)
-            found = list(func.CallOp(results, call.attributes["callee"], arguments).results)
-            least = min(range(len(found)), key=lambda k: _size_small_call_uses(found[k].type))
-            found[least] = _unless_impossible(found[least], _sum_of_firsts(arguments))
-            func.ReturnOp(found)
+            hidden = stablehlo.OptimizationBarrierOp(list(whole.arguments)).results
+            inner = func.CallOp([*kinds, single], ir.FlatSymbolRefAttr.get(name), list(hidden))
+            inner.operation.attributes[ATTRIBUTE] = attributes
+            func.ReturnOp(list(inner.results)[:-1])
     except Exception:
-        symbols.erase(whole)  # Half a function would spoil the whole program.
+        for function in reversed(made):  # Half a function would spoil the whole program.
+            symbols.erase(function)
         raise
-    return ir.FlatSymbolRefAttr.get(ir.StringAttr(name).value)
+    call.attributes["callee"] = ir.FlatSymbolRefAttr.get(outer)
 
 
-def _size_small_call_uses(kind: Any) -> int:
-    return math.prod(ir.RankedTensorType(kind).shape)
+def _new_function(
+    name: str, given: list[Any], kinds: list[Any], call: Any, module: Any, symbols: Any
+) -> tuple[Any, str]:
+    with call.location, ir.InsertionPoint(module.body):
+        function = func.FuncOp(name, ir.FunctionType.get(given, kinds), visibility="private")
+    return function, ir.StringAttr(symbols.insert(function)).value
 
 
 def _like(kind: Any, shape: tuple[int, ...]) -> Any:
@@ -61,23 +68,6 @@ def _first(value: Any) -> Any:
     return stablehlo.ConvertOp(ir.RankedTensorType.get((), ir.F32Type.get()), scalar).result
 
 
-def _unless_impossible(value: Any, total: Any) -> Any:
-    kind = ir.RankedTensorType(value.type)
-    above, below = (_compare(total, bound, way) for bound, way in ((1.0, "GT"), (0.0, "LT")))
-    other = stablehlo.ConvertOp(_like(kind, ()), total).result
-    wide = stablehlo.BroadcastInDimOp(kind, other, []).result
-    return stablehlo.SelectOp(stablehlo.AndOp(above, below).result, wide, value).result
-
-
-def _compare(x: Any, bound: float, way: str) -> Any:
-    single = ir.F32Type.get()
-    number = ir.DenseElementsAttr.get_splat(
-        ir.RankedTensorType.get((), single), ir.FloatAttr.get(single, bound)
-    )
-    direction = stablehlo.ComparisonDirectionAttr.get(way)
-    return stablehlo.CompareOp(x, stablehlo.ConstantOp(number).result, direction).result
-
-
 # What a kernel is known to hold. XLA hands other operations (sorts, scatters, custom calls, ...) to
 # libraries or callbacks, which a kernel cannot call: some raise, and some end the process.
 _HELD = set(
@@ -92,18 +82,36 @@ _HELD = set(
     case if optimization_barrier reduce reduce_window return while dot dot_general
     """.split()
 )
-# Sums and products of so many numbers: wide arithmetic fits, but one thread without XLA's fusion is
-# then the slower way.
-_COUNTED = {"reduce", "reduce_window", "dot_general", "dot", "add", "subtract", "multiply"}
-_LARGE = 4096
+# These move numbers, or write zeros for a loop to fill: no arithmetic, so of any size.
+_MOVES = set(
+    """
+    broadcast broadcast_in_dim case constant dynamic_slice dynamic_update_slice if
+    optimization_barrier reshape return slice while
+    """.split()
+)
+# XLA hands sums and products of more numbers to a library.
+_SUMS = {"reduce", "reduce_window", "dot_general", "dot"}
+_MOST_SUMMED = 4096
+_WIDEST = 2**15  # numbers of one operation: one thread is the slower way for more
+_MOST_OPERATIONS = 12_000  # of one kernel: the time to compile them grows faster than their number
 
 
-def fits_a_kernel(call: Any, module: Any) -> bool:
-    """Whether all that `call` takes, leads to and returns fits."""
+def why_not(call: Any, module: Any) -> str | None:
+    """What `call` takes, leads to or returns that a kernel cannot hold; None if all of it fits."""
     functions = {_text(f, "sym_name"): f.operation for f in module.body.operations}
-    called = functions[_text(call, "callee")]
-    ends = (*call.operands, *call.results)
-    return all(_holds_numbers(x.type) for x in ends) and _is_plain(called, functions, set())
+    for value in (*call.operands, *call.results):
+        if not _holds_numbers(value.type):
+            return f"values of {value.type}"
+    counts: dict[str, int] = {}
+    try:
+        count = _count(_text(call, "callee"), functions, counts)
+    except _DoesNotFit as reason:
+        return str(reason)
+    return f"{count} operations" if count > _MOST_OPERATIONS else None
+
+
+class _DoesNotFit(Exception):
+    pass
 
 
 def _holds_numbers(kind: Any) -> bool:
@@ -117,17 +125,18 @@ def _text(op: Any, attribute: str) -> str:
     return str(op.attributes[attribute]).strip('@"')
 
 
-def _is_plain(function: Any, functions: dict[str, Any], seen: set[str]) -> bool:
-    for op in _operations(function):
-        if op.name == "func.call":
-            name = _text(op, "callee")
-            if name not in seen:
-                seen.add(name)
-                if not _is_plain(functions[name], functions, seen):
-                    return False
-        elif not _fits(op):
-            return False
-    return True
+def _count(name: str, functions: dict[str, Any], counts: dict[str, int]) -> int:
+    """Operations of a function and of all that it calls, once for every call: XLA inlines them."""
+    if name not in counts:
+        counts[name] = 0
+        for op in _operations(functions[name]):
+            if op.name == "func.call":
+                counts[name] += _count(_text(op, "callee"), functions, counts)
+            elif not _fits(op):
+                raise _DoesNotFit(f"{op.name} of {', '.join(str(x.type) for x in op.operands)}")
+            else:
+                counts[name] += 1
+    return counts[name]
 
 
 def _operations(parent: Any) -> Iterator[Any]:
@@ -140,10 +149,12 @@ def _operations(parent: Any) -> Iterator[Any]:
 
 def _fits(op: Any) -> bool:
     kind = op.name.split(".")[-1]
-    if kind in _COUNTED:
-        sizes = (_size(operand.type) for operand in op.operands)
-        return all(size < _LARGE for size in sizes) and (kind[:3] != "dot" or _is_thin(op))
-    return kind in _HELD
+    if kind not in _HELD or (kind[:3] == "dot" and not _is_thin(op)):
+        return False
+    if kind in _MOVES:
+        return True
+    most = _MOST_SUMMED if kind in _SUMS else _WIDEST
+    return all(_size(value.type) < most for value in (*op.operands, *op.results))
 
 
 def _size(kind: Any) -> int:

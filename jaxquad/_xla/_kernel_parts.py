@@ -169,6 +169,7 @@ def _operands(op: Any) -> list[Any]:
 
 
 _SHORT = 32  # numbers that are computed again as fast as they are read
+_LONG = 2**15  # numbers that XLA divides among threads (256 KiB), which a kernel does not have
 _FEW = 10  # operations of a function, such as `jnp.clip`, that can be within a part
 
 
@@ -232,4 +233,6 @@ class _Copies:
         return light and len(op.results) == 1
 
     def is_in_a_part(self, op: Any) -> bool:
-        return self._is_light(op) and (kind(op) == "constant" or size(op.results[0]) >= _SHORT)
+        return self._is_light(op) and (
+            kind(op) == "constant" or _SHORT <= size(op.results[0]) < _LONG
+        )

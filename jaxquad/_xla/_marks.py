@@ -5,7 +5,7 @@ from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
-from ._kernel_limits import fits_a_kernel, shield, using_all
+from ._kernel_limits import hold_in_kernel, why_not
 from ._kernel_parts import ATTRIBUTE, in_parts, text
 
 
@@ -50,22 +50,21 @@ def _forward_passes(call: Any) -> Iterator[Any]:
     """The calls whose results a call takes, without their marks where nothing else was asked of."""
     for operand in call.operands:
         owner = _owner(operand)
-        if _is_plain_call(owner) and text(owner, "callee").startswith("jaxquad_kernel"):
+        if _is_plain_call(owner):
             yield owner
 
 
 def _make_kernel(call: Any, whole: Any) -> None:
-    if _is_plain_call(call) and fits_a_kernel(call, whole.module):
+    if _is_plain_call(call) and why_not(call, whole.module) is None:
         name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
         call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-        callee = using_all(call, whole.module, whole.symbol_table)
-        shield(call)
-        call.attributes["callee"] = callee
-        call.attributes[ATTRIBUTE] = ir.DictAttr.get(_tags())
+        attributes = ir.DictAttr.get(_tags())
+        hold_in_kernel(call, whole.module, whole.symbol_table, attributes)
 
 
 def _is_plain_call(op: Any) -> bool:
-    return getattr(op, "name", "") == "func.call" and ATTRIBUTE not in op.attributes
+    name = text(op, "callee") if getattr(op, "name", "") == "func.call" else ""
+    return name.startswith("jaxquad_kernel") and ATTRIBUTE not in op.attributes
 
 
 def _is_for_one_cpu(whole: Any) -> bool:

@@ -22,6 +22,7 @@ class DelayQueue(NamedTuple):
     length: int
     splits: bool  # whether a delay may end within a sample interval
     traced: bool  # its value was not known when the loop was built
+    fewest: int = 0  # whole samples by which every member's input is late
 
 
 class Loop(eqx.Module):
@@ -101,7 +102,7 @@ class Loop(eqx.Module):
     @property
     def memory(self) -> int:
         """Samples that a command may be on its way, 0 without a delay."""
-        longest, (length, splits, _) = self.longest_delay, self.queue
+        longest, (length, splits, *_) = self.longest_delay, self.queue
         if longest is not None:
             return math.floor(longest / self.dt + 1e-9) + 1 if longest > 0 else 0
         return length + (0 < length and not splits)
@@ -147,5 +148,6 @@ def _queue_of(delay: Any, dt: float, longest: float | None) -> DelayQueue:
 def _queue_for(samples: Float[np.ndarray, "..."]) -> DelayQueue:
     nearest = np.round(samples)
     whole = bool(np.all(np.abs(samples - nearest) < 1e-9 * np.maximum(nearest, 1)))
-    most = np.max(nearest if whole else samples, initial=0.0)
-    return DelayQueue(int(most) if whole else int(np.floor(most)) + 1, not whole, False)
+    samples = nearest if whole else np.floor(samples)
+    most, fewest = (int(f(samples)) if samples.size else 0 for f in (np.max, np.min))
+    return DelayQueue(most if whole else most + 1, not whole, False, fewest)

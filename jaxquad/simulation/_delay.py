@@ -1,26 +1,49 @@
-import functools as ft
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from jaxquad._xla import swap_row
 from jaxquad.loops import Loop
+
+
+class Queue(NamedTuple):
+    """Inputs on their way to the plant, for as many samples as every member waits."""
+
+    rows: Float[Array, "rows inputs *ensemble"] | None  # in the order of their places; None for one
+    newest: Float[Array, " inputs *ensemble"]
+
+    def exchange(self, index: Int[Array, ""]) -> tuple["Queue", Array]:
+        """At sample `index` the newest input takes the oldest one's place. Also the oldest."""
+        if self.rows is None:
+            return self, self.newest
+        rows, oldest = swap_row(self.rows, self.newest, index % len(self.rows))
+        return Queue(rows, self.newest), oldest
 
 
 class DelayLine(eqx.Module):
     """The inputs on their way to the plant, for a delay of any number of samples, whole or not.
 
     During a sample interval the plant first feels an `early` input, for the share of the interval
-    by which the delay exceeds whole samples, then a `late` one.
+    by which the delay exceeds whole samples, then a `late` one. All inputs first wait in a `Queue`
+    for the samples that every member waits at least; only the further ones differ by member.
     """
 
     samples: Float[Array, "*members"]  # the delay, in sample intervals
-    length: int = eqx.field(static=True)  # how many past inputs are kept
+    fewest: int = eqx.field(static=True)  # whole samples that every member waits
+    further: int = eqx.field(static=True)  # how many inputs are kept beyond the queue
     splits: bool = eqx.field(static=True)  # whether there are early inputs at all
 
-    def init(self, inputs: Float[Array, " inputs *ensemble"]) -> Float[Array, "past ..."]:
+    def queue(self, inputs: Float[Array, " inputs *ensemble"]) -> Queue | None:
         """Before the first sample the plant feels `inputs`."""
-        return jnp.broadcast_to(inputs, (self.length, *inputs.shape))
+        if self.fewest == 0:
+            return None
+        return Queue(_repeated(inputs, self.fewest - 1), inputs)
+
+    def init(self, inputs: Float[Array, " inputs *ensemble"]) -> Float[Array, "past ..."] | None:
+        """The inputs that have left the queue."""
+        return _repeated(inputs, self.further)
 
     def share(self, like: Array) -> Float[Array, "*members"]:
         """Of a sample interval that belongs to the early inputs."""
@@ -28,25 +51,45 @@ class DelayLine(eqx.Module):
         return samples - jnp.floor(samples)
 
     def step(
-        self, past: Float[Array, "past ..."], inputs: Float[Array, " inputs *ensemble"]
-    ) -> tuple[Array, Array, Array]:
-        """The past of the next sample, and the early and late inputs of this one."""
-        queue = jnp.concatenate([inputs[None], past])
-        whole = jnp.floor(self.samples).astype(int)
-        late = _of_age(queue, whole)
-        return queue[:-1], _of_age(queue, whole + 1) if self.splits else late, late
+        self, past: Float[Array, "past ..."] | None, inputs: Float[Array, " inputs *ensemble"]
+    ) -> tuple[Array | None, Array, Array]:
+        """The past of the next sample, and the early and late inputs of this one.
+
+        `inputs` are those that leave the queue; without a queue, the newest.
+        """
+        if past is None:
+            return None, inputs, inputs
+        waiting = jnp.concatenate([inputs[None], past])
+        if self.further == 1 and self.splits:  # all members' delays have the same whole samples
+            return waiting[:-1], waiting[1], waiting[0]
+        whole = jnp.floor(self.samples).astype(int) - self.fewest
+        late = _of_age(waiting, whole)
+        return waiting[:-1], _of_age(waiting, whole + 1) if self.splits else late, late
+
+
+def _repeated(inputs: Float[Array, " inputs *ensemble"], count: int) -> Array | None:
+    return jnp.broadcast_to(inputs, (count, *inputs.shape)) if count else None
 
 
 def _of_age(queue: Float[Array, "ages ..."], age: Array) -> Array:
-    # Masks, not a gather, whose reverse would be a scatter; and sums that are no reductions.
-    age = age.reshape((1,) * (queue.ndim - 1 - age.ndim) + age.shape)
-    chosen = [jnp.where(age == k, inputs, 0) for k, inputs in enumerate(queue)]
-    return ft.reduce(jnp.add, chosen)
+    # A mask, not a gather, whose reverse would be a scatter.
+    ages = jnp.arange(len(queue)).reshape((-1,) + (1,) * (queue.ndim - 1))
+    age = age.reshape((1,) * (queue.ndim - age.ndim) + age.shape)
+    return _sum_of_rows(jnp.where(ages == age, queue, 0))
+
+
+def _sum_of_rows(rows: Float[Array, "rows ..."]) -> Array:
+    """By halves: a kernel cannot hold a reduction of many numbers."""
+    while len(rows) > 1:
+        half = len(rows) // 2
+        total, odd = rows[:half] + rows[half : 2 * half], rows[2 * half :]
+        rows = jnp.concatenate([total, odd]) if len(odd) else total
+    return rows[0]
 
 
 def delay_line(loop: Loop) -> DelayLine | None:
     """That of a loop; None without a delay."""
-    length, splits, traced = loop.queue
+    length, splits, traced, fewest = loop.queue
     if length == 0:
         return None
     delay, longest = loop.delay, loop.longest_delay
@@ -55,4 +98,5 @@ def delay_line(loop: Loop) -> DelayLine | None:
         message = f"delay is outside 0 to longest_delay = {longest} s: raise longest_delay"
         delay = eqx.error_if(delay, wrong, message)
     samples = delay / loop.dt
-    return DelayLine(samples if splits else jnp.round(samples), length, splits)
+    samples = samples if splits else jnp.round(samples)
+    return DelayLine(samples, fewest, length - fewest, splits)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxquad._xla import as_one_kernel
 from jaxquad.loops import Loop
 
+from ._delay import Queue
 from ._guard import are_sound, guarded
 from ._members import common_ensemble, members_of_run, start_of
 from ._sample import Carry, LoopStep, SampleResult, step_of
@@ -22,39 +23,60 @@ _SHORT = 128  # samples that need no blocks
 
 
 def scan_in_blocks(
-    step: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], carry: PyTree, xs: PyTree, count: int
+    step: Callable[..., tuple[PyTree, PyTree]],
+    carry: PyTree,
+    xs: PyTree,
+    count: int,
+    queue: Queue | None = None,
 ) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` whose reverse keeps the carry of blocks only, and of the one it is in.
 
-    Twice the square root of `count` carries instead of all, for one forward pass more.
+    Twice the square root of `count` carries instead of all, for one forward pass more. With a
+    `queue`, of which only blocks are kept, `step(carry, x, oldest)` returns (carry, (newest, y)).
     """
-
     size = _block_size(count)
     length = -(-count // size) * size
     if length > count:
         step, xs = _until(count, step), (jnp.arange(length), jax.tree.map(_lengthened(length), xs))
-
     # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
+    step = jax.checkpoint(step, prevent_cse=False)
+    if queue is not None:
+        step, carry, xs = _with_queue(step), (queue, carry), (jnp.arange(length), xs)
+
     @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
-        return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, xs)
+        return jax.lax.scan(step, carry, xs)
 
     if length == size:
-        return block(carry, xs)
-    apart = lambda x: x.reshape(length // size, size, *x.shape[1:])
-    carry, out = jax.lax.scan(block, carry, jax.tree.map(apart, xs))
-    return carry, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:])[:count], out)
+        carry, out = block(carry, xs)
+    else:
+        apart = lambda x: x.reshape(length // size, size, *x.shape[1:])
+        carry, out = jax.lax.scan(block, carry, jax.tree.map(apart, xs))
+        out = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:])[:count], out)
+    return (carry if queue is None else carry[1]), out
 
 
-def _until(count: int, step: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]]) -> Any:
+def _with_queue(step: Callable[..., tuple[PyTree, PyTree]]) -> Callable[..., tuple[PyTree, PyTree]]:
+    """The queue changes outside of what reverse mode computes again: that would have to keep it."""
+
+    def queued(both: tuple[Queue, PyTree], xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
+        (queue, carry), (index, now) = both, xs
+        queue, oldest = queue.exchange(index)
+        carry, (newest, out) = step(carry, now, oldest)
+        return (queue._replace(newest=newest), carry), out
+
+    return queued
+
+
+def _until(count: int, step: Callable[..., tuple[PyTree, PyTree]]) -> Any:
     """The step, which leaves the carry as it is after `count` samples.
 
     A last block of another length would be compiled as a second loop.
     """
 
-    def masked(carry: PyTree, xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
+    def masked(carry: PyTree, xs: tuple[Array, PyTree], *oldest: Array) -> tuple[PyTree, PyTree]:
         index, now = xs
-        after, out = step(carry, now)
+        after, out = step(carry, now, *oldest)
         return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), after, carry), out
 
     return masked
@@ -210,16 +232,19 @@ def _scan(rest: PyTree, arrays: PyTree) -> tuple[PyTree, PyTree]:
     parts, static = eqx.partition(loop, eqx.is_array)
     # Not a nan in sight; and an argument that is not used at all would end the kernel's compiler.
     sound = are_sound(arrays, loop.ensemble)
-    carry = (carry[0]._replace(running=carry[0].running & sound), carry[1])
-    at_rest = jax.lax.stop_gradient(carry[0])
+    queue = carry[0].queue
+    start = carry[0]._replace(running=carry[0].running & sound, queue=None)
+    at_rest = jax.lax.stop_gradient(start)
 
     def sample(inner: Carry, parts: LoopStep, now: PyTree) -> tuple[Carry, SampleResult]:
         return eqx.combine(parts, static).sample(inner, *now)
 
-    def step(carry: PyTree, now: PyTree) -> tuple[PyTree, PyTree]:
-        inner, result = guarded(sample, loop.ensemble, at_rest, carry[0], parts, now)
+    def step(carry: PyTree, now: PyTree, *oldest: Array) -> tuple[PyTree, PyTree]:
+        inner, result = guarded(sample, loop.ensemble, at_rest, carry[0], parts, (*now, *oldest))
         accumulated, output = collect(carry[1], result)
-        return (inner, accumulated), output
+        if oldest:
+            output = inner.queue.newest, output
+        return (inner._replace(queue=None), accumulated), output
 
     count = scenario.reference.shape[0]
-    return scan_in_blocks(step, carry, (jnp.arange(count), scenario), count)
+    return scan_in_blocks(step, (start, carry[1]), (jnp.arange(count), scenario), count, queue)

@@ -20,7 +20,7 @@ from jaxquad.loops import (
     signals_of,
 )
 
-from ._delay import delay_line, DelayLine
+from ._delay import delay_line, DelayLine, Queue
 from ._guard import are_numbers, are_resolved, are_tame, choose, within
 from ._scenario import Scenario
 
@@ -90,8 +90,9 @@ class Carry(NamedTuple):
 
     state: PyTree  # of the plant
     memory: PyTree  # of the controller
-    past: Float[Array, "past inputs *ensemble"] | None  # inputs on their way, newest first
+    past: Float[Array, "past inputs *ensemble"] | None  # inputs that have left the queue
     running: Bool[Array, "*ensemble"]
+    queue: Queue | None = None  # inputs that no member feels yet
 
 
 class LoopStep(eqx.Module):
@@ -111,19 +112,30 @@ class LoopStep(eqx.Module):
         """At rest: before the first command arrives, the inputs are those of none."""
         line, inputs = self.line, self._driven(like)[0]
         past = None if line is None else line.init(inputs)
-        return Carry(state, self.controller.init(like), past, jnp.ones(self.ensemble, bool))
+        queue = None if line is None else line.queue(inputs)
+        return Carry(state, self.controller.init(like), past, jnp.ones(self.ensemble, bool), queue)
 
     def sample(
-        self, carry: Carry, index: Int[Array, ""], happens: Scenario
+        self,
+        carry: Carry,
+        index: Int[Array, ""],
+        happens: Scenario,
+        oldest: Float[Array, " inputs *ensemble"] | None = None,
     ) -> tuple[Carry, SampleResult]:
-        """Measure, control, and hold the inputs until the next sample."""
+        """Measure, control, and hold the inputs until the next sample.
+
+        `oldest` are the inputs that leave the queue; the next carry's queue has the newest alone.
+        """
         angle = self.plant.measure(carry.state)
         happens, bound = _wide(happens, angle), self.bound
         fine = carry.running & jnp.all(jnp.abs(angle) <= bound, axis=0)
         angle = within(angle, bound)
         measurement = self._measured(angle + happens.noise)
         memory, asked, inputs, achieved, fine = self._answer(carry, measurement, happens, fine)
-        following = self._move(carry, memory, inputs, happens, fine)
+        felt = inputs if oldest is None else oldest
+        following = self._move(carry, memory, felt, happens, fine)
+        if oldest is not None:
+            following = following._replace(queue=Queue(None, inputs))
         return following, SampleResult(
             index=index,
             time=index.astype(angle.dtype) * self.dt,
@@ -185,7 +197,7 @@ class LoopStep(eqx.Module):
             slope = lambda x: plant.derivative(x, inputs, happens.disturbance)
             return integrate(slope, state, duration, self.substeps)
 
-        if line is None or carry.past is None:
+        if line is None:
             return None, hold(carry.state, inputs, dt)
         past, early, late = line.step(carry.past, inputs)
         if not line.splits:

@@ -1,0 +1,67 @@
+"""A row of an array exchanged for another, in place, in every derivative too.
+
+`dynamic_update_slice` and `dynamic_slice` do the same, but the transpose of the latter is a sum of
+whole arrays: a queue of many samples then costs its length in every sample of a reverse pass.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float, Int
+
+
+def swap_row(
+    rows: Float[Array, "rows ..."], row: Float[Array, "..."], place: Int[Array, ""]
+) -> tuple[Float[Array, "rows ..."], Float[Array, "..."]]:
+    """The `rows` with `row` at `place`, and the row that was there.
+
+    Linear in `rows` and `row`, and its own transpose.
+    """
+    changed, old = _swap.bind(rows, row, place)
+    return changed, old
+
+
+def _compute(rows: Array, row: Array, place: Array) -> tuple[Array, Array]:
+    old = jax.lax.dynamic_index_in_dim(rows, place, 0, keepdims=False)
+    return jax.lax.dynamic_update_index_in_dim(rows, row, place, 0), old
+
+
+def _derivative(primals: Any, tangents: Any) -> tuple[list[Array], list[Any]]:
+    rows, row, place = primals
+    *moved, _ = tangents
+    out = _swap.bind(rows, row, place)
+    if all(isinstance(x, ad.Zero) for x in moved):
+        return out, [ad.Zero.from_primal_value(x) for x in out]
+    return out, _swap.bind(*map(ad.instantiate_zeros, moved), place)
+
+
+def _transpose(cotangents: Any, rows: Any, row: Any, place: Array) -> list[Any]:
+    if all(isinstance(x, ad.Zero) for x in cotangents):
+        return [None, None, None]
+    return [*_swap.bind(*map(ad.instantiate_zeros, cotangents), place), None]
+
+
+def _batch(values: Any, axes: Any) -> tuple[list[Array], list[int]]:
+    rows, row, place = values
+    size = next(x.shape[k] for x, k in zip(values, axes, strict=True) if k is not None)
+    if axes[2] is not None:  # every one at a place of its own
+        found = jax.vmap(_compute, in_axes=axes)(rows, row, place)
+        return list(found), [0, 0]
+    last = lambda x, k: (
+        jnp.broadcast_to(x[..., None], (*x.shape, size)) if k is None else jnp.moveaxis(x, k, -1)
+    )
+    changed, old = _swap.bind(last(rows, axes[0]), last(row, axes[1]), place)
+    return [changed, old], [changed.ndim - 1, old.ndim - 1]
+
+
+_swap = Primitive("swap_row")
+_swap.multiple_results = True
+_swap.def_impl(lambda *args: list(jax.jit(_compute)(*args)))
+_swap.def_abstract_eval(lambda rows, row, place: [rows, row])
+ad.primitive_jvps[_swap] = _derivative
+ad.primitive_transposes[_swap] = _transpose
+batching.primitive_batchers[_swap] = _batch
+mlir.register_lowering(_swap, mlir.lower_fun(_compute, multiple_results=True))
