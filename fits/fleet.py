@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from jaxquad.workflows import read_settings, run_batch
+from jaxquad.workflows import batch, BatchSettings
 
 
 HERE = Path(__file__).parent
@@ -24,13 +24,12 @@ def main() -> None:
     parser.add_argument("--timeout", type=float, help="s for one log, which then has failed")
     parser.add_argument("--scheduler")
     given = parser.parse_args()
-    rows = run_batch(
+    options = {"workers": given.workers, "scheduler": given.scheduler, "timeout": given.timeout}
+    changes = {name: value for name, value in options.items() if value is not None}
+    rows = batch(
         given.folder,
-        read_settings(given.config),
+        BatchSettings.from_toml(given.config).changed(changes),
         out=given.out,
-        workers=given.workers,
-        scheduler=given.scheduler,
-        timeout=given.timeout,
         listener=lambda row: print(f"{row['log']}: {row['status']}", file=sys.stderr),
     )
     for row in rows:

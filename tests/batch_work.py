@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from jaxquad.workflows import Job, run_batch, Settings
+from jaxquad.workflows import batch, BatchSettings, Job
 
 
 def measure(job: Job) -> dict:
@@ -64,4 +64,4 @@ def _note(job: Job) -> None:
 
 
 if __name__ == "__main__":
-    run_batch(sys.argv[1], Settings(), out=sys.argv[2], work=measure, workers=2)
+    batch(sys.argv[1], BatchSettings(workers=2), out=sys.argv[2], work=measure)

@@ -1,1 +1,1 @@
-from ._main import main as main
+from ._main import main as main, make_parser as make_parser

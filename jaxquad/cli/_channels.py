@@ -1,28 +1,22 @@
 import argparse
-from typing import Any
 
-from ._options import add_json, add_log, command, print_json, print_table
+from jaxquad.workflows import IdentifySettings
 
-
-EXAMPLES = """examples:
-  jaxquad channels flight.npz
-  jaxquad channels table.npy --time "data[0]"
-
-A channel whose time is not known has no rate: --time names it.
-exit codes: 0 done, 2 for what cannot be used
-"""
+from ._options import add_json, add_log, add_settings, Command, print_json, print_table
 
 
-def add(commands: Any) -> None:
-    declared = command(commands, "channels", run, "list what a file holds", EXAMPLES)
+def _add(declared: argparse.ArgumentParser) -> None:
     add_log(declared)
+    add_settings(declared, IdentifySettings, only=("time", "time_unit"))
     add_json(declared, "the list")
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     from jaxquad.records import channels
 
-    found = channels(options.file, time=options.time, time_unit=options.time_unit)
+    given = vars(options)
+    time, unit = given.get("time"), given.get("time_unit")
+    found = channels(options.file, time=time, time_unit=unit)
     if options.json:
         print_json([channel._asdict() for channel in found])
         return 0
@@ -32,3 +26,18 @@ def run(options: argparse.Namespace) -> int:
         rows.append((c.name, f"{c.samples}", *numbers, f"{c.maximum:.4g}", c.unit))
     print_table(rows)
     return 0
+
+
+CHANNELS = Command(
+    "channels",
+    "list the channels of a file",
+    """examples:
+  jaxquad channels flight.npz
+  jaxquad channels table.npy --time "data[0]"
+
+A channel without a known time has no rate: name the channel that holds the time (--time).
+exit codes: 0 done, 2 unusable input
+""",
+    _add,
+    _run,
+)

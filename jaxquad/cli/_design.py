@@ -1,58 +1,61 @@
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from ._options import add_json, command, print_json, SECONDS
-
-
-EXAMPLES = """examples:
-  jaxquad design sweep --band 0.3 12 --rate 500 --amplitude 0.2 --out sweep.csv
-  jaxquad design multisine --band 0.3 12 --rate 500 --amplitude 0.2 --lines 25 --json
-
-Without --duration, a sweep lasts five, a multisine ten of its longest periods.
-exit codes: 0 done, 2 for what cannot be designed, 4 where a guideline of the field is broken
-"""
-BROKEN = 4
+from ._options import add_json, Command, print_json
 
 
-def add(commands: Any) -> None:
-    text = "a signal to excite the vehicle with, held against the rules of the field"
-    declared = command(commands, "design", run, text, EXAMPLES)
+if TYPE_CHECKING:
+    from jaxquad.excitation import Excitation
+
+BELOW_GUIDELINE = 4
+
+
+def _add(declared: argparse.ArgumentParser) -> None:
     add = declared.add_argument
     add("kind", choices=("sweep", "multisine"))
-    add("--band", type=float, nargs=2, required=True, metavar=("LOW", "HIGH"), help="Hz")
+    add("--band", type=float, nargs=2, required=True, metavar=("LOW", "HIGH"), help="in Hz")
     add("--rate", type=float, required=True, metavar="HZ", help="samples per second")
     add("--amplitude", type=float, required=True, help="peak, in the unit of the command")
-    add("--duration", help="of the excitation, without the rests of 3 s around a sweep", **SECONDS)
+    text = (
+        "of the excitation, without the 3 s of rest around a sweep; by default five of a sweep's "
+    )
+    text += "longest periods, ten of a multisine's"
+    add("--duration", type=float, metavar="S", help=text)
     add("--lines", type=int, metavar="N", help="frequencies of a multisine; by default all")
-    add("--bandwidth", type=float, metavar="HZ", help="expected of the response, for its rule")
-    add("--phase-crossover", type=float, metavar="HZ", help="where the phase is -180 degrees")
-    add("--out", type=Path, metavar="CSV", help="by default KIND.csv")
-    add_json(declared, "the rules")
+    text = "expected bandwidth of the response, for the guideline on the lower end of the band"
+    add("--bandwidth", type=float, metavar="HZ", help=text)
+    text = "where the phase is expected to be -180 degrees, for the guideline on the upper end"
+    add("--phase-crossover", type=float, metavar="HZ", help=text)
+    add("--out", type=Path, metavar="CSV", help="by default sweep.csv or multisine.csv")
+    add_json(declared, "the guidelines")
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from jaxquad.excitation import check_guidelines
+    from jaxquad.report import write_file
 
-    signal = (_sweep if options.kind == "sweep" else _multisine)(options)
+    signal = _sweep(options) if options.kind == "sweep" else _multisine(options)
     radian = lambda hertz: None if hertz is None else 2 * np.pi * hertz
-    rules = check_guidelines(
+    found = check_guidelines(
         signal,
         omega_bandwidth=radian(options.bandwidth),
         omega_180=radian(options.phase_crossover),
     )
-    out = _write(options, signal)
+    out = options.out or Path(f"{options.kind}.csv")
+    rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
+    write_file(out, f"time,signal\n{''.join(rows)}")
     if options.json:
-        found = [rule._asdict() for rule in rules]
-        print_json({"file": str(out), "samples": signal.time.size, "ok": rules.ok, "rules": found})
+        rules = [rule._asdict() for rule in found]
+        print_json({"file": str(out), "samples": signal.time.size, "ok": found.ok, "rules": rules})
     else:
-        print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s\n{rules}\n{out}")
-    return 0 if rules.ok else BROKEN
+        print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s\n{found}\n{out}")
+    return 0 if found.ok else BELOW_GUIDELINE
 
 
-def _sweep(options: argparse.Namespace):
+def _sweep(options: argparse.Namespace) -> "Excitation":
     import numpy as np
 
     from jaxquad.excitation import sweep
@@ -67,7 +70,7 @@ def _sweep(options: argparse.Namespace):
     )
 
 
-def _multisine(options: argparse.Namespace):
+def _multisine(options: argparse.Namespace) -> "Excitation":
     import numpy as np
 
     from jaxquad.excitation import harmonics, multisine
@@ -88,16 +91,21 @@ def _multisine(options: argparse.Namespace):
 def _band(options: argparse.Namespace) -> tuple[float, float]:
     low, high = options.band
     if not 0 < low < high:
-        raise ValueError(f"the band {low:g} .. {high:g} Hz has to rise from above 0")
+        raise ValueError(f"--band is {low:g} {high:g}: give two frequencies above 0, rising")
     if not options.rate > 0:
-        raise ValueError(f"the rate is {options.rate:g} Hz: give one above 0")
+        raise ValueError(f"--rate is {options.rate:g}: give a rate above 0 Hz")
     return low, high
 
 
-def _write(options: argparse.Namespace, signal: Any) -> Path:
-    from jaxquad.workflows import write_whole
+DESIGN = Command(
+    "design",
+    "make a signal to excite the vehicle with, and check it against published guidelines",
+    """examples:
+  jaxquad design sweep --band 0.3 12 --rate 500 --amplitude 0.2 --out sweep.csv
+  jaxquad design multisine --band 0.3 12 --rate 500 --amplitude 0.2 --lines 25 --json
 
-    out = options.out or Path(f"{options.kind}.csv")
-    rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
-    write_whole(out, f"time,signal\n{''.join(rows)}".encode())
-    return out
+exit codes: 0 done, 2 unusable input, 4 a guideline is not met (the signal is written all the same)
+""",
+    _add,
+    _run,
+)

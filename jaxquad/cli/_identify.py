@@ -1,20 +1,69 @@
+"""`jaxquad identify`, `report`, `verify` and `demo`: commands around one identified log."""
+
 import argparse
+import sys
 from pathlib import Path
-from typing import Any
+
+from jaxquad.workflows import IdentifySettings
 
 from ._options import (
+    add_config,
+    add_json,
     add_log,
-    command,
-    read_mix,
-    read_segment,
-    read_unit,
-    require_identifiable,
-    SECONDS,
+    add_moved_log,
+    add_out,
+    add_result,
+    add_settings,
+    Command,
+    given_settings,
+    print_json,
+    settings_of,
     stdout_for_json,
 )
 
 
-EXAMPLES = """examples:
+NOT_IDENTIFIABLE = 3
+_CODES = "exit codes: 0 done, 2 unusable input, 3 the record does not determine the parameters\n"
+
+
+def _finish(options: argparse.Namespace, found, folder: Path | None, note: str = "") -> int:
+    """Print an identification, write its folder, and tell whether it is identifiable."""
+    with stdout_for_json(options):
+        print(found)
+        path = found.write(folder)
+        names = ", ".join(["report.html", *found.figures()])
+        print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
+    if options.json:
+        print(path.read_text(), end="")
+    if found.fit.identifiable:
+        return 0
+    print("jaxquad: error:", " ".join(found.fit.verdict.summary.split()), file=sys.stderr)
+    return NOT_IDENTIFIABLE
+
+
+def _add_identify(declared: argparse.ArgumentParser) -> None:
+    add_log(declared)
+    add_config(declared)
+    add_out(declared, "results/NAME of the file")
+    add_json(declared, "result.json")
+    add_settings(declared, IdentifySettings)
+
+
+def _identify(options: argparse.Namespace) -> int:
+    from jaxquad.workflows import identify, propose_settings
+
+    given = settings_of(options, IdentifySettings)
+    settings, proposal = propose_settings(options.file, given)
+    if proposal is not None:
+        with stdout_for_json(options):
+            print(f"{proposal}\n", flush=True)
+    return _finish(options, identify(options.file, settings), options.out)
+
+
+IDENTIFY = Command(
+    "identify",
+    "fit K e^(-delay s) / (s^n (lag s + 1)), or a transfer function, to a log",
+    """examples:
   jaxquad identify flight.ulg
   jaxquad identify flight.npz --input M --output q --reference x0 --rate 250 --start 50 --stop 76
   jaxquad identify flight.csv --input "roll=-m1-m2+m3+0.5*m4" --output p --band 0.7 12 --no-lag
@@ -23,72 +72,121 @@ EXAMPLES = """examples:
   jaxquad identify log15 --input "roll=-motor.m1^2-motor.m2^2+motor.m3^2+motor.m4^2" --output gyro.x
   jaxquad identify a.npz --input "cmd[0]" --output "rate[0]" --verify b.npz --json > fit.json
 
-Without --input and --output the log of a known autopilot says what they are; the line that this
-stands for is printed. Weights and powers of an input make a torque of motors with a thrust curve.
-exit codes: 0 done, 2 for what cannot be used, 3 where the record does not determine the parameters
+Without --input and --output, the log of a known autopilot proposes them, and the full command line
+is printed. Powers of a channel describe motors with a thrust curve.
 """
-TEXT = "fit K e^(-delay s) / (s^n (lag s + 1)) to a record"
+    + _CODES,
+    _add_identify,
+    _identify,
+)
 
 
-def add(commands: Any) -> None:
-    declared = command(commands, "identify", run, TEXT, EXAMPLES)
+def _add_report(declared: argparse.ArgumentParser) -> None:
+    add_result(declared)
+    add_moved_log(declared)
+    add_out(declared, "the folder of the result")
+    add_json(declared, "result.json")
+
+
+def _report(options: argparse.Namespace) -> int:
+    from jaxquad.workflows import identify_again, read_result
+
+    stored = read_result(options.result)
+    found = identify_again(stored, log=options.log)
+    return _finish(options, found, options.out or stored.folder)
+
+
+REPORT = Command(
+    "report",
+    "write the report and the figures of a result again",
+    """example:
+  jaxquad report results/flight
+
+The log is identified again with the settings in result.json. It has to be the same file.
+"""
+    + _CODES,
+    _add_report,
+    _report,
+)
+
+
+_OF_A_RECORD = ("input", "output", "time", "time_unit", "rate", "start", "stop", "band")
+
+
+def _add_verify(declared: argparse.ArgumentParser) -> None:
+    add_result(declared)
     add_log(declared)
-    _add_channels(declared)
-    _add_model(declared)
-    _add_estimate(declared)
-    add = declared.add_argument
-    add("--verify", type=Path, metavar="FILE", help="a record with the same channels to simulate")
-    add("--verify-start", help="in that file's time", **SECONDS)
-    add("--verify-stop", help="in that file's time", **SECONDS)
-    add("--out", type=Path, metavar="FOLDER", help="by default results/NAME of the file")
-    add("--json", action="store_true", help="result.json to stdout, and the report to stderr")
+    add_settings(declared, IdentifySettings, only=_OF_A_RECORD)
+    declared.add_argument("--out", type=Path, metavar="PNG", help="draw both outputs into a figure")
+    add_json(declared, "the measures of agreement")
 
 
-def run(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import report_identification
+def _verify(options: argparse.Namespace) -> int:
+    from jaxquad.plot import overlay
+    from jaxquad.report import verification_content
+    from jaxquad.workflows import read_result, verify_result
 
+    stored = read_result(options.result)
+    check = verify_result(stored, options.file, given_settings(options, IdentifySettings))
     with stdout_for_json(options):
-        path, verdict = report_identification(options)
+        print(check)
+        for doubt in stored.doubts:
+            print(f"! {doubt}")
+        if options.out:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            overlay(check, title=options.file.name).savefig(options.out, dpi=130)
+            print(options.out)
     if options.json:
-        print(path.read_text(), end="")
-    require_identifiable(verdict)
+        print_json(verification_content(check))
     return 0
 
 
-def _add_channels(declared: argparse.ArgumentParser) -> None:
-    add = declared.add_argument
-    add("--input", type=read_mix, help="a channel, or NAME=-a+b+0.5*c, with powers: NAME=0.1*a^2")
-    add("--output", type=read_mix, help="likewise")
-    add("--reference", type=read_mix, help="an outside signal that no feedback computes")
-    add("--axis", choices=("roll", "pitch", "yaw"), help="to propose input and output for")
-    add("--unit", type=read_unit, action="append", default=[], metavar="NAME=UNIT",
-        help="of a channel, such as q=rad/s; may be repeated")  # fmt: skip
-    add("--rate", type=float, metavar="HZ", help="to resample to; by default the file's own")
-    add("--start", help="in the file's time", **SECONDS)
-    add("--stop", help="in the file's time", **SECONDS)
-    add("--segment", type=read_segment, action="append", default=[], metavar="START:STOP",
-        help="instead of both of these; repeated, all segments are analysed together")  # fmt: skip
-    band = declared.add_mutually_exclusive_group()
-    for name, unit in (("--band", "Hz"), ("--band-rad", "rad/s")):
-        text = f"{unit}, to fit within; by default what the record resolves"
-        band.add_argument(name, type=float, nargs=2, metavar=("LOW", "HIGH"), help=text)
+VERIFY = Command(
+    "verify",
+    "simulate an identified model on another log, and compare",
+    """example:
+  jaxquad verify results/flight second_flight.npz --start 20 --stop 45 --out verification.png
+
+Channels, rate and band are those of the result, unless other ones are given.
+exit codes: 0 done, 2 unusable input, 3 the result holds no model
+""",
+    _add_verify,
+    _verify,
+)
 
 
-def _add_model(declared: argparse.ArgumentParser) -> None:
-    add = declared.add_argument
-    add("--integrators", type=int, default=1, help="n: 1 from a moment to a rate, 2 to an angle")
-    add("--no-lag", action="store_true", help="a model without a lag")
-    add("--no-delay", action="store_true", help="a model without a delay")
-    add("--poles", type=int, metavar="N", help="fit a transfer function of so many poles beside "
-        "the integrators, instead of a lag")  # fmt: skip
-    add("--zeros", type=int, metavar="N", default=0, help="and of so many zeros")
+_NEXT = """
+
+The log is simulated: one axis under rate feedback, in gusts, excited by a sweep of its command.
+True values: gain {gain:g}, lag {lag:g} s, delay {delay:g} s, so lag + delay = {sum:.4g} s.
+Look at {{report}}
+Then identify your own log:
+  jaxquad channels YOUR.LOG
+  jaxquad identify YOUR.LOG"""
 
 
-def _add_estimate(declared: argparse.ArgumentParser) -> None:
-    add = declared.add_argument
-    add("--estimator", choices=("local", "composite", "welch"), default="local",
-        help="local polynomials, composite windows, or windows of one length")  # fmt: skip
-    add("--window", help="length of a window for welch, a fifth of the record by default",
-        **SECONDS)  # fmt: skip
-    add("--cost", choices=("ml", "coherence"), default="ml",
-        help="maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14)")  # fmt: skip
+def _add_demo(declared: argparse.ArgumentParser) -> None:
+    add_out(declared, "results/demo")
+    add_json(declared, "result.json")
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
+
+    folder = options.out or Path("results/demo")
+    log = write_demo_log(folder / "demo.csv")
+    note = _NEXT.format(**DEMO_TRUTH, sum=DEMO_TRUTH["lag"] + DEMO_TRUTH["delay"])
+    return _finish(options, identify(log, DEMO), folder, note)
+
+
+DEMO = Command(
+    "demo",
+    "write a simulated log whose true model is known, and identify it",
+    """example:
+  jaxquad demo
+
+exit codes: 0 done, 2 the folder cannot be written
+""",
+    _add_demo,
+    _demo,
+)

@@ -5,59 +5,80 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Any
 
-from . import _batch, _channels, _demo, _design, _identify, _report, _tune, _verify
+from ._batch import BATCH
+from ._channels import CHANNELS
+from ._design import DESIGN
+from ._identify import DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
+from ._options import in_flags
+from ._tune import TUNE
 
 
-_COMMANDS = (_demo, _channels, _identify, _verify, _report, _tune, _design, _batch)
+_COMMANDS = (DEMO, CHANNELS, IDENTIFY, VERIFY, REPORT, TUNE, DESIGN, BATCH)
 _CODES = """exit codes:
   0  done
   2  the input or the options cannot be used
   3  the record does not determine the parameters
-  4  some logs of a batch failed; a certificate fails; an excitation breaks a guideline
+  4  some logs of a batch failed, a certificate fails, or an excitation misses a guideline
   130  interrupted
 """
-_UNUSABLE, _NOT_IDENTIFIABLE, _INTERRUPTED = 2, 3, 130
+_UNUSABLE, _INTERRUPTED = 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code, see `jaxquad --help`."""
-    options = _parser().parse_args(argv)
+    """Run the command line.
+
+    **Arguments:**
+
+    - `argv`: its words; those of the process by default.
+
+    **Returns:** the exit code, see `jaxquad --help`.
+    """
+    options = make_parser().parse_args(argv)
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from jaxquad.identify import UndeterminedError
     from jaxquad.records import RecordWarning
+    from jaxquad.workflows import SettingsError
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", RecordWarning)
-        warnings.showwarning = _warn
+        warnings.showwarning = _print_warning
         try:
             return options.run(options)
+        except SettingsError as error:
+            return _fail(in_flags(error), _UNUSABLE)
+        except UndeterminedError as error:
+            return _fail(str(error), NOT_IDENTIFIABLE)
         except (ValueError, OSError) as error:
-            print("jaxquad: error:", *str(error).split(), file=sys.stderr)
-            return _NOT_IDENTIFIABLE if isinstance(error, UndeterminedError) else _UNUSABLE
+            return _fail(str(error), _UNUSABLE)
         except KeyboardInterrupt:
             print("jaxquad: interrupted", file=sys.stderr)
             return _INTERRUPTED
 
 
-def _warn(message: Warning | str, *_: Any) -> None:
+def _fail(message: str, code: int) -> int:
+    print("jaxquad: error:", *message.split(), file=sys.stderr)
+    return code
+
+
+def _print_warning(message: Warning | str, *_: object) -> None:
     print("!", *str(message).split(), file=sys.stderr)
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line."""
     parser = argparse.ArgumentParser(
         prog="jaxquad",
         description="From a flight record to an identified model with honest error bars.",
-        epilog="\n".join((*(each.EXAMPLES.split("\n\n")[0] for each in _COMMANDS), _CODES)),
+        epilog="\n".join((*(each.examples.split("\n\n")[0] for each in _COMMANDS), _CODES)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('jaxquad')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for each in _COMMANDS:
-        each.add(commands)
+        each.declare(commands)
     return parser
 
 

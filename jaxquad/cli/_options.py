@@ -1,105 +1,140 @@
-"""What several commands share: how a command is declared, and how options are read and shown."""
+"""What several commands share: how a command is declared, and how results are shown."""
 
 import argparse
 import contextlib
 import json
-import math
-import shutil
+import re
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TypeVar
 
-from jaxquad.records import Mix, parse_mix
-
-
-if TYPE_CHECKING:
-    from jaxquad.identify import Verdict
-
-
-class Bar:
-    """How many of `total` are done, and how long the rest takes at this pace."""
-
-    def __init__(self, total: int, *, shown: bool | None = None):
-        self.total, self.done, self.start = total, 0, time.monotonic()
-        self.shown = sys.stderr.isatty() if shown is None else shown
-
-    def advance(self, text: str = "") -> None:
-        """One more is done; `text` says which."""
-        self.done += 1
-        if self.shown:
-            print(f"\r\x1b[K{self._line(text)}", end="", file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        """Clear the line."""
-        if self.shown:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-
-    def _line(self, text: str) -> str:
-        spent = time.monotonic() - self.start
-        left = spent / self.done * max(self.total - self.done, 0)
-        full = 20 * self.done // max(self.total, 1)
-        bar = f"[{'#' * full}{'.' * (20 - full)}]"
-        line = f"{bar} {self.done}/{self.total}, {left:.0f} s left  {text}"
-        plain = "".join(c if c.isprintable() else "?" for c in line)
-        return plain[: shutil.get_terminal_size().columns - 1]
+from jaxquad.workflows import BatchSettings, IdentifySettings, SettingsError, TuneSettings
 
 
 Run = Callable[[argparse.Namespace], int]
-SECONDS: dict[str, Any] = {"type": float, "metavar": "S"}
+Settings = type[IdentifySettings] | type[TuneSettings] | type[BatchSettings]
+S = TypeVar("S", IdentifySettings, TuneSettings, BatchSettings)
+Commands = Any  # argparse names the type of its subparsers nowhere public
 
 
-def command(commands: Any, name: str, run: Run, text: str, epilog: str) -> argparse.ArgumentParser:
-    """Declare a command with its examples."""
-    declared = commands.add_parser(
-        name,
-        help=text,
-        description=text,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    declared.set_defaults(run=run)
-    return declared
+class Command(NamedTuple):
+    """A command of `jaxquad`: its name, what its help says, its options, and what it does."""
+
+    name: str
+    help: str
+    examples: str
+    add: Callable[[argparse.ArgumentParser], None]
+    run: Run
+
+    def declare(self, commands: Commands) -> None:
+        declared = commands.add_parser(
+            self.name,
+            help=self.help,
+            description=self.help,
+            epilog=self.examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        declared.set_defaults(run=self.run)
+        self.add(declared)
 
 
 def add_log(declared: argparse.ArgumentParser) -> None:
-    """The file and its clock."""
-    declared.add_argument("file", type=Path, help="a log of an autopilot, CSV, NPZ, MAT, HDF5 ...")
-    declared.add_argument("--time", help="the channel that holds the time")
-    declared.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), help="its unit")
+    declared.add_argument("file", type=Path, help="a log of an autopilot, CSV, NPZ, MAT, HDF5, ...")
+
+
+def add_result(declared: argparse.ArgumentParser) -> None:
+    declared.add_argument("result", type=Path, help="the folder, or result.json, of identify")
+
+
+def add_moved_log(declared: argparse.ArgumentParser) -> None:
+    text = "the log that was identified, if it was moved"
+    declared.add_argument("--log", type=Path, metavar="FILE", help=text)
+
+
+def add_out(declared: argparse.ArgumentParser, default: str) -> None:
+    text = f"where to write; by default {default}"
+    declared.add_argument("--out", type=Path, metavar="FOLDER", help=text)
 
 
 def add_json(declared: argparse.ArgumentParser, what: str) -> None:
-    declared.add_argument("--json", action="store_true", help=f"{what} to stdout as JSON")
+    text = f"print {what} as JSON to stdout, everything else to stderr"
+    declared.add_argument("--json", action="store_true", help=text)
 
 
-def read_mix(text: str) -> Mix:
-    """`parse_mix` for an option."""
-    try:
-        return parse_mix(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+def add_config(declared: argparse.ArgumentParser) -> None:
+    text = "settings, with the names of the options as keys; options take precedence"
+    declared.add_argument("--config", type=Path, metavar="TOML", help=text)
 
 
-def read_unit(text: str) -> tuple[str, str]:
-    """`q=rad/s` as a name and its unit."""
-    name, sign, unit = (part.strip() for part in text.partition("="))
-    if not (name and sign and unit):
-        raise argparse.ArgumentTypeError(f"{text!r}: write NAME=UNIT, for instance q=rad/s")
-    return name, unit
+def add_settings(
+    declared: argparse.ArgumentParser, settings: Settings, *, only: Sequence[str] | None = None
+) -> None:
+    """Declare an option for each setting; an option that is not given stays out of the result."""
+    groups = {}
+    for key, option in settings.options().items():
+        if only is not None and key not in only:
+            continue
+        group = groups.setdefault(option.group, declared.add_argument_group(option.group) if
+                                  option.group and only is None else declared)  # fmt: skip
+        kind = option.kind
+        how: dict[str, Any] = {"dest": key, "default": argparse.SUPPRESS, "help": option.help}
+        if kind.words == 0:
+            group.add_argument(option.flag, action="store_false", **how)
+            continue
+        how |= {"type": kind.read, "metavar": kind.metavar, "choices": kind.choices}
+        how |= {"nargs": kind.words} if kind.words > 1 else {}
+        how |= {"action": "append"} if kind.repeated else {}
+        group.add_argument(option.flag, **how)
 
 
-def read_segment(text: str) -> tuple[float, float]:
-    """`22:30.5` as start and stop in s."""
-    start, _, stop = text.partition(":")
-    try:
-        span = float(start), float(stop)
-    except ValueError:
-        span = 0.0, 0.0
-    if not -math.inf < span[0] < span[1] < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r}: write START:STOP in s, for instance 22:30.5")
-    return span
+def given_settings(options: argparse.Namespace, settings: Settings) -> dict[str, object]:
+    """Those that were given on the command line."""
+    keys = settings.options()
+    return {key: value for key, value in vars(options).items() if key in keys}
+
+
+def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
+    """The settings of a TOML file, if there is one, changed by the options."""
+    given = given_settings(options, settings)
+    if options.config is None:
+        return settings.from_mapping(given)
+    return settings.from_toml(options.config).changed(given)
+
+
+_FLAGS = {
+    key: option.flag
+    for settings in (BatchSettings, TuneSettings, IdentifySettings)
+    for key, option in settings.options().items()
+}
+
+
+def in_flags(error: SettingsError) -> str:
+    """The message of an error with flags for the keys of settings."""
+    return re.sub(r"`(\w+)`", lambda key: _FLAGS.get(key[1], key[0]), str(error))
+
+
+class ProgressBar:
+    """A bar on a terminal, plain lines elsewhere."""
+
+    def __init__(self, total: int):
+        from tqdm import tqdm
+
+        self._bar = tqdm(total=total, unit="log", leave=False, disable=None)
+        self.total, self.done = total, 0
+
+    def advance(self, text: str) -> None:
+        """One more is done; `text` says which."""
+        self.done += 1
+        plain = "".join(c if c.isprintable() else "?" for c in text)
+        if self._bar.disable:
+            print(f"{self.done}/{self.total} {plain}", file=sys.stderr, flush=True)
+        else:
+            self._bar.set_postfix_str(plain, refresh=False)
+            self._bar.update()
+
+    def close(self) -> None:
+        self._bar.close()
 
 
 @contextlib.contextmanager
@@ -109,18 +144,10 @@ def stdout_for_json(options: argparse.Namespace) -> Iterator[None]:
         yield
 
 
-def require_identifiable(verdict: "Verdict") -> None:
-    """Raise `UndeterminedError`, which `main` turns into its exit code, for any other verdict."""
-    from jaxquad.identify import UndeterminedError
+def print_json(content: object) -> None:
+    from jaxquad.report import plain_content
 
-    if not verdict.identifiable:
-        raise UndeterminedError(verdict.summary)
-
-
-def print_json(content: Any) -> None:
-    from jaxquad.report import plain_content as plain
-
-    print(json.dumps(plain(content), indent=2, allow_nan=False))
+    print(json.dumps(plain_content(content), indent=2, allow_nan=False))
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:

@@ -1,17 +1,30 @@
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from jaxquad.spectra import FrequencyResponse
+
+from ._labels import plain_ticks
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _LINES = ["-", "--", "-.", ":"]
 _MARKS = ["x", "+", "^", "s"]
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What can be drawn beside a measured response."""
+
+    def frequency_response(
+        self, omega: Float[Array, " frequencies"]
+    ) -> Complex[Array, "frequencies outputs inputs"]: ...
 
 
 class _Curve(NamedTuple):
@@ -28,30 +41,36 @@ class _Curve(NamedTuple):
 
 def bode(
     frf: FrequencyResponse,
-    model: Any = None,
+    models: Model | Mapping[str, Model] | None = None,
     *,
     others: Mapping[str, FrequencyResponse] | None = None,
     pair: tuple[str, str] | None = None,
     title: str = "",
-) -> Any:
-    """Magnitude, phase and coherence of a measured response with its 95 % band, beside models.
+) -> Figure:
+    """Draw magnitude, phase and coherence of a measured response, beside models.
 
-    `model` has `frequency_response(omega)`, or is a mapping from legend texts to such models;
-    `others` are further estimates of the same response. `pair` is (output, input), by default
-    the first of each. Points whose coherence is below 0.6 are faint and have no band.
-    Returns a `matplotlib.figure.Figure`; ValueError for an unknown pair. Source: the paper's
-    Figure 5.
+    The grey band holds 95 % of the random error. Points whose coherence is below 0.6 are faint and
+    have no band. As the paper's Figure 5.
+
+    **Arguments:**
+
+    - `frf`: the measured response.
+    - `models`: a model with `frequency_response(omega)`, or several by the text of the legend.
+    - `others`: further estimates of the same response, by the text of the legend.
+    - `pair`: names of output and input; by default the first of each.
+    - `title`: above the figure.
+
+    **Raises:** ValueError for an unknown `pair`.
     """
-    from matplotlib.figure import Figure
-
     o, i = _position(frf, pair)
     figure = Figure(figsize=(6.5, 7.0), layout="constrained")
-    axes = figure.subplots(3, 1, sharex=True, height_ratios=[3, 3, 1.6])
+    axes = list(figure.subplots(3, 1, sharex=True, height_ratios=[3, 3, 1.6]))
     measured = _curve(frf, o, i)
     _draw_measured(axes, measured, f"{frf.method} estimate")
     for k, (name, other) in enumerate((others or {}).items()):
         _draw_other(axes, _beside(_curve(other, *_position(other, pair)), measured), name, k)
-    models = model if isinstance(model, Mapping) else {"model": model} if model else {}
+    if not isinstance(models, Mapping):
+        models = {"model": models} if models is not None else {}
     for k, (name, each) in enumerate(models.items()):
         _draw_model(axes, _beside(_model_curve(each, measured, o, i), measured), name, k)
     _scale(axes, measured)
@@ -89,17 +108,17 @@ def _phase(
     return phase - 360 * np.round((np.median(phase[good]) + 180) / 360)
 
 
-def _model_curve(model: Any, measured: _Curve, o: int, i: int) -> _Curve:
+def _model_curve(model: Model, measured: _Curve, o: int, i: int) -> _Curve:
     omega = np.geomspace(measured.omega[0], measured.omega[-1], 300)
-    response = np.asarray(_response(model, jnp.asarray(omega)))[:, o, i]
+    response = np.asarray(model_response(model, jnp.asarray(omega)))[:, o, i]
     phase = np.degrees(np.unwrap(np.angle(response)))
     one, none = np.ones_like(omega), np.zeros_like(omega)
     return _Curve(omega, 20 * np.log10(np.abs(response)), phase, one, none)
 
 
 @eqx.filter_jit
-def _response(
-    model: Any, omega: Float[Array, " frequencies"]
+def model_response(
+    model: Model, omega: Float[Array, " frequencies"]
 ) -> Complex[Array, "frequencies outputs inputs"]:
     return model.frequency_response(omega)
 
@@ -112,7 +131,7 @@ def _beside(curve: _Curve, measured: _Curve) -> _Curve:
     return curve._replace(phase=curve.phase - 360 * np.round(np.median(apart) / 360))
 
 
-def _draw_measured(axes: Any, curve: _Curve, name: str) -> None:
+def _draw_measured(axes: Sequence[Axes], curve: _Curve, name: str) -> None:
     omega, good = curve.omega, curve.good
     decibels = 20 / np.log(10) * curve.error
     for axis, level, error in (
@@ -130,7 +149,7 @@ def _draw_measured(axes: Any, curve: _Curve, name: str) -> None:
     axes[2].plot(omega, curve.coherence, "o-", ms=2.5, lw=0.8, color="0.15")
 
 
-def _draw_other(axes: Any, curve: _Curve, name: str, k: int) -> None:
+def _draw_other(axes: Sequence[Axes], curve: _Curve, name: str, k: int) -> None:
     mark, good = _MARKS[k % len(_MARKS)], curve.good
     style = dict(ls="none", marker=mark, ms=5, mew=0.9, color="tab:red", label=name)
     axes[0].plot(curve.omega[good], curve.magnitude[good], **style)
@@ -138,13 +157,13 @@ def _draw_other(axes: Any, curve: _Curve, name: str, k: int) -> None:
     axes[2].plot(curve.omega, curve.coherence, ls=":", marker=mark, ms=3, lw=0.8, color="tab:red")
 
 
-def _draw_model(axes: Any, curve: _Curve, name: str, k: int) -> None:
+def _draw_model(axes: Sequence[Axes], curve: _Curve, name: str, k: int) -> None:
     style = dict(ls=_LINES[k % len(_LINES)], lw=1.6, color="tab:blue", label=name)
     axes[0].plot(curve.omega, curve.magnitude, **style)
     axes[1].plot(curve.omega, curve.phase, **style)
 
 
-def _scale(axes: Any, curve: _Curve) -> None:
+def _scale(axes: Sequence[Axes], curve: _Curve) -> None:
     """Axes that show every coherent point and the models, whatever the other points do."""
     if not curve.good.any():
         return
@@ -155,7 +174,7 @@ def _scale(axes: Any, curve: _Curve) -> None:
         axis.set_ylim(shown.min() - margin, shown.max() + margin)
 
 
-def _label(figure: Any, axes: Any, name: str, title: str) -> None:
+def _label(figure: Figure, axes: Sequence[Axes], name: str, title: str) -> None:
     for axis, text in zip(axes, (f"|{name}|, dB", "phase, deg", "coherence"), strict=True):
         axis.set_ylabel(text)
         axis.grid(True, which="both", color="0.9", lw=0.5)
@@ -166,7 +185,7 @@ def _label(figure: Any, axes: Any, name: str, title: str) -> None:
     hertz = axes[0].secondary_xaxis("top", functions=(_to_hertz, _to_rad))
     hertz.set_xlabel("frequency, Hz")
     for axis in (axes[2].xaxis, hertz.xaxis):
-        _number(axis)
+        plain_ticks(axis)
     handles, labels = axes[0].get_legend_handles_labels()
     columns = min(len(labels), 3)
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9)
@@ -174,18 +193,9 @@ def _label(figure: Any, axes: Any, name: str, title: str) -> None:
         figure.suptitle(title)
 
 
-def _number(axis: Any) -> None:
-    """Ticks at 1, 2, 5 of every decade as plain numbers, not as 2 x 10^1."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def _to_hertz(omega: Any) -> Any:
+def _to_hertz(omega: Float[np.ndarray, " *frequencies"]) -> Float[np.ndarray, " *frequencies"]:
     return omega / (2 * np.pi)
 
 
-def _to_rad(hertz: Any) -> Any:
+def _to_rad(hertz: Float[np.ndarray, " *frequencies"]) -> Float[np.ndarray, " *frequencies"]:
     return hertz * 2 * np.pi

@@ -1,12 +1,14 @@
 from collections.abc import Sequence
 from textwrap import wrap
-from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from jaxquad.tuning import Certificate, SHOWN, Shown
+from jaxquad.tuning import Certificate, QUANTITIES, Quantity
 
-from ._marks import limit_line, marks, pretty
+from ._labels import draw_limit, marks, plain_ticks, raise_powers
 
 
 _TOPS = {"sensitivity_peak": 30.0}  # where the picture ends: more is as good as unstable
@@ -18,22 +20,27 @@ def certificate_figure(
     quantities: Sequence[str] = ("itae", "sensitivity_peak"),
     designs: Sequence[str] | None = None,
     title: str = "",
-) -> Any:
-    """Each member of a certificate over its inertia: who is stable, then the `quantities`.
+) -> Figure:
+    """Draw every member of a certificate over its inertia: stability, then further quantities.
 
-    Members that are linearly unstable have a cross, and no Ms or margin. Limits are dashed lines.
-    `designs` are those of the certificate that are drawn, by name, None for all.
-    Returns a `matplotlib.figure.Figure`. Raises ValueError for unknown names.
+    Linearly unstable members have a cross, and no Ms or margin. Limits are dashed lines.
+
+    **Arguments:**
+
+    - `certificate`: see `jq.certify`.
+    - `quantities`: names of `jaxquad.tuning`, a panel for each.
+    - `designs`: the names of those that are drawn; all by default.
+    - `title`: by default the verdict.
+
+    **Raises:** ValueError for unknown designs, and for more than there are marks.
     """
-    from matplotlib.figure import Figure
-
     names = tuple(certificate.designs) if designs is None else tuple(designs)
     unknown = [name for name in names if name not in certificate.designs]
     if unknown:
         raise ValueError(f"no designs {unknown}: choose from {list(certificate.designs)}")
     heights = [0.28 * len(names) + 0.1, *(2.7 for _ in quantities)]
     figure = Figure(figsize=(7.5, 1.5 + sum(heights)), layout="constrained")
-    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    panels = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
     place, label = _inertia(certificate)
     _stability(panels[0], certificate, names, place)
     for panel, quantity in zip(panels[1:], quantities, strict=True):
@@ -55,7 +62,7 @@ def _inertia(certificate: Certificate) -> tuple[np.ndarray, str]:
 
 
 def _stability(
-    panel: Any, certificate: Certificate, names: Sequence[str], place: np.ndarray
+    panel: Axes, certificate: Certificate, names: Sequence[str], place: np.ndarray
 ) -> None:
     """A row for each design: a cross for an unstable member, a dot for a stable one."""
     labels = []
@@ -74,9 +81,9 @@ def _stability(
 
 
 def _members(
-    panel: Any, certificate: Certificate, quantity: str, names: Sequence[str], place: np.ndarray
+    panel: Axes, certificate: Certificate, quantity: str, names: Sequence[str], place: np.ndarray
 ) -> None:
-    shown, top = SHOWN[quantity], _TOPS.get(quantity, np.inf)
+    shown, top = QUANTITIES[quantity], _TOPS.get(quantity, np.inf)
     lowest = []
     for name, style in reversed(marks(names).items()):
         design = certificate.designs[name]
@@ -92,20 +99,18 @@ def _members(
     for distance in certificate.distances:
         if distance.quantity == quantity:
             text = f"{distance.over} {distance.sense} {shown.text(distance.bound)}"
-            limit_line(panel, shown.number(distance.bound), pretty(text))
+            draw_limit(panel, shown.number(distance.bound), raise_powers(text))
     panel.set_yscale("log" if min(lowest) > 0 and not shown.decibels else "linear")
     panel.set_ylabel(_label(shown, top))
 
 
-def _label(shown: Shown, top: float) -> str:
-    unit = f", {pretty(shown.unit)}" if shown.unit else ""
+def _label(shown: Quantity, top: float) -> str:
+    unit = f", {raise_powers(shown.unit)}" if shown.unit else ""
     return f"{shown.title}{unit}" + (f" (beyond {top:g} at {top:g})" if np.isfinite(top) else "")
 
 
-def _finish(figure: Any, panels: Any) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    named: dict[str, Any] = {}
+def _finish(figure: Figure, panels: Sequence[Axes]) -> None:
+    named: dict[str, Artist] = {}
     for panel in panels[1:]:
         panel.grid(True, which="major", color="0.9", lw=0.5)
         handles, labels = panel.get_legend_handles_labels()
@@ -114,9 +119,7 @@ def _finish(figure: Any, panels: Any) -> None:
     for axis in [panels[-1].xaxis, *(panel.yaxis for panel in panels[1:])]:
         if axis.get_scale() == "log":
             subs = (1, 2, 3, 5) if axis is panels[-1].xaxis else (1, 2, 5)
-            axis.set_major_locator(LogLocator(subs=subs))
-            axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-            axis.set_minor_formatter(NullFormatter())
+            plain_ticks(axis, subs)
     crosses = [name for name in named if name == "linearly unstable"]
     order = [name for name in named if name not in crosses][::-1] + crosses
     figure.legend([named[name] for name in order], order, loc="outside lower center", ncols=3,

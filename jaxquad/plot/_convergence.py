@@ -1,26 +1,35 @@
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from ._marks import limit_line
+from jaxquad.tuning import Evaluation
+
+from ._labels import draw_limit
 
 
+Count = Int[np.ndarray, " evaluations"]
+Values = Float[np.ndarray, "evaluations starts"]
 _LINES = ("-", "--", "-.", ":")
 _LEAST = 1e-5  # of the cost above the best, that is drawn
 _CLOSE = 0.01  # costs are logarithms: within 1 % of the optimum
 
 
-def convergence_figure(history: Sequence[Any], *, title: str = "") -> Any:
-    """How a tune went, by gradient evaluation: cost above the best found, and share stable.
+def convergence_figure(history: Sequence[Evaluation], *, title: str = "") -> Figure:
+    """Draw how a tune went, by gradient evaluation: cost above the best, share of stable members.
 
-    `history` is that of a tune; several starts have a line each. While members are made stable
-    (grey) the cost of flights is not known.
-    Returns a `matplotlib.figure.Figure`. Raises ValueError for an empty history.
+    While members are made stable (grey) nothing is flown, and there is no cost.
+
+    **Arguments:**
+
+    - `history`: `Tuned.history`; several starts have a line each.
+    - `title`: above the figure.
+
+    **Raises:** ValueError for an empty history.
     """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
-
     if not history:
         raise ValueError("the history is empty: give that of a tune")
     count = np.arange(1, len(history) + 1)
@@ -42,7 +51,7 @@ def convergence_figure(history: Sequence[Any], *, title: str = "") -> Any:
     return figure
 
 
-def _costs(panel: Any, count: np.ndarray, cost: np.ndarray) -> None:
+def _costs(panel: Axes, count: Count, cost: Values) -> None:
     best = np.nanmin(cost) if np.isfinite(cost).any() else 0.0
     above = np.maximum(cost - best, _LEAST)
     for k, line in enumerate(above.T):
@@ -52,20 +61,22 @@ def _costs(panel: Any, count: np.ndarray, cost: np.ndarray) -> None:
         panel.plot(count[known], least, lw=1.4, label=f"start {k + 1}", **style)
         panel.plot(count[known], line[known], "o", ms=3, mfc="none", mew=0.8, color=style["color"])
     panel.set(yscale="log", ylabel="cost above the best")
-    limit_line(panel, _CLOSE, "1 %")
+    draw_limit(panel, _CLOSE, "1 %")
     panel.grid(True, which="major", color="0.9", lw=0.5)
 
 
-def _shares(panel: Any, count: np.ndarray, stable: np.ndarray) -> None:
+def _shares(panel: Axes, count: Count, stable: Values) -> None:
     for k, line in enumerate(stable.T):
         known = np.isfinite(line)
         style = {"color": f"{0.5 * k / max(1, stable.shape[1]):.2f}", "ls": _LINES[k % len(_LINES)]}
         panel.plot(count[known], 100 * line[known], drawstyle="steps-mid", lw=1.4, **style)
-    panel.set(ylabel="members stable, %", ylim=(-4, 104))
+    panel.set(ylabel="stable members, %", ylim=(-4, 104))
     panel.grid(True, which="major", color="0.9", lw=0.5)
 
 
-def _stabilising(panels: Sequence[Any], count: np.ndarray, flying: np.ndarray) -> None:
+def _stabilising(
+    panels: Sequence[Axes], count: Count, flying: Bool[np.ndarray, " evaluations"]
+) -> None:
     end = count[~flying & (np.cumsum(flying) == 0)]
     if not end.size:
         return

@@ -1,23 +1,25 @@
-from typing import Any
-
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from jaxquad.tuning import Judged, Pareto, place, SHOWN
+from jaxquad.tuning import DesignResult, front_point, Pareto, QUANTITIES
 
-from ._marks import marks, pretty
+from ._labels import marks, plain_ticks, raise_powers, Style
 
 
 _TITLES = {"activity_rate": "mean activity", "sensitivity_peak": "worst Ms"}
 
 
-def front_figure(pareto: Pareto, *, title: str = "") -> Any:
-    """ITAE over what it costs, of fresh members: the front, its worst members, and the peers.
+def front_figure(pareto: Pareto, *, title: str = "") -> Figure:
+    """Draw a Pareto front: ITAE over activity or Ms on fresh members, with other designs beside it.
 
-    A design with unstable members has a cross and its share of them; over Ms it stands at the right
-    end. Returns a `matplotlib.figure.Figure`.
+    A design with unstable members has a cross and their share; over Ms it stands at the right end.
+
+    **Arguments:**
+
+    - `pareto`: see `jaxquad.tuning`.
+    - `title`: by default what is shown.
     """
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(7.0, 5.0), layout="constrained")
     panel = figure.subplots()
     _front(panel, pareto)
@@ -25,12 +27,12 @@ def front_figure(pareto: Pareto, *, title: str = "") -> Any:
     styles = list(marks(["front", *pareto.peers]).items())[1:]
     for (name, style), design in zip(styles, pareto.peers.values(), strict=True):
         _peer(panel, name, style, design, pareto.over, edge)
-    if not all(np.isfinite(place(x, pareto.over)[0]) for x in pareto.peers.values()):
+    if not all(np.isfinite(front_point(x, pareto.over)[0]) for x in pareto.peers.values()):
         _without(panel, edge)
-    shown = SHOWN[pareto.over]
-    unit = f", {pretty(shown.unit)}" if shown.unit else ""
+    shown = QUANTITIES[pareto.over]
+    unit = f", {raise_powers(shown.unit)}" if shown.unit else ""
     panel.margins(x=0.12, y=0.1)
-    panel.set(xscale="log", yscale="log", ylabel=f"ITAE, {pretty('deg s^2')}")
+    panel.set(xscale="log", yscale="log", ylabel=f"ITAE, {raise_powers('deg s^2')}")
     panel.set_xlabel(f"{_TITLES[pareto.over]} of the members{unit}")
     _ticks(panel)
     figure.legend(loc="outside lower center", ncols=3, fontsize=9)
@@ -39,16 +41,16 @@ def front_figure(pareto: Pareto, *, title: str = "") -> Any:
 
 
 def _message(pareto: Pareto) -> str:
-    members, shown = pareto.certificates[0].members, SHOWN[pareto.over]
+    members, shown = pareto.certificates[0].members, QUANTITIES[pareto.over]
     what = f"tracking against {shown.title}: {members} fresh members fly each design"
     return f"{what}, none is unstable on the front" if pareto.front.any() else f"{what}, no front"
 
 
-def _front(panel: Any, pareto: Pareto) -> None:
-    degrees, on = SHOWN["itae"].scale, pareto.front
+def _front(panel: Axes, pareto: Pareto) -> None:
+    degrees, on = QUANTITIES["itae"].factor, pareto.front
     order = np.argsort(pareto.effort)
     kept = order[on[order]]
-    worst = np.array([c.rows[c.name].statistics["itae"].worst for c in pareto.certificates])
+    worst = np.array([c.summaries[c.name].statistics["itae"].worst for c in pareto.certificates])
     x, mean, top = pareto.effort, degrees * pareto.tracking, degrees * worst
     panel.plot(x[kept], mean[kept], "o-", color="black", ms=5, lw=1.4, label="front, mean")
     panel.plot(x[kept], top[kept], ":", color="black", lw=1.2, label="front, worst member")
@@ -60,14 +62,16 @@ def _front(panel: Any, pareto: Pareto) -> None:
 
 def _edge(pareto: Pareto) -> float:
     """Where designs without a finite effort stand."""
-    known = [place(design, pareto.over)[0] for design in pareto.peers.values()]
+    known = [front_point(design, pareto.over)[0] for design in pareto.peers.values()]
     finite = [x for x in [*pareto.effort, *known] if np.isfinite(x)]
     return 1.6 * max(finite, default=1.0)
 
 
-def _peer(panel: Any, name: str, style: Any, design: Judged, over: str, edge: float) -> None:
-    effort, itae = place(design, over)
-    x, y = min(effort, edge), SHOWN["itae"].number(itae)
+def _peer(
+    panel: Axes, name: str, style: Style, design: DesignResult, over: str, edge: float
+) -> None:
+    effort, itae = front_point(design, over)
+    x, y = min(effort, edge), QUANTITIES["itae"].number(itae)
     panel.plot(x, y, ls="none", label=name, **(style | {"ms": 8.0, "mew": 1.4}))
     count = design.unstable_count
     if count:
@@ -77,20 +81,16 @@ def _peer(panel: Any, name: str, style: Any, design: Judged, over: str, edge: fl
         panel.annotate(text, (x, y), textcoords="offset points", va="center", fontsize=9, **side)
 
 
-def _without(panel: Any, edge: float) -> None:
+def _without(panel: Axes, edge: float) -> None:
     """The place of designs that have no Ms."""
     panel.axvspan(edge / 1.15, edge * 1.15, color="0.95", lw=0, zorder=0)
     panel.annotate("no Ms", (edge, 1.0), xycoords=("data", "axes fraction"), ha="center", va="top",
                    xytext=(0, -4), textcoords="offset points", fontsize=8)  # fmt: skip
 
 
-def _ticks(panel: Any) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
+def _ticks(panel: Axes) -> None:
     for axis in (panel.xaxis, panel.yaxis):
         low, high = axis.get_view_interval()
         subs = (1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 7)
-        axis.set_major_locator(LogLocator(subs=subs))
-        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        axis.set_minor_formatter(NullFormatter())
+        plain_ticks(axis, subs)
     panel.grid(True, which="major", color="0.9", lw=0.5)

@@ -1,8 +1,11 @@
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ._labels import Style
 
 
 _LINES = [
@@ -22,24 +25,27 @@ def histories(
     target: str | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
     title: str = "",
-) -> Any:
-    """Curves over time in stacked panels, told apart by their lines as well as by their colours.
+) -> Figure:
+    """Draw curves over time in stacked panels; they differ in their lines as well as in colour.
 
-    `panels` maps the text of each vertical axis, such as "roll, deg", to its curves by name; a name
-    has one line in all panels. The curve called `target`, a set-point or a truth, lies behind the
-    others as a wide grey band. `limits` bounds vertical axes by their text, for curves that leave
-    the picture; what is not finite is not drawn. Returns a `matplotlib.figure.Figure`.
-    Raises ValueError for more curves than there are lines, and for limits of an unknown panel.
+    **Arguments:**
+
+    - `time`: in s.
+    - `panels`: the curves by name for each panel, by the text of its vertical axis, such as
+      "roll, deg". A name has the same line in all panels. Values that are not finite are left out.
+    - `target`: the name of a set-point or a truth, drawn behind the others as a wide grey line.
+    - `limits`: of vertical axes, by their text.
+    - `title`: above the figure.
+
+    **Raises:** ValueError for more curves than there are lines, and for limits of an unknown panel.
     """
-    from matplotlib.figure import Figure
-
     style = _styles(panels, target)
     unknown = [text for text in limits or {} if text not in panels]
     if unknown:
         raise ValueError(f"limits for {unknown}, but the panels are {list(panels)}")
     height = 0.9 + 2.3 * len(panels)
     figure = Figure(figsize=(6.5, max(height, 3.6)), layout="constrained")
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    axes = list(figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0])
     for axis, (text, curves) in zip(axes, panels.items(), strict=True):
         for name, values in curves.items():
             shown = np.asarray(values, float)
@@ -56,8 +62,8 @@ def histories(
 
 
 def _styles(
-    panels: Mapping[str, Mapping[str, Any]], target: str | None
-) -> dict[str, dict[str, Any]]:
+    panels: Mapping[str, Mapping[str, Float[ArrayLike, " samples"]]], target: str | None
+) -> dict[str, Style]:
     names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
     others = [name for name in names if name != target]
     if len(others) > len(_LINES):
@@ -68,7 +74,7 @@ def _styles(
     return dict(zip(others, _LINES, strict=False)) | ({target: _TARGET} if target else {})
 
 
-def _legend(figure: Any, axes: Any) -> None:
+def _legend(figure: Figure, axes: Sequence[Axes]) -> None:
     named = {}
     for axis in axes:
         handles, labels = axis.get_legend_handles_labels()

@@ -1,13 +1,12 @@
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from matplotlib.figure import Figure
 
 from jaxquad.records import Record
 
-from ._labels import short_names, visible
-from ._overlay import unit_label
+from ._labels import short_names, unit_label, visible
 
 
 Places = Int[np.ndarray, " kept"]
@@ -17,9 +16,16 @@ _COLOURS = {"reference": "tab:green", "input": "tab:blue", "output": "0.15"}
 
 
 def extremes(values: Float[np.ndarray, " samples"], columns: int = _COLUMNS) -> Places:
-    """Where each of `columns` stretches has its least and its largest value, in order of time.
+    """The places of the least and the largest value in each of `columns` parts of a signal.
 
-    All places of a short signal. A curve through them loses no peak, however long it is.
+    All places of a short signal. A curve through them loses no peak, however long the signal is.
+
+    **Arguments:**
+
+    - `values`: the signal.
+    - `columns`: the number of parts.
+
+    **Returns:** the places, in order of time.
     """
     size = -(-values.size // columns)
     if size <= 2:
@@ -34,7 +40,7 @@ def extremes(values: Float[np.ndarray, " samples"], columns: int = _COLUMNS) -> 
 
 
 def channels_of(record: Record) -> list[tuple[str, str]]:
-    """Role and name of every channel: what was asked for, what was applied, what came out."""
+    """Role and name of every channel: references, inputs, outputs."""
     roles = {
         "reference": record.reference_names,
         "input": record.input_names,
@@ -43,13 +49,18 @@ def channels_of(record: Record) -> list[tuple[str, str]]:
     return [(role, name) for role, names in roles.items() for name in names]
 
 
-def record_overview(record: Record, channels: Sequence[tuple[str, str]]) -> Any:
-    """Channels of a record over time, stacked; of long ones the extremes; angles in degrees.
+def record_figure(record: Record, channels: Sequence[tuple[str, str]] | None = None) -> Figure:
+    """Draw the channels of a record over time, stacked; angles in degrees.
 
-    `channels` are pairs of role and name. Returns a `matplotlib.figure.Figure`.
+    A long channel is drawn through its extremes, so that no peak is lost.
+
+    **Arguments:**
+
+    - `record`: what was flown.
+    - `channels`: pairs of role and name, see `channels_of`; by default all references, inputs and
+      outputs.
     """
-    from matplotlib.figure import Figure
-
+    channels = channels_of(record) if channels is None else channels
     figure = Figure(figsize=(6.5, 0.7 + 1.35 * len(channels)), layout="constrained")
     panels = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     labels = short_names([name for _, name in channels])

@@ -1,12 +1,15 @@
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxquad.spectra import FrequencyResponse
 
-from ._bode import _number, _response, COHERENT
+from ._bode import COHERENT, Model, model_response
+from ._labels import plain_ticks
 
 
 _SIGMAS = 1.96  # of a normal error, that hold 95 %
@@ -38,9 +41,15 @@ class Residuals(NamedTuple):
         return np.concatenate([self.magnitude[self.coherent], self.phase[self.coherent]])
 
 
-def residuals_of(frf: FrequencyResponse, model: Any, output: int, source: int) -> Residuals:
-    """Of the logarithm of measured over modelled response: its parts are dB and degrees."""
-    modelled = np.asarray(_response(model, jnp.asarray(frf.omega)))[:, output, source]
+def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int) -> Residuals:
+    """The logarithm of measured over modelled response, whose parts are magnitude and phase.
+
+    **Arguments:**
+
+    - `frf`, `model`: the measured response, and a model with `frequency_response(omega)`.
+    - `output`, `source`: places of output and input.
+    """
+    modelled = np.asarray(model_response(model, jnp.asarray(frf.omega)))[:, output, source]
     pair = (slice(None), output, source)
     with np.errstate(all="ignore"):
         apart = np.log(np.asarray(frf.response)[pair] / modelled)
@@ -53,14 +62,11 @@ def residuals_of(frf: FrequencyResponse, model: Any, output: int, source: int) -
         return Residuals(omega, size / error, angle / error, decibels, degrees, coherent)
 
 
-def residual_figure(found: Residuals) -> Any:
-    """Residuals over frequency with the band that holds 95 % of them if the model is right.
+def residual_figure(found: Residuals) -> Figure:
+    """Draw residuals over frequency, with the band that holds 95 % of them if the model is right.
 
-    Points whose coherence is below 0.6 are faint. Returns a `matplotlib.figure.Figure`.
+    Points whose coherence is below 0.6 are faint.
     """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
-
     figure = Figure(figsize=(6.5, 4.0), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     for panel, values, text in (
@@ -79,5 +85,5 @@ def residual_figure(found: Residuals) -> Any:
         panel.grid(True, which="both", color="0.93", lw=0.5)
     panels[1].set(xscale="log", xlabel="frequency, rad/s")
     panels[1].set_xlim(found.omega[0] / 1.05, found.omega[-1] * 1.05)
-    _number(panels[1].xaxis)
+    plain_ticks(panels[1].xaxis)
     return figure

@@ -1,15 +1,17 @@
-from ._comparison import comparison as comparison
-from ._html import write_report as write_report
-from ._html_page import page as page
-from ._html_provenance import Provenance as Provenance, provenance as provenance, Source as Source
-from ._html_text import (
-    element as element,
-    given as given,
-    Html as Html,
-    joined as joined,
-    section as section,
-    table as table,
+from ._comparison import compare_fits as compare_fits
+from ._page import (
+    Cell as Cell,
+    render_page as render_page,
+    Table as Table,
+    write_file as write_file,
 )
+from ._provenance import (
+    Provenance as Provenance,
+    provenance as provenance,
+    sha256_of as sha256_of,
+    Source as Source,
+)
+from ._report import write_report as write_report
 from ._results import (
     plain_content as plain_content,
     verification_content as verification_content,

@@ -1,6 +1,5 @@
 import json
 import math
-import os
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -9,33 +8,44 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxquad.identify import Fit, NotIdentifiable, Verification
+from jaxquad.identify import Agreement, Fit, Verification
 from jaxquad.spectra import FrequencyResponse
+
+from ._page import write_file
+
+
+Json = Mapping[str, object]
 
 
 def write_results(
     folder: str | Path,
     *,
-    fit: Fit | NotIdentifiable,
+    fit: Fit,
     frf: FrequencyResponse | None = None,
     check: Verification | None = None,
-    extra: Mapping[str, Any] | None = None,
+    extra: Json | None = None,
 ) -> Path:
-    """Write `result.json` into `folder`, whole or not at all; returns its path.
+    """Write `result.json` into a folder, whole or not at all.
 
-    Numbers that the record does not determine are null: JSON has no nan. Where nothing was, the
-    exception may stand for the fit. Raises TypeError for an `extra` that JSON cannot hold.
+    Numbers that are not finite are null: JSON has no nan. Parameters that the record does not
+    determine keep their numbers, beside `"determined": false`; where nothing could be fitted there
+    are none.
+
+    **Arguments:**
+
+    - `folder`: is made as needed.
+    - `fit`, `frf`, `check`: the fit, the response that was fitted, the model simulated on a record.
+    - `extra`: further keys.
+
+    **Returns:** the path of the file.
+
+    **Raises:** TypeError for an `extra` that JSON cannot hold.
     """
-    content: dict[str, Any] = {"jaxquad_version": _version(), "fit": _fit(fit)}
+    content: dict[str, object] = {"jaxquad_version": _version(), "fit": _fit(fit)}
     content |= {"response": _response(frf)} if frf is not None else {}
     content |= {"verification": verification_content(check)} if check is not None else {}
     content |= dict(extra or {})
-    text = json.dumps(plain_content(content), indent=2, allow_nan=False) + "\n"
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    draft = folder / f"result.json.{os.getpid()}.part"
-    draft.write_text(text)
-    return draft.replace(folder / "result.json")
+    return write_json(Path(folder) / "result.json", content)
 
 
 def _version() -> str | None:
@@ -45,36 +55,53 @@ def _version() -> str | None:
         return None
 
 
-def _fit(fit: Fit | NotIdentifiable) -> dict[str, Any]:
-    if isinstance(fit, NotIdentifiable):
-        return {"identifiable": False, "remarks": [str(fit)]}
-    numbers = ("cost", "average_cost", "chi_squared", "condition", "newton_decrement")
-    return {
+def _fit(fit: Fit) -> dict[str, object]:
+    verdict = {
+        "kind": fit.verdict.kind,
+        "summary": fit.verdict.summary,
+        "undetermined": fit.verdict.undetermined,
+        "reasons": fit.verdict.reasons,
+        "remedies": fit.verdict.remedies,
+    }
+    known: dict[str, object] = {
         "identifiable": fit.identifiable,
+        "verdict": verdict,
+        "remarks": fit.remarks,
+    }
+    if not fit.verdict.fitted:
+        return known
+    return {
+        **known,
         "parameters": [_parameter(fit, k) for k in range(len(fit.names))],
         "combinations": [
             combination._asdict() | {"interval_95": combination.interval}
             for combination in fit.combinations
         ],
-        "null_directions": fit.null_directions,
+        "null_directions": fit.verdict.null_directions,
         "covariance": fit.covariance,
-        **{name: getattr(fit, name) for name in (*numbers, "points", "steps")},
-        "remarks": fit.remarks,
+        "cost": fit.cost,
+        "average_cost": fit.average_cost,
+        "chi_squared": fit.chi_squared,
+        "condition": fit.condition,
+        "newton_decrement": fit.newton_decrement,
+        "points": fit.points,
+        "steps": fit.steps,
     }
 
 
-def _parameter(fit: Fit, k: int) -> dict[str, Any]:
+def _parameter(fit: Fit, k: int) -> dict[str, object]:
     return {
         "name": fit.names[k],
         "value": fit.values[k],
         "standard_error": fit.standard_errors[k],
+        "determined": bool(fit.determined[k]),
         "interval_95": fit.interval(fit.names[k]),
         "cramer_rao_percent": fit.cramer_rao[k],
         "insensitivity_percent": fit.insensitivity[k],
     }
 
 
-def _response(frf: FrequencyResponse) -> dict[str, Any]:
+def _response(frf: FrequencyResponse) -> dict[str, object]:
     return {
         "method": frf.method,
         "inputs": frf.input_names,
@@ -88,21 +115,30 @@ def _response(frf: FrequencyResponse) -> dict[str, Any]:
     }
 
 
-def verification_content(check: Verification) -> dict[str, Any]:
-    measures = ("rms", "tic", "fit_percent", "variance_percent")
-    names = (*measures, "shift", "bias", "initial")
-    return {name: getattr(check, name) for name in names} | {
+def verification_content(check: Verification) -> dict[str, object]:
+    """The measures of a verification, for JSON."""
+    return {
+        **_measures(check),
+        "shift": check.shift,
+        "bias": check.bias,
+        "initial": check.initial,
         "band_rad_per_s": check.band,
         "output": check.output_name,
         "unit": check.output_unit,
-        "outputs": [
-            {name: getattr(one, name) for name in ("name", "unit", *measures)}
-            for one in check.outputs
-        ],
+        "outputs": [{"name": o.name, "unit": o.unit, **_measures(o)} for o in check.outputs],
     }
 
 
-def plain_content(value: Any) -> Any:
+def _measures(found: Verification | Agreement) -> dict[str, object]:
+    return {
+        "rms": found.rms,
+        "tic": found.tic,
+        "fit_percent": found.fit_percent,
+        "variance_percent": found.variance_percent,
+    }
+
+
+def plain_content(value: object) -> Any:
     """JSON's own types, with null for what is not finite."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return plain_content(np.asarray(value).tolist())
@@ -115,15 +151,16 @@ def plain_content(value: Any) -> Any:
     return value
 
 
-def write_json(path: str | Path, content: Mapping[str, Any]) -> Path:
-    """Write `content`, arrays included, to `path`, whole or not at all; returns the path.
+def write_json(path: str | Path, content: Json) -> Path:
+    """Write a JSON file, whole or not at all.
 
-    Numbers that are not finite are null: JSON has no nan. Folders are made as needed. Raises
-    TypeError for what JSON cannot hold.
+    **Arguments:**
+
+    - `path`: its folders are made as needed.
+    - `content`: arrays included; numbers that are not finite become null.
+
+    **Returns:** the path.
+
+    **Raises:** TypeError for what JSON cannot hold.
     """
-    path = Path(path)
-    text = json.dumps(plain_content(content), indent=2, allow_nan=False) + "\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f"{path.name}.{os.getpid()}.part")
-    draft.write_text(text)
-    return draft.replace(path)
+    return write_file(path, json.dumps(plain_content(content), indent=2, allow_nan=False) + "\n")

@@ -1,32 +1,31 @@
-"""`jaxquad identify`: from the options of the command line to a printed report and a folder."""
+"""Identify one log: from its path and settings to fits, text, figures and a folder."""
 
 import dataclasses
-from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float
+from matplotlib.figure import Figure
 
 from jaxquad.identify import (
     CoherenceWeighted,
     Combination,
-    Cost,
     factors,
     Fit,
     fit,
     fit_transfer_function,
     guess_lagged_integrator,
     MaximumLikelihood,
-    NotIdentifiable,
+    UndeterminedError,
     usable,
     Verification,
     verify,
 )
 from jaxquad.models import LaggedIntegrator, TransferFunction
-from jaxquad.records import Proposal, propose, read_segments, Record, Segment
-from jaxquad.report import comparison
+from jaxquad.plot import bode, overlay, record_figure
+from jaxquad.records import Mix, parse_mix, Proposal, propose, read_segments, Record, Segment
+from jaxquad.report import compare_fits
 from jaxquad.spectra import (
     Composite,
     Estimator,
@@ -37,302 +36,396 @@ from jaxquad.spectra import (
     Welch,
 )
 
-from ._stored import write_identification
+from ._kinds import mix_text
+from ._settings import IdentifySettings
 
 
-_DOUBT = 3.0  # ratio of misfit to random error from which the band is looked into
-_DOMINATED = "feedback-dominated"
-_MOVED = 0.1  # of the gain: more than that is no matter of noise
-
-
-def by_bands(
-    found: Fit, frf: FrequencyResponse, cost: Cost, derived: Mapping[str, Callable[[Any], Any]]
-) -> tuple[Fit, str]:
-    """The fit beside those in the upper and the lower two thirds of its frequencies.
-
-    Returns it with a remark where the gain moves, and the table. Nothing is added where the
-    misfit is below three times the noise, for other models than the lagged integrator, and for a
-    response that feedback dominates: no part of it would be better.
-    """
-    small = found.chi_squared < _DOUBT**2 or not isinstance(found.model, LaggedIntegrator)
-    if small or any(_DOMINATED in remark for remark in frf.remarks):
-        return found, ""
-    used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
-    low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
-    parts = {"above": (first, high), "below": (low, second)}
-    fits: dict[str, Fit | NotIdentifiable] = {f"{low:.3g} .. {high:.3g} rad/s": found}
-    for word, band in parts.items():
-        limit = first if word == "above" else second
-        fits[f"{word} {limit:.3g} rad/s"] = _refitted(found, frf, cost, band)
-    table = comparison(fits, derived)
-    moved = [_moved(name, other, found) for name, other in list(fits.items())[1:]]
-    remarks = tuple(filter(None, moved))
-    return dataclasses.replace(found, remarks=(*found.remarks, *remarks)), table
-
-
-def _refitted(
-    found: Fit, frf: FrequencyResponse, cost: Cost, band: tuple[float, float]
-) -> Fit | NotIdentifiable:
-    """From where the fit stopped; its undetermined numbers too are finite in the model."""
-    try:
-        return fit(found.model, frf, free=found.names, cost=cost, band=band)
-    except NotIdentifiable as error:
-        return error
-    except ValueError as error:  # The solver diverged.
-        return NotIdentifiable(str(error))
-
-
-def _moved(where: str, other: Fit | NotIdentifiable, found: Fit) -> str:
-    if isinstance(other, NotIdentifiable):
-        return ""
-    before, after = found.values[0], other.values[0]
-    apart = abs(after - before)
-    if not apart > max(_MOVED * abs(before), 2 * other.standard_errors[0]):
-        return ""
-    ratio, was = other.chi_squared**0.5, found.chi_squared**0.5
-    return (
-        f"{where} the gain is {after:.4g} instead of {before:.4g}, with a misfit of {ratio:.1f} "
-        f"instead of {was:.1f}: the model does not hold over the whole band. Fit within the part "
-        f"where it does (--band, --band-rad), or fit one that has more to it"
-    )
-
-
-def with_proposal(options: Namespace) -> Namespace:
-    """Options with input and output, and the proposal printed where they come from it.
-
-    What the user gave stays. Raises ValueError where only one of the two is given, or an axis
-    beside them, and what `propose` raises.
-    """
-    if options.input and options.output:
-        if options.axis:
-            raise ValueError("--axis is for a proposal: leave it out, or --input and --output")
-        return options
-    if options.input or options.output:
-        raise ValueError("--input and --output belong together: give both, or none to be proposed")
-    proposal = propose(options.file, axis=options.axis)
-    print(f"{proposal}\n")
-    offered = proposal.options
-    one = lambda name: {name: {name: 1.0}} if name else None
-    found = {"input": offered["inputs"], "output": one(offered["outputs"]), "axis": None}
-    if options.reference is None:
-        found["reference"] = one(offered["references"])
-    if options.rate is None:
-        found["rate"] = offered["sample_rate"]
-    if proposal.setup.band and not (options.band or options.band_rad):
-        found["band"] = list(proposal.setup.band)
-    return Namespace(**(vars(options) | found | _span(options, proposal)))
-
-
-def _span(options: Namespace, proposal: Proposal) -> dict[str, Any]:
-    """All injections that were found, or what of them lies where the user says to look."""
-    if options.segment:
-        return {}
-    low = -np.inf if options.start is None else options.start
-    high = np.inf if options.stop is None else options.stop
-    inside = [(max(start, low), min(stop, high)) for start, stop in proposal.segments]
-    spans = [(start, stop) for start, stop in inside if start < stop]
-    if len(spans) > 1:
-        return {"segment": spans, "start": None, "stop": None}
-    return dict(zip(("start", "stop"), spans[0], strict=True)) if spans else {}
-
-
-def records_of(options: Namespace) -> list[Record]:
-    """One for each segment. Raises RecordError, ReadError."""
-    asked = {*options.input, *options.output, *(options.reference or {})}
-    return read_segments(
-        options.file,
-        _segments(options),
-        inputs=options.input,
-        outputs=options.output,
-        references=options.reference,
-        sample_rate=options.rate,
-        time=options.time,
-        time_unit=options.time_unit,
-        units={name: unit for name, unit in options.unit if name in asked},
-    )
-
-
-def _segments(options: Namespace) -> Sequence[Segment]:
-    if not options.segment:
-        return [(options.start, options.stop)]
-    if options.start is not None or options.stop is not None:
-        raise ValueError("--segment says where to start and stop: leave --start and --stop out")
-    return [(float(start), float(stop)) for start, stop in options.segment]
-
-
-def described(records: Sequence[Record]) -> str:
-    """All of them as they are printed; the channels once."""
-    first, *others = map(str, records)
-    return "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
-
-
-Outcome = Fit | NotIdentifiable  # the exception stands for the fit where there is none
+Model = LaggedIntegrator | TransferFunction
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
-_LATE = 0.02  # of the record: a delay above it is no delay of the vehicle
+_LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
+_MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
+_CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
+_DOMINATED = "feedback-dominated"
 
 
-def report_identification(options: Namespace) -> tuple[Path, NotIdentifiable | None]:
-    """Identify, print the report, write the files.
+@dataclasses.dataclass(frozen=True)
+class Identification:
+    """One identified log, as `identify` returns it; `str()` is its report as text.
 
-    Returns the path of `result.json` and, where the parameters are not determined, why.
+    **Attributes:**
+
+    - `path`: of the log.
+    - `settings`: those that were used, a proposal included.
+    - `records`: one for each segment.
+    - `responses`: the frequency response by method, the one to trust first.
+    - `fits`: the fit to each of them.
+    - `parts`: where the misfit is large, fits to the upper and to the lower part of the band; None
+      for one that diverged.
+    - `check`: the second record simulated, where `settings.verify` names one.
+    - `proposal`: where the log itself said what is input and output.
     """
-    options = with_proposal(options)
-    records = records_of(options)
-    methods = _methods(options)
-    frfs, outcomes = {}, {}
-    for method in methods:
-        frfs[method], outcomes[method] = _fit_twice(records, method, options)
-    ordered = options.poles is not None
-    late = {} if ordered or options.no_lag or options.no_delay else {"lag + delay": _late}
-    frf, outcome, table = frfs[methods[0]], outcomes[methods[0]], ""
-    if isinstance(outcome, Fit):
-        outcome, table = by_bands(outcome, frf, _COSTS[options.cost], late)
-    shown = f"{described(records)}\n\n{frf}"
-    print(f"{shown}\n\n{_formula(options)}, {methods[0]} estimate:\n{outcome}")
-    if ordered and isinstance(outcome, Fit):
-        print(factors(outcome))
-    if options.reference:
-        print(f"\n{comparison(outcomes, late)}")
-    elif late and isinstance(outcome, Fit):
-        print(_sum(outcome))
-    if table:
-        print(f"\n{table}")
-    check = _verified(outcome, frf, options)
-    print(f"\n{check}" if check else "")
-    path, others = write_identification(
-        options, records, frfs, outcome, check,
-        formula=_formula(options), derived=_derived(outcome, bool(late)),
-    )  # fmt: skip
-    print(f"{path}, {', '.join(others)}")
-    return path, _failure(outcome)
 
+    path: Path
+    settings: IdentifySettings
+    records: tuple[Record, ...]
+    responses: Mapping[str, FrequencyResponse]
+    fits: Mapping[str, Fit]
+    parts: Mapping[str, Fit | None]
+    check: Verification | None
+    proposal: Proposal | None
 
-def identified(options: Namespace) -> tuple[Record, FrequencyResponse, Outcome]:
-    """Without a report: the first record, the response that was fitted, and the fit."""
-    records = records_of(options)
-    return records[0], *_fit_twice(records, _methods(options)[0], options)
+    @property
+    def method(self) -> str:
+        """The estimate to trust: joint with an external reference, else direct."""
+        return next(iter(self.responses))
 
+    @property
+    def frf(self) -> FrequencyResponse:
+        """The frequency response that was fitted."""
+        return self.responses[self.method]
 
-def _methods(options: Namespace) -> tuple[str, ...]:
-    """The first is the one to believe."""
-    return ("joint", "direct") if options.reference else ("direct",)
+    @property
+    def fit(self) -> Fit:
+        """The fit to it, with its verdict."""
+        return self.fits[self.method]
 
+    @property
+    def band(self) -> tuple[float, float]:
+        """The frequencies that were fitted, in rad/s."""
+        return float(self.frf.omega[0]), float(self.frf.omega[-1])
 
-def _fit_twice(
-    records: list[Record], method: str, options: Namespace
-) -> tuple[FrequencyResponse, Outcome]:
-    """The second response is estimated with the delay that the first fit found taken out."""
-    band, delay = _band(options), 0.0
-    dt, duration = records[0].dt, max(record.duration for record in records)
-    omega = np.geomspace(*band, _POINTS) if band else None
-    while True:
-        frf = frequency_response(records, omega, estimator=_estimator(options, method, delay))
+    @property
+    def formula(self) -> str:
+        """The structure of the model in words."""
+        return model_formula(self.settings)
+
+    @property
+    def combinations(self) -> tuple[Combination, ...]:
+        """The sum of lag and delay, where the record determines it."""
         try:
-            found = _fitted(frf, options)
-        except NotIdentifiable as error:
-            return frf, error
-        late = dt * round(float(_late(found.model)) / dt)
-        if delay or not 0 < late < _LATE * duration:
-            return frf, found
-        delay = late
+            return tuple(self.fit.derived(q, name) for name, q in _sums(self.settings).items())
+        except UndeterminedError:
+            return ()
+
+    def figures(self) -> dict[str, Figure]:
+        """The figures by file name: Bode diagram, records, and the check on a second record."""
+        models = {"identified": self.fit.model} if self.fit.verdict.fitted else None
+        others = {f"{name} estimate": self.responses[name] for name in list(self.responses)[1:]}
+        figures = {
+            f"record{'' if k == 1 else f'_{k}'}.png": record_figure(record)
+            for k, record in enumerate(self.records, start=1)
+        }
+        figures["bode.png"] = bode(self.frf, models, others=others, title=self.path.name)
+        if self.check is not None:
+            title = Path(self.settings.verify or "").name
+            figures["verification.png"] = overlay(self.check, title=title)
+        return figures
+
+    def write(self, folder: str | Path | None = None) -> Path:
+        """Write `result.json`, `report.html` and the figures, by default to results/NAME.
+
+        **Returns:** the path of `result.json`.
+        """
+        from ._stored import write_identification
+
+        return write_identification(self, Path(folder or default_folder(self.path)))
+
+    def __str__(self) -> str:
+        first, *others = map(str, self.records)
+        record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
+        parts = [f"{record}\n\n{self.frf}"]
+        parts += [f"\n{self.formula}, {self.method} estimate:\n{self.fit}"]
+        sums = _sums(self.settings)
+        if self.settings.poles is not None and self.fit.verdict.fitted:
+            parts += [_text_or_reason(lambda: factors(self.fit))]
+        if self.settings.reference:
+            parts += [f"\n{compare_fits(self.fits, sums)}"]
+        elif self.fit.verdict.fitted:
+            for name, quantity in sums.items():
+                parts += [_text_or_reason(lambda n=name, q=quantity: self.fit.derived(q, n))]
+        if self.parts:
+            whole = {f"{self.band[0]:.3g} .. {self.band[1]:.3g} rad/s": self.fit}
+            parts += [f"\n{compare_fits(whole | dict(self.parts), sums)}"]
+        return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
 
 
-def _estimator(options: Namespace, method: str, delay: float) -> Estimator:
-    late = {"integrators": options.integrators, "delay": delay}
-    spectra = {
-        "local": LocalPolynomial(**late),
-        "composite": Composite(**late),
-        "welch": Welch(options.window, **late),
-    }["welch" if options.window else options.estimator]
-    return JointInputOutput(spectra) if method == "joint" else spectra
+def default_folder(path: Path) -> Path:
+    """Where the result of a log goes if nothing else is said."""
+    return Path("results") / path.stem
 
 
-def _fitted(frf: FrequencyResponse, options: Namespace) -> Fit:
-    cost, fixed = _COSTS[options.cost], {"lag": options.no_lag, "delay": options.no_delay}
-    if options.poles is not None:
-        n = options.integrators
-        delay = 0.0 if options.no_delay else "free"
-        orders = {"zeros": options.zeros, "poles": options.poles + n, "integrators": n}
-        return fit_transfer_function(frf, delay=delay, cost=cost, **orders)
-    free = ["gain", *(name for name, is_fixed in fixed.items() if not is_fixed)]
-    return fit(_start(frf, options), frf, free=free, cost=cost)
-
-
-def _band(options: Namespace) -> tuple[float, float] | None:
-    """In rad/s."""
-    given, scale = (options.band, 2 * np.pi) if options.band else (options.band_rad, 1.0)
-    if given is None:
-        return None
-    if not 0 < given[0] < given[1] < np.inf:
-        raise ValueError(f"the band {given[0]:g} .. {given[1]:g} has to rise from above 0")
-    return scale * given[0], scale * given[1]
-
-
-def _start(frf: FrequencyResponse, options: Namespace) -> LaggedIntegrator:
-    guess = guess_lagged_integrator(frf, options.integrators)
-    late = _late(guess)
-    lag = 0.0 if options.no_lag else late if options.no_delay else guess.lag
-    delay = 0.0 if options.no_delay else late if options.no_lag else guess.delay
-    return LaggedIntegrator(guess.gain, lag, delay, options.integrators)
-
-
-def _late(model: LaggedIntegrator | TransferFunction) -> Float[Array, ""]:
-    """The sum of lag and delay, which a record determines better than either."""
-    return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
-
-
-def _derived(outcome: Outcome, summed: bool) -> list[Combination]:
-    """The sum of lag and delay, if the record determines it."""
-    if not summed or not isinstance(outcome, Fit):
-        return []
+def _text_or_reason(made: Callable[[], object]) -> str:
     try:
-        return [outcome.derived(_late, "lag + delay")]
-    except NotIdentifiable:
-        return []
-
-
-def _sum(found: Fit) -> str:
-    try:
-        return str(found.derived(_late, "lag + delay"))
-    except NotIdentifiable as error:
+        return str(made())
+    except UndeterminedError as error:
         return str(error)
 
 
-def _formula(options: Namespace) -> str:
-    n = options.integrators
-    factors = [] if n == 0 else ["s"] if n == 1 else [f"s^{n}"]
-    factors += [] if options.no_lag else ["(lag s + 1)"]
-    below = " ".join(factors)
-    above = "K" if options.no_delay else "K e^(-delay s)"
-    [output], [source] = options.output, options.input
-    if options.poles is not None:
-        kind = f"{options.zeros} zeros over {options.poles} poles and {n} integrators"
-        return f"{output} / {source}, {kind}{'' if options.no_delay else ', delayed'}"
-    ratio = f" / ({below})" if len(factors) > 1 else f" / {below}" if factors else ""
+def identify(path: str | Path, settings: IdentifySettings | None = None) -> Identification:
+    """Identify one log, as `jaxquad identify` does.
+
+    The frequency response is estimated twice: the second time with the delay taken out that the
+    first fit has found. With an external reference, the joint input-output estimate is fitted, and
+    the direct one beside it.
+
+    **Arguments:**
+
+    - `path`: a log of an autopilot, CSV, NPZ, MAT, HDF5, ...
+    - `settings`: what to read from it and what to fit. By default the log proposes its input and
+      output, and K e^(-delay s) / (s (lag s + 1)) is fitted.
+
+    **Returns:** an `Identification`. Parameters that the record does not determine are marked by
+    `.fit.verdict`; nothing is written before its `.write(folder)`.
+
+    **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
+    ValueError for settings that do not go with it.
+
+    !!! example
+
+        ```python
+        settings = jq.workflows.IdentifySettings(input="M", output="q", band=(0.7, 12))
+        result = jq.workflows.identify("flight.npz", settings)
+        print(result)
+        result.write("results/flight")
+        ```
+    """
+    path = Path(path)
+    settings, proposal = propose_settings(path, settings or IdentifySettings())
+    records = read_records(path, settings)
+    methods = ("joint", "direct") if settings.reference else ("direct",)
+    responses, fits = {}, {}
+    for method in methods:
+        responses[method], found = _fit_twice(records, method, settings)
+        fits[method] = _with_remedies(found, settings)
+    best = methods[0]
+    fits[best], parts = _fit_parts(fits[best], responses[best], settings)
+    found = Identification(path, settings, records, responses, fits, parts, None, proposal)
+    return dataclasses.replace(found, check=_checked(found))
+
+
+def propose_settings(
+    path: Path, settings: IdentifySettings
+) -> tuple[IdentifySettings, Proposal | None]:
+    """Settings with input and output, from the log's proposal where they are not given.
+
+    What the settings say stays. Raises what `jaxquad.propose` raises.
+    """
+    if settings.input is not None:
+        return settings, None
+    proposal = propose(path, axis=settings.axis)
+    offered = proposal.options
+    found = {"input": mix_text(offered["inputs"]), "output": offered["outputs"], "axis": None}
+    if settings.reference is None:
+        found["reference"] = offered["references"]
+    if settings.rate is None:
+        found["rate"] = offered["sample_rate"]
+    if proposal.setup.band and settings.band is settings.band_rad is None:
+        found["band"] = proposal.setup.band
+    return dataclasses.replace(settings, **found | _proposed_span(settings, proposal)), proposal
+
+
+def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, object]:
+    """All injections that were found, or those within `start` and `stop`."""
+    if settings.segments:
+        return {}
+    low = -np.inf if settings.start is None else settings.start
+    high = np.inf if settings.stop is None else settings.stop
+    inside = [(max(start, low), min(stop, high)) for start, stop in proposal.segments]
+    spans = [(start, stop) for start, stop in inside if start < stop]
+    if len(spans) > 1:
+        return {"segments": spans, "start": None, "stop": None}
+    return dict(zip(("start", "stop"), spans[0], strict=True)) if spans else {}
+
+
+def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
+    """One record for each segment. Raises RecordError, ReadError."""
+    inputs, outputs, references = map(_mix, (settings.input, settings.output, settings.reference))
+    asked = {*inputs, *outputs, *references}
+    segments: list[Segment] = list(settings.segments) or [(settings.start, settings.stop)]
+    records = read_segments(
+        path,
+        segments,
+        inputs=inputs,
+        outputs=outputs,
+        references=references,
+        sample_rate=settings.rate,
+        time=settings.time,
+        time_unit=settings.time_unit,
+        units={name: unit for name, unit in settings.units.items() if name in asked},
+    )
+    return tuple(records)
+
+
+def _mix(text: str | None) -> Mix:
+    return {} if text is None else parse_mix(text)
+
+
+def _fit_twice(
+    records: tuple[Record, ...], method: str, settings: IdentifySettings
+) -> tuple[FrequencyResponse, Fit]:
+    """The second response is estimated with the delay that the first fit found taken out."""
+    band, delay = _band(settings), 0.0
+    dt, duration = records[0].dt, max(record.duration for record in records)
+    omega = np.geomspace(*band, _POINTS) if band else None
+    while True:
+        estimator = _estimator(settings, method, delay)
+        frf = frequency_response(list(records), omega, estimator=estimator)
+        found = _fitted(frf, settings)
+        if not found.verdict.fitted:
+            return frf, found
+        total = dt * round(float(total_delay(found.model)) / dt)
+        if delay or not 0 < total < _LONGEST * duration:
+            return frf, found
+        delay = total
+
+
+def _band(settings: IdentifySettings) -> tuple[float, float] | None:
+    """In rad/s."""
+    if settings.band is not None:
+        return 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
+    return settings.band_rad
+
+
+def _estimator(settings: IdentifySettings, method: str, delay: float) -> Estimator:
+    shape = {"integrators": settings.integrators, "delay": delay}
+    if settings.window is not None or settings.estimator == "welch":
+        estimator = Welch(settings.window, **shape)
+    elif settings.estimator == "composite":
+        estimator = Composite(**shape)
+    else:
+        estimator = LocalPolynomial(**shape)
+    return JointInputOutput(estimator) if method == "joint" else estimator
+
+
+def _fitted(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
+    cost, n = _COSTS[settings.cost], settings.integrators
+    if settings.poles is not None:
+        return fit_transfer_function(
+            frf,
+            zeros=settings.zeros,
+            poles=settings.poles + n,
+            integrators=n,
+            delay="free" if settings.delay else 0.0,
+            cost=cost,
+        )
+    free = ["gain", *(["lag"] if settings.lag else []), *(["delay"] if settings.delay else [])]
+    return fit(_start(frf, settings), frf, free=free, cost=cost)
+
+
+def _start(frf: FrequencyResponse, settings: IdentifySettings) -> LaggedIntegrator:
+    """What is fixed at zero is added to what is free."""
+    guess = guess_lagged_integrator(frf, settings.integrators)
+    total = total_delay(guess)
+    lag = 0.0 if not settings.lag else guess.lag if settings.delay else total
+    delay = 0.0 if not settings.delay else guess.delay if settings.lag else total
+    return LaggedIntegrator(guess.gain, lag, delay, settings.integrators)
+
+
+def total_delay(model: Model) -> Float[Array, ""]:
+    """The sum of lag and delay, which a record determines better than either of them."""
+    return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
+
+
+def _sums(settings: IdentifySettings) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:
+    """The quantities that are shown beside the parameters."""
+    both = settings.poles is None and settings.lag and settings.delay
+    return {"lag + delay": total_delay} if both else {}
+
+
+def _with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
+    """The same fit, whose remedies are options of `jaxquad identify`."""
+    kind, lost = found.verdict.kind, found.verdict.undetermined
+    if kind == "identifiable":
+        return found
+    excite = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
+    remedies = [excite]
+    if kind == "too few points":
+        remedies += ["use longer windows (--estimator welch --window S)"]
+    elif settings.poles is not None:
+        remedies = ["fit fewer poles and zeros (--poles, --zeros)", excite]
+    elif {"lag", "delay"} & set(lost) and settings.lag and settings.delay:
+        remedies = ["fit without the lag (--no-lag) or without the delay (--no-delay)", excite]
+    verdict = dataclasses.replace(found.verdict, remedies=tuple(remedies))
+    return dataclasses.replace(found, verdict=verdict)
+
+
+def _fit_parts(
+    found: Fit, frf: FrequencyResponse, settings: IdentifySettings
+) -> tuple[Fit, dict[str, Fit | None]]:
+    """Fits to the upper and the lower two thirds of the frequencies, where the misfit is large.
+
+    Returns the fit too, with a remark where the gain differs between them. There are no parts for
+    a misfit below three times the noise, for other models than the lagged integrator, and for a
+    response that feedback dominates: no part of it would be better.
+    """
+    small = not found.chi_squared >= _MISFIT**2 or not isinstance(found.model, LaggedIntegrator)
+    dominated = any(_DOMINATED in remark for remark in frf.remarks)
+    if not found.verdict.fitted or small or dominated:
+        return found, {}
+    used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
+    low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
+    bands = {
+        f"above {first:.3g} rad/s": (first, high),
+        f"below {second:.3g} rad/s": (low, second),
+    }
+    parts = {name: _refitted(found, frf, settings, band) for name, band in bands.items()}
+    remarks = [_gain_change(name, part, found) for name, part in parts.items()]
+    remarks = (*found.remarks, *filter(None, remarks))
+    return dataclasses.replace(found, remarks=remarks), parts
+
+
+def _refitted(
+    found: Fit, frf: FrequencyResponse, settings: IdentifySettings, band: tuple[float, float]
+) -> Fit | None:
+    """From where the fit stopped; None where the solver diverged."""
+    try:
+        return fit(found.model, frf, free=found.names, cost=_COSTS[settings.cost], band=band)
+    except ValueError:
+        return None
+
+
+def _gain_change(where: str, part: Fit | None, found: Fit) -> str:
+    if part is None or not (part.determined[0] and found.determined[0]):
+        return ""
+    before, after = found.values[0], part.values[0]
+    change = abs(after - before)
+    if not change > max(_CHANGE * abs(before), 2 * part.standard_errors[0]):
+        return ""
+    ratio, ratio_before = part.chi_squared**0.5, found.chi_squared**0.5
+    return (
+        f"{where} the gain is {after:.4g} instead of {before:.4g}, with a misfit of {ratio:.1f} "
+        f"instead of {ratio_before:.1f}: the model does not hold over the whole band. Fit the part "
+        "where it does (--band, --band-rad), or a model of higher order (--poles)"
+    )
+
+
+def model_formula(settings: IdentifySettings) -> str:
+    """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
+    n = settings.integrators
+    [output], [source] = _mix(settings.output), _mix(settings.input)
+    if settings.poles is not None:
+        kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
+        return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
+    powers = [] if n == 0 else ["s"] if n == 1 else [f"s^{n}"]
+    below = powers + (["(lag s + 1)"] if settings.lag else [])
+    above = "K e^(-delay s)" if settings.delay else "K"
+    product = " ".join(below)
+    ratio = f" / ({product})" if len(below) > 1 else f" / {product}" if below else ""
     return f"{output} / {source} = {above}{ratio}"
 
 
-def _verified(outcome: Outcome, frf: FrequencyResponse, options: Namespace) -> Verification | None:
-    """The other record simulated, within the band that was fitted."""
-    if options.verify is None or not isinstance(outcome, Fit):
+def _checked(found: Identification) -> Verification | None:
+    """The second record simulated, within the band that was fitted."""
+    settings = found.settings
+    if settings.verify is None or not found.fit.verdict.fitted:
         return None
-    swapped = {
-        "file": options.verify,
-        "start": options.verify_start,
-        "stop": options.verify_stop,
-        "segment": [],
-        "reference": None,
-    }
-    [other] = records_of(Namespace(**(vars(options) | swapped)))
-    return verify(outcome.model, other, band=(float(frf.omega[0]), float(frf.omega[-1])))
-
-
-def _failure(outcome: Outcome) -> NotIdentifiable | None:
-    if isinstance(outcome, NotIdentifiable):
-        return outcome
-    lost = " and ".join(outcome.identifiability.undetermined)
-    known = ", ".join(str(combination) for combination in outcome.combinations)
-    rest = f"only {known}" if known else "nothing of them is determined"
-    text = f"not identifiable from this record, each by itself: {lost}; {rest}"
-    return NotIdentifiable(text) if lost else None
+    other = dataclasses.replace(
+        settings,
+        start=settings.verify_start,
+        stop=settings.verify_stop,
+        segments=(),
+        reference=None,
+    )
+    [record] = read_records(Path(settings.verify), other)
+    return verify(found.fit.model, record, band=found.band)

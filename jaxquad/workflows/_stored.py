@@ -1,48 +1,142 @@
-"""What `jaxquad identify` leaves behind: `result.json`, `report.html` and its figures."""
+"""What an identification leaves on the disk, and how it is made again from that."""
 
+import dataclasses
 import json
 import shlex
-from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxquad.identify import Combination, Fit, NotIdentifiable, Verification
+from jaxquad.identify import UndeterminedError, Verification, verify
 from jaxquad.models import LaggedIntegrator, TransferFunction
-from jaxquad.plot import bode, overlay, record_figure
-from jaxquad.records import Record
-from jaxquad.report import Provenance, provenance, write_report, write_results
-from jaxquad.spectra import FrequencyResponse
+from jaxquad.report import provenance, sha256_of, write_report, write_results
+
+from ._identify import Identification, identify, Model, read_records
+from ._settings import IdentifySettings
 
 
-Model = LaggedIntegrator | TransferFunction
+_KINDS: Mapping[str, type[LaggedIntegrator] | type[TransferFunction]] = {
+    "LaggedIntegrator": LaggedIntegrator,
+    "TransferFunction": TransferFunction,
+}
 
 
-def model_content(outcome: Fit | NotIdentifiable) -> dict[str, Any]:
-    """The model's kind and numbers; nothing where there is none."""
-    if isinstance(outcome, NotIdentifiable):
-        return {}
-    model = outcome.model
-    return {
-        "model": {"kind": type(model).__name__} | {k: _plain(v) for k, v in vars(model).items()}
+def write_identification(found: Identification, folder: Path) -> Path:
+    """Write `result.json`, `report.html` and the figures; returns the path of `result.json`."""
+    spans = [[float(record.time[0]), float(record.time[-1])] for record in found.records]
+    command = identify_command(found.path, found.settings)
+    sources = [found.path, *([found.settings.verify] if found.settings.verify else [])]
+    origin = provenance(*sources, command=command)
+    extra = {
+        "record": {
+            "file": str(found.path),
+            "start_s": min(start for start, _ in spans),
+            "stop_s": max(stop for _, stop in spans),
+            "segments_s": spans,
+            "sample_rate_hz": found.records[0].sample_rate,
+        },
+        "settings": found.settings.content(),
+        "band_rad_per_s": found.band,
+        "derived": [each._asdict() for each in found.combinations],
+        "provenance": origin.content(),
+        **_model_content(found),
     }
+    path = write_results(folder, fit=found.fit, frf=found.frf, check=found.check, extra=extra)
+    _write_figures(found, folder)
+    others = {f"{name} estimate": found.responses[name] for name in list(found.responses)[1:]}
+    write_report(
+        folder / "report.html",
+        fit=found.fit,
+        frf=found.frf,
+        others=others,
+        record={
+            f"t = {record.time[0]:.6g} .. {record.time[-1]:.6g} s": record
+            for record in found.records
+        },
+        checks={} if found.check is None else {Path(sources[-1]).name: found.check},
+        derived=found.combinations,
+        provenance=origin,
+        formula=found.formula,
+    )
+    return path
 
 
-def setup_content(options: Namespace, frf: FrequencyResponse) -> dict[str, Any]:
-    """What another record needs to be read in the same way, and the band that was fitted."""
-    names = ("input", "output", "rate", "time", "time_unit")
-    setup = {name: getattr(options, name) for name in names}
-    band = [float(frf.omega[0]), float(frf.omega[-1])]
-    return {"setup": setup | {"unit": [list(each) for each in options.unit], "band_rad": band}}
+def _write_figures(found: Identification, folder: Path) -> None:
+    figures = found.figures()
+    for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
+        if earlier.name not in figures:
+            earlier.unlink(missing_ok=True)
+    for name, figure in figures.items():
+        figure.savefig(folder / name, dpi=130)
 
 
-def stored(path: Path) -> dict[str, Any]:
-    """What `jaxquad identify` left in a folder, or its `result.json` itself.
+def _model_content(found: Identification) -> dict[str, object]:
+    """The model's kind and numbers; nothing where nothing was fitted."""
+    if not found.fit.verdict.fitted:
+        return {}
+    numbers = vars(found.fit.model).items()
+    plain = {k: v if isinstance(v, int) else np.asarray(v).tolist() for k, v in numbers}
+    return {"model": {"kind": type(found.fit.model).__name__} | plain}
 
-    Raises ValueError for a file that it did not write.
+
+def identify_command(path: Path, settings: IdentifySettings) -> str:
+    """The command line that makes the result again, quoted for a shell."""
+    return shlex.join(["jaxquad", "identify", str(path), *settings.words()])
+
+
+class StoredResult(NamedTuple):
+    """A `result.json` as `read_result` reads it."""
+
+    folder: Path
+    content: Mapping[str, object]
+    settings: IdentifySettings
+    log: Path
+    hashes: tuple[str, ...]  # SHA-256 of the log, and of the record of a check
+    band: tuple[float, float]  # rad/s, that was fitted
+
+    @property
+    def summary(self) -> str:
+        """What the result says of its identifiability, in one line."""
+        return str(_part(_part(self.content, "fit"), "verdict").get("summary", ""))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The verdict and the remarks of a result that is not identifiable."""
+        fit = _part(self.content, "fit")
+        remarks = fit.get("remarks")
+        if fit.get("identifiable") is True or not isinstance(remarks, list):
+            return ()
+        return self.summary, *map(str, remarks)
+
+    @property
+    def model(self) -> Model:
+        """The identified model. Raises UndeterminedError where nothing was fitted."""
+        if "model" not in self.content:
+            raise UndeterminedError(f"the result holds no model: {self.summary}")
+        numbers = dict(_part(self.content, "model"))
+        kind = numbers.pop("kind", None)
+        if kind not in _KINDS:
+            known = ", ".join(_KINDS)
+            raise ValueError(f"the result holds a model of kind {kind!r}: known are {known}")
+        try:
+            return _KINDS[str(kind)](**numbers)  # pyright: ignore[reportArgumentType]
+        except TypeError as error:
+            raise ValueError(f"the result's model is incomplete: {error}") from error
+
+
+def _part(content: Mapping[str, object], key: str) -> Mapping[str, object]:
+    part = content.get(key)
+    return part if isinstance(part, dict) else {}
+
+
+def read_result(path: str | Path) -> StoredResult:
+    """Read the result in a folder, or a `result.json` itself.
+
+    **Raises:** ValueError for a file that `jaxquad identify` did not write.
     """
+    path = Path(path)
     path = path / "result.json" if path.is_dir() else path
     try:
         content = json.loads(path.read_text())
@@ -50,145 +144,80 @@ def stored(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: no such result: run jaxquad identify first") from error
     except ValueError as error:
         raise ValueError(f"{path}: no result of jaxquad identify: {error}") from error
-    if not isinstance(content, dict) or not {"fit", "setup", "provenance"} <= set(content):
-        raise ValueError(f"{path}: no result of this jaxquad identify: identify the record again")
-    return content
-
-
-def stored_model(content: dict[str, Any]) -> Model:
-    """The model of a stored result. Raises NotIdentifiable where there is none."""
-    if "model" not in content:
-        raise NotIdentifiable(f"the result holds no model: {' '.join(content['fit']['remarks'])}")
-    numbers = dict(content["model"])
-    kinds = {"LaggedIntegrator": LaggedIntegrator, "TransferFunction": TransferFunction}
-    kind = numbers.pop("kind", None)
-    if kind not in kinds:
-        raise ValueError(f"the result holds a model of kind {kind!r}: none of {', '.join(kinds)}")
     try:
-        return kinds[kind](**numbers)
-    except TypeError as error:
-        raise ValueError(f"the result's model is incomplete: {error}") from error
+        settings = IdentifySettings.from_mapping(content["settings"], f"{path}, settings")
+        files = content["provenance"]["files"]
+        return StoredResult(
+            folder=path.parent,
+            content=content,
+            settings=settings,
+            log=Path(content["record"]["file"]),
+            hashes=tuple(file["sha256"] for file in files),
+            band=(float(content["band_rad_per_s"][0]), float(content["band_rad_per_s"][1])),
+        )
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(
+            f"{path}: no result of this version of jaxquad identify: identify the log again"
+        ) from error
 
 
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, int) else np.asarray(value).tolist()
+def identify_again(
+    result: str | Path | StoredResult, *, log: str | Path | None = None
+) -> Identification:
+    """Identify the log of a stored result with its settings.
 
+    **Arguments:**
 
-_MIXES = ("input", "output", "reference")
-_NO_OPTIONS = ("file", "run", "json")
+    - `result`: the folder of the result, its `result.json`, or what `read_result` returns.
+    - `log`: where the log lies, if it was moved.
 
-
-def write_identification(
-    options: Namespace,
-    records: Sequence[Record],
-    frfs: Mapping[str, FrequencyResponse],
-    outcome: Fit | NotIdentifiable,
-    check: Verification | None,
-    *,
-    formula: str = "",
-    derived: Sequence[Combination] = (),
-) -> tuple[Path, list[str]]:
-    """Write the folder; returns the path of `result.json` and the names of the other files.
-
-    The first of `frfs` was fitted, the others are drawn beside it.
+    **Raises:** ValueError where the log is gone, or is not the same file by its SHA-256.
     """
-    folder = options.out or Path("results") / options.file.stem
-    method, *rest = frfs
-    spans = [[float(record.time[0]), float(record.time[-1])] for record in records]
-    source = {"file": str(options.file), "start_s": min(start for start, _ in spans)}
-    source |= {"stop_s": max(stop for _, stop in spans), "segments_s": spans}
-    source |= {"sample_rate_hz": records[0].sample_rate}
-    origin = _origin(options)
-    extra = {"record": source, "provenance": origin.content()}
-    extra |= {"derived": [_row(each) for each in derived]}
-    extra |= model_content(outcome) | setup_content(options, frfs[method])
-    path = write_results(folder, fit=outcome, frf=frfs[method], check=check, extra=extra)
-    others = {f"{name} estimate": frfs[name] for name in rest}
-    names = _draw(folder, options, records, frfs[method], outcome, check, others)
-    write_report(
-        folder / "report.html",
-        fit=outcome,
-        frf=frfs[method],
-        others=others,
-        record={_span(each): each for each in records},
-        checks=None if check is None else {options.verify.name: check},
-        derived=derived,
-        provenance=origin,
-        formula=formula,
-    )
-    return path, ["report.html", *names]
+    stored = result if isinstance(result, StoredResult) else read_result(result)
+    path = Path(log) if log is not None else stored.log
+    verified = stored.settings.verify
+    files = [path, *([Path(verified)] if verified else [])]
+    for file, known in zip(files, stored.hashes, strict=True):
+        _check_unchanged(file, known)
+    return identify(path, stored.settings)
 
 
-def _draw(
-    folder: Path,
-    options: Namespace,
-    records: Sequence[Record],
-    frf: FrequencyResponse,
-    outcome: Fit | NotIdentifiable,
-    check: Verification | None,
-    others: Mapping[str, FrequencyResponse],
-) -> list[str]:
-    models = {"identified": outcome.model} if isinstance(outcome, Fit) else None
-    figures = {
-        **{_figure(k): record_figure(record) for k, record in enumerate(records, start=1)},
-        "bode.png": bode(frf, models, others=others, title=options.file.name),
-    }
-    if check is not None:
-        figures["verification.png"] = overlay(check, title=options.verify.name)
-    for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
-        if earlier.name not in figures:
-            earlier.unlink(missing_ok=True)
-    for name, figure in figures.items():
-        figure.savefig(folder / name, dpi=130)
-    return list(figures)
+def _check_unchanged(path: Path, known: str) -> None:
+    try:
+        found = sha256_of(path)
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: the log is gone: say where it is (--log)") from error
+    if found != known:
+        raise ValueError(
+            f"{path}: this is not the log that was identified (SHA-256 {found[:12]}... instead of "
+            f"{known[:12]}...)"
+        )
 
 
-def _row(each: Combination) -> dict[str, Any]:
-    return {"name": each.name, "value": each.value, "standard_error": each.standard_error}
+def verify_result(
+    result: str | Path | StoredResult,
+    path: str | Path,
+    changes: Mapping[str, object] | None = None,
+) -> Verification:
+    """Simulate an identified model on another record, and compare.
 
+    **Arguments:**
 
-def _figure(k: int) -> str:
-    return "record.png" if k == 1 else f"record_{k}.png"
+    - `result`: the folder of the result, its `result.json`, or what `read_result` returns.
+    - `path`: the other log.
+    - `changes`: settings that differ for this log (keys of `IdentifySettings`): another channel's
+      name, another part, another band. Otherwise its whole time is used, with the channels, the
+      rate and the band of the result.
 
-
-def _span(record: Record) -> str:
-    return f"t = {record.time[0]:.6g} .. {record.time[-1]:.6g} s"
-
-
-def _origin(options: Namespace) -> Provenance:
-    files = [options.file] + ([options.verify] if options.verify else [])
-    return provenance(*files, command=command_of(options))
-
-
-def command_of(options: Namespace) -> str:
-    """The command line that these options stand for, with the defaults that were in force."""
-    words = ["jaxquad", "identify", str(options.file)]
-    for name, value in vars(options).items():
-        if name not in _NO_OPTIONS:
-            words += _words(name, value)
-    return shlex.join(words)
-
-
-def _words(name: str, value: Any) -> list[str]:
-    flag = f"--{name.replace('_', '-')}"
-    if value is None or value is False:
-        return []
-    if value is True:
-        return [flag]
-    if name in _MIXES:
-        return [flag, _mix(value)]
-    if name == "unit":
-        return [word for channel, unit in value for word in (flag, f"{channel}={unit}")]
-    if name == "segment":  # as one word, or a negative start would be taken for an option
-        return [f"{flag}={start!r}:{stop!r}" for start, stop in value]
-    if isinstance(value, list | tuple):
-        return [flag, *map(str, value)] if value else []
-    return [flag, str(value)]
-
-
-def _mix(mix: Mapping[str, Mapping[str, float]]) -> str:
-    """As `jaxquad.cli.parse_mix` reads it."""
-    [(name, weights)] = mix.items()
-    if dict(weights) == {name: 1.0}:
-        return name
-    return f"{name}=" + "".join(f"{weight:+}*{channel}" for channel, weight in weights.items())
+    **Raises:** `UndeterminedError` (a ValueError) for a result without a model, `RecordError` for a
+    log that cannot be used.
+    """
+    stored = result if isinstance(result, StoredResult) else read_result(result)
+    whole = {"start": None, "stop": None, "segments": (), "reference": None}
+    settings = dataclasses.replace(stored.settings, **whole, band=None, band_rad=stored.band)
+    changed = settings.changed(changes or {})
+    model, band = stored.model, changed.band_rad
+    if changed.band is not None:
+        band = 2 * np.pi * changed.band[0], 2 * np.pi * changed.band[1]
+    [record] = read_records(Path(path), changed)
+    return verify(model, record, band=band)

@@ -1,7 +1,7 @@
-"""`jaxquad tune`: from a fit of one axis to a tuned and certified controller."""
+"""Tune a controller on an identified axis: from a result and settings to certified gains."""
 
+import dataclasses
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -9,14 +9,17 @@ import numpy as np
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal
 from jaxquad.export import write_c_header
-from jaxquad.identify import Fit
+from jaxquad.identify import Fit, UndeterminedError
 from jaxquad.models import DecoupledAxes
 from jaxquad.plot import certificate_figure, convergence_figure
 from jaxquad.records import Record
-from jaxquad.report import provenance, write_json, write_report
+from jaxquad.report import plain_content, provenance, write_json, write_report
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
-from jaxquad.spectra import FrequencyResponse
-from jaxquad.tuning import Limit, Objective, peers, Penalty, tune, Tuned
+from jaxquad.tuning import Limit, Objective, peers, Penalty, tune as tune_controller, Tuned
+
+from ._identify import Identification
+from ._settings import TuneSettings
+from ._stored import identify_again, StoredResult
 
 
 _PULSE, _BACK = 0.375, 0.625  # of the flight: when the torque comes, and the step back
@@ -24,139 +27,172 @@ _ACTIVITY = 0.2  # limit^2 per second: where a busier command begins to cost
 _WIDTH = 0.08  # of the flight, the pulse's
 
 
-class Case(NamedTuple):
-    """What is not in the record: how far the inertia is open, and what is flown."""
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """A tuned controller as `tune` returns it, with what it was tuned on; `str()` shows both.
 
-    inertia: float  # believed, kg m^2
-    limit: float  # of the command, in its unit
-    spread: tuple[float, float]  # of the inertia, times the believed one
-    told: float  # relative error of the inertia told to the controller
-    step: float  # deg
-    disturbance: float | None  # N m; a tenth of the limit's torque if None
-    noise: float  # deg, of the measured angle
-    sensitivity: float  # the limit of the peak of |S|
-    duration: float  # s
-    dt: float  # s, of the controller
-    members: int
-    fresh: int
-    seed: int
+    **Attributes:**
 
-
-def tuned_case(found: Fit, record: Record, case: Case) -> Tuned:
-    """Tune a scheduled LADRC for the angle, beginning at certainty equivalence.
-
-    Raises ValueError for an output that is not known to be in rad or rad/s, a negative gain and
-    values that cannot be; NotIdentifiable where the plant is not determined.
+    - `identification`: the axis.
+    - `settings`: those that were used.
+    - `tuned`: controller, gains and certificate.
     """
-    _check(record, case)
-    ensemble = _ensemble(found, record, case)
+
+    identification: Identification
+    settings: TuneSettings
+    tuned: Tuned
+
+    def content(self) -> dict[str, object]:
+        """Gains, certificate and settings, for JSON."""
+        tuned = self.tuned
+        certificate = tuned.certificate
+        content = {
+            "holds": tuned.holds,
+            "values": tuned.values,
+            "cost": tuned.cost,
+            "converged": tuned.converged,
+            "stabilised": tuned.stabilised,
+            "evaluations": tuned.evaluations,
+            "seconds": tuned.seconds,
+            "remarks": tuned.remarks,
+            "certificate": None if certificate is None else certificate.content(),
+            "settings": self.settings.content(),
+        }
+        return {key: plain_content(value) for key, value in content.items()}
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write `tuned.json`, a C header, `report.html` and the figures; returns their paths."""
+        folder, found, tuned = Path(folder), self.identification, self.tuned
+        name = self.settings.name
+        origin = provenance(found.path, settings=self.settings.content())
+        write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
+        write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
+        figures = {"convergence.png": convergence_figure(tuned.history)}
+        if tuned.certificate is not None:
+            figures["certificate.png"] = certificate_figure(tuned.certificate)
+        for file, figure in figures.items():
+            figure.savefig(folder / file, dpi=130)
+        write_report(
+            folder / "report.html",
+            fit=found.fit,
+            frf=found.frf,
+            record=found.records[0],
+            tuned=tuned,
+            provenance=origin,
+            formula=found.formula,
+        )
+        return [folder / file for file in ("tuned.json", f"{name}.h", "report.html", *figures)]
+
+    def __str__(self) -> str:
+        return str(self.tuned)
+
+
+def tune(
+    result: str | Path | StoredResult | Identification,
+    settings: TuneSettings,
+    *,
+    log: str | Path | None = None,
+) -> Tuning:
+    """Tune and certify a controller for the angle of an identified axis, as `jaxquad tune` does.
+
+    A scheduled LADRC is tuned on plants that are drawn from everything the record leaves
+    uncertain, times the spread of the inertia. It starts from certainty equivalence: the gains for
+    the nominal plant, scaled with the inertia. Each plant flies a step, a torque pulse and a step
+    back.
+
+    **Arguments:**
+
+    - `result`: what `identify` returned, or the folder of a result, which is identified again.
+    - `settings`: what the record does not tell: inertia, limits, noise.
+    - `log`: where the log lies, if it was moved.
+
+    **Returns:** a `Tuning`, whose certificate was made on plants that were not tuned on.
+
+    **Raises:** ValueError for an output whose unit is neither rad nor rad/s, and for a negative
+    gain; `UndeterminedError` (a ValueError) where the record does not determine the plant.
+    """
+    found = result if isinstance(result, Identification) else identify_again(result, log=log)
+    if not found.fit.verdict.fitted:
+        raise UndeterminedError(found.fit.verdict.summary)
+    record = found.records[0]
+    _check_unit(record)
+    dt = record.dt if settings.dt is None else settings.dt
+    return Tuning(found, settings, _tuned(found.fit, record, dt, settings))
+
+
+def _check_unit(record: Record) -> None:
+    [unit] = record.output_units
+    if unit not in ("rad", "rad/s"):
+        name = record.output_names[0]
+        raise ValueError(
+            f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
+            f"identify with the output in rad/s or rad (--unit {name}=rad/s)"
+        )
+
+
+def _tuned(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Tuned:
+    ensemble = _ensemble(found, record, dt, settings)
     plant = ensemble.plant
     assert isinstance(plant, DecoupledAxes)
     gain = float(plant.torque_gain[0])
     if gain <= 0:
         raise ValueError(
-            f"the gain is negative (KT = {gain:.4g}): identify with the input's sign turned round"
+            f"the gain is negative (KT = {gain:.4g}): identify with the sign of the input reversed "
+            "(--input NAME=-CHANNEL)"
         )
-    start = LADRC(10.0, 30.0, gain / case.inertia, limit=case.limit, dt=case.dt)
-    map_of = certainty_equivalence(gain, case.inertia, span=case.spread)
-    others = peers(plant, dt=case.dt)
-    return tune(
-        ScheduledLADRC(start, map_of),
+    start = LADRC(10.0, 30.0, gain / settings.inertia, limit=settings.limit, dt=dt)
+    schedule = certainty_equivalence(gain, settings.inertia, span=settings.spread)
+    return tune_controller(
+        ScheduledLADRC(start, schedule),
         ensemble,
-        _flight(gain, case),
-        objective=_objective(case),
-        limits=(Limit("sensitivity_peak", at_most=case.sensitivity),),
-        members=case.members,
-        fresh=case.fresh,
-        peers={name: one for name, one in others.items() if name.startswith("CE")},
-        key=jax.random.key(case.seed),
+        _flight(gain, dt, settings),
+        objective=_objective(settings),
+        limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
+        members=settings.members,
+        fresh=settings.fresh,
+        peers={name: one for name, one in peers(plant, dt=dt).items() if name.startswith("CE")},
+        key=jax.random.key(settings.seed),
     )
 
 
-def _check(record: Record, case: Case) -> None:
-    [unit] = record.output_units
-    if unit not in ("rad", "rad/s"):
-        raise ValueError(
-            f"the unit of {record.output_names[0]} is {unit or 'not known'}: gains are for an "
-            "angle in rad, so identify with the output in rad/s or rad (--unit NAME=rad/s)"
-        )
-    for name in ("inertia", "limit", "step", "duration", "dt", "sensitivity"):
-        if not 0 < getattr(case, name) < np.inf:
-            raise ValueError(f"{name} is {getattr(case, name):g}: give one above 0")
-    if not 0 < case.spread[0] < case.spread[1] < np.inf:
-        low, high = case.spread
-        raise ValueError(f"the spread {low:g} .. {high:g} has to rise from above 0: 0.5 3")
-
-
-def _ensemble(found: Fit, record: Record, case: Case) -> Ensemble:
+def _ensemble(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Ensemble:
     return Ensemble.from_fit(
         found,
         recorded_dt=record.dt,
-        believed=case.inertia,
-        inertia=LogUniform(*case.spread),
-        told=Normal(case.told) if case.told else 1.0,
-        noise=np.radians(case.noise),
-        drive=Saturation(case.limit),
-        dt=case.dt,
+        believed=settings.inertia,
+        inertia=LogUniform(*settings.spread),
+        told=Normal(settings.inertia_error) if settings.inertia_error else 1.0,
+        noise=np.radians(settings.noise),
+        drive=Saturation(settings.limit),
+        dt=dt,
     )
 
 
-def _objective(case: Case) -> Objective:
-    """That of EQUATIONS.md, section 3, whose knee of 20 V^2/s belongs to a limit of 10 V."""
+def _objective(settings: TuneSettings) -> Objective:
+    """That of docs/tuning.md, whose knee of 20 V^2/s belongs to a limit of 10 V."""
     penalties = (
-        Penalty("activity_rate", knee=_ACTIVITY * case.limit**2, weight=2.0),
+        Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
         Penalty("sensitivity_peak", knee=2.0, weight=3.0),
         Penalty("abscissa", knee=-0.5, weight=5.0),
     )
-    events = _events(case)
+    events = _events(settings)
     return Objective(penalties=penalties, events=events, load_start=events[1])
 
 
-def _events(case: Case) -> tuple[float, float, float]:
-    return 0.0, _PULSE * case.duration, _BACK * case.duration
+def _events(settings: TuneSettings) -> tuple[float, float, float]:
+    return 0.0, _PULSE * settings.duration, _BACK * settings.duration
 
 
-def _flight(gain: float, case: Case) -> Scenario:
-    _, pulse, back = _events(case)
-    torque = 0.1 * gain * case.limit if case.disturbance is None else case.disturbance
-    angle = np.radians(case.step)
+def _flight(gain: float, dt: float, settings: TuneSettings) -> Scenario:
+    _, pulse, back = _events(settings)
+    torque = settings.disturbance
+    if torque is None:
+        torque = 0.1 * gain * settings.limit
+    angle = np.radians(settings.step)
     return scenario(
-        duration=case.duration,
-        dt=case.dt,
+        duration=settings.duration,
+        dt=dt,
         axes=1,
         reference=Step(angle) + Step(-angle, at=back),
-        disturbance=Pulse(torque, width=_WIDTH * case.duration, at=pulse),
+        disturbance=Pulse(torque, width=_WIDTH * settings.duration, at=pulse),
     )
-
-
-def write_tuning(
-    out: Path,
-    record: Record,
-    frf: FrequencyResponse,
-    found: Fit,
-    tuned: Tuned,
-    case: Case,
-    log: Path,
-    name: str,
-) -> list[str]:
-    """Write the folder; returns the names of the files."""
-    origin = provenance(log, settings=case._asdict())
-    write_json(out / "tuned.json", tuned_content(tuned, case) | {"provenance": origin.content()})
-    write_c_header(out / f"{name}.h", tuned.controller, name=name, axes=1)
-    figures = {"convergence.png": convergence_figure(tuned.history)}
-    if tuned.certificate is not None:
-        figures["certificate.png"] = certificate_figure(tuned.certificate)
-    for file, figure in figures.items():
-        figure.savefig(out / file, dpi=130)
-    write_report(
-        out / "report.html", fit=found, frf=frf, record=record, tuned=tuned, provenance=origin
-    )
-    return ["tuned.json", f"{name}.h", "report.html", *figures]
-
-
-def tuned_content(tuned: Tuned, case: Case) -> dict[str, Any]:
-    """For JSON."""
-    names = ("values", "cost", "converged", "stabilised", "evaluations", "seconds", "remarks")
-    content = {name: getattr(tuned, name) for name in names}
-    judged = {} if tuned.certificate is None else {"certificate": tuned.certificate.content()}
-    return {"holds": tuned.holds} | content | judged | {"case": case._asdict()}

@@ -3,19 +3,20 @@
 from collections.abc import Iterator
 from itertools import islice
 
-from ._perform import Content, failed, perform, Work
-from ._store import Job
+from ._jobs import Content, failure, Job, perform, Work
 
 
 PATIENCE = 30.0  # s, for the scheduler to answer
 _AHEAD = 2  # jobs per thread of the cluster that are handed out at a time
 
 
-def performed_on(scheduler: str, jobs: Iterator[Job], work: Work) -> Iterator[tuple[Job, Content]]:
-    """The jobs with their results, as these come in; a job whose worker is lost moves on.
+def perform_on_cluster(
+    scheduler: str, jobs: Iterator[Job], work: Work
+) -> Iterator[tuple[Job, Content]]:
+    """Yield the jobs with their results, as these come in.
 
-    A worker that finds a result on the disk does not make it again. Raises ValueError without
-    dask.distributed or without a scheduler at that address.
+    A job whose worker is lost moves to another one; a worker that finds a result on the disk does
+    not make it again. Raises ValueError without dask.distributed, and where no scheduler answers.
     """
     distributed = _distributed()
     try:
@@ -46,7 +47,7 @@ def _answer(future) -> Content:
     error = future.exception()
     if error is None:
         return future.result()
-    return failed(
+    return failure(
         f"the cluster gave it up ({type(error).__name__}: {' '.join(str(error).split())})"
     )
 

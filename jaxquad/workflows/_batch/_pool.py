@@ -11,8 +11,7 @@ from collections.abc import Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from ._perform import Content, failed, perform, Work
-from ._store import Job, keep, kept
+from ._jobs import Content, failure, Job, perform, store_result, stored_result, Work
 
 
 _SPAWN = multiprocessing.get_context("spawn")  # JAX has threads, which do not survive a fork
@@ -35,7 +34,7 @@ class _Worker:
             self.process.start()
         theirs.close()  # or the end of the process would not show on ours
 
-    def give(self, job: Job, timeout: float | int | None) -> None:
+    def give(self, job: Job, timeout: float | None) -> None:
         """Hand out the next job, to be done within so many s."""
         self.job = job
         self.due = math.inf if timeout is None else time.monotonic() + timeout
@@ -50,21 +49,23 @@ class _Worker:
             self.process.join()
             code = self.process.exitcode or 0
             how = f"killed by signal {-code}" if code < 0 else f"ended with code {code}"
-            return failed(f"its process was {how}: out of memory? It is tried again next time")
+            return failure(
+                f"its process was {how} (too little memory?); the next run tries the log again"
+            )
 
     def overdue(self) -> bool:
         return time.monotonic() >= self.due and not self.connection.poll()
 
-    def give_up(self, timeout: float | int) -> Content:
+    def give_up(self, timeout: float) -> Content:
         """Stop a job that takes too long; its failure is kept, or it would take as long again."""
         assert self.job is not None
         self.stop()
-        found = kept(self.job)  # It may have come to its end just now.
+        found = stored_result(self.job)  # It may have come to its end just now.
         if found is None:
-            found = failed(f"it took longer than {timeout:g} s: see --timeout")
+            found = failure(f"it took longer than {timeout:g} s: raise the timeout (--timeout)")
             found |= {"seconds": float(timeout), "timeout": float(timeout)}
             with contextlib.suppress(OSError):
-                keep(self.job, found)
+                store_result(self.job, found)
         return found
 
     def stop(self) -> None:
@@ -74,10 +75,10 @@ class _Worker:
         self.process.join()
 
 
-def performed(
-    jobs: Iterator[Job], work: Work, workers: int, timeout: float | int | None = None
+def perform_locally(
+    jobs: Iterator[Job], work: Work, workers: int, timeout: float | None = None
 ) -> Iterator[tuple[Job, Content]]:
-    """The jobs with their results, as these come in; `jobs` is read only as they are needed.
+    """Yield the jobs with their results, as these come in; `jobs` is read as they are needed.
 
     A job that takes longer than `timeout` s has failed, and its process is killed.
     """
@@ -88,7 +89,7 @@ def performed(
             if len(busy) == workers:
                 break
         while busy:
-            ready = wait(list(busy), _left(busy.values()))
+            ready = wait(list(busy), _seconds_left(busy.values()))
             late = [each for each, worker in busy.items() if worker.overdue()]
             for each in [*ready, *late]:
                 worker = busy.pop(each)  # pyright: ignore[reportArgumentType]
@@ -102,7 +103,7 @@ def performed(
             worker.stop()
 
 
-def _left(workers: Iterable[_Worker]) -> float | None:
+def _seconds_left(workers: Iterable[_Worker]) -> float | None:
     """Seconds until the first of them is late; None without a limit."""
     due = min(worker.due for worker in workers)
     return None if due == math.inf else max(0.0, due - time.monotonic())
@@ -113,7 +114,7 @@ def _next(
     worker: _Worker,
     jobs: Iterator[Job],
     work: Work,
-    timeout: float | int | None,
+    timeout: float | None,
 ) -> None:
     job = next(jobs, None)
     if worker.process.exitcode is not None and job is not None:
@@ -125,9 +126,7 @@ def _next(
         _start(busy, worker, job, timeout)
 
 
-def _start(
-    busy: dict[Any, _Worker], worker: _Worker, job: Job, timeout: float | int | None
-) -> None:
+def _start(busy: dict[Any, _Worker], worker: _Worker, job: Job, timeout: float | None) -> None:
     worker.give(job, timeout)
     busy[worker.connection] = worker
 

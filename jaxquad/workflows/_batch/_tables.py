@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from jaxquad.report import element, given, Html, joined, page, section, table
-
-from ._store import write_whole
+from jaxquad.report import Cell, render_page, Table, write_file
 
 
 Row = dict[str, Any]  # "log", "status", "key", and what the work returned
@@ -24,7 +22,7 @@ def write_tables(out: Path, rows: Sequence[Row]) -> list[Path]:
     writer = csv.DictWriter(text, names, restval="")
     writer.writeheader()
     writer.writerows({name: _cell(row.get(name)) for name in names} for row in flat)
-    write_whole(out / "table.csv", text.getvalue().encode("utf-8", "replace"))
+    write_file(out / "table.csv", text.getvalue())
     return [out / "table.csv", *_parquet(out, flat, names)]
 
 
@@ -64,7 +62,7 @@ def _parquet(out: Path, flat: Sequence[Row], names: Sequence[str]) -> list[Path]
         for name in names
     }  # fmt: skip
     pq.write_table(pa.table(arrays), buffer)
-    write_whole(out / "table.parquet", buffer.getvalue())
+    write_file(out / "table.parquet", buffer.getvalue())
     return [out / "table.parquet"]
 
 
@@ -74,44 +72,44 @@ def _typed(value: Any, is_text: bool) -> Any:
     return str(value).encode("utf-8", "replace").decode() if is_text else float(value)
 
 
-_WORDS = ("failed", "not identifiable", "identified")  # what needs a look comes first
+_STATES = ("failed", "not identifiable", "identified")  # what needs a look comes first
 
 
 def write_summary(out: Path, rows: Sequence[Row], *, title: str) -> Path:
-    """Write `summary.html`: what became of each log, with a link to its report."""
+    """Write `summary.html`: the state of each log, with a link to its report."""
     counts = Counter(row["status"] for row in rows)
-    states = [*_WORDS, *sorted(set(counts) - set(_WORDS))]
-    said = ", ".join(f"{counts[word]} {word}" for word in states if counts[word])
-    heading = element("h1", given(title), f": {len(rows)} logs, {said or 'none done'}")
-    parts = [_part(word, [r for r in rows if r["status"] == word]) for word in states]
-    files = element(
-        "p", "The same as ", element("a", "table.csv", attributes={"href": "table.csv"})
+    states = [*_STATES, *sorted(set(counts) - set(_STATES))]
+    counted = ", ".join(f"{counts[state]} {state}" for state in states if counts[state])
+    parts = [_part(state, [row for row in rows if row["status"] == state]) for state in states]
+    text = render_page(
+        "summary.html",
+        title=f"{title}: {counted}",
+        folder=title,
+        count=len(rows),
+        counts=counted,
+        parts=[part for part in parts if part],
     )
-    body = joined(element("header", heading, files), element("main", *filter(None, parts)))
-    path = out / "summary.html"
-    write_whole(path, page(f"{title}: {said}", body).encode())
-    return path
+    return write_file(out / "summary.html", text)
 
 
-def _part(word: str, rows: Sequence[Row]) -> str:
+def _part(state: str, rows: Sequence[Row]) -> dict[str, object]:
+    """The logs of one state, as a table."""
     if not rows:
-        return ""
+        return {}
     flat = [flattened(row) for row in rows]
-    failed = word == "failed"
+    failed = state == "failed"
     numbers = [n for n in columns(flat) if n not in ("log", "status", "error", "report", "key")]
     heads = ["log", "error", "seconds"] if failed else ["log", *numbers]
     body = [
-        [_link(row), *(_text(row.get(name)) for name in heads[1:])]
-        for row in flat
-    ]  # fmt: skip
-    title = word.capitalize()
-    return section(word.replace(" ", "-"), title, table(heads, body, title=title, texts=1 + failed))
-
-
-def _link(row: Row) -> Html:
-    if not row.get("report"):
-        return given(row["log"])
-    return element("a", given(row["log"]), attributes={"href": quote(row["report"])})
+        [
+            Cell(str(row["log"]), link=quote(row["report"] or "")),
+            *(_text(row[n]) for n in heads[1:]),
+        ]
+        for row in ({n: None for n in heads} | row for row in flat)
+    ]
+    title = state.capitalize()
+    table = Table(title, heads, body, texts=1 + failed)
+    return {"key": state.replace(" ", "-"), "title": title, "table": table}
 
 
 def _text(value: object) -> str:

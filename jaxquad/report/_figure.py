@@ -5,11 +5,12 @@ import io
 import re
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from jaxquad.plot import short_names
-
-from ._html_text import element, Html
 
 
 _LARGEST = 220_000  # bytes of an SVG; a PNG of the figures here has about half of that
@@ -19,27 +20,41 @@ _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 _WIDTH = 110  # pixels of a page for an inch
 
 
-def figure(draw: Callable[[], Any], *, alt: str, caption: str = "", formulas: bool = False) -> Html:
-    """What `draw()` returns, a `matplotlib.figure.Figure`, with a text for those who cannot see it.
+class Image(NamedTuple):
+    """A figure inside a page, with a text for those who cannot see it."""
+
+    alt: str
+    width: str  # pixels
+    height: str
+    source: str  # a data: URL
+    caption: str = ""
+    ratio: tuple[str, str] | None = None  # output and input, in front of the caption
+
+
+def embed_figure(
+    draw: Callable[[], Figure],
+    *,
+    alt: str,
+    caption: str = "",
+    ratio: tuple[str, str] | None = None,
+    formulas: bool = False,
+) -> Image:
+    """What `draw()` returns as an image.
 
     Texts in it are drawn as they are, dollar signs too, unless they are known to hold `formulas`.
     """
-    from matplotlib import rc_context
-
-    settings: Any = {"svg.hashsalt": "jaxquad", "svg.fonttype": "path", "text.parse_math": formulas}
-    with warnings.catch_warnings(), rc_context(settings):
+    settings = {"svg.hashsalt": "jaxquad", "svg.fonttype": "path", "text.parse_math": formulas}
+    with warnings.catch_warnings(), rc_context(settings):  # pyright: ignore[reportArgumentType]
         # A letter that the font does not have is drawn as a box: the caption holds it.
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         drawn = draw()
         kind, data = _encoded(drawn)
     width, height = (f"{_WIDTH * inches:.0f}" for inches in drawn.get_size_inches())
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-    named = {"alt": alt, "width": width, "height": height, "src": source}
-    image = Html(element("img", attributes=named).removesuffix("</img>"))
-    return element("figure", image, element("figcaption", caption) if caption else Html(""))
+    return Image(alt, width, height, source, caption, ratio)
 
 
-def _encoded(drawn: Any) -> tuple[str, bytes]:
+def _encoded(drawn: Figure) -> tuple[str, bytes]:
     if (layout := drawn.get_layout_engine()) is not None:
         layout.execute(drawn)  # once: savefig would do it twice, which takes longest of all
         drawn.set_layout_engine("none")

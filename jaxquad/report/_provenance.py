@@ -6,10 +6,7 @@ from collections.abc import Mapping
 from datetime import datetime, UTC
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from ._html_fit import definitions
-from ._html_text import element, given, Html, items, joined, section
+from typing import NamedTuple
 
 
 _PACKAGES = ("jaxquad", "jax", "jaxlib", "numpy", "scipy", "equinox", "optimistix")
@@ -17,7 +14,7 @@ _BLOCK = 1 << 20  # bytes
 
 
 class Source(NamedTuple):
-    """One file that a result rests on; of a folder, all files in it by the order of their names."""
+    """A file from which a result was made; a folder counts as all files in it."""
 
     name: str
     size: int  # bytes
@@ -25,7 +22,7 @@ class Source(NamedTuple):
 
 
 class Provenance(NamedTuple):
-    """Where a result comes from."""
+    """Where a result comes from: files, command, settings, versions and date."""
 
     files: tuple[Source, ...]
     command: str  # that makes the result again
@@ -33,7 +30,7 @@ class Provenance(NamedTuple):
     versions: dict[str, str]
     date: str  # ISO 8601, UTC
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, object]:
         """For `result.json`, see `jaxquad.report.write_results`."""
         return self._asdict() | {"files": [file._asdict() for file in self.files]}
 
@@ -41,12 +38,19 @@ class Provenance(NamedTuple):
 def provenance(
     *paths: str | Path,
     command: str = "",
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, object] | None = None,
     date: datetime | None = None,
 ) -> Provenance:
-    """Hash the files at `paths`, note the installed versions and the time (now, if not given).
+    """Hash files, and note the installed versions and the time.
 
-    Raises OSError for a file that cannot be read.
+    **Arguments:**
+
+    - `paths`: the files or folders that a result was made from.
+    - `command`: the command line that makes the result again.
+    - `settings`: further facts by name.
+    - `date`: now by default.
+
+    **Raises:** OSError for a file that cannot be read.
     """
     moment = (date or datetime.now(UTC)).astimezone(UTC)
     return Provenance(
@@ -59,16 +63,26 @@ def provenance(
 
 
 def _source(path: Path) -> Source:
-    files = [path]
+    return Source(path.name, sum(each.stat().st_size for each in _files(path)), sha256_of(path))
+
+
+def _files(path: Path) -> list[Path]:
     if path.is_dir():
-        files = sorted(each for each in path.rglob("*") if each.is_file())
-    digest, size = hashlib.sha256(), 0
-    for each in files:
+        return sorted(each for each in path.rglob("*") if each.is_file())
+    return [path]
+
+
+def sha256_of(path: str | Path) -> str:
+    """The SHA-256 of a file, or of all files in a folder by the order of their names.
+
+    **Raises:** OSError for a file that cannot be read.
+    """
+    digest = hashlib.sha256()
+    for each in _files(Path(path)):
         with each.open("rb") as file:
             while block := file.read(_BLOCK):
                 digest.update(block)
-                size += len(block)
-    return Source(path.name, size, digest.hexdigest())
+    return digest.hexdigest()
 
 
 def _versions() -> dict[str, str]:
@@ -81,17 +95,8 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def provenance_section(known: Provenance) -> Html:
-    files = [
-        joined(given(file.name), f", {file.size} bytes, SHA-256 ", element("code", file.sha256))
-        for file in known.files
-    ]
-    command = element("pre", known.command, css="wrap")
-    again = (element("h3", "To make it again"), command) if known.command else ()
-    facts = known.settings | {
-        "versions": ", ".join(f"{name} {text}" for name, text in known.versions.items()),
-        "date": known.date,
-    }
-    return section(
-        "provenance", "Provenance", items(files) if files else "", *again, definitions(facts)
-    )
+def provenance_section(known: Provenance) -> dict[str, object]:
+    """Files, command, versions and date, for a page."""
+    versions = ", ".join(f"{name} {text}" for name, text in known.versions.items())
+    facts = known.settings | {"versions": versions, "date": known.date}
+    return {"files": known.files, "command": known.command, "facts": facts}

@@ -1,0 +1,149 @@
+"""The parameters of a fit, their correlation, and what of them the record determines."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxquad.identify import Combination, factors, Fit, UndeterminedError
+from jaxquad.models import TransferFunction
+
+from ._page import Cell, Table
+
+
+_BOUNDS = (20.0, 10.0)  # %, of Cramer-Rao bound and insensitivity (Tischler & Remple, sec. 11.1)
+_CORRELATED = 0.9
+_DASH = "\u2013"
+
+
+def parameter_section(fit: Fit, derived: Sequence[Combination]) -> dict[str, object]:
+    """Every number with its standard error, and how good the fit is."""
+    heads = ("parameter", "value", "std. error", "95 % interval", "CR, %", "insensitivity, %")
+    rows = [_parameter(fit, k) for k in range(len(fit.names))]
+    rows += [[*_estimate(each), _DASH, _DASH] for each in derived]
+    return {
+        "table": Table("Identified parameters", heads, rows),
+        "bounds": [f"{bound:g}" for bound in _BOUNDS],
+        "is_marked": not fit.identifiable,
+        "factors": _factored(fit),
+        "facts": _quality(fit),
+        "correlation": _correlation(fit),
+        "text": str(fit),
+    }
+
+
+def _parameter(fit: Fit, k: int) -> list[str | Cell]:
+    name = fit.names[k]
+    value, error = float(fit.values[k]), float(fit.standard_errors[k])
+    cells = _estimate(Combination(name, value, error))
+    if not fit.determined[k]:
+        cells = [Cell(f"{name} *"), *cells[1:-1], "not determined"]
+    percents = zip((fit.cramer_rao[k], fit.insensitivity[k]), _BOUNDS, strict=True)
+    return [*cells, *(_marked(f"{x:.2f}", bool(x > most)) for x, most in percents)]
+
+
+def _estimate(one: Combination) -> list[str | Cell]:
+    low, high = one.interval
+    interval = f"{low:.5g} .. {high:.5g}"
+    return [Cell(one.name), f"{one.value:.5g}", f"{one.standard_error:.2g}", interval]
+
+
+def _marked(text: str, beyond: bool) -> str | Cell:
+    return Cell(text, high=True) if beyond else text
+
+
+def _factored(fit: Fit) -> str:
+    """Poles and zeros, where the model has them."""
+    if not isinstance(fit.model, TransferFunction):
+        return ""
+    try:
+        return str(factors(fit))
+    except UndeterminedError as error:
+        return str(error)
+
+
+def _quality(fit: Fit) -> dict[str, str]:
+    condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
+    ratio = np.sqrt(fit.chi_squared)
+    facts = {
+        "misfit / random error": f"{ratio:.2f} (about 1 if the model explains the response)",
+        "cost": f"{fit.cost:.4g}, on average {fit.average_cost:.4g} for each response",
+        "points": f"{fit.points} frequencies",
+        "condition of the Jacobian": condition,
+        "solver": f"{fit.steps} steps, Newton decrement {fit.newton_decrement:.1e}",
+    }
+    if fit.minima:
+        facts["starts"] = count_starts([len(point.starts) for point in fit.minima])
+    return facts
+
+
+def count_starts(starts: Sequence[int]) -> str:
+    """How many starts led to how many different optima: "3 starts, 1 optimum"."""
+    total, found = sum(starts), len(starts)
+    return f"{total} start{'s' * (total > 1)}, {found} optim{'a' if found > 1 else 'um'}"
+
+
+def _correlation(fit: Fit) -> Table | None:
+    known = np.flatnonzero(fit.determined).tolist()
+    if len(known) < 2:
+        return None
+    matrix = fit.correlation
+    rows = [
+        [Cell(fit.names[k]), *(_correlated(matrix[k, m], k == m) for m in known)] for k in known
+    ]
+    title = f"Correlation of the estimates (bold from {_CORRELATED:g})"
+    return Table(title, ["", *(Cell(fit.names[k]) for k in known)], rows)
+
+
+def _correlated(value: float, same: bool) -> str | Cell:
+    return "1" if same else _marked(f"{value:.2f}", bool(abs(value) >= _CORRELATED))
+
+
+def identifiability_section(fit: Fit) -> dict[str, object]:
+    """What the record determines, and what to do about the rest."""
+    none: dict[str, object] = {
+        "lost": [], "texts": [], "combinations": None, "directions": None, "remedies": []
+    }  # fmt: skip
+    verdict = fit.verdict
+    if fit.identifiable:
+        return none | {"texts": [_least_sharp(fit)]}
+    remedies = [f"{text[:1].upper()}{text[1:]}." for text in verdict.remedies]
+    if verdict.kind != "not identifiable":
+        return none | {"texts": [f"{verdict.summary}."], "remedies": remedies}
+    texts = [] if fit.combinations else ["No combination of them is determined either."]
+    return {
+        "lost": verdict.undetermined,
+        "texts": [*texts, *(f"{reason}." for reason in verdict.reasons)],
+        "combinations": _combinations(fit),
+        "directions": _directions(fit),
+        "remedies": remedies,
+    }
+
+
+def _least_sharp(fit: Fit) -> str:
+    text = "The record determines every free parameter by itself."
+    known = [k for k, value in enumerate(fit.values) if value != 0]
+    if not known:
+        return text
+    share, k = max((float(abs(fit.standard_errors[k] / fit.values[k])), k) for k in known)
+    worst = f"The least accurate is {fit.names[k]}: its standard error is {100 * share:.2g} %"
+    return f"{text} {worst} of its value."
+
+
+def _combinations(fit: Fit) -> Table | None:
+    if not fit.combinations:
+        return None
+    heads = ("combination", "value", "std. error", "95 % interval")
+    return Table("Combinations that are determined", heads, [*map(_estimate, fit.combinations)])
+
+
+def _directions(fit: Fit) -> Table | None:
+    directions = fit.verdict.null_directions
+    if not directions:
+        return None
+    names = list(dict.fromkeys(name for each in directions for name in each))
+    rows = [
+        [f"direction {k}", *(f"{each[n]:+.3f}" if n in each else _DASH for n in names)]
+        for k, each in enumerate(directions, start=1)
+    ]
+    title = "Null directions: relative changes that leave the responses as they are"
+    return Table(title, ["", *map(Cell, names)], rows)

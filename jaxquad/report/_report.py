@@ -1,0 +1,101 @@
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from jaxquad.identify import Combination, Fit, Verification
+from jaxquad.plot import Model
+from jaxquad.records import Record
+from jaxquad.spectra import FrequencyResponse
+from jaxquad.tuning import Certificate, Tuned
+
+from ._fit import identifiability_section, parameter_section
+from ._headline import certificate_headline, check_headline, fit_headline, remarks_of
+from ._page import render_page, write_file
+from ._provenance import Provenance, provenance_section
+from ._record import check_section, record_section
+from ._response import residual_section, response_section
+from ._tuned import tuned_section
+
+
+def write_report(
+    path: str | Path,
+    *,
+    fit: Fit,
+    frf: FrequencyResponse | Mapping[str, FrequencyResponse],
+    models: Mapping[str, Model] | None = None,
+    others: Mapping[str, FrequencyResponse] | None = None,
+    record: Record | Mapping[str, Record] | None = None,
+    checks: Verification | Mapping[str, Verification] | None = None,
+    derived: Sequence[Combination] = (),
+    tuned: Tuned | Certificate | None = None,
+    provenance: Provenance | None = None,
+    title: str = "",
+    formula: str = "",
+) -> Path:
+    """Write one self-contained HTML page on a fit, whole or not at all.
+
+    The verdict and all remarks come first. Figures are inside the page, there is no script, nothing
+    is fetched from elsewhere, and every text from a log is escaped.
+
+    **Arguments:**
+
+    - `path`: of the page.
+    - `fit`: the fit; one that is not identifiable has a page, too.
+    - `frf`: the response that was fitted, or several that one fit explains, by name.
+    - `models`: with several responses, the models under a known change (`conditions=` of `jq.fit`)
+      by the same names; by default the fit's own.
+    - `others`: further estimates of the same response, by name.
+    - `record`, `checks`: the records, and the model simulated on records; one, or several by name.
+    - `derived`: rows below the parameters, see `Fit.derived`.
+    - `tuned`: gains with their certificate, or a certificate alone.
+    - `provenance`: where the result comes from, see `jaxquad.report.provenance`.
+    - `title`: by default "output / input" of the first response.
+    - `formula`: the model in words.
+
+    **Returns:** the path.
+
+    **Raises:** ValueError for no response, and for `models` whose names no response has.
+    """
+    frfs = {"response": frf} if isinstance(frf, FrequencyResponse) else dict(frf)
+    if not frfs:
+        raise ValueError("frf is empty: give the response that was fitted, or several by name")
+    records = {"record": record} if isinstance(record, Record) else dict(record or {})
+    found = {"verification": checks} if isinstance(checks, Verification) else dict(checks or {})
+    models = _models(fit, frfs, models or {})
+    remarks = remarks_of(fit, frfs, found)
+    headlines = [fit_headline(fit, len(remarks))]
+    headlines += [check_headline(name, check) for name, check in found.items()]
+    headlines += [certificate_headline(tuned)] if tuned is not None else []
+    first = next(iter(frfs.values()))
+    names = (first.output_names[0], first.input_names[0])
+    sections = {
+        "record": record_section(records) if records else None,
+        "response": response_section(frfs, models, others or {}),
+        "residuals": residual_section(frfs, models) if models else None,
+        "parameters": parameter_section(fit, derived) if fit.verdict.fitted else None,
+        "identifiability": identifiability_section(fit),
+        "verification": check_section(found) if found else None,
+        "tuned": tuned_section(tuned) if tuned is not None else None,
+        "provenance": provenance_section(provenance) if provenance is not None else None,
+    }
+    text = render_page(
+        "report.html",
+        title=f"{headlines[0].word}: {title or ' / '.join(names)}",
+        title_text=title,
+        names=names,
+        headlines=headlines,
+        remarks=remarks,
+        formula=formula,
+        sections={name: section for name, section in sections.items() if section is not None},
+    )
+    return write_file(path, text)
+
+
+def _models(
+    fit: Fit, frfs: Mapping[str, FrequencyResponse], models: Mapping[str, Model]
+) -> dict[str, Model]:
+    unknown = [name for name in models if name not in frfs]
+    if unknown:
+        raise ValueError(f"models of no response: {unknown}; the responses are {list(frfs)}")
+    if not fit.verdict.fitted:
+        return dict(models)
+    return {name: models.get(name, fit.model) for name in frfs}

@@ -1,0 +1,94 @@
+"""Tuned gains, and their certificate on fresh members."""
+
+import numpy as np
+
+from jaxquad.plot import certificate_figure, convergence_figure
+from jaxquad.tuning import Certificate, QUANTITIES, Tuned
+
+from ._figure import embed_figure
+from ._fit import count_starts
+from ._page import Cell, Table
+
+
+_DRAWN = 7  # designs that can be told apart in a figure
+
+
+def tuned_section(tuned: Tuned | Certificate) -> dict[str, object]:
+    """The gains, how the tune went, and the certificate."""
+    certificate = tuned.certificate if isinstance(tuned, Tuned) else tuned
+    return {
+        "gains": _gains(tuned) if isinstance(tuned, Tuned) else None,
+        "certificate": None if certificate is None else _certificate(certificate),
+        "text": str(tuned),
+    }
+
+
+def _gains(tuned: Tuned) -> dict[str, object]:
+    rows = [[Cell(name), f"{value:.5g}"] for name, value in tuned.values.items()]
+    end = "converged" if tuned.converged else "did NOT converge"
+    facts = {
+        "controller": type(tuned.controller).__name__,
+        "optimisation": f"cost {tuned.cost:.5g}; {end} after {tuned.evaluations} gradient "
+        f"evaluations in {tuned.seconds:.1f} s",
+    }
+    if tuned.minima:
+        facts["starts"] = count_starts([len(point.starts) for point in tuned.minima])
+    image = None
+    if tuned.history:
+        image = embed_figure(
+            lambda: convergence_figure(tuned.history),
+            alt="Cost above the best found and share of stable members, by gradient evaluation.",
+            formulas=True,  # powers of ten
+        )
+    table = Table("Gains", ("gain", "value"), rows)
+    return {"table": table, "facts": facts, "remarks": tuned.remarks, "image": image}
+
+
+def _certificate(certificate: Certificate) -> dict[str, object]:
+    quantities = [q for q in ("itae", "sensitivity_peak") if _is_known(certificate, q)]
+    designs = tuple(certificate.designs)[:_DRAWN]
+    image = embed_figure(
+        lambda: certificate_figure(certificate, quantities=quantities, designs=designs),
+        alt="Every member over its inertia: whether it is stable, and its "
+        f"{' and '.join(QUANTITIES[q].title for q in quantities)}, for {', '.join(designs)}.",
+        formulas=True,
+    )
+    return {
+        "verdict": str(certificate).splitlines()[0],
+        "limits": [str(distance) for distance in certificate.distances],
+        "remarks": certificate.remarks,
+        "designs": _designs(certificate),
+        "image": image,
+    }
+
+
+def _is_known(certificate: Certificate, quantity: str) -> bool:
+    designs = certificate.designs.values()
+    return all(quantity in d.by_axis and np.isfinite(d.of(quantity)).any() for d in designs)
+
+
+def _designs(certificate: Certificate) -> Table:
+    """Designs side by side, by every quantity that was evaluated."""
+    found = certificate.summaries
+    percent = lambda x: "n/a" if x is None else f"{100 * x:.3g}"
+    share = lambda row: None if row.unstable is None else row.unstable / row.members
+    rows = [["unstable, %", "found", *(percent(share(row)) for row in found.values())]]
+    if certificate.independent:
+        bounds = [percent(row.unstable_at_most) for row in found.values()]
+        rows.append(["unstable, % (95 % confidence)", "at most", *bounds])
+    diverged = [percent(row.diverged / row.members) for row in found.values()]
+    rows.append(["diverged, %", "found", *diverged])
+    for quantity in certificate.design.by_axis:
+        shown = QUANTITIES[quantity]
+        title = f"{shown.title}, {shown.unit}" if shown.unit else shown.title
+        for which in ("mean", "worst"):
+            cells = [
+                shown.text(row.statistics[quantity]._asdict()[which], unit=False)
+                if quantity in row.statistics
+                else "n/a"
+                for row in found.values()
+            ]
+            rows.append([title, which, *cells])
+    heads = ("quantity", "of the members", *map(Cell, found))
+    title = f"{certificate.name} and other designs on {certificate.members} members"
+    return Table(title, heads, rows, texts=2)

@@ -1,0 +1,55 @@
+"""A simulated log whose true model is known."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxquad.excitation import sweep
+from jaxquad.report import write_file
+
+from ._settings import IdentifySettings
+
+
+_RATE, _GAIN, _LAG, _DELAY = 250.0, 280.0, 0.02, 0.008  # Hz, rad/s^2 per unit of M, s, s
+_FEEDBACK = 0.02  # of M per rad/s
+_GUST, _CORNER, _NOISE = 2.0, 3.0, 0.01  # rad/s^2, rad/s, rad/s
+# An input that is held is half a sample late.
+DEMO_TRUTH: Mapping[str, float] = {"gain": _GAIN, "lag": _LAG, "delay": _DELAY + 0.5 / _RATE}
+DEMO = IdentifySettings(
+    input="M", output="q", reference="x0", units={"q": "rad/s"}, band=(0.5, 12.0)
+)
+
+
+def write_demo_log(path: str | Path) -> Path:
+    """Write time, reference x0, command M and rate q as CSV; the same at every call.
+
+    An axis under rate feedback, in gusts, is excited by a sweep of its command. `DEMO` holds the
+    settings to identify it with, `DEMO_TRUTH` the true parameters.
+    """
+    low, high = 2 * np.pi * 0.4, 2 * np.pi * 15
+    signal = sweep(low, high, duration=40, sample_rate=_RATE, amplitude=0.06)
+    command, rate = _simulated(signal.signal)
+    columns = (signal.time, signal.signal, command, rate)
+    rows = ("{:.6f},{:.8g},{:.8g},{:.8g}\n".format(*row) for row in zip(*columns, strict=True))
+    return write_file(Path(path), f"time,x0,M,q\n{''.join(rows)}")
+
+
+def _simulated(swept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """M = x0 - feedback q, held for a sample; q' = gain M(t - delay) behind a lag, and gusts."""
+    random = np.random.default_rng(0)
+    noise, shocks = random.standard_normal((2, swept.size))
+    dt, delay = 1 / _RATE, round(_DELAY * _RATE)
+    stay, hold = np.exp(-dt / _LAG), np.exp(-_CORNER * dt)
+    command, measured = np.zeros((2, swept.size))
+    rate = moment = gust = 0.0
+    for k in range(swept.size):
+        measured[k] = rate + _NOISE * noise[k]
+        command[k] = swept[k] - _FEEDBACK * measured[k]
+        held = command[k - delay] if k >= delay else 0.0
+        # The lag's exact mean over the sample, in which its input is constant.
+        mean = held + (moment - held) * (1 - stay) * _LAG / dt
+        rate += dt * (_GAIN * mean + gust)
+        moment = held + (moment - held) * stay
+        gust = hold * gust + _GUST * np.sqrt(1 - hold**2) * shocks[k]
+    return command, measured

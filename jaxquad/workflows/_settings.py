@@ -1,0 +1,499 @@
+"""Settings of the workflows: the same in Python, on the command line, in TOML and in results."""
+
+import dataclasses
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+from . import _kinds as kinds
+from ._kinds import convert, Pair, SettingsError
+
+
+class Option(NamedTuple):
+    """How a setting is said on the command line, and what its help says."""
+
+    kind: kinds.Kind
+    help: str
+    group: str
+    flag: str
+
+
+def _option(kind: kinds.Kind, default: Any, help: str, *, group: str = "", flag: str = "") -> Any:
+    metadata = {"option": Option(kind, help, group, flag)}
+    if isinstance(default, dict):
+        return dataclasses.field(default_factory=default.copy, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+_REQUIRED = dataclasses.MISSING
+_RUN, _PART, _MODEL = "signals", "part of the record", "model"
+_ESTIMATE, _CHECK = "estimate", "check on a second record"
+_REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the place of
+    "segments": ("start", "stop"),
+    "start": ("segments",),
+    "stop": ("segments",),
+    "band": ("band_rad",),
+    "band_rad": ("band",),
+}
+
+
+class _Settings:
+    """Frozen dataclasses whose fields are declared by `_option`."""
+
+    @classmethod
+    def options(cls) -> dict[str, Option]:
+        """How each setting is said, by its key."""
+        fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+        found = {field.name: field.metadata["option"] for field in fields}
+        flags = {key: each.flag or f"--{key.replace('_', '-')}" for key, each in found.items()}
+        return {key: each._replace(flag=flags[key]) for key, each in found.items()}
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+        return {f.name: {} if f.default is _REQUIRED else f.default for f in fields}
+
+    @classmethod
+    def from_mapping(cls, content: Mapping[str, object], where: str = "") -> Self:
+        """Settings from what TOML or JSON hold; `where` begins the message of an error.
+
+        Raises SettingsError for an unknown key, with the most similar known one, for a required
+        key that is missing, and for values that cannot be.
+        """
+        try:
+            check_keys(content, cls.options())
+            missing = [
+                each.name
+                for each in dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+                if each.default is each.default_factory is _REQUIRED and each.name not in content
+            ]
+            if missing:
+                raise SettingsError(f"{' and '.join(f'`{key}`' for key in missing)} missing")
+            return cls(**content)
+        except SettingsError as error:
+            raise _within(where, error) from error
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """As `from_mapping`, from a TOML file."""
+        return cls.from_mapping(read_toml(path), str(path))
+
+    def content(self) -> dict[str, Any]:
+        """All settings, for JSON; `from_mapping` reads them."""
+        return {key: vars(self)[key] for key in self.options()}
+
+    def given(self) -> dict[str, Any]:
+        """The settings that differ from their defaults."""
+        defaults = self.defaults()
+        return {key: value for key, value in self.content().items() if value != defaults[key]}
+
+    def changed(self, changes: Mapping[str, object]) -> Self:
+        """These settings with others for some keys; `band` takes the place of `band_rad`, etc."""
+        return self.from_mapping(updated(self.given(), changes))
+
+    def words(self) -> list[str]:
+        """The options on the command line that stand for these settings."""
+        options = self.options()
+        return [w for key, value in self.given().items() for w in _words(options[key], value)]
+
+    def __post_init__(self):
+        for key, option in self.options().items():
+            object.__setattr__(self, key, self._converted(key, option.kind))
+        self._check_together()
+
+    def _converted(self, key: str, kind: kinds.Kind) -> Any:
+        value = vars(self)[key]
+        if value is None and self.defaults()[key] is None:
+            return None
+        return convert(key, kind, value)
+
+    def _check_together(self) -> None:
+        pass
+
+
+def _words(option: Option, value: Any) -> list[str]:
+    kind, flag = option.kind, option.flag
+    if kind.words == 0:
+        return [flag]
+    if kind.repeated:  # as one word, or a negative start would be taken for an option
+        items = value.items() if isinstance(value, Mapping) else value
+        return [f"{flag}={kind.write(each)}" for each in items]
+    return [flag, *(kind.write(each) for each in (value if kind.words > 1 else [value]))]
+
+
+def _within(where: str, error: SettingsError) -> SettingsError:
+    """In a file, keys are what they are: no flags of the command line stand for them."""
+    return SettingsError(f"{where}: {error}".replace("`", "") if where else str(error))
+
+
+def check_keys(content: Mapping[str, object], known: Iterable[str]) -> None:
+    """Raise SettingsError for the first key that is not known."""
+    known = list(known)
+    for key in content:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
+            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+            raise SettingsError(f"unknown key {key!r}; {hint}")
+
+
+def read_toml(path: str | Path) -> dict[str, object]:
+    """Raises SettingsError for a file that is not TOML, OSError for none."""
+    try:
+        return tomllib.loads(Path(path).read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not TOML: {error}") from error
+
+
+def updated(content: Mapping[str, object], changes: Mapping[str, object]) -> dict[str, object]:
+    """`content` with `changes`; keys that say the same in another way go (band for band_rad)."""
+    gone = {old for key in changes for old in _REPLACED.get(key, ()) if old not in changes}
+    return {key: value for key, value in content.items() if key not in gone} | dict(changes)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class IdentifySettings(_Settings):
+    """How one log is identified: signals, part of the record, model and estimate.
+
+    The keyword arguments are the keys of the TOML file; `jaxquad identify --help` lists them as
+    options. Without `input` and `output`, an autopilot's log proposes them.
+
+    **Raises:** `SettingsError` (a ValueError) for values that cannot be, and for settings that
+    exclude each other.
+
+    !!! example
+
+        ```python
+        settings = jq.workflows.IdentifySettings(
+            input="roll=-m1-m2+m3+m4", output="p", band=(0.7, 12), units={"p": "rad/s"}
+        )
+        ```
+    """
+
+    input: str | None = _option(
+        kinds.MIX,
+        None,
+        "a channel, or a weighted sum NAME=-a+b+0.5*c, also with powers: NAME=0.1*a^2; "
+        "by default the log of a known autopilot proposes input and output",
+        group=_RUN,
+    )
+    output: str | None = _option(kinds.MIX, None, "likewise", group=_RUN)
+    reference: str | None = _option(
+        kinds.MIX,
+        None,
+        "an external signal that no feedback computes; with it, the joint input-output "
+        "estimate is made beside the direct one",
+        group=_RUN,
+    )
+    axis: str | None = _option(
+        kinds.AXIS, None, "the axis to propose input and output for", group=_RUN
+    )
+    units: Mapping[str, str] = _option(
+        kinds.UNITS,
+        {},
+        "the unit of a channel, such as q=rad/s; may be repeated",
+        group=_RUN,
+        flag="--unit",
+    )
+    time: str | None = _option(kinds.TEXT, None, "the channel that holds the time", group=_RUN)
+    time_unit: str | None = _option(kinds.TIME_UNIT, None, "its unit", group=_RUN)
+    rate: float | None = _option(
+        kinds.HERTZ,
+        None,
+        "resample to this rate; by default the slowest channel's own",
+        group=_PART,
+    )
+    start: float | None = _option(
+        kinds.TIME, None, "first time to use, in the file's time", group=_PART
+    )
+    stop: float | None = _option(kinds.TIME, None, "last time to use", group=_PART)
+    segments: tuple[Pair, ...] = _option(
+        kinds.SEGMENTS,
+        (),
+        "instead of start and stop; repeat it to analyse several parts together",
+        group=_PART,
+        flag="--segment",
+    )
+    integrators: int = _option(
+        kinds.COUNT,
+        1,
+        "n in K e^(-delay s) / (s^n (lag s + 1)): 1 from a moment to a rate, 2 to an "
+        "angle; 1 by default",
+        group=_MODEL,
+    )
+    lag: bool = _option(
+        kinds.SWITCH, True, "fit a model without the lag", group=_MODEL, flag="--no-lag"
+    )
+    delay: bool = _option(
+        kinds.SWITCH, True, "fit a model without the delay", group=_MODEL, flag="--no-delay"
+    )
+    poles: int | None = _option(
+        kinds.COUNT,
+        None,
+        "fit a transfer function with this many poles beside the integrators, "
+        "instead of gain and lag",
+        group=_MODEL,
+    )
+    zeros: int = _option(kinds.COUNT, 0, "and with this many zeros; 0 by default", group=_MODEL)
+    band: Pair | None = _option(
+        kinds.BAND,
+        None,
+        "fit between these frequencies, in Hz; by default what the record resolves",
+        group=_ESTIMATE,
+    )
+    band_rad: Pair | None = _option(kinds.BAND, None, "the same in rad/s", group=_ESTIMATE)
+    estimator: str = _option(
+        kinds.ESTIMATOR,
+        "local",
+        "of the frequency response: local "
+        "polynomials, composite windows, or windows of one length; local by default",
+        group=_ESTIMATE,
+    )
+    window: float | None = _option(
+        kinds.DURATION,
+        None,
+        "length of welch's window; a fifth of the record by default",
+        group=_ESTIMATE,
+    )
+    cost: str = _option(
+        kinds.COST,
+        "ml",
+        "maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default",
+        group=_ESTIMATE,
+    )
+    verify: str | None = _option(
+        kinds.FILE,
+        None,
+        "simulate the model on this record, which has the same channels",
+        group=_CHECK,
+    )
+    verify_start: float | None = _option(kinds.TIME, None, "in that file's time", group=_CHECK)
+    verify_stop: float | None = _option(kinds.TIME, None, "in that file's time", group=_CHECK)
+
+    def _check_together(self) -> None:
+        one_of_two = (self.input is None) != (self.output is None)
+        if one_of_two:
+            raise SettingsError(
+                "`input` and `output` belong together: give both, or none to have them proposed"
+            )
+        if self.input is not None and self.axis is not None:
+            raise SettingsError(
+                "`axis` is for a proposal: leave it out, or leave `input` and `output` out"
+            )
+        if self.segments and (self.start is not None or self.stop is not None):
+            raise SettingsError(
+                "`segments` says where to start and stop: leave `start` and `stop` out"
+            )
+        if self.band is not None and self.band_rad is not None:
+            raise SettingsError("`band` (Hz) and `band_rad` (rad/s) are both given: keep one")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneSettings(_Settings):
+    """How a controller is tuned on an identified axis: what the record does not tell.
+
+    The keyword arguments are the keys of the TOML file; `jaxquad tune --help` lists them as
+    options.
+
+    **Raises:** `SettingsError` (a ValueError) for values that cannot be.
+    """
+
+    inertia: float = _option(
+        kinds.INERTIA, _REQUIRED, "nominal inertia of the axis, in kg m^2", group="vehicle"
+    )
+    limit: float = _option(
+        kinds.POSITIVE, _REQUIRED, "largest command, to either side, in its unit", group="vehicle"
+    )
+    spread: Pair = _option(
+        kinds.BAND,
+        (0.5, 3.0),
+        "range of the true inertia, as factors of the nominal one; 0.5 3 by default",
+        group="vehicle",
+    )
+    inertia_error: float = _option(
+        kinds.NOT_NEGATIVE,
+        0.1,
+        "relative standard error of the inertia that the controller's gains "
+        "are scheduled with; 0.1 by default",
+        group="vehicle",
+    )
+    noise: float = _option(
+        kinds.DEVIATION,
+        0.02,
+        "standard deviation of the measured angle; 0.02 by default",
+        group="vehicle",
+    )
+    step: float = _option(
+        kinds.DEGREES, 4.0, "step of the reference; 4 by default", group="simulated flight"
+    )
+    disturbance: float | None = _option(
+        kinds.TORQUE,
+        None,
+        "torque pulse; by default a tenth of the torque at the limit",
+        group="simulated flight",
+    )
+    duration: float = _option(
+        kinds.DURATION, 4.0, "of one flight; 4 by default", group="simulated flight"
+    )
+    dt: float | None = _option(
+        kinds.DURATION,
+        None,
+        "sampling interval of the controller; by default that of the record",
+        group="controller",
+    )
+    sensitivity: float = _option(
+        kinds.POSITIVE, 3.6, "upper limit of the peak of |S|; 3.6 by default", group="controller"
+    )
+    name: str = _option(
+        kinds.TEXT,
+        "attitude",
+        "prefix of the functions in the C header; attitude by default",
+        group="controller",
+    )
+    members: int = _option(
+        kinds.SIZE, 64, "number of plants to tune on; 64 by default", group="ensemble of plants"
+    )
+    fresh: int = _option(
+        kinds.SIZE,
+        256,
+        "number of new plants to certify on; 256 by default",
+        group="ensemble of plants",
+    )
+    seed: int = _option(
+        kinds.COUNT, 0, "of the random draws; 0 by default", group="ensemble of plants"
+    )
+
+
+class Override(NamedTuple):
+    """Settings of the logs whose paths match one of the patterns."""
+
+    logs: tuple[str, ...]
+    changes: Mapping[str, object]
+
+
+_ONE_LOG = ("verify", "verify_start", "verify_stop")
+_EVERY_LOG = ("**/*",)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BatchSettings(_Settings):
+    """Which logs of a folder are identified, how each of them, and by how many processes.
+
+    In TOML the keys of `identify` stand beside the others, and each override is a table
+    `[[override]]` with `logs` and the keys that it changes.
+
+    **Raises:** `SettingsError` (a ValueError) for values that cannot be.
+
+    !!! example
+
+        ```python
+        settings = jq.workflows.BatchSettings(
+            logs="**/*.ulg",
+            identify={"band": (0.7, 12), "integrators": 1},
+            overrides=[jq.workflows.Override(("flight_07*",), {"stop": 80})],
+        )
+        ```
+    """
+
+    logs: tuple[str, ...] = _option(
+        kinds.PATTERNS,
+        _EVERY_LOG,
+        "file patterns below the folder; by default every file but hidden ones",
+    )
+    timeout: float | None = _option(
+        kinds.DURATION,
+        None,
+        "limit for one log, which has failed if it takes longer; 1800 by default, "
+        "none with a scheduler",
+    )
+    workers: int | None = _option(
+        kinds.SIZE, None, "processes of this machine; by default one for each core"
+    )
+    scheduler: str | None = _option(
+        kinds.ADDRESS,
+        None,
+        "of a Dask cluster that sees the same files, such as tcp://10.0.0.1:8786",
+    )
+    identify: Mapping[str, object] = dataclasses.field(default_factory=dict)
+    overrides: tuple[Override, ...] = ()
+
+    @classmethod
+    def options(cls) -> dict[str, Option]:
+        names = ("logs", "timeout", "workers", "scheduler")
+        fields = {field.name: field for field in dataclasses.fields(cls)}
+        found = {name: fields[name].metadata["option"] for name in names}
+        return {name: each._replace(flag=f"--{name}") for name, each in found.items()}
+
+    @classmethod
+    def from_mapping(cls, content: Mapping[str, object], where: str = "") -> Self:
+        keys = [*cls.options(), *_LOG_KEYS]
+        try:
+            check_keys(content, [*keys, "override"])
+            tables = content.get("override", [])
+            if not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
+                raise SettingsError("`override` is no list of tables: write [[override]]")
+            own = {key: value for key, value in content.items() if key in cls.options()}
+            return cls(
+                **own,  # pyright: ignore[reportArgumentType]
+                identify={key: content[key] for key in content if key in _LOG_KEYS},
+                overrides=tuple(_override(k, table) for k, table in enumerate(tables, start=1)),
+            )
+        except SettingsError as error:
+            raise _within(where, error) from error
+
+    def __post_init__(self):
+        super().__post_init__()
+        common = self.identify
+        if isinstance(common, IdentifySettings):
+            common = common.given()
+        object.__setattr__(self, "identify", _checked(common))
+        object.__setattr__(self, "overrides", tuple(Override(*each) for each in self.overrides))
+        if self.timeout is not None and self.scheduler is not None:
+            raise SettingsError(
+                "`timeout` is for processes of this machine: leave it out with `scheduler`"
+            )
+
+    def changed(self, changes: Mapping[str, object]) -> Self:
+        return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
+
+    def of(self, log: str) -> IdentifySettings:
+        """The settings of one log, by its path below the folder.
+
+        Later overrides change earlier ones. A key that says the same in another way takes the
+        place of the other: `segments` that of `start` and `stop`, `band` that of `band_rad`.
+
+        **Raises:** `SettingsError` for settings that exclude each other.
+        """
+        found: Mapping[str, object] = self.identify
+        for patterns, changes in self.overrides:
+            if any(fnmatchcase(log, pattern) for pattern in patterns):
+                found = updated(found, changes)
+        return IdentifySettings.from_mapping(found, f"settings of {log}")
+
+
+_LOG_KEYS = tuple(key for key in IdentifySettings.options() if key not in _ONE_LOG)
+
+
+def _override(k: int, table: Mapping[str, object]) -> Override:
+    try:
+        check_keys(table, [*_LOG_KEYS, "logs"])
+        if "logs" not in table:
+            raise SettingsError('`logs` is missing: add logs = "flight_07*"')
+        patterns = convert("logs", kinds.PATTERNS, table["logs"])
+        return Override(patterns, _checked({k: v for k, v in table.items() if k != "logs"}))
+    except SettingsError as error:
+        raise SettingsError(f"override {k}: {error}") from error
+
+
+def _checked(content: Mapping[str, object]) -> dict[str, object]:
+    """The values converted; whether they go together is known once overrides are applied."""
+    check_keys(content, _LOG_KEYS)
+    options = IdentifySettings.options()
+    found = {key: convert(key, options[key].kind, value) for key, value in content.items()}
+    for key, others in _REPLACED.items():
+        if key in found and any(other in found for other in others):
+            clash = next(other for other in others if other in found)
+            raise SettingsError(f"`{key}` and `{clash}` are both given: keep one")
+    return found
