@@ -9,6 +9,7 @@ from jaxtyping import Array, Complex, Float, PyTree
 from jaxquad._core import require_x64
 from jaxquad.excitation import Excitation
 from jaxquad.identify import Free, Parameters, select_parameters
+from jaxquad.models import evaluate_response, with_arrays
 
 from ._noise import Noise, noise_covariance
 
@@ -24,7 +25,7 @@ def response_and_slopes(
     """The response to one input, and its derivatives with respect to relative changes."""
 
     def parts(z):
-        response = parameters.insert(model, z).frequency_response(omega)
+        response = evaluate_response(parameters.insert(model, z), omega)
         if not 0 <= input < response.shape[2]:  # JAX would clamp it without a word.
             raise ValueError(f"input is {input}: the model has inputs 0 to {response.shape[2] - 1}")
         response = response[:, :, input]
@@ -127,6 +128,7 @@ def predict_accuracy(
     Raises ValueError where the parameters cannot be told apart.
     """
     require_x64("a design")
+    model = with_arrays(model)
     parameters = select_parameters(model, free)
     omega, energy = _energy(excitation)
     low, high = (excitation.omega_min, excitation.omega_max) if band is None else band

@@ -9,11 +9,12 @@ from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from jaxquad._core import CONVERGED, decrement, minimise, Normal, require_x64, TOLERANCE
 from jaxquad._xla import once
+from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
 from ._assess import assess
-from ._checks import check_options
 from ._cost import CoherenceWeighted, Cost, Mask, Range, usable
+from ._fit import check_options
 from ._parameters import Free, Parameters, Place, select_parameters, Tie
 from ._problem import make_problem
 from ._result import Fit
@@ -78,8 +79,8 @@ def _check_pointwise(model: PyTree, omega: Float[Array, " f"], shape: tuple[int,
 
 @eqx.filter_jit
 def _both_ways(model, omega):
-    single = jax.vmap(lambda w: model.frequency_response(w[None])[0])(omega)
-    return model.frequency_response(omega), single
+    single = jax.vmap(lambda w: evaluate_response(model, w[None])[0])(omega)
+    return evaluate_response(model, omega), single
 
 
 @eqx.filter_jit
@@ -132,7 +133,7 @@ def _point(model, parameters, z, omega, inverse, weights) -> list[Float[Array, "
     """Weighted slopes by each parameter, and then the weighted misfit, at one frequency."""
 
     def response(z):
-        return _inserted(model, parameters, z).frequency_response(omega[None])[0]
+        return evaluate_response(_inserted(model, parameters, z), omega[None])[0]
 
     here = response(z)
     columns = []
@@ -257,6 +258,7 @@ def fit_batch(
             "a batch needs one jq.spectra.FrequencyResponse or more: fit_batch(model, frfs)"
         )
     check_options(cost, band, min_coherence, max_steps)
+    model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
     data = _common(frfs, band, min_coherence)
     ones = [np.ones(mask.shape) for mask in data.used]
@@ -307,7 +309,7 @@ def _solve(
 
 @eqx.filter_jit
 def _responses(model, parameters, z, omega):
-    return eqx.filter_vmap(lambda each: parameters.insert(model, each).frequency_response(omega))(z)
+    return eqx.filter_vmap(lambda each: evaluate_response(parameters.insert(model, each), omega))(z)
 
 
 def _ratios(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
 from jaxquad._xla import apart
+from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
 from ._parameters import Parameters
@@ -88,7 +89,7 @@ def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, ".
     """The model's responses in every record's condition."""
     model = problem.parameters.insert(problem.model, z)
     pairs = zip(problem.conditions, problem.omega, strict=True)
-    return [condition(model).frequency_response(omega) for condition, omega in pairs]
+    return [evaluate_response(condition(model), omega) for condition, omega in pairs]
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> list[Float[Array, "..."]]:

@@ -11,6 +11,11 @@ from ._multirotor import (
     Multirotor as Multirotor,
     MultirotorState as MultirotorState,
 )
+from ._protocols import (
+    evaluate_response as evaluate_response,
+    Model as Model,
+    with_arrays as with_arrays,
+)
 from ._response import Split as Split
 from ._rotation import (
     euler_acceleration as euler_acceleration,

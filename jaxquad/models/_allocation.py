@@ -47,8 +47,9 @@ class Allocation(eqx.Module):
         _require_known("convention", self.convention, tuple(_FRAMES))
         _require_known("input", self.input, _INPUTS)
         require_positive("arm", self.arm, "give the distance from centre to rotor in m")
-        for name in ("thrust_coefficient", "torque_coefficient"):
-            require_positive(name, getattr(self, name), "the convention holds the signs")
+        remedy = "the convention holds the signs"
+        require_positive("thrust_coefficient", self.thrust_coefficient, remedy)
+        require_positive("torque_coefficient", self.torque_coefficient, remedy)
 
     @property
     def matrix(self) -> Float[Array, " 3 4 *ensemble"]:

@@ -1,4 +1,5 @@
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,10 +27,10 @@ class AttitudeAxis(eqx.Module):
     K_af: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # damping, N m s/rad
 
     def __check_init__(self):
-        for name in ("L", "K_t", "J_x"):
-            require_positive(name, getattr(self, name), "give it in SI units")
-        for name in ("lag", "delay"):
-            require_nonnegative(name, getattr(self, name), "give seconds, and 0 for none")
+        for name, value in {"L": self.L, "K_t": self.K_t, "J_x": self.J_x}.items():
+            require_positive(name, value, "give it in SI units")
+        for name, value in {"lag": self.lag, "delay": self.delay}.items():
+            require_nonnegative(name, value, "give seconds, and 0 for none")
         require_finite("K_af", self.K_af)
 
     @property
@@ -38,7 +39,7 @@ class AttitudeAxis(eqx.Module):
         return self.L * self.K_t / self.J_x
 
     def frequency_response(
-        self, omega: Float[Array, " frequencies"]
+        self, omega: ArrayLike | Sequence[float]
     ) -> Complex[Array, "frequencies 1 1"]:
         """Angle over input, rad/V, at `omega` in rad/s; infinite at 0."""
         s = imaginary(omega)

@@ -1,5 +1,4 @@
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,11 +10,11 @@ from jaxquad._core import align, as_float, require_finite, require_nonnegative, 
 from ._attitude import friction
 
 
-def _per_axis(x: ArrayLike | Sequence[Any]) -> Array:
+def _per_axis(x: ArrayLike | Sequence) -> Array:
     return jnp.atleast_1d(as_float(x))
 
 
-def _per_axis_or_none(x: ArrayLike | Sequence[Any] | None) -> Array | None:
+def _per_axis_or_none(x: ArrayLike | Sequence | None) -> Array | None:
     return None if x is None else _per_axis(x)
 
 
@@ -79,7 +78,7 @@ class DecoupledAxes(eqx.Module):
         return _widest(self.torque_gain, self.inertia) / _widest(self.inertia, self.torque_gain)
 
     def init(
-        self, euler: ArrayLike | Sequence[Any] | None = None, *, ensemble: tuple[int, ...] = ()
+        self, euler: ArrayLike | Sequence | None = None, *, ensemble: tuple[int, ...] = ()
     ) -> AxesState:
         """At rest at the angles `euler` in rad, 0 if None, with the motors stopped.
 

@@ -1,5 +1,4 @@
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -82,7 +81,7 @@ class Multirotor(eqx.Module):
         return jnp.broadcast_shapes(*(v.shape[1:] for v in vectors), *(s.shape for s in scalars))
 
     def init(
-        self, euler: ArrayLike | Sequence[Any] | None = None, *, ensemble: tuple[int, ...] = ()
+        self, euler: ArrayLike | Sequence | None = None, *, ensemble: tuple[int, ...] = ()
     ) -> MultirotorState:
         """At rest at the Euler angles `euler` in rad (level if None), with the motors stopped.
 
@@ -127,8 +126,8 @@ class Multirotor(eqx.Module):
     def decoupled(self) -> DecoupledAxes:
         """The three axes near level flight, driven by the allocation's differences.
 
-        Those are what a `jq.simulation.MotorDrive` makes voltages of, such as V4 - V2. Gyroscopic terms and
-        the coupling of the axes are of second order and left out.
+        A `jq.simulation.MotorDrive` turns these, such as V4 - V2, into voltages. Gyroscopic terms
+        and the coupling of the axes are of second order and left out.
         """
         attitude, allocation = self.attitude, self.allocation
         return DecoupledAxes(

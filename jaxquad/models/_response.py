@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -213,7 +213,7 @@ def _response_jvp(primals, tangents):
         if late is not None and frequency is not None:
             angle = late[:, :, None] * frequency[None, None]
             moved.append(Split(angle * value.imag, -angle * value.real))
-    return value, _sum([Split(*(jnp.zeros_like(part) for part in value)), *moved])
+    return value, _added(Split(*(jnp.zeros_like(part) for part in value)), *moved)
 
 
 def _turned(parts: Split, late: Array | None, omega: Float[Array, " frequencies"]) -> Split:
@@ -245,8 +245,8 @@ def _mass(matrices: Matrices) -> Float[Array, "states states"]:
 
 def output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
     """(H0 + s H1) times `states`, or times the resolvent."""
-    found = _applied(matrices.H0, states)
-    return _sum([found, _applied(matrices.H1, _derivative(states, omega))])
+    rates = _applied(matrices.H1, _derivative(states, omega))
+    return _added(_real_times(matrices.H0, states), rates)
 
 
 def _lost(
@@ -278,33 +278,42 @@ def _derivative(states: Split, omega: Float[Array, " frequencies"]) -> Split:
     return Split(-factor * states.imag, factor * states.real)
 
 
-def _applied(matrix: Array | None, states: Split) -> Any:
+def _applied(matrix: Array | None, states: Split) -> Split | None:
+    return None if matrix is None else _real_times(matrix, states)
+
+
+def _real_times(matrix: Array, states: Split) -> Split:
     """A real matrix times both parts, in one product."""
-    if matrix is None:
-        return None
     both = jnp.concatenate(states, axis=1)
     found, inputs = _dot(matrix, both), states.real.shape[1]
     return Split(found[:, :inputs], found[:, inputs:])
 
 
-def _real(matrix: Array | None, like: Split) -> Any:
+def _real(matrix: Array | None, like: Split) -> Split | None:
     if matrix is None:
         return None
     return Split(jnp.broadcast_to(matrix[:, :, None], like.real.shape), jnp.zeros_like(like.imag))
 
 
-def _negative(parts: Any) -> Any:
+def _negative(parts: Split | None) -> Split | None:
     return None if parts is None else Split(-parts.real, -parts.imag)
 
 
-def _sum(terms: Sequence[Any]) -> Any:
+def _sum(terms: Sequence[Split | None]) -> Split | None:
     present = [term for term in terms if term is not None]
-    if not present:
-        return None
-    return ft.reduce(lambda a, b: Split(a.real + b.real, a.imag + b.imag), present)
+    return _added(*present) if present else None
 
 
-def _present(tangents: Any) -> Any:
+def _added(first: Split, *others: Split | None) -> Split:
+    """The sum, without what is None."""
+    present = [term for term in others if term is not None]
+    return ft.reduce(lambda a, b: Split(a.real + b.real, a.imag + b.imag), present, first)
+
+
+_Tree = TypeVar("_Tree")
+
+
+def _present(tangents: _Tree) -> _Tree:
     """The tangents, with None for those that are known to be zero."""
     absent = lambda x: isinstance(x, SymbolicZero)
     return jax.tree.map(lambda x: None if absent(x) else x, tangents, is_leaf=absent)

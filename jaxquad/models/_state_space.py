@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from jaxquad._core import (
     as_float,
@@ -15,6 +15,7 @@ from jaxquad._core import (
 )
 
 from ._modes import transmission_zeros
+from ._protocols import as_frequencies
 from ._response import Matrices, response
 
 
@@ -42,23 +43,21 @@ class StateSpace(eqx.Module):
 
     def __check_init__(self):
         _check_shapes(self)
-        for name in ("F", "G", "H0", "H1", "M"):
-            if getattr(self, name) is not None:
-                require_finite(name, getattr(self, name))
-        for name in ("input_delay", "output_delay"):
-            if getattr(self, name) is not None:
-                remedy = "a model cannot answer before its input"
-                require_nonnegative(name, getattr(self, name), remedy)
+        for name, value in _arrays(self).items():
+            if name.endswith("delay"):
+                require_nonnegative(name, value, "a model cannot answer before its input")
+            else:
+                require_finite(name, value)
         _check_mass(self.M)
 
     def frequency_response(
-        self, omega: Float[Array, " frequencies"]
+        self, omega: ArrayLike | Sequence[float]
     ) -> Complex[Array, "frequencies outputs inputs"]:
         """The response at `omega` in rad/s, outputs per inputs in their units.
 
         Infinite at a pole, to within rounding. Differentiable any number of times, in either mode.
         """
-        return _frequency_response(self, omega)
+        return _frequency_response(self, as_frequencies(omega))
 
     def select(self, outputs: Sequence[int], inputs: Sequence[int]) -> "StateSpace":
         """The model of some channels, by position and in the order given."""
@@ -133,6 +132,15 @@ def _host(model: StateSpace) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(part) for part in explicit(model))
 
 
+def _arrays(model: StateSpace) -> dict[str, Array]:
+    """What is not left out, by name."""
+    arrays = {
+        "F": model.F, "G": model.G, "H0": model.H0, "H1": model.H1, "M": model.M,
+        "input_delay": model.input_delay, "output_delay": model.output_delay,
+    }  # fmt: skip
+    return {name: x for name, x in arrays.items() if x is not None}
+
+
 def _check_shapes(model: StateSpace) -> None:
     F, G, H0 = model.F, model.G, model.H0
     if F.ndim != 2 or F.shape[0] != F.shape[1] or not F.size:
@@ -151,11 +159,11 @@ def _check_shapes(model: StateSpace) -> None:
         "input_delay": (inputs,),
         "output_delay": (outputs,),
     }
+    arrays = _arrays(model)
     for name, shape in wanted.items():
-        found = getattr(model, name)
-        if found is not None and found.shape != shape:
+        if name in arrays and arrays[name].shape != shape:
             raise ValueError(
-                f"{name} has shape {found.shape}, but {states} states, {inputs} inputs and "
+                f"{name} has shape {arrays[name].shape}, but {states} states, {inputs} inputs and "
                 f"{outputs} outputs need {shape}: look at F, G and H0 too."
             )
 

@@ -1,14 +1,19 @@
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from jaxquad._core import as_float, is_concrete, is_zero, require_finite, require_nonnegative
 
+from ._protocols import as_frequencies
 
-def imaginary(omega: Float[Array, "*points"]) -> Complex[Array, "*points"]:
-    """s = j omega, in the precision of `omega`."""
+
+def imaginary(omega: ArrayLike | Sequence[float]) -> Complex[Array, "..."]:
+    """s = j omega, in the precision of `omega`; whole numbers become floats."""
+    omega = as_frequencies(omega)
     return jax.lax.complex(jnp.zeros_like(omega), omega)
 
 
@@ -46,7 +51,7 @@ class TransferFunction(eqx.Module):
         return above / below * jnp.exp(-self.delay.astype(s.dtype) * s)
 
     def frequency_response(
-        self, omega: Float[Array, " frequencies"]
+        self, omega: ArrayLike | Sequence[float]
     ) -> Complex[Array, "frequencies 1 1"]:
         """The response at `omega` in rad/s, in units of output per input."""
         return self(imaginary(omega))[:, None, None]
@@ -85,13 +90,13 @@ class LaggedIntegrator(eqx.Module):
 
     def __check_init__(self):
         require_finite("gain", self.gain)
-        for name in ("lag", "delay"):
-            require_nonnegative(name, getattr(self, name), "give seconds, and 0 for none")
+        for name, value in {"lag": self.lag, "delay": self.delay}.items():
+            require_nonnegative(name, value, "give seconds, and 0 for none")
         if self.integrators not in (0, 1, 2, 3):
             raise ValueError(f"integrators is {self.integrators}: give 0 to 3")
 
     def frequency_response(
-        self, omega: Float[Array, " frequencies"]
+        self, omega: ArrayLike | Sequence[float]
     ) -> Complex[Array, "frequencies 1 1"]:
         """Response at `omega` in rad/s."""
         s = imaginary(omega)
