@@ -9,7 +9,7 @@ from ._estimators import (
     Composite as Composite,
     JointInputOutput as JointInputOutput,
     LocalPolynomial as LocalPolynomial,
+    Periodic as Periodic,
     Welch as Welch,
 )
 from ._frequency_response import Distortion as Distortion, FrequencyResponse as FrequencyResponse
-from ._periodic import Periodic as Periodic

@@ -7,14 +7,8 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad.records import Record
 
-from ._conditioned import Channels
-from ._estimators import Welch
-from ._segments import Segments
-from ._window import window
-
 
 _MOST_FREQUENCIES = 1024  # the covariance of a pair is made between all of them
-_ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
 
 
 def check_alike(records: Sequence[Record]) -> None:
@@ -65,37 +59,6 @@ def check_references(records: Sequence[Record]) -> None:
         )
 
 
-def check_windows(independent: Sequence[float], segments: Segments, channels: Channels) -> None:
-    """Raise `ValueError` where there are too few windows to tell the inputs apart."""
-    for count, (_, starts) in zip(independent, segments.groups, strict=True):
-        if len(starts) <= channels.inputs or count < channels.inputs:
-            raise ValueError(
-                f"{count:.1f} independent windows cannot tell {channels.inputs} inputs apart: use "
-                f"a window below a {channels.inputs + 2}th of the record, or record longer"
-            )
-
-
-def check_excited(
-    omega: Float[np.ndarray, " frequencies"],
-    power: Float[np.ndarray, "channels frequencies"],
-    records: Sequence[Record],
-    welch: Welch,
-    method: Literal["direct", "joint"],
-) -> None:
-    """Raise `ValueError` for a channel that never moves, or a spectrum of mere rounding errors."""
-    first = records[0]
-    names = first.input_names + (first.reference_names if method == "joint" else ())
-    largest = check_moving(records, method)
-    gain = np.sum(window(welch.shape, welch.length(records)))
-    for name, level in zip(names, np.sqrt(power), strict=False):
-        lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[first.names.index(name)]))
-        if lost.size:
-            raise ValueError(
-                f"no excitation at {omega[lost[0]]:.4g} rad/s: the spectrum of {name!r} is zero "
-                "there; keep omega within the band that was excited"
-            )
-
-
 def check_moving(
     records: Sequence[Record], method: Literal["direct", "joint"]
 ) -> Float[np.ndarray, " channels"]:
@@ -130,22 +93,3 @@ def check_band(omega: Float[ArrayLike, " frequencies"] | None, dt: float) -> Non
             f"omega must rise from above 0 to below the Nyquist frequency {nyquist:.4g} rad/s; "
             f"it runs from {omega.min():.4g} to {omega.max():.4g}"
         )
-
-
-def checked_omega(
-    omega: Float[ArrayLike, " frequencies"] | None, records: Sequence[Record], welch: Welch
-) -> Float[np.ndarray, " frequencies"]:
-    """Frequencies in rad/s, by default `welch`'s; `ValueError` unless the window resolves them."""
-    if omega is None:
-        return welch.default_omega(records)
-    check_band(omega, records[0].dt)
-    omega = np.asarray(omega, dtype=float)
-    seconds = welch.length(records) * records[0].dt
-    lowest = 2 * np.pi / seconds
-    if omega[0] < 0.999 * lowest:
-        raise ValueError(
-            f"{omega[0]:.4g} rad/s is below the {lowest:.4g} rad/s of which one cycle fits the "
-            f"window of {seconds:.4g} s: raise it, or set a window above "
-            f"{2 * np.pi / omega[0]:.4g} s"
-        )
-    return omega

@@ -7,9 +7,9 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from jaxquad.records import Record
 
-from ._checks import check_alike, checked_omega
+from ._checks import check_alike
 from ._estimators import Welch
-from ._segments import transform_records
+from ._welch import checked_omega, transform_records
 from ._window import window
 
 

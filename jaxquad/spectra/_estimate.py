@@ -1,21 +1,20 @@
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._checks import check_alike, check_band, check_distinct, check_moving, check_references
-from ._estimators import Composite, JointInputOutput, LocalPolynomial, Welch
+from ._estimators import Composite, JointInputOutput, LocalPolynomial, Periodic, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._local_estimate import estimate_local_polynomial
-from ._periodic import Periodic
-from ._periodic_estimate import estimate_periodic
-from ._windows import by_windows
+from ._local_estimate import estimate_local_polynomial, LocalEstimate
+from ._periodic import estimate_periodic, PeriodicEstimate
+from ._welch import by_windows
 
 
 _CYCLES = 5.0  # of the longest record, in the lowest frequency by default
@@ -47,7 +46,11 @@ def by_period(
 
 
 def _result(
-    records: Sequence[Record], omega: Grid, found: Any, method: Method, integrators: int
+    records: Sequence[Record],
+    omega: Grid,
+    found: LocalEstimate | PeriodicEstimate,
+    method: Method,
+    integrators: int,
 ) -> FrequencyResponse:
     known = np.isfinite(np.asarray(found.response))
     spread = np.sqrt(np.asarray(found.errors.variance()) / 2)
@@ -68,11 +71,11 @@ def _result(
         output_names=records[0].output_names,
         remarks=remarks + found.remarks,
         integrators=integrators,
-        distortion=getattr(found, "distortion", None),
+        distortion=found.distortion if isinstance(found, PeriodicEstimate) else None,
     )
 
 
-def _pairs(columns: Any) -> Float[np.ndarray, "frequencies pairs"]:
+def _pairs(columns: np.ndarray | Array) -> Float[np.ndarray, "frequencies pairs"]:
     return np.nan_to_num(np.asarray(columns).reshape(len(columns), -1))
 
 

@@ -7,7 +7,6 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad.records import Record
 
-from ._periodic import Periodic
 from ._window import window
 
 
@@ -164,6 +163,43 @@ class Composite(eqx.Module):
 
 # Making and checking a module takes as long as transforming one window length.
 _welch = ft.lru_cache(maxsize=64)(Welch)
+
+
+_DRIFT = 0.02  # samples by which the periods of a record may shift against its clock
+
+
+class Periodic(eqx.Module):
+    """Averages over whole periods of a periodic excitation, at its own harmonics only.
+
+    `period` is in s, a whole number of samples; `discard` periods at the start of each record
+    count as transient. Several records are taken as realisations with phases of their own:
+    what scatters between them beyond the noise is nonlinear distortion, and the response is the
+    best linear approximation. Source: Pintelon and Schoukens, System Identification, 2nd ed.,
+    sections 2.5 and 4.3.1 (robust method).
+    """
+
+    period: float = eqx.field(static=True)
+    discard: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        if not 0 < self.period < np.inf:
+            raise ValueError(f"period {self.period} s must be positive")
+        if self.discard < 0 or self.discard != int(self.discard):
+            raise ValueError(f"discard {self.discard}: give a number of whole periods, 0 or more")
+
+    def samples(self, record: Record) -> int:
+        """Samples to a period; `ValueError` unless they are a whole number over the record."""
+        exact = self.period / record.dt
+        whole = int(round(exact))
+        shift = abs(exact - whole) * record.samples / max(exact, 1.0)
+        if whole < 4 or shift > _DRIFT:
+            raise ValueError(
+                f"the period of {self.period:.8g} s is {exact:.8g} samples at "
+                f"{record.sample_rate:.6g} Hz, not a whole number of at least 4: over the record "
+                f"the periods shift by {shift:.3g} samples (limit {_DRIFT}); give the exact "
+                "period, or read the record with a sample_rate that divides it"
+            )
+        return whole
 
 
 class JointInputOutput(eqx.Module):

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ._error_covariance import ErrorCovariance
-from ._local_bins import Bins
-from ._local_fit import LocalFit
+from ._local_fit import Bins, LocalFit
 
 
 _BANDWIDTH = 0.2  # of the smoothing, in ln(omega)

@@ -1,49 +1,23 @@
+"""Averages over the periods of a periodic excitation, at its own harmonics."""
+
 from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
+from ._error_covariance import ErrorCovariance
+from ._estimators import Periodic
+from ._frequency_response import Distortion
+from ._local_noise import smooth_noise
 
-_DRIFT = 0.02  # samples by which the periods of a record may shift against its clock
+
+_CHANCE = 1e-4  # of taking noise for an excited line, for distortion, or for a line in the noise
 _FAINT = 1e-4  # power of a line, to that of the strongest, below which it counts as unexcited
-_CHANCE = 1e-4  # of taking noise for an excited line, in a whole spectrum
-
-
-class Periodic(eqx.Module):
-    """Averages over whole periods of a periodic excitation, at its own harmonics only.
-
-    `period` is in s, a whole number of samples; `discard` periods at the start of each record
-    count as transient. Several records are taken as realisations with phases of their own:
-    what scatters between them beyond the noise is nonlinear distortion, and the response is the
-    best linear approximation. Source: Pintelon and Schoukens, System Identification, 2nd ed.,
-    sections 2.5 and 4.3.1 (robust method).
-    """
-
-    period: float = eqx.field(static=True)
-    discard: int = eqx.field(static=True, default=1)
-
-    def __check_init__(self):
-        if not 0 < self.period < np.inf:
-            raise ValueError(f"period {self.period} s must be positive")
-        if self.discard < 0 or self.discard != int(self.discard):
-            raise ValueError(f"discard {self.discard}: give a number of whole periods, 0 or more")
-
-    def samples(self, record: Record) -> int:
-        """Samples to a period; `ValueError` unless they are a whole number over the record."""
-        exact = self.period / record.dt
-        whole = int(round(exact))
-        shift = abs(exact - whole) * record.samples / max(exact, 1.0)
-        if whole < 4 or shift > _DRIFT:
-            raise ValueError(
-                f"the period of {self.period:.8g} s is {exact:.8g} samples at "
-                f"{record.sample_rate:.6g} Hz, not a whole number of at least 4: over the record "
-                f"the periods shift by {shift:.3g} samples (limit {_DRIFT}); give the exact "
-                "period, or read the record with a sample_rate that divides it"
-            )
-        return whole
 
 
 class Periods(eqx.Module):
@@ -117,3 +91,300 @@ def excited_lines(periods: Sequence[Periods], channels: slice) -> Int[np.ndarray
     freedom = 2.0 * sum(each.count - 1 for each in periods)
     clear = power > fdtri(2.0 * len(periods), freedom, 1 - _CHANCE / len(power)) * noise
     return np.flatnonzero(np.any(clear & (power > _FAINT * np.max(power, axis=0)), axis=1))
+
+
+_DEPENDENT = 1e-8  # smallest singular value of the inputs' cross powers, to the largest
+_ROUNDING = 1e-24  # power of rounding errors, to that of the output
+
+Lines = Int[np.ndarray, " frequencies"]
+Averaged = Complex[np.ndarray, "frequencies channels realisations"]
+Levels = Float[np.ndarray, "frequencies outputs"]
+Covariances = Complex[np.ndarray, "frequencies outputs outputs"]
+
+
+class Averages(NamedTuple):
+    """The error of `response` is `sum_r v[f, o, r] effect[f, i, r]`, v the averages' noise."""
+
+    u: Complex[np.ndarray, "frequencies inputs realisations"]
+    y: Complex[np.ndarray, "frequencies outputs realisations"]
+    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    effect: Complex[np.ndarray, "frequencies inputs realisations"]
+    known: Bool[np.ndarray, " frequencies"]
+
+
+class Scatter(NamedTuple):
+    """Powers per line of the averages over a record's periods, smooth along frequency."""
+
+    noise: Levels
+    total: Levels | None  # of one realisation more than inputs, or more
+    significant: Bool[np.ndarray, " outputs"]
+    root: Covariances  # of the larger of the two that counts
+    periods: float  # to an average
+
+    def nonlinear(self) -> Levels:
+        """Power that the noise does not explain."""
+        total = self.noise if self.total is None else self.total
+        return np.maximum(total - self.noise, 0.0)
+
+
+def instrumental(u: Averaged, y: Averaged, z: Averaged) -> Averages:
+    """G = Y Z^H (U Z^H)^-1 at each line."""
+    adjoint = np.conj(np.swapaxes(z, 1, 2))
+    cross = u @ adjoint
+    size = np.linalg.norm(u, axis=2)[:, :, None] * np.linalg.norm(z, axis=2)[:, None, :]
+    strength = np.linalg.svd(cross / np.maximum(size, 1e-300), compute_uv=False)
+    known = strength[:, -1] > _DEPENDENT * np.maximum(strength[:, 0], 1e-300)
+    inverse = np.linalg.inv(np.where(known[:, None, None], cross, np.eye(u.shape[1])))
+    effect = np.swapaxes(adjoint @ inverse, 1, 2)
+    response = np.swapaxes(effect @ np.swapaxes(y, 1, 2), 1, 2)
+    return Averages(u, y, response, effect, known)
+
+
+def judge_scatter(
+    omega: Float[np.ndarray, " frequencies"],
+    fit: Averages,
+    periods: Sequence[Periods],
+    lines: Lines,
+) -> Scatter:
+    """Noise from period to period, seen through v = y - G u, and scatter between realisations.
+
+    With input noise and feedback, v is what perturbs G: its variance is that of Pintelon and
+    Schoukens, eq. 2-25, with the covariance of input and output.
+    """
+    from scipy.special import fdtri
+
+    inputs, outputs = fit.u.shape[1], fit.y.shape[1]
+    count = 1 / float(np.mean([1 / each.count for each in periods]))
+    freedom = float(sum(each.count - 1 for each in periods))
+    left = np.concatenate(
+        [-fit.response, np.broadcast_to(np.eye(outputs), (len(lines), outputs, outputs))], axis=2
+    )
+    channels = slice(0, inputs + outputs)
+    covariance = pooled(periods)[lines][:, channels, channels] / count
+    noise = left @ covariance @ np.conj(np.swapaxes(left, 1, 2))
+    power, root = _smooth(omega, noise, freedom, fit.known)
+    spare = float(fit.u.shape[2] - inputs)
+    if spare <= 0:
+        return Scatter(power, None, np.zeros(outputs, bool), root, count)
+    residual = fit.y - fit.response @ fit.u
+    between = residual @ np.conj(np.swapaxes(residual, 1, 2)) / spare
+    total, total_root = _smooth(omega, between, spare, fit.known)
+    ratio = np.sum(_diagonal(between) / power * fit.known[:, None], axis=0)
+    size = 2.0 * max(np.sum(fit.known), 1)
+    ratio = 2 * ratio / size
+    significant = ratio > fdtri(size * spare, size * freedom, 1 - _CHANCE)
+    # Rounding errors repeat from period to period, and not from one realisation to the next.
+    output = np.mean(np.abs(fit.y) ** 2, axis=(0, 2))
+    significant &= np.mean(_diagonal(between), axis=0) > _ROUNDING * output
+    if np.any(significant):
+        larger = np.sqrt(np.maximum(power, total) / total)
+        return Scatter(power, total, significant, total_root * larger[:, :, None], count)
+    return Scatter(power, total, significant, root, count)
+
+
+def _smooth(
+    omega: Float[np.ndarray, " frequencies"],
+    covariance: Covariances,
+    freedom: float,
+    known: Bool[np.ndarray, " frequencies"],
+) -> tuple[Levels, Covariances]:
+    """Powers and roots, smooth along frequency but for lines that stand out."""
+    from scipy.special import gammaincinv
+
+    spacing = np.gradient(omega) if omega.size > 1 else omega
+    smooth = smooth_noise(omega, spacing, covariance, np.where(known, freedom, 0.0))
+    raw = _diagonal(covariance)
+    high = gammaincinv(freedom, 1 - _CHANCE) / freedom
+    power = np.where(raw > high * smooth.power, raw, smooth.power)
+    return power, smooth._replace(power=power).root()
+
+
+def _diagonal(x: Covariances) -> Levels:
+    return np.real(np.diagonal(x, axis1=1, axis2=2))
+
+
+_UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
+_UNSETTLED = 4.0  # power of the first period's departure, to that of the noise
+
+Coherence = Float[np.ndarray, "frequencies outputs inputs"]
+
+
+class PeriodicEstimate(NamedTuple):
+    """Responses at the excited lines; nan and an immense error where undetermined."""
+
+    omega: Float[np.ndarray, " frequencies"]  # rad/s
+    response: Complex[Array, "frequencies outputs inputs"]
+    coherence: Float[Array, "frequencies outputs inputs"]
+    direct_coherence: Float[Array, "frequencies outputs inputs"]
+    multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
+    errors: ErrorCovariance
+    distortion: Distortion
+    remarks: tuple[str, ...]
+
+
+def estimate_periodic(
+    records: Sequence[Record],
+    omega: Float[np.ndarray, " asked"] | None,
+    options: Periodic,
+    method: Literal["direct", "joint"],
+) -> PeriodicEstimate:
+    """Responses of all outputs to all inputs, by default at all lines that are excited.
+
+    With Z the period averages of the references ("joint") or of the inputs ("direct") over the
+    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which noise fed
+    back to the input does not bias either: only its average over the periods remains. Raises
+    `ValueError` for fewer records than inputs, and for an `omega` that is no excited line.
+    """
+    inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
+    _check(records, inputs, options, method)
+    periods = [record_periods(record, options) for record in records]
+    first = inputs + outputs if method == "joint" else 0
+    instruments = slice(first, first + inputs)
+    grid = line_frequencies(records[0], options)
+    lines = _chosen(excited_lines(periods, instruments), grid, omega)
+    averages = np.stack([each.mean[lines] for each in periods], axis=2)
+    u, y, z = averages[:, :inputs], averages[:, inputs : inputs + outputs], averages[:, instruments]
+    fit = instrumental(u, y, z)
+    scatter = judge_scatter(grid[lines], fit, periods, lines)
+    direct, lesser = _coherence(fit, scatter, periods, lines)
+    return PeriodicEstimate(
+        grid[lines],
+        jnp.asarray(np.where(fit.known[:, None, None], fit.response, np.nan)),
+        jnp.asarray(lesser if method == "joint" else direct),
+        jnp.asarray(direct),
+        jnp.asarray(_multiple(fit, scatter)),
+        _errors(grid[lines], fit, scatter),
+        _distortion(grid[lines], fit, scatter, records[0], len(records)),
+        _remarks(grid[lines], fit, scatter, periods),
+    )
+
+
+def _check(
+    records: Sequence[Record], inputs: int, options: Periodic, method: Literal["direct", "joint"]
+) -> None:
+    sizes = {options.samples(record) for record in records}
+    if len(sizes) > 1:
+        raise ValueError(f"periods of {sorted(sizes)} samples: read the records at one sample_rate")
+    if len(records) < inputs:
+        raise ValueError(
+            f"{inputs} inputs at once need as many records, with other phases in each; there are "
+            f"{len(records)}: record more, or use jq.spectra.LocalPolynomial()"
+        )
+    count = records[0].references.shape[1]
+    if method == "joint" and count != inputs:
+        raise ValueError(
+            f"the joint estimate of {inputs} inputs needs as many outside references; the record "
+            f"has {count}: {list(records[0].reference_names)}"
+        )
+
+
+def _chosen(
+    lines: Int[np.ndarray, " excited"],
+    grid: Float[np.ndarray, " lines"],
+    omega: Float[np.ndarray, " asked"] | None,
+) -> Int[np.ndarray, " chosen"]:
+    """The excited lines, or those of `omega`."""
+    if lines.size == 0:
+        raise ValueError(
+            "no harmonic of the period stands out of the noise in the input: check the period, or "
+            "use another estimator for an excitation that is not periodic"
+        )
+    if omega is None:
+        return lines
+    nearest = lines[np.argmin(np.abs(grid[lines][None, :] - omega[:, None]), axis=1)]
+    off = np.abs(grid[nearest] - omega) > 1e-6 * omega + 1e-6 * grid[0]
+    if np.any(off):
+        raise ValueError(
+            f"{omega[off][0]:.6g} rad/s is no excited line: the nearest one is "
+            f"{grid[nearest][off][0]:.6g} rad/s; without omega all {lines.size} lines are taken"
+        )
+    return nearest
+
+
+def _coherence(
+    fit: Averages, scatter: Scatter, periods: Sequence[Periods], lines: Lines
+) -> tuple[Coherence, Coherence]:
+    """Of one period: what an input explains of an output, and the lesser of that and of the
+    repeated part of the input."""
+    inputs = fit.u.shape[1]
+    power = np.einsum("fir,fjr->fij", fit.u, np.conj(fit.u)) / fit.u.shape[2]
+    power = np.where(fit.known[:, None, None], power, np.eye(inputs))
+    alone = 1 / np.real(np.diagonal(np.linalg.inv(power), axis1=1, axis2=2))
+    explained = np.abs(fit.response) ** 2 * alone[:, None, :]
+    left = scatter.noise * scatter.periods + scatter.nonlinear()
+    direct = np.where(fit.known[:, None, None], explained / (explained + left[:, :, None]), 0.0)
+    jitter = pooled(periods)[lines][:, :inputs, :inputs]
+    steady = alone / (alone + np.real(np.diagonal(jitter, axis1=1, axis2=2)))
+    return direct, np.minimum(direct, steady[:, None, :] * fit.known[:, None, None])
+
+
+def _multiple(fit: Averages, scatter: Scatter) -> Float[np.ndarray, "frequencies outputs"]:
+    """Of one period: what all inputs together explain of an output."""
+    explained = np.mean(np.abs(np.nan_to_num(fit.response) @ fit.u) ** 2, axis=2)
+    return explained / (explained + scatter.noise * scatter.periods + scatter.nonlinear())
+
+
+def _errors(
+    omega: Float[np.ndarray, " frequencies"], fit: Averages, scatter: Scatter
+) -> ErrorCovariance:
+    """Each line has noise of its own, as many atoms as inputs."""
+    count, inputs, _ = fit.effect.shape
+    kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
+    kernel = np.where(fit.known[:, None, None], kernel, _UNKNOWN**2 * np.eye(inputs))
+    values, vectors = np.linalg.eigh(kernel)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    effect = np.zeros((count, inputs, count, inputs), complex)
+    effect[np.arange(count), :, np.arange(count)] = root
+    effect = effect.reshape(count, inputs, -1)
+    noise = np.where(fit.known[:, None, None], scatter.root, np.eye(scatter.root.shape[1]))
+    return ErrorCovariance(jnp.asarray(omega), jnp.asarray(effect), jnp.asarray(noise))
+
+
+def _distortion(
+    omega: Float[np.ndarray, " frequencies"],
+    fit: Averages,
+    scatter: Scatter,
+    record: Record,
+    realisations: int,
+) -> Distortion:
+    explained = np.abs(fit.response @ fit.u) ** 2
+    unknown = np.nan if scatter.total is None else 1.0
+    total = scatter.noise if scatter.total is None else scatter.total
+    return Distortion(
+        omega,
+        np.sqrt(np.mean(explained, axis=2)),
+        np.sqrt(scatter.noise),
+        np.sqrt(total) * unknown,
+        np.sqrt(scatter.nonlinear()) * unknown,
+        scatter.significant,
+        record.output_names,
+        realisations,
+    )
+
+
+def _remarks(
+    omega: Float[np.ndarray, " frequencies"],
+    fit: Averages,
+    scatter: Scatter,
+    periods: Sequence[Periods],
+) -> tuple[str, ...]:
+    remarks, lost = [], omega[~fit.known]
+    if lost.size:
+        remarks.append(
+            f"undetermined at {lost.size} of {omega.size} lines ({lost[0]:.4g}..{lost[-1]:.4g} "
+            "rad/s): the records excite the inputs too much alike there"
+        )
+    unsettled = [each.settled for each in periods if each.settled > _UNSETTLED]
+    if unsettled:
+        remarks.append(
+            f"the first period kept differs from the later ones by {max(unsettled):.3g} times the "
+            "power of the noise: a transient is left; discard more periods"
+        )
+    if scatter.total is None:
+        remarks.append(
+            "no more records than inputs: errors hold the noise only; nonlinear distortion shows "
+            "between records whose lines have other phases"
+        )
+    elif np.any(scatter.significant):
+        remarks.append("nonlinear distortion: errors are those of the best linear approximation")
+    return tuple(remarks)

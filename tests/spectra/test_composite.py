@@ -8,8 +8,7 @@ from scipy import optimize
 from jaxquad.excitation import sweep
 from jaxquad.records import Record
 from jaxquad.spectra import Composite, frequency_response, Welch
-from jaxquad.spectra._average import combine
-from jaxquad.spectra._conditioned import Conditioned
+from jaxquad.spectra._average import combine, Conditioned
 
 
 RATE = 250.0

@@ -9,7 +9,7 @@ from scipy import signal
 
 from jaxquad.excitation import harmonics, multisine, sweep
 from jaxquad.records import Record
-from jaxquad.spectra._estimators import LocalPolynomial
+from jaxquad.spectra import LocalPolynomial
 from jaxquad.spectra._local_estimate import estimate_local_polynomial
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxquad.spectra._local_bins import Bins
-from jaxquad.spectra._local_estimate import reach
+from jaxquad.spectra._local_fit import Bins
+from jaxquad.spectra._local_width import reach
 
 
 LINES = np.arange(1, 401) * 0.1  # rad/s

@@ -5,7 +5,7 @@ from scipy.signal import lfilter
 
 from jaxquad.excitation import sweep
 from jaxquad.records import Record
-from jaxquad.spectra._estimators import LocalPolynomial
+from jaxquad.spectra import LocalPolynomial
 from jaxquad.spectra._local_estimate import estimate_local_polynomial
 
 

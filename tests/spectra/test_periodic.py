@@ -8,8 +8,8 @@ import pytest
 from scipy import signal
 
 from jaxquad.records import Record
-from jaxquad.spectra._periodic import Periodic
-from jaxquad.spectra._periodic_estimate import estimate_periodic
+from jaxquad.spectra import Periodic
+from jaxquad.spectra._periodic import estimate_periodic
 
 
 Method = Literal["direct", "joint"]

@@ -1,23 +1,152 @@
 """Responses by averages over windows: one length (Welch) or several (Composite)."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
+from jaxquad._core import require_x64
 from jaxquad.records import Record
 
-from ._average import average, Averaged
-from ._checks import check_excited, check_windows, checked_omega
-from ._conditioned import Channels
+from ._average import average, Averaged, Channels
+from ._blocks import lattice_windows
+from ._checks import check_band, check_moving
 from ._error_covariance import ErrorCovariance, overlaps, place_windows
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._segments import Segments, transform_records
-from ._window import coefficients
+from ._transform import transform_windows
+from ._window import coefficients, segment_starts, window
+
+
+Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
+
+
+class Segments(NamedTuple):
+    """Transforms of one set of windows for each length, in absolute phase.
+
+    Channels stand as in `Record.names`: inputs, outputs, references. `groups` are the lengths and
+    the starts in samples, of the records one after the other, with gaps wider than any window.
+    """
+
+    transforms: tuple[Complex[Array, "windows frequencies channels"], ...]
+    groups: Layout
+
+
+def transform_records(
+    records: Sequence[Record], omega: Float[np.ndarray, " frequencies"], members: Sequence[Welch]
+) -> Segments:
+    """Transform all channels of all records; no window spans the seam of two records."""
+    require_x64("a frequency response")
+    layouts = _layouts(records, omega, members)
+    parts, starts, origin = [], [[] for _ in members], 0
+    for record, layout in zip(records, layouts, strict=True):
+        parts.append(_transform_record(record, omega, members[0], layout, origin))
+        for mine, (_, local) in zip(starts, layout, strict=True):
+            mine += [origin + start for start in local]
+        origin += record.samples + max(length for length, _ in layout)
+    kinds = zip(*parts, strict=True)
+    joined = tuple(mine[0] if len(mine) == 1 else jnp.concatenate(mine) for mine in kinds)
+    lengths = [length for length, _ in layouts[0]]
+    return Segments(joined, tuple(zip(lengths, map(tuple, starts), strict=True)))
+
+
+def _layouts(
+    records: Sequence[Record], omega: Float[np.ndarray, " frequencies"], members: Sequence[Welch]
+) -> list[Layout]:
+    """Lengths and starts for each record. One window keeps its length to the sample.
+
+    Several, whose lengths are a choice of ours, take lengths that share blocks of samples.
+    """
+    lengths = tuple(member.length(records) for member in members)
+    samples = [record.samples - members[0].integrators for record in records]
+    overlap = members[0].overlap
+    if len(members) == 1:
+        return [((lengths[0], segment_starts(n, lengths[0], overlap)),) for n in samples]
+    angle = omega * records[0].dt
+    shared = tuple(n for n, _ in lattice_windows(min(samples), lengths, overlap, angle))
+    return [lattice_windows(n, shared, overlap, angle) for n in samples]
+
+
+def _transform_record(
+    record: Record,
+    omega: Float[np.ndarray, " frequencies"],
+    welch: Welch,
+    layout: Layout,
+    origin: int,
+) -> list[Complex[Array, "_ frequencies channels"]]:
+    n, late = welch.integrators, welch.late(record)
+    outputs = np.diff(record.outputs, n, axis=0)
+    outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
+    # A difference looks back by n/2 samples, which the window would weigh like any other delay.
+    centre = slice(n - n // 2, record.samples - n // 2)
+    columns = np.hstack([record.inputs[centre], outputs, record.references[centre]])
+    angle = omega * record.dt
+    found = transform_windows(
+        columns, angle, layout, shape=welch.shape, detrend=welch.detrend, origin=float(origin)
+    )
+    if not (n or late):
+        return found
+    factor = np.ones((omega.size, columns.shape[1]), complex)
+    first = len(record.input_names)
+    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
+    factor[:, first : first + outputs.shape[1]] = recolour[:, None]
+    return [part * factor[None] for part in found]
+
+
+_ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
+
+
+def check_windows(independent: Sequence[float], segments: Segments, channels: Channels) -> None:
+    """Raise `ValueError` where there are too few windows to tell the inputs apart."""
+    for count, (_, starts) in zip(independent, segments.groups, strict=True):
+        if len(starts) <= channels.inputs or count < channels.inputs:
+            raise ValueError(
+                f"{count:.1f} independent windows cannot tell {channels.inputs} inputs apart: use "
+                f"a window below a {channels.inputs + 2}th of the record, or record longer"
+            )
+
+
+def check_excited(
+    omega: Float[np.ndarray, " frequencies"],
+    power: Float[np.ndarray, "channels frequencies"],
+    records: Sequence[Record],
+    welch: Welch,
+    method: Literal["direct", "joint"],
+) -> None:
+    """Raise `ValueError` for a channel that never moves, or a spectrum of mere rounding errors."""
+    first = records[0]
+    names = first.input_names + (first.reference_names if method == "joint" else ())
+    largest = check_moving(records, method)
+    gain = np.sum(window(welch.shape, welch.length(records)))
+    for name, level in zip(names, np.sqrt(power), strict=False):
+        lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[first.names.index(name)]))
+        if lost.size:
+            raise ValueError(
+                f"no excitation at {omega[lost[0]]:.4g} rad/s: the spectrum of {name!r} is zero "
+                "there; keep omega within the band that was excited"
+            )
+
+
+def checked_omega(
+    omega: Float[ArrayLike, " frequencies"] | None, records: Sequence[Record], welch: Welch
+) -> Float[np.ndarray, " frequencies"]:
+    """Frequencies in rad/s, by default `welch`'s; `ValueError` unless the window resolves them."""
+    if omega is None:
+        return welch.default_omega(records)
+    check_band(omega, records[0].dt)
+    omega = np.asarray(omega, dtype=float)
+    seconds = welch.length(records) * records[0].dt
+    lowest = 2 * np.pi / seconds
+    if omega[0] < 0.999 * lowest:
+        raise ValueError(
+            f"{omega[0]:.4g} rad/s is below the {lowest:.4g} rad/s of which one cycle fits the "
+            f"window of {seconds:.4g} s: raise it, or set a window above "
+            f"{2 * np.pi / omega[0]:.4g} s"
+        )
+    return omega
 
 
 _TOGETHER = 0.5  # average coherence between inputs above which the textbook warns
