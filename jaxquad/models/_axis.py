@@ -1,5 +1,4 @@
 import dataclasses
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,6 +6,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from jaxquad._core import as_float, is_zero, require_finite, require_nonnegative, require_positive
 
+from ._protocols import Frequencies
 from ._transfer_function import imaginary, TransferFunction
 
 
@@ -38,9 +38,7 @@ class AttitudeAxis(eqx.Module):
         """Angular acceleration per unit of input, L K_t / J_x, in rad/s^2/V."""
         return self.L * self.K_t / self.J_x
 
-    def frequency_response(
-        self, omega: ArrayLike | Sequence[float]
-    ) -> Complex[Array, "frequencies 1 1"]:
+    def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """Angle over input, rad/V, at `omega` in rad/s; infinite at 0."""
         s = imaginary(omega)
         lever, inertia, lag, delay, damping = (

@@ -9,6 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 
+Frequencies = ArrayLike | Sequence[float | int]  # rad/s
+
+
 @runtime_checkable
 class Model(Protocol):
     """A linear model, `jq.TransferFunction`, `jq.StateSpace` or a user's own `eqx.Module`.
@@ -64,7 +67,7 @@ def with_arrays(model: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.asarray(float(x)) if number(x) else x, model)
 
 
-def as_frequencies(omega: ArrayLike | Sequence[float]) -> Float[Array, "..."]:
+def as_frequencies(omega: Frequencies) -> Float[Array, "..."]:
     """Frequencies as an array of floats; floats keep their precision."""
     omega = jnp.asarray(omega)
     return omega if eqx.is_inexact_array(omega) else omega.astype(float)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from jaxquad._core import (
     as_float,
@@ -15,7 +15,7 @@ from jaxquad._core import (
 )
 
 from ._modes import transmission_zeros
-from ._protocols import as_frequencies
+from ._protocols import as_frequencies, Frequencies
 from ._response import Matrices, response
 
 
@@ -51,7 +51,7 @@ class StateSpace(eqx.Module):
         _check_mass(self.M)
 
     def frequency_response(
-        self, omega: ArrayLike | Sequence[float]
+        self, omega: Frequencies
     ) -> Complex[Array, "frequencies outputs inputs"]:
         """The response at `omega` in rad/s, outputs per inputs in their units.
 

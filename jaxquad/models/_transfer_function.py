@@ -1,17 +1,15 @@
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from jaxquad._core import as_float, is_concrete, is_zero, require_finite, require_nonnegative
 
-from ._protocols import as_frequencies
+from ._protocols import as_frequencies, Frequencies
 
 
-def imaginary(omega: ArrayLike | Sequence[float]) -> Complex[Array, "..."]:
+def imaginary(omega: Frequencies) -> Complex[Array, "..."]:
     """s = j omega, in the precision of `omega`; whole numbers become floats."""
     omega = as_frequencies(omega)
     return jax.lax.complex(jnp.zeros_like(omega), omega)
@@ -50,9 +48,7 @@ class TransferFunction(eqx.Module):
         )
         return above / below * jnp.exp(-self.delay.astype(s.dtype) * s)
 
-    def frequency_response(
-        self, omega: ArrayLike | Sequence[float]
-    ) -> Complex[Array, "frequencies 1 1"]:
+    def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """The response at `omega` in rad/s, in units of output per input."""
         return self(imaginary(omega))[:, None, None]
 
@@ -95,9 +91,7 @@ class LaggedIntegrator(eqx.Module):
         if self.integrators not in (0, 1, 2, 3):
             raise ValueError(f"integrators is {self.integrators}: give 0 to 3")
 
-    def frequency_response(
-        self, omega: ArrayLike | Sequence[float]
-    ) -> Complex[Array, "frequencies 1 1"]:
+    def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """Response at `omega` in rad/s."""
         s = imaginary(omega)
         gain, lag, delay = (x.astype(s.dtype) for x in (self.gain, self.lag, self.delay))
