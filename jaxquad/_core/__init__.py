@@ -16,6 +16,7 @@ from ._checks import (
     Number as Number,
     whole_samples as whole_samples,
 )
+from ._files import write_file as write_file
 from ._levenberg_marquardt import (
     advance as advance,
     begin as begin,

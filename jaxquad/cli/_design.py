@@ -34,8 +34,8 @@ def _add(declared: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
+    from jaxquad._core import write_file
     from jaxquad.excitation import check_guidelines
-    from jaxquad.report import write_file
 
     signal = _sweep(options) if options.kind == "sweep" else _multisine(options)
     radian = lambda hertz: None if hertz is None else 2 * np.pi * hertz

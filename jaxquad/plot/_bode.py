@@ -1,5 +1,5 @@
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxquad.models import evaluate_response, Model
 from jaxquad.spectra import FrequencyResponse
 
 from ._labels import plain_ticks
@@ -16,15 +17,6 @@ from ._labels import plain_ticks
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _LINES = ["-", "--", "-.", ":"]
 _MARKS = ["x", "+", "^", "s"]
-
-
-@runtime_checkable
-class Model(Protocol):
-    """What can be drawn beside a measured response."""
-
-    def frequency_response(
-        self, omega: Float[Array, " frequencies"]
-    ) -> Complex[Array, "frequencies outputs inputs"]: ...
 
 
 class _Curve(NamedTuple):
@@ -120,7 +112,7 @@ def _model_curve(model: Model, measured: _Curve, o: int, i: int) -> _Curve:
 def model_response(
     model: Model, omega: Float[Array, " frequencies"]
 ) -> Complex[Array, "frequencies outputs inputs"]:
-    return model.frequency_response(omega)
+    return evaluate_response(model, omega)
 
 
 def _beside(curve: _Curve, measured: _Curve) -> _Curve:

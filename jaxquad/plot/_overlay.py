@@ -7,7 +7,8 @@ from matplotlib.figure import Figure
 
 from jaxquad.identify import Agreement, Verification
 
-from ._labels import unit_label
+from ._labels import Style, unit_label
+from ._record import extremes
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -16,7 +17,7 @@ Samples = Float[np.ndarray, " samples"]
 def overlay(check: Verification, *, title: str = "") -> Figure:
     """Draw measured and simulated outputs over time, with their difference below each.
 
-    Angles are in degrees.
+    Angles are in degrees. A long curve is drawn through its extremes, so that no peak is lost.
 
     **Arguments:**
 
@@ -45,15 +46,20 @@ def _draw(
 ) -> None:
     top, bottom = axes
     scale, unit = unit_label(one.unit)
-    top.plot(time, scale * measured, color="0.15", lw=1.0, label="measured")
     model = {"color": "tab:blue", "lw": 1.6, "ls": "--", "label": "simulated, open loop"}
-    top.plot(time, scale * simulated, **model)
+    _plot(top, time, scale * measured, {"color": "0.15", "lw": 1.0, "label": "measured"})
+    _plot(top, time, scale * simulated, model)
     top.legend(loc="upper right", fontsize=9, ncols=2)
     top.set_ylabel(f"{one.name}{unit}")
-    bottom.plot(time, scale * (measured - simulated), color="tab:red", lw=0.9)
+    _plot(bottom, time, scale * (measured - simulated), {"color": "tab:red", "lw": 0.9})
     bottom.set_ylabel(f"difference{unit}")
     for axis in axes:
         axis.grid(True, color="0.9", lw=0.5)
         axis.margins(x=0)
     low, high = top.get_ylim()
     top.set_ylim(low, high + 0.15 * (high - low))
+
+
+def _plot(panel: Axes, time: Samples, values: Samples, style: Style) -> None:
+    kept = extremes(values)
+    panel.plot(time[kept], values[kept], **style)

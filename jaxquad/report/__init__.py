@@ -3,7 +3,6 @@ from ._page import (
     Cell as Cell,
     render_page as render_page,
     Table as Table,
-    write_file as write_file,
 )
 from ._provenance import (
     Provenance as Provenance,

@@ -3,12 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from jaxquad.identify import Verification
 from jaxquad.plot import (
     channels_of,
-    extremes,
     overlay,
     record_figure,
     ROWS,
@@ -85,23 +82,9 @@ def _overlay(name: str, check: Verification) -> Image:
         outputs=tuple(replace(one, name=n, unit=short_unit(one.unit)) for one, n in outputs),
     )
     return embed_figure(
-        lambda: overlay(thinned(short)),
+        lambda: overlay(short),
         alt=f"Measured and simulated {check.output_name} over time, {name}: fit "
         f"{check.fit_percent:.1f} %, TIC {check.tic:.3f}.",
-    )
-
-
-def thinned(check: Verification) -> Verification:
-    """Of a long one, the samples at the extremes of what is drawn."""
-    shape = (check.time.size, -1)
-    measured, simulated = check.measured.reshape(shape), check.simulated.reshape(shape)
-    curves = np.concatenate([measured, simulated, measured - simulated], axis=1).T
-    kept = np.unique(np.concatenate([extremes(curve) for curve in curves]))
-    return replace(
-        check,
-        time=check.time[kept],
-        measured=check.measured[kept],
-        simulated=check.simulated[kept],
     )
 
 

@@ -1,6 +1,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from jaxquad._core import write_file
 from jaxquad.identify import Combination, Fit, Verification
 from jaxquad.plot import Model
 from jaxquad.records import Record
@@ -9,7 +10,7 @@ from jaxquad.tuning import Certificate, Tuned
 
 from ._fit import identifiability_section, parameter_section
 from ._headline import certificate_headline, check_headline, fit_headline, remarks_of
-from ._page import render_page, write_file
+from ._page import render_page
 from ._provenance import Provenance, provenance_section
 from ._record import check_section, record_section
 from ._response import residual_section, response_section

@@ -8,10 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxquad._core import write_file
 from jaxquad.identify import Agreement, Fit, Verification
 from jaxquad.spectra import FrequencyResponse
-
-from ._page import write_file
 
 
 Json = Mapping[str, object]

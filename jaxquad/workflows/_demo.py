@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxquad._core import write_file
 from jaxquad.excitation import sweep
-from jaxquad.report import write_file
 
 from ._settings import IdentifySettings
 

@@ -7,10 +7,10 @@ import jax
 import numpy as np
 
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
-from jaxquad.ensembles import Ensemble, LogUniform, Normal
+from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
 from jaxquad.identify import Fit, UndeterminedError
-from jaxquad.models import DecoupledAxes
+from jaxquad.loops import Loop
 from jaxquad.plot import certificate_figure, convergence_figure
 from jaxquad.records import Record
 from jaxquad.report import plain_content, provenance, write_json, write_report
@@ -131,9 +131,8 @@ def _check_unit(record: Record) -> None:
 
 
 def _tuned(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Tuned:
-    ensemble = _ensemble(found, record, dt, settings)
-    plant = ensemble.plant
-    assert isinstance(plant, DecoupledAxes)
+    posterior = Posterior(found, recorded_dt=record.dt, believed=settings.inertia)
+    plant, ensemble = posterior.plant, _ensemble(posterior, settings)
     gain = float(plant.torque_gain[0])
     if gain <= 0:
         raise ValueError(
@@ -142,8 +141,12 @@ def _tuned(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Tun
         )
     start = LADRC(10.0, 30.0, gain / settings.inertia, limit=settings.limit, dt=dt)
     schedule = certainty_equivalence(gain, settings.inertia, span=settings.spread)
+    loop = Loop(
+        plant, ScheduledLADRC(start, schedule), drive=Saturation(settings.limit), dt=dt,
+        delay=posterior.delay,
+    )  # fmt: skip
     return tune_controller(
-        ScheduledLADRC(start, schedule),
+        loop,
         ensemble,
         _flight(gain, dt, settings),
         objective=_objective(settings),
@@ -155,16 +158,12 @@ def _tuned(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Tun
     )
 
 
-def _ensemble(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Ensemble:
-    return Ensemble.from_fit(
-        found,
-        recorded_dt=record.dt,
-        believed=settings.inertia,
+def _ensemble(posterior: Posterior, settings: TuneSettings) -> Ensemble:
+    return Ensemble(
+        posterior,
         inertia=LogUniform(*settings.spread),
         told=Normal(settings.inertia_error) if settings.inertia_error else 1.0,
         noise=np.radians(settings.noise),
-        drive=Saturation(settings.limit),
-        dt=dt,
     )
 
 

@@ -1,10 +1,7 @@
-import json
-
 import numpy as np
 import pytest
 
 from jaxquad.plot import histories
-from jaxquad.report import write_json
 
 
 TIME = np.linspace(0, 1, 50)
@@ -43,12 +40,3 @@ def test_too_many_curves_and_unknown_panels_are_refused():
         histories(TIME, {"roll": {str(k): TIME for k in range(6)}})
     with pytest.raises(ValueError, match=r"limits for \['pitch'\].*\['roll'\]"):
         histories(TIME, {"roll": {"x": TIME}}, limits={"pitch": (0.0, 1.0)})
-
-
-def test_json_is_whole_and_holds_null_for_what_is_not_finite(tmp_path):
-    path = write_json(tmp_path / "new" / "x.json", {"a": np.array([1.0, np.nan]), "b": (1, 2)})
-    assert json.loads(path.read_text()) == {"a": [1.0, None], "b": [1, 2]}
-    with pytest.raises(TypeError):
-        write_json(path, {"a": object()})
-    assert [each.name for each in path.parent.iterdir()] == ["x.json"]
-    assert json.loads(path.read_text())["b"] == [1, 2]

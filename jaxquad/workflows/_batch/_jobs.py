@@ -10,9 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, IO, NamedTuple
 
-from jaxquad.report import write_file
+from jaxquad._core import write_file
 
-from .._identify import identify
 from .._settings import IdentifySettings
 
 
@@ -73,6 +72,8 @@ def identify_log(job: Job) -> Content:
     """Identify one log; its report and figures go to `logs/` in the folder of the batch."""
     import jax
     import matplotlib
+
+    from .._identify import identify  # here: a process with other work starts in half the time
 
     name = re.sub(r"[^\w.-]", "_", Path(job.log).stem)[:60]
     folder = Path(job.out) / "logs" / f"{name}-{job.key[:12]}"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from jaxquad.report import Cell, render_page, Table, write_file
+from jaxquad._core import write_file
 
 
 Row = dict[str, Any]  # "log", "status", "key", and what the work returned
@@ -77,6 +77,8 @@ _STATES = ("failed", "not identifiable", "identified")  # what needs a look come
 
 def write_summary(out: Path, rows: Sequence[Row], *, title: str) -> Path:
     """Write `summary.html`: the state of each log, with a link to its report."""
+    from jaxquad.report import render_page
+
     counts = Counter(row["status"] for row in rows)
     states = [*_STATES, *sorted(set(counts) - set(_STATES))]
     counted = ", ".join(f"{counts[state]} {state}" for state in states if counts[state])
@@ -94,6 +96,8 @@ def write_summary(out: Path, rows: Sequence[Row], *, title: str) -> Path:
 
 def _part(state: str, rows: Sequence[Row]) -> dict[str, object]:
     """The logs of one state, as a table."""
+    from jaxquad.report import Cell, Table
+
     if not rows:
         return {}
     flat = [flattened(row) for row in rows]

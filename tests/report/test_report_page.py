@@ -14,7 +14,6 @@ from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad.report import provenance, write_report
-from jaxquad.report._html_verdict import certified, checked, remarks_of, verdict_of
 
 
 @pytest.fixture(scope="module")
@@ -128,11 +127,10 @@ def test_the_source_can_be_checked_and_made_again(whole, log):
     assert f"numpy {np.__version__}" in text
 
 
-def test_equal_results_give_equal_bytes(tmp_path, frf, log):
+def test_equal_results_give_equal_bytes(tmp_path, frf, fit, log):
     origin = provenance(log, date=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC))
     assert origin.date == "2026-01-02T03:04:05+00:00"
-    error = jq.identify.NotIdentifiable("no")
-    pages = [write_report(tmp_path / name, fit=error, frf=frf, provenance=origin) for name in "ab"]
+    pages = [write_report(tmp_path / name, fit=fit, frf=frf, provenance=origin) for name in "ab"]
     assert pages[0].read_bytes() == pages[1].read_bytes()
 
 
@@ -158,45 +156,58 @@ def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
     assert "\ufffdcod.exe\u200f \u05d0\u05d1 \ufffdx" in page.text("h1")
 
 
-def test_not_identifiable_comes_first_and_shows_no_number(tmp_path, frf):
+def test_not_identifiable_comes_first_and_marks_its_numbers(tmp_path, frf):
     """One record tells L K_t / J_x of an attitude axis, and neither of the two."""
     axis = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.02, delay=0.0)
     response = response_of(axis, error=0.02, seed=1)
     fit = jq.fit(axis, response, free=("J_x", "K_t", "lag"), cost=jq.identify.MaximumLikelihood())
     page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=response))
     assert page.text().split()[:3] == ["\u2717", "NOT", "IDENTIFIABLE"]
-    assert "each by itself: J_x, K_t; determined: L K_t / J_x = " in page.text("header")
+    assert "each by itself: J_x and K_t; only L K_t / J_x = " in page.text("header")
     tables, text = page.text("table"), page.text("section")
     assert tables.count("not determined") == 2 and "nan" not in text
     assert "Null directions" in text and "direction 1" in text and "jq.identify.Prior" in text
 
 
 def test_what_could_not_be_fitted_has_a_page_too(tmp_path, frf, record):
-    error = jq.identify.NotIdentifiable("no usable frequency: coherence is below 0.6")
     weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence * 0.1)
     blind = eqx.tree_at(
         lambda f: (f.response, f.random_error),
         weak,
         (weak.response.at[3:].set(np.nan), weak.random_error.at[3:].set(np.inf)),
     )
-    page = read_page(write_report(tmp_path / "r.html", fit=error, frf=blind, record=record))
+    none = jq.fit(TRUTH, weak)
+    page = read_page(write_report(tmp_path / "r.html", fit=none, frf=blind, record=record))
     assert page.errors == [] and all(is_image(*each) for each in page.figures())
-    assert page.text("header").startswith("\u2717 NOT IDENTIFIABLE y0 / u0no usable frequency")
+    words = page.text("header").split()
+    assert words[:6] == ["\u2717", "NOT", "IDENTIFIABLE", "y0", "/", "u0"]
     assert "parameters" not in [attributes["id"] for attributes in page.of("section")]
 
 
-def test_a_misfit_and_a_failed_verification_are_in_the_verdict(frf, fit, record):
+def header_of(tmp_path, **content):
+    """The words at the top of a page."""
+    return read_page(write_report(tmp_path / "r.html", **content)).text("header")
+
+
+def test_a_misfit_and_a_failed_verification_are_in_the_header(tmp_path, frf, fit, record):
     off = dataclasses.replace(fit, chi_squared=16.0, remarks=("the misfit is 4.0 times",))
     check = jq.verify(jq.LaggedIntegrator(-280.0, 0.016, 0.011), record)
-    remarks = remarks_of(off, {"a": frf}, {"b": check})
-    assert remarks == ["the misfit is 4.0 times"]
-    found = verdict_of(off, 1)
-    assert found.level == "warn" and "BUT IT MISFITS by 4.0 times the random error" in found.word
-    assert checked("b", check)[:2] == ("bad", "VERIFICATION FAILS")
-    none = verdict_of(dataclasses.replace(fit, newton_decrement=fit.cost), 0)
-    assert none[:2] == ("bad", "NO RESULT")
-    assert verdict_of(fit, 2).word == "IDENTIFIED, with 2 remarks"
-    assert certified(dataclasses.replace(tuned_by_hand(), certificate=None)).word == "NOT CERTIFIED"
+    header = header_of(tmp_path, fit=off, frf=frf, checks={"b": check})
+    assert "! IDENTIFIED, but the misfit is 4.0 times the random error" in header
+    assert "\u2717 VERIFICATION FAILS b: fit" in header and "the misfit is 4.0 times" in header
+
+
+def test_remarks_and_missing_certificates_are_in_the_header(tmp_path, frf, fit):
+    remarked = dataclasses.replace(fit, remarks=("one", "two"))
+    tuned = dataclasses.replace(tuned_by_hand(), certificate=None)
+    header = header_of(tmp_path, fit=remarked, frf=frf, tuned=tuned)
+    assert "! IDENTIFIED, with 2 remarks" in header and "! NOT CERTIFIED" in header
+
+
+def test_a_fit_without_a_minimum_is_no_result(tmp_path, frf, fit):
+    stopped = dataclasses.replace(fit.verdict, kind="no minimum")
+    header = header_of(tmp_path, fit=dataclasses.replace(fit, verdict=stopped), frf=frf)
+    assert header.split()[:3] == ["\u2717", "NO", "MINIMUM"]
 
 
 def test_several_responses_have_a_part_each(tmp_path, frf, fit):

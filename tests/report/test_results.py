@@ -1,4 +1,4 @@
-"""Figures that can be read, and result files that can be parsed."""
+"""Result files that can be parsed, and fits side by side."""
 
 import json
 
@@ -8,8 +8,7 @@ import pytest
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
-from jaxquad.plot import bode, overlay, record_figure
-from jaxquad.report import comparison, write_results
+from jaxquad.report import compare_fits, write_json, write_results
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -38,62 +37,6 @@ def silent_fit():
     """Of a response that is coherent nowhere."""
     frf = response_of(TRUTH, error=0.05, seed=0)
     return jq.fit(TRUTH, eqx.tree_at(lambda f: f.coherence, frf, 0.1 * frf.coherence))
-
-
-def lines(axis):
-    return {line.get_label(): line for line in axis.get_lines()}
-
-
-def test_a_bode_figure_names_its_axes_with_units(frf):
-    magnitude, phase, coherence = bode(frf, {"truth": TRUTH}).axes[:3]
-    assert magnitude.get_ylabel() == "|y0 / u0|, dB"
-    assert phase.get_ylabel() == "phase, deg"
-    assert coherence.get_xlabel() == "frequency, rad/s" and coherence.get_xscale() == "log"
-
-
-def test_the_band_is_the_95_per_cent_band_of_the_random_error(frf):
-    magnitude = bode(frf).axes[0]
-    (band,) = magnitude.collections
-    corners = band.get_paths()[0].vertices
-    at_first = corners[np.isclose(corners[:, 0], OMEGA[0]), 1]
-    width = 2 * 1.96 * 0.05 * 20 / np.log(10)
-    assert np.ptp(at_first) == pytest.approx(width, rel=1e-9)
-
-
-def test_the_model_is_drawn_on_the_branch_of_the_measured_phase():
-    """A delay of many turns, and a response that starts beyond -180 deg."""
-    slow = jq.LaggedIntegrator(280.0, 0.016, 1.0)
-    figure = bode(response_of(slow), {"model": slow})
-    measured, model = (lines(figure.axes[1])[name] for name in ("joint estimate", "model"))
-    drawn = np.interp(measured.get_xdata(), model.get_xdata(), model.get_ydata())
-    assert np.max(np.abs(drawn - measured.get_ydata())) < 2  # deg, of linear interpolation
-
-
-def test_points_without_coherence_are_shown_apart(frf):
-    weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence.at[:5].set(0.3))
-    drawn = lines(bode(weak, others={"direct": frf}).axes[0])
-    assert len(drawn["joint estimate"].get_xdata()) == OMEGA.size - 5
-    assert len(drawn["joint estimate, coherence below 0.6"].get_xdata()) == 5
-    assert drawn["direct"].get_marker() != drawn["joint estimate"].get_marker()
-    with pytest.raises(ValueError, match=r"no response \('p', 'u0'\)"):
-        bode(frf, pair=("p", "u0"))
-
-
-def test_an_overlay_shows_degrees_and_the_measures(check):
-    figure = overlay(check)
-    top, bottom = figure.axes
-    assert top.get_ylabel() == "q, deg/s" and bottom.get_xlabel() == "time, s"
-    np.testing.assert_allclose(
-        lines(top)["measured"].get_ydata(), np.degrees(check.measured), rtol=1e-12
-    )
-    assert f"{check.fit_percent:.1f} %" in figure.get_suptitle()
-
-
-def test_every_channel_of_a_record_is_drawn():
-    time = np.arange(100) * 0.01
-    record = jq.Record(time, np.sin(time), np.cos(time), np.sin(2 * time), output_units="rad")
-    labels = [axis.get_ylabel() for axis in record_figure(record).axes]
-    assert labels == ["r", "u", "y, deg"]
 
 
 def test_a_result_file_holds_the_numbers_of_the_fit(tmp_path, fit, frf, check):
@@ -131,14 +74,24 @@ def test_a_failed_write_leaves_the_old_result(tmp_path, fit):
 def test_fits_stand_side_by_side_and_what_is_missing_says_so(fit):
     nothing = silent_fit()
     late = {"lag + delay": lambda model: model.lag + model.delay}
-    head, joint, direct = comparison({"joint": fit, "direct": nothing}, late).splitlines()
+    head, joint, direct, note = compare_fits({"joint": fit, "direct": nothing}, late).splitlines()
     assert head.split() == "gain lag delay lag + delay misfit / error".split()
     assert f"{fit.values[0]:.5g} +- {fit.standard_errors[0]:.2g}" in joint
     assert str(f"{fit.derived(late['lag + delay']).value:.5g}") in joint
     assert direct.split() == ["direct", "not", "identifiable"]
+    assert note == "(+- one standard error)"
 
 
 def test_where_nothing_was_fitted_there_is_no_number(tmp_path, frf):
     content = json.loads(write_results(tmp_path, fit=silent_fit(), frf=frf).read_text())["fit"]
     assert not content["identifiable"] and "parameters" not in content
     assert "coherence reaches 0.6 at 0 of" in content["verdict"]["summary"]
+
+
+def test_json_is_whole_and_holds_null_for_what_is_not_finite(tmp_path):
+    path = write_json(tmp_path / "new" / "x.json", {"a": np.array([1.0, np.nan]), "b": (1, 2)})
+    assert json.loads(path.read_text()) == {"a": [1.0, None], "b": [1, 2]}
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+    assert [each.name for each in path.parent.iterdir()] == ["x.json"]
+    assert json.loads(path.read_text())["b"] == [1, 2]
