@@ -115,6 +115,7 @@ def test_disturbances_are_those_of_an_independent_recursion(loaded, loops):
     )
 
 
+@pytest.mark.slow
 def test_the_paper_s_loop_has_the_stated_window_and_margins(loops):
     ratios = np.array([1.0, 0.53, 0.283])
     analysis = jq.analyse(jq.Loop(loops.rig(ratios * loops.INERTIA), loops.ladrc(np.ones(3))))
@@ -126,12 +127,14 @@ def test_the_paper_s_loop_has_the_stated_window_and_margins(loops):
     assert float(analysis.gain_margin[0]) == pytest.approx(1 / low, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_linear_loop_knows_no_small_angles(loops):
     plant, controller = loops.rig([2 * loops.LEVER] * 2), loops.ladrc([3.0, 3.0])
     large, small = loops.step(plant, controller, np.radians([3.0, 1.0]))
     np.testing.assert_allclose(large.angle, small.angle, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_b0_that_moves_after_the_first_swing_leaves_the_overshoot(linear):
     steps = importlib.import_module("reproduction.steps")
     early, late = steps.moving_steps().values()

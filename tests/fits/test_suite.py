@@ -60,6 +60,7 @@ def test_the_suite_has_the_scenarios_s0_to_s11_and_seven_designs(data):
     assert all(scenario["purpose"] for scenario in data["scenarios"].values())
 
 
+@pytest.mark.slow
 def test_every_case_builds_its_rig_its_signals_and_every_controller(fits, data):
     designs = [
         fits.designs.Design(
@@ -121,6 +122,7 @@ def test_a_pair_of_equations_is_solved_within_its_bounds(fits):
     assert found == pytest.approx([1.0, 2.0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_every_family_meets_the_common_targets(data, loops):
     targets = data["targets"]
     free = [
@@ -133,6 +135,7 @@ def test_every_family_meets_the_common_targets(data, loops):
         assert loop.activity == pytest.approx(targets["activity"], rel=0.005)
 
 
+@pytest.mark.slow
 def test_the_printed_design_is_not_matched_and_says_what_it_reaches(loops):
     printed = loops["paper's LADRC, as printed"]
     assert not printed.matched
@@ -165,6 +168,7 @@ def by_hand(gains, dt):
     return matrix, noise, step, -np.concatenate([[through, 0], row]), through
 
 
+@pytest.mark.slow
 def test_the_matched_pid_has_that_ms_and_that_activity_by_its_textbook_form(data, loops):
     dt, gains = data["dt"], loops["tuned PID"].design.gains
     kp, ki, kd, filter = textbook(gains)
@@ -179,6 +183,7 @@ def test_the_matched_pid_has_that_ms_and_that_activity_by_its_textbook_form(data
     assert np.sqrt(power) == pytest.approx(data["targets"]["activity"], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_step_of_the_matched_pid_overshoots_as_far_as_it_may(data, loops):
     matrix, _, step, *_ = by_hand(loops["tuned PID"].design.gains, data["dt"])
     state, highest = np.zeros(4), 0.0
@@ -190,6 +195,7 @@ def test_the_step_of_the_matched_pid_overshoots_as_far_as_it_may(data, loops):
     assert highest - 1 == pytest.approx(allowed, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_no_other_shape_of_a_pid_has_more_integral_gain_at_the_same_targets(fits, data, loops):
     design = loops["tuned PID"].design
     names = ("pole", "filter", "damping", "ratio")
@@ -220,6 +226,7 @@ def test_no_other_shape_of_a_pid_has_more_integral_gain_at_the_same_targets(fits
     assert np.all(over[more] > data["designs"]["tuned PID"]["shape"]["overshoot"])
 
 
+@pytest.mark.slow
 def test_a_linear_loop_answers_steps_of_all_sizes_alike(fits, data, loops):
     chosen = ["LADRC, b0 = KT/Jhat", "half-gain LADRC"]
     case = altered(fits, data, "S1", "A", designs=chosen)
@@ -228,6 +235,7 @@ def test_a_linear_loop_answers_steps_of_all_sizes_alike(fits, data, loops):
     assert all(row.numbers["variation"] < 1e-9 and row.verdict == "pass" for row in rows)
 
 
+@pytest.mark.slow
 def test_a_pulse_beyond_the_drive_is_called_infeasible(fits, data, loops):
     [case] = [c for c in fits.data.cases(data, ("S2",)) if c.name.startswith("2.5")]
     case = case._replace(data=case.data | {"duration": 10.0, "designs": ["LADRC, b0 = KT/Jhat"]})
@@ -236,6 +244,7 @@ def test_a_pulse_beyond_the_drive_is_called_infeasible(fits, data, loops):
     assert beyond.verdict.startswith("infeasible") and "50 %" in beyond.verdict
 
 
+@pytest.mark.slow
 def test_a_mark_that_no_row_can_meet_is_an_error(fits, data, loops):
     case = altered(fits, data, "S0", "A", marks=[{"quantity": "stabel", "at_least": 1.0}])
     row = fits.rows.Row(case, "", "tuned PID", {"stable": 1.0})
