@@ -1,4 +1,3 @@
-from ._common_subexpressions import once as once
 from ._devices import (
     asked_devices as asked_devices,
     Devices as Devices,
@@ -15,6 +14,6 @@ from ._engine import (
     engine as engine,
     Jit as Jit,
 )
+from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse
 from ._kernel import as_one_kernel as as_one_kernel
-from ._no_fuse import apart as apart
 from ._swap import swap_row as swap_row

@@ -3,7 +3,7 @@
 import functools as ft
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,44 +12,94 @@ from jaxtyping import PyTree
 
 from jaxquad._core import is_concrete
 
-from ._kernel import has_kernels
+from ._kernel import why_no_kernels
+from ._switch import Kernel, left_plain, plain_loops, set_kernel, warn_once
 
 
 class Engine(NamedTuple):
-    """What loops are compiled with here."""
+    """What loops are compiled with. It changes how long they take, and no result."""
 
     platform: str
-    one_kernel: bool  # a loop is one kernel of plain vector code, if it is plain arithmetic
+    one_kernel: bool  # whether a loop of plain arithmetic becomes one kernel
     vector_bits: int | None  # of a jit with `compiler_options()`; None for the compiler's choice
+    why_not: str | None  # why no loop becomes a kernel
+    left_plain: tuple[str, ...]  # what did not become a kernel in this process, and why
 
 
-_WIDEST = {"xla_cpu_prefer_vector_width": 512}  # bits; LLVM takes half of what a CPU can, unasked
+def engine(kernel: Kernel | None = None) -> Engine:
+    """Tell what loops are compiled with, and choose it.
+
+    On a CPU a time loop is compiled as one kernel, which makes a single flight about ten times
+    faster. This relies on internals of XLA. It is on for the versions of jaxlib that the tests ran
+    on; with any other, a child process tries it once, and its answer is kept in the user's cache
+    folder (not with `JAXQUAD_CACHE=off` in the environment). Loops with operations that a kernel
+    cannot hold, or with too many or too large ones, are compiled plain.
+
+    Where `jq.simulate`, `jq.evaluate` and the like are called outside of `jax.jit`, a kernel that
+    does not compile is compiled plain, with a warning. Within a `jax.jit` of your own that cannot
+    be done: if it fails in XLA, call `jq.engine(kernel="off")` and file an issue.
+
+    **Arguments:**
+
+    - `kernel`: `"off"` compiles all loops plain from then on, as `JAXQUAD_KERNEL=off` in the
+        environment does; `"auto"` makes kernels of those that can be; `None` leaves it as it is.
+
+    **Returns:**
+
+    An `Engine`: platform, whether loops become kernels and why not, and what was left plain.
+
+    **Raises:**
+
+    - `ValueError`: `kernel`, or `JAXQUAD_KERNEL`, is another word.
+    """
+    if kernel is not None:
+        set_kernel(kernel)
+    reason = why_no_kernels()
+    bits = compiler_options().get("xla_cpu_prefer_vector_width")
+    return Engine(jax.default_backend(), reason is None, bits, reason, left_plain())
 
 
 class Jit:
     """`eqx.filter_jit` of a function that loops, with the compiler's options for loops.
 
     JAX takes options of an outermost jit only: within another, such as a user's, this one has none,
-    and `compiler_options()` are there to be given to that one.
+    and `compiler_options()` are there to be given to that one. What does not compile with kernels
+    is compiled plain, with a warning.
     """
 
     def __init__(self, function: Callable[..., PyTree]):
         ft.update_wrapper(self, function)
         self._plain = eqx.filter_jit(function)
         self._function = function
+        self._failed: set[tuple] = set()
 
     @ft.cached_property
-    def _tuned(self) -> Any:
+    def _tuned(self) -> Callable[..., PyTree]:
         options = compiler_options()
-        given: dict[str, Any] = {"compiler_options": options} if options else {}
-        return eqx.filter_jit(self._function, **given)
+        return eqx.filter_jit(self._function, **({"compiler_options": options} if options else {}))
 
     def __call__(self, *args: PyTree) -> PyTree:
         if not _is_outermost(args):
             return self._plain(*args)
-        return self._tuned(*args)
+        if why_no_kernels() is not None:
+            return self._tuned(*args)
+        if self._failed and _shapes(args) in self._failed:
+            return self._without_kernels(*args)
+        try:
+            return self._tuned(*args)
+        except eqx.EquinoxRuntimeError:  # raised by what runs: it did compile
+            raise
+        except jax.errors.JaxRuntimeError as error:
+            result = self._without_kernels(*args)  # If the kernel is not at fault, this raises too.
+            self._failed.add(_shapes(args))
+            warn_once(f"{self.__name__} did not compile as one kernel ({_first_line(error)})")
+            return result
 
-    def lower(self, *args: PyTree) -> Any:
+    def _without_kernels(self, *args: PyTree) -> PyTree:
+        with plain_loops(True):
+            return self._tuned(*args)
+
+    def lower(self, *args: PyTree) -> eqx._jit.Lowered:
         return (self._tuned if _is_outermost(args) else self._plain).lower(*args)
 
 
@@ -61,18 +111,14 @@ def compiler_options() -> dict[str, int]:
     return dict(_known()) if jax.default_backend() == "cpu" else {}
 
 
-def engine() -> Engine:
-    """How fast loops can be here: a CPU's XLA may lack what makes them so. It changes no result."""
-    platform = jax.default_backend()
-    bits = compiler_options().get("xla_cpu_prefer_vector_width")
-    return Engine(platform, platform == "cpu" and has_kernels(), bits)
+_WIDEST = {"xla_cpu_prefer_vector_width": 512}  # bits; LLVM takes half of what a CPU can, unasked
 
 
 @ft.cache
 def _known() -> tuple[tuple[str, int], ...]:
     try:
         jax.jit(lambda: 0, compiler_options=_WIDEST).lower().compile()
-    except Exception as error:
+    except jax.errors.JaxRuntimeError as error:
         warnings.warn(
             f"loops run up to a tenth slower: this jaxlib refuses {_WIDEST} ({error})", stacklevel=2
         )
@@ -84,3 +130,14 @@ def _is_outermost(args: PyTree) -> bool:
     # Within another jit even a constant is traced.
     arrays = filter(eqx.is_array, (jnp.zeros(()), *jax.tree.leaves(args)))
     return all(map(is_concrete, arrays))
+
+
+def _shapes(args: PyTree) -> tuple:
+    """What tells compiled programs apart."""
+    leaves, structure = jax.tree.flatten(args)
+    arrays = [x for x in leaves if eqx.is_array(x)]
+    return str(structure), *((x.shape, str(x.dtype)) for x in arrays)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0][:200]

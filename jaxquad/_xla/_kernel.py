@@ -2,24 +2,28 @@
 
 XLA's CPU runtime dispatches every small operation of a loop by itself, which costs more than the
 arithmetic of one vehicle does. A call with two attributes becomes one kernel instead. They are
-internal to XLA: on other devices, for computations that such a kernel cannot hold, and where JAX
-or XLA does not know them, the loop is compiled as any other.
+internal to XLA, so they are used only where the installed version is known to take them, and what
+goes in is bounded; all else is compiled as any other program.
 """
 
-import functools as ft
-import warnings
 from collections.abc import Callable
-from typing import Any
 
 import jax
+import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
+
+from ._canary import why_not_trusted
+from ._switch import is_off, warn_once
 
 
 try:
     from ._marks import enter, leave
-except Exception:  # JAX's interfaces to its compiler are not stable ones: they may be elsewhere.
+except (ImportError, AttributeError) as error:  # JAX's interfaces to its compiler may move.
     enter = leave = None
+    _MISSING = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
+else:
+    _MISSING = None
 
 
 def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
@@ -28,8 +32,7 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     So are its derivatives: what is differentiated is marked where it enters and where it leaves,
     and each mark is the transpose of the other.
     """
-    if enter is None or leave is None:
-        _say_so()
+    if enter is None or leave is None or why_no_kernels() is not None:
         return function(*args)
 
     def jaxquad_kernel(*args: PyTree) -> PyTree:
@@ -39,17 +42,17 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     return jax.tree.map(_marked(leave), jax.jit(jaxquad_kernel)(*entered))
 
 
-def has_kernels() -> bool:
-    """Whether this JAX has what a kernel is marked with."""
-    return enter is not None and leave is not None
+def why_no_kernels() -> str | None:
+    """Why loops are compiled plain here; None if they become kernels."""
+    if is_off():
+        return "switched off"
+    if jax.default_backend() != "cpu":
+        return f"the platform is {jax.default_backend()}, and kernels are for CPUs"
+    if _MISSING is not None:
+        warn_once(_MISSING)
+        return _MISSING
+    return why_not_trusted()
 
 
-@ft.cache
-def _say_so() -> None:
-    if jax.default_backend() == "cpu":
-        message = "loops take several times as long: this JAX lacks what makes them one kernel"
-        warnings.warn(f"{message} (jax {jax.__version__})", stacklevel=2)
-
-
-def _marked(mark: Any) -> Callable[[Array], Array]:
+def _marked(mark: jax.extend.core.Primitive) -> Callable[[Array], Array]:
     return lambda x: mark.bind(x) if jnp.issubdtype(x.dtype, jnp.floating) else x

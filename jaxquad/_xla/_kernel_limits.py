@@ -2,7 +2,6 @@
 
 import functools as ft
 from collections.abc import Iterator
-from typing import Any
 
 from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func, stablehlo
@@ -11,7 +10,9 @@ from jax.extend.mlir.dialects import func, stablehlo
 ATTRIBUTE = "mhlo.frontend_attributes"
 
 
-def hold_in_kernel(call: Any, module: Any, symbols: Any, attributes: Any) -> None:
+def hold_in_kernel(
+    call: ir.Operation, module: ir.Module, symbols: ir.SymbolTable, attributes: ir.Attribute
+) -> None:
     """Turn a plain call into one of a function that calls a kernel which does the same.
 
     The kernel is given its operands behind a barrier, for XLA would put constants in the arguments'
@@ -45,22 +46,27 @@ def hold_in_kernel(call: Any, module: Any, symbols: Any, attributes: Any) -> Non
 
 
 def _new_function(
-    name: str, given: list[Any], kinds: list[Any], call: Any, module: Any, symbols: Any
-) -> tuple[Any, str]:
+    name: str,
+    given: list[ir.Type],
+    kinds: list[ir.Type],
+    call: ir.Operation,
+    module: ir.Module,
+    symbols: ir.SymbolTable,
+) -> tuple[func.FuncOp, str]:
     with call.location, ir.InsertionPoint(module.body):
         function = func.FuncOp(name, ir.FunctionType.get(given, kinds), visibility="private")
     return function, ir.StringAttr(symbols.insert(function)).value
 
 
-def _like(kind: Any, shape: tuple[int, ...]) -> Any:
+def _like(kind: ir.Type, shape: tuple[int, ...]) -> ir.Type:
     return ir.RankedTensorType.get(shape, ir.RankedTensorType(kind).element_type)
 
 
-def _sum_of_firsts(values: list[Any]) -> Any:
+def _sum_of_firsts(values: list[ir.Value]) -> ir.Value:
     return ft.reduce(lambda x, y: stablehlo.AddOp(x, y).result, map(_first, values))
 
 
-def _first(value: Any) -> Any:
+def _first(value: ir.Value) -> ir.Value:
     """The first number of an array, in single precision."""
     rank = len(ir.RankedTensorType(value.type).shape)
     corner = stablehlo.SliceOp(value, [0] * rank, [1] * rank, [1] * rank).result
@@ -89,6 +95,8 @@ _MOVES = set(
     optimization_barrier reshape return slice while
     """.split()
 )
+_BRANCHES = {"case", "if"}
+_NARROW = 128  # numbers that XLA never divides among threads
 # XLA hands sums and products of more numbers to a library.
 _SUMS = {"reduce", "reduce_window", "dot_general", "dot"}
 _MOST_SUMMED = 4096
@@ -96,15 +104,15 @@ _WIDEST = 2**15  # numbers of one operation: one thread is the slower way for mo
 _MOST_OPERATIONS = 12_000  # of one kernel: the time to compile them grows faster than their number
 
 
-def why_not(call: Any, module: Any) -> str | None:
+def why_not(call: ir.Operation, module: ir.Module) -> str | None:
     """What `call` takes, leads to or returns that a kernel cannot hold; None if all of it fits."""
-    functions = {_text(f, "sym_name"): f.operation for f in module.body.operations}
+    functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
     for value in (*call.operands, *call.results):
         if not _holds_numbers(value.type):
             return f"values of {value.type}"
     counts: dict[str, int] = {}
     try:
-        count = _count(_text(call, "callee"), functions, counts)
+        count = _count(text(call, "callee"), functions, counts)
     except _DoesNotFit as reason:
         return str(reason)
     return f"{count} operations" if count > _MOST_OPERATIONS else None
@@ -114,24 +122,24 @@ class _DoesNotFit(Exception):
     pass
 
 
-def _holds_numbers(kind: Any) -> bool:
+def _holds_numbers(kind: ir.Type) -> bool:
     """Whether these are real numbers, integers or booleans, at least one of them."""
     array = ir.RankedTensorType(kind)
     real = isinstance(array.element_type, ir.FloatType | ir.IntegerType)
-    return real and array.has_static_shape and _size(kind) > 0
+    return real and array.has_static_shape and size_of(kind) > 0
 
 
-def _text(op: Any, attribute: str) -> str:
+def text(op: ir.Operation, attribute: str) -> str:
     return str(op.attributes[attribute]).strip('@"')
 
 
-def _count(name: str, functions: dict[str, Any], counts: dict[str, int]) -> int:
+def _count(name: str, functions: dict[str, ir.Operation], counts: dict[str, int]) -> int:
     """Operations of a function and of all that it calls, once for every call: XLA inlines them."""
     if name not in counts:
         counts[name] = 0
         for op in _operations(functions[name]):
             if op.name == "func.call":
-                counts[name] += _count(_text(op, "callee"), functions, counts)
+                counts[name] += _count(text(op, "callee"), functions, counts)
             elif not _fits(op):
                 raise _DoesNotFit(f"{op.name} of {', '.join(str(x.type) for x in op.operands)}")
             else:
@@ -139,7 +147,7 @@ def _count(name: str, functions: dict[str, Any], counts: dict[str, int]) -> int:
     return counts[name]
 
 
-def _operations(parent: Any) -> Iterator[Any]:
+def _operations(parent: ir.Operation) -> Iterator[ir.Operation]:
     for region in parent.regions:
         for block in region:
             for op in block:
@@ -147,24 +155,30 @@ def _operations(parent: Any) -> Iterator[Any]:
                 yield from _operations(op.operation)
 
 
-def _fits(op: Any) -> bool:
-    kind = op.name.split(".")[-1]
+def _fits(op: ir.Operation) -> bool:
+    kind = kind_of(op)
     if kind not in _HELD or (kind[:3] == "dot" and not _is_thin(op)):
         return False
+    if kind in _BRANCHES and len(op.results) == 1 and size_of(op.results[0].type) >= _NARROW:
+        return False  # A branch's only result is divided among threads.
     if kind in _MOVES:
         return True
     most = _MOST_SUMMED if kind in _SUMS else _WIDEST
-    return all(_size(value.type) < most for value in (*op.operands, *op.results))
+    return all(size_of(value.type) < most for value in (*op.operands, *op.results))
 
 
-def _size(kind: Any) -> int:
+def size_of(kind: ir.Type) -> int:
     size = 1
     for length in ir.RankedTensorType(kind).shape:
         size *= length
     return size
 
 
-def _is_thin(dot: Any) -> bool:
+def kind_of(op: ir.Operation) -> str:
+    return op.name.split(".")[-1]
+
+
+def _is_thin(dot: ir.Operation) -> bool:
     """Whether a product has a vector on one side: XLA writes a plain loop for it."""
     dims = stablehlo.DotDimensionNumbers(dot.attributes["dot_dimension_numbers"])
     shared = (

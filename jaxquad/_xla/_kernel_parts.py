@@ -5,14 +5,12 @@ what several of them need: three times over in a controlled vehicle, more in its
 merges nothing across the calls of functions, so what is needed twice becomes a part's result.
 """
 
-import math
-from typing import Any
-
 from jax.extend.mlir import ir
-from jax.extend.mlir.dialects import func
+from jax.extend.mlir.dialects import func, stablehlo
+
+from ._kernel_limits import ATTRIBUTE, kind_of, size_of, text
 
 
-ATTRIBUTE = "mhlo.frontend_attributes"
 MOVES = set("broadcast_in_dim convert iota reshape slice".split())  # nothing to save in these
 _SLOW = set(
     """
@@ -37,12 +35,12 @@ _DEAR = 5  # additions, what it costs to write a result down and to read it
 class Division:
     """Of one block of operations: what is kept, and the step of its computation that yields it."""
 
-    def __init__(self, block: Any, copies: Any):
+    def __init__(self, block: ir.Block, copies: "_Copies"):
         self.copies = copies
         *self.ops, self.end = operations(block)
         self.source = {value: k for k, op in enumerate(self.ops) for value in op.results}
         self.light = [copies.is_in_a_part(op) for op in self.ops]
-        self.fixed = [kind(op) == "constant" for op in self.ops]
+        self.fixed = [kind_of(op) == "constant" for op in self.ops]
         self.kept = self._kept()
 
     def _kept(self) -> list[bool]:
@@ -54,7 +52,7 @@ class Division:
                 continue
             users = [place.get(use.owner.operation, -1) for use in self.ops[k].results[0].uses]
             outside = any(j < 0 or not self.light[j] for j in users)
-            moves = kind(self.ops[k]) in MOVES
+            moves = kind_of(self.ops[k]) in MOVES
             uses[k] = sum(uses[j] if self._moves(j) else 1 for j in users if j >= 0)
             if moves and outside:
                 self.light[k] = False
@@ -70,11 +68,11 @@ class Division:
             sources = [self.source.get(value, -1) for value in op.operands]
             price[k] = sum(price[j] for j in sources if j >= 0 and not kept[j])
             if not self._moves(k):
-                price[k] += _PRICE if kind(op) in _SLOW else 1
+                price[k] += _PRICE if kind_of(op) in _SLOW else 1
                 kept[k] |= price[k] * (uses[k] - 1) >= _DEAR
 
     def _moves(self, k: int) -> bool:
-        return self.light[k] and kind(self.ops[k]) in MOVES
+        return self.light[k] and kind_of(self.ops[k]) in MOVES
 
     def apply(self) -> None:
         if sum(self.kept) < 2:
@@ -107,6 +105,8 @@ class Division:
     def _emit(self, members: list[int]) -> None:
         inputs, within = self._needs(members)
         kinds = [self.ops[k].results[0].type for k in members]
+        # XLA divides among threads what is a function's only result; a kernel has one thread.
+        kinds += [ir.RankedTensorType.get((), ir.F32Type.get())]
         shape = ir.FunctionType.get([x.type for x in inputs], kinds)
         with self.ops[members[0]].location:
             with ir.InsertionPoint(self.copies.module.body):
@@ -119,16 +119,17 @@ class Division:
                     for i, operand in enumerate(self.ops[k].operands):
                         op.operands[i] = values[operand]
                     values[self.ops[k].results[0]] = op.results[0]
-                func.ReturnOp([values[self.ops[k].results[0]] for k in members])
+                found = [values[self.ops[k].results[0]] for k in members]
+                func.ReturnOp([*found, stablehlo.ConstantOp(_zero()).result])
             with ir.InsertionPoint(self.end):
                 call = func.CallOp(kinds, ir.FlatSymbolRefAttr.get(name), inputs)
         call.operation.attributes[ATTRIBUTE] = ir.DictAttr.get(
             {"inlineable": ir.StringAttr.get("false")}
         )
-        for k, result in zip(members, call.results, strict=True):
+        for k, result in zip(members, list(call.results)[:-1], strict=True):
             self.ops[k].results[0].replace_all_uses_with(result)
 
-    def _needs(self, members: list[int]) -> tuple[list[Any], list[int]]:
+    def _needs(self, members: list[int]) -> tuple[list[ir.Value], list[int]]:
         """What a part is given, and the operations in it."""
         inputs, within, open_ = {}, set(members), list(members)
         while open_:
@@ -142,23 +143,18 @@ class Division:
         return list(inputs), sorted(within)
 
 
-def text(op: Any, attribute: str) -> str:
-    return str(op.attributes[attribute]).strip('@"')
+def _zero() -> ir.Attribute:
+    single = ir.F32Type.get()
+    return ir.DenseElementsAttr.get_splat(
+        ir.RankedTensorType.get((), single), ir.FloatAttr.get(single, 0.0)
+    )
 
 
-def kind(op: Any) -> str:
-    return op.name.split(".")[-1]
-
-
-def operations(block: Any) -> list[Any]:
+def operations(block: ir.Block) -> list[ir.Operation]:
     return [op.operation for op in block.operations]
 
 
-def size(value: Any) -> int:
-    return math.prod(ir.RankedTensorType(value.type).shape)
-
-
-def _operands(op: Any) -> list[Any]:
+def _operands(op: ir.Operation) -> list[ir.Value]:
     """Also those that an operation's regions take from around them."""
     found = list(op.operands)
     for region in op.regions:
@@ -173,22 +169,19 @@ _LONG = 2**15  # numbers that XLA divides among threads (256 KiB), which a kerne
 _FEW = 10  # operations of a function, such as `jnp.clip`, that can be within a part
 
 
-def in_parts(name: str, module: Any, symbols: Any) -> str:
-    """The name of a copy of a function, its loops included, that is made of parts.
-
-    Of the function itself if the compiler's interfaces have changed.
-    """
-    made: list[Any] = []
+def in_parts(name: str, module: ir.Module, symbols: ir.SymbolTable) -> str:
+    """The name of a copy of a function, its loops included, that is made of parts."""
+    made: list[ir.Operation] = []
     try:
         return _Copies(module, symbols, made).copy(name)
     except Exception:
         for function in reversed(made):  # Half a function would spoil the whole program.
             symbols.erase(function)
-        return name
+        raise
 
 
 class _Copies:
-    def __init__(self, module: Any, symbols: Any, made: list[Any]):
+    def __init__(self, module: ir.Module, symbols: ir.SymbolTable, made: list[ir.Operation]):
         self.module, self.symbols, self.made = module, symbols, made
         self.functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
         self.named: dict[str, str] = {}
@@ -202,21 +195,21 @@ class _Copies:
             self._divide(function.operation)
         return self.named[name]
 
-    def insert(self, function: Any) -> str:
+    def insert(self, function: ir.Operation) -> str:
         name = ir.StringAttr(self.symbols.insert(function)).value
         self.made.append(function)
         return name
 
-    def _divide(self, op: Any) -> None:
+    def _divide(self, op: ir.Operation) -> None:
         for place, region in enumerate(op.regions):
             for block in region:
                 for inner in operations(block):
                     if inner.name == "func.call" and not self.is_small(text(inner, "callee")):
                         name = self.copy(text(inner, "callee"))
                         inner.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-                    elif kind(inner) in ("while", "case", "if"):
+                    elif kind_of(inner) in ("while", "case", "if"):
                         self._divide(inner)
-                if kind(op) != "while" or place == 1:  # the first region is the condition
+                if kind_of(op) != "while" or place == 1:  # the first region is the condition
                     Division(block, self).apply()
 
     def is_small(self, name: str) -> bool:
@@ -227,12 +220,12 @@ class _Copies:
             self.small[name] = 0 < len(ops) <= _FEW and all(map(self._is_light, ops[:-1]))
         return self.small[name]
 
-    def _is_light(self, op: Any) -> bool:
+    def _is_light(self, op: ir.Operation) -> bool:
         called = op.name == "func.call" and ATTRIBUTE not in op.attributes
-        light = self.is_small(text(op, "callee")) if called else kind(op) in ELEMENTWISE
+        light = self.is_small(text(op, "callee")) if called else kind_of(op) in ELEMENTWISE
         return light and len(op.results) == 1
 
-    def is_in_a_part(self, op: Any) -> bool:
+    def is_in_a_part(self, op: ir.Operation) -> bool:
         return self._is_light(op) and (
-            kind(op) == "constant" or _SHORT <= size(op.results[0]) < _LONG
+            kind_of(op) == "constant" or _SHORT <= size_of(op.results[0].type) < _LONG
         )

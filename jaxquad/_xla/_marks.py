@@ -1,12 +1,13 @@
 from collections.abc import Callable, Iterator
-from typing import Any
 
+import jax
 from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
-from ._kernel_limits import hold_in_kernel, why_not
-from ._kernel_parts import ATTRIBUTE, in_parts, text
+from ._kernel_limits import ATTRIBUTE, hold_in_kernel, text, why_not
+from ._kernel_parts import in_parts
+from ._switch import note, warn_once
 
 
 _TAGS = {"inlineable": "false", "xla_cpu_small_call": "true"}
@@ -20,7 +21,7 @@ def _identity(name: str) -> Primitive:
     return mark
 
 
-def _transposed(mark: Primitive) -> Callable[..., tuple[Any]]:
+def _transposed(mark: Primitive) -> Callable[..., tuple]:
     return lambda ct, _: (ct if isinstance(ct, ad.Zero) else mark.bind(ct),)
 
 
@@ -30,23 +31,24 @@ ad.deflinear2(enter, _transposed(leave))
 ad.deflinear2(leave, _transposed(enter))
 
 
-def _tag(ctx: Any, x: Any) -> list[Any]:
+def _tag(ctx: mlir.LoweringRuleContext, x: ir.Value) -> list[ir.Value]:
     """Turn the call that `x` comes from, by now differentiated and batched, into a kernel."""
+    whole = ctx.module_context
     try:
-        call, whole = _owner(x), ctx.module_context
+        call = _owner(x)
         if _is_plain_call(call) and _is_for_one_cpu(whole):
             for found in (call, *_forward_passes(call)):
                 _make_kernel(found, whole)
-    except Exception:  # The compiler's interfaces have changed: do without the kernel.
-        pass
+    except Exception as error:  # The compiler's interfaces have changed: do without the kernel.
+        warn_once(f"JAX {jax.__version__} cannot mark a kernel ({type(error).__name__}: {error})")
     return [x]
 
 
-def _owner(x: Any) -> Any:
+def _owner(x: ir.Value) -> ir.Operation:
     return getattr(x.owner, "operation", x.owner)
 
 
-def _forward_passes(call: Any) -> Iterator[Any]:
+def _forward_passes(call: ir.Operation) -> Iterator[ir.Operation]:
     """The calls whose results a call takes, without their marks where nothing else was asked of."""
     for operand in call.operands:
         owner = _owner(operand)
@@ -54,20 +56,26 @@ def _forward_passes(call: Any) -> Iterator[Any]:
             yield owner
 
 
-def _make_kernel(call: Any, whole: Any) -> None:
-    if _is_plain_call(call) and why_not(call, whole.module) is None:
-        name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
-        call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-        attributes = ir.DictAttr.get(_tags())
-        hold_in_kernel(call, whole.module, whole.symbol_table, attributes)
+def _make_kernel(call: ir.Operation, whole: mlir.ModuleContext) -> None:
+    if not _is_plain_call(call):
+        return
+    reason = why_not(call, whole.module)
+    if reason is not None:
+        note(f"a kernel does not hold {reason}")
+        return
+    name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
+    call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
+    tags = {name: ir.StringAttr.get(value) for name, value in _TAGS.items()}
+    hold_in_kernel(call, whole.module, whole.symbol_table, ir.DictAttr.get(tags))
 
 
-def _is_plain_call(op: Any) -> bool:
-    name = text(op, "callee") if getattr(op, "name", "") == "func.call" else ""
-    return name.startswith("jaxquad_kernel") and ATTRIBUTE not in op.attributes
+def _is_plain_call(op: ir.Operation | ir.Block) -> bool:
+    if not isinstance(op, ir.Operation) or op.name != "func.call" or ATTRIBUTE in op.attributes:
+        return False
+    return text(op, "callee").startswith("jaxquad_kernel")
 
 
-def _is_for_one_cpu(whole: Any) -> bool:
+def _is_for_one_cpu(whole: mlir.ModuleContext) -> bool:
     """Whether XLA has nothing to split among devices: a kernel cannot be split."""
     mesh = getattr(whole.axis_context, "mesh", None)
     if mesh is None:
@@ -75,10 +83,6 @@ def _is_for_one_cpu(whole: Any) -> bool:
     else:
         alone = whole.axis_context.manual_axes == frozenset(mesh.axis_names)
     return alone and tuple(whole.platforms) == ("cpu",)
-
-
-def _tags() -> dict[str, ir.Attribute]:
-    return {name: ir.StringAttr.get(value) for name, value in _TAGS.items()}
 
 
 mlir.register_lowering(enter, lambda ctx, x: [x])

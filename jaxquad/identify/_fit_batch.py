@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from jaxquad._core import CONVERGED, decrement, minimise, Normal, require_x64, TOLERANCE
-from jaxquad._xla import once
+from jaxquad._xla import evaluate_once
 from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
@@ -123,7 +123,7 @@ def _normal(model, parameters, z, omega, inverse, weights) -> Normal:
         return _point(model, parameters, z, omega, inverse, weights)
 
     members = jax.vmap(point, in_axes=(0, None, -1, -1))
-    everywhere = once(jax.vmap(members, in_axes=(None, 0, 0, 0)))
+    everywhere = evaluate_once(jax.vmap(members, in_axes=(None, 0, 0, 0)))
     columns = everywhere(list(z), omega, inverse, weights)
     stacked = jnp.stack([jnp.moveaxis(column, 1, -1) for column in columns])
     return _products(stacked.reshape(len(columns), -1, z.shape[1]))

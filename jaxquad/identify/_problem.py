@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
-from jaxquad._xla import apart
+from jaxquad._xla import no_fuse
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
@@ -123,7 +123,7 @@ def _logarithm_jvp(primals, tangents):
     # One reciprocal for all tangents: complex divisions would cost most of a fit.
     power = primals[0] * primals[0] + primals[1] * primals[1]
     c, s = (part / power for part in primals)
-    return _logarithm(*primals), apart(_turned, *tangents, c, s)
+    return _logarithm(*primals), no_fuse(_turned, *tangents, c, s)
 
 
 def _turned(real: Part, imag: Part, c: Part, s: Part) -> tuple[Part, Part]:

@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from jaxquad._core import Normal, normal_equations, RUNNING, STALLED, TOLERANCE
-from jaxquad._xla import apart
+from jaxquad._xla import no_fuse
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
 from ._problem import (
@@ -55,7 +55,7 @@ def _products(
     weights: Float[Array, "outputs inputs frequencies"],
     scale: Float[Array, " parameters"],
 ) -> Normal:
-    r, rows = (misfit * weights).reshape(-1), apart(_weighted, slopes, weights, scale)
+    r, rows = (misfit * weights).reshape(-1), no_fuse(_weighted, slopes, weights, scale)
     rows = rows.reshape(len(scale), -1)
     return Normal(0.5 * jnp.sum(r**2), rows @ r, rows @ rows.T)
 
@@ -99,11 +99,12 @@ class Stop(NamedTuple):
 
     z: Float[Array, " parameters"]
     converged: Bool[Array, ""]
-    reason: Any
+    reason: PyTree
     steps: Int[Array, ""]
 
 
-Residual = Callable[[Float[Array, " parameters"], Any], Float[Array, " residuals"]]
+Evaluate = Callable[[Float[Array, " parameters"], PyTree], Normal]
+Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residuals"]]
 
 _MESSAGES = {
     RUNNING: "The maximum number of steps was reached",
@@ -114,7 +115,7 @@ _MESSAGES = {
 def solve(
     problem: Problem,
     z0: Float[Array, " parameters"],
-    solver: Any,
+    solver: eqx.Module | None,
     max_steps: int,
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
@@ -131,7 +132,9 @@ def solution_at(stop: Stop, facts: tuple, derivatives: Sensitivity) -> Solution:
 
 
 @eqx.filter_jit
-def descend(problem: Problem, z0: Float[Array, " parameters"], solver: Any, max_steps: int) -> Stop:
+def descend(
+    problem: Problem, z0: Float[Array, " parameters"], solver: eqx.Module | None, max_steps: int
+) -> Stop:
     """The minimisation alone, in one compiled call."""
     return least_squares(
         residuals, z0, problem, solver=solver, max_steps=max_steps, normal=problem_normal
@@ -153,12 +156,12 @@ _describe = eqx.filter_jit(describe)
 def least_squares(
     residual: Residual,
     z0: Float[Array, " parameters"],
-    args: Any,
+    args: PyTree,
     *,
-    solver: Any = None,
+    solver: eqx.Module | None = None,
     max_steps: int,
     tolerance: float = TOLERANCE,
-    normal: Callable[[Any, Any], Normal] | None = None,
+    normal: Evaluate | None = None,
 ) -> Stop:
     """The solver set-up of every fit; `None` is `DampedGaussNewton`, on the normal equations.
 
@@ -190,7 +193,7 @@ def _walled(residual: Residual) -> Residual:
     return walled
 
 
-def _reason(reason: Any) -> str:
+def _reason(reason: PyTree) -> str:
     """The first sentence of why a solver stopped."""
     if isinstance(reason, jax.Array):
         return _MESSAGES[int(reason)]

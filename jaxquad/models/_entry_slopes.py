@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._xla import apart
+from jaxquad._xla import no_fuse
 
 from ._response import Matrices, output_of, solved, Split
 
@@ -43,8 +43,8 @@ def logarithmic_slopes(
     seen, undelayed = (output_of(matrices, omega, x) for x in (found.resolvent, found.states))
     picked = _picked(entries, seen, found.states, omega)
     delays = picked.late[..., None] * omega[None, None, None]
-    over = apart(_reciprocal, undelayed)
-    return found.value, apart(_multiplied, picked.left, picked.right, over, delays)
+    over = no_fuse(_reciprocal, undelayed)
+    return found.value, no_fuse(_multiplied, picked.left, picked.right, over, delays)
 
 
 def _reciprocal(response: Split) -> Split:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxquad._xla import apart
+from jaxquad._xla import no_fuse
 
 
 class Split(NamedTuple):
@@ -206,7 +206,7 @@ def _response_jvp(primals, tangents):
         change.append(_applied(matrices.H1, turned))
     pushed = _sum(push)
     if pushed is not None:
-        change.append(apart(product, output_of(matrices, omega, found.resolvent), pushed))
+        change.append(no_fuse(product, output_of(matrices, omega, found.resolvent), pushed))
     changed = _sum(change)
     moved = [None if changed is None else _turned(changed, matrices.late, omega)]
     for late, frequency in ((d.late, omega), (matrices.late, d_omega)):
@@ -220,7 +220,7 @@ def _turned(parts: Split, late: Array | None, omega: Float[Array, " frequencies"
     if late is None:
         return parts
     angle = late[:, :, None] * omega[None, None]
-    (real, imag), c, s = parts, apart(jnp.cos, angle), apart(jnp.sin, angle)
+    (real, imag), c, s = parts, no_fuse(jnp.cos, angle), no_fuse(jnp.sin, angle)
     return Split(real * c + imag * s, imag * c - real * s)
 
 

@@ -12,7 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from ._no_fuse import apart
+
+def no_fuse(function: Callable[..., Any], *args: Any) -> Any:
+    """A call that the CPU's compiler does not fuse: what it fuses, it computes for each user anew.
+
+    Without its private mark, a plain call.
+    """
+    try:
+        from jax.experimental.xla_metadata import set_xla_metadata
+    except ImportError:
+        return function(*args)
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(function)(*args)
 
 
 _COSTLY = {"exp", "log", "sin", "cos", "tan", "div", "atan2", "sqrt", "rsqrt", "pow", "tanh"}
@@ -20,7 +31,7 @@ _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
 _SMALL = 1024  # elements, below which a call costs more than recomputing
 
 
-def once(function: Callable[..., Any]) -> Callable[..., Any]:
+def evaluate_once(function: Callable[..., Any]) -> Callable[..., Any]:
     """The same function, in which expensive operations on large arrays are not recomputed.
 
     Complex quotients become products with one reciprocal, which loses them where a denominator's
@@ -85,7 +96,7 @@ def _single(equation: Any, args: list[Any], known: dict) -> Any:
     if name == "integer_pow" and params["y"] < 0 and jnp.iscomplexobj(args[0]):
         return jax.lax.integer_pow(_reciprocal_of(args[0], known), -params["y"])
     if name in _COSTLY:
-        return apart(lambda *xs: _bind(equation, xs)[0], *args)
+        return no_fuse(lambda *xs: _bind(equation, xs)[0], *args)
     return _bind(equation, args)[0]
 
 
@@ -97,7 +108,7 @@ def _bind(equation: Any, args: Sequence[Any]) -> list[Any]:
 
 
 def _reciprocal_of(value: Any, known: dict) -> Any:
-    return _remembered(("reciprocal",), [value], known, lambda: [apart(_reciprocal, value)])[0]
+    return _remembered(("reciprocal",), [value], known, lambda: [no_fuse(_reciprocal, value)])[0]
 
 
 def _reciprocal(value: Any) -> Any:
