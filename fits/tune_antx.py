@@ -42,13 +42,10 @@ LIMIT = 1.0  # of M, which is normalised
 EVENTS = (0.0, 1.5, 3.0, 4.5)  # s
 # An inertia of 1 makes torques accelerations in rad/s^2: the flight tells K = KT / J alone.
 ASSUMED: dict[str, Any] = {
-    "believed": 1.0,
     "inertia": jq.ensembles.LogUniform(*SPAN),
     "told": jq.ensembles.Normal(0.1),
     "torque_gain": jq.ensembles.Normal(0.05),
     "noise": np.radians(0.01),  # theta of the flight has 0.007 deg of white noise above 20 Hz
-    "drive": jq.simulation.Saturation(LIMIT),
-    "dt": DT,
 }
 FREE, HALF = ("ladrc.wc", "map.values"), ("ladrc.feedback_factor",)
 PID_FREE = ("pid.kp", "pid.ki", "pid.proportional_weight", "map.values")
@@ -74,18 +71,20 @@ def own_activity(record: jq.Record) -> float:
 
 
 def case_of(fit: jq.identify.Fit, activity: float) -> Case:
-    ensemble = jq.Ensemble.from_fit(fit, recorded_dt=DT, **ASSUMED)
+    posterior = jq.ensembles.Posterior(fit, recorded_dt=DT, believed=1.0)
+    ensemble = jq.Ensemble(posterior, **ASSUMED)
     penalties = (
         jq.tuning.Penalty("activity_rate", knee=activity, weight=2.0),
         jq.tuning.Penalty("sensitivity_peak", knee=2.0, weight=3.0),
         jq.tuning.Penalty("abscissa", knee=-0.5, weight=5.0),
     )
-    ladrc, pid = starts(ensemble.plant, SPAN, limit=LIMIT, dt=DT, wo=WO)
-    objective = jq.Objective(penalties=penalties, events=EVENTS, load_start=EVENTS[1])
-    others = equivalent(ensemble)
-    return Case(
-        ensemble, flight(), objective, LIMITS, ladrc, pid, FREE, HALF, PID_FREE, others, 0.1
+    ladrc, pid = starts(posterior.plant, SPAN, limit=LIMIT, dt=DT, wo=WO)
+    loop = jq.Loop(
+        posterior.plant, ladrc, drive=jq.simulation.Saturation(LIMIT), delay=posterior.delay, dt=DT
     )
+    objective = jq.Objective(penalties=penalties, events=EVENTS, load_start=EVENTS[1])
+    others = equivalent(loop)
+    return Case(loop, ensemble, flight(), objective, LIMITS, pid, FREE, HALF, PID_FREE, others, 0.1)
 
 
 def crossovers(found: Study, plant: Any, fit: jq.identify.Fit) -> tuple[float, float]:
@@ -106,7 +105,7 @@ def described(
 ) -> str:
     gain, error = fit.values[0], fit.standard_errors[0]
     later = late(fit)
-    crossover, peak = crossovers(found, case.ensemble.plant, fit)
+    crossover, peak = crossovers(found, case.loop.plant, fit)
     low, high = BAND
     inside = "inside" if low < crossover and peak < high else "NOT inside"
     return f"""\
@@ -153,7 +152,7 @@ def main(out: Path, seed: int, size: Size, data: Path) -> None:
             "fit_percent_on_the_other_flight": check.fit_percent,
         },
         "assumed": {"inertia": SPAN, "told": 0.1, "torque_gain": 0.05, "activity": activity},
-        "crossover_and_peak": crossovers(found, case.ensemble.plant, fit),
+        "crossover_and_peak": crossovers(found, case.loop.plant, fit),
     }
     files = write(out, found, front, name="antx_pitch", extra=extra)
     print(f"\n{out}: {', '.join(files)}; {time.perf_counter() - began:.1f} s")

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad.tuning import Certificate, Distance, Judged, Pareto
+from jaxquad.tuning import Certificate, DesignResult, Distance, Pareto
 
 
 MEMBERS = 12
@@ -23,7 +23,7 @@ def judged(itae: Any = 1.0, peak=2.0, activity=10.0, unstable: Any = ()):
         "sensitivity_peak": np.where(which, np.nan, wide(peak)),
         "gain_margin": np.where(which, np.nan, wide(2.0)),
     }
-    return Judged(by_axis, which, np.zeros(MEMBERS, bool))
+    return DesignResult(by_axis, which, np.zeros(MEMBERS, bool))
 
 
 def certificate(designs, distances=()):

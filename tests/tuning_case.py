@@ -1,4 +1,4 @@
-"""The case of EQUATIONS.md, section 3: its ensemble, its scenario, its starts and designs.
+"""The case of docs/tuning.md: its ensemble, its scenario, its starts and designs.
 
 The section does not print when things happen. The clock of ITAE starts again at every event, and
 activity is per second: with that, and these times, the printed designs' ITAE come out within 7 % in
@@ -6,6 +6,7 @@ the mean and 15 % in the members' 95 % quantile; their worst, which rests on one
 drawn, within 20 % (certainty equivalence, 10/30, is 19 % off).
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,9 +19,14 @@ from jaxquad.control import (
     ScheduledPID,
 )
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Uniform
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Pulse, Saturation, scenario, Sine, Step
 from jaxquad.tuning import Objective
+from jaxquad.tuning._cost import evaluate_cost, stack_copies, Subproblem
+from jaxquad.tuning._parameters import select_coordinates
+from jaxquad.tuning._phases import initial_multipliers
+from jaxquad.tuning._problem import make_problem, TimeSpan
 
 
 KT, J0, LIMIT, DT = 0.0468, 0.0552, 10.0, 0.002  # N m/V, kg m^2, V, s
@@ -39,7 +45,13 @@ def ensemble(**others):
         "coulomb": 0.002,
         "noise": np.radians(0.02),
     }
-    return Ensemble(DecoupledAxes([KT], [J0]), drive=Saturation(LIMIT), **(laws | others))
+    return Ensemble(**(laws | others))
+
+
+def loop(controller=None):
+    """Of the nominal plant; members are drawn around any controller."""
+    start = ladrc(3.0, 30.0) if controller is None else controller
+    return Loop(DecoupledAxes([KT], [J0]), start, drive=Saturation(LIMIT), dt=DT)
 
 
 def flight(duration=10.0):
@@ -106,3 +118,25 @@ PRINTED = {
     "tuned CE": (equivalent(3.97, 49.6, 1.82), (9.0, 16.0, 20.5), 0.0),
     "tuned map": (printed_map(), (7.9, 12.5, 13.8), 0.0),
 }
+
+
+def evaluator(controller, free=None, *, members=64, limits=(), fly=True, multiplier=0.0):
+    """A function of z that gives the cost and its gradient, and the z of the controller.
+
+    Over flights, or the linear loops alone. `multiplier` is that of every limit and member.
+    """
+    drawn = ensemble().draw(loop(), members, jax.random.key(0))
+    problem = make_problem(controller, drawn, flight(), span=TimeSpan(EVENTS))
+    coordinates, on = select_coordinates(controller, free), jnp.array([True])
+    given = initial_multipliers(problem, limits, 1)
+    given = given._replace(values=tuple(multiplier + x for x in given.values))
+    subproblem = Subproblem(
+        stack_copies(objective(), 1), stack_copies(tuple(limits), 1), given, jnp.array([fly]),
+        jnp.full(1, -0.75),
+    )  # fmt: skip
+
+    def cost(z):
+        found = evaluate_cost(jnp.asarray(z)[None], on, coordinates, problem, subproblem)
+        return float(found.value[0]), np.asarray(found.gradient[0])
+
+    return cost, coordinates.start

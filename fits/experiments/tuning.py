@@ -33,17 +33,17 @@ QUICK = Size(members=16, points=0, others=False)
 class Case(NamedTuple):
     """What is tuned, for whom, and by what it is judged."""
 
+    loop: jq.Loop  # around the LADRC
     ensemble: jq.Ensemble
     flight: jq.simulation.Scenario
     objective: jq.Objective
     limits: tuple[jq.Limit, ...]
-    ladrc: jq.control.ScheduledLADRC
     pid: jq.control.ScheduledPID
     free: Sequence[str]  # of the LADRC with full gains
     half: Sequence[str]  # of its half-gain factors
     pid_free: Sequence[str]
     peers: Mapping[str, Any]  # that are not tuned
-    reserve: float = 0.03  # by which limits are kept: more where laws have long tails
+    reserve: float = 0.03  # by which limits are tightened: more for distributions with long tails
 
 
 class Study(NamedTuple):
@@ -81,9 +81,9 @@ def starts(
     return jq.control.ScheduledLADRC(ladrc, map()), jq.control.ScheduledPID(pid, map(factor=0.65))
 
 
-def equivalent(ensemble: jq.Ensemble) -> dict[str, Any]:
-    """Certainty equivalence with the gains of the paper, on the nominal plant of an ensemble."""
-    all_of = peers(ensemble.plant, dt=ensemble.dt)
+def equivalent(loop: jq.Loop) -> dict[str, Any]:
+    """Certainty equivalence with the gains of the paper, on the nominal plant."""
+    all_of = peers(loop.plant, dt=loop.dt)
     return {name: design for name, design in all_of.items() if name.startswith("CE")}
 
 
@@ -93,12 +93,15 @@ def study(case: Case, size: Size, key: jax.Array) -> Study:
         jq.tune, ensemble=case.ensemble, scenario=case.flight, objective=case.objective,
         limits=case.limits, reserve=case.reserve, members=size.members, key=key,
     )  # fmt: skip
-    pid = tuned(case.pid, free=case.pid_free, fresh=None) if size.others else None
-    full = tuned(case.ladrc, free=case.free, fresh=None) if size.others else None
+    loop = case.loop
+    around_pid = loop.with_controller(case.pid)
+    pid = tuned(around_pid, free=case.pid_free, fresh=None) if size.others else None
+    full = tuned(loop, free=case.free, fresh=None) if size.others else None
     named = {PID_NAME: pid, FULL_NAME: full}
     others = {n: found.controller for n, found in named.items() if found} | dict(case.peers)
     free = [*case.free, *case.half]
-    ladrc = tuned(halved(case.ladrc, case.half), free=free, fresh=size.fresh, peers=others)
+    start = loop.with_controller(halved(loop.controller, case.half))
+    ladrc = tuned(start, free=free, fresh=size.fresh, peers=others)
     return Study(ladrc, pid, full, others)
 
 
@@ -110,7 +113,7 @@ def halved(start: jq.control.ScheduledLADRC, factors: Sequence[str]) -> jq.contr
 
 def _beside(found: Study) -> str:
     """The tuned PID's numbers, and what the LADRC gains or loses against it."""
-    pid, rows = found.pid, found.certificate.rows
+    pid, rows = found.pid, found.certificate.summaries
     assert pid is not None
     own, theirs = (rows[name].statistics for name in (found.certificate.name, PID_NAME))
     values = ", ".join(f"{name} {value:.4g}" for name, value in pid.values.items())
@@ -133,7 +136,8 @@ def front_of(
     if not size.points:
         return None
     return jq.tuning.pareto(
-        found.ladrc.controller, case.ensemble, case.flight, over=over, points=size.points,
+        case.loop.with_controller(found.ladrc.controller), case.ensemble, case.flight, over=over,
+        points=size.points,
         free=[*case.free, *case.half], objective=case.objective, peers=found.peers,
         members=size.members, fresh=size.fresh, key=key,
     )  # fmt: skip
@@ -173,7 +177,7 @@ def _title(front: jq.tuning.Pareto, certificate: jq.tuning.Certificate) -> str:
         return ""
     peaks = {
         name: row.statistics["sensitivity_peak"].worst
-        for name, row in certificate.rows.items()
+        for name, row in certificate.summaries.items()
         if not row.unstable
     }
     beyond = [f"{name} has {peak:.1f}" for name, peak in peaks.items() if peak > min(bounds)]

@@ -1,7 +1,7 @@
 from ._distributions import (
     Choice as Choice,
+    Distribution as Distribution,
     Fixed as Fixed,
-    Law as Law,
     LogNormal as LogNormal,
     LogUniform as LogUniform,
     Normal as Normal,
@@ -9,3 +9,4 @@ from ._distributions import (
 )
 from ._ensemble import Ensemble as Ensemble
 from ._members import Members as Members, Payload as Payload
+from ._posterior import make_plant as make_plant, Posterior as Posterior

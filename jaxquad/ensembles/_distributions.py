@@ -1,8 +1,7 @@
-"""What is known of a quantity before it is drawn."""
+"""Probability distributions for uncertain parameters."""
 
 import abc
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -12,12 +11,12 @@ from jaxtyping import ArrayLike, Float
 Numbers = Float[np.ndarray, "..."]  # [] or [axes]
 
 
-def as_numbers(given: ArrayLike | Sequence[Any]) -> Numbers:
+def as_numbers(given: ArrayLike | Sequence[float]) -> Numbers:
     """In double precision, outside JAX: members are drawn before anything is compiled."""
     return np.asarray(given, dtype=float)
 
 
-def as_numbers_or_none(given: ArrayLike | Sequence[Any] | None) -> Numbers | None:
+def as_numbers_or_none(given: ArrayLike | Sequence[float] | None) -> Numbers | None:
     return None if given is None else as_numbers(given)
 
 
@@ -35,7 +34,7 @@ def check_finite(**values: Numbers) -> None:
     """Raise ValueError for the first of the named values that is not finite."""
     for name, value in values.items():
         if not np.all(np.isfinite(value)):
-            raise ValueError(f"{name} is {number(value)}: a law needs finite numbers")
+            raise ValueError(f"{name} is {number(value)}: a distribution needs finite numbers")
 
 
 def check_above_zero(remedy: str, **values: Numbers) -> None:
@@ -51,7 +50,8 @@ def check_axes(**values: Numbers) -> None:
     if any(len(shape) > 1 for shape in shapes.values()) or len(set(shapes.values()) - {()}) > 1:
         text = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
         raise ValueError(
-            f"a law's numbers have the shapes {text}: give one for all axes, or one for each axis"
+            f"the numbers of a distribution have the shapes {text}: give one for all axes, or "
+            "one for each axis"
         )
 
 
@@ -61,13 +61,13 @@ def check_ends(low: Numbers, high: Numbers) -> None:
     check_finite(low=low, high=high)
     if not np.all(low < high):
         raise ValueError(
-            f"a law from {number(low)} to {number(high)} is empty: give low < high, and a plain "
-            "number for what does not vary"
+            f"a distribution from {number(low)} to {number(high)} is empty: give low < high, or a "
+            "plain number for a quantity that does not vary"
         )
 
 
-def from_end_to_end(count: int) -> Float[np.ndarray, " count"]:
-    """Shares of the probability for a grid that holds both ends of a range."""
+def _from_end_to_end(count: int) -> Float[np.ndarray, " count"]:
+    """Probabilities for a grid that holds both ends of a range."""
     return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
 
 
@@ -75,16 +75,15 @@ Shares = Float[np.ndarray, "rows members"]  # of the probability, 0 to 1
 Values = Float[np.ndarray, "axes members"]
 
 
-class Law(eqx.Module):
-    """What is known of a quantity before it is drawn; numbers are one for all axes, or `[axes]`.
+class Distribution(eqx.Module):
+    """A probability distribution of one quantity; its numbers are scalars, or `[axes]`.
 
-    All samplings share `quantile`, which makes values of shares of the probability, so that a law
-    never gives a value outside its `support`.
+    All samplings go through `quantile`, so no value outside the `support` is ever drawn.
     """
 
     @abc.abstractmethod
     def quantile(self, u: Shares) -> Values:
-        """The values below which lies the share `u` of the probability."""
+        """The values that are exceeded with the probability 1 - `u`."""
 
     @property
     @abc.abstractmethod
@@ -96,12 +95,17 @@ class Law(eqx.Module):
         """Whether members differ."""
         return True
 
-    def levels(self, count: int) -> Float[np.ndarray, " count"]:
-        """Shares of the probability that a grid of `count` values stands on."""
+    @property
+    def relative(self) -> bool:
+        """Whether its numbers are in units of the nominal value."""
+        return False
+
+    def grid_levels(self, count: int) -> Float[np.ndarray, " count"]:
+        """The probabilities at which a grid of `count` levels has its values."""
         return (np.arange(count) + 0.5) / count
 
-    def about(self, value: Numbers | None, name: str) -> "Law":
-        """The law where the quantity's own value is known: laws relative to it become absolute."""
+    def about(self, nominal: Numbers | None, name: str) -> "Distribution":
+        """The distribution in SI units, given the `nominal` value of the quantity `name`."""
         return self
 
     @property
@@ -110,8 +114,13 @@ class Law(eqx.Module):
         """In words, for a table."""
 
 
-class Fixed(Law):
-    """One value for all members."""
+class Fixed(Distribution):
+    """One value for all members.
+
+    **Arguments:**
+
+    - `value`: a number, or one for each axis.
+    """
 
     value: Numbers = eqx.field(converter=as_numbers)
 
@@ -135,8 +144,17 @@ class Fixed(Law):
         return number(self.value)
 
 
-class Choice(Law):
-    """One of several `values`, each as likely as the others."""
+class Choice(Distribution):
+    """One of several values, all equally likely.
+
+    **Arguments:**
+
+    - `values`: two or more, in one row.
+
+    **Raises:**
+
+    - `ValueError`: there are fewer, or one is not finite.
+    """
 
     values: Float[np.ndarray, "..."] = eqx.field(converter=as_numbers)  # one row
 
@@ -158,22 +176,33 @@ class Choice(Law):
         return "one of " + ", ".join(f"{x:.4g}" for x in self.values)
 
 
-def as_law(given: Law | ArrayLike | Sequence[Any]) -> Law:
-    """A law as it is; a number, or one for each axis, is known exactly."""
-    return given if isinstance(given, Law) else Fixed(given)
+def as_distribution(given: Distribution | ArrayLike | Sequence[float]) -> Distribution:
+    """A distribution as it is; a number, or one for each axis, as `Fixed`."""
+    return given if isinstance(given, Distribution) else Fixed(given)
 
 
-def law_or_none(given: Law | ArrayLike | Sequence[Any] | None) -> Law | None:
-    return None if given is None else as_law(given)
+def distribution_or_none(
+    given: Distribution | ArrayLike | Sequence[float] | None,
+) -> Distribution | None:
+    return None if given is None else as_distribution(given)
 
 
-REACH = 4.0  # standard deviations at which normal laws end
+REACH = 4.0  # standard deviations at which normal distributions end
 _TAIL = 3.167124183311998e-05  # of the normal distribution beyond the reach
-_DEVIATION = "it is a standard deviation; for what does not vary give a plain number"
+_DEVIATION = "it is a standard deviation; for a quantity that does not vary give a plain number"
 
 
-class Uniform(Law):
-    """Every value from `low` to `high` alike. Raises ValueError unless low < high."""
+class Uniform(Distribution):
+    """Uniform between two values.
+
+    **Arguments:**
+
+    - `low`, `high`: the ends, scalars or one for each axis.
+
+    **Raises:**
+
+    - `ValueError`: unless low < high, both finite.
+    """
 
     low: Numbers = eqx.field(converter=as_numbers)
     high: Numbers = eqx.field(converter=as_numbers)
@@ -189,16 +218,25 @@ class Uniform(Law):
     def support(self) -> tuple[Numbers, Numbers]:
         return self.low, self.high
 
-    def levels(self, count: int) -> Float[np.ndarray, " count"]:
-        return from_end_to_end(count)
+    def grid_levels(self, count: int) -> Float[np.ndarray, " count"]:
+        return _from_end_to_end(count)
 
     @property
     def text(self) -> str:
         return f"uniform {number(self.low)} .. {number(self.high)}"
 
 
-class LogUniform(Law):
-    """Every ratio alike, from `low` to `high`. Raises ValueError unless 0 < low < high."""
+class LogUniform(Distribution):
+    """Uniform in the logarithm, for quantities that are known up to a factor.
+
+    **Arguments:**
+
+    - `low`, `high`: the ends, scalars or one for each axis.
+
+    **Raises:**
+
+    - `ValueError`: unless 0 < low < high, both finite.
+    """
 
     low: Numbers = eqx.field(converter=as_numbers)
     high: Numbers = eqx.field(converter=as_numbers)
@@ -217,19 +255,26 @@ class LogUniform(Law):
     def support(self) -> tuple[Numbers, Numbers]:
         return self.low, self.high
 
-    def levels(self, count: int) -> Float[np.ndarray, " count"]:
-        return from_end_to_end(count)
+    def grid_levels(self, count: int) -> Float[np.ndarray, " count"]:
+        return _from_end_to_end(count)
 
     @property
     def text(self) -> str:
         return f"log-uniform {number(self.low)} .. {number(self.high)}"
 
 
-class Normal(Law):
-    """Normal with a standard `deviation`, cut off at 4 of them.
+class Normal(Distribution):
+    """Normal, truncated at 4 standard deviations.
 
-    Without a `mean`, the deviation is relative to the quantity's own value: `Normal(0.05)` is 5 %
-    of it. Raises ValueError for a deviation that is not above 0.
+    **Arguments:**
+
+    - `deviation`: the standard deviation. Without a `mean` it is relative to the nominal value:
+        `Normal(0.05)` is 5 % of it.
+    - `mean`: in the unit of the quantity; by default the nominal value.
+
+    **Raises:**
+
+    - `ValueError`: the deviation is not above 0.
     """
 
     deviation: Numbers = eqx.field(converter=as_numbers)
@@ -245,33 +290,45 @@ class Normal(Law):
         return np.asarray(1.0) if self.mean is None else self.mean
 
     def quantile(self, u: Shares) -> Values:
-        return row(self._mean) + row(self.deviation) * scores(u)
+        return row(self._mean) + row(self.deviation) * normal_scores(u)
 
     @property
     def support(self) -> tuple[Numbers, Numbers]:
         reach = REACH * self.deviation
         return np.asarray(self._mean - reach), np.asarray(self._mean + reach)
 
-    def about(self, value: Numbers | None, name: str) -> Law:
+    @property
+    def relative(self) -> bool:
+        return self.mean is None
+
+    def about(self, nominal: Numbers | None, name: str) -> Distribution:
         if self.mean is not None:
             return self
-        if value is None:
+        if nominal is None:
             raise ValueError(
-                f"{name} is Normal({number(self.deviation)}), relative to a value that is not known"
-                " here: say the mean, jq.ensembles.Normal(deviation, mean=...), both in its unit"
+                f"{name} is Normal({number(self.deviation)}), relative to a nominal value that the "
+                "loop does not have: give the mean, jq.ensembles.Normal(deviation, mean=...)"
             )
-        return Normal(self.deviation * np.abs(value), value)
+        return Normal(self.deviation * np.abs(nominal), nominal)
 
     @property
     def text(self) -> str:
         return f"normal {number(self._mean)} +- {number(self.deviation)}"
 
 
-class LogNormal(Law):
-    """Values around `median` whose logarithm is normal with `deviation`, cut off at 4 of them.
+class LogNormal(Distribution):
+    """Log-normal, truncated at 4 standard deviations of the logarithm.
 
-    For spreads too wide for `jq.ensembles.Normal`, whose values would reach 0. Raises ValueError for a
-    deviation or median that is not above 0.
+    For spreads too wide for `jq.ensembles.Normal`, whose values would reach 0.
+
+    **Arguments:**
+
+    - `deviation`: the standard deviation of the natural logarithm.
+    - `median`: in the unit of the quantity.
+
+    **Raises:**
+
+    - `ValueError`: the deviation or the median is not above 0.
     """
 
     deviation: Numbers = eqx.field(converter=as_numbers)
@@ -283,7 +340,7 @@ class LogNormal(Law):
         check_above_zero("logarithms need it", median=self.median)
 
     def quantile(self, u: Shares) -> Values:
-        return row(self.median) * np.exp(row(self.deviation) * scores(u))
+        return row(self.median) * np.exp(row(self.deviation) * normal_scores(u))
 
     @property
     def support(self) -> tuple[Numbers, Numbers]:
@@ -295,8 +352,8 @@ class LogNormal(Law):
         return f"log-normal {number(self.median)} */ exp({number(self.deviation)})"
 
 
-def scores(u: Shares) -> Shares:
-    """Standard normal values of shares of the probability, within 4 on both sides."""
+def normal_scores(u: Shares) -> Shares:
+    """Standard normal values at the probabilities `u`, between -4 and 4."""
     from scipy.special import ndtri
 
     return ndtri(_TAIL + (1 - 2 * _TAIL) * u)

@@ -1,7 +1,7 @@
-"""From an ensemble's laws to its members."""
+"""From the distributions of an ensemble to its members."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -9,36 +9,41 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from jaxquad._core import as_float, is_concrete
+from jaxquad.loops import Loop
 
-from ._distributions import Law, scores, Shares
-from ._members import Carried, Members
-from ._variation import Drawn, plant_inertia, times, varied
+from ._distributions import Distribution, normal_scores, Shares
+from ._members import MemberPayload, Members
+from ._variation import count_axes, Drawn, multiply, plant_inertia, vary_plant
+
+
+if TYPE_CHECKING:
+    from ._ensemble import Ensemble
 
 
 SAMPLINGS = ("latin", "random", "sobol", "grid")
 
 
-def generator(key: Key[Array, ""]) -> np.random.Generator:
+def make_generator(key: Key[Array, ""]) -> np.random.Generator:
     """Random numbers of a key, outside JAX: nothing is compiled, and both precisions get the same.
 
-    Raises ValueError under jit.
+    Raise ValueError under jit.
     """
     if not is_concrete(key):
         raise ValueError("members are drawn outside jit, vmap and grad: pass drawn members in")
     return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
 
 
-def member_keys(key: Key[Array, ""], members: int) -> Key[Array, " members"]:
+def make_member_keys(key: Key[Array, ""], members: int) -> Key[Array, " members"]:
     """A key for each member; more members leave the first ones' as they are."""
-    random = generator(jax.random.fold_in(key, 1))
+    random = make_generator(jax.random.fold_in(key, 1))
     words = random.integers(0, 2**32, (members, 2), dtype=np.uint32)
     # Other generators draw numbers under vmap that depend on how many members there are.
     return jax.random.wrap_key_data(jnp.asarray(words), impl="threefry2x32")
 
 
-def unit_points(sampling: str, key: Key[Array, ""], rows: int, members: int) -> Shares:
-    """Shares of the probability, one row for each number that a member draws."""
-    random = generator(key)
+def draw_unit_points(sampling: str, key: Key[Array, ""], rows: int, members: int) -> Shares:
+    """Probabilities, one row for each number that a member draws."""
+    random = make_generator(key)
     if sampling == "sobol":
         return _sobol(random, rows, members)
     inside = random.random((rows, members))
@@ -48,22 +53,22 @@ def unit_points(sampling: str, key: Key[Array, ""], rows: int, members: int) -> 
     return (cells + inside) / members
 
 
-def grid_points(laws: Sequence[Law], members: int) -> Shares:
-    """Every combination of equally many levels of each law; the last law changes fastest.
+def make_grid(given: Sequence[Distribution], members: int) -> Shares:
+    """Every combination of equally many levels of each; the last one changes fastest.
 
-    Raises ValueError where `members` is no such number.
+    Raise ValueError where `members` is no such number.
     """
-    if not laws:
+    if not given:
         return np.zeros((0, members))
-    count = round(members ** (1 / len(laws)))
-    if count ** len(laws) != members:
-        below = int(members ** (1 / len(laws)))
-        near = " or ".join(str(k ** len(laws)) for k in (below, below + 1))
+    count = round(members ** (1 / len(given)))
+    if count ** len(given) != members:
+        below = int(members ** (1 / len(given)))
+        near = " or ".join(str(k ** len(given)) for k in (below, below + 1))
         raise ValueError(
-            f"a grid over {len(laws)} quantities has as many levels of each, so {members} members "
-            f'do not fill one: draw {near}, or use sampling="latin" for any number'
+            f"a grid over {len(given)} quantities has equally many levels of each, so {members} "
+            f'members do not fill one: draw {near}, or use sampling="latin" for any number'
         )
-    levels = np.meshgrid(*(law.levels(count) for law in laws), indexing="ij")
+    levels = np.meshgrid(*(one.grid_levels(count) for one in given), indexing="ij")
     return np.stack([each.ravel() for each in levels])
 
 
@@ -80,79 +85,90 @@ def _sobol(random: np.random.Generator, rows: int, members: int) -> Shares:
 Wide = Callable[[np.ndarray], Float[np.ndarray, "axes members"]]
 
 
-def drawn_members(ensemble: Any, n: int, key: Key[Array, ""], sampling: str) -> Members:
-    """`n` members of an `Ensemble`."""
-    laws, axes = ensemble.laws, ensemble.axes
-    rows = _rows(laws, ensemble.independent, axes)
-    deviates = 0 if ensemble.fitted is None else ensemble.fitted.deviates
-    points = _points(laws, rows, deviates, n, key, sampling)
-    drawn = _values(laws, rows, points, axes)
+def draw_members(
+    ensemble: "Ensemble", loop: Loop, n: int, key: Key[Array, ""], sampling: str
+) -> Members:
+    """`n` members of an `Ensemble` around a `Loop`."""
+    given, axes = ensemble.absolute(loop), count_axes(loop.plant)
+    rows = _count_rows(given, ensemble.independent, axes)
+    deviates = 0 if ensemble.plants is None else ensemble.plants.deviates
+    points = _points(given, rows, deviates, n, key, sampling)
+    drawn = _values(given, rows, points, axes)
     wide: Wide = lambda x: np.broadcast_to(x if x.ndim > 1 else x[:, None], (axes, n))
-    plant, delay, longest = ensemble.plant, np.zeros(1), 0.0
-    if ensemble.fitted is not None:
-        plant, delay, longest = ensemble.fitted.plants(scores(points[sum(rows.values()) :]))
-    if "delay" in laws:
-        delay, longest = drawn["delay"], _latest(laws["delay"])
-    believed = times(plant_inertia(ensemble.plant), drawn["inertia"])
+    plant, delay = loop.plant, np.atleast_1d(np.asarray(loop.delay))
+    longest = loop.longest_delay or float(np.max(delay))
+    if ensemble.plants is not None:
+        scores = normal_scores(points[sum(rows.values()) :])
+        plant, delay, longest = ensemble.plants.draw(scores, loop.dt)
+    if "delay" in given:
+        delay, longest = drawn["delay"], _latest(given["delay"])
+    believed = multiply(plant_inertia(loop.plant), drawn["inertia"])
     return Members(
-        plant=varied(plant, drawn),
+        plant=vary_plant(plant, drawn),
         delay=as_float(wide(delay)[0]),
-        inertia_told=as_float(wide(times(believed, drawn["told"]))),
-        keys=member_keys(key, n),
-        noise=as_float(wide(drawn["noise"])) if "noise" in laws else None,
-        gust=as_float(wide(drawn["gust"])) if "gust" in laws else None,
-        payload=_carried(ensemble, laws, drawn, wide),
-        drive=ensemble.drive,
-        encoder=ensemble.encoder,
+        inertia_told=as_float(wide(multiply(believed, drawn["told"]))),
+        keys=make_member_keys(key, n),
+        noise=as_float(wide(drawn["noise"])) if "noise" in given else None,
+        gust=as_float(wide(drawn["gust"])) if "gust" in given else None,
+        payload=_payload(plant_inertia(loop.plant), given, drawn, wide),
+        drive=loop.drive,
+        encoder=loop.encoder,
         longest_delay=longest,
         gust_corner=ensemble.gust_corner,
-        dt=ensemble.dt,
+        dt=loop.dt,
+        substeps=loop.substeps,
+        bound=loop.bound,
     )
 
 
-def _rows(laws: dict[str, Law], independent: tuple[str, ...], axes: int) -> dict[str, int]:
-    """How many numbers each law draws for a member."""
-    return {name: axes if name in independent else 1 for name, law in laws.items() if law.varies}
+Given = dict[str, Distribution]
+
+
+def _count_rows(given: Given, independent: tuple[str, ...], axes: int) -> dict[str, int]:
+    """How many numbers each distribution draws for a member."""
+    return {name: axes if name in independent else 1 for name, one in given.items() if one.varies}
 
 
 def _points(
-    laws: dict[str, Law],
+    given: Given,
     rows: dict[str, int],
     deviates: int,
     n: int,
     key: Key[Array, ""],
     sampling: str,
 ) -> Shares:
-    """Shares of the probability: of the laws first, then of the fit."""
+    """Probabilities: of the distributions first, then of the posterior."""
     if sampling == "grid":
-        return grid_points([laws[name] for name, count in rows.items() for _ in range(count)], n)
-    return unit_points(sampling, key, sum(rows.values()) + deviates, n)
+        return make_grid([given[name] for name, count in rows.items() for _ in range(count)], n)
+    return draw_unit_points(sampling, key, sum(rows.values()) + deviates, n)
 
 
-def _values(laws: dict[str, Law], rows: dict[str, int], points: Shares, axes: int) -> Drawn:
+def _values(given: Given, rows: dict[str, int], points: Shares, axes: int) -> Drawn:
     """Of each quantity, [axes] where it is known and [axes, members] where it varies."""
     drawn, first = {}, 0
-    for name, law in laws.items():
-        if not law.varies:
-            drawn[name] = np.broadcast_to(law.support[0], (axes,))
+    for name, one in given.items():
+        if not one.varies:
+            drawn[name] = np.broadcast_to(one.support[0], (axes,))
             continue
-        value = law.quantile(points[first : first + rows[name]])
+        value = one.quantile(points[first : first + rows[name]])
         drawn[name] = np.broadcast_to(value, (axes, points.shape[1]))
         first += rows[name]
     return drawn
 
 
-def _carried(ensemble: Any, laws: dict[str, Law], drawn: Drawn, wide: Wide) -> Carried | None:
-    if ensemble.payload is None:
+def _payload(
+    nominal: Float[np.ndarray, "..."], given: Given, drawn: Drawn, wide: Wide
+) -> MemberPayload | None:
+    if "payload added" not in given:
         return None
-    inertia = times(plant_inertia(ensemble.plant), drawn["payload added"])
+    inertia = multiply(nominal, drawn["payload added"])
     at = wide(drawn["payload at"])[0]
     until = np.full(at.shape, np.inf)
-    if "payload width" in laws:
+    if "payload width" in given:
         until = at + wide(drawn["payload width"])[0]
     parts = (as_float(x) for x in (wide(inertia), at, until))
-    return Carried(*parts, latest=_latest(laws["payload at"]))
+    return MemberPayload(*parts, latest=_latest(given["payload at"]))
 
 
-def _latest(law: Law) -> float:
-    return float(np.max(law.support[1]))
+def _latest(one: Distribution) -> float:
+    return float(np.max(one.support[1]))

@@ -1,45 +1,59 @@
+"""Drawn members of an ensemble, and how they fly."""
+
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Key
+from jaxtyping import Array, ArrayLike, Float, Int, Key, PyTree
 
-from jaxquad._core import is_concrete
-from jaxquad.models import DecoupledAxes, Multirotor
-from jaxquad.simulation import Drive, Encoder, gauss_markov, Scenario
+from jaxquad._core import is_concrete, mark_members, per_member
+from jaxquad.control import schedule_for_flight
+from jaxquad.loops import Drive, Loop, Sensor
+from jaxquad.simulation import gauss_markov, Scenario
 
-from ._distributions import as_law, Law, law_or_none
+from ._distributions import as_distribution, Distribution, distribution_or_none
+from ._variation import VariablePlant
 
 
 class Payload(eqx.Module):
-    """Inertia that members pick up in flight `at` a time in s, for `width` s (None: to the end).
+    """Inertia that members pick up in flight; the controller is not told.
 
-    `added` is in units of the plant's own inertia: 1.0 doubles it, a negative number sets down what
-    was carried from the start. Each of the three is a number or a law, of which each member has its
-    own draw; times are rounded to samples. The controller is not told.
-    Raises ValueError for times before the start.
+    Each argument is a number or a distribution, from which every member has its own draw. Times
+    are rounded to samples.
+
+    **Arguments:**
+
+    - `added`: in units of the plant's nominal inertia: 1.0 doubles it, a negative number removes
+        what was carried from the start.
+    - `at`: when it is picked up, in s.
+    - `width`: how long it is carried, in s; None is to the end.
+
+    **Raises:**
+
+    - `ValueError`: in an `Ensemble`, for times before the start and for inertias of 0 or less.
     """
 
-    added: Law = eqx.field(converter=as_law)
-    at: Law = eqx.field(converter=as_law, kw_only=True)  # s
-    width: Law | None = eqx.field(converter=law_or_none, default=None, kw_only=True)  # s
+    added: Distribution = eqx.field(converter=as_distribution)
+    at: Distribution = eqx.field(converter=as_distribution, kw_only=True)  # s
+    width: Distribution | None = eqx.field(
+        converter=distribution_or_none, default=None, kw_only=True
+    )  # s
 
 
-class Carried(eqx.Module):
+class MemberPayload(eqx.Module):
     """The payload of each member."""
 
-    inertia: Float[Array, "axes members"]  # kg m^2
-    at: Float[Array, " members"]  # s
-    until: Float[Array, " members"]  # s
+    inertia: Float[Array, "axes members"] = per_member(1)  # kg m^2
+    at: Float[Array, " members"] = per_member(0)  # s
+    until: Float[Array, " members"] = per_member(0)  # s
     latest: float = eqx.field(static=True)  # s, that `at` can be
 
     def signal(self, samples: int, dt: float) -> Float[Array, "samples axes members"]:
         """The added inertia in kg m^2, sample by sample.
 
-        Raises ValueError for a payload that can come after the last sample.
+        Raise ValueError for a payload that can come after the last sample.
         """
         if self.latest >= samples * dt:
             raise ValueError(
@@ -53,51 +67,96 @@ class Carried(eqx.Module):
 
 
 class Members(eqx.Module):
-    """Drawn members of an ensemble: arrays only, the members last.
+    """Drawn members of an ensemble, on the last axis of all arrays that differ between them.
 
-    `plant` holds `[axes, members]` where they differ and `[axes]` where they do not. To fly them,
-    `jq.evaluate(members.plant, controller.told(members.inertia_told), members.flight(scenario),
-    delay=members.delay, drive=members.drive, encoder=members.encoder, dt=members.dt)`, under jit
-    with `longest_delay=members.longest_delay`.
+    `jq.evaluate(members.loop(controller), members.flight(scenario))` flies all of them.
     """
 
-    plant: DecoupledAxes | Multirotor
-    delay: Float[Array, " members"]  # s, of the command
-    inertia_told: Float[Array, "axes members"]  # kg m^2, what a scheduled controller is told
-    keys: Key[Array, " members"]  # of what happens to each in flight
-    noise: Float[Array, "axes members"] | None = None  # rad, standard deviation
-    gust: Float[Array, "axes members"] | None = None  # N m, standard deviation
-    payload: Carried | None = None
+    plant: VariablePlant
+    delay: Float[Array, " members"] = per_member(0)  # s, of the command
+    inertia_told: Float[Array, "axes members"] = per_member(1)  # kg m^2, for scheduled controllers
+    keys: Key[Array, " members"] = per_member(0)  # of noise and gusts
+    noise: Float[Array, "axes members"] | None = per_member(1, default=None)  # rad, deviation
+    gust: Float[Array, "axes members"] | None = per_member(1, default=None)  # N m, deviation
+    payload: MemberPayload | None = None
     drive: Drive | None = None
-    encoder: Encoder | None = None
+    encoder: Sensor | None = None
     longest_delay: float = eqx.field(static=True, default=0.0)  # s, that any draw can have
     gust_corner: float = eqx.field(static=True, default=2.0)  # rad/s
     dt: float = eqx.field(static=True, default=0.002)  # s
+    substeps: int = eqx.field(static=True, default=1)
+    bound: float = eqx.field(static=True, default=100.0)  # rad
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """How many members there are."""
         return self.inertia_told.shape[-1]
 
     @property
     def axes(self) -> int:
-        """Of the plant."""
+        """How many angles the plant turns by."""
         return self.inertia_told.shape[0]
 
-    def take(self, indices: ArrayLike | Sequence[Any]) -> "Members":
-        """Some of the members, with the noise that is theirs. Raises ValueError for others."""
-        return _picked(self, _places(indices, self.size))
+    def take(self, indices: ArrayLike | Sequence[int]) -> "Members":
+        """Some of the members, with the noise that is theirs.
+
+        **Arguments:**
+
+        - `indices`: a row of one or more places, 0 to `size` - 1.
+
+        **Raises:**
+
+        - `ValueError`: for other indices.
+        """
+        return _take(self, _require_indices(indices, self.size))
+
+    def loop(self, controller: PyTree) -> Loop:
+        """The loops of all members around one controller.
+
+        **Arguments:**
+
+        - `controller`: one controller for all members. A scheduled one gets, for each member, the
+            gains at the inertia that it is told.
+
+        **Returns:**
+
+        A `jq.Loop` with the plants and delays of the members.
+
+        **Raises:**
+
+        - `ValueError`: the controller was made for another sample interval.
+        """
+        delayed = self.longest_delay > 0
+        return Loop(
+            self.plant,
+            schedule_for_flight(controller, self.inertia_told),
+            drive=self.drive,
+            encoder=self.encoder,
+            delay=self.delay if delayed else 0.0,
+            longest_delay=self.longest_delay if delayed else None,
+            dt=self.dt,
+            substeps=self.substeps,
+            bound=self.bound,
+        )
 
     def flight(self, scenario: Scenario) -> Scenario:
-        """The scenario with each member's own noise, gusts and payload on top of what it holds.
+        """The scenario with each member's own noise, gusts and payload added to it.
 
         The same member draws the same numbers in every flight of the same length, whatever others
-        fly with it. Raises ValueError for a scenario of other axes, or of another ensemble.
+        fly with it.
+
+        **Arguments:**
+
+        - `scenario`: for one loop, or for as many as there are members.
+
+        **Raises:**
+
+        - `ValueError`: the scenario is for other axes or for another number of members.
         """
         count = self._checked(scenario)
         added = self._drawn(count)
-        parts = {name: _total(getattr(scenario, name), x) for name, x in added.items()}
-        where = lambda s: [getattr(s, name) for name in parts]
+        parts = {name: _add(vars(scenario)[name], x) for name, x in added.items()}
+        where = lambda s: [vars(s)[name] for name in parts]
         return eqx.tree_at(where, scenario, list(parts.values()), is_leaf=lambda x: x is None)
 
     def _checked(self, scenario: Scenario) -> int:
@@ -126,29 +185,13 @@ class Members(eqx.Module):
         return drawn
 
 
-_VECTORS = {"inertia", "torque_gain", "lag", "damping", "stiffness", "coulomb", "limit"}
-_SHARED = 99  # an array that no member has for itself
-
-
-def _own_rank(path: Any) -> int:
-    """Dimensions that the array at a path has without an axis of members."""
-    room, *_, name = [getattr(entry, "name", "") for entry in (*path, *path)]
-    if room == "encoder" or (room == "drive" and name != "limit"):
-        return _SHARED
-    return 1 if room in ("plant", "drive") and name in _VECTORS else 0
-
-
 @eqx.filter_jit
-def _picked(members: Members, places: Int[Array, " some"]) -> Members:
-    held, rest = eqx.partition(members, eqx.is_array)
-
-    def chosen(path: Any, x: Array) -> Array:
-        return x[..., places] if x.ndim > _own_rank(path) else x
-
-    return eqx.combine(jax.tree_util.tree_map_with_path(chosen, held), rest)
+def _take(members: Members, places: Int[Array, " some"]) -> Members:
+    own = mark_members(members, (members.size,))
+    return jax.tree.map(lambda x, mine: x[..., places] if mine else x, members, own)
 
 
-def _places(indices: ArrayLike | Sequence[Any], size: int) -> Array:
+def _require_indices(indices: ArrayLike | Sequence[int], size: int) -> Array:
     places = jnp.asarray(indices)
     if places.ndim != 1 or not jnp.issubdtype(places.dtype, jnp.integer) or not places.size:
         raise ValueError(f"indices are {indices}: give a row of whole numbers, one or more")
@@ -172,7 +215,7 @@ def _gusts(keys: Key[Array, " members"], shape: tuple[int, int], corner: float, 
     return jax.vmap(draw, out_axes=-1)(keys)
 
 
-def _total(given: Array | None, own: Float[Array, "samples axes members"]) -> Array:
+def _add(given: Array | None, own: Float[Array, "samples axes members"]) -> Array:
     if given is None:
         return own
     return given.reshape(given.shape[:2] + (given.shape[2:] or (1,))) + own.astype(given.dtype)

@@ -1,7 +1,6 @@
-"""Plants drawn from a fit, and whether the record determines what they depend on."""
+"""The plants that a fit leaves uncertain, and whether the record determines what they need."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,21 +8,48 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import as_float, is_zero, require_positive
-from jaxquad.identify import check_drawable, draw_models, Fit, known_covariance, NotIdentifiable
-from jaxquad.models import AttitudeAxis, DecoupledAxes, LaggedIntegrator, TransferFunction
+from jaxquad._core import as_float, check_positive, is_zero, require_positive
+from jaxquad.identify import check_drawable, draw_models, Fit, known_covariance, UndeterminedError
+from jaxquad.models import (
+    AttitudeAxis,
+    DecoupledAxes,
+    LaggedIntegrator,
+    Multirotor,
+    TransferFunction,
+)
 
-from ._distributions import scores
-from ._draw import unit_points
+from ._distributions import normal_scores
+from ._draw import draw_unit_points
 
 
 Build = Callable[[PyTree], tuple[DecoupledAxes, Array]]  # the plant, and the delay in s
+Given = Callable[[PyTree], tuple[DecoupledAxes, ArrayLike]]
 
 
-def builder(
-    model: PyTree, believed: ArrayLike | None, plant: Callable[[PyTree], Any] | None
-) -> Build:
-    """How plants are made of models like this one. Raises ValueError where that is not known."""
+def make_plant(
+    model: PyTree, *, believed: ArrayLike | None = None
+) -> tuple[DecoupledAxes, Float[Array, ""]]:
+    """Make the plant of a loop from an identified model of one axis.
+
+    **Arguments:**
+
+    - `model`: a `jq.models.AttitudeAxis`, a `jq.LaggedIntegrator`, or a `jq.TransferFunction` of
+        that form.
+    - `believed`: the inertia in kg m^2 that belongs to the gain b = KT / J, if the model has none.
+
+    **Returns:**
+
+    The plant, and the delay of the model in s.
+
+    **Raises:**
+
+    - `ValueError`: the model is of another form, or `believed` is missing or not above 0.
+    """
+    return _choose_builder(model, believed, None)(model)
+
+
+def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | None) -> Build:
+    """How plants are made of models like this one. Raise ValueError where that is not known."""
     if plant is not None:
         return _given(plant, believed)
     if believed is not None:
@@ -35,22 +61,24 @@ def builder(
         return lambda m: _of_axis(m, believed, lagging=not is_zero(model.lag))
     if not isinstance(model, LaggedIntegrator | TransferFunction):
         raise ValueError(
-            f"a {type(model).__name__} is no axis of known form: give plant=, a function of the "
-            "model that returns (jq.DecoupledAxes(...), delay in s)"
+            f"it is not known how to make a plant of a {type(model).__name__}: give plant=, a "
+            "function of the model that returns (jq.DecoupledAxes(...), delay in s)"
         )
     if believed is None:
         raise ValueError(
-            f"a {type(model).__name__} knows the gain b = KT / J, but no inertia: give believed= "
-            "in kg m^2, to which disturbances in N m and the inertia told to a controller belong"
+            f"a {type(model).__name__} has the gain b = KT / J, but no inertia: give believed=, "
+            "the inertia in kg m^2 that torques and the inertia told to a controller refer to"
         )
     if isinstance(model, LaggedIntegrator):
         return _of_integrator(model, believed)
     return _of_transfer_function(model, believed)
 
 
-def _given(plant: Callable[[PyTree], Any], believed: ArrayLike | None) -> Build:
+def _given(plant: Given, believed: ArrayLike | None) -> Build:
     if believed is not None:
-        raise ValueError("believed is for models of known form: with plant= the function says J")
+        raise ValueError(
+            "give plant= or believed=, not both: the function plant= says the inertia itself"
+        )
 
     def build(model: PyTree) -> tuple[DecoupledAxes, Array]:
         made = plant(model)
@@ -112,75 +140,140 @@ def _axis(gain: Array, lag: Array | None, believed: Array) -> DecoupledAxes:
 
 
 _LOST = 0.01  # share of a variance that may lie in directions which are not drawn
-_LOOKED_AT = 1024  # draws by which the longest delay is judged
+_DRAWS = 1024  # by which the longest delay is found
 
 
-class Fitted(eqx.Module):
-    """The plants and delays that a fit leaves open."""
+class Posterior(eqx.Module):
+    """The plants and delays that an identification leaves uncertain.
+
+    It is the first argument of a `jq.Ensemble`, and has the nominal values for a `jq.Loop`.
+
+    !!! example
+
+        ```python
+        posterior = jq.ensembles.Posterior(fit, recorded_dt=0.01, believed=0.0552)
+        loop = jq.Loop(posterior.plant, controller, delay=posterior.delay)
+        ensemble = jq.Ensemble(posterior, inertia=jq.ensembles.LogUniform(0.5, 3.0))
+        ```
+    """
 
     fit: Fit
+    plant: DecoupledAxes  # nominal: of the fitted model
+    delay: float  # s, nominal
     build: Build = eqx.field(static=True)
     held_back: float = eqx.field(static=True)  # s, of the delay, which the loop adds by itself
-    longest: float = eqx.field(static=True)  # s
-    dt: float = eqx.field(static=True)  # s, of the loop
+    longest: float = eqx.field(static=True)  # s, of many draws
+
+    def __init__(
+        self,
+        fit: Fit,
+        *,
+        recorded_dt: float | None,
+        believed: ArrayLike | None = None,
+        plant: Given | None = None,
+    ):
+        """**Arguments:**
+
+        - `fit`: of a `jq.models.AttitudeAxis`, a `jq.LaggedIntegrator` (b = K, from the command to
+            rate or angle in rad), a `jq.TransferFunction` of that form, or, with `plant`, of any
+            other model.
+        - `recorded_dt`: the sample interval in s of a record whose input was held from sample to
+            sample. Half of it is in the identified delay and is subtracted, down to 0, since a
+            simulated loop holds its inputs itself. None for an input that was not held, and for a
+            fit by `jq.refine(..., hold="zero")`, which holds it too.
+        - `believed`: the inertia in kg m^2 that belongs to the gain, where the fit determines only
+            b = KT / J: torques in N m and the inertia told to a controller refer to it.
+        - `plant`: a function of the model that returns the pair (`jq.DecoupledAxes`, delay in s).
+
+        **Raises:**
+
+        - `ValueError`: the fit found no minimum or has no finite errors, or its model is not known.
+        """
+        if recorded_dt is not None:
+            check_positive(recorded_dt=recorded_dt)
+        check_drawable(fit, hold_undetermined=True)
+        self.fit, self.build = fit, _choose_builder(fit.model, believed, plant)
+        self.held_back = 0.0 if recorded_dt is None else recorded_dt / 2
+        self.plant, delay = self.build(fit.model)
+        self.delay = float(np.maximum(np.asarray(delay) - self.held_back, 0.0))
+        points = draw_unit_points("latin", jax.random.key(0), self.deviates, _DRAWS)
+        self.longest = float(np.max(self._drawn(normal_scores(points))[1]))
 
     @property
     def deviates(self) -> int:
         """How many normal numbers a draw takes."""
         return len(self.fit.names)
 
-    def plants(
-        self, deviates: Float[np.ndarray, "parameters members"]
+    def draw(
+        self, scores: Float[np.ndarray, "parameters members"], dt: float
     ) -> tuple[DecoupledAxes, Float[np.ndarray, "1 members"], float]:
-        """Plants, their delays in s, and the longest that counts for their loop."""
-        plant, delay = drawn_plants(self.fit, self.build, jnp.asarray(deviates))
-        _check_positive(plant)
-        delay = np.maximum(np.asarray(delay) - self.held_back, 0.0)
-        longest = max(self.longest, whole_samples_above(delay, self.dt))
+        """Plants, their delays in s, and the longest that a loop of this `dt` reckons with."""
+        plant, delay = self._drawn(scores)
+        longest = max(_whole_samples_above(x, dt) for x in (self.longest, np.max(delay)))
         return plant, delay[None], longest
+
+    def _drawn(
+        self, scores: Float[np.ndarray, "parameters members"]
+    ) -> tuple[DecoupledAxes, Float[np.ndarray, " members"]]:
+        plant, delay = _draw_plants(self.fit, self.build, jnp.asarray(scores))
+        _check_positive(plant)
+        return plant, np.maximum(np.asarray(delay) - self.held_back, 0.0)
+
+    def require_nominal(self, plant: DecoupledAxes | Multirotor) -> None:
+        """Raise ValueError unless `plant` is what the draws are around."""
+        own = self.plant
+        if not (
+            isinstance(plant, DecoupledAxes)
+            and plant.shape == own.shape
+            and np.allclose(plant.inertia, own.inertia)
+            and np.allclose(plant.torque_gain, own.torque_gain)
+        ):
+            raise ValueError(
+                "the plant of the loop is not the one that was identified: give "
+                "jq.Loop(posterior.plant, controller, delay=posterior.delay)"
+            )
+
+    def require_determined(self, replaced: tuple[str, ...]) -> None:
+        """Raise UndeterminedError where a quantity changes with undetermined parameters.
+
+        Quantities that are `replaced` by distributions do not count.
+        """
+        _require_determined(self.fit, self.build, replaced)
 
     def __str__(self) -> str:
         names = ", ".join(self.fit.names)
         held = ""
         if not self.fit.identifiable:
-            held = f"; {', '.join(self.fit.identifiability.undetermined)} vary only in what counts"
+            undetermined = ", ".join(self.fit.verdict.undetermined)
+            held = f"; of {undetermined} only what the record determines varies"
         return f"drawn from the covariance of a fit of {names}{held}"
 
 
-def fitted(
-    fit: Fit, build: Build, *, recorded_dt: float | None, dt: float, replaced: tuple[str, ...]
-) -> Fitted:
-    """A fit to draw from; `replaced` are the plant's quantities that laws replace.
-
-    Raises NotIdentifiable where a plant changes with what the record does not determine.
-    """
-    check_drawable(fit, hold_undetermined=True)
-    require_determined(fit, build, replaced)
-    held_back = 0.0 if recorded_dt is None else recorded_dt / 2
-    start = Fitted(fit, build, held_back, 0.0, dt)
-    points = unit_points("latin", jax.random.key(0), start.deviates, _LOOKED_AT)
-    return Fitted(fit, build, held_back, start.plants(scores(points))[2], dt)
-
-
-def drawn_plants(
+def _draw_plants(
     fit: Fit, build: Build, deviates: Float[Array, "parameters members"]
 ) -> tuple[DecoupledAxes, Float[Array, " members"]]:
     """[axes, members] in every parameter of the plant."""
     models = draw_models(fit, deviates, hold_undetermined=True)
+    return _build_plants(build, models, fit.model, deviates.shape[1])
+
+
+@eqx.filter_jit
+def _build_plants(
+    build: Build, models: PyTree, one: PyTree, count: int
+) -> tuple[DecoupledAxes, Float[Array, " members"]]:
     place = lambda drawn, one: -1 if eqx.is_array(drawn) and drawn.ndim > one.ndim else None
-    axes = jax.tree.map(place, models, fit.model)
-    each = eqx.filter_vmap(build, in_axes=(axes,), out_axes=-1, axis_size=deviates.shape[1])
-    return eqx.filter_jit(each)(models)
+    axes = jax.tree.map(place, models, one)
+    return eqx.filter_vmap(build, in_axes=(axes,), out_axes=-1, axis_size=count)(models)
 
 
-def whole_samples_above(delay: Float[np.ndarray, "..."], dt: float) -> float:
-    """The longest `delay` in s, up to whole samples, so that other draws have the same."""
-    return float(np.ceil(np.max(delay) / dt - 1e-9)) * dt
+def _whole_samples_above(delay: float, dt: float) -> float:
+    """`delay` in s, up to whole samples, so that other draws have the same."""
+    return float(np.ceil(delay / dt - 1e-9)) * dt
 
 
-def require_determined(fit: Fit, build: Build, replaced: tuple[str, ...]) -> None:
-    """Raise NotIdentifiable where a quantity changes with undetermined directions of the fit."""
-    here = jnp.asarray(fit._fitted())
+def _require_determined(fit: Fit, build: Build, replaced: tuple[str, ...]) -> None:
+    """Raise UndeterminedError where a quantity changes with undetermined directions of the fit."""
+    here = jnp.asarray(fit.values)
 
     def numbers(values: Array) -> dict[str, Array]:
         plant, delay = build(fit.parameters.replace(fit.model, values))
@@ -190,18 +283,18 @@ def require_determined(fit: Fit, build: Build, replaced: tuple[str, ...]) -> Non
     if fit.identifiable:
         return
     slopes = {n: np.asarray(s) * fit.units for n, s in jax.jacfwd(numbers)(here).items()}
-    moved = [numbers(jnp.asarray(values)) for values in fit.identifiability.alternatives]
+    moved = [numbers(jnp.asarray(values)) for values in fit.verdict.alternatives]
     fixed, lost = numbers(here), []
     for name, slope in slopes.items():
         jumps = [not np.allclose(other[name], fixed[name], rtol=1e-6, atol=0) for other in moved]
         if any(jumps) or any(_depends(fit, row) for row in slope):
             lost.append(name)
     if lost:
-        raise NotIdentifiable(_refusal(fit, lost))
+        raise UndeterminedError(_refusal(fit, lost))
 
 
 def _depends(fit: Fit, slope: Float[np.ndarray, " parameters"]) -> bool:
-    verdict, size = fit.identifiability, np.linalg.norm(slope)
+    verdict, size = fit.verdict, np.linalg.norm(slope)
     if np.any(np.abs(verdict.exact @ slope) > 1e-6 * size):
         return True
     if any(slope[fit.names.index(name)] != 0 for name in verdict.curved):
@@ -218,12 +311,12 @@ def _refusal(fit: Fit, lost: list[str]) -> str:
         remedies.append("believed=, an inertia in kg m^2, if b = KT / J is determined")
     replaceable = [name for name in lost if name not in ("inertia", "torque_gain")]
     if replaceable:
-        remedies.append(f"a law instead, {replaceable[0]}=jq.ensembles.Uniform(low, high)")
-    undetermined = ", ".join(fit.identifiability.undetermined)
+        remedies.append(f"a distribution instead, {replaceable[0]}=jq.ensembles.Uniform(low, high)")
+    undetermined = ", ".join(fit.verdict.undetermined)
     return (
-        f"the plant's {', '.join(lost)} would change with what the record does not determine "
-        f"({undetermined}): give {'; or '.join(remedies)}; or fit under a jq.identify.Prior or with a "
-        "second record"
+        f"the plant's {', '.join(lost)} would change with parameters that the record does not "
+        f"determine ({undetermined}): give {'; or '.join(remedies)}; or fit with a "
+        "jq.identify.Prior or a second record"
     )
 
 
@@ -236,6 +329,6 @@ def _check_positive(plant: DecoupledAxes) -> None:
         if wrong:
             raise ValueError(
                 f"{name} is not above 0 in {wrong} of {values.shape[-1]} plants drawn from the "
-                f"fit, the least is {np.min(values):.4g}: fit it by its bare name, which keeps its "
-                "sign, or with more excitation"
+                f"fit, the least is {np.min(values):.4g}: name it without jq.identify.Real in "
+                "free=, which keeps its sign, or record more excitation"
             )

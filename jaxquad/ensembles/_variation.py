@@ -1,7 +1,6 @@
-"""From drawn numbers to plants."""
+"""Plants with drawn values in place of their nominal ones."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -11,38 +10,38 @@ from jaxquad._core import as_float
 from jaxquad.models import Allocation, Attitude, DecoupledAxes, MotorLag, Multirotor
 
 
-FACTORS = ("inertia", "torque_gain", "told")  # of what the plant has
+FACTORS = ("inertia", "torque_gain", "told")  # of nominal values; the others replace these
 QUANTITIES = (*FACTORS, "lag", "delay", "damping", "stiffness", "coulomb", "noise", "gust")
+VariablePlant = DecoupledAxes | Multirotor
 Numbers = Float[np.ndarray, "..."]
 Drawn = Mapping[str, Numbers]  # [axes] or [axes, members] of each quantity
 
 
-def own_value(plant: DecoupledAxes | Multirotor, name: str) -> Numbers | None:
-    """What a plant without members has for a quantity of an ensemble; None for nothing."""
-    body: Any = plant.attitude if isinstance(plant, Multirotor) else plant
+def nominal_value(plant: VariablePlant, name: str) -> Numbers | None:
+    """The value of a quantity in a plant without members; None if the plant does not have it."""
     if name == "lag" and isinstance(plant, Multirotor):
         return None if plant.motor is None else np.asarray(plant.motor.time_constant)
-    value = getattr(body, name, None)
+    value = vars(plant.attitude if isinstance(plant, Multirotor) else plant).get(name)
     return None if value is None else np.asarray(value)
 
 
-def varied(plant: DecoupledAxes | Multirotor, drawn: Drawn) -> DecoupledAxes | Multirotor:
+def vary_plant(plant: VariablePlant, drawn: Drawn) -> VariablePlant:
     """The plant with drawn factors of inertia and torque gain, and the other quantities replaced.
 
     Quantities that were not drawn keep the plant's value.
     """
     names = ("damping", "stiffness", "coulomb")
-    own: Any = {name: drawn.get(name, own_value(plant, name)) for name in names}
-    inertia = times(plant_inertia(plant), drawn["inertia"])
+    own = {name: drawn.get(name, nominal_value(plant, name)) for name in names}
+    inertia = multiply(plant_inertia(plant), drawn["inertia"])
     if isinstance(plant, DecoupledAxes):
-        gain = times(np.asarray(plant.torque_gain), drawn["torque_gain"])
+        gain = multiply(np.asarray(plant.torque_gain), drawn["torque_gain"])
         return DecoupledAxes(gain, inertia, lag=drawn.get("lag", plant.lag), **own)
     attitude = Attitude(inertia, rotor_inertia=plant.attitude.rotor_inertia, **own)
     motor = MotorLag(drawn["lag"][0]) if "lag" in drawn else plant.motor
-    return Multirotor(attitude, _stronger(plant.allocation, drawn["torque_gain"][0]), motor)
+    return Multirotor(attitude, _scale_torques(plant.allocation, drawn["torque_gain"][0]), motor)
 
 
-def _stronger(rotors: Allocation, factor: Numbers) -> Allocation:
+def _scale_torques(rotors: Allocation, factor: Numbers) -> Allocation:
     """All three torques times a factor; the arm is as wide, since it tells the ensemble's shape."""
     where = lambda r: (r.arm, r.thrust_coefficient, r.torque_coefficient)
     factors = (np.ones_like(factor), factor, factor)
@@ -50,17 +49,17 @@ def _stronger(rotors: Allocation, factor: Numbers) -> Allocation:
     return eqx.tree_at(where, rotors, scaled)
 
 
-def plant_inertia(plant: DecoupledAxes | Multirotor) -> Numbers:
+def plant_inertia(plant: VariablePlant) -> Numbers:
     """[axes] or [axes, members], kg m^2."""
     return np.asarray(plant.attitude.inertia if isinstance(plant, Multirotor) else plant.inertia)
 
 
-def axes_of(plant: DecoupledAxes | Multirotor) -> int:
-    """How many angles it turns by."""
+def count_axes(plant: VariablePlant) -> int:
+    """How many angles a plant turns by."""
     return 3 if isinstance(plant, Multirotor) else plant.shape[0]
 
 
-def times(a: Numbers, b: Numbers) -> Numbers:
+def multiply(a: Numbers, b: Numbers) -> Numbers:
     """The product; the one with fewer trailing axes holds for all members."""
     rank = max(a.ndim, b.ndim)
     a, b = (x.reshape(x.shape + (1,) * (rank - x.ndim)) for x in (a, b))

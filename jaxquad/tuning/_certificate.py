@@ -1,13 +1,30 @@
-from typing import Any
+"""What a design was shown to do on fresh members, and how that is printed."""
+
+from typing import TypedDict
 
 import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float, PyTree
 
-from ._distance import Distance
-from ._judged import Judged, LINEAR
-from ._quantities import SHOWN
-from ._row import Row, row_of
+from jaxquad.control import LADRC
+
+from ._design_result import DesignResult, DesignSummary, Distance, summarise_design
+from ._quantities import QUANTITIES
+
+
+class Provenance(TypedDict, total=False):
+    """What a certificate was made from."""
+
+    members: int
+    fresh: bool  # drawn for the certificate
+    sampling: str  # "random", or "given" for members that the caller drew
+    key: list[int] | None
+    precision: str
+    ensemble: list[str] | None
+    device: str
+    versions: dict[str, str]
+    controller: dict[str, object]
 
 
 _NAMED = (
@@ -16,8 +33,8 @@ _NAMED = (
 )  # fmt: skip
 
 
-def member_text(certificate: Any, index: int) -> str:
-    """The parameters of one member, axes apart by slashes."""
+def member_text(certificate: "Certificate", index: int) -> str:
+    """The parameters of one member; values of different axes have slashes between them."""
     known = certificate.member(index)
     J = known["inertia"]
     parts = [f"J {_joined(J)} kg m^2"]
@@ -33,8 +50,8 @@ def member_text(certificate: Any, index: int) -> str:
     return f"member {index}: {', '.join(parts)}"
 
 
-def worst_lines(certificate: Any) -> list[str]:
-    """What is worst in which member; a member that is worst in several is named once."""
+def worst_lines(certificate: "Certificate") -> list[str]:
+    """The worst value of each quantity and its member; a member is named once."""
     by_member: dict[int, list[str]] = {}
     for quantity in _NAMED:
         if quantity not in certificate.design.by_axis:
@@ -42,12 +59,12 @@ def worst_lines(certificate: Any) -> list[str]:
         worst = certificate.design.worst_member(quantity)
         if worst is not None:
             value = certificate.design.of(quantity)[worst]
-            text = f"{SHOWN[quantity].title} {SHOWN[quantity].text(value)}"
+            text = f"{QUANTITIES[quantity].title} {QUANTITIES[quantity].text(value)}"
             by_member.setdefault(worst, []).append(text)
     return [f"{', '.join(what)}: {member_text(certificate, k)}" for k, what in by_member.items()]
 
 
-def _joined(values: Any) -> str:
+def _joined(values: Float[np.ndarray, "..."]) -> str:
     texts = [f"{x:.3g}" for x in np.atleast_1d(values)]
     return texts[0] if len(set(texts)) == 1 else "/".join(texts)
 
@@ -73,18 +90,18 @@ _LINES = (
 _FIRST = 34
 
 
-def described(certificate: Any) -> str:
+def describe(certificate: "Certificate") -> str:
     """The verdict, the limits, the designs side by side, the worst members, and the remarks."""
     lines = [verdict(certificate)]
     lines += [f"  {distance}" for distance in certificate.distances]
-    lines += _table(certificate.rows)
+    lines += _table(certificate.summaries)
     lines += [f"  worst members of {certificate.name}:"]
     lines += [f"    {line}" for line in worst_lines(certificate)]
     lines += [f"  ! {remark}" for remark in certificate.remarks]
     return "\n".join([*lines, f"  {_provenance(certificate.provenance)}"])
 
 
-def verdict(certificate: Any) -> str:
+def verdict(certificate: "Certificate") -> str:
     """One line: whether the certificate holds, or what fails first and by how much."""
     on = f"{certificate.members} {'fresh ' * certificate.provenance['fresh']}members"
     if certificate.holds:
@@ -96,23 +113,23 @@ def verdict(certificate: Any) -> str:
     return f"CERTIFICATE FAILS on {on}: {first}{more}"
 
 
-def _proven(certificate: Any) -> str:
-    bound = certificate.rows[certificate.name].unstable_at_most
+def _proven(certificate: "Certificate") -> str:
+    bound = certificate.summaries[certificate.name].unstable_at_most
     return (
         "" if bound is None else f" (proven: at most {100 * bound:.2g} % of all, 95 % confidence)"
     )
 
 
-def _failures(certificate: Any) -> list[str]:
+def _failures(certificate: "Certificate") -> list[str]:
     design, found = certificate.design, []
     if design.unstable is None:
-        found.append("the controller has no linear form, so its stability is not known")
+        found.append("the controller has no method linear(), so its stability is not known")
     elif design.unstable.any():
         found.append(_count(design.unstable, "linearly unstable", certificate))
     if design.diverged.any():
         found.append(_count(design.diverged, "diverged in flight", certificate))
-    if design.runaway:
-        found.append(design.runaway)
+    if design.observer_instability:
+        found.append(design.observer_instability)
     missed = [distance for distance in certificate.distances if not distance.met]
     for distance in sorted(missed, key=lambda d: -np.inf if np.isnan(d.percent) else d.percent):
         where = "" if distance.member is None else member_text(certificate, distance.member)
@@ -120,14 +137,14 @@ def _failures(certificate: Any) -> list[str]:
     return found
 
 
-def _count(which: np.ndarray, what: str, certificate: Any) -> str:
+def _count(which: np.ndarray, what: str, certificate: "Certificate") -> str:
     count, first = int(which.sum()), int(np.argmax(which))
     worst = certificate.design.worst_member("abscissa")  # None without a linear form
     where = member_text(certificate, first if worst is None or not which[worst] else worst)
     return f"{count} of {which.size} ({count / which.size:.1%}) {what} ({where})"
 
 
-def _table(rows: dict[str, Row]) -> list[str]:
+def _table(rows: dict[str, DesignSummary]) -> list[str]:
     widths = {name: max(len(name), 7) + 3 for name in rows}
     head = " " * (_FIRST + 2) + "".join(f"{name:>{widths[name]}}" for name in rows)
     lines = [head, *_counts(rows, widths)]
@@ -139,7 +156,7 @@ def _table(rows: dict[str, Row]) -> list[str]:
     return lines
 
 
-def _counts(rows: dict[str, Row], widths: dict[str, int]) -> list[str]:
+def _counts(rows: dict[str, DesignSummary], widths: dict[str, int]) -> list[str]:
     share = lambda x: "n/a" if x is None else f"{100 * x:.3g}"
     values = {
         ("unstable, %", "found"): [
@@ -155,14 +172,15 @@ def _counts(rows: dict[str, Row], widths: dict[str, int]) -> list[str]:
     ]
 
 
-def _cell(row: Row, quantity: str, statistic: str) -> str:
-    unknown = quantity in LINEAR and quantity != "abscissa" and row.unstable
+def _cell(row: DesignSummary, quantity: str, statistic: str) -> str:
+    linear = QUANTITIES[quantity].linear and quantity != "abscissa"
+    unknown = linear and row.unstable
     if unknown or quantity not in row.statistics:
         return "n/a"
-    return SHOWN[quantity].text(getattr(row.statistics[quantity], statistic), unit=False)
+    return QUANTITIES[quantity].text(getattr(row.statistics[quantity], statistic), unit=False)
 
 
-def _provenance(known: dict[str, Any]) -> str:
+def _provenance(known: Provenance) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in known["versions"].items())
     return f"{known['members']} members, {known['sampling']}, key {known['key']}; {versions}"
 
@@ -171,10 +189,12 @@ def _provenance(known: dict[str, Any]) -> str:
 _RATIOS, _ENDS = (3.0, 5.0, 10.0), (0.48, 0.44, 0.42)
 
 
-def lag_remark(controller: Any, delay: Any, lag: Any) -> str | None:
-    """lag times wc of a LADRC beside where no b0 helps any more; None for other controllers."""
-    ladrc = getattr(controller, "ladrc", controller)
-    if lag is None or not (hasattr(ladrc, "wc") and hasattr(ladrc, "wo")):
+def lag_remark(
+    controller: PyTree, delay: ArrayLike, lag: Float[ArrayLike, "..."] | None
+) -> str | None:
+    """Compare lag times wc of a LADRC with the most that any b0 stabilises; None for others."""
+    ladrc = _find_ladrc(controller)
+    if lag is None or ladrc is None:
         return None
     wc, wo = float(np.max(np.asarray(ladrc.wc))), float(np.max(np.asarray(ladrc.wo)))
     longest, late = float(np.max(np.asarray(lag))), float(np.max(np.asarray(delay)))
@@ -184,58 +204,66 @@ def lag_remark(controller: Any, delay: Any, lag: Any) -> str | None:
         text += f", {(longest + late) * wc:.2g} with the delay of {1e3 * late:.3g} ms"
     if longest * wc >= end:
         return (
-            f"{text}: too large, no b0 stabilises LADRC beyond about {end:.2g} at wo/wc = "
-            f"{wo / wc:.3g}; wc below {end / longest:.3g} rad/s is necessary"
+            f"{text}: too large, no b0 stabilises a LADRC beyond about {end:.2g} at wo/wc = "
+            f"{wo / wc:.3g}. Reduce wc below {end / longest:.3g} rad/s"
         )
     return (
-        f"{text}; no b0 stabilises LADRC beyond about {end:.2g} at wo/wc = {wo / wc:.3g}, and Ms "
-        "and margins are lost long before: a smaller wc buys them"
+        f"{text}; no b0 stabilises a LADRC beyond about {end:.2g} at wo/wc = {wo / wc:.3g}, and "
+        "margins end long before that. Reduce wc to recover margin"
     )
 
 
+def _find_ladrc(controller: PyTree) -> LADRC | None:
+    is_ladrc = lambda x: isinstance(x, LADRC)
+    return next(filter(is_ladrc, jax.tree.leaves(controller, is_leaf=is_ladrc)), None)
+
+
 class Certificate(eqx.Module):
-    """What a design was shown to do, on members of an ensemble that its tuner never saw.
+    """What a design was shown to do on members of an ensemble that its tuner never saw.
 
     It `holds` if no member is linearly unstable (by the exact poles), none diverged in flight, no
-    observer is unstable by itself (it would run away in saturation), and every limit is met; the
-    first line of `str()` says so, or what failed by how much and where. None unstable of n members
-    drawn at random proves a share: at most 1.2 % with 95 % confidence for n = 256
-    (Clopper-Pearson), and no more than that. Numbers are SI; print is in degrees.
-    The first of the `designs` is the one that is certified; the others are peers on the same
-    members and noise. Numbers of the linear loop leave out members that are unstable, counted in
-    `rows`. Of several axes each member counts by its worst one, but for the integrals in `rows`,
-    which are sums.
+    observer is unstable by itself (it would run away in saturation), and every limit is met. The
+    first line of `str()` says so, or what failed, by how much and in which member. None unstable of
+    n members drawn at random proves a share: at most 1.2 % with 95 % confidence for n = 256
+    (Clopper-Pearson), and no more than that.
+
+    The first of the `designs` is the one that is certified; the others are its peers on the same
+    members and noise. Numbers of the linear loop leave out members that are unstable, which
+    `summaries` counts. Of several axes each member counts by its worst one, except for the
+    integrals in `summaries`, which are sums. Numbers are in SI units, those in print in degrees.
     """
 
-    designs: dict[str, Judged]  # by name; what is certified comes first
+    designs: dict[str, DesignResult]  # by name; what is certified comes first
     distances: tuple[Distance, ...]  # to each limit
     facts: dict[str, Float[np.ndarray, "axes members"]]  # inertia, torque_gain, lag, delay, told
     nominal: Float[np.ndarray, " axes"] | None  # inertia, kg m^2; None if it is not known
-    provenance: dict[str, Any]  # key, members, sampling, versions
+    provenance: Provenance
     remarks: tuple[str, ...]
 
     @property
     def name(self) -> str:
-        """Of the design that is certified."""
+        """The name of the design that is certified."""
         return next(iter(self.designs))
 
     @property
-    def design(self) -> Judged:
-        """The numbers of the design that is certified, of each member."""
+    def design(self) -> DesignResult:
+        """The numbers of the design that is certified."""
         return self.designs[self.name]
 
     @property
     def members(self) -> int:
+        """How many members there are."""
         return self.design.members
 
     @property
     def stable(self) -> bool:
         """No member is linearly unstable, none diverged, and no observer is unstable by itself."""
-        design = self.design
-        return design.unstable_count == 0 and not design.diverged.any() and not design.runaway
+        design, observer = self.design, self.design.observer_instability
+        return design.unstable_count == 0 and not design.diverged.any() and not observer
 
     @property
     def holds(self) -> bool:
+        """Whether the design is stable on all members and meets every limit."""
         return self.stable and all(distance.met for distance in self.distances)
 
     @property
@@ -244,32 +272,32 @@ class Certificate(eqx.Module):
         return self.provenance["sampling"] == "random"
 
     @property
-    def rows(self) -> dict[str, Row]:
+    def summaries(self) -> dict[str, DesignSummary]:
         """Statistics of each design over the members."""
         known = self.independent
-        return {name: row_of(x, independent=known) for name, x in self.designs.items()}
+        return {name: summarise_design(x, independent=known) for name, x in self.designs.items()}
 
     def member(self, index: int) -> dict[str, Float[np.ndarray, " axes"]]:
         """The parameters of one member, per axis, in SI units."""
         return {name: values[:, index] for name, values in self.facts.items()}
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, object]:
         """Everything, arrays per member included, for `jaxquad.report.write_json`."""
         return {
             "certificate": verdict(self),
             "holds": self.holds,
             "provenance": self.provenance,
             "limits": [distance._asdict() | {"met": distance.met} for distance in self.distances],
-            "designs": {name: row.content() for name, row in self.rows.items()},
+            "designs": {name: row.content() for name, row in self.summaries.items()},
             "remarks": self.remarks,
             "members": self.facts | {"nominal_inertia": self.nominal},
             "per_member": {name: _arrays(design) for name, design in self.designs.items()},
         }
 
     def __str__(self) -> str:
-        return described(self)
+        return describe(self)
 
 
-def _arrays(design: Judged) -> dict[str, Any]:
+def _arrays(design: DesignResult) -> dict[str, object]:
     flags = {"unstable": design.unstable, "diverged": design.diverged}
     return flags | {name: design.of(name) for name in design.by_axis}

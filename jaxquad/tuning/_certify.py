@@ -1,30 +1,43 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, PyTree
 
+from jaxquad.control import (
+    LADRC,
+    LinearisableController,
+    ObserverController,
+    PID,
+    schedule_for_analysis,
+)
 from jaxquad.ensembles import Ensemble, Members
-from jaxquad.simulation import Scenario
+from jaxquad.loops import Loop
+from jaxquad.models import DecoupledAxes, Multirotor
+from jaxquad.simulation import evaluate, Metrics, Scenario
 
-from ._certificate import Certificate, lag_remark
-from ._distance import distances
-from ._judge import axes_of, judge, Span
-from ._judged import LINEAR
+from ._certificate import Certificate, lag_remark, Provenance
+from ._design_result import DesignResult, measure_distances
+from ._loop_numbers import loop_numbers, LoopNumbers, worst_of
+from ._objective import Limit
+from ._problem import DeviceChoice, TimeSpan
+from ._quantities import LINEAR, QUANTITIES
+
+
+Plant = DecoupledAxes | Multirotor
 
 
 def certify(
-    controller: Any,
+    loop: Loop,
     ensemble: Ensemble | Members,
     scenario: Scenario,
     *,
-    limits: Sequence[Any] = (),
-    peers: Mapping[str, Any] | None = None,
+    limits: Sequence[Limit] = (),
+    peers: Mapping[str, PyTree] | None = None,
     members: int = 256,
     key: Key[Array, ""] | None = None,
     events: Sequence[float] = (),
@@ -32,47 +45,78 @@ def certify(
     stop: float | None = None,
     load_start: float | None = None,
     name: str = "tuned",
-    devices: int | Sequence[Any] | None = None,
+    devices: DeviceChoice = None,
 ) -> Certificate:
-    """Show what a design does on members that its tuner never saw, beside its `peers`.
+    """Evaluate a design on members that its tuner never saw, beside its peers.
 
-    Of an `ensemble`, `members` are drawn at random, each by itself, by `ensemble.fresh` with `key`
-    (`jax.random.key(0)` if None): give the tuner's key, whose training members are other draws.
-    `jq.ensembles.Members` are taken as they are, and it is on the caller that nothing was tuned on them.
-    All designs fly the `scenario` with the same noise. `limits` are `jq.Limit`s. At the `events`,
-    times in s, ITAE's clock starts anew and the overshoot of a step is judged; `start`, `stop`,
-    `load_start` and `devices` are those of `jq.evaluate`, all best as the tuner's. A payload
-    counts in the linear loops with the most and the least of it, the worse of all.
-    Raises ValueError for parts that do not fit, and for limits on what is not judged.
+    A payload counts in the linear loops with the most and the least of it, the worse of all.
+
+    !!! example
+
+        ```python
+        certificate = jq.certify(loop.with_controller(tuned.controller), ensemble, flight,
+                                 limits=[jq.Limit("sensitivity_peak", at_most=3.6)])
+        print(certificate)
+        ```
+
+    **Arguments:**
+
+    - `loop`: the design is `loop.controller`; the rest is nominal.
+    - `ensemble`: `members` are drawn from it at random, each by itself, by `ensemble.fresh`.
+        `jq.ensembles.Members` are taken as they are, and nothing may have been tuned on them.
+    - `scenario`: all designs fly it with the same noise.
+    - `limits`: what the design has to meet.
+    - `peers`: other controllers to stand beside the design, by name.
+    - `members`: how many are drawn.
+    - `key`: give the tuner's key, whose training members are other draws; `jax.random.key(0)` by
+        default.
+    - `events`: times in s at which ITAE's clock starts again and the overshoot of a step is judged.
+    - `start`, `stop`, `load_start`, `devices`: see `jq.evaluate`; best as for the tuner.
+    - `name`: of the design in the certificate.
+
+    **Raises:**
+
+    - `ValueError`: parts do not fit together, or a limit is on what is not computed.
     """
     key = jax.random.key(0) if key is None else key
-    drawn = _drawn(ensemble, members, key)
+    drawn = ensemble
+    if isinstance(ensemble, Ensemble):
+        drawn = ensemble.fresh(loop, members, key)  # independent, as the bound of a share needs
+    require_same_rate(loop, drawn)
     flight = drawn.flight(scenario)
-    designs = {name: controller, **{_free(n, name): peer for n, peer in (peers or {}).items()}}
-    span = Span(events, start, stop, load_start)
-    judged = {n: judge(design, drawn, flight, span, devices) for n, design in designs.items()}
-    facts, nominal = _facts(drawn), _nominal(ensemble)
+    designs = {name: loop.controller} | _named(peers or {}, name)
+    span = TimeSpan(tuple(events), start, stop, load_start)
+    results = {n: evaluate_design(x, drawn, flight, span, devices) for n, x in designs.items()}
+    known = _provenance(ensemble, drawn, key)
+    known["controller"] = _describe_controller(loop.controller)
     found = Certificate(
-        judged, distances(judged[name], limits), facts, nominal,
-        _provenance(ensemble, drawn, key) | {"controller": _numbers(controller)}, (),
-    )  # fmt: skip
-    return dataclasses.replace(found, remarks=tuple(_remarks(found, controller, drawn)))
+        designs=results,
+        distances=measure_distances(results[name], limits),
+        facts=_facts(drawn),
+        nominal=_nominal_inertia(loop) if isinstance(ensemble, Ensemble) else None,
+        provenance=known,
+        remarks=(),
+    )
+    return dataclasses.replace(found, remarks=tuple(_remarks(found, loop.controller, drawn)))
 
 
-def _drawn(ensemble: Ensemble | Members, count: int, key: Key[Array, ""]) -> Members:
-    if isinstance(ensemble, Members):
-        return ensemble
-    return ensemble.fresh(count, key)  # independent draws, as the bound of a share needs
+def require_same_rate(loop: Loop, members: Members) -> None:
+    """Raise ValueError for members that were drawn around a loop of another sample interval."""
+    if not np.isclose(loop.dt, members.dt, rtol=1e-6):
+        raise ValueError(
+            f"the members were drawn around a loop with dt = {members.dt} s, but this one has "
+            f"{loop.dt} s: draw them again, ensemble.draw(loop, n, key)"
+        )
 
 
-def _free(peer: str, name: str) -> str:
-    if peer == name:
-        raise ValueError(f"a peer has the name {peer!r} of the design itself: call it otherwise")
-    return peer
+def _named(peers: Mapping[str, PyTree], name: str) -> dict[str, PyTree]:
+    if name in peers:
+        raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")
+    return dict(peers)
 
 
 def _facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
-    plant = axes_of(drawn.plant)
+    plant = decouple(drawn.plant)
     given = {"inertia": plant.inertia, "torque_gain": plant.torque_gain, "lag": plant.lag}
     shape = (plant.shape[0], drawn.size)
     wide = lambda x: np.broadcast_to(np.asarray(x) if x.ndim > 1 else x[:, None], shape)
@@ -81,14 +125,12 @@ def _facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
     return facts | {"told": np.asarray(drawn.inertia_told) / facts["inertia"]}
 
 
-def _nominal(ensemble: Ensemble | Members) -> Float[np.ndarray, " axes"] | None:
-    if isinstance(ensemble, Members):
-        return None
-    axes = axes_of(ensemble.plant)
+def _nominal_inertia(loop: Loop) -> Float[np.ndarray, " axes"]:
+    axes = decouple(loop.plant)
     return np.array(jnp.broadcast_to(axes.inertia, axes.shape))
 
 
-def _provenance(given: Any, drawn: Members, key: Key[Array, ""]) -> dict[str, Any]:
+def _provenance(given: Ensemble | Members, drawn: Members, key: Key[Array, ""]) -> Provenance:
     fresh = isinstance(given, Ensemble)
     names = ("jaxquad", "jax", "jaxlib", "numpy")
     return {
@@ -103,22 +145,120 @@ def _provenance(given: Any, drawn: Members, key: Key[Array, ""]) -> dict[str, An
     }
 
 
-def _numbers(controller: Any) -> dict[str, Any]:
+def _describe_controller(controller: PyTree) -> dict[str, object]:
     """The controller's class and numbers, by their places in it."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(controller, eqx.is_array))
     numbers = {jax.tree_util.keystr(path)[1:]: np.asarray(x).tolist() for path, x in leaves}
     return {"class": type(controller).__name__, "numbers": numbers}
 
 
-def _remarks(found: Certificate, controller: Any, drawn: Members) -> list[str]:
-    missed = [x for x in found.distances if x.quantity in LINEAR and not x.met]
-    lag = lag_remark(controller, drawn.delay, axes_of(drawn.plant).lag)
+def _remarks(found: Certificate, controller: PyTree, drawn: Members) -> list[str]:
+    missed = [x for x in found.distances if QUANTITIES[x.quantity].linear and not x.met]
+    lag = lag_remark(controller, drawn.delay, decouple(drawn.plant).lag)
     remarks = [lag] if lag and (missed or not found.stable) else []
     if not found.independent:
-        remarks.append("the members were given: whether a tuner saw them is not known here")
+        remarks.append("the members were given: whether the tuner saw them is not known")
     counts = {n: x.unstable_count for n, x in found.designs.items() if x.unstable_count}
     if counts:
         text = ", ".join(f"{count} of {n}" for n, count in counts.items())
         remarks.append(f"no Ms and no margins (n/a) over members that are unstable: {text}")
-    runaways = [(n, x.runaway) for n, x in found.designs.items() if x.runaway and n != found.name]
-    return remarks + [f"of {n}, {why}" for n, why in runaways]
+    others = [(n, x.observer_instability) for n, x in found.designs.items() if n != found.name]
+    return remarks + [f"of {n}: {why}" for n, why in others if why]
+
+
+def decouple(plant: Plant) -> DecoupledAxes:
+    """The plant near level flight, one axis at a time."""
+    return plant.decoupled() if isinstance(plant, Multirotor) else plant
+
+
+def evaluate_design(
+    controller: PyTree,
+    members: Members,
+    flight: Scenario,
+    span: TimeSpan,
+    devices: DeviceChoice = None,
+) -> DesignResult:
+    """`controller` on all `members`, in a `flight` that has their noise in it.
+
+    The loop in time holds every limit, the encoder and dry friction. The linear one is exact, and
+    is that of a controller with a method `linear`, a scheduled or adaptive one at the inertia that
+    it is told.
+    """
+    axes = flight.reference.shape[1]
+    loop = members.loop(controller)
+    loop = loop.with_controller(_widen(loop.controller, axes, members.size))
+
+    def run(start: float, stop: float | None, load_start: float | None = None) -> Metrics:
+        return evaluate(
+            loop, flight, start=start, stop=stop, load_start=load_start, devices=devices
+        )
+
+    whole = run(span.start, span.stop, span.load_start)
+    parts = [run(*part) for part in span.parts] if len(span.parts) > 1 else [whole]
+    numbers = _join(whole, parts)
+    linear = _linear(controller, members, flight)
+    if linear is not None:
+        numbers |= {name: linear._asdict()[name] for name in LINEAR}
+    unstable = None if linear is None else ~np.all(linear.stable, axis=0)
+    observed = isinstance(controller, ObserverController)
+    why = controller.observer_instability() if observed else ""
+    return DesignResult(numbers, unstable, np.asarray(whole.diverged), why)
+
+
+_PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what an inertia told may change
+
+
+def _widen(law: PyTree, axes: int, members: int) -> PyTree:
+    """The gains of a LADRC or PID in one shape, so that all of a kind share a compile."""
+    if not isinstance(law, LADRC | PID):
+        return law
+    gains = {name: x for name, x in vars(law).items() if isinstance(x, Array)}
+    full = {name: _full(x, name, axes, members) for name, x in gains.items()}
+    return dataclasses.replace(law, **full)
+
+
+def _full(gain: Array, name: str, axes: int, members: int) -> Array:
+    shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
+    given = np.asarray(gain)
+    aligned = given.reshape(given.shape + (1,) * (len(shape) - given.ndim)) if given.ndim else given
+    return jnp.asarray(np.broadcast_to(aligned, shape))
+
+
+_INTEGRALS = ("itae", "iae", "ise")
+_WHOLE = ("activity", "energy", "saturation_share", "peak", "rms", "disturbance_rmse")
+
+
+def _join(whole: Metrics, parts: Sequence[Metrics]) -> dict[str, np.ndarray]:
+    stack = lambda name: np.stack([np.asarray(vars(one)[name], float) for one in parts])
+    numbers = {name: np.asarray(vars(whole)[name], float) for name in _WHOLE}
+    numbers["activity_rate"] = numbers["activity"] / (whole.stop - whole.start)
+    numbers["overshoot"] = _greatest(stack("overshoot"))
+    return numbers | {name: stack(name).sum(axis=0) for name in _INTEGRALS}
+
+
+def _greatest(values: Float[np.ndarray, "parts axes members"]) -> np.ndarray:
+    """NaN where no part has a step."""
+    known = ~np.isnan(values)
+    greatest = np.max(np.where(known, values, -np.inf), axis=0)
+    return np.where(known.any(axis=0), greatest, np.nan)
+
+
+def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:
+    law = schedule_for_analysis(controller, members.inertia_told)
+    if not isinstance(law, LinearisableController):
+        return None
+    axes = flight.reference.shape[1]
+    law, late = _widen(law, axes, members.size), members.delay
+    plants = [decouple(plant) for plant in _with_payloads(members.plant, flight)]
+    loops = [
+        loop_numbers(plant, law, late, longest=members.longest_delay, axes=axes) for plant in plants
+    ]
+    return worst_of(loops)
+
+
+def _with_payloads(plant: Plant, flight: Scenario) -> list[Plant]:
+    """The plant, and with the most and the least that the flight makes it carry."""
+    if flight.payload is None:
+        return [plant]
+    extremes = [np.max(flight.payload, axis=0), np.min(flight.payload, axis=0)]
+    return [plant, *(plant.with_added_inertia(x) for x in extremes if np.any(x != 0))]

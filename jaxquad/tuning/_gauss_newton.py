@@ -1,34 +1,50 @@
 """Least squares on the tracking errors themselves, through optimistix."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from jaxquad.control import schedule_for_flight
 from jaxquad.simulation import scan_loop
 
 from ._cost import SMOOTHING
-from ._objective import is_gated, Mean, Objective, Penalty, stability_gate
+from ._objective import (
+    is_gated,
+    Limit,
+    Mean,
+    Objective,
+    Penalty,
+    risk_text,
+    stability_gate,
+)
 from ._parameters import Coordinates
-from ._problem import Problem, split
-from ._quantities import per_member
+from ._problem import Problem
+from ._quantities import combine_axes, split_quantities
 
 
 _LEAST = 1e-12
 
 
 class GaussNewton(eqx.Module):
-    """Levenberg-Marquardt on sqrt(t) times the errors of all members: tracking counts as ITSE.
+    """Least squares on the tracking errors of all members, by Levenberg-Marquardt.
 
-    ITAE is no sum of squares; the integral of t error^2 is. Each member's counts in units of what
-    it is at the start, which stands for its logarithm, and penalties enter by their square roots.
-    Terms of the objective other than ITAE, risks other than the mean, and limits are not sums of
-    squares: they are refused. `stride` samples share a residual.
+    Residuals are sqrt(t) times the errors, so tracking counts as ITSE, the integral of t error^2;
+    ITAE itself is no sum of squares. Each member's errors are in units of their size at the start,
+    which stands for the logarithm, and penalties enter by their square roots.
+
+    **Arguments:**
+
+    - `steps`: the most steps.
+    - `tolerance`: relative, of cost and parameters.
+    - `stride`: samples that share a residual.
+
+    **Raises:**
+
+    - `ValueError`: `steps` or `stride` is below 1. A tune raises it for terms other than ITAE, for
+        risks other than the mean and for limits, none of which are sums of squares.
     """
 
     steps: int = 30
@@ -48,20 +64,20 @@ class _Given(eqx.Module):
     stride: int = eqx.field(static=True)
 
 
-def require_squares(objective: Objective, limits: Sequence[Any]) -> None:
-    """Raises ValueError for what is no sum of squares."""
+def require_squares(objective: Objective, limits: Sequence[Limit]) -> None:
+    """Raise ValueError for what is no sum of squares."""
     odd = [name for name in objective.terms if name != "itae"]
     odd += [f"limit on {limit.quantity}" for limit in limits]
     if not isinstance(objective.risk, Mean):
-        odd.append(f"risk {getattr(objective.risk, 'text', 'of your own')}")
+        odd.append(f"risk {risk_text(objective.risk)}")
     if odd:
         raise ValueError(
-            f"GaussNewton needs sums of squares, which these are not: {', '.join(odd)}; take "
-            "LBFGS(), or the term itae with penalties and the mean risk"
+            f"GaussNewton cannot minimise {', '.join(odd)}: no sum of squares. Take LBFGS(), "
+            "or the term itae with penalties and the mean risk"
         )
 
 
-def least_squares(
+def minimise_squares(
     coordinates: Coordinates,
     problem: Problem,
     objective: Objective,
@@ -72,8 +88,8 @@ def least_squares(
     import lineax as lx
     import optimistix as optx
 
-    still = jnp.ones((problem.loops.inertia_told.shape[0], problem.members))
-    given = _Given(coordinates, problem, objective.penalties, still, method.stride)
+    units = jnp.ones((problem.linear.inertia_told.shape[0], problem.members))
+    given = _Given(coordinates, problem, objective.penalties, units, method.stride)
     own = jnp.sum(_errors(jnp.asarray(start), given) ** 2, axis=0)
     given = eqx.tree_at(lambda g: g.scale, given, jnp.sum(own, axis=0, keepdims=True) + 0 * own)
     solver = optx.LevenbergMarquardt(
@@ -91,13 +107,13 @@ def _residuals(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
     members = given.problem.members
     tracking = _errors(z, given) / jnp.sqrt(given.scale + _LEAST)[None]
     controller = given.coordinates.controller_at(z)
-    flights, linear = split({p.quantity for p in given.penalties} | {"abscissa"})
-    numbers = given.problem.loops.numbers(controller, linear, SMOOTHING)
+    flights, linear = split_quantities({p.quantity for p in given.penalties} | {"abscissa"})
+    numbers = given.problem.linear.numbers(controller, linear, SMOOTHING)
     if flights:
         numbers |= given.problem.in_time(controller, flights)
     gate = stability_gate(numbers["abscissa"])
     costs = [
-        p(per_member(p.quantity, numbers[p.quantity]), gate if is_gated(p.quantity) else gate + 1)
+        p(combine_axes(p.quantity, numbers[p.quantity]), gate if is_gated(p.quantity) else gate + 1)
         for p in given.penalties
     ]
     bounds = jnp.sqrt(jnp.stack(costs) + _LEAST) if costs else jnp.zeros((0, members))
@@ -111,7 +127,7 @@ def _linearised(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
 
 
 @_linearised.def_jvp
-def _with_columns(primals: Any, tangents: Any) -> Any:
+def _with_columns(primals: PyTree, tangents: PyTree) -> PyTree:
     # A column for each parameter, one flight after the other: linearised, the loop would store all.
     (z, _), run = primals, lambda z: _residuals(z, primals[1])
     column = lambda unit: jax.jvp(run, (z,), (unit,))[1]
@@ -122,9 +138,8 @@ def _with_columns(primals: Any, tangents: Any) -> Any:
 def _errors(z: Float[Array, " n"], given: _Given) -> Float[Array, "points axes members"]:
     """sqrt(t) error every few samples, t from the last event."""
     problem, stride = given.problem, given.stride
-    law = schedule_for_flight(given.coordinates.controller_at(z), problem.loops.inertia_told)
     keep = lambda nothing, now: (nothing, now.reference - now.angle)
-    loop = problem.loop.with_controller(law)
+    loop = problem.loop_around(given.coordinates.controller_at(z))
     stored = scan_loop(loop, problem.flight, keep, lambda like: None)[1]
     span, dt = problem.span, loop.dt
     index = np.arange(span.first, span.last + 1, stride)

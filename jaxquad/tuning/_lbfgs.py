@@ -1,7 +1,7 @@
 """L-BFGS for many problems at once: each evaluation serves all of them."""
 
 from collections.abc import Callable, Generator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -10,17 +10,27 @@ from jaxtyping import Bool, Float, Int
 
 Vector = Float[np.ndarray, " n"]
 Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-# values [problems] and gradients [problems, n] at points [problems, n] of the problems that are on
+# values [problems] and gradients [problems, n] at points [problems, n] of problems that are on
 
 
 class LBFGS(eqx.Module):
-    """How L-BFGS steps: by a strong-Wolfe line search that mostly takes its first trial.
+    """L-BFGS with a strong-Wolfe line search that mostly accepts its first trial.
 
-    It stops where a step lowers the cost by less than `tolerance` twice in a row (costs are
-    logarithms, so 1e-4 is 0.01 %), where the gradient's greatest entry is below
-    `gradient_tolerance`, or after `evaluations`. No parameter moves by more than `longest_step`
-    nepers at once. A trial without a finite cost is taken back by half.
-    Source: Nocedal and Wright, Numerical Optimization, algorithms 7.4, 3.5 and 3.6.
+    A trial without a finite cost is halved. Source: Nocedal and Wright, Numerical Optimization,
+    algorithms 7.4, 3.5 and 3.6.
+
+    **Arguments:**
+
+    - `evaluations`: the most gradients.
+    - `tolerance`: it stops where a step lowers the cost by less than this twice in a row (costs are
+        logarithms, so 1e-4 is 0.01 %).
+    - `gradient_tolerance`: it stops where the gradient's greatest entry is below this.
+    - `memory`: pairs of steps and gradients that are kept.
+    - `longest_step`, `first_step`: nepers by which any parameter moves at most, and at first.
+
+    **Raises:**
+
+    - `ValueError`: a count is below 1, or a step is not above 0.
     """
 
     evaluations: int = 60
@@ -61,7 +71,8 @@ class _Point(NamedTuple):
 
 _TRIALS = 7  # of a line search
 _End = tuple[_Point, bool, str]
-_Search = Generator[Vector, tuple[float, Vector], Any]
+_Descending = Generator[Vector, tuple[float, Vector], _End]
+_Searching = Generator[Vector, tuple[float, Vector], tuple[_Point | None, int]]
 
 
 def minimise(
@@ -72,7 +83,7 @@ def minimise(
     on: Bool[np.ndarray, " problems"] | None = None,
     enough: Callable[[int, float], bool] | None = None,
 ) -> Descent:
-    """Runs all problems in lockstep: `evaluate(z, on)` tells values and gradients of those `on`.
+    """Run all problems in lockstep: `evaluate(z, on)` gives values and gradients of those `on`.
 
     Problems that are not `on` from the start stay there. `enough(problem, value)` ends a problem
     early. One that is done stays where it is best.
@@ -81,7 +92,7 @@ def minimise(
     on = np.ones(len(z), bool) if on is None else np.array(on)
     searches = [_lbfgs(x, method, _bound(enough, k)) for k, x in enumerate(z)]
     still = [_Point(x, np.nan, np.full_like(x, np.nan)) for x in z]
-    ends: list[Any] = [(point, False, "not started") for point in still]
+    ends: list[_End] = [(point, False, "not started") for point in still]
     counts = np.zeros(len(z), int)
     z = np.stack([next(search) for search in searches])
     while on.any():
@@ -104,11 +115,11 @@ def minimise(
     )
 
 
-def _bound(enough, problem):
+def _bound(enough: Callable[[int, float], bool] | None, problem: int) -> Callable[[float], bool]:
     return (lambda value: False) if enough is None else (lambda value: enough(problem, value))
 
 
-def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool]) -> _Search:
+def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool]) -> _Descending:
     point = _Point(z, *(yield z))
     left, pairs, idle = method.evaluations - 1, [], 0
     if not _finite(point):
@@ -124,7 +135,7 @@ def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool]) -> _Search
         if direction @ point.gradient >= 0:  # rounding has spoilt the pairs
             pairs, direction = [], -point.gradient
         step = _first(direction, pairs, method)
-        found, left = yield from _searched(point, direction, step, left, method.longest_step)
+        found, left = yield from _search_line(point, direction, step, left, method.longest_step)
         if found is None and pairs:
             pairs = []  # once more, downhill
             continue
@@ -140,7 +151,7 @@ def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool]) -> _Search
 
 
 def _direction(gradient: Vector, pairs: list[tuple[Vector, Vector]]) -> Vector:
-    """Minus the inverse Hessian of the pairs times the gradient: two loops."""
+    """Minus the inverse Hessian of the pairs times the gradient, by the two-loop recursion."""
     q, shares = gradient.copy(), []
     for s, y in reversed(pairs):
         share = (s @ q) / (s @ y)
@@ -153,7 +164,7 @@ def _direction(gradient: Vector, pairs: list[tuple[Vector, Vector]]) -> Vector:
     return -q
 
 
-def _first(direction: Vector, pairs: list, method: LBFGS) -> float:
+def _first(direction: Vector, pairs: list[tuple[Vector, Vector]], method: LBFGS) -> float:
     longest = np.max(np.abs(direction))
     if pairs:
         return min(1.0, method.longest_step / longest)
@@ -161,7 +172,9 @@ def _first(direction: Vector, pairs: list, method: LBFGS) -> float:
     return method.first_step / longest
 
 
-def _searched(start: _Point, direction: Vector, step: float, left: int, longest: float) -> _Search:
+def _search_line(
+    start: _Point, direction: Vector, step: float, left: int, longest: float
+) -> _Searching:
     """A point that meets the strong Wolfe conditions, or the best that lowers the cost; else None.
 
     Returns it with the evaluations that are left.

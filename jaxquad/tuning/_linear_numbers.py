@@ -17,9 +17,9 @@ from jaxquad.loops import (
     join,
     loop_qualities,
     noise_gain,
+    OpenLoop,
     powers,
     sampled,
-    SampledLoop,
     sharpest,
     without_idle_states,
 )
@@ -106,7 +106,7 @@ def _numbers(
     return found
 
 
-def _peak(loop: SampledLoop) -> Float[Array, ""]:
+def _peak(loop: OpenLoop) -> Float[Array, ""]:
     grid = np.geomspace(_LOWEST, 1.0, _POINTS) * np.pi / loop.dt
     away = 1 + loop.loop(jnp.asarray(grid, loop.shift.dtype))
     square = away.real**2 + away.imag**2  # about a sharp peak it is a parabola

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxquad.control import LinearController
-from jaxquad.loops import analyse_loop, LoopAnalysis
+from jaxquad.loops import analyse, Loop, LoopAnalysis
 from jaxquad.models import DecoupledAxes
 
 
@@ -52,11 +52,12 @@ def loop_numbers(
     plant: DecoupledAxes, controller: Any, delay: Float[Array, " members"], *, longest: float,
     axes: int,
 ) -> LoopNumbers:  # fmt: skip
-    """`jq.loops.analyse_loop` of each axis and member; stability by the eigenvalues themselves."""
+    """`jq.analyse` of each axis and member; stability by the eigenvalues themselves."""
     members = delay.shape[0]
     flat = _Laws(_linear(controller, axes, members), axes * members)
     late = jnp.asarray(np.tile(np.asarray(delay), axes))
-    found = analyse_loop(_flat(plant, axes, members), flat, delay=late, longest_delay=longest)
+    loop = Loop(_flat(plant, axes, members), flat, delay=late, longest_delay=longest)
+    found = analyse(loop, 0)
     slowest = np.real(found.poles[:, 0])
     stable = np.asarray(found.stable) & (slowest < 0)
     numbers = {name: _where(stable, found, name) for name in LoopNumbers._fields[2:]}

@@ -1,5 +1,8 @@
+"""What a tune minimises: quantities of each member, penalties, limits, and risks over members."""
+
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -15,10 +18,23 @@ from jaxquad._core import (
     require_positive,
 )
 
-from ._quantities import level, OF_THE_LOOP, per_member, QUANTITIES, require_quantity
+from ._quantities import combine_axes, level, QUANTITIES, require_quantity
 
 
-Risk = Callable[[Float[Array, " members"]], Float[Array, ""]]
+class Risk(Protocol):
+    """Makes one number of those of all members; larger is worse."""
+
+    def __call__(self, values: Float[Array, " members"], /) -> Float[Array, ""]: ...
+
+
+@runtime_checkable
+class _Titled(Protocol):
+    text: str
+
+
+def risk_text(risk: Risk) -> str:
+    """The `text` of a risk, or the name of its class."""
+    return risk.text if isinstance(risk, _Titled) else type(risk).__name__.lower()
 
 
 class Mean(eqx.Module):
@@ -31,7 +47,10 @@ class Mean(eqx.Module):
 
 
 class Worst(eqx.Module):
-    """The worst member. Its gradient is that of one member: CVaR moves more steadily."""
+    """The worst member.
+
+    Its gradient is that of one member alone, so a descent is steadier with `jq.tuning.CVaR`.
+    """
 
     text: str = eqx.field(static=True, default="worst", init=False)
 
@@ -40,16 +59,26 @@ class Worst(eqx.Module):
 
 
 class CVaR(eqx.Module):
-    """The mean of the worst `share` of the members, exactly also where that is no whole number.
+    """The conditional value at risk: the mean of the worst `share` of the members.
 
-    Source: Rockafellar and Uryasev (2000). Raises ValueError for a share not in 0 < share <= 1.
+    A share that is no whole number of members counts the last one in part.
+
+    Source: Rockafellar and Uryasev, "Optimization of conditional value-at-risk" (2000).
+
+    **Arguments:**
+
+    - `share`: above 0 and at most 1.
+
+    **Raises:**
+
+    - `ValueError`: the share is outside of that.
     """
 
     share: float = eqx.field(static=True, default=0.2)
 
     def __check_init__(self):
         if not 0 < self.share <= 1:
-            raise ValueError(f"share is {self.share}: give that of the worst members, as 0.2")
+            raise ValueError(f"share is {self.share}: give one above 0 and at most 1, as 0.2")
 
     @property
     def text(self) -> str:
@@ -64,9 +93,15 @@ class CVaR(eqx.Module):
 
 
 class Mix(eqx.Module):
-    """A weighted sum of risks: `Mix(((0.5, Mean()), (0.5, CVaR(0.2))))`.
+    """A weighted sum of risks, as `Mix(((0.5, Mean()), (0.5, CVaR(0.2))))`.
 
-    Raises ValueError for weights that are not above 0.
+    **Arguments:**
+
+    - `parts`: pairs of a weight above 0 and a risk.
+
+    **Raises:**
+
+    - `ValueError`: there are no parts, or a weight is not above 0.
     """
 
     parts: Sequence[tuple[float, Risk]]
@@ -77,7 +112,7 @@ class Mix(eqx.Module):
 
     @property
     def text(self) -> str:
-        return " + ".join(f"{w:g} {getattr(risk, 'text', 'risk')}" for w, risk in self.parts)
+        return " + ".join(f"{w:g} {risk_text(risk)}" for w, risk in self.parts)
 
     def __call__(self, values: Float[Array, " members"]) -> Float[Array, ""]:
         total = jnp.zeros((), values.dtype)
@@ -95,14 +130,23 @@ def soft(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class Penalty(eqx.Module):
-    """A soft bound, added to every member's cost: `weight` soft(ln(q / knee)).
+    """A soft bound that is added to every member's cost: `weight` soft(ln(q / knee)).
 
-    With soft(x) = softplus(8 x) / 8. The abscissa, which has either sign, counts as (q - knee) in
-    1/s, overshoot and the share of saturation as (q - knee) in steps of 10 % of step or samples.
-    For margins, of which less is worse, the sign is turned. Those of the linear loop, but for the
-    abscissa, act on stable members only. Knees are SI (rad, s).
-    Source: EQUATIONS.md, section 3. Raises ValueError for an unknown quantity, a negative weight
-    and a knee that has no logarithm.
+    soft(x) = softplus(8 x) / 8. The abscissa, which can have either sign, counts as (q - knee) in
+    1/s; overshoot and the share of saturation count as (q - knee) in steps of 10 %. For margins,
+    of which less is worse, the sign is reversed. Penalties on the linear loop, except on the
+    abscissa, act on stable members only. Source: docs/tuning.md.
+
+    **Arguments:**
+
+    - `quantity`: a name from `jq.tuning.QUANTITIES`.
+    - `knee`: where the cost begins, in SI units (rad, s).
+    - `weight`: the cost per neper beyond the knee.
+
+    **Raises:**
+
+    - `ValueError`: the quantity does not exist, the weight is negative, or the knee has no
+        logarithm.
     """
 
     quantity: str = eqx.field(static=True)
@@ -112,39 +156,45 @@ class Penalty(eqx.Module):
     def __check_init__(self):
         require_quantity(self.quantity)
         require_bound(self.quantity, self.knee)
-        require_nonnegative("weight", self.weight, "it says how much being beyond the knee costs")
+        require_nonnegative("weight", self.weight, "give the cost per neper beyond the knee")
 
     def __call__(
         self, values: Float[Array, " members"], gate: Float[Array, " members"]
     ) -> Float[Array, " members"]:
         """The cost of each member; `gate` is 1 where its loop is stable, 0 where it is not."""
         beyond = level(self.quantity, values) - level(self.quantity, self.knee)
-        if QUANTITIES[self.quantity].smaller_is_worse:
-            beyond = -beyond
-        cost = self.weight * soft(beyond)
+        cost = self.weight * soft(QUANTITIES[self.quantity].sign * beyond)
         return gate * cost if is_gated(self.quantity) else cost
 
 
 def is_gated(quantity: str) -> bool:
-    """Whether a number means nothing where the loop is unstable."""
-    return quantity in OF_THE_LOOP and quantity != "abscissa"
+    """Whether the quantity is meaningless for an unstable loop."""
+    return QUANTITIES[quantity].linear and quantity != "abscissa"
 
 
 def require_bound(quantity: str, bound: Float[Array, "..."]) -> None:
-    """Raises ValueError for a bound that has no level."""
+    """Raise ValueError for a bound that has no level."""
     require_finite(f"the bound of {quantity}", bound)
     if QUANTITIES[quantity].logarithmic:
-        require = f"the bound of {quantity}, which counts by its logarithm,"
-        require_positive(require, bound, f"give it in {QUANTITIES[quantity].unit}")
+        name = f"the bound of {quantity}, which counts by its logarithm,"
+        require_positive(name, bound, f"give it in {QUANTITIES[quantity].si_unit}")
 
 
 class Limit(eqx.Module):
-    """A hard bound on one quantity: `Limit("sensitivity_peak", at_most=3.6)`.
+    """A hard bound on one quantity, as `Limit("sensitivity_peak", at_most=3.6)`.
 
-    `over` says of which number of the members, by default of the worst; of several axes each member
-    counts by its worst one. Bounds are SI (rad, s, rad s^2). The tuner keeps limits by an augmented
-    Lagrangian on the members that it tunes on, the certificate judges them on fresh ones.
-    Raises ValueError for an unknown quantity and unless there is one bound.
+    Of several axes each member counts by its worst one. The tuner enforces limits by an augmented
+    Lagrangian on the members that it tunes on; the certificate checks them on fresh members.
+
+    **Arguments:**
+
+    - `quantity`: a name from `jq.tuning.QUANTITIES`.
+    - `at_most`, `at_least`: the bound in SI units (rad, s, rad s^2); give one of the two.
+    - `over`: the number over the members that is bounded, by default that of the worst.
+
+    **Raises:**
+
+    - `ValueError`: the quantity does not exist, or there is not exactly one bound.
     """
 
     quantity: str = eqx.field(static=True)
@@ -167,21 +217,24 @@ class Limit(eqx.Module):
 
     @property
     def bound(self) -> Float[Array, "..."]:
-        return self.at_least if self.at_most is None else self.at_most  # type: ignore[return-value]
+        """The number that must not be passed."""
+        bound = self.at_least if self.at_most is None else self.at_most
+        assert bound is not None
+        return bound
 
     @property
     def sign(self) -> float:
-        """1 where more is worse."""
+        """1 for `at_most`, -1 for `at_least`."""
         return -1.0 if self.at_most is None else 1.0
 
     def excess(self, values: Float[Array, " members"]) -> Float[Array, ""]:
-        """How far the members are beyond the limit, in its unit; above 0 it is violated."""
+        """How far the members are beyond the limit, in its unit; above 0 it is missed."""
         return self.over(self.sign * values) - self.sign * self.bound
 
     def beyond(self, values: Float[Array, " members"]) -> Float[Array, " members"]:
-        """The same as levels, one for each constraint that the limit makes: above 0, violated.
+        """The excess as levels, one for each constraint that the limit makes; above 0, missed.
 
-        The worst member is within the bound if each of them is, which is a smooth constraint.
+        The worst member is within the bound if every member is, and that is a smooth constraint.
         """
         beyond = self.sign * (level(self.quantity, values) - level(self.quantity, self.bound))
         if isinstance(self.over, Worst):
@@ -190,8 +243,8 @@ class Limit(eqx.Module):
 
     def __str__(self) -> str:
         sense = "at most" if self.at_most is not None else "at least"
-        over = getattr(self.over, "text", type(self.over).__name__.lower())
-        return f"{self.quantity} {sense} {np.asarray(self.bound).item():.4g} ({over})"
+        bound = np.asarray(self.bound).item()
+        return f"{self.quantity} {sense} {bound:.4g} ({risk_text(self.over)})"
 
 
 _STANDARD = (
@@ -199,7 +252,7 @@ _STANDARD = (
     ("sensitivity_peak", 2.0, 3.0),
     ("abscissa", -0.5, 5.0),
 )
-_RAMP = 0.25  # 1/s, the decay at which a member counts as stable in full
+_RAMP = 0.25  # 1/s, the decay rate from which a member counts in full
 
 Numbers = dict[str, Float[Array, "axes members"]]
 
@@ -213,18 +266,30 @@ def _penalties() -> tuple[Penalty, ...]:
 
 
 class Objective(eqx.Module):
-    """What tuning minimises: `risk` over the members of the sum of terms and penalties of each.
+    """What a tune minimises: the `risk` over the members of each one's terms and penalties.
 
     A term is its weight times the logarithm of a quantity (overshoot and saturation share, which
     may be 0, count in steps of 10 %). The default is ln(ITAE) + 2 soft(ln(activity rate / 20))
-    + 3 gate soft(ln(Ms / 2)) + 5 soft(abscissa + 0.5), whose gate is 1 where the loop is stable and
-    has no derivative. The activity rate is the sum of squared changes of the command per second, in
-    V^2/s: give your own penalties where commands have another unit.
+    + 3 gate soft(ln(Ms / 2)) + 5 soft(abscissa + 0.5), whose gate is 1 for a stable loop, 0 for an
+    unstable one, and has no derivative. The activity rate is the sum of squared changes of the
+    command per second, in V^2/s: give your own penalties where commands have another unit.
+    Source: docs/tuning.md.
 
-    `events` are the times in s at which the clock of ITAE starts again, such as those of steps and
-    gusts; without any it runs from `start`. Only start <= t < stop (s) counts; overshoot ends and
-    peak, rms and the error of the disturbance's estimate begin at `load_start`.
-    Source: EQUATIONS.md, section 3. Raises ValueError for unknown quantities and weights.
+    **Arguments:**
+
+    - `terms`: weights by the names of quantities, see `jq.tuning.QUANTITIES`.
+    - `penalties`: soft bounds.
+    - `risk`: what counts over the members: `jq.tuning.Mean`, `jq.tuning.CVaR`, `jq.tuning.Worst`,
+        `jq.tuning.Mix`, or a function of your own.
+    - `events`: times in s at which the clock of ITAE starts again, such as those of steps and
+        gusts; without any it runs from `start`.
+    - `start`, `stop`: only start <= t < stop counts, in s.
+    - `load_start`: where overshoot ends, and where peak, rms and the error of the disturbance's
+        estimate begin, in s.
+
+    **Raises:**
+
+    - `ValueError`: there are no terms, or a quantity or an event does not exist.
     """
 
     terms: dict[str, Array] = eqx.field(converter=_weights, default_factory=lambda: {"itae": 1.0})
@@ -241,11 +306,11 @@ class Objective(eqx.Module):
         for name in self.terms:
             require_quantity(name)
         if not all(math.isfinite(t) and t >= 0 for t in self.events):
-            raise ValueError(f"events are {self.events}: give times in s from 0 on")
+            raise ValueError(f"events are {self.events}: give times in s, 0 or later")
 
     @property
     def quantities(self) -> frozenset[str]:
-        """Whatever has to be measured, the abscissa included."""
+        """All quantities that have to be computed, the abscissa among them."""
         return frozenset(self.terms) | {p.quantity for p in self.penalties} | {"abscissa"}
 
     def costs(self, numbers: Numbers) -> Float[Array, " members"]:
@@ -253,11 +318,11 @@ class Objective(eqx.Module):
         gate = stability_gate(numbers["abscissa"])
         total = jnp.zeros_like(gate)
         for name, weight in self.terms.items():
-            term = weight * level(name, per_member(name, numbers[name]))
-            term = -term if QUANTITIES[name].smaller_is_worse else term
-            total = total + (gate * term if is_gated(name) else term)
+            term = weight * level(name, combine_axes(name, numbers[name]))
+            signed = QUANTITIES[name].sign * term
+            total = total + (gate * signed if is_gated(name) else signed)
         for penalty in self.penalties:
-            values = per_member(penalty.quantity, numbers[penalty.quantity])
+            values = combine_axes(penalty.quantity, numbers[penalty.quantity])
             total = total + penalty(values, gate)
         return total
 
@@ -265,7 +330,7 @@ class Objective(eqx.Module):
 def stability_gate(abscissa: Float[Array, "axes members"]) -> Float[Array, " members"]:
     """1 for a stable member, 0 for an unstable one, without a derivative.
 
-    |S| is small beyond the boundary of stability, so that a peak of it would pull members there.
+    Beyond the boundary of stability |S| is small: its peak would pull members there.
     """
     slowest = jnp.max(abscissa, axis=0)
     return jax.lax.stop_gradient(jnp.clip(-slowest / _RAMP, 0, 1))

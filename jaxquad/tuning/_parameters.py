@@ -1,6 +1,6 @@
 """Which numbers of a controller are tuned, and the coordinates in which they are."""
 
-from typing import Any
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -8,157 +8,137 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad.control import AdaptiveLADRC, InertiaMap, LADRC, PID, ScheduledLADRC, ScheduledPID
+from jaxquad.control import find_transform, Transform, Tunable
 from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
 
 
-_SHARPNESS = 20.0
-FLATTEST = 0.05  # nepers from knot to knot that a start is given at least: a flat one has no slope
+class Block(eqx.Module):
+    """An array that is tuned as a whole, in the coordinates of its `transform`."""
 
-
-def falling(z: Float[Array, "knots columns"]) -> Float[Array, "knots columns"]:
-    """The first row as it is, each further one softplus(20 z) / 20 below the last."""
-    drops = jax.nn.softplus(_SHARPNESS * z[1:]) / _SHARPNESS
-    return z[:1] - jnp.concatenate([jnp.zeros_like(z[:1]), jnp.cumsum(drops, axis=0)])
-
-
-def falling_inverse(
-    values: Float[np.ndarray, "knots columns"],
-) -> Float[np.ndarray, "knots columns"]:
-    """The z whose `falling` is nearest to `values`, in which rows that do not fall are flat."""
-    drops = np.maximum(values[:-1] - values[1:], FLATTEST)
-    return np.concatenate([values[:1], np.log(np.expm1(_SHARPNESS * drops)) / _SHARPNESS])
-
-
-_OF_PID = ("kp", "ki", "kd", "filter", "proportional_weight")
-
-
-class Row(eqx.Module):
-    """The knots of a map, which fall; a column for each axis."""
-
-    name: str = eqx.field(static=True)
     places: tuple[Place, ...] = eqx.field(static=True)
-    shape: tuple[int, int] = eqx.field(static=True)
+    shape: tuple[int, ...] = eqx.field(static=True)
+    transform: Transform
     start: Float[Array, " numbers"]
+
+    def values(self, z: Float[Array, " numbers"]) -> Float[Array, " numbers"]:
+        """The elements of the array at the coordinates `z`."""
+        return self.transform.forward(z.reshape(self.shape)).reshape(-1)
 
 
 class Coordinates(eqx.Module):
-    """Tuned numbers as one vector: logarithms of gains, the falling knots of maps.
+    """Tuned numbers as one vector z: logarithms of gains first, then the arrays in `blocks`.
 
-    `parameters` are those of `jq.fit`, for all numbers that are in no map.
+    `parameters` are those of `jq.fit`, for all numbers that are in no block.
     """
 
     controller: PyTree
     parameters: Parameters | None
-    rows: tuple[Row, ...]
+    blocks: tuple[Block, ...]
 
     @property
     def start(self) -> Float[np.ndarray, " n"]:
+        """z of the controller as it was given."""
         gains = (
             []
             if self.parameters is None
             else [np.asarray(self.parameters.start)[: self.parameters.count]]
         )
-        return np.concatenate([np.asarray(x) for x in [*gains, *(row.start for row in self.rows)]])
+        return np.concatenate([*gains, *(np.asarray(block.start) for block in self.blocks)])
 
     @property
     def names(self) -> tuple[str, ...]:
+        """The name of each tuned number."""
         names = () if self.parameters is None else self.parameters.names
-        return names + tuple(place.name for row in self.rows for place in row.places)
+        return names + tuple(place.name for block in self.blocks for place in block.places)
 
-    def controller_at(self, z: Float[Array, " n"]) -> Any:
+    @property
+    def arrays(self) -> frozenset[str]:
+        """The names of the arrays that the tuned numbers are in."""
+        return frozenset(name.partition("[")[0] for name in self.names)
+
+    def controller_at(self, z: Float[Array, " n"]) -> PyTree:
         """The controller with its tuned numbers set."""
         controller, first = self.controller, 0
         if self.parameters is not None:
             first = self.parameters.count
             controller = self.parameters.insert(controller, z[:first])
-        for row in self.rows:
-            values = falling(z[first : first + len(row.places)].reshape(row.shape))
-            controller = with_values(controller, row.places, values.reshape(-1))
-            first += len(row.places)
+        for block in self.blocks:
+            values = block.values(z[first : first + len(block.places)])
+            controller = with_values(controller, block.places, values)
+            first += len(block.places)
         return controller
 
     def values(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
         """The tuned numbers by name."""
-        tuned = design_at(self, jnp.asarray(z))
-        held = [np.asarray(x).reshape(-1) for x in _leaves(tuned)]
-        by_name = {place.name: float(held[place.leaf][place.index]) for place in self._places}
-        return {name: by_name[name] for name in self.names}
-
-    @property
-    def _places(self) -> list[Place]:
-        return name_places(self.controller)
+        tuned = eqx.filter(build_design(self, jnp.asarray(z)), eqx.is_inexact_array)
+        held = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(tuned)]
+        places = {place.name: place for place in name_places(self.controller)}
+        at = lambda place: float(held[place.leaf][place.index])
+        return {name: at(places[name]) for name in self.names}
 
 
 @eqx.filter_jit
-def design_at(coordinates: Coordinates, z: Float[Array, " n"]) -> Any:
+def build_design(coordinates: Coordinates, z: Float[Array, " n"]) -> PyTree:
     """`coordinates.controller_at(z)`, compiled as one."""
     return coordinates.controller_at(z)
 
 
-def coordinates(controller: Any, free: Free = None) -> Coordinates:
-    """Of a controller and of `free`, as in `jq.fit`; None is what its class makes sense of.
+def select_coordinates(controller: PyTree, free: Free = None) -> Coordinates:
+    """The coordinates in which a controller is tuned.
 
-    The knots `values` of an `InertiaMap` that are named as a whole stay falling. Raises ValueError
-    for names that do not exist, for numbers that start at 0 without a scale, and in float32.
+    **Arguments:**
+
+    - `controller`: the start.
+    - `free`: the numbers to tune, as in `jq.fit`; by default those that `controller.tunable()`
+        names. An array that is named as a whole, and that has a transform of its own, such as the
+        knots of a `jq.control.InertiaMap`, is tuned in the coordinates of that.
+
+    **Raises:**
+
+    - `ValueError`: names that do not exist, a number that starts at 0, an ensemble of controllers,
+        or single precision.
     """
-    if getattr(controller, "ensemble", ()):
+    _require_one(controller)
+    free = list(_default(controller)) if free is None else free
+    places = name_places(controller)
+    blocks: list[Block] = []
+    chosen = free
+    if not callable(free):
+        chosen = []
+        for item in [free] if isinstance(free, str) else free:
+            block = _block(controller, item, places) if isinstance(item, str) else None
+            blocks.append(block) if block is not None else chosen.append(item)
+    parameters = select_parameters(controller, chosen) if callable(chosen) or chosen else None
+    if parameters is None and not blocks:
+        raise ValueError('free is empty: name the numbers to tune, as ["wc", "wo"]')
+    return Coordinates(controller, parameters, tuple(blocks))
+
+
+def _require_one(controller: PyTree) -> None:
+    ensemble = getattr(controller, "ensemble", ())
+    if ensemble:
         raise ValueError(
-            f"the controller is an ensemble of {controller.ensemble}: give one controller; "
+            f"the controller is an ensemble of {ensemble}: give one controller; "
             "a tune makes its own copies for members and starts"
         )
-    free = _default(controller) if free is None else free
-    places = name_places(controller)
-    wanted = [free] if isinstance(free, str) else free
-    rows, others = [], []
-    for item in wanted if not callable(wanted) else ():
-        row = _row(controller, item, places) if isinstance(item, str) else None
-        rows.append(row) if row is not None else others.append(item)
-    chosen = wanted if callable(wanted) else others
-    parameters = select_parameters(controller, chosen) if callable(chosen) or chosen else None
-    if parameters is None and not rows:
-        raise ValueError('free is empty: name the numbers to tune, as ["wc", "wo"]')
-    return Coordinates(controller, parameters, tuple(rows))
 
 
-def _default(controller: Any) -> list[str]:
-    if isinstance(controller, LADRC):
-        return ["wc", "wo", "b0"]
-    if isinstance(controller, PID):
-        return _gains_of(controller, "")
-    if isinstance(controller, ScheduledLADRC | AdaptiveLADRC):
-        return ["ladrc.wc", "ladrc.wo", "map.values"]
-    if isinstance(controller, ScheduledPID):
-        # Its map's size and that of all gains are one and the same: kd stays.
-        return [name for name in _gains_of(controller.pid, "pid.") if name != "pid.kd"] + [
-            "map.values"
-        ]
-    raise ValueError(
-        f"which numbers of a {type(controller).__name__} are to be tuned is not known: name them, "
-        "free=[...], as in jq.fit"
-    )
+def _default(controller: PyTree) -> Mapping[str, Transform | None]:
+    if not isinstance(controller, Tunable):
+        raise ValueError(
+            f"a {type(controller).__name__} does not say which of its numbers are tuned: name "
+            'them, free=["kp", "kd"], or give it a method tunable()'
+        )
+    return controller.tunable()
 
 
-def _gains_of(pid: PID, prefix: str) -> list[str]:
-    names = [name for name in _OF_PID if np.all(np.asarray(getattr(pid, name)) != 0)]
-    if getattr(pid, "measurement_filter", None) is not None:
-        names.append("measurement_filter")
-    return [prefix + name for name in names]
-
-
-def _row(controller: Any, name: str, places: list[Place]) -> Row | None:
-    """The row of knots of that name, if it is one of an `InertiaMap`."""
-    owner, _, last = name.rpartition(".")
-    part = controller
-    for step in owner.split(".") if owner else ():
-        part = getattr(part, step, None)
-    if last != "values" or not isinstance(part, InertiaMap):
+def _block(controller: PyTree, name: str, places: list[Place]) -> Block | None:
+    """The array of that name, if a part of the controller declares coordinates for it."""
+    transform = find_transform(controller, name)
+    if transform is None:
         return None
-    values = np.asarray(part.values)
     mine = tuple(place for place in places if place.name.startswith(f"{name}["))
-    columns = values.reshape(values.shape[0], -1)
-    return Row(name, mine, columns.shape, jnp.asarray(falling_inverse(columns).reshape(-1)))
-
-
-def _leaves(model: Any) -> list[Array]:
-    return jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+    leaves = jax.tree.leaves(eqx.filter(controller, eqx.is_inexact_array))
+    values = np.asarray(leaves[mine[0].leaf])
+    start = np.asarray(transform.inverse(values))
+    return Block(mine, values.shape, transform, jnp.asarray(start.reshape(-1)))

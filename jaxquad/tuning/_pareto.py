@@ -1,36 +1,34 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
+from jaxquad.loops import Loop
 from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate
 from ._certify import certify
-from ._checks import require_kinds
-from ._copies import copies
-from ._judged import Judged
+from ._cost import stack_copies
+from ._design_result import DesignResult, DesignSummary, front_point, summarise_design
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty
-from ._parameters import coordinates, design_at
+from ._parameters import build_design, select_coordinates
 from ._phases import solve
-from ._problem import problem_of
+from ._problem import DeviceChoice, make_problem, TimeSpan
 from ._progress import Progress
-from ._quantities import SHOWN
-from ._row import row_of
-from ._tune import _tightened, stabilising_rate
+from ._quantities import QUANTITIES
+from ._tune import draw_or_take, require_kinds, stabilising_rate, tighten
 
 
-def front_text(pareto: Any) -> str:
+def describe_front(pareto: "Pareto") -> str:
     """A line for each point, then for each peer."""
-    shown = SHOWN[pareto.over]
+    shown = QUANTITIES[pareto.over]
     over = f"{shown.title}{', ' + shown.unit if shown.unit else ''}"
     members = pareto.certificates[0].members
     kept, count = int(np.sum(pareto.front)), len(pareto.controllers)
@@ -43,19 +41,21 @@ def front_text(pareto: Any) -> str:
     points = (pareto.levels, pareto.certificates, pareto.front, pareto.converged)
     for k, (level, certificate, on, done) in enumerate(zip(*points, strict=True)):
         name = f"{k + 1}{'' if on else ', dominated'}{'' if done else ', not done'}"
-        lines.append(_row(name, f"{level:.3g}", certificate.rows[certificate.name], pareto.over))
+        lines.append(
+            _row(name, f"{level:.3g}", certificate.summaries[certificate.name], pareto.over)
+        )
     for name, design in pareto.peers.items():
-        lines.append(_row(name, "", row_of(design, independent=False), pareto.over))
+        lines.append(_row(name, "", summarise_design(design, independent=False), pareto.over))
     return "\n".join(lines)
 
 
-def _row(name: str, level: str, row: Any, over: str) -> str:
+def _row(name: str, level: str, row: DesignSummary, over: str) -> str:
     itae, peak = row.statistics["itae"], row.statistics.get("sensitivity_peak")
     worst = f"{peak.worst:.3g}" if peak is not None and row.unstable == 0 else "n/a"
     effort = row.statistics["activity_rate"].mean if over == "activity_rate" else None
     first = worst if effort is None else f"{effort:.4g}"
     share = "n/a" if row.unstable is None else f"{100 * row.unstable / row.members:.3g}"
-    numbers = [f"{SHOWN['itae'].number(x):.4g}" for x in (itae.mean, itae.worst)]
+    numbers = [f"{QUANTITIES['itae'].number(x):.4g}" for x in (itae.mean, itae.worst)]
     return f"  {name:<24}{level:>9}{first:>18}{numbers[0]:>15}{numbers[1]:>9}{worst:>10}{share:>13}"
 
 
@@ -67,19 +67,19 @@ _WEIGHT = 4.0  # of the penalty that holds a point at its level
 
 
 class Pareto(eqx.Module):
-    """Designs between tracking and `over`, each judged on fresh members with its own certificate.
+    """A front of designs between tracking and `over`, each with a certificate on fresh members.
 
-    The points are ordered by the level about which `over` was held. `front` says which of them are
-    stable for all members, and beaten in both numbers by no other such point; the rest is listed.
-    The bound in a certificate holds for a point chosen beforehand: certify the one that you take
-    because of it again, with another key.
+    The points are ordered by the level at which `over` was held. `front` says which of them are
+    stable for all members, and not dominated in both numbers by another such point. The confidence
+    bound in a certificate holds for a point that was chosen beforehand: certify the point that you
+    choose by it again, with another key.
     """
 
     over: str = eqx.field(static=True)
-    levels: Float[np.ndarray, " points"]  # about which each point was held
-    controllers: tuple[Any, ...]
+    levels: Float[np.ndarray, " points"]  # at which each point was held
+    controllers: tuple[PyTree, ...]
     certificates: tuple[Certificate, ...]
-    peers: dict[str, Judged]
+    peers: dict[str, DesignResult]
     converged: Bool[np.ndarray, " points"]
     evaluations: Int[np.ndarray, " points"]  # gradients
     seconds: float = eqx.field(static=True)  # of the descent, without the certificates
@@ -87,12 +87,12 @@ class Pareto(eqx.Module):
     @property
     def tracking(self) -> Float[np.ndarray, " points"]:
         """Mean ITAE of the fresh members, rad s^2."""
-        return np.array([place(c.design, self.over)[1] for c in self.certificates])
+        return np.array([front_point(c.design, self.over)[1] for c in self.certificates])
 
     @property
     def effort(self) -> Float[np.ndarray, " points"]:
-        """Of `over`: the mean activity, or the worst Ms; inf with an unstable member."""
-        return np.array([place(c.design, self.over)[0] for c in self.certificates])
+        """The mean activity, or the worst Ms, which is infinite with an unstable member."""
+        return np.array([front_point(c.design, self.over)[0] for c in self.certificates])
 
     @property
     def front(self) -> Bool[np.ndarray, " points"]:
@@ -102,20 +102,21 @@ class Pareto(eqx.Module):
         better = (x[:, None] <= x) & (y[:, None] <= y) & ((x[:, None] < x) | (y[:, None] < y))
         return stable & ~np.any(better & stable[:, None], axis=0)
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, object]:
         """Every point's numbers, for `jaxquad.report.write_json`."""
+        own = vars(self) | {"effort": self.effort, "tracking": self.tracking, "front": self.front}
         names = ("over", "levels", "effort", "tracking", "front", "converged", "evaluations")
-        rows = [c.rows[c.name].content() | {"holds": c.holds} for c in self.certificates]
+        rows = [c.summaries[c.name].content() | {"holds": c.holds} for c in self.certificates]
         known = self.certificates[0].independent
-        peers = {n: row_of(x, independent=known).content() for n, x in self.peers.items()}
-        return {name: getattr(self, name) for name in names} | {"points": rows, "peers": peers}
+        peers = {n: summarise_design(x, independent=known).content() for n, x in self.peers.items()}
+        return {name: own[name] for name in names} | {"points": rows, "peers": peers}
 
     def __str__(self) -> str:
-        return front_text(self)
+        return describe_front(self)
 
 
 def pareto(
-    controller: Any,
+    loop: Loop,
     ensemble: Ensemble | Members,
     scenario: Scenario,
     *,
@@ -125,77 +126,71 @@ def pareto(
     objective: Objective | None = None,
     limits: Sequence[Limit] = (),
     reserve: float = 0.03,
-    peers: Mapping[str, Any] | None = None,
+    peers: Mapping[str, PyTree] | None = None,
     free: Free = None,
     members: int = 64,
     fresh: int | Members = 256,
     method: LBFGS | None = None,
     key: Key[Array, ""] | None = None,
     progress: bool | None = None,
-    devices: int | Sequence[Any] | None = None,
+    devices: DeviceChoice = None,
 ) -> Pareto:
-    """What tracking costs: `points` designs between little and much of `over`, tuned at once.
+    """What better tracking costs: designs between little and much of `over`, tuned together.
 
-    All points descend in lockstep on the same `members`, each with the `objective` and a penalty
-    that holds `over` about its own one of `levels`: of "activity", squared changes of the command
-    per second, or of "sensitivity_peak". It takes the place of the objective's penalty on that, of
-    whose knee the levels go to either side if they are None. Then each point gets a certificate on
-    `fresh` members. The other arguments are those of `tune`.
-    Raises ValueError for an unknown `over`, for levels that do not rise, and as `tune` does.
+    All points descend in lockstep on the same members, each with the objective and a penalty that
+    holds `over` at its own level. Then each point gets a certificate.
+
+    **Arguments:**
+
+    - `loop`, `ensemble`, `scenario`: as for `jq.tune`.
+    - `over`: "activity", squared changes of the command per second, or "sensitivity_peak".
+    - `points`: how many designs.
+    - `levels`: at which `over` is held, rising; by default to either side of the knee of the
+        objective's penalty on it, which these penalties replace.
+    - `fresh`: how many members each point is certified on, or those members.
+    - The others: as for `jq.tune`.
+
+    **Raises:**
+
+    - `ValueError`: `over` is unknown, the levels do not rise, or as `jq.tune` does.
     """
     if over not in _NAMES:
         raise ValueError(f"no front over {over!r}: choose one of {', '.join(_NAMES)}")
     over, objective = _NAMES[over], Objective() if objective is None else objective
     method = LBFGS() if method is None else method
-    require_kinds(ensemble, objective, limits, method)
+    require_kinds(loop, ensemble, objective, limits, method)
     held = _levels(over, objective, points, levels)
     if isinstance(ensemble, Members) and not isinstance(fresh, Members):
         raise ValueError("the members to tune on are given: give fresh=, other members, too")
     key = jax.random.key(0) if key is None else key
-    span = {name: getattr(objective, name) for name in ("events", "start", "stop", "load_start")}
-    free_ones, watched = coordinates(controller, free), Progress(progress)
-    problem = problem_of(
-        controller, _drawn(ensemble, members, key), scenario, **span, devices=devices
-    )
-    tightened = tuple(_tightened(limit, reserve) for limit in limits)
+    span, watched = TimeSpan.of(objective), Progress(progress)
+    coordinates = select_coordinates(loop.controller, free)
+    drawn = draw_or_take(loop, ensemble, members, key)
+    problem = make_problem(loop.controller, drawn, scenario, span=span, devices=devices)
+    tightened = tuple(tighten(limit, reserve) for limit in limits)
     found = solve(
-        free_ones, problem, np.tile(free_ones.start, (len(held), 1)),
-        _objectives(objective, over, held), copies(tightened, len(held)),
-        method=method, rate=stabilising_rate(objective),
-        progress=watched,
+        coordinates, problem, np.tile(coordinates.start, (len(held), 1)),
+        _objectives(objective, over, held), stack_copies(tightened, len(held)),
+        method=method, rate=stabilising_rate(objective), progress=watched,
     )  # fmt: skip
     seconds = watched.seconds
-    designs = [design_at(free_ones, jnp.asarray(z)) for z in found.z]
-    judged_on, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
-    judge = lambda c, others: certify(
-        c,
-        judged_on,
-        scenario,
-        limits=limits,
-        peers=others,
-        members=count,
-        key=key,
-        **span,
-        devices=devices,
-    )
-    certificates = [judge(c, {} if k else peers) for k, c in enumerate(designs)]
-    others = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}
+    designs = [build_design(coordinates, jnp.asarray(z)) for z in found.z]
+    others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
+    certificates = [
+        certify(
+            loop.with_controller(design), others, scenario, limits=limits,
+            peers={} if k else peers, members=count, key=key, devices=devices, **span._asdict(),
+        )
+        for k, design in enumerate(designs)
+    ]  # fmt: skip
+    beside = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}
     certificates[0] = dataclasses.replace(
         certificates[0], designs={"tuned": certificates[0].design}
     )
     return Pareto(
-        over, held, tuple(designs), tuple(certificates), others, found.converged,
+        over, held, tuple(designs), tuple(certificates), beside, found.converged,
         found.evaluations, seconds,
     )  # fmt: skip
-
-
-def place(design: Judged, over: str) -> tuple[float, float]:
-    """Where a design stands beside a front: its effort and its mean ITAE."""
-    values = design.of(over)
-    if over != "sensitivity_peak":
-        return float(np.mean(values)), float(np.mean(design.of("itae")))
-    unstable = design.unstable is None or bool(design.unstable.any())
-    return np.inf if unstable else float(np.max(values)), float(np.mean(design.of("itae")))
 
 
 def _levels(
@@ -213,10 +208,6 @@ def _levels(
     if held.ndim != 1 or held.size < 2 or not np.all((held > 0) & (np.diff(held, prepend=0) > 0)):
         raise ValueError(f"levels are {levels}: give 2 or more above 0 that rise")
     return held
-
-
-def _drawn(ensemble: Ensemble | Members, count: int, key: Key[Array, ""]) -> Members:
-    return ensemble if isinstance(ensemble, Members) else ensemble.draw(count, key)
 
 
 def _objectives(objective: Objective, over: str, levels: np.ndarray) -> Objective:

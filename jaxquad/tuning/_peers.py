@@ -1,14 +1,13 @@
-"""What a tuned design is held against."""
-
-from typing import Any
+"""Designs that a tuned one is compared with."""
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
 
-from ._judge import axes_of
+from ._certify import decouple, Plant
 
 
 WC, WO = 10.0, 30.0  # rad/s, the paper's
@@ -17,13 +16,24 @@ PAPER_B0 = (3.0, 1.6)  # before and after the paper's adaptation, rad/s^2 per V
 RIG_GAIN = 2 * QUANSER_HOVER.arm * QUANSER_HOVER.thrust_coefficient / QUANSER_HOVER.inertia[0]
 
 
-def paper_designs(plant: Any, *, dt: float = 0.002) -> dict[str, LADRC]:
-    """The paper's LADRCs for a plant: 10 and 30 rad/s with b0 = 3, and with b0 = 1.6.
+def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
+    """The paper's two LADRCs for a plant: 10 and 30 rad/s with b0 = 3, and with b0 = 1.6.
 
-    On the rig's roll axis (b = 0.848 rad/s^2 per V) b0 is exactly that; on another plant, or
-    another axis, it has the same ratio to b: 3.54 and 1.89. `plant` is the nominal
-    `jq.DecoupledAxes` or `jq.models.Multirotor`, without an ensemble.
-    Source: section 5 of the paper, docs/equations.md. Raises ValueError for an ensemble.
+    On the rig's roll axis (b = 0.848 rad/s^2 per V) b0 is exactly that. On another plant or axis it
+    has the same ratio to b: 3.54 and 1.89. Source: section 5 of the paper, docs/equations.md.
+
+    **Arguments:**
+
+    - `plant`: the nominal `jq.DecoupledAxes` or `jq.models.Multirotor`, without an ensemble.
+    - `dt`: the sample interval in s.
+
+    **Returns:**
+
+    The designs by name, for `peers=` of a tune or certificate.
+
+    **Raises:**
+
+    - `ValueError`: the plant is an ensemble, or of another kind.
     """
     b = np.asarray(_nominal(plant).gain, float)
     designs = {}
@@ -35,31 +45,44 @@ def paper_designs(plant: Any, *, dt: float = 0.002) -> dict[str, LADRC]:
     return designs
 
 
-def peers(plant: Any, *, pid: Any = None, dt: float = 0.002) -> dict[str, Any]:
+def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict[str, PyTree]:
     """Designs to stand beside a tuned one in its certificate, by name.
 
-    The paper's two, the certainty-equivalence LADRC (10 and 30 rad/s, b0 = KT / J of the inertia
-    told), and `pid` if given: a PID tuned on the same ensemble, scheduled or not.
+    The paper's two, and the certainty-equivalence LADRC (10 and 30 rad/s, b0 = KT / J of the
+    inertia told).
+
+    **Arguments:**
+
+    - `plant`, `dt`: as for `jq.tuning.paper_designs`.
+    - `pid`: a PID tuned on the same ensemble, to add as "tuned PID".
+
+    **Returns:**
+
+    The designs by name.
+
+    **Raises:**
+
+    - `ValueError`: as `jq.tuning.paper_designs` does.
     """
     axes = _nominal(plant)
     KT, J = jnp.broadcast_arrays(axes.torque_gain, axes.inertia)
     # As a map of ln J, b0 = KT / J is straight: two knots, far apart, hold it everywhere.
     map = certainty_equivalence(KT, J, span=(1e-3, 1e3), knots=2)
-    designs: dict[str, Any] = dict(paper_designs(plant, dt=dt))
+    designs: dict[str, PyTree] = dict(paper_designs(plant, dt=dt))
     designs["CE 10/30"] = ScheduledLADRC(LADRC(WC, WO, axes.gain, dt=dt), map)
     return designs if pid is None else designs | {"tuned PID": pid}
 
 
-def _nominal(plant: Any) -> DecoupledAxes:
+def _nominal(plant: Plant) -> DecoupledAxes:
     if not isinstance(plant, DecoupledAxes | Multirotor):
         raise ValueError(
             f"the plant is a {type(plant).__name__}: give the nominal jq.DecoupledAxes or "
-            "jq.models.Multirotor, such as ensemble.plant"
+            "jq.models.Multirotor, such as loop.plant"
         )
-    axes = axes_of(plant)
+    axes = decouple(plant)
     if len(axes.shape) > 1:
         raise ValueError(
-            f"the plant is an ensemble of {axes.shape[1:]}: give the nominal one, whose gain the "
-            "designs are made for"
+            f"the plant is an ensemble of {axes.shape[1:]}: give the nominal one, for whose "
+            "gain the designs are made"
         )
     return axes

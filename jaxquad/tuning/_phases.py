@@ -1,24 +1,25 @@
 """Stabilise, then optimise: all problems in lockstep, limits by an augmented Lagrangian."""
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import ArrayLike, Bool, Float, Int, PyTree
 
-from ._copies import one_of
-from ._cost import Aim, evaluate, Pull, Told
-from ._gauss_newton import GaussNewton, least_squares
-from ._lbfgs import Descent, LBFGS, minimise
+from jaxquad.control import ObserverController
+
+from ._cost import CostResult, evaluate_cost, Multipliers, Subproblem, take_problem
+from ._gauss_newton import GaussNewton, minimise_squares
+from ._lbfgs import Descent, Evaluate, LBFGS, minimise
 from ._objective import Limit, Objective
-from ._observer_alone import refusal
-from ._parameters import Coordinates
+from ._parameters import build_design, Coordinates
 from ._problem import Problem
 from ._progress import Evaluation, Progress
-from ._quantities import OF_THE_LOOP
+from ._quantities import QUANTITIES
 
 
 MET = 2e-3  # beyond a limit, as a level: 0.2 %
@@ -27,34 +28,34 @@ _STALLED = 0.9  # of what a limit was missed by before: it falls no further
 _AS_GOOD = 1.05  # of the least miss: of rounds that miss limits so nearly alike, the cost decides
 
 
-def no_pull(problem: Problem, limits: Sequence[Limit], problems: int) -> Pull:
+def initial_multipliers(problem: Problem, limits: Sequence[Limit], problems: int) -> Multipliers:
     """Before anything is known of the limits."""
-    sizes = [_constraints(problem, limit) for limit in limits]
-    multipliers = tuple(jnp.asarray(np.zeros((problems, size))) for size in sizes)
-    return Pull(multipliers, jnp.asarray(np.full((problems, len(sizes)), _STIFFNESS)))
+    sizes = [_count_constraints(problem, limit) for limit in limits]
+    values = tuple(jnp.asarray(np.zeros((problems, size))) for size in sizes)
+    return Multipliers(values, jnp.asarray(np.full((problems, len(sizes)), _STIFFNESS)))
 
 
-def pulled(
-    told: Told,
-    pull: Pull,
+def update_multipliers(
+    result: CostResult,
+    multipliers: Multipliers,
     before: Float[np.ndarray, "problems limits"],
     on: Bool[np.ndarray, " problems"],
-) -> tuple[Pull, Float[np.ndarray, "problems limits"]]:
-    """The next multipliers for problems that are `on`, and how far each limit is missed.
+) -> tuple[Multipliers, Float[np.ndarray, "problems limits"]]:
+    """The next multipliers of problems that are `on`, and how far each limit is missed.
 
-    Where a limit is missed by more than a quarter of what it was `before`, it becomes stiffer.
+    A limit becomes stiffer where it is missed by more than a quarter of what it was `before`.
     """
-    keep, multipliers, most = np.asarray(on)[:, None], [], []
-    stiffness = np.asarray(pull.stiffness)
-    for k, beyond in enumerate(map(np.asarray, told.beyond)):
-        old = np.asarray(pull.multipliers[k])
+    keep, values, most = np.asarray(on)[:, None], [], []
+    stiffness = np.asarray(multipliers.stiffness)
+    for k, beyond in enumerate(map(np.asarray, result.beyond)):
+        old = np.asarray(multipliers.values[k])
         raised = np.maximum(old + stiffness[:, k : k + 1] * beyond, 0)
-        multipliers.append(jnp.asarray(np.where(keep, raised, old)))
+        values.append(jnp.asarray(np.where(keep, raised, old)))
         most.append(beyond.max(axis=1))
     missed = np.stack(most, axis=1)
     slow = missed > np.maximum(0.25 * before, MET)
     stiffer = np.where(slow & keep, _STIFFER, 1.0) * stiffness
-    return Pull(tuple(multipliers), jnp.asarray(stiffer)), missed
+    return Multipliers(tuple(values), jnp.asarray(stiffer)), missed
 
 
 class Rounds:
@@ -72,7 +73,7 @@ class Rounds:
 
     @property
     def stalled(self) -> Bool[np.ndarray, " problems"]:
-        """Which problems have twice come no nearer to limits that they miss by more than 2 %."""
+        """Which problems miss limits by more than 2 %, and came no nearer to them in two rounds."""
         if len(self.missed) < 3:
             return np.zeros(len(self.points[0]), bool)
         least, last, now = np.min(self.missed[:-2], axis=0), *self.missed[-2:]
@@ -87,15 +88,15 @@ class Rounds:
         return np.stack([self.points[r][k] for k, r in enumerate(chosen)])
 
 
-def _constraints(problem: Problem, limit: Limit) -> int:
+def _count_constraints(problem: Problem, limit: Limit) -> int:
     """One for each member that a limit is kept on."""
-    wide = problem.wide if limit.quantity in OF_THE_LOOP else None
-    return problem.members if wide is None else wide.members
+    limited = problem.limited if QUANTITIES[limit.quantity].linear else None
+    return problem.members if limited is None else limited.members
 
 
 _ROUNDS = 8  # of multipliers
-_TIMES = 3  # what a descent may take, of evaluations, is what all rounds may
-_BEYOND_KNEE = 0.25  # 1/s, what the first phase aims at below the abscissa that is enough
+_TIMES = 3  # evaluations of all rounds together, in those of one descent
+_BEYOND_KNEE = 0.25  # 1/s, below the abscissa that is enough: where the first phase aims
 
 
 class Solution(NamedTuple):
@@ -104,16 +105,16 @@ class Solution(NamedTuple):
     z: Float[np.ndarray, "problems n"]
     cost: Float[np.ndarray, " problems"]  # the objective without what limits added
     gradient: Float[np.ndarray, "problems n"]
-    able: Bool[np.ndarray, " problems"]  # no member is unstable
-    stabilised: Bool[np.ndarray, " problems"]  # nor slower than the abscissa that is enough
+    stable: Bool[np.ndarray, " problems"]  # all members
+    stabilised: Bool[np.ndarray, " problems"]  # all members decay as fast as was asked
     converged: Bool[np.ndarray, " problems"]
     reasons: tuple[str, ...]
-    refusal: str  # of the last step that a controller refused, empty if none did
+    refusal: str  # why the controller refused the last of the steps that it refused, if any
     evaluations: Int[np.ndarray, " problems"]  # of the second phase: flights and linear loops
     stabilising: Int[np.ndarray, " problems"]  # of the first phase: linear loops only
     beyond: Float[np.ndarray, "problems limits"]  # greatest, as levels: above 0, violated
-    pull: Pull
-    told: Told
+    multipliers: Multipliers
+    result: CostResult
 
 
 def solve(
@@ -133,130 +134,187 @@ def solve(
     first phase's best if one of them is unstable. Otherwise no step is taken to where one is, and
     where limits cannot be met the end is the round that missed them least.
     """
-    runner = _Runner(coordinates, problem, objectives, tuple(limits), method, rate, progress)
+    memory = _Memory()
+    runner = _Runner(
+        coordinates, problem, objectives, tuple(limits), method, rate, progress, memory
+    )
     first = runner.stabilise(np.asarray(start, float))
     slowest = runner.slowest(first.z)
-    able = slowest < 0
-    second, pull, told, beyond, count = runner.optimise(first.z, able)
+    stable = slowest < 0
+    second, multipliers, result, beyond, counts = runner.optimise(first.z, stable)
     return Solution(
-        z=second.z, cost=np.where(able, np.asarray(told.cost), np.nan), gradient=second.gradient,
-        able=able, stabilised=slowest < rate, converged=second.converged & able,
-        reasons=second.reasons, refusal=runner.refusal, evaluations=count,
-        stabilising=first.evaluations,
-        beyond=beyond, pull=pull, told=told,
+        z=second.z, cost=np.where(stable, np.asarray(result.cost), np.nan),
+        gradient=second.gradient, stable=stable, stabilised=slowest < rate,
+        converged=second.converged & stable, reasons=second.reasons, refusal=memory.refusal,
+        evaluations=counts, stabilising=first.evaluations, beyond=beyond, multipliers=multipliers,
+        result=result,
     )  # fmt: skip
 
 
-class _Runner:
-    def __init__(self, coordinates, problem, objectives, limits, method, rate, progress):
-        self.coordinates, self.problem, self.method = coordinates, problem, method
-        self.objectives, self.limits, self.rate = objectives, limits, rate
-        self.progress = progress
-        self.last: Any = None
-        self.refusal = ""
-        self.first = method if isinstance(method, LBFGS) else LBFGS()
+class _Memory:
+    """What a run remembers of its evaluations."""
 
-    def told(self, z: Any, on: Any, fly: Any, pull: Pull) -> Told:
+    def __init__(self) -> None:
+        self.slowest: Float[np.ndarray, " problems"] = np.zeros(0)  # 1/s, of the last one
+        self.refusal = ""
+
+
+class _Runner(eqx.Module):
+    coordinates: Coordinates
+    problem: Problem
+    objectives: Objective
+    limits: tuple[Limit, ...]
+    method: LBFGS | GaussNewton
+    rate: float  # 1/s
+    progress: Progress
+    memory: _Memory
+
+    def evaluate(
+        self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
+    ) -> CostResult:
         """One evaluation of the problems that are on."""
         count = len(z)
         rate = jnp.full(count, self.rate - _BEYOND_KNEE)
         flies = jnp.broadcast_to(jnp.asarray(fly), (count,))
-        aim = Aim(self.objectives, self.limits, pull, flies, rate)
+        subproblem = Subproblem(self.objectives, self.limits, multipliers, flies, rate)
         given = (jnp.asarray(z), jnp.asarray(on))
-        told = evaluate(*given, self.coordinates, self.problem, aim)
-        return jax.tree.map(np.asarray, told)  # NumPy compiles nothing for what follows
+        result = evaluate_cost(*given, self.coordinates, self.problem, subproblem)
+        return jax.tree.map(np.asarray, result)  # NumPy compiles nothing for what follows
 
-    def both(self, fly: bool, pull: Pull) -> Any:
-        def both(z, on):
-            told = self.told(z, on, fly, pull)
+    def evaluator(self, fly: bool, multipliers: Multipliers) -> Evaluate:
+        """What a descent calls: infinite where a step must not go."""
+
+        def evaluate(z: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            result = self.evaluate(z, on, fly, multipliers)
             if fly:  # limits must not buy themselves members that are unstable
-                lost = np.max(told.numbers["abscissa"], axis=1) >= 0
-                told = told._replace(value=np.where(lost, np.inf, told.value))
-            refused = [bool(go) and bool(self.refused(x)) for x, go in zip(z, on, strict=True)]
-            told = told._replace(value=np.where(refused, np.inf, told.value))
-            self.last = told
-            self.progress.add(_evaluation(told, z, on, fly, self.progress.seconds))
-            return np.asarray(told.value), np.asarray(told.gradient)
+                lost = np.max(result.numbers["abscissa"], axis=1) >= 0
+                result = result._replace(value=np.where(lost, np.inf, result.value))
+            refused = [bool(go) and bool(self.refusal(x)) for x, go in zip(z, on, strict=True)]
+            result = result._replace(value=np.where(refused, np.inf, result.value))
+            self.memory.slowest = result.numbers["abscissa"].max(axis=1)
+            self.progress.add(_evaluation(result, z, on, fly, self.progress.seconds))
+            return np.asarray(result.value), np.asarray(result.gradient)
 
-        return both
+        return evaluate
 
-    def refused(self, z: np.ndarray) -> str:
+    def refusal(self, z: np.ndarray) -> str:
         """Why no step goes to `z`; the last such reason is kept."""
-        why = refusal(self.coordinates, z)
-        self.refusal = why or self.refusal
+        why = find_refusal(self.coordinates, z)
+        self.memory.refusal = why or self.memory.refusal
         return why
 
     def stabilise(self, z: np.ndarray) -> Descent:
-        pull = no_pull(self.problem, self.limits, len(z))
-        enough = lambda k, value: float(self.last.numbers["abscissa"][k].max()) < self.rate
-        return minimise(self.both(False, pull), z, self.first, enough=enough)
+        """The first phase: linear loops alone."""
+        multipliers = initial_multipliers(self.problem, self.limits, len(z))
+        method = self.method if isinstance(self.method, LBFGS) else LBFGS()
+        enough = lambda k, value: float(self.memory.slowest[k]) < self.rate
+        return minimise(self.evaluator(False, multipliers), z, method, enough=enough)
 
     def slowest(self, z: np.ndarray) -> np.ndarray:
-        everyone = np.ones(len(z), bool)
-        told = self.told(z, everyone, False, no_pull(self.problem, self.limits, len(z)))
-        return np.asarray(told.numbers["abscissa"]).max(axis=1)
+        """The abscissa of each problem's slowest member, 1/s."""
+        multipliers = initial_multipliers(self.problem, self.limits, len(z))
+        result = self.evaluate(z, np.ones(len(z), bool), False, multipliers)
+        return np.asarray(result.numbers["abscissa"]).max(axis=1)
 
-    def descended(self, z: np.ndarray, on: np.ndarray, pull: Pull, left: int) -> Descent:
-        if not isinstance(self.method, GaussNewton):
-            method = eqx.tree_at(lambda m: m.evaluations, self.method, left)
-            return minimise(self.both(True, pull), z, method, on=on)
-        ends = [
-            least_squares(
-                self.coordinates, self.problem, one_of(self.objectives, k), x, self.method
-            )
-            if on[k]
-            else (x, 0, False)
-            for k, x in enumerate(z)
-        ]
+    def descend(self, z: np.ndarray, on: np.ndarray, given: Multipliers, left: int) -> Descent:
+        """One round of the second phase, of at most `left` evaluations."""
+        if isinstance(self.method, LBFGS):
+            method = dataclasses.replace(self.method, evaluations=left)
+            return minimise(self.evaluator(True, given), z, method, on=on)
+        ends = [self._squares(k, x) if on[k] else (x, 0, False) for k, x in enumerate(z)]
         points, steps, done = zip(*ends, strict=True)
-        value, gradient = self.both(True, pull)(np.stack(points), on)
+        value, gradient = self.evaluator(True, given)(np.stack(points), on)
         reasons = tuple(
             "" if d else f"stopped after {s} steps" for s, d in zip(steps, done, strict=True)
         )
         return Descent(np.stack(points), value, gradient, np.array(steps), np.array(done), reasons)
 
-    def optimise(self, z: np.ndarray, able: np.ndarray) -> Any:
-        pull, on = no_pull(self.problem, self.limits, len(z)), able.copy()
+    def _squares(self, k: int, z: np.ndarray) -> tuple[np.ndarray, int, bool]:
+        assert isinstance(self.method, GaussNewton)
+        objective = take_problem(self.objectives, k)
+        return minimise_squares(self.coordinates, self.problem, objective, z, self.method)
+
+    def optimise(self, z: np.ndarray, able: np.ndarray) -> "_Optimised":
+        """The second phase of the problems that are `able`: rounds of multipliers."""
+        multipliers = initial_multipliers(self.problem, self.limits, len(z))
+        on, everyone, rounds = able.copy(), np.ones_like(able), Rounds()
         counts, beyond = np.zeros(len(z), int), np.full((len(z), len(self.limits)), np.inf)
-        told = self.told(z, np.ones_like(able), able, pull)
-        _require_finite(told, able)
-        descent: Any = None
-        everyone, rounds = np.ones_like(able), Rounds()
-        most = getattr(self.method, "evaluations", 0)
+        result = self.evaluate(z, everyone, able, multipliers)
+        _require_finite(result, able)
+        descent: Descent | None = None
+        most = self.method.evaluations if isinstance(self.method, LBFGS) else 0
         for _ in range(_ROUNDS if self.limits else 1):
-            found = self.descended(z, on, pull, min(most, int(_TIMES * most - counts.max())))
-            descent = found if descent is None else _merged(descent, found, on)
+            left = min(most, int(_TIMES * most - counts.max()))
+            found = self.descend(z, on, multipliers, left)
+            descent = found if descent is None else _merge(descent, found, on)
             z, counts = descent.z, counts + found.evaluations
-            told = self.told(z, everyone, able, pull)
+            result = self.evaluate(z, everyone, able, multipliers)
             if not self.limits:
-                return descent, pull, told, beyond, counts
-            pull, beyond = pulled(told, pull, beyond, on)
-            rounds.add(z, np.asarray(told.cost), beyond)
+                return _Optimised(descent, multipliers, result, beyond, counts)
+            multipliers, beyond = update_multipliers(result, multipliers, beyond, on)
+            rounds.add(z, np.asarray(result.cost), beyond)
             on = on & (beyond.max(axis=1) > MET) & ~rounds.stalled
             if not on.any() or counts.max() >= _TIMES * most:
                 break
+        assert descent is not None
         if np.any(rounds.best() != z):
             z = rounds.best()
-            told = self.told(z, everyone, able, pull)
-            beyond = np.stack([np.max(x, axis=1) for x in told.beyond], axis=1)
-            descent = descent._replace(z=z, gradient=np.asarray(told.gradient))
-        return descent, pull, told, beyond, counts
+            result = self.evaluate(z, everyone, able, multipliers)
+            beyond = np.stack([np.max(x, axis=1) for x in result.beyond], axis=1)
+            descent = descent._replace(z=z, gradient=np.asarray(result.gradient))
+        return _Optimised(descent, multipliers, result, beyond, counts)
 
 
-def _require_finite(told: Told, able: np.ndarray) -> None:
+class _Optimised(NamedTuple):
+    descent: Descent
+    multipliers: Multipliers
+    result: CostResult
+    beyond: Float[np.ndarray, "problems limits"]
+    counts: Int[np.ndarray, " problems"]
+
+
+def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
+    """Why the controller at `z` cannot be built or must not be flown; empty if it can."""
+    controller = build_design(coordinates, z)
+    for part in _iter_modules(controller):
+        try:
+            _check_again(part)
+        except ValueError as error:
+            return str(error)
+    if not isinstance(controller, ObserverController):
+        return ""
+    return controller.observer_instability() or controller.observer_slowness()
+
+
+def _check_again(module: eqx.Module) -> None:
+    """Raise ValueError where the module would refuse to be built with the values it has."""
+    for kind in type(module).__mro__:
+        if "__check_init__" in vars(kind):
+            vars(kind)["__check_init__"](module)
+
+
+def _iter_modules(tree: PyTree) -> Iterator[eqx.Module]:
+    """`tree` and the modules in it."""
+    if isinstance(tree, eqx.Module):
+        yield tree
+        for part in vars(tree).values():
+            yield from _iter_modules(part)
+
+
+def _require_finite(result: CostResult, able: np.ndarray) -> None:
     """A cost that is no number would end the descent where it starts."""
-    value = np.asarray(told.value)
+    value = np.asarray(result.value)
     if not able.any() or np.isfinite(value[able]).any():
         return
-    bad = [n for n, x in told.numbers.items() if not np.isfinite(np.asarray(x)[able]).all()]
+    bad = [n for n, x in result.numbers.items() if not np.isfinite(np.asarray(x)[able]).all()]
     raise ValueError(
         f"the cost is {value[able][0]} at the start, though every member is stable, because of "
-        f"{', '.join(bad) or 'the limits'}: the scenario or the controller do not have it (only a "
-        "controller with an observer estimates a disturbance), or members diverge in flight"
+        f"{', '.join(bad) or 'the limits'}: the scenario or the controller does not have it (only "
+        "a controller with an observer estimates a disturbance), or members diverge in flight"
     )
 
 
-def _merged(old: Descent, new: Descent, on: np.ndarray) -> Descent:
+def _merge(old: Descent, new: Descent, on: np.ndarray) -> Descent:
     pick = lambda a, b: np.where(on.reshape((-1,) + (1,) * (a.ndim - 1)), b, a)
     reasons = tuple(b if o else a for a, b, o in zip(old.reasons, new.reasons, on, strict=True))
     fields = Descent._fields[:-1]
@@ -264,17 +322,19 @@ def _merged(old: Descent, new: Descent, on: np.ndarray) -> Descent:
     return Descent(**arrays, reasons=reasons)
 
 
-def _evaluation(told: Told, z: np.ndarray, on: np.ndarray, fly: bool, seconds: float) -> Evaluation:
+def _evaluation(
+    result: CostResult, z: np.ndarray, on: np.ndarray, fly: bool, seconds: float
+) -> Evaluation:
     hide = lambda x: np.where(on, np.asarray(x), np.nan)
-    abscissa = np.asarray(told.numbers["abscissa"])
-    worst = told.costs if fly else told.numbers["abscissa"]
+    abscissa = np.asarray(result.numbers["abscissa"])
+    worst = result.costs if fly else result.numbers["abscissa"]
     return Evaluation(
         phase="optimise" if fly else "stabilise",
         z=np.array(z),
-        cost=hide(told.value),
-        gradient_norm=hide(np.linalg.norm(told.gradient, axis=1)),
+        cost=hide(result.value),
+        gradient_norm=hide(np.linalg.norm(result.gradient, axis=1)),
         stable=hide(np.mean(abscissa < 0, axis=1)),
         worst=hide(np.argmax(worst, axis=1)),
-        means={name: hide(np.mean(x, axis=1)) for name, x in told.numbers.items()},
+        means={name: hide(np.mean(x, axis=1)) for name, x in result.numbers.items()},
         seconds=seconds,
     )

@@ -1,45 +1,70 @@
-"""What a tune is about, with everything that does not change while it runs."""
+"""The members of a tune in their flights: everything that does not change while it runs."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxquad._xla import asked_devices, devices_for
-from jaxquad.control import flown, told
+from jaxquad._xla import asked_devices, Devices, devices_for
+from jaxquad.control import schedule_for_analysis, schedule_for_flight
 from jaxquad.ensembles import Members
+from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.simulation import (
     Authority,
-    check_loop,
+    check_run,
     divisor,
     find_authority,
     loop_over_devices,
-    loop_settings,
     makes_step,
     over_devices,
     scan_loop,
     Scenario,
-    Settings,
     wide,
     Window,
     window,
 )
 
 from ._linear_numbers import linear_numbers
-from ._parts import parts_of
-from ._quantities import IN_TIME
+from ._objective import Objective
+
+
+DeviceChoice = int | Sequence[jax.Device] | None  # see `jq.evaluate`
+
+
+class TimeSpan(NamedTuple):
+    """What of a flight counts, in s; ITAE's clock and overshoot start again at the `events`."""
+
+    events: Sequence[float] = ()
+    start: float = 0.0
+    stop: float | None = None
+    load_start: float | None = None
+
+    @classmethod
+    def of(cls, objective: Objective) -> "TimeSpan":
+        """That of an objective."""
+        return cls(objective.events, objective.start, objective.stop, objective.load_start)
+
+    @property
+    def parts(self) -> list[tuple[float, float | None]]:
+        """From event to event, in s."""
+        ends = np.inf if self.stop is None else self.stop
+        inside = sorted({float(t) for t in self.events if self.start < t < ends})
+        return list(zip([self.start, *inside], [*inside, self.stop], strict=True))
 
 
 _SOFTNESS = 0.005  # of the limit, about which a command counts as saturated in part
 
 
+_WHOLE = TimeSpan()
+
+
 class Span(NamedTuple):
-    """The samples that count, as `jaxquad.simulate._window.Window`, but known before."""
+    """The samples that count, as `jaxquad.simulation.Window`, but static."""
 
     first: int
     last: int
@@ -158,29 +183,30 @@ def _error(now: Any) -> Array:
     return now.reference - now.angle
 
 
-class Loops(eqx.Module):
+class LinearLoops(eqx.Module):
     """The linear loops of members."""
 
     axes: DecoupledAxes  # the plant near level flight
     delay: Float[Array, " members"]  # s
     inertia_told: Float[Array, "axes members"]  # kg m^2
     longest_delay: float = eqx.field(static=True)  # s
-    devices: tuple[Any, ...] = eqx.field(static=True, default=())
+    devices: Devices = eqx.field(static=True, default=())
 
     @property
     def members(self) -> int:
+        """How many there are."""
         return self.inertia_told.shape[-1]
 
     def numbers(
-        self, controller: Any, wanted: Collection[str], smoothing: float
+        self, controller: PyTree, wanted: Collection[str], smoothing: float
     ) -> dict[str, Float[Array, "axes members"]]:
         """The wanted quantities of the linear loop of each member, the abscissa with them."""
 
-        def run(own: Any, controller: Any) -> dict[str, Array]:
+        def run(own: PyTree, controller: PyTree) -> dict[str, Array]:
             axes, delay, inertia = own
             return linear_numbers(
-                axes, told(controller, inertia), delay, longest=self.longest_delay, wanted=wanted,
-                smoothing=smoothing,
+                axes, schedule_for_analysis(controller, inertia), delay,
+                longest=self.longest_delay, wanted=wanted, smoothing=smoothing,
             )  # fmt: skip
 
         if len(self.devices) < 2:
@@ -195,105 +221,92 @@ class Loops(eqx.Module):
 class Problem(eqx.Module):
     """Members in their flights: all of it is data, so that it compiles once for a shape."""
 
-    plant: Any
-    loops: Loops
-    wide: Loops | None  # of more members, on which limits of the loop are kept
+    loop: Loop  # of all members, around the controller that a tune starts from
+    linear: LinearLoops
+    limited: LinearLoops | None  # of more members, on which limits of the linear loop are kept
     flight: Scenario
-    settings: Settings
     span: Span = eqx.field(static=True)
-    events: tuple[float, ...] = eqx.field(static=True)
+    events: tuple[float, ...] = eqx.field(static=True)  # s
     parts: tuple[tuple[int, int], ...] = eqx.field(static=True)  # samples from event to event
 
     @property
     def members(self) -> int:
-        return self.loops.members
+        """How many are flown."""
+        return self.linear.members
+
+    def loop_around(self, controller: PyTree) -> Loop:
+        """The loops of all members around another controller."""
+        return self.loop.with_controller(schedule_for_flight(controller, self.linear.inertia_told))
 
     def in_time(
-        self, controller: Any, wanted: Collection[str]
+        self, controller: PyTree, wanted: Collection[str]
     ) -> dict[str, Float[Array, "axes members"]]:
         """The wanted quantities of a flight of each member."""
-        law, span = flown(controller, self.loops.inertia_told), self.span
-        loop = (self.plant, law, self.flight, self.settings)
-        names = {"activity" if name == "activity_rate" else name for name in wanted}
-        run = lambda loop, _: self._summed(loop, tuple(sorted(names)))
-        numbers = loop_over_devices(run, loop, None, self.loops.devices)
+        run = (self.loop_around(controller), self.flight)
+        names = tuple(sorted({"activity" if n == "activity_rate" else n for n in wanted}))
+        summed = lambda run, _: self._summed(*run, names)
+        numbers = loop_over_devices(summed, run, None, self.linear.devices)
         if "activity_rate" in wanted:
-            duration = (span.last - span.first + 1) * self.settings.dt
+            duration = (self.span.last - self.span.first + 1) * self.loop.dt
             numbers["activity_rate"] = numbers["activity"] / duration
         return {name: numbers[name] for name in wanted}
 
     def _summed(
-        self, loop: tuple[Any, Any, Scenario, Settings], names: tuple[str, ...]
+        self, loop: Loop, flight: Scenario, names: tuple[str, ...]
     ) -> dict[str, Float[Array, "axes members"]]:
-        plant, law, flight, settings = loop
-        found = find_authority(plant, settings.drive, law)
-        steps = steps_of(flight.reference, self.parts)
-        sums = Accumulate(names, self.span, settings.dt, self.events, self.parts, steps, found)
-        return sums.finished(scan_loop(*loop, sums.update, sums.begin)[0])
+        found = find_authority(loop.plant, loop.drive, loop.controller)
+        steps = find_steps(flight.reference, self.parts)
+        sums = Accumulate(names, self.span, loop.dt, self.events, self.parts, steps, found)
+        return sums.finished(scan_loop(loop, flight, sums.update, sums.begin)[0])
 
 
-def steps_of(reference: Float[Array, "samples axes ..."], parts: Any) -> Steps:
+def find_steps(
+    reference: Float[Array, "samples axes ..."], parts: Sequence[tuple[int, int]]
+) -> Steps:
     """Where the reference of each part goes, as `jq.evaluate` has it of a window of its own."""
     before = [reference[a - 1] if a else jnp.zeros_like(reference[0]) for a, _ in parts]
     target = [reference[b] for _, b in parts]
     known = [makes_step(reference, Window(a, b, a, b)) for a, b in parts]
-    stacks = (jnp.stack(x) for x in (target, before, known))
-    target, before, known = stacks
+    target, before, known = (jnp.stack(x) for x in (target, before, known))
     return Steps(target, before, known & (target != before))
 
 
-def problem_of(
-    controller: Any,
+def make_problem(
+    controller: PyTree,
     members: Members,
     scenario: Scenario,
-    wide: Members | None = None,
+    limited: Members | None = None,
     *,
-    events: tuple[float, ...] = (),
-    start: float = 0.0,
-    stop: float | None = None,
-    load_start: float | None = None,
-    devices: Any = None,
+    span: TimeSpan = _WHOLE,
+    devices: DeviceChoice = None,
 ) -> Problem:
-    """Of `members`, and of the linear loops of `wide` ones where limits are to be kept.
+    """Of `members`, and of the linear loops of the `limited` ones on which limits are kept.
 
-    Raises ValueError for parts that do not fit together, as `jq.evaluate` does.
+    Raise ValueError for parts that do not fit together, as `jq.evaluate` does.
     """
-    flight, dt = members.flight(scenario), members.dt
-    settings = loop_settings(
-        dt=dt, drive=members.drive, encoder=members.encoder, delay=np.asarray(members.delay)
-    )
-    check_loop(members.plant, flown(controller, members.inertia_told), flight, settings)
-    samples = len(flight.reference)
-    late = [t for t in events if t >= samples * dt - 0.5 * dt]
+    flight, loop = members.flight(scenario), members.loop(controller)
+    check_run(loop, flight)
+    samples, dt = len(flight.reference), loop.dt
+    late = [t for t in span.events if t >= samples * dt - 0.5 * dt]
     if late:
         raise ValueError(f"events at {late} s lie beyond the scenario of {samples * dt:.6g} s")
-    place = window(samples, dt, start=start, stop=stop, load_start=load_start)
-    windows = [
-        window(samples, dt, start=a, stop=b, load_start=None)
-        for a, b in parts_of(events, start, stop)
-    ]
+    place = window(samples, dt, start=span.start, stop=span.stop, load_start=span.load_start)
+    windows = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
     parts = [(int(x[0]), int(x[1])) for x in windows]
     return Problem(
-        plant=members.plant,
-        loops=_loops(members, devices),
-        wide=None if wide is None else _loops(wide, devices),
+        loop=loop,
+        linear=_linear_loops(members, devices),
+        limited=None if limited is None else _linear_loops(limited, devices),
         flight=flight,
-        settings=settings,
         span=Span(*(int(x) for x in place)),
-        events=tuple(float(t) for t in events),
+        events=tuple(float(t) for t in span.events),
         parts=tuple(parts) if len(parts) > 1 else ((int(place[0]), int(place[3])),),
     )
 
 
-def _loops(members: Members, devices: Any) -> Loops:
+def _linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
     plant = members.plant
     axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
     places = devices_for(members.size, asked_devices(devices))
     longest = float(members.longest_delay)
-    return Loops(axes, members.delay, members.inertia_told, longest, places)
-
-
-def split(wanted: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What is of a flight and what is of the linear loop."""
-    names = sorted(wanted)
-    return tuple(n for n in names if n in IN_TIME), tuple(n for n in names if n not in IN_TIME)
+    return LinearLoops(axes, members.delay, members.inertia_told, longest, places)

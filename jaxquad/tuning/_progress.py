@@ -1,4 +1,4 @@
-"""What a tune tells while it runs, and what it remembers of every evaluation."""
+"""The evaluations of a tune: kept, and printed while it runs."""
 
 import sys
 import time
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 
 class Evaluation(NamedTuple):
-    """One evaluation of all problems, whose arrays are [problems]; nan where one rests."""
+    """One evaluation of all problems, with arrays [problems]; NaN for those that have ended."""
 
     phase: str  # "stabilise" or "optimise"
     z: Float[np.ndarray, "problems n"]
@@ -26,7 +26,7 @@ Listener = Callable[[Evaluation], None]
 
 
 class Progress:
-    """Keeps every evaluation, and writes a line of it where somebody watches."""
+    """Keeps every evaluation, and prints a line of it on a terminal."""
 
     def __init__(self, shown: bool | None, listener: Listener | None = None):
         self.history: list[Evaluation] = []
@@ -44,12 +44,12 @@ class Progress:
 
     def add(self, evaluation: Evaluation) -> None:
         self.history.append(evaluation)
-        self.say(line(len(self.history), evaluation))
+        self.say(describe_evaluation(len(self.history), evaluation))
         if self.listener is not None:
             self.listener(evaluation)
 
 
-def line(count: int, now: Evaluation) -> str:
+def describe_evaluation(count: int, now: Evaluation) -> str:
     """One line of text of an evaluation; of several problems, the best one's numbers."""
     known = np.isfinite(now.cost)
     best = int(np.argmin(np.where(known, now.cost, np.inf)))

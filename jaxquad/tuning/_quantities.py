@@ -1,5 +1,6 @@
-"""What objectives and limits are made of: names, and how a number of each is compared."""
+"""The quantities that are tuned, limited and certified: one entry each in `QUANTITIES`."""
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,21 +11,36 @@ from jaxtyping import Array, ArrayLike, Float
 _DEGREE = float(np.degrees(1.0))
 
 
-class Shown(NamedTuple):
-    """How a quantity in SI units is printed."""
+class Quantity(NamedTuple):
+    """A number of a loop: how it is computed, how two of it compare, and how it is printed."""
 
-    title: str
-    unit: str
+    title: str  # in tables and figures
+    unit: str  # as printed
+    factor: float = 1.0  # from SI units to the printed one
+    decibels: bool = False  # printed as 20 log10
+    linear: bool = False  # of the linear loop, see `jq.loops.LoopAnalysis`; else of a flight
+    si_unit: str = "1"
+    logarithmic: bool = True  # it is compared by its logarithm; else in steps of `scale`
     scale: float = 1.0
-    decibels: bool = False
+    least: float = 1e-9  # value of which a logarithm is taken
+    most: float = 1e9
+    smaller_is_worse: bool = False
+    summed: bool = False  # over the axes in an objective; else the worst axis counts
+
+    @property
+    def sign(self) -> float:
+        """-1 where a smaller number is the worse one, else 1."""
+        return -1.0 if self.smaller_is_worse else 1.0
 
     def number(self, value: float) -> float:
+        """The value in the printed unit."""
         if self.decibels:
             with np.errstate(divide="ignore", invalid="ignore"):
                 return float(20 * np.log10(value))
-        return float(value) * self.scale
+        return float(value) * self.factor
 
     def text(self, value: float, *, unit: bool = True) -> str:
+        """The value as printed; an infinite margin is "any"."""
         number = self.number(value)
         if np.isnan(number):
             return "n/a"
@@ -33,67 +49,49 @@ class Shown(NamedTuple):
         return f"{number:.4g}{' ' + self.unit if unit and self.unit else ''}"
 
 
-SHOWN = {
-    "itae": Shown("ITAE", "deg s^2", _DEGREE),
-    "iae": Shown("IAE", "deg s", _DEGREE),
-    "ise": Shown("ISE", "deg^2 s", _DEGREE**2),
-    "overshoot": Shown("overshoot", "%"),
-    "peak": Shown("peak error", "deg", _DEGREE),
-    "rms": Shown("rms error", "deg", _DEGREE),
-    "disturbance_rmse": Shown("disturbance error", "N m"),
-    "activity": Shown("activity", "u^2"),
-    "activity_rate": Shown("activity", "u^2/s"),
-    "energy": Shown("energy", "u^2 s"),
-    "saturation_share": Shown("saturated", "%", 100.0),
-    "abscissa": Shown("slowest pole", "1/s"),
-    "sensitivity_peak": Shown("Ms", ""),
-    "gain_margin": Shown("gain margin up", "dB", decibels=True),
-    "gain_reduction": Shown("gain margin down", "dB", decibels=True),
-    "phase_margin": Shown("phase margin", "deg", _DEGREE),
-    "delay_margin": Shown("delay margin", "ms", 1e3),
-    "noise_gain": Shown("noise gain", "u/rad"),
-}
+# To add one: an entry here, and a number of that name from what computes it, which is
+# `jaxquad.simulation.FlightCosts` for a flight, `jaxquad.loops.LoopNumbers` for a linear loop.
+QUANTITIES = {
+    "itae": Quantity("ITAE", "deg s^2", _DEGREE, si_unit="rad s^2", summed=True),
+    "iae": Quantity("IAE", "deg s", _DEGREE, si_unit="rad s", summed=True),
+    "ise": Quantity("ISE", "deg^2 s", _DEGREE**2, si_unit="rad^2 s", summed=True),
+    "activity": Quantity("activity", "u^2", si_unit="unit^2", summed=True),
+    "activity_rate": Quantity("activity", "u^2/s", si_unit="unit^2/s", summed=True),
+    "energy": Quantity("energy", "u^2 s", si_unit="unit^2 s", summed=True),
+    "overshoot": Quantity("overshoot", "%", si_unit="%", logarithmic=False, scale=10.0),
+    "peak": Quantity("peak error", "deg", _DEGREE, si_unit="rad"),
+    "rms": Quantity("rms error", "deg", _DEGREE, si_unit="rad"),
+    "disturbance_rmse": Quantity("disturbance error", "N m", si_unit="N m"),
+    "saturation_share": Quantity("saturated", "%", 100.0, logarithmic=False, scale=0.1),
+    "abscissa": Quantity("slowest pole", "1/s", linear=True, si_unit="1/s", logarithmic=False),
+    "sensitivity_peak": Quantity("Ms", "", linear=True),
+    "gain_margin": Quantity(
+        "gain margin up", "dB", decibels=True, linear=True, least=1.0, most=1e3,
+        smaller_is_worse=True,
+    ),
+    "gain_reduction": Quantity("gain margin down", "dB", decibels=True, linear=True, least=1e-3),
+    "phase_margin": Quantity(
+        "phase margin", "deg", _DEGREE, linear=True, si_unit="rad", logarithmic=False, most=3.15,
+        smaller_is_worse=True,
+    ),
+    "delay_margin": Quantity(
+        "delay margin", "ms", 1e3, linear=True, si_unit="s", least=1e-5, most=10.0,
+        smaller_is_worse=True,
+    ),
+    "noise_gain": Quantity("noise gain", "u/rad", linear=True, si_unit="unit/rad"),
+}  # fmt: skip
+LINEAR = tuple(name for name, quantity in QUANTITIES.items() if quantity.linear)
 
 
-class Quantity(NamedTuple):
-    """How a number is compared: as its logarithm, or in steps of `scale`."""
-
-    unit: str
-    logarithmic: bool = True
-    scale: float = 1.0
-    least: float = 1e-9  # that a logarithm is taken of
-    most: float = 1e9
-    smaller_is_worse: bool = False
-    summed: bool = False  # over the axes in an objective; else the worst axis counts
-
-
-IN_TIME = {
-    "itae": Quantity("rad s^2", summed=True),
-    "iae": Quantity("rad s", summed=True),
-    "ise": Quantity("rad^2 s", summed=True),
-    "activity": Quantity("unit^2", summed=True),
-    "activity_rate": Quantity("unit^2/s", summed=True),
-    "energy": Quantity("unit^2 s", summed=True),
-    "overshoot": Quantity("%", logarithmic=False, scale=10.0),
-    "peak": Quantity("rad"),
-    "rms": Quantity("rad"),
-    "disturbance_rmse": Quantity("N m"),
-    "saturation_share": Quantity("1", logarithmic=False, scale=0.1),
-}
-OF_THE_LOOP = {
-    "abscissa": Quantity("1/s", logarithmic=False),
-    "sensitivity_peak": Quantity("1"),
-    "noise_gain": Quantity("unit/rad"),
-    "gain_margin": Quantity("1", least=1.0, most=1e3, smaller_is_worse=True),
-    "gain_reduction": Quantity("1", least=1e-3),
-    "phase_margin": Quantity("rad", logarithmic=False, most=3.15, smaller_is_worse=True),
-    "delay_margin": Quantity("s", least=1e-5, most=10.0, smaller_is_worse=True),
-}
-QUANTITIES = IN_TIME | OF_THE_LOOP
+def split_quantities(wanted: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names of flight quantities, and those of the linear loop."""
+    names = sorted(wanted)
+    flight = tuple(name for name in names if not QUANTITIES[name].linear)
+    return flight, tuple(name for name in names if QUANTITIES[name].linear)
 
 
 def require_quantity(name: str) -> None:
-    """Raises ValueError for a quantity that does not exist."""
+    """Raise ValueError for a quantity that does not exist."""
     if name not in QUANTITIES:
         raise ValueError(f"there is no quantity {name!r}: choose one of {', '.join(QUANTITIES)}")
 
@@ -107,7 +105,7 @@ def level(name: str, value: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     return jnp.log(jnp.maximum(bounded, quantity.least))
 
 
-def per_member(
+def combine_axes(
     name: str, value: Float[Array, "axes members"], *, worst: bool = False
 ) -> Float[Array, " members"]:
     """One number for each member: the sum over its axes, or that of its worst axis."""

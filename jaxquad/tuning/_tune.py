@@ -1,76 +1,34 @@
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Key, PyTree
 
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
+from jaxquad.loops import Loop
 from jaxquad.simulation import Scenario
 
-from ._certificate import lag_remark
-from ._certify import certify
-from ._checks import require_judges, require_kinds, require_steps
-from ._copies import copies
-from ._gauss_newton import GaussNewton
+from ._certificate import Certificate, lag_remark
+from ._certify import certify, require_same_rate
+from ._cost import stack_copies
+from ._gauss_newton import GaussNewton, require_squares
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective
-from ._parameters import Coordinates, coordinates, design_at
+from ._parameters import build_design, select_coordinates
 from ._phases import Solution, solve
-from ._problem import Problem, problem_of
+from ._problem import DeviceChoice, find_steps, make_problem, Problem, TimeSpan
 from ._progress import Listener, Progress
-from ._quantities import OF_THE_LOOP
-from ._tuned import Kept, optima, scattered, Tuned
+from ._quantities import QUANTITIES
+from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
 
 
-_ACTIVE = 1e-3  # the multiplier's sum above which a limit costs something
-
-
-def kept_limits(limits: Sequence[Limit], solution: Solution, index: int) -> tuple[Kept, ...]:
-    """Each limit as it was given, on the members that were tuned on."""
-    kept = []
-    for k, limit in enumerate(limits):
-        values = jnp.asarray(solution.told.bounded[k][index])
-        excess = float(limit.excess(values))
-        found = float(limit.bound) + limit.sign * excess
-        acts = float(solution.pull.multipliers[k][index].sum()) > _ACTIVE
-        kept.append(Kept(limit, found, excess <= 0, acts))
-    return tuple(kept)
-
-
-def remarks_of(
-    controller: Any, problem: Problem, solution: Solution, index: int, kept: Sequence[Kept]
-) -> Iterator[str]:
-    slowest = np.asarray(solution.told.numbers["abscissa"][index])
-    if not solution.able[index]:
-        count = int(np.sum(slowest >= 0))
-        yield (
-            f"{count} of the {slowest.size} members that were tuned on cannot be stabilised from "
-            f"here (slowest pole {slowest.max():+.3g} 1/s), so nothing was optimised: start "
-            "slower, or narrow the ensemble"
-        )
-    elif not solution.stabilised[index]:
-        yield f"the slowest pole of a member decays at {-slowest.max():.3g} 1/s only"
-    missed = [one for one in kept if not one.met]
-    for one in missed:
-        yield f"the limit on {one.limit} cannot be met: {one.found:.4g} at best"
-    if missed or not solution.able[index]:
-        remark = lag_remark(controller, problem.loops.delay, problem.loops.axes.lag)
-        if remark is not None:
-            yield remark
-    if solution.refusal and not solution.converged[index]:
-        yield f"steps were taken back where the controller refuses its gains: {solution.refusal}"
-    if not solution.converged[index] and solution.able[index]:
-        yield f"the descent has not converged: {solution.reasons[index]}"
-
-
-_WIDE = 512
+Method = LBFGS | GaussNewton
 
 
 def tune(
-    controller: Any,
+    loop: Loop,
     ensemble: Ensemble | Members,
     scenario: Scenario,
     *,
@@ -82,94 +40,132 @@ def tune(
     fresh: int | Members | None = 256,
     starts: int = 1,
     scatter: float = 0.4,
-    method: LBFGS | GaussNewton | None = None,
-    peers: Mapping[str, Any] | None = None,
+    method: Method | None = None,
+    peers: Mapping[str, PyTree] | None = None,
     key: Key[Array, ""] | None = None,
     progress: bool | None = None,
     listener: Listener | None = None,
-    devices: int | Sequence[Any] | None = None,
+    devices: DeviceChoice = None,
 ) -> Tuned:
-    """Tune a controller by gradient through the closed loop, for all of an ensemble at once.
+    """Tune a controller by gradient through the closed loops of all members of an ensemble at once.
 
-    First the slowest pole of every one of the `members` is moved to the left of the knee of the
-    objective's penalty on the abscissa (-0.5 1/s without one), which needs no flights; then the
-    `objective` is minimised through their flights of the `scenario`, see `jq.Objective`. `limits`
-    are kept by an augmented Lagrangian, those of the linear loop on 512 further members, and by
-    `reserve` (0.03 is 3 %) more than they ask, because fresh members reach further than those that
-    were tuned on. A design whose certificate fails is
-    returned too, and says so first.
+    First the slowest pole of every member is moved to the left of the knee of the objective's
+    penalty on the abscissa (-0.5 1/s without one), which needs no flights. Then the objective is
+    minimised through their flights of the scenario. Limits are enforced by an augmented Lagrangian,
+    those of the linear loop on 512 further members. A design whose certificate fails is returned,
+    too, and says so first. Source: docs/tuning.md.
 
-    `controller` is the start: a `jq.LADRC`, `jq.PID`, one of them scheduled, an adaptive LADRC, or
-    a module of one's own with `linear`, then with `free` naming the numbers to tune, as in
-    `jq.fit`. None frees wc, wo and b0 or the map's knots, of a PID all gains that are not 0. Gains
-    keep their sign; knots of an `jq.control.InertiaMap` fall. With several `starts`, others are scattered
-    about the first (normal, by `scatter` nepers) and solved in lockstep; `Tuned.minima` lists where
-    they led, and the best is returned. `method` is `jq.tuning.LBFGS` or `jq.tuning.GaussNewton`. `fresh` says on
-    how many new members the certificate judges the design beside its `peers`, or on which; None
-    does without. `progress` writes a line per evaluation on stderr, by default if that is a
-    terminal; `listener` is called with each. The members' loops are split over `devices`, see
-    `jq.evaluate`.
-    Needs float64. Raises ValueError for parts that do not fit together.
-    Source: EQUATIONS.md, section 3.
+    !!! example
+
+        ```python
+        loop = jq.Loop(plant, controller, drive=jq.simulation.Saturation(10.0), delay=0.004)
+        ensemble = jq.Ensemble(
+            inertia=jq.ensembles.LogUniform(0.5, 3.0), lag=jq.ensembles.Uniform(0.01, 0.04)
+        )
+        tuned = jq.tune(loop, ensemble, flight, limits=[jq.Limit("sensitivity_peak", at_most=3.6)])
+        print(tuned)
+        ```
+
+    **Arguments:**
+
+    - `loop`: what is nominal; `loop.controller` is the start. It has the method `linear`, as
+        `jq.LADRC`, `jq.PID`, both of them scheduled, and the adaptive LADRC have.
+    - `ensemble`: what varies, or members that were drawn from it.
+    - `scenario`: what all members fly.
+    - `objective`: what is minimised, see `jq.Objective`.
+    - `limits`: bounds that the design has to keep.
+    - `reserve`: by how much more limits are enforced than asked (0.03 is 3 %), because fresh
+        members reach further than those that were tuned on.
+    - `free`: the numbers to tune, as in `jq.fit`; by default those that `controller.tunable()`
+        names: wc, wo and b0 or the knots of its map, of a PID all gains that are not 0. Gains keep
+        their sign; the knots of a `jq.control.InertiaMap` stay falling.
+    - `members`: how many are drawn to tune on.
+    - `fresh`: how many new members the certificate evaluates the design on, or those members; None
+        makes no certificate.
+    - `starts`, `scatter`: with several starts, others are scattered about the first (normal, by
+        `scatter` nepers) and solved together; `Tuned.minima` lists where they ended, and the best
+        is returned.
+    - `method`: `jq.tuning.LBFGS` (by default) or `jq.tuning.GaussNewton`.
+    - `peers`: controllers that stand beside the design in its certificate, by name.
+    - `key`: of all draws; `jax.random.key(0)` by default.
+    - `progress`: write a line per evaluation on stderr; by default if that is a terminal.
+    - `listener`: is called with each `jq.tuning.Evaluation`.
+    - `devices`: over which the members are split, see `jq.evaluate`.
+
+    **Returns:**
+
+    A `jq.tuning.Tuned` with `.controller` and `.certificate`.
+
+    **Raises:**
+
+    - `ValueError`: parts do not fit together, or the controller is in single precision.
     """
     objective = Objective() if objective is None else objective
     method = LBFGS() if method is None else method
-    require_kinds(ensemble, objective, limits, method)
+    require_kinds(loop, ensemble, objective, limits, method)
     key = jax.random.key(0) if key is None else key
-    span = {name: getattr(objective, name) for name in ("events", "start", "stop", "load_start")}
-    free_ones, watched = coordinates(controller, free), Progress(progress, listener)
-    drawn = ensemble if isinstance(ensemble, Members) else ensemble.draw(members, key)
-    require_judges(fresh, drawn, peers)
-    wide = _wide(ensemble, limits, key)
-    problem = problem_of(controller, drawn, scenario, wide, **span, devices=devices)
+    span, watched = TimeSpan.of(objective), Progress(progress, listener)
+    coordinates = select_coordinates(loop.controller, free)
+    drawn = draw_or_take(loop, ensemble, members, key)
+    _require_fresh(fresh, drawn, peers)
+    limited = _draw_limited(loop, ensemble, limits, key)
+    problem = make_problem(loop.controller, drawn, scenario, limited, span=span, devices=devices)
     require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
-    solution = _solved(
-        free_ones, problem, scattered(free_ones.start, starts, scatter, seed=0),
-        objective, [_tightened(limit, reserve) for limit in limits],
-        method, watched,
+    begun = scatter_starts(coordinates.start, starts, scatter, seed=0)
+    solution = solve(
+        coordinates, problem, begun, stack_copies(objective, starts),
+        stack_copies(tuple(tighten(limit, reserve) for limit in limits), starts),
+        method=method, rate=stabilising_rate(objective), progress=watched,
     )  # fmt: skip
     seconds, best = watched.seconds, _best(solution)
-    tuned = design_at(free_ones, jnp.asarray(solution.z[best]))
-    judged = None
+    tuned = build_design(coordinates, jnp.asarray(solution.z[best]))
+    certificate: Certificate | None = None
     if fresh is not None and not (isinstance(ensemble, Members) and isinstance(fresh, int)):
         watched.say("certificate on fresh members ...")
         others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
-        judged = certify(
-            tuned,
-            others,
-            scenario,
-            limits=limits,
-            peers=peers,
-            members=count,
-            key=key,
-            **span,
-            devices=devices,
-        )
-    kept = kept_limits(limits, solution, best)
+        certificate = certify(
+            loop.with_controller(tuned), others, scenario, limits=limits, peers=peers,
+            members=count, key=key, devices=devices, **span._asdict(),
+        )  # fmt: skip
+    found = _limit_results(limits, solution, best)
     return Tuned(
         controller=tuned,
-        certificate=judged,
+        certificate=certificate,
         stabilised=bool(solution.stabilised[best]),
         converged=bool(solution.converged[best]),
         cost=float(solution.cost[best]),
-        values=free_ones.values(solution.z[best]),
-        limits=kept,
-        minima=optima(solution.cost, solution.z, solution.converged, free_ones.values),
+        values=coordinates.values(solution.z[best]),
+        limits=found,
+        minima=distinct_optima(solution, coordinates),
         evaluations=int(solution.evaluations[best]),
         stabilising=int(solution.stabilising[best]),
         history=tuple(watched.history),
         seconds=seconds,
-        remarks=tuple(remarks_of(tuned, problem, solution, best, kept)),
+        remarks=tuple(_remarks(tuned, problem, solution, best, found)),
     )
 
 
-def _wide(
-    ensemble: Ensemble | Members, limits: Sequence[Limit], key: Key[Array, ""]
+_WIDE = 512
+
+
+def draw_or_take(
+    loop: Loop, ensemble: Ensemble | Members, count: int, key: Key[Array, ""]
+) -> Members:
+    """`count` members of an ensemble, or the members that were given."""
+    if isinstance(ensemble, Ensemble):
+        return ensemble.draw(loop, count, key)
+    require_same_rate(loop, ensemble)
+    return ensemble
+
+
+def _draw_limited(
+    loop: Loop, ensemble: Ensemble | Members, limits: Sequence[Limit], key: Key[Array, ""]
 ) -> Members | None:
     """More members where there are limits of the linear loop, whose worst case is in a corner."""
-    if isinstance(ensemble, Members) or not any(x.quantity in OF_THE_LOOP for x in limits):
+    linear = any(QUANTITIES[limit.quantity].linear for limit in limits)
+    if isinstance(ensemble, Members) or not linear:
         return None
-    return ensemble.draw(_WIDE, jax.random.fold_in(key, 1))
+    return ensemble.draw(loop, _WIDE, jax.random.fold_in(key, 1))
 
 
 def stabilising_rate(objective: Objective) -> float:
@@ -178,25 +174,12 @@ def stabilising_rate(objective: Objective) -> float:
     return min([*knees, -0.1]) if knees else -0.5
 
 
-def _solved(
-    free_ones: Coordinates,
-    problem: Problem,
-    start: np.ndarray,
-    objective: Objective,
-    limits: Sequence[Limit],
-    method: Any,
-    watched: Progress,
-) -> Solution:
-    count = len(start)
-    return solve(
-        free_ones, problem, start, copies(objective, count), copies(tuple(limits), count),
-        method=method, rate=stabilising_rate(objective), progress=watched,
-    )  # fmt: skip
-
-
-def _tightened(limit: Limit, reserve: float) -> Limit:
+def tighten(limit: Limit, reserve: float) -> Limit:
+    """The limit with a reserve; raise ValueError for one outside of 0 <= reserve < 1."""
     if not 0 <= reserve < 1:
-        raise ValueError(f"reserve is {reserve}: give the share by which limits are kept, as 0.03")
+        raise ValueError(
+            f"reserve is {reserve}: give the share by which limits are tightened, as 0.03"
+        )
     share = limit.sign * np.sign(np.asarray(limit.bound)) * reserve
     name = "at_least" if limit.at_most is None else "at_most"
     return Limit(limit.quantity, **{name: limit.bound * (1 - share)}, over=limit.over)
@@ -208,3 +191,100 @@ def _best(solution: Solution) -> int:
     missed = np.where(np.asarray(missed) > 5e-3, missed, 0.0)
     cost = np.where(np.isnan(solution.cost), np.inf, solution.cost)
     return int(np.lexsort((cost, np.broadcast_to(missed, cost.shape), np.isinf(cost)))[0])
+
+
+_ACTIVE = 1e-3  # the multiplier's sum above which a limit costs something
+
+
+def _limit_results(
+    limits: Sequence[Limit], solution: Solution, index: int
+) -> tuple[LimitResult, ...]:
+    """Each limit as it was given, on the members that were tuned on."""
+    results = []
+    for k, limit in enumerate(limits):
+        values = jnp.asarray(solution.result.limited[k][index])
+        excess = float(limit.excess(values))
+        found = float(limit.bound) + limit.sign * excess
+        active = float(solution.multipliers.values[k][index].sum()) > _ACTIVE
+        results.append(LimitResult(limit, found, excess <= 0, active))
+    return tuple(results)
+
+
+def _remarks(
+    controller: PyTree,
+    problem: Problem,
+    solution: Solution,
+    index: int,
+    limits: Sequence[LimitResult],
+) -> Iterator[str]:
+    slowest = np.asarray(solution.result.numbers["abscissa"][index])
+    if not solution.stable[index]:
+        count = int(np.sum(slowest >= 0))
+        yield (
+            f"{count} of the {slowest.size} members that were tuned on cannot be stabilised from "
+            f"this start (slowest pole {slowest.max():+.3g} 1/s), so nothing was optimised: start "
+            "with slower gains, or narrow the ensemble"
+        )
+    elif not solution.stabilised[index]:
+        yield f"the slowest pole of a member decays at only {-slowest.max():.3g} 1/s"
+    missed = [one for one in limits if not one.met]
+    for one in missed:
+        yield f"the limit on {one.limit} cannot be met: {one.found:.4g} at best"
+    if missed or not solution.stable[index]:
+        remark = lag_remark(controller, problem.linear.delay, problem.linear.axes.lag)
+        if remark is not None:
+            yield remark
+    if solution.refusal and not solution.converged[index]:
+        yield f"the descent reached a bound of the controller: {solution.refusal}"
+    if not solution.converged[index] and solution.stable[index]:
+        yield f"the descent has not converged: {solution.reasons[index]}"
+
+
+def require_kinds(
+    loop: object, ensemble: object, objective: object, limits: object, method: object
+) -> None:
+    """Raise ValueError for an argument of another kind, and for limits on no sum of squares."""
+    if not isinstance(loop, Loop):
+        raise ValueError(
+            f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...), whose "
+            "controller is the start"
+        )
+    if not isinstance(ensemble, Ensemble | Members):
+        raise ValueError(
+            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
+            "jq.ensembles.Members of it"
+        )
+    if not isinstance(objective, Objective):
+        name = type(objective).__name__
+        raise ValueError(f"objective is a {name}: give jq.Objective(terms={{'itae': 1.0}}, ...)")
+    if not isinstance(limits, Sequence) or not all(isinstance(x, Limit) for x in limits):
+        raise ValueError(f"limits are {limits}: give a list, as [jq.Limit('overshoot', at_most=5)]")
+    if not isinstance(method, LBFGS | GaussNewton):
+        raise ValueError(f"method is {method!r}: give jq.tuning.LBFGS() or jq.tuning.GaussNewton()")
+    if isinstance(method, GaussNewton):
+        require_squares(objective, limits)
+
+
+def _require_fresh(fresh: object, drawn: Members, peers: Mapping[str, PyTree] | None) -> None:
+    """Raise ValueError for members that are tuned on, and for a peer of the design's name."""
+    if "tuned" in (peers or {}):
+        raise ValueError("a peer has the name 'tuned' of the design itself: rename it")
+    if isinstance(fresh, Members):
+        data = [np.asarray(jax.random.key_data(x.keys)) for x in (fresh, drawn)]
+        mine, theirs = ({tuple(row) for row in x} for x in data)
+        if mine & theirs:
+            raise ValueError(
+                f"{len(mine & theirs)} of the fresh members are those that are tuned on: a "
+                "certificate needs others, as ensemble.fresh(loop, 256, key) draws them"
+            )
+
+
+def require_steps(problem: Problem, wanted: frozenset[str]) -> None:
+    """Raise ValueError for an overshoot where there is no step."""
+    if "overshoot" not in wanted:
+        return
+    if not np.any(np.asarray(find_steps(problem.flight.reference, problem.parts).known)):
+        raise ValueError(
+            "overshoot is wanted, but the reference makes no step from event to event: give a "
+            "scenario with one, and its times as Objective(events=...)"
+        )

@@ -1,11 +1,13 @@
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from ._certificate import Certificate
 from ._objective import Limit
+from ._parameters import Coordinates
+from ._phases import Solution
 from ._progress import Evaluation
 
 
@@ -13,7 +15,7 @@ _COST, _PLACE = 2e-3, 0.1  # within which two ends are one: of the cost, and in 
 
 
 class Optimum(NamedTuple):
-    """A point at which some of the starts ended; those that did not stabilise cost nan."""
+    """A point at which some of the starts ended; its cost is NaN if it was not stabilised."""
 
     cost: float
     z: Float[np.ndarray, " n"]
@@ -22,7 +24,7 @@ class Optimum(NamedTuple):
     converged: bool
 
 
-def scattered(
+def scatter_starts(
     start: Float[np.ndarray, " n"], count: int, scatter: float, seed: int
 ) -> Float[np.ndarray, "starts n"]:
     """The start itself, and others about it: normal by `scatter` (nepers), a Latin hypercube."""
@@ -41,14 +43,10 @@ def scattered(
     return np.concatenate([start[None], start + scatter * deviates])
 
 
-def optima(
-    cost: Float[np.ndarray, " starts"],
-    z: Float[np.ndarray, "starts n"],
-    converged: np.ndarray,
-    named,
-) -> tuple[Optimum, ...]:
-    """Distinct ends, the best first; `named(z)` tells the tuned numbers."""
+def distinct_optima(solution: Solution, coordinates: Coordinates) -> tuple[Optimum, ...]:
+    """The distinct points at which the starts ended, the best first."""
     found: list[Optimum] = []
+    cost, z = solution.cost, solution.z
     for k in np.argsort(np.where(np.isnan(cost), np.inf, cost), kind="stable"):
         same = [
             i for i, o in enumerate(found)
@@ -58,35 +56,36 @@ def optima(
             old = found[same[0]]
             found[same[0]] = old._replace(starts=(*old.starts, int(k)))
         else:
-            found.append(Optimum(float(cost[k]), z[k], named(z[k]), (int(k),), bool(converged[k])))
+            values, done = coordinates.values(z[k]), bool(solution.converged[k])
+            found.append(Optimum(float(cost[k]), z[k], values, (int(k),), done))
     return tuple(found)
 
 
-class Kept(NamedTuple):
-    """A limit on the members that were tuned on."""
+class LimitResult(NamedTuple):
+    """How a limit ended on the members that were tuned on."""
 
     limit: Limit
     found: float  # in the limit's unit
     met: bool
-    active: bool  # it holds the optimum back
+    active: bool  # the cost would be lower without it
 
 
 class Tuned(eqx.Module):
     """A tuned controller, and what is known of it. The first line of `str()` is the verdict.
 
-    `certificate` judges it on fresh members; None if that was not asked for. What `limits` and
-    `minima` tell is of the members that were tuned on. `evaluations` counts gradients through the
+    `certificate` evaluates it on fresh members; it is None if that was not asked for. `limits` and
+    `minima` are on the members that were tuned on. `evaluations` counts gradients through the
     flights of all members, `stabilising` those of the linear loops alone that came before.
     """
 
-    controller: Any
+    controller: PyTree
     certificate: Certificate | None
     stabilised: bool  # every member that was tuned on
     converged: bool
     cost: float
     values: dict[str, float]  # of the tuned numbers
-    limits: tuple[Kept, ...]
-    minima: tuple[Optimum, ...]  # distinct ends of the starts, the best first
+    limits: tuple[LimitResult, ...]
+    minima: tuple[Optimum, ...]  # at which the starts ended, the best first
     evaluations: int
     stabilising: int
     history: tuple[Evaluation, ...]
@@ -95,8 +94,8 @@ class Tuned(eqx.Module):
 
     @property
     def active(self) -> tuple[Limit, ...]:
-        """The limits that hold the optimum back."""
-        return tuple(kept.limit for kept in self.limits if kept.active)
+        """The limits without which the cost would be lower."""
+        return tuple(one.limit for one in self.limits if one.active)
 
     @property
     def holds(self) -> bool:
@@ -105,20 +104,20 @@ class Tuned(eqx.Module):
 
     def __str__(self) -> str:
         first, *rest = ["NOT CERTIFIED: no fresh members were asked for"]
-        missed = [_kept(kept) for kept in self.limits if not kept.met]
+        missed = [_describe_limit(one) for one in self.limits if not one.met]
         if missed:
             first = f"{first}; {'; '.join(missed)}"
         if self.certificate is not None:
             first, *rest = str(self.certificate).splitlines()
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
-        lines = [first, f"tuned: {numbers}", f"  {_effort(self)}"]
-        lines += [f"  {_kept(kept)}" for kept in self.limits]
-        lines += _ends(self.minima) if len(self.minima) > 1 else []
+        lines = [first, f"tuned: {numbers}", f"  {_describe_effort(self)}"]
+        lines += [f"  {_describe_limit(one)}" for one in self.limits]
+        lines += _describe_optima(self.minima) if len(self.minima) > 1 else []
         lines += [f"  ! {remark}" for remark in self.remarks]
         return "\n".join(lines + rest)
 
 
-def _effort(tuned: Tuned) -> str:
+def _describe_effort(tuned: Tuned) -> str:
     ends = "converged" if tuned.converged else "not converged"
     return (
         f"cost {tuned.cost:.5g}, {ends} after {tuned.evaluations} gradients"
@@ -126,23 +125,26 @@ def _effort(tuned: Tuned) -> str:
     )
 
 
-def _kept(kept: Kept) -> str:
-    state = "holds the optimum back" if kept.active else "does not act" if kept.met else "MISSED"
-    state = state if kept.met else "MISSED: it cannot be met with the others"
-    beyond = abs(kept.found - float(kept.limit.bound))
-    by = "" if kept.met else f" (by {beyond:.3g})"
-    return f"limit on {kept.limit}: {kept.found:.4g}{by} on the members tuned on, {state}"
+def _describe_limit(one: LimitResult) -> str:
+    if not one.met:
+        beyond = abs(one.found - float(one.limit.bound))
+        return (
+            f"limit on {one.limit}: {one.found:.4g} (by {beyond:.3g}) on the members tuned on, "
+            "MISSED: it cannot be met together with the others"
+        )
+    state = "active" if one.active else "not active"
+    return f"limit on {one.limit}: {one.found:.4g} on the members tuned on, {state}"
 
 
-def _ends(minima: tuple[Optimum, ...]) -> list[str]:
+def _describe_optima(minima: tuple[Optimum, ...]) -> list[str]:
     total = sum(len(o.starts) for o in minima)
-    lines = [f"  {total} starts, {len(minima)} different ends:"]
+    lines = [f"  {total} starts, {len(minima)} optima:"]
     for o in minima:
         cost = "not stabilised" if np.isnan(o.cost) else f"cost {o.cost:.5g}"
-        lines.append(f"    {cost}, from {len(o.starts)} of the starts ({_listed(o.starts)})")
+        lines.append(f"    {cost}, from {len(o.starts)} of the starts ({_list_starts(o.starts)})")
     return lines
 
 
-def _listed(starts: tuple[int, ...]) -> str:
+def _list_starts(starts: tuple[int, ...]) -> str:
     shown = ", ".join(str(k) for k in starts[:8])
     return shown if len(starts) <= 8 else f"{shown}, ..."

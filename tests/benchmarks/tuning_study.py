@@ -1,4 +1,4 @@
-"""Tunes of the case of EQUATIONS.md, section 3, from several starts, and a PID beside them.
+"""Tunes of the case of docs/tuning.md from several starts, and a PID beside them.
 
 Run with `python tests/benchmarks/tuning_study.py` from the repository's root: about two minutes.
 """
@@ -20,6 +20,7 @@ from tuning_case import (  # noqa: E402
     EVENTS,
     flat,
     flight,
+    loop,
     objective,
     PRINTED,
     scheduled_pid,
@@ -33,15 +34,15 @@ KEY = jax.random.key(0)
 
 
 def printed() -> None:
-    """The designs that section 3.2 prints, on 1024 members."""
+    """The designs of `tuning_case.PRINTED`, on 1024 members."""
     designs = {name: row[0] for name, row in PRINTED.items()}
     first, *others = designs
     judged = certify(
-        designs[first], ensemble(), flight(), peers={n: designs[n] for n in others}, name=first,
+        loop(designs[first]), ensemble(), flight(), peers={n: designs[n] for n in others}, name=first,
         events=EVENTS, members=1024, key=KEY,
     )  # fmt: skip
     print("ITAE deg s^2 mean/p95/worst, unstable %: found, printed")
-    for name, row in judged.rows.items():
+    for name, row in judged.summaries.items():
         _, (mean, p95, worst), unstable = PRINTED[name]
         found = np.degrees(row.statistics["itae"][:3])
         share = 100 * (row.unstable or 0) / row.members
@@ -54,12 +55,12 @@ def printed() -> None:
 def tuned(name: str, controller, **options) -> None:
     begun = time.perf_counter()
     found = tune(
-        controller, ensemble(), flight(), objective=objective(), key=KEY, progress=False, **options
+        loop(controller), ensemble(), flight(), objective=objective(), key=KEY, progress=False, **options
     )
     seconds = time.perf_counter() - begun
     flown = np.array([np.nanmin(e.cost) for e in found.history if e.phase == "optimise"])
     assert found.certificate is not None
-    values = found.certificate.rows["tuned"].statistics
+    values = found.certificate.summaries["tuned"].statistics
     itae, peak, overshoot = (values[q] for q in ("itae", "sensitivity_peak", "overshoot"))
     within = int(np.flatnonzero(flown < found.cost + 0.01)[0]) + 1
     print(

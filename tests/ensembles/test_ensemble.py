@@ -1,10 +1,11 @@
 """Members are what their laws say, the same for the same key, and fly as single loops do."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from scipy import stats
@@ -21,7 +22,6 @@ from jaxquad.ensembles import (
     Payload,
     Uniform,
 )
-from jaxquad.ensembles._ensemble import check_plant
 
 
 KEY, OTHER = jax.random.key(0), jax.random.key(1)
@@ -31,23 +31,40 @@ COUNT, DT, SAMPLES = 8, 0.002, 250
 SCENARIO = jq.scenario(duration=SAMPLES * DT, axes=1, reference=jq.Step(np.radians(4.0)))
 
 
-def made(plant, **laws) -> Any:
-    return Ensemble(plant, **laws)
+class Around(NamedTuple):
+    """An ensemble around the nominal loop of a plant."""
+
+    loop: jq.Loop
+    ensemble: Ensemble
+
+    def draw(self, n, key):
+        return self.ensemble.draw(self.loop, n, key)
+
+    def fresh(self, n, key):
+        return self.ensemble.fresh(self.loop, n, key)
 
 
-def section_3(plant=AXIS, **changes) -> Any:
-    """The ensemble of EQUATIONS.md, section 3."""
+def made(plant, drive=None, nominal_delay=0.0, **laws) -> Around:
+    multirotor = isinstance(plant, jq.models.Multirotor)
+    drive = jq.simulation.MotorDrive(plant.allocation) if multirotor else drive
+    controller = jq.LADRC(10.0, 30.0, 0.848)
+    loop = jq.Loop(plant, controller, drive=drive, dt=DT, delay=nominal_delay)
+    return Around(loop, Ensemble(**laws))
+
+
+def study(plant=AXIS, *, drive=None, **changes) -> Around:
+    """The ensemble of docs/tuning.md."""
     laws = {
         "inertia": LogUniform(0.5, 3.0), "torque_gain": Normal(0.05), "told": Normal(0.1),
-        "lag": Uniform(0.01, 0.04), "delay": 0.004, "coulomb": 0.002, "noise": np.radians(0.02),
-        "drive": jq.simulation.Saturation(10.0), "gust_corner": 200.0,
+        "lag": Uniform(0.01, 0.04), "coulomb": 0.002, "noise": np.radians(0.02),
+        "gust_corner": 200.0,
     }  # fmt: skip
-    return made(plant, **(laws | changes))
+    return made(plant, drive or jq.simulation.Saturation(10.0), 0.004, **(laws | changes))
 
 
 @pytest.fixture(scope="module")
 def many():
-    return section_3(sampling="random").draw(4096, KEY)
+    return study(sampling="random").draw(4096, KEY)
 
 
 def test_each_quantity_follows_its_law(many):
@@ -95,7 +112,7 @@ def test_choices_are_equally_likely():
 
 
 def test_a_latin_hypercube_has_one_member_in_each_share_of_each_law():
-    members = section_3().draw(COUNT, KEY)
+    members = study().draw(COUNT, KEY)
     shares = [
         np.log(np.asarray(members.plant.inertia[0]) / 0.0552 / 0.5) / np.log(6.0),
         (np.asarray(members.plant.lag[0]) - 0.01) / 0.03,
@@ -109,7 +126,7 @@ def test_sobol_points_are_more_even_than_random_ones():
     law = {"inertia": Uniform(0.5, 1.5), "lag": Uniform(0.0 + 1e-9, 1.0), "torque_gain": 1.0}
 
     def discrepancy(sampling):
-        members = section_3(sampling=sampling, told=1.0, **law).draw(100, KEY)
+        members = study(sampling=sampling, told=1.0, **law).draw(100, KEY)
         points = [members.plant.inertia[0] / 0.0552 - 0.5, members.plant.lag[0]]
         return stats.qmc.discrepancy(np.clip(np.stack(points, axis=1), 0, 1))
 
@@ -126,7 +143,7 @@ def test_a_grid_holds_the_ends_and_every_combination():
              for a, b in zip(both.plant.inertia[0], both.plant.lag[0], strict=True)}  # fmt: skip
     assert len(pairs) == 9 and len({a for a, _ in pairs}) == 3
     with pytest.raises(ValueError, match="draw 9 or 16"):
-        Ensemble(AXIS, **two).draw(10, KEY)
+        made(AXIS, **two).draw(10, KEY)
 
 
 def arrays(members):
@@ -138,18 +155,18 @@ def arrays(members):
 
 
 def test_the_key_alone_decides_and_fresh_members_are_others():
-    ensemble = section_3()
+    ensemble = study()
     one, again, other = (ensemble.draw(COUNT, key) for key in (KEY, KEY, OTHER))
     fresh = ensemble.fresh(COUNT, KEY)
     assert all(map(np.array_equal, arrays(one), arrays(again)))
-    for drawn in (other, fresh, section_3(sampling="grid", told=1.0).fresh(COUNT, KEY)):
+    for drawn in (other, fresh, study(sampling="grid", told=1.0).fresh(COUNT, KEY)):
         assert not np.intersect1d(drawn.plant.inertia, one.plant.inertia).size
         assert not np.array_equal(drawn.flight(SCENARIO).noise, one.flight(SCENARIO).noise)
 
 
 def test_fresh_members_do_not_follow_those_that_were_tuned_on():
     """1024 pairs know a correlation of 0 to 0.03; noise samples to 0.02 and less."""
-    ensemble = section_3()
+    ensemble = study()
     one, fresh = ensemble.draw(1024, KEY), ensemble.fresh(1024, KEY)
     pairs = [(one.plant.inertia[0], fresh.plant.inertia[0]), (one.plant.lag[0], fresh.plant.lag[0])]
     short = [m.take(np.arange(COUNT)).flight(SCENARIO).noise for m in (one, fresh)]
@@ -158,7 +175,7 @@ def test_fresh_members_do_not_follow_those_that_were_tuned_on():
 
 
 def test_draws_of_a_number_have_one_shape_and_compile_once():
-    ensemble, traces = section_3(delay=Uniform(0.001, 0.006)), []
+    ensemble, traces = study(delay=Uniform(0.001, 0.006)), []
 
     @eqx.filter_jit
     def fly(members):
@@ -176,14 +193,14 @@ def test_draws_of_a_number_have_one_shape_and_compile_once():
 
 def test_members_are_drawn_outside_jit():
     with pytest.raises(ValueError, match="outside jit"):
-        jax.jit(lambda key: section_3().draw(COUNT, key).delay)(KEY)
+        jax.jit(lambda key: study().draw(COUNT, key).delay)(KEY)
 
 
 def test_both_precisions_draw_the_same_members_and_noise():
-    double = section_3(gust=0.01).draw(COUNT, KEY)
+    double = study(gust=0.01).draw(COUNT, KEY)
     with jax.enable_x64(False):
         plant = jq.DecoupledAxes([0.0468], [0.0552])
-        single = section_3(plant, gust=0.01).draw(COUNT, KEY)
+        single = study(plant, gust=0.01).draw(COUNT, KEY)
         happens = jq.scenario(duration=SAMPLES * DT, axes=1)
         noise = single.flight(happens).noise
     assert {x.dtype for x in arrays(single)} == {np.dtype("float32")} and noise.dtype == np.float32
@@ -194,7 +211,7 @@ def test_both_precisions_draw_the_same_members_and_noise():
 
 def test_each_member_keeps_its_own_noise_gust_and_payload_when_others_are_left_out():
     payload = Payload(Uniform(0.2, 1.0), at=Uniform(0.1, 0.2), width=Uniform(0.05, 0.1))
-    members = section_3(gust=Uniform(0.01, 0.03), payload=payload).draw(COUNT, KEY)
+    members = study(gust=Uniform(0.01, 0.03), payload=payload).draw(COUNT, KEY)
     chosen = np.array([3, 6])
     whole, part = members.flight(SCENARIO), members.take(chosen).flight(SCENARIO)
     assert members.take(chosen).size == 2 and members.size == COUNT
@@ -205,7 +222,7 @@ def test_each_member_keeps_its_own_noise_gust_and_payload_when_others_are_left_o
 
 def test_noise_and_gusts_have_the_deviation_of_each_member():
     laws = {"noise": Choice([1e-4, 5e-4]), "gust": Choice([0.01, 0.03]), "sampling": "random"}
-    members = section_3(**laws).draw(COUNT, KEY)
+    members = study(**laws).draw(COUNT, KEY)
     flight = members.flight(SCENARIO)
     noise, gust = (np.asarray(x)[:, 0] for x in (flight.noise, flight.disturbance))
     assert len(set(np.asarray(members.noise[0]))) == len(set(np.asarray(members.gust[0]))) == 2
@@ -227,7 +244,7 @@ def test_what_a_scenario_already_holds_is_kept():
         ensemble=COUNT,
         key=OTHER,
     )
-    members = section_3(gust=0.01).draw(COUNT, KEY)
+    members = study(gust=0.01).draw(COUNT, KEY)
     own = members.flight(SCENARIO)
     both = members.flight(wide)
     np.testing.assert_allclose(both.noise, np.asarray(wide.noise) + own.noise, rtol=1e-12)
@@ -242,27 +259,25 @@ LADRC = ScheduledLADRC(
 
 
 def flown(members, happens):
-    told = LADRC.told(members.inertia_told)
-    given = {"drive": members.drive, "dt": members.dt, "delay": members.delay}
-    return np.asarray(jq.simulate(members.plant, told, happens, **given).angle)
+    return np.asarray(jq.simulate(members.loop(LADRC), happens).angle)
 
 
 def test_a_member_flies_as_the_plant_that_it_stands_for():
-    members, k = section_3().draw(COUNT, KEY), 5
+    members, k = study().draw(COUNT, KEY), 5
     happens, plant = members.flight(SCENARIO), members.plant
     lone = jq.DecoupledAxes(
         plant.torque_gain[:, k], plant.inertia[:, k], lag=plant.lag[:, k], coulomb=0.002
     )
     happening = eqx.tree_at(lambda s: s.noise, happens, happens.noise[..., k])
-    told = LADRC.told(members.inertia_told[:, k])
+    told = LADRC.scheduled_at(members.inertia_told[:, k])
     alone = jq.simulate(
-        lone, told, happening, delay=0.004, drive=jq.simulation.Saturation(10.0)
+        jq.Loop(lone, told, delay=0.004, drive=jq.simulation.Saturation(10.0)), happening
     ).angle
     np.testing.assert_allclose(flown(members, happens)[..., k], alone, rtol=1e-9, atol=1e-15)
 
 
 def test_a_payload_from_the_start_is_more_inertia():
-    heavy = section_3(payload=Payload(0.5, at=0.0), inertia=Uniform(0.5, 1.0)).draw(COUNT, KEY)
+    heavy = study(payload=Payload(0.5, at=0.0), inertia=Uniform(0.5, 1.0)).draw(COUNT, KEY)
     inertia = heavy.plant.inertia + 0.5 * 0.0552
     more = eqx.tree_at(lambda m: (m.plant.inertia, m.payload), heavy, (inertia, None))
     angles = [flown(members, members.flight(SCENARIO)) for members in (heavy, more)]
@@ -270,7 +285,7 @@ def test_a_payload_from_the_start_is_more_inertia():
 
 
 def test_a_payload_is_carried_from_its_time_for_its_width():
-    members = section_3(payload=Payload(Uniform(0.5, 1.0), at=Uniform(0.1, 0.2), width=0.1)).draw(
+    members = study(payload=Payload(Uniform(0.5, 1.0), at=Uniform(0.1, 0.2), width=0.1)).draw(
         8, KEY
     )
     payload = np.asarray(members.flight(SCENARIO).payload)[:, 0]
@@ -303,10 +318,12 @@ def test_members_of_a_hover_fit_its_loop():
     plant = jq.quanser_hover()
     drive = jq.simulation.MotorDrive(plant.allocation)
     laws = {"inertia": LogUniform(0.5, 3.0), "torque_gain": Normal(0.05), "noise": 1e-4}
-    members = made(plant, **laws, delay=0.004, drive=drive).draw(COUNT, KEY)
+    members = made(plant, **laws, delay=0.004).draw(COUNT, KEY)
     ladrc = jq.LADRC(4.0, 50.0, [0.9, 0.9, 0.15], limit=10.0)
     happens = members.flight(jq.scenario(duration=SAMPLES * DT))
-    run = lambda: jq.simulate(members.plant, ladrc, happens, delay=members.delay, drive=drive)
+    run = lambda: jq.simulate(
+        jq.Loop(members.plant, ladrc, delay=members.delay, drive=drive), happens
+    )
     assert jax.eval_shape(lambda: run().angle).shape == (SAMPLES, 3, COUNT)
 
 
@@ -327,12 +344,24 @@ def test_a_law_may_have_a_number_for_each_axis():
     assert np.all((lag > law.support[0][:, None]) & (lag < law.support[1][:, None]))
 
 
+def test_what_does_not_vary_is_that_of_the_loop():
+    nominal = made(AXIS, jq.simulation.Saturation(3.0), 0.004)
+    members = nominal.draw(COUNT, KEY)
+    assert np.all(np.asarray(members.delay) == 0.004) and members.longest_delay == 0.004
+    assert members.drive is nominal.loop.drive and members.dt == DT
+    for name in ("torque_gain", "inertia"):
+        drawn = np.broadcast_to(vars(members.plant)[name], (1, COUNT))
+        np.testing.assert_array_equal(drawn, np.broadcast_to(vars(AXIS)[name][:, None], (1, COUNT)))
+    late = made(AXIS, nominal_delay=0.004, delay=Normal(0.1)).draw(COUNT, KEY).delay
+    assert np.mean(late) == pytest.approx(0.004, rel=0.05) and np.std(late) > 1e-4
+
+
 def test_str_is_a_table_of_what_varies_and_how():
-    text = str(section_3(payload=Payload(Uniform(0.0, 1.0), at=2.0)))
+    text = str(study(payload=Payload(Uniform(0.0, 1.0), at=2.0)).ensemble)
     lines = {line.split()[0]: line for line in text.splitlines()[1:]}
-    assert "log-uniform 0.5 .. 3" in lines["inertia"] and "0.0552 kg m^2" in lines["inertia"]
+    assert "log-uniform 0.5 .. 3" in lines["inertia"] and "nominal" in lines["inertia"]
     assert "uniform 0.01 .. 0.04" in lines["lag"] and lines["lag"].endswith(" s")
-    assert "normal 1 +- 0.1" in lines["told"] and "latin" in text and "Saturation" in text
+    assert "normal 1 +- 0.1" in lines["told"] and "latin" in text
     assert len(text.splitlines()) < 15
 
 
@@ -342,16 +371,14 @@ WRONG = {
     "inertia=0": (dict(inertia=0.0), "above 0"),
     "told=Normal(0.25)": (dict(told=Normal(0.25)), "told"),
     "lag=0": (dict(lag=0.0), "leave it None"),
-    "lag=Normal(0.1)": (dict(lag=Normal(0.1)), "say the mean"),
-    "delay=Normal(0.1)": (dict(delay=Normal(0.1)), "say the mean"),
+    "lag=Normal(0.1)": (dict(lag=Normal(0.1)), "give the mean"),
     "delay<0": (dict(delay=Uniform(-0.001, 0.004)), "cannot be negative"),
     "noise<0": (dict(noise=-1e-4), "standard deviation"),
     "axes": (dict(lag=Uniform([0.01, 0.02], [0.03, 0.04])), "2 axes, but the plant has 1"),
     "delay axes": (dict(delay=[0.01, 0.02]), "one for all axes"),
     "sampling": (dict(sampling="halton"), "latin, random, sobol, grid"),
     "independent": (dict(independent=("delay",)), "name quantities that vary"),
-    "lost": (dict(payload=Payload(-0.5, at=1.0)), "set down less"),
-    "dt": (dict(dt=0.0), "dt is 0"),
+    "lost": (dict(payload=Payload(-0.5, at=1.0)), "remove less"),
 }
 
 
@@ -359,7 +386,7 @@ WRONG = {
 def test_what_cannot_be_is_refused(what):
     laws, message = WRONG[what]
     with pytest.raises(ValueError, match=message):
-        section_3(**laws)
+        study(**laws).draw(COUNT, KEY)
 
 
 @pytest.mark.parametrize(
@@ -373,7 +400,7 @@ def test_what_cannot_be_is_refused(what):
         (lambda: Normal(0.0), "plain number"),
         (lambda: LogNormal(0.1, -1.0), "median"),
         (lambda: Choice([1.0]), "two or more"),
-        (lambda: Uniform([[1.0]], [[2.0]]), "one for each axis"),
+        (lambda: Uniform(np.array([[1.0]]), np.array([[2.0]])), "one for each axis"),
         (lambda: Uniform([1.0, 2.0], [3.0, 4.0, 5.0]), "one for each axis"),
         (lambda: Fixed(np.inf), "finite"),
     ],
@@ -383,17 +410,36 @@ def test_empty_laws_are_refused(make, message):
         make()
 
 
+@pytest.fixture
+def without_type_checks():
+    """As in use: the tests check the types of all arguments, a user's Python does not."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_what_belongs_to_the_loop_is_refused_in_an_ensemble(without_type_checks):
+    wrong: Any = AXIS
+    with pytest.raises(ValueError, match="plants is a DecoupledAxes.*jq.Loop"):
+        Ensemble(wrong)
+    with pytest.raises(ValueError, match="loop is a DecoupledAxes"):
+        Ensemble().draw(wrong, COUNT, KEY)
+    with pytest.raises(ValueError, match="not of a LaggedIntegrator.*Posterior"):
+        made(wrong).ensemble.draw(jq.Loop(jq.LaggedIntegrator(1.0), jq.LADRC(1, 3, 1)), COUNT, KEY)
+
+
 def test_plants_that_are_no_single_plant_are_refused():
-    with pytest.raises(ValueError, match="from_fit"):
-        check_plant(jq.LaggedIntegrator(1.0))
     with pytest.raises(ValueError, match="already is an ensemble"):
-        Ensemble(jq.DecoupledAxes([0.05], [[0.05, 0.06]]))
+        made(jq.DecoupledAxes([0.05], [[0.05, 0.06]])).draw(COUNT, KEY)
+    with pytest.raises(ValueError, match="already is an ensemble"):
+        made(AXIS, nominal_delay=np.array([0.0, 0.002])).draw(COUNT, KEY)
+    rotors = made(jq.quanser_hover(), torque_gain=Normal(0.05), independent=("torque_gain",))
     with pytest.raises(ValueError, match="one for all axes"):
-        Ensemble(jq.quanser_hover(), torque_gain=Normal(0.05), independent=("torque_gain",))
+        rotors.draw(COUNT, KEY)
 
 
 def test_requests_that_cannot_be_met_are_refused():
-    ensemble = section_3(payload=Payload(0.5, at=Uniform(0.4, 0.6)))
+    ensemble = study(payload=Payload(0.5, at=Uniform(0.4, 0.6)))
     members = ensemble.draw(COUNT, KEY)
     for n in (0, -3, True):
         with pytest.raises(ValueError, match="1 or more"):
@@ -403,8 +449,8 @@ def test_requests_that_cannot_be_met_are_refused():
     with pytest.raises(ValueError, match="axes=1"):
         members.flight(jq.scenario(duration=1.0))
     with pytest.raises(ValueError, match="8 members"):
-        members.flight(jq.scenario(duration=1.0, axes=1, noise=jq.simulation.WhiteNoise(1.0), ensemble=4,
-                                   key=KEY))  # fmt: skip
-    for wrong in ([8], [-1], [], 3, [0.5]):
+        noise = jq.simulation.WhiteNoise(1.0)
+        members.flight(jq.scenario(duration=1.0, axes=1, noise=noise, ensemble=4, key=KEY))
+    for wrong in ([8], [-1], [], 3, np.array([0.5])):
         with pytest.raises(ValueError, match="indices"):
             members.take(wrong)

@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxquad._core import ensemble_shape, mark_members
 from jaxquad.control import AdaptiveLADRC, InertiaMap, LADRC, PD, RecursiveInertia
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
-from jaxquad.simulation import evaluate, MotorDrive, scenario, simulate, Step, WhiteNoise
-from jaxquad.simulation._members import members_of_run, per_member
+from jaxquad.simulation import evaluate, in_slices, MotorDrive, scenario, simulate, Step, WhiteNoise
 from jaxquad.simulation._memory import free_memory, require_memory
 from jaxquad.simulation._over_devices import over_devices
-from jaxquad.simulation._slices import in_slices
 
 
 ROUNDING = 1e-12  # the same sums, in vectors of another length
@@ -110,10 +109,8 @@ def test_one_device_is_asked_for_in_any_way():
 
 def split(plant, controller, happens, **options):
     """The arrays of a loop that are split, by name."""
-    own = members_of_run((Loop(plant, controller, **options), happens))
-    if own is None:
-        return None
-    paths = jax.tree_util.tree_leaves_with_path(own)
+    run = (Loop(plant, controller, **options), happens)
+    paths = jax.tree_util.tree_leaves_with_path(mark_members(run, ensemble_shape(*run)))
     name = ft.partial(jax.tree_util.keystr, simple=True, separator=".")
     room = ("loop", "scenario")
     return {f"{room[path[0].idx]}.{name(path[1:])}" for path, is_own in paths if is_own is True}
@@ -139,7 +136,7 @@ def test_an_ensemble_of_two_axes_is_split_on_the_last():
 
 
 def test_one_loop_has_no_members():
-    assert split(DecoupledAxes([0.05], [0.06]), PD([40.0], [8.0]), noisy(1, ())) is None
+    assert split(DecoupledAxes([0.05], [0.06]), PD([40.0], [8.0]), noisy(1, ())) == set()
 
 
 def test_three_members_are_told_from_three_axes_and_three_knots():
@@ -157,27 +154,6 @@ def test_a_parameter_in_one_dimension_is_split():
     controller = LADRC([8.0] * 3, [30.0] * 3, [0.4, 0.4, 0.2])
     drive = MotorDrive(hover.allocation)
     assert split(vehicle, controller, noisy(3, ()), drive=drive) == {"loop.plant.allocation.arm"}
-
-
-class Table(eqx.Module):
-    """As many knots as members."""
-
-    x: jax.Array
-    y: jax.Array
-
-
-def test_the_columns_of_a_table_are_not_members():
-    def looked_up(parts):
-        table, gain = parts
-        return gain * jnp.sum(table.x * table.y)
-
-    table = Table(jnp.ones(20), jnp.ones((3, 20))[0])
-    own = per_member(looked_up, (table, jnp.ones(20)), 20)
-    assert jax.tree.leaves(own) == [False, False, True]
-
-
-def test_a_number_of_members_that_is_fixed_cannot_be_split():
-    assert per_member(lambda x: x * jnp.ones(20), jnp.ones(20), 20) is None
 
 
 def test_over_one_device_it_is_the_function_itself():

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools as ft
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,8 +12,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.ensembles import Ensemble, LogUniform, Normal, Uniform
-from jaxquad.ensembles._posterior import builder
+from jaxquad.ensembles import Ensemble, LogUniform, make_plant, Normal, Posterior, Uniform
 
 
 ML, KEY = jq.identify.MaximumLikelihood(), jax.random.key(0)
@@ -126,7 +125,7 @@ def test_the_key_alone_decides_the_draws():
 
 def test_what_is_not_determined_is_not_drawn():
     with pytest.raises(
-        jq.identify.NotIdentifiable, match=r"J_x, K_t \(only L K_t / J_x is\).*jq.identify.Prior"
+        jq.identify.UndeterminedError, match=r"J_x, K_t \(only L K_t / J_x is\).*jq.identify.Prior"
     ):
         ratio_fit().ensemble(5, KEY)
 
@@ -144,7 +143,7 @@ def test_held_directions_leave_the_spread_of_what_is_determined():
 
 def test_directions_lost_in_noise_are_held_and_the_rest_keeps_its_spread():
     fit = sum_fit()
-    assert not len(fit.identifiability.exact) and fit.identifiability.undetermined
+    assert not len(fit.verdict.exact) and fit.verdict.undetermined
     drawn = fit.ensemble(MANY, KEY, hold_undetermined=True)
     total = fit.derived(lambda m: m.lag + m.delay)
     assert spread(drawn.gain) == pytest.approx(fit.standard_errors[0], rel=0.03)
@@ -192,9 +191,28 @@ def test_the_truth_lies_in_the_range_of_the_draws_as_often_as_it_should():
     assert 88 <= held <= 100
 
 
-def from_fit(fit, **options) -> Any:
+class Around(NamedTuple):
+    """An ensemble of a posterior around its nominal loop."""
+
+    loop: jq.Loop
+    ensemble: Ensemble
+
+    def draw(self, n, key):
+        return self.ensemble.draw(self.loop, n, key)
+
+    def fresh(self, n, key):
+        return self.ensemble.fresh(self.loop, n, key)
+
+
+OF_POSTERIOR = ("recorded_dt", "believed", "plant")
+
+
+def from_fit(fit, **options) -> Around:
     given: dict[str, Any] = {"recorded_dt": 0.01} | options
-    return Ensemble.from_fit(fit, **given)
+    distributions = {name: x for name, x in given.items() if name not in OF_POSTERIOR}
+    posterior = Posterior(fit, **{name: x for name, x in given.items() if name in OF_POSTERIOR})
+    loop = jq.Loop(posterior.plant, jq.LADRC(10.0, 30.0, 1.0), delay=posterior.delay)
+    return Around(loop, Ensemble(posterior, **distributions))
 
 
 def test_plants_are_drawn_from_an_attitude_axis_with_a_believed_inertia():
@@ -210,12 +228,12 @@ def test_plants_are_drawn_from_an_attitude_axis_with_a_believed_inertia():
 
 def test_a_plant_that_needs_what_is_not_determined_is_refused():
     with pytest.raises(
-        jq.identify.NotIdentifiable, match="inertia, torque_gain .*J_x, K_t.*believed="
+        jq.identify.UndeterminedError, match="inertia, torque_gain .*J_x, K_t.*believed="
     ):
         from_fit(ratio_fit())
-    with pytest.raises(jq.identify.NotIdentifiable, match="delay, lag .*law instead"):
+    with pytest.raises(jq.identify.UndeterminedError, match="delay, lag .*distribution instead"):
         from_fit(sum_fit(), believed=1.0)
-    with pytest.raises(jq.identify.NotIdentifiable, match="delay would"):
+    with pytest.raises(jq.identify.UndeterminedError, match="delay would"):
         from_fit(sum_fit(), believed=1.0, lag=Uniform(0.01, 0.02))
 
 
@@ -269,7 +287,7 @@ def test_models_of_the_same_response_make_the_same_plant(integrators, lag):
             jq.models.AttitudeAxis(L=0.2, K_t=28.0 * 0.06 / 0.2, J_x=0.06, lag=lag, delay=0.011)
         )
     for one in models:
-        plant, delay = builder(one, 0.05, None)(one)
+        plant, delay = make_plant(one, believed=0.05)
         assert float(plant.gain[0]) == pytest.approx(28.0) and float(delay) == 0.011
         assert float(plant.inertia[0]) == 0.05
         assert (plant.lag is None) == (lag == 0)
@@ -310,8 +328,8 @@ class Pendulum(eqx.Module):
 
 
 def test_any_other_model_is_drawn_by_a_function_of_it():
-    with pytest.raises(ValueError, match="Pendulum .*plant="):
-        builder(Pendulum(jnp.asarray(0.09)), 1.0, None)
+    with pytest.raises(ValueError, match="a Pendulum: give plant="):
+        make_plant(Pendulum(jnp.asarray(0.09)), believed=1.0)
 
     def plant(model):
         return jq.DecoupledAxes([0.05 * model.gain], [0.05], stiffness=[model.lag]), 0.002
@@ -326,7 +344,7 @@ def test_any_other_model_is_drawn_by_a_function_of_it():
 def test_functions_of_the_wrong_kind_and_models_without_a_form_are_refused():
     with pytest.raises(ValueError, match="pair"):
         from_fit(sharp_fit(), plant=lambda m: m)
-    with pytest.raises(ValueError, match="believed is for models of known form"):
+    with pytest.raises(ValueError, match="plant= or believed=, not both"):
         from_fit(sharp_fit(), plant=lambda m: m, believed=1.0)
     with pytest.raises(ValueError, match="give believed="):
         from_fit(sharp_fit())
@@ -334,13 +352,13 @@ def test_functions_of_the_wrong_kind_and_models_without_a_form_are_refused():
         from_fit(sharp_fit(), believed=-1.0)
     with pytest.raises(ValueError, match="recorded_dt"):
         from_fit(sharp_fit(), believed=1.0, recorded_dt=-0.01)
-    with pytest.raises(ValueError, match="say the mean"):
-        from_fit(sharp_fit(), believed=1.0, lag=Normal(0.1))
+    with pytest.raises(ValueError, match="give the mean"):
+        from_fit(sharp_fit(), believed=1.0, lag=Normal(0.1)).draw(8, KEY)
     for denominator in ([1.0, 3.0, 9.0], [1.0, 3.0, 9.0, 0.0], [1.0, 0.0, 0.0, 0.0]):
         with pytest.raises(ValueError, match="is not K"):
-            builder(jq.TransferFunction([8.0], denominator), 1.0, None)
+            make_plant(jq.TransferFunction([8.0], denominator), believed=1.0)
     with pytest.raises(ValueError, match="3 integrators"):
-        builder(jq.LaggedIntegrator(8.0, integrators=3), 1.0, None)
+        make_plant(jq.LaggedIntegrator(8.0, integrators=3), believed=1.0)
 
 
 def test_a_plant_of_the_wrong_sign_is_refused():
@@ -350,5 +368,12 @@ def test_a_plant_of_the_wrong_sign_is_refused():
 
 
 def test_str_says_what_was_fitted():
-    text = str(from_fit(ratio_fit(), believed=0.0552, inertia=LogUniform(0.5, 3.0)))
+    text = str(from_fit(ratio_fit(), believed=0.0552, inertia=LogUniform(0.5, 3.0)).ensemble)
     assert "fit of J_x, K_t, lag" in text and "log-uniform 0.5 .. 3" in text
+
+
+def test_a_loop_around_another_plant_than_the_identified_one_is_refused():
+    ensemble = from_fit(sharp_fit(), believed=1.0)
+    other = ensemble.loop.with_plant(jq.DecoupledAxes([280.0], [2.0]))
+    with pytest.raises(ValueError, match="posterior.plant"):
+        ensemble.ensemble.draw(other, 8, KEY)

@@ -75,10 +75,12 @@ def test_the_tuned_map_reaches_what_the_prototype_reached_on_section_3(result):
 
 
 def test_its_members_are_those_of_the_case_that_the_tuner_is_tested_on(script):
-    ours, theirs = script.section_3(), tuning_case.ensemble()
-    for name, law in theirs.laws.items():
-        assert str(ours.laws[name]) == str(law)
-    drawn, expected = (e.draw(8, jax.random.key(1)) for e in (ours, theirs))
+    ours, theirs = script.assumed().ensemble, tuning_case.ensemble()
+    for name, one in theirs.distributions.items():
+        assert str(ours.distributions[name]) == str(one)
+    loops = script.assumed().loop, tuning_case.loop()
+    pairs = zip((ours, theirs), loops, strict=True)
+    drawn, expected = (e.draw(loop, 8, jax.random.key(1)) for e, loop in pairs)
     np.testing.assert_array_equal(drawn.inertia_told, expected.inertia_told)
     np.testing.assert_array_equal(drawn.delay, expected.delay)
     ours, theirs = script.flight(), tuning_case.flight()

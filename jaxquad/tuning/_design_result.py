@@ -1,0 +1,263 @@
+"""The numbers of one design on every member, their statistics, and how far they are from limits."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ._objective import Limit, Risk, risk_text
+from ._quantities import QUANTITIES
+
+
+Numbers = Float[np.ndarray, " members"]
+
+
+class DesignResult(eqx.Module):
+    """One design on every member of an ensemble: the numbers that a certificate is made of.
+
+    Of several axes, integrals are summed and other quantities are those of the worst axis. Numbers
+    are in SI units, see `jq.simulation.Metrics` and `jq.loops.LoopAnalysis`. Those of the linear
+    loop are NaN where it is unstable, except the abscissa; any is NaN where the scenario or the
+    controller does not have it.
+    """
+
+    by_axis: dict[str, Float[np.ndarray, "axes members"]]
+    unstable: Bool[np.ndarray, " members"] | None  # by the exact poles; None without a linear form
+    diverged: Bool[np.ndarray, " members"]
+    observer_instability: str = ""  # why an observer of the controller is unstable by itself
+
+    @property
+    def members(self) -> int:
+        """How many members there are."""
+        return self.diverged.size
+
+    @property
+    def unstable_count(self) -> int | None:
+        """How many members are linearly unstable; None without a linear form."""
+        return None if self.unstable is None else int(np.sum(self.unstable))
+
+    def of(self, quantity: str, *, worst_axis: bool = False) -> Numbers:
+        """One number for each member.
+
+        **Arguments:**
+
+        - `quantity`: a name from `jq.tuning.QUANTITIES`.
+        - `worst_axis`: take the worst axis of integrals, too, instead of their sum.
+
+        **Raises:**
+
+        - `ValueError`: the quantity was not computed.
+        """
+        if quantity not in self.by_axis:
+            known = ", ".join(self.by_axis)
+            raise ValueError(f"{quantity!r} was not computed: choose one of {known}")
+        if QUANTITIES[quantity].summed and not worst_axis:
+            return np.sum(self.by_axis[quantity], axis=0)
+        worst = _worst_axis(self.by_axis[quantity], QUANTITIES[quantity].sign)
+        if self.unstable is not None and _needs_stability(quantity):
+            return np.where(self.unstable, np.nan, worst)
+        return worst
+
+    def worst_member(self, quantity: str) -> int | None:
+        """The index of the member with the worst finite number; None without any."""
+        values = QUANTITIES[quantity].sign * self.of(quantity)
+        known = np.isfinite(values)
+        return int(np.argmax(np.where(known, values, -np.inf))) if known.any() else None
+
+
+def _needs_stability(quantity: str) -> bool:
+    return QUANTITIES[quantity].linear and quantity != "abscissa"
+
+
+def _worst_axis(values: Float[np.ndarray, "axes members"], sign: float) -> Numbers:
+    known = ~np.isnan(values)
+    worst = sign * np.max(np.where(known, sign * values, -np.inf), axis=0)
+    return np.where(known.any(axis=0), worst, np.nan)
+
+
+def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
+    """The exact one-sided confidence bound of a share, by Clopper and Pearson.
+
+    None of 256 bounds the share by 1.2 %, none of 3000 by 0.1 %.
+    Source: Clopper and Pearson, Biometrika 26 (1934).
+
+    **Arguments:**
+
+    - `count`: how many of the independent members showed the event.
+    - `draws`: how many members there were.
+    - `level`: the confidence.
+
+    **Returns:**
+
+    The share that the true one exceeds with a probability of at most 1 - `level`.
+
+    **Raises:**
+
+    - `ValueError`: there are fewer draws than counted, or the level is not between 0 and 1.
+    """
+    if not (0 <= count <= draws and draws >= 1):
+        raise ValueError(f"{count} of {draws} members: give 1 draw or more, and a count among them")
+    if not 0 < level < 1:
+        raise ValueError(f"level is {level}: give a confidence between 0 and 1, such as 0.95")
+    if count == draws:
+        return 1.0
+    from scipy.special import betaincinv
+
+    return float(betaincinv(count + 1, draws - count, level))
+
+
+class Statistics(NamedTuple):
+    """One quantity over the members that have it; NaN without any."""
+
+    mean: float
+    p95: float  # of margins, the value that 5 % of the members fall below
+    worst: float
+    members: int  # that have it: a linear quantity exists for stable loops only
+    worst_member: int | None
+
+
+class DesignSummary(NamedTuple):
+    """One design of a certificate, over all members."""
+
+    members: int
+    unstable: int | None  # by the exact poles of the linear loop; None without a linear form
+    unstable_at_most: float | None  # share, with 95 % confidence
+    diverged: int
+    statistics: dict[str, Statistics]
+
+    def content(self) -> dict[str, object]:
+        """Everything, for `jaxquad.report.write_json`."""
+        plain = {name: one._asdict() for name, one in self.statistics.items()}
+        return self._asdict() | {"statistics": plain}
+
+
+def summarise_design(design: DesignResult, *, independent: bool) -> DesignSummary:
+    """Statistics of every computed quantity; the bound only for `independent` members."""
+    count = design.unstable_count
+    bound = None if count is None else upper_bound(count, design.members)
+    return DesignSummary(
+        members=design.members,
+        unstable=count,
+        unstable_at_most=bound if independent else None,
+        diverged=int(np.sum(design.diverged)),
+        statistics={name: _statistics(design, name) for name in design.by_axis},
+    )
+
+
+def _statistics(design: DesignResult, name: str) -> Statistics:
+    values, sign = design.of(name), QUANTITIES[name].sign
+    known = values[~np.isnan(values)]
+    partial = known.size < values.size and not QUANTITIES[name].linear
+    if not known.size or partial:
+        return Statistics(np.nan, np.nan, np.nan, known.size, design.worst_member(name))
+    worst = sign * np.max(sign * known)
+    return Statistics(
+        float(np.mean(known)), sign * _p95(sign * known), float(worst), known.size,
+        design.worst_member(name),
+    )  # fmt: skip
+
+
+def _p95(values: Numbers) -> float:
+    """Infinite as soon as it rests on an infinite value."""
+    ordered = np.sort(values)
+    if not np.isfinite(ordered).all():
+        return float(ordered[int(np.ceil(0.95 * (ordered.size - 1)))])
+    return float(np.quantile(ordered, 0.95))
+
+
+class Distance(NamedTuple):
+    """How far a design is from one limit, in the SI unit of the limit."""
+
+    quantity: str
+    over: str  # the number over the members that is bounded, such as "worst"
+    sense: str  # "at most" or "at least"
+    bound: float
+    found: float  # NaN if it is not known, infinite with unstable members
+    slack: float  # met by this much; below 0, missed
+    percent: float  # slack over the bound
+    beyond: int  # members that are beyond the bound themselves
+    without: int  # members that are unstable and have no such number
+    of_others: float  # what is found without those
+    members: int
+    member: int | None  # the worst one
+
+    @property
+    def met(self) -> bool:
+        """Whether the limit is met; an unknown number does not meet it."""
+        return bool(self.slack >= 0)
+
+    def __str__(self) -> str:
+        shown = QUANTITIES[self.quantity]
+        demand = f"{shown.title}, {self.over}, {self.sense} {shown.text(self.bound)}"
+        if np.isnan(self.found):
+            return f"{demand}: not known, because the scenario or the controller does not have it"
+        several = self.beyond > 0 and self.over == "worst"
+        beyond = f", {self.beyond} of {self.members} members beyond" if several else ""
+        if self.without:
+            known = np.isfinite(self.of_others)
+            others = f"; of the others {shown.text(self.of_others)}" if known else ""
+            return f"{demand}: missed, {self.without} members are unstable{others}{beyond}"
+        if not np.isfinite(self.found):
+            return f"{demand}: {shown.text(self.found)}, {'met' if self.met else 'missed'}{beyond}"
+        difference = abs(shown.number(self.found) - shown.number(self.bound))
+        by = f"{'met' if self.met else 'missed'} by {difference:.3g} {shown.unit}".rstrip()
+        share = f" ({abs(self.percent):.2g} %)" if np.isfinite(self.percent) else ""
+        return f"{demand}: {shown.text(self.found)}, {by}{share}{beyond}"
+
+
+def measure_distances(design: DesignResult, limits: Sequence[Limit]) -> tuple[Distance, ...]:
+    """Of one design to each of the limits. Raise ValueError for quantities not computed."""
+    return tuple(_distance(design, limit) for limit in limits)
+
+
+def _distance(design: DesignResult, limit: Limit) -> Distance:
+    bound, sign = float(limit.bound), limit.sign
+    values = sign * _with_unstable(design, limit.quantity)  # larger is worse
+    found = sign * _risk(limit.over, values)
+    slack = sign * (bound - found)
+    return Distance(
+        quantity=limit.quantity,
+        over=risk_text(limit.over),
+        sense="at least" if limit.at_most is None else "at most",
+        bound=bound,
+        found=found,
+        slack=slack,
+        percent=100 * slack / abs(bound) if bound else np.copysign(np.inf, slack),
+        beyond=int(np.sum(~(values <= sign * bound))),
+        without=int(np.sum(np.isposinf(values))),
+        of_others=sign * _risk(limit.over, values[~np.isposinf(values)]),
+        members=values.size,
+        member=None if np.isnan(values).any() else int(np.argmax(values)),
+    )
+
+
+def _with_unstable(design: DesignResult, quantity: str) -> Numbers:
+    """The numbers of the members; an unstable one has the worst number possible."""
+    values = design.of(quantity, worst_axis=True)
+    if QUANTITIES[quantity].linear and design.unstable is not None:
+        worst = QUANTITIES[quantity].sign * np.inf
+        return np.where(design.unstable & np.isnan(values), worst, values)
+    return values
+
+
+def _risk(over: Risk, values: Numbers) -> float:
+    if not values.size or np.isnan(values).any():
+        return np.nan
+    if np.isposinf(values).any():
+        return np.inf  # whatever its weight: 0 times it would be nan
+    return float(over(jnp.asarray(values)))
+
+
+def front_point(design: DesignResult, over: str) -> tuple[float, float]:
+    """Where a design stands beside a front: its effort and its mean ITAE.
+
+    The effort is the mean of `over`, or the worst Ms, which is infinite with unstable members.
+    """
+    values = design.of(over)
+    if over != "sensitivity_peak":
+        return float(np.mean(values)), float(np.mean(design.of("itae")))
+    unstable = design.unstable is None or bool(design.unstable.any())
+    return np.inf if unstable else float(np.max(values)), float(np.mean(design.of("itae")))
