@@ -82,6 +82,11 @@ class AdaptiveLADRC(eqx.Module):
         """The trailing shape of all gains, () for one controller."""
         return ensemble_shape(self)
 
+    @property
+    def limit(self) -> Float[Array, "..."]:
+        """Of the command, either sign: that of the `ladrc`."""
+        return self.ladrc.limit
+
     def prepared(self) -> "AdaptiveLADRC":
         """The same controller with the gains of its ladrc computed: what to run in a loop."""
         if isinstance(self.ladrc, LADRCLaw):

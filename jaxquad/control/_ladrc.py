@@ -41,7 +41,7 @@ Placement = Literal["discrete", "continuous"]
 
 
 class LADRCGains(eqx.Module):
-    """What multiplies errors of the angle, of the rate and of the observer, half gains included."""
+    """The gains on errors of the angle, of the rate and of the observer, half gains included."""
 
     proportional: Float[Array, "..."] = per_member(1)  # 1/s^2; order 1: 1/s
     derivative: Float[Array, "..."] | None = per_member(1)  # 1/s; None for order 1
@@ -78,7 +78,7 @@ class LADRCState(NamedTuple):
 
 
 class LADRCLaw(eqx.Module):
-    """A `LADRC` with its gains computed: what a loop runs, sample by sample."""
+    """A `LADRC` with its gains computed, for a loop to run sample by sample."""
 
     gains: LADRCGains
     b0: Float[Array, "..."] = per_member(1)
@@ -142,7 +142,7 @@ class LADRCLaw(eqx.Module):
         return LADRCState(jnp.stack(corrected), command, b0), command
 
     def _feedback(self, estimate: Sequence[Array], reference: Reference) -> Array:
-        """What b0 u is to be, in rad/s^2; order 1 in rad/s."""
+        """The wanted b0 u in rad/s^2; order 1 in rad/s."""
         ahead = isinstance(reference, Setpoint)
         angle = reference.angle if ahead else reference
         drive = fit(self.gains.proportional, angle) * (angle - estimate[0]) - estimate[-1]
@@ -210,14 +210,33 @@ class LADRC(eqx.Module):
 
     An extended state observer with bandwidth `wo` estimates y, y' and f; the feedback cancels f and
     places the poles at `wc`: b0 u = kp (r - y) + kd (r' - y') + r'' - f, with r' and r'' of a
-    `Setpoint`, else 0. The command is bounded by `limit`, and the observer sees the bounded one,
-    which is the anti-windup. Half-gain tuning: a `feedback_factor` of 0.5 halves kp (of r too) and
-    kd, an `observer_factor` of 0.5 the observer's gains; 1/b0 acts on f in full either way.
+    `Setpoint`, else 0. The observer sees the bounded command, which is the anti-windup.
+    Source: section 4.2 of the paper, which does not print the law; docs/control.md; Gao (2003);
+    Herbst, arXiv 1908.04610 and 2003.03986 (half gain).
 
-    Every gain is a scalar, one value per axis, or `[axes, *ensemble]`, and differentiable.
-    Source: docs/control.md; Gao (2003); Herbst, arXiv 1908.04610 and 2003.03986 (half gain).
-    Raises ValueError for gains that are not above 0, that fit no common shape, or that are too fast
-    for `dt`, and for an unknown order, placement or observer.
+    !!! example
+
+        ```python
+        controller = jq.LADRC(wc=10.0, wo=30.0, b0=0.848, limit=10.0)
+        ```
+
+    **Arguments:** (each gain is a scalar, one value per axis, or `[axes, *ensemble]`)
+
+    - `wc`, `wo`: the bandwidths of feedback and observer in rad/s.
+    - `b0`: the gain of the plant, in rad/s^2 (order 1: rad/s) per unit of command.
+    - `order`: 2, or 1 for a rate.
+    - `observer`: `CurrentObserver()`, or any other `jq.control.Observer`.
+    - `placement`: "discrete" places the poles of the sampled loop, "continuous" those of a loop
+        without sampling.
+    - `feedback_factor`, `observer_factor`: for half-gain tuning. 0.5 halves kp and kd, or the gains
+        of the observer; f is cancelled in full either way.
+    - `limit`: of |u|, in units of the command.
+    - `dt`: the sample interval in s.
+
+    **Raises:**
+
+    - `ValueError`: a gain is not above 0, is too fast for `dt` or does not fit the others' shapes;
+        order, placement or observer is unknown.
     """
 
     wc: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s
@@ -289,21 +308,21 @@ class LADRC(eqx.Module):
     ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
         """As `step`, with another `b0` from this sample on.
 
-        The estimate of f = y'' - b0 u moves by what b0 moves, so that an unsaturated command, and
-        the predicted y'', stay where they are. Where b0 changes, use it for every sample.
+        The estimate of f = y'' - b0 u changes with b0, so that an unsaturated command and the
+        predicted y'' do not. Where b0 varies, call this method at each sample.
         """
         return self.prepared().step_with(state, reference, measurement, b0)
 
     def applied(self, state: LADRCState, achieved: Float[Array, " axes *ensemble"]) -> LADRCState:
-        """What the drive really gave since the last `step`: saturated, or with a test signal."""
+        """The state with the command that the drive really gave since the last `step`."""
         return self.prepared().applied(state, achieved)
 
     def signals(self, state: LADRCState) -> dict[str, Array]:
-        """ "disturbance" f/b0 in units of the command: times the torque per unit, it is in N m."""
+        """ "disturbance": f/b0 in units of the command; times the torque per unit it is in N m."""
         return self.prepared().signals(state)
 
     def linear(self, axis: int = 0, member: Member = None) -> LinearController:
-        """One axis without its limit, exactly; `member` picks one of an ensemble."""
+        """One axis without its limit, exactly; `member` picks one member of an ensemble."""
         at = lambda gain: pick(gain, axis, member)
         whole = self.gains
         correction = jnp.stack([at(row) for row in whole.correction])
@@ -355,7 +374,7 @@ class LADRC(eqx.Module):
     def transfer_functions(
         self, axis: int = 0, member: Member = None
     ) -> tuple[TransferFunction, TransferFunction]:
-        """C and F of u = F r - C y in continuous time, which is LADRC as `dt` goes to 0.
+        """C and F of u = F r - C y in continuous time: LADRC in the limit of `dt` = 0.
 
         C is a PID with a second-order filter (order 1: PI with one of first order), F/C the
         prefilter of the reference.
@@ -393,5 +412,5 @@ def _require_choices(ladrc: LADRC) -> None:
     if not isinstance(ladrc.observer, Observer):
         raise ValueError(
             f"observer is {ladrc.observer!r}: choose CurrentObserver(), PredictiveObserver() or "
-            "EulerObserver()."
+            "EulerObserver(), or give an object with the methods of jq.control.Observer."
         )

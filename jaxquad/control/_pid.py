@@ -10,6 +10,7 @@ from jaxquad._core import (
     align,
     as_float,
     as_float_or_none,
+    check_positive,
     ensemble_shape,
     fit,
     full_shape,
@@ -28,7 +29,7 @@ from ._protocols import AntiWindup, LinearController, Member, Reference, Setpoin
 
 
 class Clamping(eqx.Module):
-    """Stops the integral while it would drive a saturated command further into its limit."""
+    """Anti-windup that stops the integral while it drives a saturated command beyond its limit."""
 
     def __call__(
         self,
@@ -41,10 +42,17 @@ class Clamping(eqx.Module):
 
 
 class BackCalculation(eqx.Module):
-    """Lets the integral follow the bounded command with the tracking time `time` in s.
+    """Anti-windup by which the integral follows the bounded command with a tracking time.
 
-    Source: Åström & Hägglund, Advanced PID Control, section 3.5. Raises ValueError for a time that
-    is not above 0.
+    Source: Åström & Hägglund, Advanced PID Control, section 3.5.
+
+    **Arguments:**
+
+    - `time`: the tracking time in s, usually between kd/kp and kp/ki.
+
+    **Raises:**
+
+    - `ValueError`: the time is not above 0.
     """
 
     time: Float[Array, "..."] = per_member(
@@ -100,7 +108,7 @@ class PIDState(NamedTuple):
 
 
 class PIDLaw(eqx.Module):
-    """A `PID` with its filter of the measurement computed: what a loop runs, sample by sample.
+    """A `PID` with its filter of the measurement computed, for a loop to run sample by sample.
 
     Without that filter the state's integral is ahead by half a sample, by the trapezoidal rule.
     """
@@ -220,19 +228,30 @@ class PID(eqx.Module):
 
     u = kp (proportional_weight r - y) + ki int(r - y)
         + kd s/(1 + s/filter) (derivative_weight r - y),
-    exactly for signals that are straight between samples. A `Setpoint` brings its rate, which then
-    stands in for derivative_weight r', and its acceleration times `feedforward` (1/b of the plant).
+    exactly for signals that are straight between samples. The rate of a `Setpoint` replaces
+    derivative_weight r'; its acceleration is added times `feedforward`.
+    Source: Åström & Hägglund, Advanced PID Control, ch. 3.
 
-    The command is bounded by `limit`, which must be the tightest one in the loop: what a drive cuts
-    off beyond it winds the integral up. Every gain is a scalar, one value per axis, or
-    `[axes, *ensemble]`, and differentiable. Source: Åström & Hägglund, Advanced PID Control, ch. 3.
+    **Arguments:** (each gain is a scalar, one value per axis, or `[axes, *ensemble]`)
 
-    With a `measurement_filter`, in rad/s, y is what a second-order Butterworth filter makes of the
-    measurement and y' that filter's own rate, so that noise rolls off in all three terms; `filter`
-    then acts on the reference's rate alone. It is exact for a measurement held over the sample
-    before it, must be below 1/dt, and the integral is then dt times the sum of the errors.
-    Raises ValueError for gains that are not finite or fit no common shape, and for a filter, limit
-    or dt that is not above 0.
+    - `kp`, `ki`, `kd`: in units of the command per rad, per rad s and per rad/s.
+    - `filter`: the bandwidth of the derivative in rad/s.
+    - `proportional_weight`, `derivative_weight`: of the reference.
+    - `feedforward`: in units of the command per rad/s^2, 1/b of the plant for all of it.
+    - `measurement_filter`: None, or a bandwidth in rad/s below 1/dt. A second-order Butterworth
+        filter then gives y and its rate y', so that noise is attenuated in all three terms, and
+        `filter` acts on the rate of the reference alone. It is exact for a measurement held over
+        the sample before it; the integral is then dt times the sum of the errors.
+    - `limit`: of |u|. Give the tightest limit of the loop: where a drive cuts off more, the
+        integral winds up.
+    - `anti_windup`: `Clamping()`, `BackCalculation(time)`, any other `jq.control.AntiWindup`, or
+        None.
+    - `dt`: the sample interval in s.
+
+    **Raises:**
+
+    - `ValueError`: a gain is not finite or does not fit the others' shapes; a filter, the limit or
+        `dt` is not above 0.
     """
 
     kp: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad
@@ -252,8 +271,8 @@ class PID(eqx.Module):
     def __check_init__(self):
         if self.anti_windup is not None and not isinstance(self.anti_windup, AntiWindup):
             raise ValueError(
-                f"anti_windup is {self.anti_windup!r}: choose Clamping(), BackCalculation(time) or "
-                "None."
+                f"anti_windup is {self.anti_windup!r}: choose Clamping(), BackCalculation(time), "
+                "None, or give a function as jq.control.AntiWindup describes it."
             )
         require_sample(self.dt)
         for name, gain in _gains(self).items():
@@ -338,41 +357,64 @@ class PDState(NamedTuple):
 
 
 class PD(eqx.Module):
-    """Proportional feedback and filtered-derivative damping: holds a rig while it is excited.
+    """Proportional feedback and a filtered derivative, to hold a plant while it is excited.
 
-    `command = proportional (reference - measurement) - derivative rate`, with the rate from a
-    first-order filter of `bandwidth` (rad/s) at the sample interval `dt` (s).
+    command = proportional (reference - measurement) - derivative rate, with the rate from a
+    first-order filter.
+
+    **Arguments:**
+
+    - `proportional`, `derivative`: in units of the command per rad and per rad/s, one value per
+        axis or `[axes, *ensemble]`.
+    - `bandwidth`: of the filter in rad/s.
+    - `dt`: the sample interval in s.
+
+    **Raises:**
+
+    - `ValueError`: `dt` or `bandwidth` is not positive.
     """
 
-    proportional: Float[Array, " axes"] = per_member(1, converter=as_float)  # V/rad
-    derivative: Float[Array, " axes"] = per_member(1, converter=as_float)  # V s/rad
+    proportional: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad
+    derivative: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad/s
     bandwidth: float = eqx.field(static=True, default=125.0)  # 20 Hz
     dt: float = eqx.field(static=True, default=0.002)
 
     def __check_init__(self):
-        if not (self.dt > 0 and self.bandwidth > 0):
-            raise ValueError(
-                f"dt {self.dt} s and bandwidth {self.bandwidth} rad/s must both be positive"
-            )
+        check_positive(dt=self.dt, bandwidth=self.bandwidth)
+        require_shapes({"proportional": self.proportional, "derivative": self.derivative})
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the gains, () for one controller."""
+        return ensemble_shape(self)
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> PDState:
-        """At rest, with arrays shaped as the measurement `like`."""
-        zero = jnp.zeros_like(like)
+        """At rest; shaped as the measurement `like` and the ensemble of the gains."""
+        zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
         return PDState(zero, zero, jnp.zeros((), like.dtype))
 
     def step(
         self,
         state: PDState,
-        reference: Float[Array, " axes *ensemble"],
+        reference: Reference,
         measurement: Float[Array, " axes *ensemble"],
     ) -> tuple[PDState, Float[Array, " axes *ensemble"]]:
-        """One sample: the command to hold until the next one."""
+        """One sample: the command to hold until the next one.
+
+        **Raises:**
+
+        - `ValueError`: the reference is a `Setpoint`, which a PD cannot feed forward.
+        """
+        if isinstance(reference, Setpoint):
+            raise ValueError(
+                "a PD feeds nothing forward, but the reference has a rate or an acceleration: take "
+                "a jq.LADRC or jq.PID, or leave them None"
+            )
         keep = jnp.exp(jnp.asarray(-self.bandwidth * self.dt, measurement.dtype))
         slope = (measurement - state.measurement) * (state.started / self.dt)
         rate = keep * state.rate + (1 - keep) * slope
-        shape = (-1,) + (1,) * (measurement.ndim - 1)
-        proportional, derivative = self.proportional.reshape(shape), self.derivative.reshape(shape)
-        command = proportional * (reference - measurement) - derivative * rate
+        gain, damping = fit(self.proportional, measurement), fit(self.derivative, measurement)
+        command = gain * (reference - measurement) - damping * rate
         return PDState(measurement, rate, jnp.ones_like(state.started)), command
 
 
@@ -383,9 +425,16 @@ def place_pd(
     damping: float,
     dt: float = 0.002,
 ) -> PD:
-    """The `PD` that gives gain/s^2 per axis this natural frequency (rad/s) and damping ratio.
+    """The `PD` that gives the plant gain/s^2 a natural frequency and a damping ratio.
 
-    `gain` in rad/s^2 per unit of command.
+    **Arguments:**
+
+    - `gain`: in rad/s^2 per unit of command, one value per axis.
+    - `natural_frequency`: in rad/s; `damping`: its ratio; `dt`: the sample interval in s.
+
+    **Returns:**
+
+    The controller.
     """
     gain = as_float(gain)
     return PD(natural_frequency**2 / gain, 2 * damping * natural_frequency / gain, dt=dt)

@@ -112,7 +112,7 @@ class ObserverController(Protocol):
         ...
 
 
-def find_transform(part: Any, name: str) -> Transform | None:
+def find_transform(part: object, name: str) -> Transform | None:
     """The coordinates of the array `name`, as `part` or the innermost part that owns it says."""
     if isinstance(part, Tunable) and (found := part.tunable().get(name)) is not None:
         return found
@@ -120,7 +120,7 @@ def find_transform(part: Any, name: str) -> Transform | None:
     return find_transform(getattr(part, owner, None), rest) if dot else None
 
 
-def schedule_for_analysis(controller: Any, inertia: Float[ArrayLike, "..."]) -> Any:
+def schedule_for_analysis(controller: object, inertia: Float[ArrayLike, "..."]) -> Any:
     """`controller.scheduled_at(inertia)` of a scheduled controller, any other one as it is.
 
     An adaptive controller becomes the one that it is once its estimate has reached `inertia`.
@@ -130,7 +130,7 @@ def schedule_for_analysis(controller: Any, inertia: Float[ArrayLike, "..."]) -> 
     return controller
 
 
-def schedule_for_flight(controller: Any, inertia: Float[ArrayLike, "..."]) -> Any:
+def schedule_for_flight(controller: object, inertia: Float[ArrayLike, "..."]) -> Any:
     """What to simulate: a controller that has `step` as it is, another one scheduled."""
     return controller if hasattr(controller, "step") else schedule_for_analysis(controller, inertia)
 
@@ -208,7 +208,7 @@ class InertiaEstimator(Protocol):
 
     def update(
         self,
-        state: Any,
+        state: PyTree,
         command: Float[Array, " axes *ensemble"],
         measurement: Float[Array, " axes *ensemble"],
     ) -> PyTree:
@@ -219,7 +219,7 @@ class InertiaEstimator(Protocol):
         """
         ...
 
-    def estimate(self, state: Any) -> InertiaEstimate:
+    def estimate(self, state: PyTree) -> InertiaEstimate:
         """The estimate by the samples so far."""
         ...
 
@@ -228,10 +228,10 @@ class InertiaEstimator(Protocol):
 class ProbingEstimator(InertiaEstimator, Protocol):
     """An `InertiaEstimator` with a test signal of its own."""
 
-    def probe(self, state: Any) -> Float[Array, " axes *ensemble"]:
+    def probe(self, state: PyTree) -> Float[Array, " axes *ensemble"]:
         """The test signal to add to the next command."""
         ...
 
-    def excite(self, state: Any) -> PyTree:
+    def excite(self, state: PyTree) -> PyTree:
         """The state with the estimate in doubt, in which the test signal starts."""
         ...

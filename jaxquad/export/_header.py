@@ -2,7 +2,6 @@ import os
 import re
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from jaxquad.control import LADRC, PID, ScheduledLADRC, ScheduledPID
 
@@ -20,50 +19,75 @@ _SOURCES = {
 
 
 def c_header(
-    controller: Any,
+    controller: object,
     *,
     name: str = "attitude",
     precision: Precision = "float",
     axes: int | None = None,
 ) -> str:
-    """A LADRC or a PID, plain or scheduled, as one self-contained C99 header; C++ takes it, too.
+    """Write a LADRC or a PID, plain or scheduled, as one C99 header, which C++ compiles too.
 
     Its functions are `<name>_init(state)`, `<name>_step(state, reference, reference_rate,
     reference_acceleration, measurement, command)` once a sample and, of a LADRC,
     `<name>_applied(state, achieved)` and `<name>_init_at(state, measurement)`; a scheduled
     controller has `<name>_schedule(state, inertia)`. Signals are arrays of `<NAME>_AXES`, in rad
-    and units of the command; the set-point's derivatives may be null pointers. The difference
+    and units of the command; the derivatives of the set-point may be null pointers. The difference
     equations are those of `controller.step`, to rounding. Nothing is allocated, and only a map
-    calls the C library (log and exp). `axes` is needed where all gains are scalars.
-    Raises ValueError for an ensemble, for numbers that C's type does not hold, for a `name` that is
-    no C identifier and for a controller that cannot be written.
+    calls the C library (log and exp).
+
+    **Arguments:**
+
+    - `controller`: a `LADRC`, `PID`, `ScheduledLADRC` or `ScheduledPID`.
+    - `name`: begins all identifiers.
+    - `precision`: "float" or "double".
+    - `axes`: how many; needed where all gains are scalars.
+
+    **Returns:**
+
+    The text of the header.
+
+    **Raises:**
+
+    - `ValueError`: the controller is of another class or an ensemble, the C type does not hold a
+        number, or `name` is no C identifier.
     """
     source = _SOURCES.get(type(controller))
     if source is None:
-        known = ", ".join(f"jq.{kind.__name__}" for kind in _SOURCES)
+        known = ", ".join(kind.__name__ for kind in _SOURCES)
         raise ValueError(
-            f"the controller is a {type(controller).__name__}, but {known} can be written in C; of "
-            "an adaptive LADRC, write the jq.control.ScheduledLADRC and tell it your estimate."
+            f"The controller is a {type(controller).__name__}, but only {known} can be written in "
+            "C. For an adaptive LADRC, write a jq.control.ScheduledLADRC and call its _schedule "
+            "with your estimate of the inertia."
         )
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or "__" in name:
         raise ValueError(
-            f"name is {name!r}, but it must begin C identifiers: letters, digits and single "
-            "underscores, a letter first."
+            f"name is {name!r}, which is no C identifier: use letters, digits and single "
+            "underscores, with a letter first."
         )
-    return written(source(controller, axes, precision), name, precision, controller.dt, _version())
+    return written(source(controller, axes, precision), name, precision, _version())
 
 
 def write_c_header(
     path: str | Path,
-    controller: Any,
+    controller: object,
     *,
     name: str = "attitude",
     precision: Precision = "float",
     axes: int | None = None,
 ) -> Path:
-    """Write `c_header` to `path`, whole or not at all; returns the path.
+    """Write `c_header` to a file; an interrupted call leaves no half-written file.
 
-    Folders are made as needed. Raises ValueError as `c_header` does.
+    **Arguments:**
+
+    - `path`: of the file; missing folders are created. The others are those of `c_header`.
+
+    **Returns:**
+
+    The path.
+
+    **Raises:**
+
+    - `ValueError`: as `c_header`.
     """
     text = c_header(controller, name=name, precision=precision, axes=axes)
     path = Path(path)

@@ -76,8 +76,8 @@ $lines
 }"""
 
 SCHEDULE = """\
-/* Told another inertia, kg m^2: b0 moves, an unsaturated command does not, because the estimate
- * of f moves instead. What is not above 0 is ignored. Starts at the nominal inertia. */
+/* Another inertia, kg m^2: b0 changes, an unsaturated command does not, because the estimate of f
+ * changes instead. Values that are not above 0 are ignored. Starts at the nominal inertia. */
 static inline void ${name}_schedule(${name}_state *state, const $real inertia[${NAME}_AXES])
 {
     for (int k = 0; k < ${NAME}_AXES; ++k) {
@@ -116,6 +116,7 @@ def ladrc_source(ladrc: LADRC, axes: int | None, precision: Precision) -> Source
     count, gains = _gains_of(ladrc, axes, precision, {})
     return Source(
         what=f"LADRC of order {ladrc.order} for {axes_text(count)}.",
+        dt=ladrc.dt,
         settings=_settings(ladrc, True),
         gains=_noted(ladrc, gains),
         state=_STATES[ladrc.order] | _COMMAND,
@@ -132,7 +133,8 @@ def scheduled_ladrc_source(law: ScheduledLADRC, axes: int | None, precision: Pre
     noted["b0"] = noted["b0"]._replace(note=f"{_UNITS[ladrc.order]}, at the nominal inertia")
     start = _starting(ladrc, "state->b0[k] = ${name}_table[k].b0;")
     return Source(
-        what=f"LADRC of order {ladrc.order} for {axes_text(count)}, b0 after the inertia.",
+        what=f"LADRC of order {ladrc.order} for {axes_text(count)}, b0 by the inertia.",
+        dt=ladrc.dt,
         settings=_settings(ladrc, False)
         | {"b0": "piecewise linear from ln inertia to ln b0, constant beyond the knots"},
         gains=noted,
@@ -148,7 +150,7 @@ def _gains_of(
 ) -> tuple[int, dict[str, np.ndarray]]:
     if type(ladrc.observer) not in _OBSERVERS:
         known = ", ".join(f"{kind.__name__}()" for kind in _OBSERVERS)
-        raise ValueError(f"observer is {ladrc.observer!r}: in C there are {known}.")
+        raise ValueError(f"observer is {ladrc.observer!r}, but only {known} can be written in C.")
     gains = ladrc.gains
     values = {"kp": gains.proportional}
     values |= {} if gains.derivative is None else {"kd": gains.derivative}
@@ -168,7 +170,7 @@ def _settings(ladrc: LADRC, with_b0: bool) -> dict[str, str]:
     units = {"wc": " rad/s", "wo": " rad/s", "feedback_factor": "", "observer_factor": ""}
     units |= {"b0": f" {_UNITS[ladrc.order]}"} if with_b0 else {}
     units |= {"limit": " of |command|"}
-    found = {n: f"{np.asarray(getattr(ladrc, n)).tolist()}{unit}" for n, unit in units.items()}
+    found = {n: f"{np.asarray(vars(ladrc)[n]).tolist()}{unit}" for n, unit in units.items()}
     return found | {"observer": type(ladrc.observer).__name__, "placement": ladrc.placement}
 
 

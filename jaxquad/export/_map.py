@@ -1,7 +1,7 @@
 """A b0 map in C."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array
@@ -19,11 +19,12 @@ class MapSource(NamedTuple):
     start: np.ndarray
 
 
-def require_map(rule: Any) -> InertiaMap:
+def require_map(rule: object) -> InertiaMap:
     """Raises ValueError for a map that cannot be written."""
     if not isinstance(rule, InertiaMap):
         raise ValueError(
-            f"the map is a {type(rule).__name__}, but only a jq.control.InertiaMap can be written in C."
+            f"The map is a {type(rule).__name__}, but only a jq.control.InertiaMap can be written "
+            "in C: give values of your map at some knots to an InertiaMap."
         )
     return rule
 

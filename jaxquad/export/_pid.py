@@ -1,7 +1,5 @@
 """PID, with its gains fixed or divided by a b0 that follows an inertia."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -86,8 +84,8 @@ $lines
 }"""
 
 SCHEDULE = """\
-/* Told another inertia, kg m^2: the gains change at once, the integral of the command stays. What
- * is not above 0 is ignored. Starts at the nominal inertia. */
+/* Another inertia, kg m^2: the gains change at once, the integral of the command does not. Values
+ * that are not above 0 are ignored. Starts at the nominal inertia. */
 static inline void ${name}_schedule(${name}_state *state, const $real inertia[${NAME}_AXES])
 {
     for (int k = 0; k < ${NAME}_AXES; ++k)
@@ -118,6 +116,7 @@ def pid_source(pid: PID, axes: int | None, precision: Precision) -> Source:
     count, gains = _gains_of(pid, axes, precision, {})
     return Source(
         what=f"PID for {axes_text(count)}.",
+        dt=pid.dt,
         settings=_settings(pid),
         gains=_members(gains),
         state=_states(pid),
@@ -135,7 +134,8 @@ def scheduled_pid_source(law: ScheduledPID, axes: int | None, precision: Precisi
     b0 = {"b0": "in force, rad/s^2 per unit of command"}
     start = "state->b0[k] = ${name}_table[k].b0;"
     return Source(
-        what=f"PID for {axes_text(count)}, gains per b0, b0 after the inertia.",
+        what=f"PID for {axes_text(count)}, gains divided by b0, b0 by the inertia.",
+        dt=law.pid.dt,
         settings=_settings(law.pid)
         | {"b0": "piecewise linear from ln inertia to ln b0, constant beyond the knots"},
         gains=_members(gains) | {"b0": Gain("at the nominal inertia", gains["b0"])},
@@ -151,11 +151,11 @@ def scheduled_pid_source(law: ScheduledPID, axes: int | None, precision: Precisi
 def _gains_of(pid: PID, axes: int | None, precision: Precision, more: dict) -> tuple[int, dict]:
     if not (pid.anti_windup is None or isinstance(pid.anti_windup, Clamping | BackCalculation)):
         raise ValueError(
-            f"anti_windup is {pid.anti_windup!r}: in C there are Clamping(), BackCalculation(time) "
-            "and None."
+            f"anti_windup is {pid.anti_windup!r}, but only Clamping(), BackCalculation(time) and "
+            "None can be written in C."
         )
     names = ("kp", "ki", "kd", "feedforward", "proportional_weight", "derivative_weight", "limit")
-    values: dict[str, Any] = {name: getattr(pid, name) for name in names} | more
+    values: dict[str, Array] = {name: vars(pid)[name] for name in names} | more
     require_precision(values | {"filter": pid.filter}, precision)
     return per_axis(values | _samples_of(pid, precision), axes)
 
@@ -199,7 +199,7 @@ def _starting(pid: PID, more: str) -> tuple[str, ...]:
 def _settings(pid: PID) -> dict[str, str]:
     units = {"kp": "per rad", "ki": "per rad s", "kd": "per rad/s", "filter": "rad/s",
              "measurement_filter": "rad/s", "limit": "of |command|"}  # fmt: skip
-    found = {name: getattr(pid, name) for name in units}
+    found = {name: vars(pid)[name] for name in units}
     text = {n: f"{np.asarray(x).tolist()} {units[n]}" for n, x in found.items() if x is not None}
     rule = pid.anti_windup
     time = f"({np.asarray(rule.time).tolist()} s)" if isinstance(rule, BackCalculation) else ""

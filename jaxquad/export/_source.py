@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from string import Template
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -12,14 +12,14 @@ Precision = Literal["float", "double"]
 _TYPES = {"float": np.float32, "double": np.float64}
 
 
-def type_of(precision: Precision) -> type[np.floating[Any]]:
+def type_of(precision: Precision) -> type[np.floating]:
     """NumPy's name of a C type. Raises ValueError for another."""
     if precision not in _TYPES:
         raise ValueError(f'precision is {precision!r}: choose "float" or "double".')
     return _TYPES[precision]
 
 
-def number(value: Any, name: str, precision: Precision) -> str:
+def number(value: float | np.floating, name: str, precision: Precision) -> str:
     """A C constant that reads back as the same number; FLT_MAX or DBL_MAX for infinity.
 
     Raises ValueError for nan and for what a float cannot hold.
@@ -28,7 +28,7 @@ def number(value: Any, name: str, precision: Precision) -> str:
     with np.errstate(over="ignore", under="ignore"):
         held = kind(value)
     if np.isnan(value) or (np.isinf(held) and not np.isinf(value)) or (held == 0 and value != 0):
-        raise ValueError(f"{name} is {value}, which no {precision} of C holds: look at the gains.")
+        raise ValueError(f"{name} is {value}, which a C {precision} cannot hold: check the gains.")
     if np.isinf(held):
         most = "FLT_MAX" if precision == "float" else "DBL_MAX"
         return most if held > 0 else f"-{most}"
@@ -82,6 +82,7 @@ class Source(NamedTuple):
     """The C of one controller; its functions are templates of `$name`, `$NAME`, `$real`, `$f`."""
 
     what: str
+    dt: float  # s
     settings: Mapping[str, str]  # provenance, by name
     gains: Mapping[str, Gain]
     state: Mapping[str, str]  # notes of its members, arrays [axes]
@@ -105,8 +106,8 @@ def per_axis(values: Mapping[str, jax.Array], axes: int | None) -> tuple[int, di
     if wide:
         text = ", ".join(f"{name} {shape}" for name, shape in wide.items())
         raise ValueError(
-            f"The gains are those of an ensemble, {text}: a header holds one controller, so pick a "
-            "member, as jax.tree.map(lambda x: x[:, 0] if x.ndim > 1 else x, controller)."
+            f"The gains are those of an ensemble, {text}, but a header holds one controller: pick "
+            "a member, as jax.tree.map(lambda x: x[:, 0] if x.ndim > 1 else x, controller)."
         )
     count = {len(x) for x in found.values() if x.ndim} or ({axes} if axes else set())
     if not count:
@@ -125,22 +126,21 @@ def require_precision(values: Mapping[str, jax.Array], precision: Precision) -> 
     coarse = [name for name, x in values.items() if np.asarray(x).dtype == np.float32]
     if precision == "double" and coarse:
         raise ValueError(
-            f"{coarse[0]} is a float32, so that a header in double would show digits that it has "
-            'not: take precision="float", or make the controller after '
-            'jax.config.update("jax_enable_x64", True).'
+            f"{coarse[0]} is a float32, which has fewer digits than a header in double shows: "
+            'take precision="float", or make the controller after jq.enable_x64().'
         )
 
 
-def written(source: Source, name: str, precision: Precision, dt: float, version: str) -> str:
-    """The header."""
+def written(source: Source, name: str, precision: Precision, version: str) -> str:
+    """The text of the header."""
     axes = len(next(gain.values for gain in source.gains.values()))
     names = {
         "name": name, "NAME": name.upper(), "real": precision,
         "f": "f" if precision == "float" else "", "axes": axes,
-        "dt": number(dt, "dt", precision),
+        "dt": number(source.dt, "dt", precision),
     }  # fmt: skip
     parts = [
-        _comment(source, precision, dt, version),
+        _comment(source, precision, version),
         _top(source),
         _gains(source, precision),
         *source.tables,
@@ -152,9 +152,9 @@ def written(source: Source, name: str, precision: Precision, dt: float, version:
     return Template("\n\n".join(parts) + "\n").substitute(names)
 
 
-def _comment(source: Source, precision: Precision, dt: float, version: str) -> str:
-    lines = [source.what, "", f"Written by jaxquad {version}; do not edit, export it anew."]
-    lines.append(f"Sample interval {dt!r} s, numbers in {precision}. SI units and radians.")
+def _comment(source: Source, precision: Precision, version: str) -> str:
+    lines = [source.what, "", f"Written by jaxquad {version}; do not edit it, export it again."]
+    lines.append(f"Sample interval {source.dt!r} s, numbers in {precision}. SI units and radians.")
     lines += [f"{name}: {text}" for name, text in source.settings.items()]
     text = "\n".join(f" * {line}".rstrip() for line in lines)
     return f"/* {text[3:]}\n */".replace("$", "")

@@ -98,7 +98,7 @@ def test_the_estimate_is_proportional_to_the_torque_gain_and_its_gradient_says_s
         (lambda: RecursiveInertia([GAIN, -1.0], INERTIA), "torque_gain is"),
         (lambda: RecursiveInertia(GAIN, [[0.0]]), "nominal is"),
         (lambda: lock_in(nuisance=("angle",)), "two frequencies"),
-        (lambda: lock_in(tones=ProbeTones((2.05,))), "10.25 periods"),
+        (lambda: lock_in(tones=ProbeTones((2.05,))), "has 10.25 periods"),
         (lambda: lock_in(tones=ProbeTones((0.6,))), "from 5 to 250"),
         (lambda: lock_in(tones=ProbeTones((2.0, 2.4))), "closer than 0.8 Hz"),
         (lambda: lock_in(window=5.001), "whole number of samples"),

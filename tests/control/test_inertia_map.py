@@ -86,7 +86,7 @@ def test_maps_follow_the_precision_of_their_input():
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: InertiaMap(INERTIA, [0.0, 0.0], [1.0, 1.0]), "each above the last"),
+        (lambda: InertiaMap(INERTIA, [0.0, 0.0], [1.0, 1.0]), "two or more that rise"),
         (lambda: InertiaMap(INERTIA, [0.0, 1.0], [1.0, 1.0, 1.0]), "2 knots"),
         (lambda: InertiaMap(0.0, [0.0, 1.0], [1.0, 1.0]), "nominal is 0.0"),
         (lambda: certainty_equivalence(TORQUE_GAIN, INERTIA, span=(2.0, 1.0)), "low < high"),

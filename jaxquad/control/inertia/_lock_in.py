@@ -22,7 +22,7 @@ class LockInSolution(NamedTuple):
 
 
 class _Tones(NamedTuple):
-    """What each tone says: [tones, axes, *ensemble]."""
+    """The measurement at each tone: [tones, axes, *ensemble]."""
 
     ratio: Array  # real part of torque / acceleration, kg m^2
     weight: Array  # 1 / variance of it, 0 where the tone does not stand out
@@ -36,13 +36,13 @@ def solve(
     contrast: float,
     stiff: bool,
 ) -> LockInSolution:
-    """Inertia from what torque and acceleration have in common with each tone.
+    """Inertia from the correlations of torque and acceleration with each tone.
 
     The parts are a tone's cosine and sine; the places a frequency below it, its own, one above.
     At a tone torque / acceleration = J - k / w^2 + j (damping, lag), with w^2 the `square`: the
-    real part counts. Beside it there is no tone: what the ratio leaves of the torque there is the
-    disturbance. Its power, of four degrees of freedom, gives the variance. A tone stands out when
-    its acceleration has `contrast` times the power of its neighbours'.
+    real part is used. Beside it there is no tone: the torque that the ratio does not explain there
+    is the disturbance, whose power, of four degrees of freedom, gives the variance. A tone counts
+    if its acceleration has `contrast` times the power of its neighbours'.
     """
     tones = _ratios(acceleration, torque, contrast)
     return _stiff(tones, square) if stiff else _free(tones)
@@ -90,7 +90,7 @@ def _stiff(tones, square):
     )
 
 
-BESIDE = 2  # periods a window: the nearest that a Hann window keeps apart from the tone
+BESIDE = 2  # periods per window: the nearest that a Hann window separates from the tone
 
 
 class WindowSums(NamedTuple):
@@ -110,29 +110,29 @@ class LockInWindows(eqx.Module):
         samples = self.window / self.dt
         if abs(samples - round(samples)) > 1e-6 * samples or not 100 <= samples <= 40000:
             raise ValueError(
-                f"a window of {self.window} s holds {samples:g} samples of {self.dt} s: give it "
-                "a whole number of samples from 100 to 40000"
+                f"A window of {self.window} s holds {samples:g} samples of {self.dt} s: give it "
+                "a whole number of samples from 100 to 40000."
             )
         for frequency in self.frequencies:
             self._require_whole(frequency)
         apart = np.diff(sorted(self.periods))
         if np.any(apart < 2 * BESIDE):
             raise ValueError(
-                f"tones of {self.frequencies} Hz are closer than {2 * BESIDE / self.window:g} Hz, "
-                f"what a window of {self.window} s can tell apart: give a longer window"
+                f"Tones of {self.frequencies} Hz are closer than {2 * BESIDE / self.window:g} Hz, "
+                f"the resolution of a window of {self.window} s: give a longer window."
             )
 
     def _require_whole(self, frequency):
         periods = frequency * self.window
         if abs(periods - round(periods)) > 1e-6 * periods:
             raise ValueError(
-                f"a tone of {frequency} Hz makes {periods:g} periods in a window of {self.window} "
-                f"s: give a whole number, such as {max(round(periods), 5) / self.window:g} Hz"
+                f"A tone of {frequency} Hz has {periods:g} periods in a window of {self.window} s: "
+                f"give a whole number, such as {max(round(periods), 5) / self.window:g} Hz."
             )
         if not 5 <= round(periods) <= self.samples / 10:
             raise ValueError(
-                f"a tone of {frequency} Hz makes {periods:g} periods in a window of {self.window} "
-                f"s: give it from 5 to {self.samples // 10}"
+                f"A tone of {frequency} Hz has {periods:g} periods in a window of {self.window} s: "
+                f"give it from 5 to {self.samples // 10}."
             )
 
     @property
@@ -218,24 +218,37 @@ class LockInState(NamedTuple):
 
 
 class LockInInertia(AbstractInertia):
-    """Inertia at the frequencies of its own test tones: torque over acceleration, in phase.
+    """Inertia by a lock-in at its own test tones: torque over acceleration, in phase.
 
     Both sides of the sampled equation of motion are correlated with each tone over Hann windows of
-    `window` seconds, one beginning each half window. A tone makes a whole number of periods in a
-    window. Whatever makes another whole number, such as a constant torque or the rig's 5 s sine,
-    drops out exactly; a motor's lag and damping fall in quadrature; the ends of a window, where
-    encoder noise would enter, do not count. A delay of d seconds costs 1 - cos(omega d). A
-    stiffness k leaves J - k / omega^2 at one tone; `nuisance=("angle",)` with two tones or more
-    takes it out. An encoder bends angles of a count or two by 0.5 to 4 %, unless noise stirs them.
+    `window` seconds; a new window begins each half window. Each tone has a whole number of periods
+    in a window. Signals with another whole number, such as a constant torque or the paper's 5 s
+    sine, drop out exactly; a motor's lag and damping are in quadrature; the ends of a window, where
+    encoder noise would enter, have no weight. A delay of d seconds biases the inertia by
+    cos(omega d) - 1, an encoder angles of a count or two by 0.5 to 4 %. A stiffness k leaves
+    J - k / omega^2 at one tone; `nuisance=("angle",)` with two tones or more removes it.
 
-    The standard deviation is that of one window, from the disturbance two periods a window beside
-    its tones, with four degrees of freedom: it is known to a third, and assumes a spectrum that
-    is flat from there to the tone. Between windows the estimate is held and ages by `drift` in
-    relative deviation per root second. Only windows throughout which the tones were on count, and
-    tones of `contrast` times the power beside them; trust takes a relative deviation of `trust`.
-    A change of the inertia counts in full after the first window that begins after it, which is
-    one window and a half at the latest. Source: docs/control.md.
-    Raises `ValueError` for tones that do not fit the window or each other.
+    The standard deviation is that of one window, from the disturbance at two periods per window
+    beside the tones. It has four degrees of freedom, so that it is known to a third, and it assumes
+    a spectrum that is flat from there to the tone. Between windows the relative deviation grows by
+    `drift` per root second. Windows count in which the tones were on throughout, and tones of
+    `contrast` times the power beside them. After a change of the inertia the first window that
+    begins after it counts, one and a half windows later at most.
+    Source: docs/control.md.
+
+    **Arguments:**
+
+    - `torque_gain`: in N m per unit of command; `nominal`: the design's inertia in kg m^2. Both are
+        scalars, one value per axis, or `[axes, *ensemble]`.
+    - `tones`: the test signal.
+    - `window`: in s, from 100 to 40000 samples.
+    - `nuisance`: () or ("angle",).
+    - `contrast`; `trust`: the relative deviation up to which an estimate is trusted; `drift`: in
+        1/sqrt(s); `dt`: in s.
+
+    **Raises:**
+
+    - `ValueError`: a tone does not fit the window or the other tones, or a value is not positive.
     """
 
     tones: ProbeTones = eqx.field(default_factory=ProbeTones)
@@ -246,11 +259,11 @@ class LockInInertia(AbstractInertia):
     def __check_init__(self):
         check_positive(dt=self.dt, window=self.window)
         if self.nuisance not in ((), ("angle",)):
-            raise ValueError(f"nuisance is {self.nuisance}: give () or ('angle',)")
+            raise ValueError(f"nuisance is {self.nuisance}: give () or ('angle',).")
         if self.nuisance and len(self.tones.frequencies) < 2:
             raise ValueError(
-                f"one tone, {self.tones.frequencies} Hz, cannot tell stiffness from inertia: "
-                "give the probe two frequencies, or leave the nuisance 'angle' out"
+                f"One tone, {self.tones.frequencies} Hz, cannot separate stiffness from inertia: "
+                "give ProbeTones two frequencies, or leave the nuisance 'angle' out."
             )
         self._windows()
 

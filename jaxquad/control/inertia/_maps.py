@@ -25,8 +25,19 @@ class FuzzyMap(eqx.Module):
     A triangular set stands on each of the `centres`, reaching to its neighbours, the outer ones
     level beyond; "if delta is P_i then db0 is P_j" gives each set one of the `increments`, and
     defuzzification is the weighted average. The memberships sum to 1, so that this is the straight
-    line between (centre, increment) points, and nothing else. Source: Eq. (25) and its text.
-    Raises `ValueError` for centres that do not rise and for increments that leave no b0 above 0.
+    line between (centre, increment) points, and nothing else.
+    Source: Eq. (25) of the paper and its text; docs/equations.md.
+
+    **Arguments:**
+
+    - `nominal`: the inertia in kg m^2 at which delta is 1; `b0`: in rad/s^2 per unit of command.
+        Both are scalars, one value per axis, or `[axes, *ensemble]`.
+    - `centres`: of the sets, two or more values of delta that rise.
+    - `increments`: of b0, one for each set.
+
+    **Raises:**
+
+    - `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
     """
 
     nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2
@@ -40,11 +51,11 @@ class FuzzyMap(eqx.Module):
         require_finite("increments", self.increments)
         rises = not is_concrete(self.centres) or np.all(np.diff(np.asarray(self.centres)) > 0)
         if self.centres.ndim != 1 or self.centres.size < 2 or not rises:
-            raise ValueError(f"centres are {self.centres}: give two or more, each above the last")
+            raise ValueError(f"centres are {self.centres}: give two or more that rise.")
         if self.increments.shape != self.centres.shape:
             raise ValueError(
                 f"increments have the shape {self.increments.shape}: give one for each of the "
-                f"{self.centres.size} sets"
+                f"{self.centres.size} sets."
             )
         if is_concrete(self.b0) and is_concrete(self.increments):
             least = np.min(self.b0) + np.min(self.increments)
@@ -84,7 +95,7 @@ class FuzzyMap(eqx.Module):
 
 
 def printed_map(nominal: Float[Array, "..."] | float, *, b0: float = 3.0) -> FuzzyMap:
-    """The paper's map, to show what its printed ranges do; not for use.
+    """The map with the ranges that the paper prints, to show what they do; not for use.
 
     Eight sets over 1 < delta < 22 and 0 <= db0 <= 24 can only raise b0, while the paper's own b0
     falls from 3 to 1.6, which is delta = 1.875. There this map says 4.0, past the stability limit
@@ -117,11 +128,20 @@ class Falling(eqx.Module):
 class InertiaMap(eqx.Module):
     """From an inertia to the controller's gain b0: piecewise linear in ln J -> ln b0.
 
-    Straight between `knots`, constant beyond the first and the last. Slope -1 is certainty
-    equivalence, b0 = KT / J, which `certainty_equivalence` makes; knots and values are arrays, to
-    be tuned by gradient. Triangular fuzzy sets with averaged outputs are such a map, too: see
-    `jq.control.FuzzyMap`. Source: Eq. (25) of the paper, docs/equations.md, with another map.
-    Raises `ValueError` for knots that do not rise and for shapes that do not fit.
+    Straight between `knots`, constant beyond the first and the last. Slope -1 is b0 = KT / J, which
+    `certainty_equivalence` makes. Triangular fuzzy sets with averaged outputs are such a map, too:
+    see `jq.control.FuzzyMap`. Source: Eq. (25) of the paper, docs/equations.md, with another map.
+
+    **Arguments:**
+
+    - `nominal`: the design's inertia in kg m^2, a scalar, one value per axis, or
+        `[axes, *ensemble]`.
+    - `knots`: ln(J / nominal), two or more values that rise.
+    - `values`: ln b0 at each knot, `[knots]`, `[knots, axes]` or `[knots, axes, *ensemble]`.
+
+    **Raises:**
+
+    - `ValueError`: the knots do not rise, or the shapes do not fit.
     """
 
     nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2; axes *ensemble
@@ -134,11 +154,11 @@ class InertiaMap(eqx.Module):
         require_finite("values", self.values)
         rises = not is_concrete(self.knots) or np.all(np.diff(np.asarray(self.knots)) > 0)
         if self.knots.ndim != 1 or self.knots.size < 2 or not rises:
-            raise ValueError(f"knots are {self.knots}: give two or more, each above the last")
+            raise ValueError(f"knots are {self.knots}: give two or more that rise.")
         if self.values.ndim == 0 or self.values.shape[0] != self.knots.size:
             raise ValueError(
                 f"values have the shape {self.values.shape}: give one for each of the "
-                f"{self.knots.size} knots, (knots,), (knots, axes) or (knots, axes, members)"
+                f"{self.knots.size} knots, (knots,), (knots, axes) or (knots, axes, members)."
             )
 
     @property
@@ -186,10 +206,23 @@ def certainty_equivalence(
     knots: int = 6,
     factor: float = 1.0,
 ) -> InertiaMap:
-    """b0 = `factor` KT / J for J from `span[0]` to `span[1]` times the `nominal`, held beyond.
+    """The map b0 = `factor` KT / J: the estimate is used as if it were the true inertia.
 
-    `torque_gain` KT in N m per unit of command and `nominal` in kg m^2 are scalars, `[axes]` or
-    `[axes, *ensemble]`. With lag in the loop a `factor` above 1 is better: about 1.8 for 20 ms.
+    **Arguments:**
+
+    - `torque_gain`: KT in N m per unit of command; `nominal`: in kg m^2. Both are scalars, one
+        value per axis, or `[axes, *ensemble]`.
+    - `span`: the lowest and the highest J / nominal; b0 is constant beyond.
+    - `knots`: how many.
+    - `factor`: with a lag in the loop a value above 1 is better, about 1.8 for 20 ms.
+
+    **Returns:**
+
+    An `InertiaMap`.
+
+    **Raises:**
+
+    - `ValueError`: a value is not positive, or the span is not one.
     """
     torque_gain, nominal = as_float(torque_gain), as_float(nominal)
     require_positive("torque_gain", torque_gain, "give N m per unit of command, on the rig L Kf")
@@ -198,7 +231,7 @@ def certainty_equivalence(
     if not 0 < low < high < float("inf") or knots < 2:
         raise ValueError(
             f"span is {span} times the nominal inertia in {knots} knots: give 0 < low < high and "
-            "2 knots or more"
+            "2 knots or more."
         )
     places = np.linspace(np.log(low), np.log(high), knots)
     top = jnp.log(factor * times(torque_gain, 1 / nominal))

@@ -19,11 +19,20 @@ class ProbeTones(eqx.Module):
     """Sines to add to the command while the inertia is in doubt.
 
     They start when the estimate's relative standard deviation is above `above` and stop when it is
-    below `below`: a permanent 0.3 V at 2 Hz adds two thirds to the ITAE of a step of the rig.
-    `above=0` keeps them on. An estimator learns only while its tones are on, because without them
-    a closed loop shows the controller, not the plant. `amplitude`, in units of the command, is a
-    scalar or one per axis; 0 says that others excite the loop all the time. Raises `ValueError`
-    for frequencies that are not positive and for `below` above `above`.
+    below `below`: permanent tones of 0.3 V at 2 Hz add two thirds to the ITAE of a step of the
+    Hover. An estimator learns only while its tones are on, because without them a closed loop shows
+    the controller, not the plant.
+
+    **Arguments:**
+
+    - `frequencies`: in Hz.
+    - `amplitude`: of each sine in units of the command, a scalar or one value per axis. 0 says that
+        other signals excite the loop all the time.
+    - `above`, `below`: relative standard deviations; `above=0` keeps the tones on.
+
+    **Raises:**
+
+    - `ValueError`: a frequency is not positive, or `below` is above `above`.
     """
 
     frequencies: tuple[float, ...] = eqx.field(static=True, default=(2.0,))  # Hz
@@ -33,11 +42,11 @@ class ProbeTones(eqx.Module):
 
     def __check_init__(self):
         if not self.frequencies or not all(f > 0 for f in self.frequencies):
-            raise ValueError(f"frequencies are {self.frequencies} Hz: give at least one, above 0")
+            raise ValueError(f"frequencies are {self.frequencies} Hz: give at least one, above 0.")
         if self.above != 0 and not 0 <= self.below <= self.above:
             raise ValueError(
-                f"tones start above {self.above} and stop below {self.below}: give 0 <= below <= "
-                "above, or above=0 for permanent tones"
+                f"Tones start above {self.above} and stop below {self.below}: give 0 <= below <= "
+                "above, or above=0 for permanent tones."
             )
         require_nonnegative("amplitude", self.amplitude, "give units of the command")
 
@@ -45,7 +54,7 @@ class ProbeTones(eqx.Module):
         return ProbeState(jnp.zeros((), jnp.int32), jnp.ones_like(like))
 
     def step(self, state: ProbeState, estimate: InertiaEstimate) -> ProbeState:
-        """One sample on, with the switch after what is known now."""
+        """The state one sample later, switched by the `estimate`."""
         return ProbeState(state.index + 1, self.switch(state.exciting, estimate))
 
     def switch(
@@ -77,11 +86,11 @@ class ProbeTones(eqx.Module):
 
 
 class NoProbe(eqx.Module):
-    """No test signal: others excite the loop, and an estimator hears every sample.
+    """No test signal: the estimator uses every sample.
 
-    Only for loops that really are excited, by an injected signal or a busy reference. Where gusts
-    alone move the rig, least squares found the controller instead of the plant: of 64 loops with
-    b0 = 1.6 one in seven trusted an inertia that was up to 40 % off.
+    Only for loops that are excited by other means, an injected signal or a busy reference. Where
+    only gusts move the Hover, least squares finds the controller instead of the plant: of 64 loops
+    with b0 = 1.6 one in seven trusted an inertia that was up to 40 % off.
     """
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> ProbeState:

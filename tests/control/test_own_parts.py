@@ -1,0 +1,196 @@
+"""An estimator, an observer, a controller and a map of a user's own work by having the methods."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxquad as jq
+from jaxquad.control import (
+    CurrentObserver,
+    InertiaEstimate,
+    InertiaEstimator,
+    LADRC,
+    LinearController,
+    Observer,
+    schedule_for_analysis,
+    schedule_for_flight,
+    ScheduledController,
+    ScheduledLADRC,
+    Transform,
+    Tunable,
+)
+
+
+KT, J, DT = 0.047, 0.055, 0.002
+PLANT = jq.DecoupledAxes([KT], [J])
+STEP = jq.scenario(duration=2.0, reference={"roll": jq.Step(0.1, at=0.1)}, axes=1)
+
+
+class PositionFeedback(eqx.Module):
+    """u = kp (r - y) - kd (y - y of the sample before) / dt."""
+
+    kp: jax.Array
+    kd: jax.Array
+    dt: float = eqx.field(static=True, default=DT)
+
+    def init(self, like):
+        return jnp.zeros_like(like)
+
+    def step(self, state, reference, measurement):
+        angle = reference.angle if isinstance(reference, jq.control.Setpoint) else reference
+        slope = (measurement - state) / self.dt
+        return measurement, self.kp * (angle - measurement) - self.kd * slope
+
+    def linear(self, axis=0, member=None):
+        slope = self.kd / self.dt
+        one, zero = jnp.ones(()), jnp.zeros(())
+        return LinearController(
+            zero[None, None], zero[None], one[None], slope[None], self.kp, -self.kp - slope, self.dt
+        )
+
+    def tunable(self):
+        return {"kp": None, "kd": None}
+
+
+class TextbookObserver(eqx.Module):
+    """The zero-order-hold observer by its matrices: Phi, Gamma and Ackermann's formula."""
+
+    current = True
+    fastest = float(np.pi)
+
+    def gains(self, wo, dt, order):
+        return self.correction(wo, dt, order)
+
+    def correction(self, wo, dt, order):
+        phi, _ = self._matrices(dt)
+        pole = jnp.exp(-wo * dt)
+        shifted = phi - pole[..., None, None] * jnp.eye(3)
+        sought = shifted @ shifted @ shifted
+        row = jnp.array([[1.0, 0.0, 0.0]])
+        seen = jnp.concatenate([row @ phi, row @ phi @ phi, row @ phi @ phi @ phi])
+        return jnp.moveaxis(sought @ jnp.linalg.solve(seen, jnp.eye(3))[:, 2], -1, 0)
+
+    def predict(self, estimate, drive, dt):
+        phi, gamma = self._matrices(dt)
+        rows = [sum(phi[i, j] * x for j, x in enumerate(estimate)) for i in range(3)]
+        return [row + gamma[i] * drive for i, row in enumerate(rows)]
+
+    def _matrices(self, dt):
+        phi = jnp.array([[1.0, dt, dt**2 / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+        return phi, jnp.array([dt**2 / 2, dt, 0.0])
+
+
+class RatioState(NamedTuple):
+    angle: jax.Array
+    change: jax.Array
+    command: jax.Array
+    torque: jax.Array
+    acceleration: jax.Array
+    samples: jax.Array
+
+
+class RatioEstimator(eqx.Module):
+    """Torque over acceleration, least squares over all samples; no test signal, no dt."""
+
+    def init(self, like):
+        zero = jnp.zeros_like(like)
+        return RatioState(zero, zero, zero, zero, zero, jnp.zeros((), int))
+
+    def update(self, state, command, measurement):
+        change = measurement - state.angle
+        known = state.samples >= 2
+        acceleration = jnp.where(known, (change - state.change) / DT**2, 0)
+        torque = KT * (command + state.command) / 2
+        return RatioState(
+            measurement,
+            change,
+            command,
+            state.torque + acceleration * torque,
+            state.acceleration + acceleration**2,
+            state.samples + 1,
+        )
+
+    def estimate(self, state):
+        excited = state.acceleration > 1.0
+        inertia = state.torque / jnp.where(excited, state.acceleration, 1)
+        return InertiaEstimate(
+            jnp.where(excited, inertia, J), 0.01 * inertia, excited.astype(inertia.dtype)
+        )
+
+
+class PowerMap(eqx.Module):
+    """b0 = KT / J to a power that is tuned between 0 and 2."""
+
+    exponent: jax.Array
+
+    def __call__(self, inertia):
+        return (KT / inertia) ** self.exponent
+
+    def tunable(self):
+        return {"exponent": UpToTwo()}
+
+
+class UpToTwo(eqx.Module):
+    def forward(self, z):
+        return 2 * jax.nn.sigmoid(z)
+
+    def inverse(self, values):
+        return np.log(values / (2 - values))
+
+
+def test_they_have_the_methods_and_are_no_classes_of_the_package():
+    feedback = PositionFeedback(jnp.ones(()), jnp.ones(()))
+    parts = [(Observer, TextbookObserver()), (InertiaEstimator, RatioEstimator())]
+    for protocol, part in [*parts, (Tunable, feedback), (Transform, UpToTwo())]:
+        assert isinstance(part, protocol) and type(part).__mro__[1] is eqx.Module
+
+
+def test_a_controller_flies_as_its_linear_form_says():
+    loop = jq.Loop(PLANT, PositionFeedback(jnp.asarray(4.0), jnp.asarray(1.0)), delay=0.003)
+    flight, found = jq.simulate(loop, STEP), jq.analyse(loop)
+    left = np.abs(np.asarray(flight.angle)[-1, 0, ...] - 0.1)
+    assert bool(found.stable) and left < 0.1 * np.exp(1.7 * float(found.abscissa))
+    unstable = loop.with_controller(PositionFeedback(jnp.asarray(4.0), jnp.asarray(-0.1)))
+    assert not bool(jq.analyse(unstable).stable)
+
+
+def test_an_observer_of_the_same_matrices_flies_and_is_linearised_as_the_librarys():
+    own, same = (
+        LADRC(10.0, 30.0, KT / J, observer=x) for x in (TextbookObserver(), CurrentObserver())
+    )
+    np.testing.assert_allclose(own.gains.correction, same.gains.correction, rtol=1e-9)
+    loops = [jq.Loop(PLANT, controller, delay=0.003) for controller in (own, same)]
+    angles = [np.asarray(jq.simulate(loop, STEP).angle) for loop in loops]
+    np.testing.assert_allclose(*angles, atol=1e-12)
+    for one, other in zip(*(jax.tree.leaves(x.linear()) for x in (own, same)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_an_estimator_without_a_test_signal_or_a_sample_interval_adapts_b0():
+    chart = jq.control.certainty_equivalence(KT, J)
+    law = jq.AdaptiveLADRC(LADRC(10.0, 30.0, 1.6), RatioEstimator(), chart, settling=0.05)
+    heavy = jq.DecoupledAxes([KT], [1.7 * J])
+    flight = jq.simulate(jq.Loop(heavy, law), STEP)
+    assert float(flight.signals["b0"][-1, 0]) == pytest.approx(KT / (1.7 * J), rel=1e-6)
+    with pytest.raises(ValueError, match="RatioEstimator has no test signal"):
+        law.excite(law.init(jnp.zeros(1)))
+
+
+def test_what_has_not_the_methods_of_an_estimator_is_refused():
+    with pytest.raises(ValueError, match="methods init, update and estimate"):
+        jq.AdaptiveLADRC(LADRC(10.0, 30.0, 1.6), TextbookObserver(), lambda inertia: 1 / inertia)
+
+
+def test_a_map_schedules_and_says_in_which_coordinates_it_is_tuned():
+    law = ScheduledLADRC(LADRC(10.0, 30.0, 1.0), PowerMap(jnp.asarray(1.0)))
+    assert isinstance(law, ScheduledController)
+    for schedule in (schedule_for_flight, schedule_for_analysis):
+        assert float(schedule(law, [2 * J]).b0[0]) == pytest.approx(KT / (2 * J))
+    assert list(law.tunable()) == ["ladrc.wc", "ladrc.wo", "map.exponent"]
+    transform = jq.control.find_transform(law, "map.exponent")
+    assert transform.forward(transform.inverse(np.asarray(1.3))) == pytest.approx(1.3)
+    assert jq.control.find_transform(law, "ladrc.wc") is None
