@@ -4,6 +4,18 @@ from ._criteria import (
     DOptimal as DOptimal,
     LargestError as LargestError,
 )
-from ._noise import MeasuredNoise as MeasuredNoise
+from ._noise import MeasuredNoise as MeasuredNoise, noise_covariance as noise_covariance
 from ._optimal_multisine import Design as Design, optimal_multisine as optimal_multisine
-from ._prediction import predict_accuracy as predict_accuracy, Prediction as Prediction
+from ._prediction import (
+    information_per_energy as information_per_energy,
+    predict_accuracy as predict_accuracy,
+    Prediction as Prediction,
+)
+from ._search import (
+    certify_powers as certify_powers,
+    least_peak_phases as least_peak_phases,
+    multisine_peaks as multisine_peaks,
+    multisine_signals as multisine_signals,
+    optimal_powers as optimal_powers,
+    Powers as Powers,
+)

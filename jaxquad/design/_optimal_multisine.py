@@ -10,9 +10,8 @@ from jaxquad.identify import Free, select_parameters
 
 from ._criteria import Criterion, DOptimal
 from ._noise import Noise
-from ._phases import waves
 from ._prediction import check_distinct, Prediction, unit_information
-from ._search import gather_limits, Plan, search, Trial
+from ._search import gather_limits, multisine_signals, Plan, search, Trial
 
 
 class Design(eqx.Module):
@@ -199,7 +198,7 @@ def _design(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Design
 def _excitation(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Excitation:
     """The signal from its sample nearest to zero on."""
     amplitudes = np.sqrt(2 * best.power).astype(complex)[None, :]
-    wave = waves(plan.orders, best.phase, amplitudes, plan.samples)[0]
+    wave = multisine_signals(plan.orders, best.phase, amplitudes, plan.samples)[0]
     wave = np.roll(wave, -int(np.abs(wave).argmin()))
     lines = plan.omega[best.power > 0]
     return Excitation(

@@ -1,10 +1,8 @@
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, PyTree
+from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from jaxquad._core import require_x64
 from jaxquad.excitation import Excitation
@@ -99,7 +97,7 @@ class Prediction(eqx.Module):
         """Of the information."""
         return float(np.linalg.slogdet(self.information)[1])
 
-    def seconds_for(self, standard_errors: Any) -> Float[np.ndarray, " parameters"]:
+    def seconds_for(self, standard_errors: ArrayLike) -> Float[np.ndarray, " parameters"]:
         """Seconds of the same excitation, repeated, for each of these relative standard errors."""
         return self.seconds * (self.standard_errors / np.asarray(standard_errors)) ** 2
 

@@ -1,15 +1,251 @@
 """Powers and phases in turn: which power is best depends on the crest factors of the phases."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from ._criteria import Criterion
-from ._phases import least_peak_phases, peaks
-from ._powers import certify, optimal_powers, Powers
+
+
+_NORMS = (4, 16, 64, 256)  # each the start of the next; the last is almost the peak
+_PHASE_STEPS = 60  # of each
+_STARTS = 4
+_COARSE, _FINE = 8, 64  # least points to a cycle of the highest line: to search, and to judge
+
+Phase = Float[np.ndarray, " frequencies"]
+Amplitudes = Complex[np.ndarray, "signals frequencies"]
+
+
+def least_peak_phases(
+    orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes, *, seed: int
+) -> Phase:
+    """Phases of the lines that lower the largest peak of several signals at once.
+
+    The signals are sums of `amplitudes` times cos(order 2 pi t + phase), `orders` per period, in
+    units of their limits. The p-norm over all of them is lowered for a rising p, from several
+    starts. Source: Guillaume, Schoukens, Pintelon and Kollar (1991), for one signal.
+    """
+    used = np.flatnonzero(amplitudes[0])
+    few, heights = orders[used], amplitudes[:, used]
+    rng = np.random.default_rng(seed)
+    starts = [_schroeder(few, heights[0])]
+    starts += [rng.uniform(-np.pi, np.pi, used.size) for _ in range(_STARTS - 1)]
+    found = [_lowered(start, few, heights) for start in starts]
+    highest = [multisine_peaks(few, phase, heights).max() for phase in found]
+    phase = np.zeros(orders.size)
+    phase[used] = found[int(np.argmin(highest))]
+    return phase
+
+
+def multisine_peaks(
+    orders: Int[np.ndarray, " frequencies"], phase: Phase, amplitudes: Amplitudes
+) -> Float[np.ndarray, " signals"]:
+    """The least bound on each signal's peak at any time that its values at many points give.
+
+    Between N points, a signal of order n exceeds them by 1 / cos(pi n / N) at most (Ehlich and
+    Zeller, 1964): 0.1 %.
+    """
+    points = 1 << int(np.ceil(np.log2(_FINE * orders.max())))
+    levels = np.abs(multisine_signals(orders, phase, amplitudes, points))
+    return levels.max(axis=1) / np.cos(np.pi * orders.max() / points)
+
+
+def multisine_signals(
+    orders: Int[np.ndarray, " frequencies"], phase: Phase, amplitudes: Amplitudes, points: int
+) -> Float[np.ndarray, "signals points"]:
+    """One period of each signal, at evenly spaced points."""
+    return _waves(orders, amplitudes * np.exp(1j * phase), points)
+
+
+def _schroeder(
+    orders: Int[np.ndarray, " frequencies"], amplitudes: Complex[np.ndarray, " frequencies"]
+) -> Phase:
+    """Each line's delay in proportion to the power of the lines below it (Schroeder, 1970)."""
+    power = np.abs(amplitudes) ** 2
+    below = np.concatenate([[0.0], np.cumsum(power)[:-1]]) / power.sum()
+    return -2 * np.pi * np.concatenate([[0.0], np.cumsum(below[1:] * np.diff(orders))])
+
+
+def _lowered(
+    phase: Phase, orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes
+) -> Phase:
+    from scipy.optimize import minimize
+
+    points = 1 << int(np.ceil(np.log2(_COARSE * orders.max())))
+    for norm in _NORMS:
+        lowered = minimize(
+            _log_norm, phase, (orders, amplitudes, points, norm),
+            jac=True, method="CG", options=dict(maxiter=_PHASE_STEPS),
+        )  # fmt: skip
+        phase = lowered.x
+    return phase
+
+
+def _log_norm(
+    phase: Phase,
+    orders: Int[np.ndarray, " frequencies"],
+    amplitudes: Amplitudes,
+    points: int,
+    norm: int,
+) -> tuple[float, Phase]:
+    """Logarithm of the norm over all signals and points, and its gradient."""
+    turned = amplitudes * np.exp(1j * phase)
+    signals = _waves(orders, turned, points)
+    top = np.abs(signals).max()
+    unit = signals / top
+    powers = unit ** (norm - 2)
+    total = np.sum(powers * unit**2)
+    through = np.fft.rfft(powers * unit / (top * total), axis=1)[:, orders]
+    slope = np.real(1j * turned * np.conj(through)).sum(axis=0)
+    return float(np.log(total / unit.size) / norm + np.log(top)), slope
+
+
+def _waves(
+    orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes, points: int
+) -> Float[np.ndarray, "signals points"]:
+    spectrum = np.zeros((len(amplitudes), points // 2 + 1), complex)
+    spectrum[:, orders] = 0.5 * points * amplitudes
+    return np.fft.irfft(spectrum, points, axis=1)
+
+
+_STEPS = 40_000
+_BETWEEN = 25  # steps between two looks at the certificate
+_TOLERANCE = 3e-4  # of the flight time
+
+Power = Float[Array, " frequencies"]
+PerPower = Float[Array, "models frequencies parameters parameters"]
+Costs = Float[Array, "limits frequencies"]
+Share = Float[Array, ""]
+
+
+class Powers(NamedTuple):
+    """Mean squares of the lines, and the price of each limit in information; prices sum to 1."""
+
+    power: Power
+    price: Float[Array, " limits"]
+
+
+class Certificate(NamedTuple):
+    """How far powers are from the best, by the equivalence theorem."""
+
+    dispersion: Power  # information that a line buys per cost, to all there is: 1 at best
+    gap: Float[Array, ""]  # the best design's log information exceeds this one's by no more
+
+
+def optimal_powers(
+    per_power: PerPower, costs: Costs, criterion: Criterion, names: tuple[str, ...], share: Share
+) -> Powers:
+    """Maximise the mean of the models' log information, each limit's `costs @ power` at most 1.
+
+    No line takes more than `share` of what the limits leave it alone. Each step multiplies the
+    powers by the information that a unit of cost buys at each line, to the criterion's exponent,
+    and the prices of the limits by their use. With a single limit that is the algorithm of Silvey,
+    Titterington and Torsney (1978), under which D- and A-optimality never fall (Yu, 2010).
+    """
+    price = jnp.full(costs.shape[0], 1 / costs.shape[0], costs.dtype)
+    start = Powers(_feasible(_cap(costs, share), costs), price)
+    return _improved(start, per_power, costs, criterion, names, share, jnp.asarray(_STEPS))[0]
+
+
+def certify_powers(
+    found: Powers,
+    per_power: PerPower,
+    costs: Costs,
+    criterion: Criterion,
+    names: tuple[str, ...],
+    share: Share,
+) -> Certificate:
+    """Bound what any powers within the limits could gain over those found, whatever these are.
+
+    Weak duality; with one limit and no cap, the equivalence theorem of Kiefer and Wolfowitz (1960).
+    """
+    return _improved(found, per_power, costs, criterion, names, share, jnp.asarray(0))[1]
+
+
+@eqx.filter_jit
+def _improved(
+    found: Powers,
+    per_power: PerPower,
+    costs: Costs,
+    criterion: Criterion,
+    names: tuple[str, ...],
+    share: Share,
+    steps: Int[Array, ""],
+) -> tuple[Powers, Certificate]:
+    """At most so many steps on; with none, only the certificate, at no second compilation."""
+    slope = _slope(per_power, criterion, names)
+    cap = _cap(costs, share)
+
+    def step(_, state):
+        price = state.price * (costs @ state.power)
+        price = price / jnp.sum(price)
+        cost = price @ costs
+        gain = (slope(state.power) / cost) ** criterion.exponent
+        return Powers(_filled(state.power * gain, cost, cap), price)
+
+    def certificate(state):
+        power, cost = _feasible(state.power, costs), state.price @ costs
+        slopes = slope(power)
+        return Certificate(slopes / cost, _gap(slopes, cost, cap, power))
+
+    def improve(carry):
+        state, _, done = carry
+        state = jax.lax.fori_loop(0, jnp.minimum(_BETWEEN, steps), step, state)
+        return state, certificate(state), done + _BETWEEN
+
+    def unfinished(carry):
+        _, proof, done = carry
+        return (done == 0) | ((proof.gap > _TOLERANCE) & (done < steps))
+
+    unknown = Certificate(jnp.zeros_like(found.power), jnp.asarray(jnp.inf))
+    start = (found, unknown, jnp.zeros_like(steps))
+    state, proof, _ = jax.lax.while_loop(unfinished, improve, start)
+    return state._replace(power=_feasible(state.power, costs)), proof
+
+
+def _slope(
+    per_power: PerPower, criterion: Criterion, names: tuple[str, ...]
+) -> Callable[[Power], Power]:
+    def information(power):
+        each = jnp.einsum("f,mfpq->mpq", power, per_power)
+        return jnp.mean(jax.vmap(lambda m: criterion.log_information(m, names))(each))
+
+    return jax.grad(information)
+
+
+def _cap(costs: Costs, share: Share) -> Power:
+    return share / jnp.max(costs, axis=0)
+
+
+def _feasible(power: Power, costs: Costs) -> Power:
+    return power / jnp.maximum(jnp.max(costs @ power), 1.0)
+
+
+def _filled(wanted: Power, cost: Power, cap: Power) -> Power:
+    """`wanted` scaled to a cost of 1, where what exceeds its cap goes to the others."""
+
+    def again(_, scale):
+        full = scale * wanted >= cap
+        left = 1 - jnp.sum(jnp.where(full, cost * cap, 0.0))
+        open = jnp.sum(jnp.where(full, 0.0, cost * wanted))
+        return jnp.where(open > 0, left / jnp.where(open > 0, open, 1.0), scale)
+
+    scale = jax.lax.fori_loop(0, 12, again, 1 / jnp.sum(cost * wanted))
+    return jnp.minimum(scale * wanted, cap)
+
+
+def _gap(slope: Power, cost: Power, cap: Power, power: Power) -> Float[Array, ""]:
+    """By how much any powers within the limits could do better: concavity, and the best filling."""
+    order = jnp.argsort(-slope / cost)
+    room = (cost * cap)[order]
+    before = jnp.cumsum(room) - room
+    taken = jnp.clip(1 - before, 0, room)
+    return jnp.sum(taken * (slope / cost)[order]) - slope @ power
 
 
 class Limits(NamedTuple):
@@ -112,10 +348,10 @@ def _trial(
     found = optimal_powers(problem, jnp.asarray(costs), plan.criterion, plan.names, share)
     power = _without_faint(np.asarray(found.power), costs)
     phase = least_peak_phases(plan.orders, _signals(plan, power), seed=seed)
-    reached = peaks(plan.orders, phase, _signals(plan, power))
+    reached = multisine_peaks(plan.orders, phase, _signals(plan, power))
     power, reached = power / reached.max() ** 2, reached / reached.max()
     crest = reached / np.sqrt(0.5 * np.sum(np.abs(_signals(plan, power)) ** 2, axis=1))
-    proof = certify(
+    proof = certify_powers(
         Powers(jnp.asarray(power), found.price), problem, jnp.asarray(plan.limits.costs(crest)),
         plan.criterion, plan.names, share,
     )  # fmt: skip

@@ -1,13 +1,11 @@
+from ._assess import MISFIT as MISFIT
 from ._cost import (
+    coherence_weight as coherence_weight,
     CoherenceWeighted as CoherenceWeighted,
     Cost as Cost,
     MaximumLikelihood as MaximumLikelihood,
+    paper_cost as paper_cost,
     usable as usable,
-)
-from ._draws import (
-    check_drawable as check_drawable,
-    draw_models as draw_models,
-    known_covariance as known_covariance,
 )
 from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
@@ -23,11 +21,26 @@ from ._parameters import (
     select_parameters as select_parameters,
     with_values as with_values,
 )
-from ._problem import Prior as Prior
+from ._problem import (
+    make_problem as make_problem,
+    Prior as Prior,
+    Problem as Problem,
+    residuals as residuals,
+)
 from ._reduce import reduce_structure as reduce_structure, Reduction as Reduction
-from ._remarks import FAILED as FAILED, MISFIT as MISFIT
-from ._result import Fit as Fit
-from ._starts import Minimum as Minimum
+from ._result import (
+    check_drawable as check_drawable,
+    draw_models as draw_models,
+    Fit as Fit,
+    known_covariance as known_covariance,
+)
+from ._simulated import integrate_plant as integrate_plant
+from ._solve import least_squares as least_squares, problem_normal as problem_normal
+from ._starts import (
+    Minimum as Minimum,
+    solve_from_many as solve_from_many,
+    spread_starts as spread_starts,
+)
 from ._transfer_function_fit import fit_transfer_function as fit_transfer_function
 from ._transfer_function_guess import guess_transfer_function as guess_transfer_function
 from ._verdict import (

@@ -1,52 +1,85 @@
-"""What a misfit costs: weights on the logarithm of the ratio of model to measurement."""
+"""Costs: weights on the logarithm of the ratio of model to measurement."""
 
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
 from jaxquad.spectra import FrequencyResponse
 
 
 _DB = 20 / np.log(10)  # dB to a unit of natural logarithm
-_W_P = 0.01745  # 1 dB weighs as much as 7.57 deg
+_W_g, _W_p = 1.0, 0.01745  # so that 1 dB weighs as much as 7.57 deg
 
 Mask = Bool[np.ndarray, "frequencies outputs inputs"]
 Ratio = Float[np.ndarray, "frequencies outputs inputs"]
 Weights = Float[np.ndarray, "frequencies outputs inputs 2"]
 
 
+def coherence_weight(gamma_squared: Ratio) -> Ratio:
+    """Eq. (14), the weight of a point: W_gamma = [1.58 (1 - exp(-gamma^2))]^2.
+
+    The paper prints it without the square. Source: docs/equations.md.
+    """
+    return (1.58 * (1 - np.exp(-gamma_squared))) ** 2
+
+
+def paper_cost(
+    T: Complex[np.ndarray, " frequencies"],
+    T_hat: Complex[np.ndarray, " frequencies"],
+    gamma_squared: Float[np.ndarray, " frequencies"],
+) -> float:
+    """Eq. (14) for one response: J = 20/n_omega sum W_gamma [W_g (|T^| - |T|)^2 + W_p (angle)^2].
+
+    `T` is the model's response and `T_hat` the measured one; magnitudes count in dB, phases in deg,
+    W_g = 1 and W_p = 0.01745. `CoherenceWeighted` gives the fit the same cost as weights.
+    The paper prints a minus before W_p. Source: Tischler & Remple, eq. 11.4; docs/equations.md.
+    """
+    decibels = 20 * np.log10(np.abs(T_hat) / np.abs(T))
+    degrees = np.degrees(np.angle(T_hat / T))
+    squares = _W_g * decibels**2 + _W_p * degrees**2
+    return float(20 / T.size * np.sum(coherence_weight(gamma_squared) * squares))
+
+
 @runtime_checkable
 class Cost(Protocol):
-    """Gives the weights of `ln|T/T^|` and of `angle(T/T^)` in rad, zero outside the mask."""
+    """How much each point of a response counts in a fit; any object with this method is one."""
 
     def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
-        """`ratio` is |model / measurement|, 1 before there is a model."""
+        """Weights of `ln|T/T^|` and of `angle(T/T^)` in rad, on a last axis of two.
+
+        **Arguments:**
+
+        - `frf`: the measured response T^.
+        - `used`: which points count; the weights of the others have to be 0.
+        - `ratio`: |model / measurement|, 1 before there is a model.
+        """
         ...
 
 
 class CoherenceWeighted(eqx.Module):
-    """The cost of Eq. (14), corrected: J = 20/n sum W_gamma [W_g dB^2 + W_p deg^2].
+    """The cost of Eq. (14), `paper_cost`, summed over the responses (CIFER's).
 
-    W_gamma = [1.58 (1 - exp(-gamma^2))]^2, W_g = 1, W_p = 0.01745, summed over the responses.
-    J below 100 is acceptable, below 50 very good. Source: Tischler & Remple eq. 11.4; the paper
-    prints a minus and an unsquared weight.
+    An average cost below 100 is acceptable, below 50 very good. It has no noise model, so
+    `jq.identify.Prior`s need `MaximumLikelihood` instead.
+    Source: Tischler & Remple, eq. 11.4; docs/equations.md says what the paper prints.
     """
 
     def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
         points = np.maximum(used.sum(axis=0, keepdims=True), 1)
-        trust = 1.58 * (1 - np.exp(-np.asarray(frf.coherence)))
-        root = np.where(used, np.sqrt(20 / points) * trust, 0.0)
-        return np.stack([root * _DB, root * np.sqrt(_W_P) * np.degrees(1.0)], axis=-1)
+        W_gamma = coherence_weight(np.asarray(frf.coherence))
+        root = np.where(used, np.sqrt(20 / points) * np.sqrt(W_gamma), 0.0)
+        units = np.sqrt(_W_g) * _DB, np.sqrt(_W_p) * np.degrees(1.0)
+        return np.stack([root * unit for unit in units], axis=-1)
 
 
 class MaximumLikelihood(eqx.Module):
-    """Squared log-ratio over the response's random error: the likelihood of Gaussian noise.
+    """The likelihood of Gaussian noise: squared logarithm of the ratio over its random error.
 
-    The logarithm of the ratio is unbiased for circular noise. The random error is taken relative to
-    the model: relative to the measurement, points that came out low by chance would weigh more.
+    The random error is taken relative to the model: relative to the measurement, points that came
+    out low by chance would weigh more. The logarithm is unbiased for circular noise.
     """
 
     def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
@@ -61,13 +94,17 @@ Band = Range | Mapping[tuple[str, str], Range | None] | None
 
 
 def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
-    """Known, within the band of its pair, and coherent on the local average."""
+    """Which points of a response a fit uses.
+
+    A point counts if it is known, lies within the band of its pair (rad/s), and the coherence,
+    averaged over a third of an octave, is at least `least`.
+    """
     known = np.isfinite(np.asarray(frf.response)) & np.isfinite(np.asarray(frf.random_error))
     coherent = _local_mean(np.asarray(frf.omega), np.asarray(frf.coherence)) >= least
-    return known & coherent & _inside(frf, band)
+    return known & coherent & _in_band(frf, band)
 
 
-def _inside(frf: FrequencyResponse, band: Band) -> Bool[np.ndarray, "frequencies outputs inputs"]:
+def _in_band(frf: FrequencyResponse, band: Band) -> Bool[np.ndarray, "frequencies outputs inputs"]:
     if not isinstance(band, Mapping):
         one = _between(frf, band)
         return np.broadcast_to(one[:, None, None], frf.response.shape)
@@ -106,8 +143,8 @@ def _local_mean(
 ) -> Float[np.ndarray, "frequencies outputs inputs"]:
     """Mean over about a third of an octave.
 
-    Points chosen one by one, because their own coherence came out high by chance, are biased.
+    Choosing single points whose own coherence came out high by chance would bias the fit.
     """
-    apart = np.log(omega[:, None] / omega[None, :])
-    kernel = np.exp(-0.5 * (apart / 0.2) ** 2)
+    distance = np.log(omega[:, None] / omega[None, :])
+    kernel = np.exp(-0.5 * (distance / 0.2) ** 2)
     return np.einsum("fg,goi->foi", kernel / kernel.sum(axis=1, keepdims=True), values)

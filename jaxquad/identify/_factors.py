@@ -1,6 +1,6 @@
 """A fitted transfer function as gain, zeros and poles with their standard errors."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -13,21 +13,25 @@ from ._result import Fit
 from ._verdict import Combination, UndeterminedError
 
 
-def factors_text(factors: Any) -> str:
+def _factors_text(factors: "Factors") -> str:
     """`-7.03 +- 0.2 (2.89 +- 0.1) / ((89.1 +- 9) [0.626 +- 0.01, 6.11 +- 0.05])`."""
-    above = [_factor_factor_text(each) for each in factors.zeros]
-    below = ["(0)"] * factors.integrators + [_factor_factor_text(each) for each in factors.poles]
+    above = [_factor_text(each) for each in factors.zeros]
+    below = ["(0)"] * factors.integrators + [_factor_text(each) for each in factors.poles]
     lines = [" ".join([_number(*factors.gain[1:]), *above])]
     lines[0] += f" / ({' '.join(below)})" if below else ""
     if factors.delay.value != 0:
         lines[0] += f" exp(-({_number(*factors.delay[1:])}) s)"
-    lines.append("(a) is s + a, [zeta, omega] is s^2 + 2 zeta omega s + omega^2, rad/s")
+    lines.append(
+        "(a) is s + a, [zeta, omega] is s^2 + 2 zeta omega s + omega^2, rad/s; +- one std. error"
+    )
     if any(each.repeated for each in (*factors.zeros, *factors.poles)):
-        lines.append("~ repeated within its error: it may split, and has no first-order error")
+        lines.append(
+            "~ repeated within its error: the roots may be two, and have no first-order error"
+        )
     return "\n".join(lines)
 
 
-def _factor_factor_text(factor: Any) -> str:
+def _factor_text(factor: "Factor") -> str:
     pairs = zip(factor.values, factor.standard_errors, strict=True)
     if factor.repeated:
         inside = ", ".join(f"~{value:.4g}" for value in factor.values)
@@ -48,8 +52,9 @@ _CLOSE = 3.0  # standard errors between two roots, within which they count as re
 class Factor(NamedTuple):
     """`(s + a)` for a real root -a, or `s^2 + 2 zeta omega s + omega^2` for a pair.
 
-    `values` are (a,) or (zeta, omega), in rad/s, nan where the record does not determine them.
-    The errors of a `repeated` root are nan: a root that may split has no first-order error.
+    `values` are (a,) or (zeta, omega) with a and omega in rad/s, nan where the record does not
+    determine them. A `repeated` root lies so near another one that it has no first-order error:
+    its standard errors are nan.
     """
 
     root: complex  # rad/s; the upper one of a pair
@@ -68,7 +73,7 @@ class Factors(eqx.Module):
     delay: Combination  # s; its error is 0 where it was fixed
 
     def __str__(self) -> str:
-        return factors_text(self)
+        return _factors_text(self)
 
 
 class _Spread(NamedTuple):
@@ -92,16 +97,29 @@ class _Spread(NamedTuple):
 
 
 def factors(fit: Fit) -> Factors:
-    """Factor the transfer function of a fit; errors by first-order propagation.
+    """Gain, zeros and poles of a fitted transfer function, with standard errors.
 
-    A coefficient that moves by dc_j moves a root r of P by -r^j dc_j / P'(r). Raises ValueError
-    if the model is no `jq.TransferFunction`, `UndeterminedError` if no coefficient is determined.
+    Errors are propagated to first order: a change dc_j of a coefficient of the polynomial P moves
+    its root r by -r^j dc_j / P'(r).
+
+    **Arguments:**
+
+    - `fit`: a fit of a `jq.TransferFunction`, as of `jq.fit_transfer_function`.
+
+    **Returns:**
+
+    `jq.identify.Factors`.
+
+    **Raises:**
+
+    - `ValueError`: the model is no `jq.TransferFunction`.
+    - `UndeterminedError`: no coefficient is determined.
     """
     model = fit.model
     if not isinstance(model, TransferFunction):
         raise ValueError(
-            f"factors of a {type(model).__name__}: only a fit of a jq.TransferFunction has them; "
-            "see jq.fit_transfer_function"
+            f"a {type(model).__name__} has no gain, zeros and poles: fit a jq.TransferFunction, "
+            "for instance with jq.fit_transfer_function"
         )
     if not np.any(fit.determined):
         reasons = "; ".join(fit.verdict.reasons)
@@ -171,11 +189,11 @@ def _is_repeated(
     spread: _Spread,
 ) -> bool:
     """Whether another root lies so near that the sum and difference of the two are mixed up."""
-    apart = float(np.min(np.abs(others - root), initial=np.inf))
-    if apart <= 1e-6 * abs(root) or not np.all(np.isfinite(slope)):
+    distance = float(np.min(np.abs(others - root), initial=np.inf))
+    if distance <= 1e-6 * abs(root) or not np.all(np.isfinite(slope)):
         return True
     error = np.hypot(spread.error(np.real(slope)), spread.error(np.imag(slope)))
-    return bool(apart < min(_CLOSE * error, LIMIT * abs(root)))
+    return bool(distance < min(_CLOSE * error, LIMIT * abs(root)))
 
 
 def _factor(

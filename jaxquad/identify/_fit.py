@@ -1,6 +1,6 @@
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
@@ -22,8 +22,17 @@ from ._verdict import Verdict, without_numbers
 def guess_lagged_integrator(frf: FrequencyResponse, integrators: int) -> LaggedIntegrator:
     """Starting values for K e^(-delay s) / (s^integrators (lag s + 1)) from a response's shape.
 
-    K from the magnitude and the phase in the lower half of the coherent band,
-    lag and delay from the slope of the phase, half each. Good enough for a fit to start from.
+    K comes from the magnitude and the sign of the lower half of the coherent band, lag and delay
+    half each from the slope of the phase. Good enough for `jq.fit` to start from.
+
+    **Arguments:**
+
+    - `frf`: a measured response; its first output and input count.
+    - `integrators`: 1 from a moment to a rate, 2 to an angle.
+
+    **Returns:**
+
+    A `jq.LaggedIntegrator`.
     """
     omega, response = np.asarray(frf.omega), np.asarray(frf.response)[:, 0, 0]
     coherence = np.asarray(frf.coherence)[:, 0, 0]
@@ -50,42 +59,65 @@ def fit(
     band: Band = None,
     min_coherence: float = 0.6,
     starts: int = 1,
-    solver: Any = None,
+    solver: eqx.Module | None = None,
     max_steps: int = 256,
 ) -> Fit:
     """Identify the `free` parameters of a model from one or several frequency responses.
 
-    `model` is any `eqx.Module` with `frequency_response(omega)`; its values are the start. `free`
-    names parameters (`"J_x"`, `"numerator[0]"`, `jq.identify.Real("zero")`), selects them
-    (`lambda m: (m.gain, m.delay)`), or is `None` for all. A bare name keeps the sign of its start.
-    `tied` are numbers that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
-    With several responses, `conditions` says how the model differs in each record, for instance
-    `(None, lambda m: m.with_added_inertia(0.03))`. `priors` are known values with standard errors.
-    Only frequencies within `band` (rad/s) with a coherence of at least `min_coherence` count; a
-    mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs a band of their own, or `None` to
-    leave them out. With several `starts`, a Latin hypercube around the given one is solved side by
-    side, and `Fit.minima` lists all distinct stops with their costs.
-    `solver` is any optimistix least-squares solver, Levenberg-Marquardt by default.
+    **Arguments:**
 
-    What the record does not determine is said by `Fit.verdict`; where too few frequencies are
-    usable to fit anything, the result holds the starting values. Raises `ValueError` for names
-    that the model does not have and for a solver that diverged, `PrecisionError` in 32 bits.
-    Source: Eq. (14), corrected.
+    - `model`: any `eqx.Module` with `frequency_response(omega)`; its values are the start.
+    - `frf`: a `jq.spectra.FrequencyResponse`, or a list of them that share the parameters.
+    - `free`: the parameters to fit, by name (`"J_x"`, `"numerator[0]"`,
+        `jq.identify.Real("zero")`) or selected (`lambda m: (m.gain, m.delay)`); `None` for all.
+        A bare name keeps the sign of its start.
+    - `tied`: parameters that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
+    - `cost`: `jq.identify.CoherenceWeighted()`, Eq. (14), or `jq.identify.MaximumLikelihood()`.
+    - `conditions`: how the model differs in each response, for instance
+        `(None, lambda m: m.with_added_inertia(0.03))`.
+    - `priors`: known values with their standard errors, `jq.identify.Prior`.
+    - `band`: (low, high) in rad/s. A mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs
+        of output and input a band of their own, or leaves them out with `None`.
+    - `min_coherence`: frequencies with a lower coherence do not count.
+    - `starts`: how many starting points, spread around the model's values in a Latin hypercube.
+        `Fit.minima` lists where they ended.
+    - `solver`: any optimistix least-squares solver; Levenberg-Marquardt by default.
+    - `max_steps`: of the solver.
+
+    **Returns:**
+
+    A `jq.identify.Fit`. Its `verdict` says what the record determines; where too few frequencies
+    are usable to fit anything, the result holds the starting values.
+
+    **Raises:**
+
+    - `ValueError`: for names that the model does not have, options that make no sense, and a
+        solver that diverged.
+    - `PrecisionError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
+
+    !!! example
+
+        ```python
+        fit = jq.fit(jq.LaggedIntegrator(gain=100.0, lag=0.03, delay=0.02), frf, band=(1.0, 30.0))
+        print(fit)
+        ```
+
+    Source: Eq. (14) of the paper, as corrected in docs/equations.md.
     """
     require_x64("a fit")
-    frfs = checked_responses(frf)
+    frfs = require_responses(frf)
     check_options(cost, band, min_coherence, max_steps)
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
     used = [usable(one, band, min_coherence) for one in frfs]
-    check_knowledge(model, priors, cost)
+    _check_priors_against(model, priors, cost)
     too_few = _too_few_points(frfs, used, parameters, min_coherence, band)
     if too_few is not None:
         remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
         return unfitted(model, parameters, too_few, tuple(remarks))
     problem = make_problem(model, parameters, frfs, conditions, priors)
     problem, solution, minima = _solved(problem, frfs, used, cost, (starts, solver, max_steps))
-    check_finite(solution)
+    _check_finite(solution)
     check_priors(problem, solution)
     return assess(problem, frfs, solution, minima)
 
@@ -117,9 +149,9 @@ def _solved(
     frfs: Sequence[FrequencyResponse],
     used: Sequence[Mask],
     cost: Cost,
-    how: tuple[int, Any, int],
+    how: tuple[int, eqx.Module | None, int],
 ) -> tuple[Problem, Solution, tuple[Minimum, ...]]:
-    """Solve, and once more where the weights depend on the model that came out."""
+    """Solve; where the weights depend on the model, solve again under those of the solution."""
     starts, solver, max_steps = how
     weights = _weights(cost, frfs, used, [np.ones(mask.shape) for mask in used])
     problem = problem.weighted([jnp.asarray(each) for each in weights])
@@ -130,7 +162,7 @@ def _solved(
         fastest = max(float(frf.omega[-1]) for frf in frfs)
         spread = spread_starts(problem.parameters, starts, fastest=fastest)
         solution, minima = solve_from_many(problem, spread, solver, max_steps)
-    again = _weights(cost, frfs, used, ratios(solution))
+    again = _weights(cost, frfs, used, _ratios(solution))
     if all(np.allclose(old, new, rtol=1e-4) for old, new in zip(weights, again, strict=True)):
         return problem, solution, minima
     problem = problem.weighted([jnp.asarray(each) for each in again])
@@ -141,71 +173,76 @@ def _weights(cost: Cost, frfs, used, ratios) -> list[Weights]:
     return [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
 
 
-def ratios(solution: Solution) -> list[Ratio]:
+def _ratios(solution: Solution) -> list[Ratio]:
     """|model / measurement| at a solution."""
     return [np.exp(np.asarray(part)[..., 0]) for part in solution.sensitivity.misfits]
 
 
-def checked_responses(frf: Any) -> list[FrequencyResponse]:
-    """One response or several, each measured on its own."""
+def require_responses(frf: object) -> list[FrequencyResponse]:
+    """One response or several, as a list. Raise ValueError for anything else, and for repeats."""
     frfs = list(frf) if isinstance(frf, Sequence) else [frf]
     if not frfs or not all(isinstance(one, FrequencyResponse) for one in frfs):
         kinds = ", ".join(sorted({type(one).__name__ for one in frfs})) or "nothing"
         raise ValueError(
-            f"a fit needs a jq.spectra.FrequencyResponse or a list of them, not {kinds}: make one with "
-            "jq.frequency_response(record), and call jq.fit(model, response)"
+            f"a fit needs a jq.spectra.FrequencyResponse or a list of them, not {kinds}: make one "
+            "with jq.frequency_response(record), and call jq.fit(model, response)"
         )
     for k, one in enumerate(frfs):
         for other in frfs[:k]:
             if np.array_equal(np.asarray(one.response), np.asarray(other.response)):
-                raise ValueError(f"response {k} of {len(frfs)} is there twice: it counts once")
+                raise ValueError(f"response {k} of {len(frfs)} is given twice: leave it out once")
     return frfs
 
 
-def check_options(cost: Any, band: Any, min_coherence: float, max_steps: int) -> None:
-    """Values that mean nothing."""
+def check_options(cost: object, band: object, min_coherence: float, max_steps: int) -> None:
+    """Check `cost`, `band`, `min_coherence` and `max_steps`; raise ValueError."""
     if isinstance(cost, type) or not isinstance(cost, Cost):
         raise ValueError(
-            f"cost={cost!r}: pass an object, jq.identify.CoherenceWeighted() or jq.identify.MaximumLikelihood()"
+            f"cost={cost!r}: pass an object, jq.identify.CoherenceWeighted() or "
+            "jq.identify.MaximumLikelihood()"
         )
     for limits in band.values() if isinstance(band, Mapping) else [band]:
         if limits is not None and np.shape(limits) != (2,):
             raise ValueError(f"band={limits!r}: give two frequencies in rad/s, (low, high)")
     if not 0 < min_coherence < 1:
-        raise ValueError(f"min_coherence is {min_coherence}: it lies between 0 and 1, usually 0.6")
+        raise ValueError(
+            f"min_coherence is {min_coherence}: give a number between 0 and 1, usually 0.6"
+        )
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}: give at least 1")
 
 
-def check_knowledge(model: PyTree, priors: Sequence[Prior], cost: Cost) -> None:
-    """Priors that the cost cannot weigh, or that speak of what the model does not have."""
+def _check_priors_against(model: PyTree, priors: Sequence[Prior], cost: Cost) -> None:
+    """Raise ValueError for priors under a cost without noise, and for unknown parameters."""
     if priors and not isinstance(cost, MaximumLikelihood):
         raise ValueError(
-            "a prior has a standard error, but the cost (14) has no noise to weigh it against: "
+            "a prior needs a cost that knows the noise, and that of Eq. (14) does not: "
             "pass cost=jq.identify.MaximumLikelihood()"
         )
     known = [place.name for place in name_places(model)] if priors else []
     for prior in priors:
         if isinstance(prior.quantity, str) and prior.quantity not in known:
-            raise ValueError(f"no parameter {prior.quantity!r} for a prior; there are: {known}")
+            raise ValueError(
+                f"no parameter {prior.quantity!r} for a prior; the model has: {', '.join(known)}"
+            )
 
 
-def check_finite(solution: Solution) -> None:
-    """A solver that diverged."""
+def _check_finite(solution: Solution) -> None:
+    """Raise ValueError where the solver diverged."""
     finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
     if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
         raise ValueError(
-            f"the fit diverged: {solution.message or 'the model has no finite response there'}; "
-            "start nearer to the answer, or leave solver= at its damped default"
+            f"the fit diverged: {solution.message or 'the response of the model is not finite'}; "
+            "start from other values, or leave solver= at its default"
         )
 
 
 def check_priors(problem: Problem, solution: Solution) -> None:
-    """A prior on something that nothing free moves."""
+    """Raise ValueError for a prior on a quantity that no free parameter changes."""
     slopes = np.asarray(solution.sensitivity.prior_slopes)[:, : problem.parameters.count]
     idle = np.flatnonzero(~np.any(slopes, axis=1))
     if idle.size:
         raise ValueError(
-            f"prior {idle[0] + 1} speaks of nothing that is free: free its parameter, or leave "
-            f"the prior out; free are {', '.join(problem.parameters.names)}"
+            f"prior {idle[0] + 1} is on a quantity that no free parameter changes: free its "
+            f"parameter, or leave the prior out; free are {', '.join(problem.parameters.names)}"
         )

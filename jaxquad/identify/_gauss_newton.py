@@ -1,12 +1,11 @@
 """The default solver of fits for optimistix, whose import takes long: import this file late."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._core import (
     advance,
@@ -32,10 +31,10 @@ class DampedGaussNewton(optx.AbstractLeastSquaresSolver):
 
     rtol: float
     atol: float
-    norm: Callable[[Any], Float[Array, ""]]
-    normal: Callable[[Any, Any], Normal] | None
+    norm: Callable[[PyTree], Float[Array, ""]]
+    normal: Callable[[Array, PyTree], Normal] | None
 
-    def __init__(self, tolerance: float, normal: Callable[[Any, Any], Normal] | None = None):
+    def __init__(self, tolerance: float, normal: Callable[[Array, PyTree], Normal] | None = None):
         """`tolerance` of a step relative to 1 + |y|, and of the root of the cost it would save.
 
         `normal(y, args)` gives the normal equations of the same residuals, where there is a faster
@@ -48,7 +47,7 @@ class DampedGaussNewton(optx.AbstractLeastSquaresSolver):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Descent:
         return begin(y)
 
-    def step(self, fn, y, args, options, state, tags) -> tuple[Array, Descent, Any]:
+    def step(self, fn, y, args, options, state, tags) -> tuple[Array, Descent, PyTree]:
         state = advance(self._evaluation(fn, args), state, jnp.iinfo(jnp.int32).max, self.rtol)
         state = jax.lax.cond(state.status == STALLED, settle, lambda same: same, state)
         return state.z, state, fn(y, args)[1]
@@ -58,10 +57,12 @@ class DampedGaussNewton(optx.AbstractLeastSquaresSolver):
         result = optx.RESULTS.where(state.status == STALLED, failed, optx.RESULTS.successful)
         return state.status != RUNNING, result
 
-    def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[Any, Any, dict]:
+    def postprocess(
+        self, fn, y, aux, args, options, state, tags, result
+    ) -> tuple[Array, PyTree, dict]:
         return y, aux, {}
 
-    def _evaluation(self, fn: Callable[..., Any], args: Any) -> Callable[[Array], Normal]:
+    def _evaluation(self, fn: Callable[..., PyTree], args: PyTree) -> Callable[[Array], Normal]:
         known = self.normal
         if known is not None:
             return lambda z: known(z, args)

@@ -1,6 +1,5 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,21 +10,22 @@ from jaxtyping import PyTree
 from jaxquad._core import require_x64
 from jaxquad.records import Record
 
-from ._checks import check_priors
+from ._fit import check_priors
 from ._output_error_problem import found_at, OutputError, relaxed, Trial
 from ._output_error_result import assess_output_error
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of
 from ._result import Fit
 from ._simulated import (
+    band_filter,
     band_gain,
     check_channels,
     check_growth,
-    filtered,
-    is_plant,
+    count_states,
+    DifferentialModel,
+    Linear,
     linear_model,
     motions_of,
-    states_of,
 )
 
 
@@ -48,7 +48,7 @@ def refine(
     `derivative(state, inputs, disturbance)` and `measure(state)` is integrated by diffrax without
     disturbance (zeros like what it measures), and its initial state, beside `init()`, estimated.
     `free`, `tied` and `priors` are those of `jq.fit`, `hold` and `band` those of `jq.verify`; model
-    and data are filtered alike. Each record has its own start, trim and noise level. Outputs are
+    and data are band_filter alike. Each record has its own start, trim and noise level. Outputs are
     weighted by their residuals' variance, estimated in turn with the parameters; `cost` is in
     units of it. Standard errors hold for coloured residuals.
 
@@ -104,11 +104,11 @@ def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Pro
     )
 
 
-def _trial(model: Any, record: Record, hold: str, band: tuple[float, float] | None) -> Trial:
+def _trial(model: PyTree, record: Record, hold: str, band: tuple[float, float] | None) -> Trial:
     gain = band_gain(band, record)
     gain = None if gain is None else jnp.asarray(gain)
-    if is_plant(model) and not _is_linear(model):
-        motions, start = None, jnp.ones(states_of(model))
+    if isinstance(model, DifferentialModel) and not isinstance(model, Linear):
+        motions, start = None, jnp.ones(count_states(model))
         _check_measured(model, record)
     else:
         plant = linear_model(model)
@@ -116,22 +116,18 @@ def _trial(model: Any, record: Record, hold: str, band: tuple[float, float] | No
         check_growth(plant, record)
         found = motions_of(plant, record.duration)
         motions, start = (found.slow, found.fast), jnp.zeros(0)
-    y = filtered(jnp.asarray(record.outputs), gain)
+    y = band_filter(jnp.asarray(record.outputs), gain)
     weights = 1 / jnp.std(y, axis=0)
     return Trial(jnp.asarray(record.inputs), y, weights, gain, motions, start, record.dt, hold)
 
 
-def _check_measured(model: Any, record: Record) -> None:
+def _check_measured(model: DifferentialModel, record: Record) -> None:
     measured = jnp.size(model.measure(model.init()))
     if measured != len(record.output_names):
         raise ValueError(
             f"the plant measures {measured} outputs, the record has {record.output_names}: pick "
             "them with jq.records.select"
         )
-
-
-def _is_linear(model: Any) -> bool:
-    return hasattr(model, "transfer_function") or hasattr(model, "state_space")
 
 
 def _with_units(problem: OutputError) -> OutputError:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import minimise_on_host, Normal, RUNNING, solve_definite, STALLED
 
 from ._problem import prior_misfits, Problem
-from ._simulated import filtered, forced, free, integrated, linear_model, Motions
+from ._simulated import band_filter, forced, free, integrate_plant, linear_model, Motions
 from ._solve import describe, Solution
 
 
@@ -77,7 +77,7 @@ def parts(
 ) -> tuple[Float[Array, "samples outputs"], Float[Array, "samples outputs unknowns"]]:
     """Weighted misfit at zero start and trim, and what each unit of them adds to the output."""
     if trial.motions is None:
-        simulated = integrated(model, trial.u, trial.start * start, trial.dt, trial.hold)
+        simulated = integrate_plant(model, trial.u, trial.start * start, trial.dt, trial.hold)
         shifts = jnp.eye(trial.y.shape[1])[None]
         columns = jnp.broadcast_to(shifts, (*trial.y.shape, trial.y.shape[1]))
     else:
@@ -86,8 +86,8 @@ def parts(
         motions = Motions(*trial.motions, ())
         columns = free(plant, motions, len(trial.u), trial.dt)
     weights = trial.weights[None]
-    misfit = (trial.y - filtered(simulated, trial.gain)) * weights
-    return misfit, filtered(columns, trial.gain) * weights[:, :, None]
+    misfit = (trial.y - band_filter(simulated, trial.gain)) * weights
+    return misfit, band_filter(columns, trial.gain) * weights[:, :, None]
 
 
 def unexplained(

@@ -19,6 +19,8 @@ from ._accuracy import (
     Known,
     Matrix,
     Noise,
+    orthonormal,
+    projected_noise,
     scaled_inverse,
 )
 from ._assess import (
@@ -29,12 +31,12 @@ from ._assess import (
     _units,
     no_minimum,
     physical_covariance,
+    remarks_on_priors,
+    runaways,
 )
-from ._coloured import orthonormal, projected_noise
 from ._identifiability import Information
 from ._output_error_problem import Descent, Found, found_at, OutputError, Trial, with_fixed_slopes
 from ._problem import Problem
-from ._remarks import remarks_on_priors, runaways
 from ._result import Fit
 from ._solve import Solution
 from ._verdict import Verdict

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from ._draws import draw_models
+from ._accuracy import Matrix
 from ._parameters import Parameters
 from ._starts import Minimum
 from ._verdict import Combination, UndeterminedError, Verdict
@@ -67,7 +67,7 @@ def _quality(fit: "Fit") -> str:
     return (
         f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
         f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} points, condition {condition}, "
-        f"Newton decrement {fit.newton_decrement:.1e}, {fit.steps} steps"
+        f"Newton decrement {fit.newton_decrement:.1e}, {counted(fit.steps, 'step')}"
     )
 
 
@@ -135,51 +135,185 @@ class Fit(eqx.Module):
     ) -> Combination:
         """Any function of the model with its standard error: `lambda m: m.lag + m.delay`.
 
-        First-order propagation of the covariance. Raises `UndeterminedError`, a ValueError, where
-        the quantity depends on what the record does not determine.
+        **Arguments:**
+
+        - `quantity`: from a model to a number.
+        - `name`: for messages and print.
+
+        **Returns:**
+
+        A `jq.identify.Combination`, by first-order propagation of the covariance.
+
+        **Raises:**
+
+        - `UndeterminedError`: the quantity depends on what the record does not determine.
         """
         if not self.verdict.fitted:
             raise UndeterminedError(f"{name} has no value: {self.verdict.summary}")
         here = jnp.asarray(self.values)
         gradient = jax.grad(lambda x: quantity(self.parameters.replace(self.model, x)))(here)
         slope = np.asarray(gradient) * self.units
-        if self._moves(quantity, slope):
+        if self._depends_on_undetermined(quantity, slope):
             lost = ", ".join(self.verdict.undetermined)
             raise UndeterminedError(
-                f"{name} changes with what this record does not determine ({lost}): fit it under "
-                "a jq.identify.Prior or with a second record, or ask for a determined combination"
+                f"{name} depends on what this record does not determine ({lost}): fit with a "
+                "jq.identify.Prior or a second record, or ask for a determined combination"
             )
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
         return Combination(name, float(quantity(self.model)), error)
 
     def ensemble(self, n: int, key: Key[Array, ""], *, hold_undetermined: bool = False) -> PyTree:
-        """`n` models drawn from the fit; leaves with free or tied numbers get a last axis `[n]`.
+        """Draw `n` models from the fit; leaves with free or tied numbers get a last axis `[n]`.
 
-        The draws are normal in the coordinates of the fit (logarithms of what keeps its sign, so
-        that a lag never comes out negative), with the calibrated covariance, widened where the
-        standard errors are. Raises `UndeterminedError` where the record leaves parameters
-        undetermined. With `hold_undetermined` these directions stay where the solver stopped and
-        only what is determined varies: right for quantities that `derived` accepts, and no spread
-        at all for others. Raises ValueError for a fit that found no minimum or has no finite
-        standard errors, and for parameters that ran to zero.
+        Draws are normal in the coordinates of the fit (logarithms of parameters that keep their
+        sign, so that a lag never comes out negative), with the calibrated covariance.
+
+        **Arguments:**
+
+        - `n`: how many.
+        - `key`: of the random numbers.
+        - `hold_undetermined`: keep what the record does not determine where the solver stopped,
+            and let only the rest vary: right for quantities that `derived` accepts, and no spread
+            at all for others.
+
+        **Returns:**
+
+        A model like `Fit.model`.
+
+        **Raises:**
+
+        - `UndeterminedError`: the record leaves parameters undetermined, and these are not held.
+        - `ValueError`: the fit found no minimum, has no finite standard errors, or a parameter
+            ran to zero.
         """
         if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
-            raise ValueError(f"n is {n}: draw a whole number of models, 1 or more")
+            raise ValueError(f"n is {n}: give a whole number of models, 1 or more")
         scores = jax.random.normal(key, (len(self.names), n))
         return draw_models(self, scores, hold_undetermined=hold_undetermined)
 
-    def _moves(self, quantity: Callable[[PyTree], Float[Array, ""]], slope: np.ndarray) -> bool:
-        """Whether a quantity changes with what leaves all responses as they are."""
+    def _depends_on_undetermined(
+        self, quantity: Callable[[PyTree], Float[Array, ""]], slope: np.ndarray
+    ) -> bool:
+        """Whether a quantity changes where the responses do not."""
         verdict = self.verdict
-        first_order = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
-        touched = [slope[self.names.index(name)] != 0 for name in verdict.curved]
+        along_null = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
+        on_curved = [slope[self.names.index(name)] != 0 for name in verdict.curved]
         here = float(quantity(self.model))
         others = [
             float(quantity(self.parameters.replace(self.model, jnp.asarray(values))))
             for values in verdict.alternatives
         ]
-        apart = [abs(other - here) > 1e-6 * abs(here) for other in others]
-        return bool(np.any(first_order) or any(touched) or any(apart))
+        differs = [abs(other - here) > 1e-6 * abs(here) for other in others]
+        return bool(np.any(along_null) or any(on_curved) or any(differs))
 
     def __str__(self) -> str:
         return fit_table(self)
+
+
+def draw_models(
+    fit: Fit, scores: Float[Array, "parameters members"], *, hold_undetermined: bool = False
+) -> PyTree:
+    """The models at standard normal `scores`, as `Fit.ensemble` draws and refuses them."""
+    values = _drawn_values(fit, scores, hold_undetermined=hold_undetermined)
+    replaced = _replaced(fit.parameters, fit.model, values)
+    places = (*fit.parameters.places[: len(fit.names)], *(p for p, _ in fit.parameters.ties))
+    touched, structure = {place.leaf for place in places}, jax.tree.structure(fit.model)
+    floating = [k for k, x in enumerate(jax.tree.leaves(fit.model)) if _is_inexact(x)]
+    drawn = {floating[leaf] for leaf in touched}
+    pairs = zip(jax.tree.leaves(fit.model), jax.tree.leaves(replaced), strict=True)
+    leaves = [jnp.moveaxis(new, 0, -1) if k in drawn else x for k, (x, new) in enumerate(pairs)]
+    return jax.tree.unflatten(structure, leaves)
+
+
+@eqx.filter_jit
+def _replaced(
+    parameters: Parameters, model: PyTree, values: Float[Array, "parameters members"]
+) -> PyTree:
+    return jax.vmap(lambda v: parameters.replace(model, v))(values.T)
+
+
+def _drawn_values(
+    fit: Fit, scores: Float[Array, "parameters members"], *, hold_undetermined: bool = False
+) -> Float[Array, "parameters members"]:
+    """Physical values of the free parameters."""
+    check_drawable(fit, hold_undetermined)
+    changes = jnp.asarray(_root(known_covariance(fit))) @ scores
+    here, units = jnp.asarray(fit.values)[:, None], jnp.asarray(fit.units)[:, None]
+    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])[:, None]
+    return jnp.where(logarithmic, here * jnp.exp(changes), here + units * changes)
+
+
+def check_drawable(fit: Fit, hold_undetermined: bool) -> None:
+    """Raise ValueError for a fit that cannot be drawn from, as `Fit.ensemble` says."""
+    if not fit.verdict.fitted:
+        raise UndeterminedError(f"there is nothing to draw from: {fit.verdict.summary}")
+    zeros = _ran_to_zero(fit)
+    if zeros:
+        raise ValueError(
+            f"{', '.join(zeros)} ran to zero, and a logarithm has no spread there to draw from: "
+            "set it to 0, leave it out of free=, and fit again"
+        )
+    stopped = [remark for remark in fit.remarks if remark.startswith("no minimum")]
+    if stopped:
+        raise ValueError(
+            f"the fit did not converge, so there is nothing to draw from: {stopped[0]}"
+        )
+    lost = fit.verdict.undetermined
+    known = fit.standard_errors[fit.determined]
+    if not (np.all(np.isfinite(fit.relative_covariance)) and np.all(np.isfinite(known))):
+        raise ValueError(
+            "the fit's standard errors are not finite, so there is nothing to draw from: use a "
+            "response with random errors, and fit again"
+        )
+    if lost and not hold_undetermined:
+        raise UndeterminedError(_refusal(fit, lost))
+
+
+def known_covariance(fit: Fit) -> Matrix:
+    """The covariance of relative changes, without the directions that are not determined.
+
+    Quantities that depend on none of these keep their variance.
+    """
+    held = _held_directions(fit)
+    keep = np.eye(len(fit.names)) - held.T @ held
+    return keep @ fit.relative_covariance @ keep
+
+
+def _held_directions(fit: Fit) -> Float[np.ndarray, "held parameters"]:
+    """Orthonormal relative changes that the fit calls undetermined, exactly or by its noise."""
+    verdict, names = fit.verdict, fit.names
+    shares = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
+    null = np.array(shares).reshape(-1, len(names))
+    single = np.eye(len(names))[~fit.determined & ~np.any(null, axis=0)]
+    # The printed directions leave small shares out; the exact ones must not.
+    rest = null - null @ verdict.exact.T @ verdict.exact
+    count = len(null) - len(verdict.exact)
+    noisy = np.linalg.svd(rest, full_matrices=False)[2][:count] if count > 0 else rest[:0]
+    return np.linalg.qr(np.concatenate([verdict.exact, noisy, single]).T)[0].T
+
+
+def _root(covariance: Matrix) -> Matrix:
+    variances, directions = np.linalg.eigh(covariance)
+    return directions * np.sqrt(np.maximum(variances, 0.0))
+
+
+def _ran_to_zero(fit: Fit) -> list[str]:
+    """Parameters that keep their sign, whose errors are no longer relative to themselves."""
+    logarithmic = fit.parameters.logarithmic[: len(fit.names)]
+    at_zero = ~np.isclose(np.abs(fit.units), np.abs(fit.values), rtol=1e-6) & fit.determined
+    rows = zip(fit.names, logarithmic, at_zero, strict=True)
+    return [name for name, log, zero in rows if log and zero]
+
+
+def _refusal(fit: Fit, lost: tuple[str, ...]) -> str:
+    names, known = ", ".join(lost), " and ".join(c.name for c in fit.combinations)
+    determined = f" (only {known} is)" if known else ""
+    return (
+        f"the record does not determine {names}{determined}, so they cannot be drawn: fix them at "
+        "measured values as far as needed, give a jq.identify.Prior or a second record; or, for "
+        "quantities that depend on determined combinations alone, give hold_undetermined=True"
+    )
+
+
+def _is_inexact(x: object) -> bool:
+    return isinstance(x, jax.Array | np.ndarray) and jnp.issubdtype(x.dtype, jnp.inexact)

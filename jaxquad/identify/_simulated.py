@@ -1,12 +1,12 @@
 """Linear models over a record: what the inputs force, and what start and trim add to it."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxquad.models import (
     explicit,
@@ -41,7 +41,7 @@ def band_gain(
     return np.abs(response) ** 2
 
 
-def filtered(
+def band_filter(
     x: Float[Array, " samples *columns"], gain: Float[Array, " bins"] | None
 ) -> Float[Array, " samples *columns"]:
     """`x` within the band; outside the record it continues mirrored through its two ends."""
@@ -61,18 +61,49 @@ _RELATIVE, _ABSOLUTE = 1e-8, 1e-10  # tolerances of the states within one sample
 _STEPS = 64  # within one sample at most
 
 
-def is_plant(model: Any) -> bool:
-    """Whether a model is given by its differential equation."""
-    return all(callable(getattr(model, name, None)) for name in ("init", "derivative", "measure"))
+@runtime_checkable
+class DifferentialModel(Protocol):
+    """A model that is given by its differential equation."""
+
+    def init(self) -> PyTree:
+        """The state at the first sample, unless it is estimated."""
+        ...
+
+    def derivative(
+        self, state: PyTree, inputs: Float[Array, " inputs"], disturbance: Float[Array, "..."]
+    ) -> PyTree:
+        """Of the state, by time in s."""
+        ...
+
+    def measure(self, state: PyTree) -> Float[Array, "..."]:
+        """The outputs."""
+        ...
 
 
-def states_of(plant: Any) -> int:
+@runtime_checkable
+class HasStateSpace(Protocol):
+    """A model that can be written as a state space."""
+
+    def state_space(self) -> StateSpace: ...
+
+
+@runtime_checkable
+class HasTransferFunction(Protocol):
+    """A model that can be written as a transfer function."""
+
+    def transfer_function(self) -> TransferFunction: ...
+
+
+Linear = TransferFunction | StateSpace | HasStateSpace | HasTransferFunction
+
+
+def count_states(plant: DifferentialModel) -> int:
     """How many numbers the state has."""
     return ravel_pytree(plant.init())[0].size
 
 
-def integrated(
-    plant: Any,
+def integrate_plant(
+    plant: DifferentialModel,
     u: Float[Array, "samples inputs"],
     start: Float[Array, " states"],
     dt: float,
@@ -126,13 +157,14 @@ class Motions(NamedTuple):
     groups: tuple[int, ...]  # how many of the fast columns belong to each speed
 
 
-def linear_model(model: Any) -> TransferFunction | StateSpace:
+def linear_model(model: PyTree) -> TransferFunction | StateSpace:
     """The model as one that `simulate_linear` takes."""
     if isinstance(model, TransferFunction | StateSpace):
         return model
-    for name in ("state_space", "transfer_function"):
-        if callable(getattr(model, name, None)):
-            return getattr(model, name)()
+    if isinstance(model, HasStateSpace):
+        return model.state_space()
+    if isinstance(model, HasTransferFunction):
+        return model.transfer_function()
     raise ValueError(
         f"{type(model).__name__} has no transfer_function() and no state_space(): give a "
         "jq.TransferFunction, a jq.StateSpace, or a model with one of these methods"
@@ -140,26 +172,27 @@ def linear_model(model: Any) -> TransferFunction | StateSpace:
 
 
 def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None:
-    """A model for other channels than the record has."""
+    """Raise ValueError for a model of other channels than the record has."""
     inputs, outputs = 1, 1
     if isinstance(plant, StateSpace):
         inputs, outputs = plant.G.shape[1], len(plant.H0)
     if (len(record.input_names), len(record.output_names)) != (inputs, outputs):
         raise ValueError(
-            f"the model compares {_count(inputs, 'input')} with {_count(outputs, 'output')}, the "
-            f"record has {record.input_names} and {record.output_names}: pick them with jq.records.select"
+            f"the model has {_count(inputs, 'input')} and {_count(outputs, 'output')}, the record "
+            f"has {', '.join(record.input_names)} and {', '.join(record.output_names)}: pick "
+            "channels with jq.records.select"
         )
 
 
 def check_growth(plant: TransferFunction | StateSpace, record: Record) -> None:
-    """An unstable model over so long a record that its own motion drowns every measurement."""
+    """Raise ValueError for an unstable model over a record too long to simulate it."""
     poles = np.asarray(plant.poles)
     fastest = np.max(np.real(poles), initial=0.0) * record.duration
     if not fastest < np.log(_OUTGROWN):
         raise ValueError(
-            f"the model's open-loop response overflows within {record.duration:.4g} s: its poles "
-            f"are {poles}, and it grows by e^{fastest:.3g}; take an unstable model on a shorter "
-            "record (jq.records.trim), or fit it to frequency responses, which need no simulation"
+            f"the model is unstable (poles {poles} rad/s) and its response grows by "
+            f"e^{fastest:.3g} within {record.duration:.4g} s: cut the record with jq.records.trim, "
+            "or fit frequency responses, which need no simulation"
         )
 
 

@@ -1,6 +1,6 @@
 """Local minima: many starting points, solved at once, and what each of them led to."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -80,7 +80,7 @@ def spread_starts(
 def solve_from_many(
     problem: Problem,
     starts: Float[np.ndarray, "starts parameters"],
-    solver: Any,
+    solver: eqx.Module | None,
     max_steps: int,
 ) -> tuple[Solution, tuple[Minimum, ...]]:
     """Solve from every start in one call; the best point, and all distinct ones, best first.

@@ -14,19 +14,18 @@ from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
 from ._assess import unfitted
-from ._checks import check_options
 from ._cost import Band, CoherenceWeighted, Cost, MaximumLikelihood
-from ._fit import fit
+from ._fit import check_options, fit
 from ._parameters import name_places, Parameters, Real
 from ._rational import descend, Rational, Samples
 from ._result import Fit
 from ._transfer_function_guess import (
-    checked_response,
-    checked_structure,
     Delay,
     MORE_POINTS,
-    one_pair,
+    require_single_response,
+    require_structure,
     search,
+    select_pair,
     Structure,
     too_few_points,
     transfer_function,
@@ -169,8 +168,8 @@ def fit_transfer_function(
     """
     require_x64("a fit")
     check_options(cost, band, min_coherence, max_steps)
-    structure = checked_structure(zeros, poles, integrators, delay)
-    pair = one_pair(checked_response(frf), output, input)
+    structure = require_structure(zeros, poles, integrators, delay)
+    pair = select_pair(require_single_response(frf), output, input)
     too_few = too_few_points(pair, structure, band, min_coherence)
     if too_few is not None:
         return _unfitted(structure, too_few, pair.remarks)

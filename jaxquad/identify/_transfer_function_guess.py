@@ -1,7 +1,7 @@
 """Starting values for a transfer function of any order, from a response alone."""
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,9 +11,9 @@ from jaxquad._core import require_x64
 from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ._checks import check_options, checked_responses
 from ._cost import Band, CoherenceWeighted, Cost, Mask, usable
-from ._rational import descend, Rational, Samples, sanathanan_koerner
+from ._fit import check_options, require_responses
+from ._rational import Coefficients, descend, Rational, Samples, sanathanan_koerner
 from ._verdict import UndeterminedError
 
 
@@ -65,16 +65,23 @@ def _delays(samples: Samples) -> Float[np.ndarray, " delays"]:
 def _reflected(model: Rational) -> list[Rational]:
     """One zero or pole, or a pair, mirrored in the imaginary axis."""
     found = []
-    for side in ("above", "below"):
-        lead, roots = getattr(model, side)[-1], polyroots(getattr(model, side))
-        for root in roots[roots.imag >= 0]:
-            mine = (roots == root) | (roots == root.conj())
-            mirrored = np.where(mine, -roots.conj(), roots)
-            sign = -1.0 if np.sum(mine) % 2 and side == "above" else 1.0
-            coefficients = sign * lead * np.real(polyfromroots(mirrored))
-            found.append(model._replace(**{side: coefficients}))
-            if np.sum(mine) % 2:
-                found.append(found[-1]._replace(above=-found[-1].above))
+    for above, odd in _mirrored(model.above):
+        side = model._replace(above=-above if odd else above)
+        found += [side, side._replace(above=-side.above)] if odd else [side]
+    for below, odd in _mirrored(model.below):
+        side = model._replace(below=below)
+        found += [side, side._replace(above=-side.above)] if odd else [side]
+    return found
+
+
+def _mirrored(coefficients: Coefficients) -> list[tuple[Coefficients, bool]]:
+    """The polynomials with one root, or pair, mirrored, and whether it was a single root."""
+    roots, found = polyroots(coefficients), []
+    for root in roots[roots.imag >= 0]:
+        mine = (roots == root) | (roots == root.conj())
+        mirrored = np.where(mine, -roots.conj(), roots)
+        polynomial = coefficients[-1] * np.real(polyfromroots(mirrored))
+        found.append((polynomial, bool(np.sum(mine) % 2)))
     return found
 
 
@@ -95,7 +102,7 @@ def _relocated(samples: Samples, model: Rational) -> list[Rational]:
     return found
 
 
-def one_pair(frf: FrequencyResponse, output: int | str, input: int | str) -> FrequencyResponse:
+def select_pair(frf: FrequencyResponse, output: int | str, input: int | str) -> FrequencyResponse:
     """The response of one output to one input, by name or number; raises ValueError."""
     o = _position("output", output, frf.output_names)
     i = _position("input", input, frf.input_names)
@@ -172,8 +179,8 @@ def guess_transfer_function(
     """
     require_x64("a transfer function")
     check_options(cost, band, min_coherence, 1)
-    structure = checked_structure(zeros, poles, integrators, delay)
-    pair = one_pair(checked_response(frf), output, input)
+    structure = require_structure(zeros, poles, integrators, delay)
+    pair = select_pair(require_single_response(frf), output, input)
     reason = too_few_points(pair, structure, band, min_coherence)
     if reason is not None:
         raise UndeterminedError(f"no transfer function from this record: {reason}; {MORE_POINTS}")
@@ -181,8 +188,9 @@ def guess_transfer_function(
     return transfer_function(search(samples, structure), samples, structure)
 
 
-def checked_response(frf: Any) -> FrequencyResponse:
-    found = checked_responses(frf)
+def require_single_response(frf: object) -> FrequencyResponse:
+    """A single response. Raise ValueError for several."""
+    found = require_responses(frf)
     if len(found) > 1:
         raise ValueError(
             f"{len(found)} responses: a transfer function is fitted to one; combine the records in "
@@ -191,8 +199,8 @@ def checked_response(frf: Any) -> FrequencyResponse:
     return found[0]
 
 
-def checked_structure(zeros: int, poles: int, integrators: int, delay: Delay) -> Structure:
-    """Orders that make a proper transfer function, or ValueError."""
+def require_structure(zeros: int, poles: int, integrators: int, delay: Delay) -> Structure:
+    """Orders that make a proper transfer function. Raise ValueError for others."""
     orders = {"zeros": zeros, "poles": poles, "integrators": integrators}
     for name, value in orders.items():
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:

@@ -30,8 +30,8 @@ class Combination(NamedTuple):
     def __str__(self) -> str:
         low, high = self.interval
         return (
-            f"{self.name} = {self.value:.5g} +- {self.standard_error:.2g}  "
-            f"(95 %: {low:.5g} .. {high:.5g})"
+            f"{self.name} = {self.value:.5g} +- {self.standard_error:.2g} "
+            f"(std. error; 95 %: {low:.5g} .. {high:.5g})"
         )
 
 
@@ -88,7 +88,8 @@ class Verdict(eqx.Module):
             lines = [self.summary.replace(head, head.upper(), 1)]
         else:
             lines = [
-                f"NOT IDENTIFIABLE from this record, each by itself: {', '.join(self.undetermined)}",
+                "NOT IDENTIFIABLE from this record, each by itself: "
+                + ", ".join(self.undetermined),
                 *self._determined(),
                 *(f"  {reason}" for reason in self.reasons),
             ]

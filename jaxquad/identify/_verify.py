@@ -1,20 +1,19 @@
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from jaxquad._core import require_x64
 from jaxquad.records import Record
 
-from ._coloured import orthonormal, projected_noise
+from ._accuracy import orthonormal, projected_noise
 from ._simulated import (
+    band_filter,
     band_gain,
     check_channels,
     check_growth,
-    filtered,
     forced,
     free,
     linear_model,
@@ -127,7 +126,7 @@ _SEEN = 3.0  # standard errors from which a starting transient is one
 
 
 def verify(
-    model: Any,
+    model: PyTree,
     record: Record,
     *,
     band: tuple[float, float] | None = None,
@@ -160,7 +159,7 @@ def verify(
         free(plant, motions, record.samples, record.dt),
     ]
     gain = None if gain is None else jnp.asarray(gain)
-    measured, driven, columns = (np.asarray(filtered(part, gain)) for part in parts)
+    measured, driven, columns = (np.asarray(band_filter(part, gain)) for part in parts)
     unknowns, kept = _unknowns(measured - driven, columns, motions, _spread(record, measured))
     simulated = driven + columns[:, :, :kept] @ unknowns
     whole, each = agreements(record, measured, simulated, shares)

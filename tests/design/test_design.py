@@ -13,19 +13,23 @@ from scipy.optimize import minimize
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad._core._arrays import as_float
+from jaxquad._core import as_float
 from jaxquad.design import (
     AOptimal,
+    certify_powers,
     DOptimal,
+    information_per_energy,
     LargestError,
+    least_peak_phases,
     MeasuredNoise,
+    multisine_peaks,
+    multisine_signals,
+    noise_covariance,
     optimal_multisine,
+    optimal_powers,
+    Powers,
     predict_accuracy,
 )
-from jaxquad.design._noise import noise_covariance
-from jaxquad.design._phases import least_peak_phases, peaks, waves
-from jaxquad.design._powers import certify, optimal_powers, Powers
-from jaxquad.design._prediction import information_per_energy
 
 
 D_OPTIMAL = DOptimal()
@@ -83,7 +87,7 @@ def solve(per_power, costs, criterion=D_OPTIMAL, lines=1):
     problem = (jnp.asarray(per_power), jnp.asarray(costs))
     options = (criterion, ("a", "b", "c"), jnp.asarray(1 / lines, dtype=float))
     found = optimal_powers(*problem, *options)
-    proof = certify(found, *problem, *options)
+    proof = certify_powers(found, *problem, *options)
     return np.asarray(found.power), np.asarray(proof.dispersion), float(proof.gap)
 
 
@@ -142,7 +146,7 @@ def test_the_certificate_bounds_bad_powers_too():
     rng = np.random.default_rng(0)
     for other in rng.dirichlet(np.ones(best.size), size=5):
         bad = Powers(jnp.asarray(other), jnp.ones(1))
-        gap = float(certify(bad, *options, jnp.asarray(1.0, dtype=float)).gap)
+        gap = float(certify_powers(bad, *options, jnp.asarray(1.0, dtype=float)).gap)
         assert 0 < value(best) - value(other) < gap
 
 
@@ -193,7 +197,8 @@ def test_phases_peak_less_than_equal_sines_of_schroeder():
     index = np.arange(orders.size)
     schroeder = -np.pi * index * (index - 1) / orders.size
     crest = [
-        peaks(orders, each, equal)[0] * np.sqrt(2 / orders.size) for each in (phase, schroeder)
+        multisine_peaks(orders, each, equal)[0] * np.sqrt(2 / orders.size)
+        for each in (phase, schroeder)
     ]
     assert crest[0] < 1.5 < crest[1]
 
@@ -201,8 +206,8 @@ def test_phases_peak_less_than_equal_sines_of_schroeder():
 def test_no_peak_hides_between_the_points_that_are_looked_at():
     orders, phase = np.array([1, 7, 16]), np.array([0.3, 1.0, 2.0])
     amplitudes = np.array([[1.0, 0.5, 2.0]]) + 0j
-    finest = np.abs(waves(orders, phase, amplitudes, 100_000)).max()
-    assert finest <= peaks(orders, phase, amplitudes)[0] <= 1.0013 * finest
+    finest = np.abs(multisine_signals(orders, phase, amplitudes, 100_000)).max()
+    assert finest <= multisine_peaks(orders, phase, amplitudes)[0] <= 1.0013 * finest
 
 
 def test_information_is_that_of_white_noise_in_the_time_domain():

@@ -1,5 +1,7 @@
 """Bad input to a fit: one clear error each, that names the value and what to do."""
 
+import inspect
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,10 +10,10 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.identify._checks import check_options, checked_responses
 
 
 START = jq.LaggedIntegrator(150.0, 0.03, 0.02)
+untyped_fit = inspect.unwrap(jq.fit)  # as without the test suite's check of types
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +69,11 @@ def test_zero_coherence_is_not_identifiable(frf):
 
 
 def test_a_prior_needs_a_cost_with_noise(frf):
-    refuse("a prior has a standard error", frf, priors=[jq.identify.Prior("lag", 0.02, 0.001)])
+    refuse(
+        "a prior needs a cost that knows the noise",
+        frf,
+        priors=[jq.identify.Prior("lag", 0.02, 0.001)],
+    )
     refuse(
         "no parameter 'lagg' for a prior",
         frf,
@@ -81,37 +87,34 @@ def test_a_prior_needs_a_cost_with_noise(frf):
 def test_every_response_needs_a_condition_and_counts_once(frf):
     other = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), seed=1)
     refuse("1 conditions for 2 responses", (frf, other), conditions=(None,))
-    refuse("response 1 of 2 is there twice", (frf, frf))
+    refuse("response 1 of 2 is given twice", (frf, frf))
 
 
 def test_what_is_no_response_is_named():
     with pytest.raises(ValueError, match="a list of them, not nothing"):
-        checked_responses([])
+        untyped_fit(START, [])
     with pytest.raises(ValueError, match="not LaggedIntegrator.*jq.fit"):
-        checked_responses(START)
+        untyped_fit(START, START)
 
 
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        (
-            (jq.identify.MaximumLikelihood, None, 0.6, 9),
-            "pass an object, jq.identify.CoherenceWeighted",
-        ),
-        (("ml", None, 0.6, 9), "cost='ml': pass an object"),
-        ((jq.identify.MaximumLikelihood(), 5.0, 0.6, 9), "band=5.0: give two frequencies"),
-        ((jq.identify.MaximumLikelihood(), None, 2.0, 9), "min_coherence is 2.0"),
-        ((jq.identify.MaximumLikelihood(), None, 0.6, 0), "max_steps is 0"),
+        ({"cost": jq.identify.MaximumLikelihood}, "pass an object, jq.identify.CoherenceWeighted"),
+        ({"cost": "ml"}, "cost='ml': pass an object"),
+        ({"band": 5.0}, "band=5.0: give two frequencies"),
+        ({"min_coherence": 2.0}, "min_coherence is 2.0"),
+        ({"max_steps": 0}, "max_steps is 0"),
     ],
 )
-def test_options_that_mean_nothing_are_refused(options, match):
+def test_options_that_make_no_sense_are_refused(frf, options, match):
     with pytest.raises(ValueError, match=match):
-        check_options(*options)
+        untyped_fit(START, frf, **options)
 
 
 def test_a_prior_on_what_is_not_free_is_refused(frf):
     refuse(
-        "prior 1 speaks of nothing that is free",
+        "prior 1 is on a quantity that no free parameter changes",
         frf,
         free=("gain",),
         priors=[jq.identify.Prior("lag", 0.02, 0.001)],

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad.identify._solve import least_squares
+from jaxquad.identify import least_squares
 
 
 DIGITS = 1e-6  # six significant digits

@@ -11,8 +11,7 @@ from scipy.optimize import least_squares
 from scipy.signal import dlsim, lfilter
 
 import jaxquad as jq
-from jaxquad.identify import refine
-from jaxquad.identify._simulated import integrated
+from jaxquad.identify import integrate_plant, refine
 from jaxquad.models import StateSpace
 
 
@@ -159,7 +158,7 @@ def test_a_linear_plant_integrates_to_its_exact_discretisation():
     def both(values):
         stiffness, damping, gain = values
         plant = Oscillator(stiffness, damping, gain)
-        solved = integrated(plant, jnp.asarray(U[:300, None]), jnp.zeros(2), DT, "first")[:, 0]
+        solved = integrate_plant(plant, jnp.asarray(U[:300, None]), jnp.zeros(2), DT, "first")[:, 0]
         one = jnp.ones(())
         exact = jq.TransferFunction(gain[None], jnp.stack([one, damping, stiffness]))
         return solved, jq.models.simulate_linear(exact, U[:300], DT, hold="first")

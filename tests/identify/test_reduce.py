@@ -7,7 +7,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.models._transfer_function import imaginary
+from jaxquad.models import imaginary
 
 
 class Roll(eqx.Module):

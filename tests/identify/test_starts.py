@@ -8,9 +8,13 @@ from scipy.optimize import least_squares
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
-from jaxquad.identify._parameters import select_parameters
-from jaxquad.identify._problem import Problem, residuals, unchanged
-from jaxquad.identify._starts import solve_from_many, spread_starts
+from jaxquad.identify import (
+    make_problem,
+    residuals,
+    select_parameters,
+    solve_from_many,
+    spread_starts,
+)
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -18,16 +22,8 @@ FAR = jq.LaggedIntegrator(1e4, 1.0, 1.0)
 
 
 def problem_of(model, frf, free=None):
-    return Problem(
-        model=model,
-        parameters=select_parameters(model, free),
-        conditions=(unchanged,),
-        quantities=(),
-        omega=(frf.omega,),
-        measured=(frf.response,),
-        weights=(jnp.full((*frf.response.shape, 2), 50.0),),
-        known=jnp.zeros((0, 2)),
-    )
+    problem = make_problem(model, select_parameters(model, free), [frf])
+    return problem.weighted([jnp.full((*frf.response.shape, 2), 50.0)])
 
 
 def test_the_given_start_is_the_first_and_the_others_fill_every_layer():

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 import jaxquad as jq
-from jaxquad._core._levenberg_marquardt import normal_equations
-from jaxquad.identify._parameters import select_parameters
-from jaxquad.identify._problem import make_problem, residuals
-from jaxquad.identify._solve import problem_normal
+from jaxquad._core import normal_equations
+from jaxquad.identify import make_problem, problem_normal, residuals, select_parameters
 
 
 OMEGA = jnp.asarray(np.geomspace(0.2, 30.0, 12))
