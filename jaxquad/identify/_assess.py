@@ -25,7 +25,7 @@ from ._accuracy import (
     Record,
     scaled_inverse,
 )
-from ._identifiability import decide, Information, LIMIT
+from ._identifiability import assess_identifiability, Information, LIMIT
 from ._parameters import Parameters, Place
 from ._problem import Problem
 from ._result import Fit
@@ -54,7 +54,7 @@ def assess(
     inflation = misfit if misfit > MISFIT**2 else 1.0
     covariance = calibrated_covariance(bread, noise, inflation)
     decrement = _decrement(bread, gradient, ran_to_zero(problem, solution))
-    if decrement > FAILED * max(cost, 1e-9):
+    if decrement > _NO_MINIMUM * max(cost, 1e-9):
         verdict = by_data = no_minimum(parameters.names, decrement, cost)
     else:
         facts = _information(problem, solution, blocks, covariance, units, inflation)
@@ -100,7 +100,7 @@ def no_minimum(names: tuple[str, ...], decrement: float, cost: float) -> Verdict
     return without_numbers(
         "no minimum",
         names,
-        f"one more Gauss-Newton step would lower the cost by {decrement:.3g} of {cost:.4g}",
+        f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}",
         "start from other values",
         "try many starts at once (starts=20)",
     )
@@ -232,11 +232,13 @@ def _information(
 def _identifiability(facts: Information, known: Known) -> tuple[Verdict, Verdict]:
     """What data and priors determine together, and what the data determine alone."""
     if not len(known.misfit):
-        verdict = decide(facts)
+        verdict = assess_identifiability(facts)
         return verdict, verdict
     # Rows come in pairs of magnitude and phase; a prior's row counts once.
     priors = np.repeat(known.slopes, 2, axis=0) / np.sqrt(2)
-    return decide(facts._replace(root=np.concatenate([facts.root, priors]))), decide(facts)
+    return assess_identifiability(
+        facts._replace(root=np.concatenate([facts.root, priors]))
+    ), assess_identifiability(facts)
 
 
 def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
@@ -246,8 +248,8 @@ def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
 
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
-FAILED = 1e-2  # share of the cost that a step would still save, from which nothing is a result
-_POOR = 10.0  # ratio from which a wrong minimum is likely
+_NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
+_POOR = 10.0  # ratio above which a local minimum is likely
 _LOCAL = ", or this is a local minimum: try other starting values"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
 
@@ -261,8 +263,8 @@ def remarks_on_fit(
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
         remarks.append(
-            f"no minimum: one more Gauss-Newton step would lower the cost by {decrement:.3g} of "
-            f"{cost:.4g}; try other starting values{_opposite(problem, solution)}"
+            f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
+            f"{2 * decrement:.3g}; try other starting values{_opposite(problem, solution)}"
         )
     if chi_squared > MISFIT**2:
         ratio = np.sqrt(chi_squared)
@@ -287,10 +289,10 @@ def _opposite(problem: Problem, solution: Solution) -> str:
 def remarks_on_priors(
     pulls: Float[np.ndarray, " priors"], verdict: Verdict, by_data: Verdict
 ) -> list[str]:
-    """What rests on the priors alone, and which of them the data contradict."""
+    """Parameters that only a prior determines, and priors that the data contradict."""
     remarks = [
         f"prior {k + 1} is {abs(pull):.1f} of its standard errors away from the fit: data and "
-        "prior contradict each other"
+        "prior contradict each other; check both"
         for k, pull in enumerate(pulls)
         if abs(pull) > 3
     ]
@@ -298,8 +300,8 @@ def remarks_on_priors(
     if resolved:
         known = ", ".join(combination.name for combination in by_data.combinations)
         remarks.append(
-            f"{' and '.join(resolved)}: told apart by the prior alone; the record by itself "
-            f"determines only {known or 'none of them'}"
+            f"{' and '.join(resolved)}: determined by the prior alone; the record by itself "
+            f"determines {'only ' + known if known else 'none of them'}"
         )
     return remarks
 
@@ -307,7 +309,7 @@ def remarks_on_priors(
 def remarks_on_leakage(
     problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution
 ) -> list[str]:
-    """Responses of integrating plants that were estimated as if there were no integrator."""
+    """Remark on responses of integrating plants that were estimated without integrators."""
     misfits = solution.sensitivity.misfits
     for frf, weights, misfit in zip(frfs, problem.weights, misfits, strict=True):
         level = np.log(np.abs(np.asarray(frf.response))) + np.asarray(misfit)[..., 0]
@@ -320,9 +322,9 @@ def remarks_on_leakage(
             leak = _leakage(steepness - frf.integrators, frf.resolution / omega[0])
             if leak > error:
                 return [
-                    f"the response falls as 1/s^{steepness} at its lowest frequencies and leaks "
-                    f"through the window, by up to {100 * leak:.2g} % at {omega[0]:.3g} rad/s: "
-                    f"estimate it with jq.spectra.Welch(integrators={min(steepness, 3)})"
+                    f"the response falls as 1/s^{steepness} at its lowest frequencies, where the "
+                    f"window's leakage biases it by up to {100 * leak:.2g} % (at {omega[0]:.3g} "
+                    f"rad/s): estimate it with jq.spectra.Welch(integrators={min(steepness, 3)})"
                 ]
     return []
 
@@ -335,20 +337,22 @@ def _leakage(integrators: int, resolution: float) -> float:
 def ran_to_zero(problem: Problem, solution: Solution) -> list[int]:
     """Which of the parameters that keep their sign ran towards zero."""
     logarithmic = np.array(problem.parameters.logarithmic[: problem.parameters.count])
-    return np.flatnonzero(logarithmic & (_moved(problem, solution) < -_FAR)).tolist()
+    return np.flatnonzero(logarithmic & (_change_of_z(problem, solution) < -_FAR)).tolist()
 
 
-def _moved(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
+def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
     return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
 
 
 def runaways(problem: Problem, solution: Solution) -> list[str]:
+    """Remarks on parameters that ran to zero or to infinity."""
     names, low = problem.parameters.names, ran_to_zero(problem, solution)
     remarks = [
-        f"{names[k]} ran to zero: leave it out, or let its sign change with jq.identify.Real({names[k]!r})"
+        f"{names[k]} ran to zero: leave it out, or let its sign change with "
+        f"jq.identify.Real({names[k]!r})"
         for k in low
     ]
-    for k in np.flatnonzero(_moved(problem, solution) > 2 * _FAR):
+    for k in np.flatnonzero(_change_of_z(problem, solution) > 2 * _FAR):
         if problem.parameters.logarithmic[k]:
-            remarks.append(f"{names[k]} ran to infinity: start elsewhere, or leave it out")
+            remarks.append(f"{names[k]} ran to infinity: start from other values, or leave it out")
     return remarks

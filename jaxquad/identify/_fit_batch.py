@@ -25,7 +25,7 @@ _CHUNK = 64  # fits side by side: their Jacobians stay in the cache
 
 
 class BatchSolution(NamedTuple):
-    """Where every member of a batch stopped."""
+    """Where the fit of every response of a batch stopped."""
 
     z: Float[Array, "batch parameters"]
     values: Float[Array, "batch parameters"]  # physical
@@ -189,7 +189,7 @@ def _products(columns: Float[Array, "columns points batch"]) -> Normal:
 
 
 class BatchFit(eqx.Module):
-    """Fits of one structure to many responses; `fit(k)` is that of response k with its doubts."""
+    """Fits of one model to many responses; `fit(k)` is the whole result for response k."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     values: Float[np.ndarray, "batch parameters"]
@@ -204,7 +204,7 @@ class BatchFit(eqx.Module):
     z: Float[np.ndarray, "batch parameters"]
 
     def fit(self, k: int) -> Fit:
-        """Response k: standard errors, identifiability, remarks."""
+        """The fit of response k, with standard errors, verdict and remarks."""
         frf, z = self.frfs[k], jnp.asarray(self.z[k])
         problem = make_problem(self.model, self.parameters, [frf])
         problem = problem.weighted([jnp.asarray(self.weights[k])])
@@ -214,7 +214,7 @@ class BatchFit(eqx.Module):
 
     def __str__(self) -> str:
         lost = int(np.sum(~self.converged))
-        lines = [f"{len(self.values)} fits, {lost} of which reached no minimum"]
+        lines = [f"{len(self.values)} fits; {lost} of them reached no minimum"]
         good = self.values[self.converged]
         if len(good):
             low, middle, high = np.percentile(good, [5, 50, 95], axis=0)
@@ -247,15 +247,28 @@ def fit_batch(
 ) -> BatchFit:
     """Fit one model to each of many responses on the same frequencies, in one compiled call.
 
-    For fleets, Monte Carlo studies and sliding windows: 1000 fits of five parameters take about as
-    long as 20 of scipy's. All start from the model's values, by Levenberg-Marquardt. Options are
-    those of `jq.fit`. Raises `ValueError` for responses on different frequencies or channels.
+    For fleets, Monte Carlo studies and sliding windows. All fits start from the model's values.
+
+    **Arguments:**
+
+    - `model`, `free`, `tied`, `cost`, `min_coherence`, `max_steps`: as in `jq.fit`.
+    - `frfs`: responses on the same frequencies, with the same channels.
+    - `band`: (low, high) in rad/s.
+
+    **Returns:**
+
+    `jq.identify.BatchFit`.
+
+    **Raises:**
+
+    - `ValueError`: responses on different frequencies or channels, or without a usable frequency.
+    - `PrecisionError`: JAX runs in 32 bits.
     """
     require_x64("a fit")
     frfs = list(frfs)
     if not frfs or not all(isinstance(frf, FrequencyResponse) for frf in frfs):
         raise ValueError(
-            "a batch needs one jq.spectra.FrequencyResponse or more: fit_batch(model, frfs)"
+            "fit_batch needs a list of jq.spectra.FrequencyResponse: fit_batch(model, frfs)"
         )
     check_options(cost, band, min_coherence, max_steps)
     model = with_arrays(model)

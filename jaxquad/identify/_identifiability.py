@@ -1,4 +1,4 @@
-"""What a record can and cannot tell, decided from the Fisher information before any number."""
+"""Which parameters a record determines, decided from the Fisher information."""
 
 from collections.abc import Callable
 from fractions import Fraction
@@ -134,7 +134,7 @@ def _sum(weights: Float[np.ndarray, " parameters"], named: Named) -> Combination
 
 LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
 _MEMBER = 0.05  # share of a null direction from which a parameter takes part in it
-_MOVE = 0.4  # finite relative change along a null direction that has to change nothing
+_MOVE = 0.4  # finite relative change along a null direction, to test products against sums
 _FLOOR = 1e-8  # of the largest singular value: below it lies rounding
 
 
@@ -158,7 +158,7 @@ class Information(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """Parameters that share null directions, and what they leave determined."""
+    """Parameters that share null directions, and the combinations of them that are determined."""
 
     members: np.ndarray
     combinations: list[Combination]
@@ -166,19 +166,21 @@ class _Group(NamedTuple):
     curved: bool
 
 
-def decide(information: Information) -> Verdict:
-    """Null directions of the Fisher information, and what is left outside them."""
+def assess_identifiability(information: Information) -> Verdict:
+    """Null directions of the Fisher information, and the combinations outside them."""
     count = len(information.covariance)
     _, singular, right = np.linalg.svd(information.root[:, :count], full_matrices=True)
     singular = np.pad(singular, (0, count - len(singular)))
     exact = singular <= _FLOOR * singular[0]
     null = right[exact | (singular * LIMIT < 1)]
     null = _sparse(null) if len(null) else null
-    lost = np.any(null, axis=0) | _blurred(information.covariance)
-    null = _explained(null, information.covariance)
+    lost = np.any(null, axis=0) | _imprecise(information.covariance)
+    null = _with_causes(null, information.covariance)
     sure = _sparse(right[exact]) if np.any(exact) else null[:0]
-    facts = information._replace(covariance=_opened(information.covariance, right[exact]))
-    groups = [_explore(null, sure, block, facts) for block in _blocks(null)]
+    information = information._replace(
+        covariance=_with_null_variance(information.covariance, right[exact])
+    )
+    groups = [_analyse_group(null, sure, block, information) for block in _group_members(null)]
     names = information.names
     undetermined = tuple(names[k] for k in np.flatnonzero(lost))
     return Verdict(
@@ -196,16 +198,16 @@ def decide(information: Information) -> Verdict:
     )
 
 
-def _blurred(covariance: np.ndarray) -> np.ndarray:
-    """Parameters with a standard error beyond the limit, whatever direction it comes from."""
+def _imprecise(covariance: np.ndarray) -> np.ndarray:
+    """Parameters with a standard error beyond the limit."""
     return np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) > LIMIT
 
 
-def _explained(
+def _with_causes(
     null: Float[np.ndarray, "null parameters"], covariance: np.ndarray
 ) -> Float[np.ndarray, "more parameters"]:
-    """With the direction that blurs each parameter that is blurred, but is in none of `null`."""
-    left = _blurred(covariance) & ~np.any(null, axis=0)
+    """`null`, and the direction of most variance of each imprecise parameter in none of them."""
+    left = _imprecise(covariance) & ~np.any(null, axis=0)
     if not left.any():
         return null
     spread, directions = np.linalg.eigh(covariance)
@@ -220,7 +222,7 @@ def _sparse(null: Float[np.ndarray, "null parameters"]) -> Float[np.ndarray, "nu
     return np.where(np.abs(rows) > _MEMBER, rows, 0.0)
 
 
-def _blocks(null: Float[np.ndarray, "null parameters"]) -> list[np.ndarray]:
+def _group_members(null: Float[np.ndarray, "null parameters"]) -> list[np.ndarray]:
     """Groups of parameters that share null directions."""
     groups: list[set[int]] = []
     for row in null:
@@ -232,76 +234,82 @@ def _blocks(null: Float[np.ndarray, "null parameters"]) -> list[np.ndarray]:
     return [np.array(sorted(group)) for group in groups]
 
 
-def _opened(covariance: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """Covariance with a huge variance along exact null directions, where the inverse shows none."""
+def _with_null_variance(covariance: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Covariance with a large variance along exact null directions; a pseudo-inverse has none."""
     keep = np.eye(len(covariance)) - exact.T @ exact
     return keep @ covariance @ keep + 1e4 * exact.T @ exact
 
 
-def _explore(
+def _analyse_group(
     null: Float[np.ndarray, "null parameters"],
     sure: Float[np.ndarray, "exact parameters"],
     block: np.ndarray,
-    facts: Information,
+    information: Information,
 ) -> _Group:
-    """One group: which kind of combination survives a finite move, and its determined ones."""
+    """Determined combinations of one group, of the kind that holds over a finite change."""
     sure = sure[np.any(sure[:, block], axis=1)]
     kept: list[tuple[str, np.ndarray]] = []
     for kind in KINDS if len(sure) else ():
-        values = _moved(sure, kind, facts)
-        kept += [(kind, values)] if facts.same(values) else []
+        values = _moved_along(sure, kind, information)
+        kept += [(kind, values)] if information.same(values) else []
     kinds = tuple(kind for kind, _ in kept) if len(sure) else KINDS
-    rows = _outside(null[:, block])
-    effects = facts.root[:, block] @ np.linalg.pinv(rows) if len(rows) else rows.T
-    found = [_named(row, block, effects[:, k], facts, kinds) for k, row in enumerate(rows) if kinds]
+    rows = _complement(null[:, block])
+    effects = information.root[:, block] @ np.linalg.pinv(rows) if len(rows) else rows.T
+    found = [
+        _describe(row, block, effects[:, k], information, kinds)
+        for k, row in enumerate(rows)
+        if kinds
+    ]
     found = [one for one in found if one is not None]
     return _Group(block, found, [values for _, values in kept], not kinds and len(rows) > 0)
 
 
-def _moved(
-    sure: Float[np.ndarray, "exact parameters"], kind: str, facts: Information
+def _moved_along(
+    sure: Float[np.ndarray, "exact parameters"], kind: str, information: Information
 ) -> Float[np.ndarray, " parameters"]:
     """Values a finite way along the null directions, at constant products or at constant sums."""
-    count = len(facts.covariance)
+    count = len(information.covariance)
     direction = _MOVE * np.sum(sure * np.arange(1, len(sure) + 1)[:, None] / len(sure), axis=0)
-    values, units = facts.values[:count], facts.units[:count]
+    values, units = information.values[:count], information.units[:count]
     return values * np.exp(direction) if kind == "product" else values + units * direction
 
 
-def _outside(null: Float[np.ndarray, "null members"]) -> Float[np.ndarray, "rows members"]:
+def _complement(null: Float[np.ndarray, "null members"]) -> Float[np.ndarray, "rows members"]:
     """Combinations of the members that no null direction moves."""
     _, singular, right = np.linalg.svd(null[np.any(null, axis=1)], full_matrices=True)
     return echelon(right[int(np.sum(singular > 1e-6)) :])
 
 
-def _named(
+def _describe(
     row: np.ndarray,
     block: np.ndarray,
     effect: np.ndarray,
-    facts: Information,
+    information: Information,
     kinds: tuple[str, ...],
 ) -> Combination | None:
     """None if the record does not determine it any better than its parts."""
-    weights = np.zeros(len(facts.values))
+    weights = np.zeros(len(information.values))
     weights[block] = row
-    weights = _with_fixed(weights, effect, facts) if "product" in kinds else weights
-    used = np.array(sorted(np.flatnonzero(weights), key=lambda k: facts.order[k]))
-    count = len(facts.covariance)
+    weights = _with_fixed(weights, effect, information) if "product" in kinds else weights
+    used = np.array(sorted(np.flatnonzero(weights), key=lambda k: information.order[k]))
+    count = len(information.covariance)
     relative = np.zeros((len(weights), len(weights)))
-    relative[:count, :count] = facts.covariance
-    names = tuple(facts.names[k] for k in used)
-    named = Named(names, facts.values[used], facts.units[used], relative[np.ix_(used, used)])
+    relative[:count, :count] = information.covariance
+    names = tuple(information.names[k] for k in used)
+    named = Named(
+        names, information.values[used], information.units[used], relative[np.ix_(used, used)]
+    )
     vague = is_vague(weights[used], named, LIMIT)
     return None if vague else combine(weights[used], named, kinds)
 
 
 def _with_fixed(
-    weights: Float[np.ndarray, " all"], effect: np.ndarray, facts: Information
+    weights: Float[np.ndarray, " all"], effect: np.ndarray, information: Information
 ) -> Float[np.ndarray, " all"]:
     """Adds fixed parameters that act just as the combination does; signed to raise the response."""
     weights = weights.copy()
-    for k in range(len(facts.covariance), len(weights)):
-        column = facts.root[:, k]
+    for k in range(len(information.covariance), len(weights)):
+        column = information.root[:, k]
         power = float(column @ effect) / max(float(effect @ effect), 1e-300)
         rest = np.linalg.norm(column - power * effect)
         if abs(power) > 0.1 and rest < 1e-6 * np.linalg.norm(column):

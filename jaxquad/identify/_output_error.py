@@ -11,7 +11,7 @@ from jaxquad._core import require_x64
 from jaxquad.records import Record
 
 from ._fit import check_priors
-from ._output_error_problem import found_at, OutputError, relaxed, Trial
+from ._output_error_problem import descend_by_turns, found_at, OutputError, Trial
 from ._output_error_result import assess_output_error
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of
@@ -40,20 +40,35 @@ def refine(
     priors: Sequence[Prior] = (),
     max_steps: int = 64,
 ) -> Fit:
-    """Output-error estimate of the `free` parameters in the time domain, from the model's values.
+    """Output-error estimate of a model's `free` parameters in the time domain.
 
-    A linear model (`TransferFunction`, `StateSpace`, or with `transfer_function()` or
-    `state_space()`) is discretised exactly; initial state, biases on the state derivatives and a
-    shift of each output are eliminated by least squares. Any other `eqx.Module` with `init()`,
-    `derivative(state, inputs, disturbance)` and `measure(state)` is integrated by diffrax without
-    disturbance (zeros like what it measures), and its initial state, beside `init()`, estimated.
-    `free`, `tied` and `priors` are those of `jq.fit`, `hold` and `band` those of `jq.verify`; model
-    and data are band_filter alike. Each record has its own start, trim and noise level. Outputs are
-    weighted by their residuals' variance, estimated in turn with the parameters; `cost` is in
-    units of it. Standard errors hold for coloured residuals.
+    Outputs are weighted by the variance of their residuals, which is estimated in turn with the
+    parameters; `Fit.cost` is in units of it. Standard errors hold for coloured residuals. Each
+    record has its own initial state, trim and noise level.
 
-    Raises ValueError for what `jq.fit` and `jq.verify` refuse and for a model that cannot be
-    simulated at its starting values, `PrecisionError` in 32 bits.
+    **Arguments:**
+
+    - `model`: its values are the start. A linear model (`jq.TransferFunction`, `jq.StateSpace`, or
+        one with `transfer_function()` or `state_space()`) is discretised exactly; initial state,
+        biases on the state derivatives and a shift of each output are eliminated by least squares.
+        Any other `eqx.Module` with `init()`, `derivative(state, inputs, disturbance)` and
+        `measure(state)` is integrated by diffrax with a disturbance of zero; its initial state is
+        estimated as a change of `init()`.
+    - `record`: a `jq.Record` or a list of them.
+    - `free`, `tied`, `priors`: as in `jq.fit`.
+    - `hold`, `band`: as in `jq.verify`; model and data are filtered alike.
+    - `max_steps`: of the solver.
+
+    **Returns:**
+
+    A `jq.identify.Fit`.
+
+    **Raises:**
+
+    - `ValueError`: what `jq.fit` and `jq.verify` refuse, and a model that cannot be simulated from
+        its starting values.
+    - `PrecisionError`: JAX runs in 32 bits.
+
     Source: Klein & Morelli, Aircraft System Identification, ch. 6 (modified Newton-Raphson with
     relaxation, errors corrected for coloured residuals).
     """
@@ -62,8 +77,8 @@ def refine(
     parameters = select_parameters(model, free, tied)
     base = _base(model, parameters, priors)
     trials = tuple(_trial(model, one, hold, band) for one in records)
-    problem = _with_units(OutputError(base, trials, _known_zeros(model, parameters)))
-    descent = relaxed(problem, max_steps)
+    problem = _with_units(OutputError(base, trials, _fixed_zeros(model, parameters)))
+    descent = descend_by_turns(problem, max_steps)
     check_priors(base, descent.solution)
     return assess_output_error(descent, records)
 
@@ -72,17 +87,17 @@ def _checked(record: Record | Sequence[Record], max_steps: int, hold: str) -> li
     records = [record] if isinstance(record, Record) else list(record)
     if not records or not all(isinstance(one, Record) for one in records):
         kinds = ", ".join(sorted({type(one).__name__ for one in records})) or "nothing"
-        raise ValueError(f"refine needs a jq.Record or a list of them, not {kinds}")
+        raise ValueError(f"refine needs a jq.Record or a list of them, not {kinds}: see jq.read")
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}: give at least 1")
     if hold not in ("first", "zero"):
-        raise ValueError(f'hold is {hold!r}: inputs run straight ("first") or are held ("zero")')
+        raise ValueError(
+            f'hold is {hold!r}: give "first" (straight between samples) or "zero" (held)'
+        )
     for one in records:
         still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
         if still:
-            raise ValueError(
-                f"output {still[0]} does not move: leave it out with jq.records.select"
-            )
+            raise ValueError(f"output {still[0]} is constant: leave it out with jq.records.select")
     return records
 
 
@@ -90,7 +105,9 @@ def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Pro
     known = [place.name for place in name_places(model)]
     for prior in priors:
         if isinstance(prior.quantity, str) and prior.quantity not in known:
-            raise ValueError(f"no parameter {prior.quantity!r} for a prior; there are: {known}")
+            raise ValueError(
+                f"no parameter {prior.quantity!r} for a prior; the model has: {', '.join(known)}"
+            )
     numbers = [[prior.value, prior.standard_error] for prior in priors]
     return Problem(
         model=model,
@@ -125,8 +142,8 @@ def _check_measured(model: DifferentialModel, record: Record) -> None:
     measured = jnp.size(model.measure(model.init()))
     if measured != len(record.output_names):
         raise ValueError(
-            f"the plant measures {measured} outputs, the record has {record.output_names}: pick "
-            "them with jq.records.select"
+            f"the model measures {measured} outputs, the record has "
+            f"{', '.join(record.output_names)}: pick channels with jq.records.select"
         )
 
 
@@ -143,8 +160,9 @@ def _with_units(problem: OutputError) -> OutputError:
         sizes = np.sqrt(np.mean(mine**2, axis=(0, 1)))
         if not np.all(np.isfinite(sizes)):
             raise ValueError(
-                "the plant cannot be integrated over the record from its starting values: it "
-                "diverges or is too stiff; start from other values, or cut the record with jq.records.trim"
+                "the model cannot be integrated over the record from its starting values: it "
+                "diverges or is too stiff. Start from other values, or cut the record with "
+                "jq.records.trim"
             )
         seen = sizes > 1e-6 * np.max(sizes, initial=0.0)
         start = jnp.asarray(np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0))
@@ -153,8 +171,8 @@ def _with_units(problem: OutputError) -> OutputError:
     return dataclasses.replace(problem, trials=tuple(trials))
 
 
-def _known_zeros(model: PyTree, parameters: Parameters) -> tuple[int, ...]:
-    moved = {place.leaf for place in parameters.places} | {p.leaf for p, _ in parameters.ties}
+def _fixed_zeros(model: PyTree, parameters: Parameters) -> tuple[int, ...]:
+    changed = {place.leaf for place in parameters.places} | {p.leaf for p, _ in parameters.ties}
     leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
     still = [k for k, leaf in enumerate(leaves) if not np.any(np.asarray(leaf))]
-    return tuple(k for k in still if k not in moved)
+    return tuple(k for k in still if k not in changed)

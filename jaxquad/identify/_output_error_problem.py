@@ -180,7 +180,7 @@ def _point(problem: OutputError, z: Float[np.ndarray, " n"]) -> _Point:
     return _Point(problem, z, found_at(jnp.asarray(z), problem))
 
 
-def relaxed(problem: OutputError, max_steps: int) -> Descent:
+def descend_by_turns(problem: OutputError, max_steps: int) -> Descent:
     """Parameters and noise level by turns: the maximum of the likelihood of both."""
     base, steps = problem.base, 0
     count = base.parameters.count

@@ -54,20 +54,21 @@ def remarks_on_output_error(
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
         remarks.append(
-            f"no minimum: one more Gauss-Newton step would lower the cost by {decrement:.3g}, "
-            f"where the noise alone accounts for {taken:.3g}; start nearer, for instance from a "
-            "frequency-domain fit"
+            f"no minimum: one more Gauss-Newton step would lower the cost by {2 * decrement:.3g}, "
+            f"where the noise alone accounts for {taken:.3g}; start from other values, for "
+            "instance those of jq.fit"
         )
     fed = dict.fromkeys(name for record in records for name in record.reference_names)
     if fed:
         remarks.append(
             f"the record has references ({', '.join(fed)}), so a loop may have been closed: output "
-            "error is biased where feedback returns the noise to the input; simulate the loop, or "
-            "fit the joint estimate, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())"
+            "error is biased where feedback returns the noise to the input; fit the joint "
+            "estimate instead, "
+            "jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())"
         )
     remarks.append(
-        "the noise level is that of the residuals, which makes the misfit beside it 1: judge the "
-        "model by jq.verify on another record"
+        "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
+        "model: judge this one by jq.verify on another record"
     )
     return remarks
 
@@ -75,7 +76,7 @@ def remarks_on_output_error(
 def remarks_on_colour(
     misfits: Sequence[Float[np.ndarray, "samples outputs"]], bread: Matrix, covariance: Matrix
 ) -> list[str]:
-    """Residuals so coloured that it matters."""
+    """Remark on residuals whose colour changes the standard errors."""
     white = np.diagonal(scaled_inverse(bread))
     ratio = np.sqrt(np.diagonal(covariance) / np.maximum(white, 1e-300))
     ratio = ratio[ratio > 1e-3]  # what nothing determines has none
@@ -90,8 +91,8 @@ def remarks_on_colour(
     ]
 
 
-class Seen(NamedTuple):
-    """One record at the solution, without what its initial state and trim can explain."""
+class Projected(NamedTuple):
+    """Misfit and slopes of one record, orthogonal to its initial state and trim."""
 
     misfit: Float[np.ndarray, "samples outputs"]
     slopes: Float[np.ndarray, "samples outputs all"]  # of the misfit, by relative changes
@@ -107,11 +108,11 @@ class Reduced(NamedTuple):
     output: Float[np.ndarray, " all"]  # measured output
 
 
-def seen_records(
+def project_records(
     problem: OutputError, found: Found, rescale: Float[np.ndarray, " all"]
-) -> list[Seen]:
-    """The records with slopes by relative changes, clear of the initial states."""
-    seen, at = [], rescale.size
+) -> list[Projected]:
+    """Each record with slopes by relative changes, orthogonal to its initial state and trim."""
+    projected, at = [], rescale.size
     parts = zip(problem.trials, found.misfits, found.slopes, found.columns, strict=True)
     for trial, misfit, slopes, columns in parts:
         slopes, states = np.asarray(slopes), trial.start.size
@@ -119,18 +120,18 @@ def seen_records(
         basis = orthonormal(own)
         mine = slopes[:, :, : rescale.size] * rescale
         share = np.einsum("tok,toa->ka", basis, mine)
-        seen.append(Seen(np.asarray(misfit), mine - basis @ share, basis))
+        projected.append(Projected(np.asarray(misfit), mine - basis @ share, basis))
         at += states
-    return seen
+    return projected
 
 
-def reduced_rows(seen: Sequence[Seen], trials: Sequence[Trial], count: int) -> Reduced:
-    """One orthonormal basis of the slopes of all records, and everything else as it shows in it."""
-    every = seen[0].slopes.shape[2]
-    stacked = np.concatenate([one.slopes.reshape(-1, every) for one in seen])
+def reduced_rows(projected: Sequence[Projected], trials: Sequence[Trial], count: int) -> Reduced:
+    """Slopes, misfit, noise and output in one orthonormal basis of the slopes of all records."""
+    every = projected[0].slopes.shape[2]
+    stacked = np.concatenate([one.slopes.reshape(-1, every) for one in projected])
     basis, root = np.linalg.qr(np.concatenate([stacked, np.zeros((every, every))]))
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
-    for one, trial in zip(seen, trials, strict=True):
+    for one, trial in zip(projected, trials, strict=True):
         mine = basis[at : at + one.misfit.size].reshape(one.slopes.shape)
         measured = np.asarray(trial.y * trial.weights[None])
         aim += np.einsum("tok,to->k", mine, one.misfit)
@@ -171,11 +172,14 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     problem, solution = descent.problem, descent.solution
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
     units, rescale = _units(base, solution), _rescale(solution, _units(base, solution))
-    seen, known = seen_records(problem, descent.found, rescale[:count]), _known(solution, units)
-    reduced = reduced_rows(seen, problem.trials, count)
+    projected, known = (
+        project_records(problem, descent.found, rescale[:count]),
+        _known(solution, units),
+    )
+    reduced = reduced_rows(projected, problem.trials, count)
     bread, gradient, noise = gauss_newton(reduced, known, count)
-    rows = sum(one.misfit.size for one in seen)
-    data_cost = sum(float(np.sum(one.misfit**2)) for one in seen)
+    rows = sum(one.misfit.size for one in projected)
+    data_cost = sum(float(np.sum(one.misfit**2)) for one in projected)
     cost = data_cost + float(np.sum(known.misfit**2))
     covariance = calibrated_covariance(bread, noise)
     taken = float(np.trace(scaled_inverse(bread) @ noise.data))
@@ -190,7 +194,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         verdict = dataclasses.replace(verdict, remedies=())
     physical, unbounded = physical_covariance(covariance, slopes, parameters.names, verdict)
     percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
-    fitted = count + sum(one.nuisance.shape[2] for one in seen)
+    fitted = count + sum(one.nuisance.shape[2] for one in projected)
     return Fit(
         model=solution.model,
         names=parameters.names,
@@ -200,7 +204,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
         insensitivity=insensitivity(bread) * percent,
         cost=cost,
-        average_cost=cost / sum(one.misfit.shape[1] for one in seen),
+        average_cost=cost / sum(one.misfit.shape[1] for one in projected),
         information=_deviance(problem) + cost + 2 * taken,
         chi_squared=data_cost / max(rows - fitted, 1),
         newton_decrement=decrement,
@@ -210,7 +214,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         verdict=verdict,
         remarks=(
             *remarks_on_output_error(base, solution, records, decrement, taken),
-            *remarks_on_colour([one.misfit for one in seen], bread, covariance),
+            *remarks_on_colour([one.misfit for one in projected], bread, covariance),
             *remarks_on_priors(known.misfit, verdict, by_data),
         ),
         parameters=parameters,
@@ -232,8 +236,8 @@ def _verdict(
     found = _identifiability(_information(descent, reduced, covariance, units), free)
     if units.size == count or not any(verdict.undetermined for verdict in found):
         return found
-    seen = seen_records(problem, with_fixed_slopes(descent), _rescale(solution, units))
-    reduced = reduced_rows(seen, problem.trials, count)
+    projected = project_records(problem, with_fixed_slopes(descent), _rescale(solution, units))
+    reduced = reduced_rows(projected, problem.trials, count)
     return _identifiability(_information(descent, reduced, covariance, units), known)
 
 
@@ -270,10 +274,10 @@ def _same(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:
     if np.any(logarithmic & (ratio <= 0)):
         return False
     z = np.where(logarithmic, np.log(np.where(logarithmic, ratio, 1.0)), ratio)
-    moved = found_at(jnp.concatenate([jnp.asarray(z), descent.z[count:]]), problem).misfits
+    other = found_at(jnp.concatenate([jnp.asarray(z), descent.z[count:]]), problem).misfits
     return all(
         _close(np.asarray(new), np.asarray(old), trial)
-        for new, old, trial in zip(moved, found.misfits, problem.trials, strict=True)
+        for new, old, trial in zip(other, found.misfits, problem.trials, strict=True)
     )
 
 

@@ -13,13 +13,13 @@ from jaxquad._core import require_float64
 
 
 class Positive(NamedTuple):
-    """A free parameter that keeps the sign of its starting value: fitted as its logarithm."""
+    """A free parameter that keeps the sign of its starting value; its logarithm is fitted."""
 
     name: str
 
 
 class Real(NamedTuple):
-    """A free parameter that may cross zero; `scale` is its typical size (by default |start|)."""
+    """A free parameter that may cross zero; `scale` is its typical size, by default |start|."""
 
     name: str
     scale: float | None = None
@@ -79,7 +79,7 @@ class Parameters(eqx.Module):
             value = jnp.asarray(tie(model))
             if value.shape != ():
                 raise ValueError(
-                    f"{place.name} is tied to something of shape {value.shape}: give one number"
+                    f"{place.name} is tied to an array of shape {value.shape}: return one number"
                 )
             model = with_values(model, (place,), value[None])
         return model
@@ -113,7 +113,17 @@ def name_places(model: PyTree) -> list[Place]:
 def select_parameters(
     model: PyTree, free: Free, tied: Mapping[str, Tie] | None = None
 ) -> Parameters:
-    """Resolve `free=` and `tied=` against the model; `ValueError` for what they cannot mean."""
+    """The free and tied parameters of a model, as `jq.fit` takes them.
+
+    **Arguments:**
+
+    - `model`: any `eqx.Module`.
+    - `free`, `tied`: as in `jq.fit`.
+
+    **Raises:**
+
+    - `ValueError`: a name that the model does not have, is given twice, or starts at 0 or inf.
+    """
     places = name_places(model)
     ties = _tied(places, tied or {})
     bound = {place.name for place, _ in ties}
@@ -195,7 +205,7 @@ def _choose(
         scale = item.scale or abs(value)
         if not scale > 0:
             raise ValueError(
-                f"{name} starts at 0: say its size with jq.identify.Real({name!r}, scale=...)"
+                f"{name} starts at 0: give its typical size, jq.identify.Real({name!r}, scale=...)"
             )
         return by_name[name], False, scale
     if value == 0:

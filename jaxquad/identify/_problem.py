@@ -19,10 +19,22 @@ Condition = Callable[[PyTree], PyTree]
 
 
 class Prior(eqx.Module):
-    """A known value of a parameter, or of any function of the model, with its standard error.
+    """A known value of a parameter, or of a function of the model, with its standard error.
 
-    A data-sheet value, a thrust stand, a static torque: `Prior("K_t", 0.1188, 0.002)` or
-    `Prior(lambda m: m.L * m.K_t, 0.0234, 0.0003)`.
+    A data-sheet value, a thrust stand, a static torque: it counts as one more measurement.
+
+    **Arguments:**
+
+    - `quantity`: a parameter's name, or a function from the model to a number.
+    - `value`: in the quantity's unit.
+    - `standard_error`: likewise, above 0.
+
+    !!! example
+
+        ```python
+        priors = [jq.identify.Prior("K_t", 0.1188, 0.002),
+                  jq.identify.Prior(lambda m: m.L * m.K_t, 0.0234, 0.0003)]
+        ```
     """
 
     quantity: str | Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
@@ -32,8 +44,8 @@ class Prior(eqx.Module):
     def __check_init__(self):
         if not (0 < self.standard_error < np.inf and np.isfinite(self.value)):
             raise ValueError(
-                f"prior {self.value} +- {self.standard_error}: a finite value and a positive "
-                "standard error are needed"
+                f"a prior of {self.value} with standard error {self.standard_error}: give a finite "
+                "value and a positive standard error"
             )
 
 
@@ -64,7 +76,10 @@ def make_problem(
     """The problem of these responses, under weights of zero."""
     conditions = [None] * len(frfs) if conditions is None else list(conditions)
     if len(conditions) != len(frfs):
-        raise ValueError(f"{len(conditions)} conditions for {len(frfs)} responses: give one each")
+        raise ValueError(
+            f"{len(conditions)} conditions for {len(frfs)} responses: give one for each, None "
+            "where the model holds as it is"
+        )
     numbers = [[prior.value, prior.standard_error] for prior in priors]
     shapes = [(*frf.response.shape, 2) for frf in frfs]
     return Problem(
@@ -94,21 +109,21 @@ def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, ".
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> list[Float[Array, "..."]]:
     """`ln|T/T^|` and wrapped phase of `T/T^` in rad, on a last axis of two, per record."""
-    logs = _logs(z, problem)
+    logs = _log_ratios(z, problem)
     return [jnp.stack([jnp.moveaxis(part, -1, 0) for part in log], axis=-1) for log in logs]
 
 
 Part = Float[Array, "outputs inputs frequencies"]
 
 
-def _logs(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Part]]:
+def _log_ratios(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Part]]:
     # Frequencies come last until all is done: derivatives are then fast loops over them.
     logs = []
     for model, measured in zip(responses(z, problem), problem.measured, strict=True):
-        here, there = (jnp.moveaxis(x, 0, -1) for x in (_alike(model, measured), measured))
+        here, there = (jnp.moveaxis(x, 0, -1) for x in (_of_same_shape(model, measured), measured))
         power = jnp.real(there) ** 2 + jnp.imag(there) ** 2
         c, s = jnp.real(there) / power, jnp.imag(there) / power
-        logs.append(_logarithm(*_turned(jnp.real(here), jnp.imag(here), c, s)))
+        logs.append(_logarithm(*_rotate(jnp.real(here), jnp.imag(here), c, s)))
     return logs
 
 
@@ -123,21 +138,22 @@ def _logarithm_jvp(primals, tangents):
     # One reciprocal for all tangents: complex divisions would cost most of a fit.
     power = primals[0] * primals[0] + primals[1] * primals[1]
     c, s = (part / power for part in primals)
-    return _logarithm(*primals), no_fuse(_turned, *tangents, c, s)
+    return _logarithm(*primals), no_fuse(_rotate, *tangents, c, s)
 
 
-def _turned(real: Part, imag: Part, c: Part, s: Part) -> tuple[Part, Part]:
+def _rotate(real: Part, imag: Part, c: Part, s: Part) -> tuple[Part, Part]:
     return real * c + imag * s, imag * c - real * s
 
 
-def _alike(
+def _of_same_shape(
     model: Complex[Array, "..."], measured: Complex[Array, "frequencies outputs inputs"]
 ) -> Complex[Array, "frequencies outputs inputs"]:
-    # Broadcasting would fit one output to all of them without a word.
+    # Broadcasting would fit one output to all of them silently.
     if model.shape != measured.shape:
         raise ValueError(
             f"the model's response has shape {model.shape}, the measured one {measured.shape} "
-            "(frequencies, outputs, inputs): pick channels with jq.records.select, or extend the model"
+            "(frequencies, outputs, inputs): pick channels with jq.records.select, or extend the "
+            "model"
         )
     return model
 
@@ -153,7 +169,7 @@ def prior_misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " pri
 
 def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
     """All weighted misfits in one vector: half its squared norm is what the solver lowers."""
-    pairs = zip(_logs(z, problem), problem.weights, strict=True)
+    pairs = zip(_log_ratios(z, problem), problem.weights, strict=True)
     parts = [
         (part * jnp.moveaxis(weight[..., k], 0, -1)).reshape(-1)
         for log, weight in pairs

@@ -11,11 +11,11 @@ from jaxquad.spectra import FrequencyResponse
 from ._cost import Band, CoherenceWeighted, Cost
 from ._fit import fit
 from ._parameters import Free, Parameters, Positive, Real, select_parameters, Tie
-from ._result import Fit
+from ._result import counted, Fit
 
 
 class Step(NamedTuple):
-    """One parameter tried without: why, and what became of it."""
+    """A fit without one parameter, and the decision."""
 
     parameter: str
     reason: str
@@ -28,7 +28,7 @@ class Step(NamedTuple):
 
 
 class Reduction(eqx.Module):
-    """The smallest structure that explains the responses, and the protocol that led there."""
+    """The smallest structure that explains the responses, and the steps that led to it."""
 
     fit: Fit
     first: Fit
@@ -49,7 +49,9 @@ class Reduction(eqx.Module):
         for step in self.steps:
             numbers = f"{step.average_cost:9.4g}{step.rise:+10.3g}{step.change:+12.4g}"
             lines.append(f"{step.parameter:<{width}}  {step.reason:<16}{numbers}  {step.verdict}")
-        return "\n".join([*lines, f"{len(self.fit.names)} parameters are left:", str(self.fit)])
+        return "\n".join(
+            [*lines, f"{counted(len(self.fit.names), 'parameter')} left:", str(self.fit)]
+        )
 
 
 class _Options(NamedTuple):
@@ -76,11 +78,26 @@ def reduce_structure(
 ) -> Reduction:
     """Leave out, one after the other, the parameters that the responses do not need.
 
-    First the one with the largest insensitivity above `insensitivity` (%), then the largest
-    Cramer-Rao bound above `cramer_rao` (%); each is set to its `null` value, 0 by default, and the
-    rest fitted again. It stays out if Takeuchi's information criterion does not rise (which counts
-    errors that neighbouring frequencies share once only), or, with a number for `rise`, if the
-    average cost rises by no more than that: CIFER's habit is 1 to 2. Other options are `jq.fit`'s.
+    Tried first is the parameter with the largest insensitivity above `insensitivity`, then the one
+    with the largest Cramer-Rao bound above `cramer_rao`. It is set to its `null` value and the rest
+    is fitted again. It stays out if Takeuchi's information criterion does not rise.
+
+    **Arguments:**
+
+    - `model`, `frf`, `free`, `tied`, `cost`, `band`, `min_coherence`: as in `jq.fit`.
+    - `null`: values of parameters that are left out, by name; 0 by default.
+    - `insensitivity`, `cramer_rao`: limits in per cent.
+    - `rise`: leave out by the rise of the average cost instead, which is to be no more than this;
+        1 to 2 is usual with CIFER.
+
+    **Returns:**
+
+    `jq.identify.Reduction`: the smallest structure, and what was tried.
+
+    **Raises:**
+
+    - `ValueError`: a name in `null` that is not free, and what `jq.fit` refuses.
+
     Source: Tischler & Remple, ch. 13, model structure determination.
     """
     options = _Options(tied, cost, band, min_coherence, null or {})
@@ -89,7 +106,8 @@ def reduce_structure(
     unknown = set(options.null) - set(parameters.names)
     if unknown:
         raise ValueError(
-            f"null={sorted(unknown)}: not free; free are {', '.join(parameters.names)}"
+            f"null names {', '.join(sorted(unknown))}, which is not free; free are: "
+            f"{', '.join(parameters.names)}"
         )
     first = best = _fitted(model, frf, kinds, options)
     steps, needed = [], set()
@@ -99,7 +117,7 @@ def reduce_structure(
             break
         name, reason = worst
         trial = _without(best, frf, kinds, name, options)
-        step = _judged(best, trial, name, reason, rise)
+        step = _decide(best, trial, name, reason, rise)
         steps.append(step)
         needed.add(name)
         best = trial if step.dropped and trial is not None else best
@@ -154,11 +172,9 @@ def _without(
         return None
 
 
-def _judged(best: Fit, trial: Fit | None, name: str, reason: str, rise: float | None) -> Step:
+def _decide(best: Fit, trial: Fit | None, name: str, reason: str, rise: float | None) -> Step:
     if trial is None or not np.isfinite(trial.cost):
-        return Step(
-            name, reason, np.inf, np.inf, np.inf, np.inf, False, "kept: no response without"
-        )
+        return Step(name, reason, np.inf, np.inf, np.inf, np.inf, False, "kept: no fit without it")
     higher = trial.average_cost - best.average_cost
     change = trial.information - best.information
     dropped = change <= 0 if rise is None else higher <= rise

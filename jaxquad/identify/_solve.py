@@ -108,7 +108,7 @@ Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residu
 
 _MESSAGES = {
     RUNNING: "The maximum number of steps was reached",
-    STALLED: "Every shorter step fails too: the model is not finite nearby, or not smooth",
+    STALLED: "No shorter step lowers the cost: the model is not finite or not smooth nearby",
 }
 
 
@@ -163,11 +163,23 @@ def least_squares(
     tolerance: float = TOLERANCE,
     normal: Evaluate | None = None,
 ) -> Stop:
-    """The solver set-up of every fit; `None` is `DampedGaussNewton`, on the normal equations.
+    """Minimise a sum of squares as every fit does.
 
-    `z` should be relative or logarithmic, so that one unit means the same for all elements. Any
-    optimistix least-squares solver can take its place, with a tolerance of its own. `normal` is a
-    faster way to the normal equations of the same residuals, for the default solver.
+    **Arguments:**
+
+    - `residual`: a function of `z` and `args` that returns a vector.
+    - `z0`: where to start. `z` should be relative or logarithmic, so that one unit means the same
+        for all elements.
+    - `args`: passed on to `residual`.
+    - `solver`: any optimistix least-squares solver, with its own tolerance; `None` for damped
+        Gauss-Newton (Levenberg-Marquardt) on the normal equations.
+    - `max_steps`: of the solver.
+    - `tolerance`: of the default solver, for steps relative to 1 + |z|.
+    - `normal`: a faster way to the normal equations of the same residuals, for the default solver.
+
+    **Returns:**
+
+    `z` where the solver stopped, whether it converged, the reason and the number of steps.
     """
     # Imported late: optimistix doubles the time of `import jaxquad`.
     import optimistix as optx

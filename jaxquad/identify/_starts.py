@@ -1,4 +1,4 @@
-"""Local minima: many starting points, solved at once, and what each of them led to."""
+"""Local minima: many starting points, solved side by side, and where each of them ended."""
 
 from typing import NamedTuple
 
@@ -17,21 +17,21 @@ from ._solve import describe, least_squares, problem_normal, Solution, solution_
 
 
 MINIMUM = "minimum"
-FLAT = "flat: some change of parameters leaves the cost as it is"
+FLAT = "flat: some change of parameters does not change the cost"
 SADDLE = "stationary, but no minimum: the cost falls to one side"
-WALL = "a wall: no shorter step lowers the cost, yet its slope is not zero"
+WALL = "no minimum: no shorter step lowers the cost, yet its slope is not zero"
 UNFINISHED = "the maximum number of steps was reached"
-NOWHERE = "the model is not finite at the start"
+NOT_FINITE = "the model is not finite at the start"
 
 
 class Minimum(NamedTuple):
-    """A point at which solves from some of the starts stopped."""
+    """A point at which the fits from some of the starts ended."""
 
     cost: float  # sum of squares
     z: Float[np.ndarray, " parameters"]
     values: Float[np.ndarray, " parameters"]  # physical
     starts: tuple[int, ...]  # which of them led here
-    decrement: float  # what one more Gauss-Newton step would save of half the cost
+    decrement: float  # Newton decrement: half of what one more step would save of the cost
     curvature: float  # smallest eigenvalue of the cost's Hessian, scaled to unit diagonal
     kind: str  # "minimum", or what it is instead
 
@@ -51,10 +51,21 @@ def spread_starts(
 ) -> Float[np.ndarray, "starts parameters"]:
     """Starting vectors `z`: the given start, then a Latin hypercube around it.
 
-    Parameters that keep their sign spread over `factor` to both sides, evenly in the logarithm;
-    those that may cross zero over twice their scale. A delay stays below half a turn at the
-    `fastest` frequency (rad/s), beyond which its minima repeat every turn: it is a parameter whose
-    name ends in `delay`. Raises ValueError for no starts, or a factor that spreads nothing.
+    Parameters that keep their sign spread evenly in the logarithm, those that may cross zero over
+    twice their scale. A parameter whose name ends in `delay` stays below half a turn at the fastest
+    frequency, beyond which minima repeat with each turn.
+
+    **Arguments:**
+
+    - `parameters`: of `jq.identify.select_parameters`.
+    - `count`: how many starts.
+    - `fastest`: the highest frequency in rad/s.
+    - `factor`: how far to spread to both sides, above 1.
+    - `seed`: of the random numbers.
+
+    **Raises:**
+
+    - `ValueError`: no starts, or a factor that spreads nothing.
     """
     if count < 1:
         raise ValueError(f"starts is {count}: give 1 for the given start alone, or more")
@@ -83,11 +94,26 @@ def solve_from_many(
     solver: eqx.Module | None,
     max_steps: int,
 ) -> tuple[Solution, tuple[Minimum, ...]]:
-    """Solve from every start in one call; the best point, and all distinct ones, best first.
+    """Solve from every start in one call.
 
-    A minimum comes before a wall of lower cost only in the first result: the tuple is sorted by
-    cost. Starts of `solver=None` run side by side, those of an optimistix solver one by one, since
-    its LAPACK calls can hang under `vmap`. Raises ValueError if no start has a finite response.
+    Starts of the default solver run side by side, those of an optimistix solver one by one, since
+    its LAPACK calls can hang under `vmap`.
+
+    **Arguments:**
+
+    - `problem`: of `jq.identify.make_problem`.
+    - `starts`: vectors `z`, of `spread_starts`.
+    - `solver`: `None` for the default, or an optimistix least-squares solver.
+    - `max_steps`: of the solver.
+
+    **Returns:**
+
+    The best solution, a minimum before a lower point that is none; and all distinct points, sorted
+    by cost.
+
+    **Raises:**
+
+    - `ValueError`: no start has a finite response.
     """
     z, status, normal, steps, bent = _solve_all(problem, jnp.asarray(starts), solver, max_steps)
     host = jax.tree.map(np.asarray, (z, status, normal, bent))
@@ -133,7 +159,7 @@ def _distinct(
     normal: Normal,
     bent: Float[np.ndarray, "starts parameters parameters"],
 ) -> tuple[Minimum, ...]:
-    """Stops that no more than a millionth of the cost tells apart are one point."""
+    """The distinct stops: those within a millionth of the cost are one."""
     order = [int(k) for k in np.argsort(normal.cost) if np.isfinite(normal.cost[k])]
     groups: list[list[int]] = []
     for k in order:
@@ -148,16 +174,16 @@ def _distinct(
     if lost:
         first = z[lost[0]]
         values = np.asarray(parameters.values(jnp.asarray(first)))
-        points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOWHERE))
+        points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOT_FINITE))
     return tuple(points)
 
 
-def _same(apart: np.ndarray, normal: Normal, one: int, other: int) -> bool:
+def _same(difference: np.ndarray, normal: Normal, one: int, other: int) -> bool:
     floor = 1e-6 * (normal.cost[one] + 1e-6)
     if abs(normal.cost[other] - normal.cost[one]) > floor:
         return False
-    near = bool(np.max(np.abs(apart)) <= 1e-4)
-    return near or bool(0.5 * apart @ normal.hessian[one] @ apart <= floor)
+    near = bool(np.max(np.abs(difference)) <= 1e-4)
+    return near or bool(0.5 * difference @ normal.hessian[one] @ difference <= floor)
 
 
 def _point(parameters, z, status, normal, bent, group) -> Minimum:
@@ -191,19 +217,19 @@ def _kind(status: int, left: float, cost: float, curvature: float) -> str:
     return MINIMUM if curvature > 1e-9 else FLAT
 
 
-_ASIDE = 0.05  # longest step to the side, relative
+_ASIDE = 0.05  # longest relative step of the test for a saddle
 _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
 def remarks_on_minima(
     problem: Problem, solution: Solution, bread: Matrix, minima: tuple[Minimum, ...]
 ) -> list[str]:
-    """A saddle instead of a minimum, rivals of nearly the same cost, starts that got nowhere."""
+    """Remarks on a saddle instead of a minimum, and on other minima of nearly the same cost."""
     remarks = []
     if solution.converged and _falls_aside(problem, solution, bread):
         remarks.append(
-            "stationary, but no minimum: the cost falls to one side; start elsewhere, or give "
-            "starts=20"
+            "stationary, but no minimum: the cost falls to one side; start from other values, or "
+            "give starts=20"
         )
     found = [point for point in minima if point.is_minimum]
     rivals = [p for p in found[1:] if p.cost <= _NEAR * found[0].cost]
@@ -211,8 +237,8 @@ def remarks_on_minima(
         values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
         remarks.append(
             f"{len(rivals)} other minima cost less than {_NEAR:g} times the best; the next costs "
-            f"{rivals[0].cost:.4g} at {', '.join(problem.parameters.names)} = {values}: another "
-            "record or a wider band would tell them apart"
+            f"{rivals[0].cost:.4g} at {', '.join(problem.parameters.names)} = {values}: record "
+            "more, or over a wider band, to know which is right"
         )
     return remarks
 

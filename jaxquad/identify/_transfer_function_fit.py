@@ -40,7 +40,7 @@ _CHANCE = 15.0
 _BEYOND = 20.0  # times the highest frequency, from which a pole is a constant
 
 
-def idle_pair(
+def _cancelling_pair(
     pair: FrequencyResponse,
     samples: Samples,
     structure: Structure,
@@ -71,7 +71,7 @@ def idle_pair(
     return reason, f"fit {orders}"
 
 
-def far_pole(fit: Fit, highest: float) -> tuple[str, str] | None:
+def _pole_beyond_band(fit: Fit, highest: float) -> tuple[str, str] | None:
     """Reason and remedy for a fit that is not identifiable as a pole left the band (rad/s)."""
     poles = fit.model.poles
     if fit.identifiable or not poles.size or np.max(np.abs(poles)) < _BEYOND * highest:
@@ -80,7 +80,7 @@ def far_pole(fit: Fit, highest: float) -> tuple[str, str] | None:
     orders = f"zeros={min(len(fit.model.zeros), poles.size - 1)}, poles={poles.size - 1}"
     reason = (
         f"a pole at {far.real:.2g} rad/s is so far above the highest frequency, {highest:.3g} "
-        f"rad/s, that it cannot be told from a gain: {orders} are enough"
+        f"rad/s, that it acts as a gain: {orders} are enough"
     )
     return reason, f"fit {orders}"
 
@@ -157,14 +157,31 @@ def fit_transfer_function(
 
         (b_0 s^m + .. + b_m) exp(-delay s) / (s^integrators (s^k + a_1 s^(k-1) + .. + a_k))
 
-    with m = `zeros` and k + `integrators` = `poles`. No start is needed: see
-    `jq.identify.guess_transfer_function`. Coefficients may have any sign: poles and zeros are never forced
-    to one side. A free `delay` that runs to 0 is fixed there, with a remark. `jq.identify.factors` gives
-    gain, zeros and poles. Where fewer zeros and poles explain the response as well, the fit is
-    not identifiable, and says which orders to take.
+    with m = `zeros` and k + `integrators` = `poles`. No starting values are needed, see
+    `jq.identify.guess_transfer_function`. Coefficients may have any sign: poles and zeros may lie
+    on either side of the imaginary axis. The parameters of the result are `numerator[0]` ..,
+    `denominator[1]` .. and `delay`; `jq.identify.factors` gives gain, zeros and poles.
 
-    The result's parameters are `numerator[0]` .. , `denominator[1]` .. and `delay`. Options
-    and errors as in `jq.fit`. Source: Tischler & Remple, ch. 11, eq. 11.4.
+    **Arguments:**
+
+    - `frf`: a measured response.
+    - `zeros`, `poles`: the orders; `poles` counts the integrators.
+    - `delay`: in s, or "free". A free delay that runs to 0 is fixed there, with a remark.
+    - `integrators`: poles that stay at 0.
+    - `output`, `input`: the channels, by name or number.
+    - `cost`, `band`, `min_coherence`, `max_steps`: as in `jq.fit`.
+
+    **Returns:**
+
+    A `jq.identify.Fit`. Where fewer zeros and poles explain the response as well, its `verdict`
+    is "not identifiable", and says which orders to fit.
+
+    **Raises:**
+
+    - `ValueError`: orders that make no proper transfer function, and what `jq.fit` refuses.
+    - `PrecisionError`: JAX runs in 32 bits.
+
+    Source: Tischler & Remple, ch. 11, eq. 11.4.
     """
     require_x64("a fit")
     check_options(cost, band, min_coherence, max_steps)
@@ -179,10 +196,10 @@ def fit_transfer_function(
         pair, transfer_function(best, samples, structure), structure, samples, cost, band,
         min_coherence, max_steps,
     )  # fmt: skip
-    idle = idle_pair(pair, samples, structure, best, band, min_coherence)
+    idle = _cancelling_pair(pair, samples, structure, best, band, min_coherence)
     if idle is not None:
         return _refused(result, *idle)
-    far = far_pole(result, float(samples.omega[-1]) * samples.unit)
+    far = _pole_beyond_band(result, float(samples.omega[-1]) * samples.unit)
     return result if far is None else _with_reason(result, *far)
 
 

@@ -167,15 +167,25 @@ def guess_transfer_function(
     band: Band = None,
     min_coherence: float = 0.6,
 ) -> TransferFunction:
-    """A transfer function of given orders that is near a response, with no start of one's own.
+    """A transfer function of given orders near a measured response, without starting values.
 
-    Linear fits (Sanathanan-Koerner) over a range of delays, the best ones refined under
-    `cost`, and again with roots reflected or moved. Poles and zeros may lie on either side
-    of the imaginary axis. `poles` counts the `integrators`, which stay at 0. `delay` in s, or
-    "free". Options as in `jq.fit`; frequencies below `min_coherence` are left out.
+    Linear fits (Sanathanan-Koerner) over a range of delays; the best ones are refined under
+    `cost`, and again with roots reflected or moved.
 
-    Raises `UndeterminedError` where too few frequencies are left, `ValueError` for orders that
-    make no proper transfer function or that no start fits, `PrecisionError` in 32 bits.
+    **Arguments:**
+
+    - `frf`, `zeros`, `poles`, `delay`, `integrators`, `output`, `input`, `cost`, `band`,
+        `min_coherence`: as in `jq.fit_transfer_function`.
+
+    **Returns:**
+
+    A `jq.TransferFunction`.
+
+    **Raises:**
+
+    - `UndeterminedError`: fewer frequencies are usable than the orders need.
+    - `ValueError`: orders that make no proper transfer function, or that no start fits.
+    - `PrecisionError`: JAX runs in 32 bits.
     """
     require_x64("a transfer function")
     check_options(cost, band, min_coherence, 1)

@@ -23,7 +23,7 @@ from ._simulated import (
 
 
 class Agreement(eqx.Module):
-    """How well one output, or all of them together, agree with what was measured."""
+    """How well one output, or all of them together, agree with the measurement."""
 
     name: str = eqx.field(static=True)
     unit: str = eqx.field(static=True)
@@ -40,11 +40,12 @@ class Agreement(eqx.Module):
 
 
 class Verification(eqx.Module):
-    """A model's simulated outputs beside measured ones (CIFER's VERIFY).
+    """A model's simulated outputs beside the measured ones (CIFER's VERIFY).
 
     `rms`, `tic`, `fit_percent` and `variance_percent` are those of all outputs together under the
-    weights, `outputs` holds those of each. With one output, `measured` and `simulated` have no
-    axis of outputs. Guidelines: a Theil inequality coefficient below 0.25 is good agreement.
+    weights; `outputs` holds those of each. With one output, `measured` and `simulated` have one
+    axis. A Theil inequality coefficient (TIC) below 0.25 is good agreement.
+    Source: Tischler & Remple, sec. 14.2.
     """
 
     time: Float[np.ndarray, " samples"]  # s
@@ -122,7 +123,7 @@ def agreements(
     return agreement("", "", measured, simulated, weights), tuple(each)
 
 
-_SEEN = 3.0  # standard errors from which a starting transient is one
+_SIGNIFICANT = 3.0  # standard errors from which a starting transient is estimated
 
 
 def verify(
@@ -133,19 +134,34 @@ def verify(
     hold: str = "first",
     weights: Sequence[float] | None = None,
 ) -> Verification:
-    """Simulate the measured inputs open loop and compare, on a record that was not fitted.
+    """Simulate the measured inputs open loop and compare the outputs (CIFER's VERIFY).
 
-    `model` is a `TransferFunction`, a `StateSpace`, or has a method `transfer_function()` or
-    `state_space()`. Constant biases on the state derivatives, the initial state and a shift of each
-    output are estimated by least squares, for no record starts in perfect trim; fast starting
-    transients only where they stand out from the (coloured) rest. `band` (rad/s) restricts the
-    comparison: an integrating plant drifts on disturbances that no model predicts. `hold` says how
-    inputs run between their samples: "first" (straight), which suits an identified model, whose
-    delay contains the half sample for which an input is held; or "zero" (held), for one without.
-    `weights` multiply the squares of the outputs in the measures of all together; give them where
-    units differ, for by default they are 1.
-    Raises ValueError for a model of other channels, and for one that outgrows the record.
-    Source: Tischler & Remple, time-domain verification.
+    Give a record that was not fitted. Constant biases on the state derivatives, the initial state
+    and a shift of each output are estimated by least squares, as no record starts in perfect trim;
+    fast starting transients only where they stand out from the (coloured) residual.
+
+    **Arguments:**
+
+    - `model`: a `jq.TransferFunction`, a `jq.StateSpace`, or a model with `transfer_function()` or
+        `state_space()`.
+    - `record`: with the model's inputs and outputs.
+    - `band`: (low, high) in rad/s, to compare within: an integrating plant drifts on disturbances
+        that no model predicts.
+    - `hold`: "first" if inputs run straight between their samples, which suits an identified model
+        (its delay contains the half sample for which an input is held); "zero" if they are held.
+    - `weights`: of the squares of the outputs in the measures of all together; give them where
+        units differ. 1 by default.
+
+    **Returns:**
+
+    `jq.identify.Verification`.
+
+    **Raises:**
+
+    - `ValueError`: a model of other channels, or one that is too unstable to be simulated.
+    - `PrecisionError`: JAX runs in 32 bits.
+
+    Source: Tischler & Remple, sec. 14.2, time-domain verification.
     """
     require_x64("a verification")
     plant = linear_model(model)
@@ -187,7 +203,8 @@ def _weights(weights: Sequence[float] | None, record: Record) -> Float[np.ndarra
     shares = np.ones(count) if weights is None else np.asarray(weights, float)
     if shares.shape != (count,) or not np.all(np.isfinite(shares) & (shares > 0)):
         raise ValueError(
-            f"weights={weights}: give one positive number for each output, {record.output_names}"
+            f"weights={weights}: give one positive number for each output: "
+            f"{', '.join(record.output_names)}"
         )
     return shares
 
@@ -196,7 +213,7 @@ def _spread(record: Record, measured: np.ndarray) -> Float[np.ndarray, " outputs
     spread = np.std(measured, axis=0)
     for name, one in zip(record.output_names, spread, strict=True):
         if one == 0:
-            raise ValueError(f"output {name} does not move: nothing to compare with")
+            raise ValueError(f"output {name} is constant: leave it out with jq.records.select")
     return spread
 
 
@@ -236,8 +253,8 @@ def _stands_out(columns: np.ndarray, left: np.ndarray, found: np.ndarray, last: 
     covariance = projected_noise(ways, left, orthonormal(columns))
     tested = found[-last:] * np.where(np.isfinite(scale[-last:]), scale[-last:], 0.0)
     size = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
-    apart = np.linalg.pinv(covariance / np.outer(size, size)) @ (tested / size)
-    return float(tested / size @ apart) > last * _SEEN**2
+    scaled = np.linalg.pinv(covariance / np.outer(size, size)) @ (tested / size)
+    return float(tested / size @ scaled) > last * _SIGNIFICANT**2
 
 
 def _physical(

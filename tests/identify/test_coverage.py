@@ -11,6 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from coverage_study import draw, omega_of, studies  # noqa: E402  # pyright: ignore
 
 
+pytestmark = pytest.mark.slow
 STUDIES = studies()
 
 

@@ -34,6 +34,7 @@ def written(model, name, value):
     return jq.StateSpace(**(parts | {leaf: array}))
 
 
+@pytest.mark.slow
 def test_32_parameters_are_identified_from_54_pairs():
     rng = np.random.default_rng(0)
     # A chain of modes of their own, which all inputs push and all outputs see.
@@ -52,6 +53,7 @@ def test_32_parameters_are_identified_from_54_pairs():
     assert fit.chi_squared == pytest.approx(1, abs=0.15)
 
 
+@pytest.mark.slow
 def test_an_unstable_plant_with_zeros_on_the_diagonal_is_identified():
     # Hovering: speed, pitch rate, pitch angle; an unstable oscillation.
     truth = jq.StateSpace(
@@ -66,6 +68,7 @@ def test_an_unstable_plant_with_zeros_on_the_diagonal_is_identified():
     assert fit.identifiable and apart.max() < 4
 
 
+@pytest.mark.slow
 def test_the_units_of_the_states_change_no_estimate():
     F, G = np.array([[-1.0, 2.0], [-3.0, -0.5]]), np.array([[1.0], [4.0]])
     scale = np.diag([1e6, 1e-6])
@@ -79,6 +82,7 @@ def test_the_units_of_the_states_change_no_estimate():
     np.testing.assert_allclose(other.standard_errors / ratio, one.standard_errors, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_responses_that_span_six_decades_are_fitted():
     truth = jq.StateSpace(
         F=[[0.0, 1.0, 0.0], [0.0, -0.2, 5.0], [0.0, 0.0, -4.0]],

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from jaxquad._xla._common_subexpressions import once
+from jaxquad._xla import evaluate_once
 
 import jaxquad as jq
 from jaxquad.identify._fit_batch import solve_batch
@@ -112,5 +112,5 @@ def test_expensive_functions_evaluated_once_are_the_same_functions():
     def function(x, y):
         return jnp.exp(-y) / y, jnp.arctan2(x, 1 + x) + jnp.sqrt(x), y**-2, jnp.abs(y), x[:3] / 3
 
-    for got, expected in zip(jax.jit(once(function))(x, y), function(x, y), strict=True):
+    for got, expected in zip(jax.jit(evaluate_once(function))(x, y), function(x, y), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-14)

@@ -38,7 +38,7 @@ def test_a_start_at_zero_asks_for_a_sign(frf):
         free=("lag",),
     )
     refuse(
-        r"lag starts at 0: say its size",
+        r"lag starts at 0: give its typical size",
         frf,
         model=jq.LaggedIntegrator(1.0),
         free=(jq.identify.Real("lag"),),

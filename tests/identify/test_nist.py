@@ -126,7 +126,17 @@ def _check(values, slopes, misfits, certified, total):
 NEEDS_OTHER_STARTS = ("MGH17", 0)  # the first start leads every local method tried to b4 = infinity
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name != "Lanczos1"])
+QUICK = ("BoxBOD", "MGH10", "Thurber")  # one of two parameters, one that is hard, one of seven
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in MODELS
+        if name != "Lanczos1"
+    ],
+)
 def test_certified_to_six_digits_from_both_starts(data, name):
     starts, certified, total, y, x = _read(data / "nist_strd" / f"{name}.dat")
     found = _solve_all(name, starts, y, x)
@@ -136,6 +146,7 @@ def test_certified_to_six_digits_from_both_starts(data, name):
             assert converged
 
 
+@pytest.mark.slow
 def test_the_start_that_no_local_method_survives_is_reached_from_others_around_it(data):
     starts, certified, total, y, x = _read(data / "nist_strd" / "MGH17.dat")
     rng = np.random.default_rng(0)
@@ -147,6 +158,7 @@ def test_the_start_that_no_local_method_survives_is_reached_from_others_around_i
     _check(values[best, order], slopes[best][:, order], misfits[best], certified, total)
 
 
+@pytest.mark.slow
 def test_lanczos1_has_residuals_below_double_precision(data):
     """Its residuals are 1e-13 of values near 2.5: their sum of squares needs longer numbers."""
     starts, certified, total, y, x = _read(data / "nist_strd" / "Lanczos1.dat")

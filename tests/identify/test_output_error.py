@@ -74,6 +74,7 @@ def test_standard_errors_are_the_scatter_under_white_and_coloured_noise(pole):
     assert all(coloured) if pole else np.mean(coloured) < 0.1
 
 
+@pytest.mark.slow
 def test_time_and_frequency_domain_agree_within_their_errors():
     record = jq.Record(TIME, U, CLEAN + 0.05 * noise(2))
     frf = jq.frequency_response(record, np.geomspace(1.5, 15.0, 40))
@@ -94,7 +95,7 @@ def test_a_loop_that_may_be_closed_is_spoken_of():
     fit = refined(CLEAN + 0.05 * noise(3), references=U)
     assert any("output error is biased where feedback" in remark for remark in fit.remarks)
     assert fit.chi_squared == pytest.approx(1, abs=0.02)
-    assert any("makes the misfit beside it 1" in remark for remark in fit.remarks)
+    assert any("is 1 for any model" in remark for remark in fit.remarks)
 
 
 def test_an_exact_record_gives_exact_values():
@@ -128,6 +129,7 @@ def cubic(*values):
     return Cubic(*(jnp.asarray(float(value)) for value in values))
 
 
+@pytest.mark.slow
 def test_a_pendulum_with_cubic_damping_is_recovered_from_any_initial_state():
     truth, count = np.array([20.0, 0.5, 0.8, 10.0]), 400
     u = U[:count]
@@ -147,12 +149,13 @@ def test_a_pendulum_with_cubic_damping_is_recovered_from_any_initial_state():
     assert fit.identifiable and fit.newton_decrement < 1e-4
     np.testing.assert_array_less(np.abs(fit.values - truth), 3.5 * fit.standard_errors)
     np.testing.assert_array_less(fit.standard_errors / truth, 0.2)
-    with pytest.raises(ValueError, match="measures 1 outputs, the record has .'y1'"):
+    with pytest.raises(ValueError, match="measures 1 outputs, the record has y1"):
         refine(cubic(*truth), jq.Record(TIME[:count], u, np.stack([y, u], axis=1)))
     with pytest.raises(ValueError, match="cannot be integrated"):
         refine(cubic(20.0, 0.5, -5.0, 10.0), record)  # the rate runs away in finite time
 
 
+@pytest.mark.slow
 def test_a_linear_plant_integrates_to_its_exact_discretisation():
     @jax.jit
     def both(values):
@@ -186,6 +189,7 @@ class Oscillator(eqx.Module):
         return state[0]
 
 
+@pytest.mark.slow
 def test_twelve_parameters_of_two_inputs_and_three_outputs_are_recovered():
     F = np.array([[-1.0, 2.0, 0.3], [-4.0, -1.5, 0.8], [0.2, -0.6, -0.7]])
     G = np.array([[1.0, 0.0], [0.5, 2.0], [0.0, 1.5]])
@@ -209,6 +213,7 @@ def test_twelve_parameters_of_two_inputs_and_three_outputs_are_recovered():
     np.testing.assert_allclose(check.shift, [1.0, -2.0, 0.5], atol=0.2)
 
 
+@pytest.mark.slow
 def test_what_two_records_cannot_tell_apart_is_said_and_resolved_by_a_prior():
     """Within a band that leaves the drift of the integrators out."""
     truth = jq.models.AttitudeAxis(L=0.2, K_t=0.12, J_x=0.05, lag=0.05)
@@ -219,7 +224,7 @@ def test_what_two_records_cannot_tell_apart_is_said_and_resolved_by_a_prior():
     known = jq.identify.Prior("K_t", 0.12, 0.003)
     options = {"free": ("J_x", "K_t"), "hold": "zero", "band": (1.0, 40.0)}
     fit = refine(start, records, **options, priors=[known])
-    [told] = [remark for remark in fit.remarks if "told apart" in remark]
+    [told] = [remark for remark in fit.remarks if "by the prior alone" in remark]
     assert "by the prior alone; the record by itself determines only L K_t / J_x" in told
     assert fit.identifiable
     np.testing.assert_array_less(np.abs(fit.values - [0.05, 0.12]), 3 * fit.standard_errors)
@@ -231,13 +236,13 @@ def test_what_two_records_cannot_tell_apart_is_said_and_resolved_by_a_prior():
 
 def test_what_cannot_be_refined_is_refused():
     record = jq.Record(TIME, U, CLEAN)
-    with pytest.raises(ValueError, match="overflows within 19.98 s"):
+    with pytest.raises(ValueError, match="unstable .*within 19.98 s"):
         refine(jq.TransferFunction([1.0], [1.0, -9.0]), record, free="numerator[0]")
     with pytest.raises(ValueError, match="needs a jq.Record or a list of them, not nothing"):
         refine(START, [])
-    with pytest.raises(ValueError, match="hold is .cubic.: inputs run straight"):
+    with pytest.raises(ValueError, match="hold is .cubic.: give .first."):
         refine(START, record, hold="cubic")
-    with pytest.raises(ValueError, match="one input with one output"):
+    with pytest.raises(ValueError, match="one input and one output"):
         refine(START, jq.Record(TIME, U, np.stack([CLEAN, U], axis=1)))
     with pytest.raises(ValueError, match="Nyquist frequency 157.1"):
         refine(START, record, band=(1.0, 200.0))

@@ -56,11 +56,16 @@ def problem(**options):
 @pytest.mark.parametrize(
     "options",
     [
-        {},
-        {"priors": [jq.identify.Prior("G[1][0]", 3.5, 0.2)]},
-        {"tied": {"F[2][1]": lambda m: -m.F[1, 1] / 2}},
+        pytest.param({}, id="every kind of entry"),
+        pytest.param(
+            {"priors": [jq.identify.Prior("G[1][0]", 3.5, 0.2)]},
+            id="a prior",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"tied": {"F[2][1]": lambda m: -m.F[1, 1] / 2}}, id="a tie", marks=pytest.mark.slow
+        ),
     ],
-    ids=["every kind of entry", "a prior", "a tie"],
 )
 def test_normal_equations_are_those_of_the_differentiated_residuals(options):
     made = problem(**options)

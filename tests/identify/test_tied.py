@@ -35,6 +35,7 @@ def test_a_tied_number_follows_the_free_one():
     assert fit.model.gains[1] == -fit.model.gains[0]
 
 
+@pytest.mark.slow
 def test_a_tie_sharpens_what_both_outputs_determine():
     frf = response_of(TRUTH, seed=0)
     tied = jq.fit(START, frf, free=FREE, tied=TIED, cost=ML)
@@ -73,6 +74,7 @@ def test_each_pair_has_a_band_of_its_own():
     np.testing.assert_allclose(fit.values, [3.0, 0.2, 0.05], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_pair_can_be_left_out():
     frf = response_of(TRUTH)
     fit = jq.fit(START, frf, free=FREE[:2], tied=TIED, cost=ML, band={("y1", "u0"): None})

@@ -248,6 +248,7 @@ def test_a_delay_that_runs_to_zero_is_fixed_there_and_so_are_integrators():
         factors(jq.fit(jq.LaggedIntegrator(20.0, 0.1, 0.01), frf))
 
 
+@pytest.mark.slow
 def test_the_cessna_agrees_with_cifer(data):
     path = ROOT / "fits" / "cessna_navfit.py"
     spec = importlib.util.spec_from_file_location("cessna_navfit", path)

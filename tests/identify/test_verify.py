@@ -92,13 +92,14 @@ def test_models_and_bands_that_cannot_be_verified_are_refused():
         jq.verify(object(), record)
     with pytest.raises(ValueError, match="Nyquist frequency 314.2"):
         jq.verify(MODEL, record, band=(1.0, 400.0))
-    with pytest.raises(ValueError, match="overflows within 14.99 s"):
+    with pytest.raises(ValueError, match="unstable .*within 14.99 s"):
         jq.verify(jq.TransferFunction([1.0], [1.0, -60.0]), record)
     two = jq.Record(TIME, np.stack([u, u + 1], axis=1), y)
-    with pytest.raises(ValueError, match="one input with one output"):
+    with pytest.raises(ValueError, match="one input and one output"):
         jq.verify(MODEL, two)
 
 
+@pytest.mark.slow
 def test_the_antx_model_verifies_on_the_other_flight(data):
     """Fitted on the PRBS flight, verified on the sweep flight, between 0.7 and 12 Hz."""
     band = (2 * np.pi * 0.7, 2 * np.pi * 12)

@@ -26,14 +26,14 @@ def fit(integrators):
 
 def test_leakage_of_an_integrator_is_remarked_with_its_remedy():
     error, leaking = fit(integrators=0)
-    (remark,) = [remark for remark in leaking.remarks if "leaks through the window" in remark]
+    (remark,) = [remark for remark in leaking.remarks if "leakage biases it" in remark]
     assert "falls as 1/s^1" in remark and "jq.spectra.Welch(integrators=1)" in remark
     assert error > 0.05
 
 
 def test_without_leakage_the_error_bars_are_ten_times_smaller_and_hold():
     leaking, clean = fit(integrators=0)[1], fit(integrators=1)[1]
-    assert not any("leaks" in remark for remark in clean.remarks)
+    assert not any("leakage" in remark for remark in clean.remarks)
     assert clean.standard_errors[0] < 0.1 * leaking.standard_errors[0]
     # The held input is half a sample of 10 ms late.
     for fitted in (leaking, clean):
