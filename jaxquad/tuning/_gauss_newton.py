@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad.simulation import scan_loop
+from jaxquad.simulation import SampleResult, scan_loop
 
 from ._cost import SMOOTHING
 from ._objective import (
@@ -135,17 +135,22 @@ def _with_columns(primals: PyTree, tangents: PyTree) -> PyTree:
     return run(z), jax.tree.map(lambda c: jnp.tensordot(tangents[0], c, 1), columns)
 
 
+class _Errors(eqx.Module):
+    """Stores the error of every sample, rad."""
+
+    def begin(self, like: Array) -> None:
+        return None
+
+    def update(self, total: None, now: SampleResult) -> tuple[None, Array]:
+        return total, now.reference - now.angle
+
+
 def _errors(z: Float[Array, " n"], given: _Given) -> Float[Array, "points axes members"]:
     """sqrt(t) error every few samples, t from the last event."""
     problem, stride = given.problem, given.stride
-    keep = lambda nothing, now: (nothing, now.reference - now.angle)
     loop = problem.loop_around(given.coordinates.controller_at(z))
-    stored = scan_loop(loop, problem.flight, keep, lambda like: None)[1]
-    span, dt = problem.span, loop.dt
-    index = np.arange(span.first, span.last + 1, stride)
-    since = np.min(
-        [np.where(index >= s, index - s, np.inf)
-         for s in [span.first, *(round(t / dt) for t in problem.events)]], axis=0,
-    )  # fmt: skip
-    weight = np.sqrt(since * dt * dt * stride)
+    stored = scan_loop(loop, problem.flight, _Errors())[1]
+    index = np.arange(problem.window.first, problem.window.last + 1, stride)
+    since = np.min([np.where(index >= a, index - a, np.inf) for a, _ in problem.parts], axis=0)
+    weight = np.sqrt(since * loop.dt * loop.dt * stride)
     return stored[index] * weight[:, None, None]

@@ -7,8 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxquad._core import per_member
 from jaxquad.control import LinearController
 from jaxquad.loops import analyse, Loop, LoopAnalysis
 from jaxquad.models import DecoupledAxes
@@ -34,17 +35,13 @@ class _Laws(eqx.Module):
     """The linear controllers of many loops, on a leading axis."""
 
     laws: LinearController
-    count: int = eqx.field(static=True)
+    index: Int[Array, " loops"] = per_member(0)
 
     @property
     def dt(self) -> float:
         return self.laws.dt
 
-    @property
-    def ensemble(self) -> tuple[int, ...]:
-        return (self.count,)
-
-    def linear(self, axis: int, member: Any) -> LinearController:
+    def linear(self, axis: int, member: tuple[Int[Array, ""]]) -> LinearController:
         return jax.tree.map(lambda x: x[member[0]], self.laws)
 
 
@@ -54,7 +51,7 @@ def loop_numbers(
 ) -> LoopNumbers:  # fmt: skip
     """`jq.analyse` of each axis and member; stability by the eigenvalues themselves."""
     members = delay.shape[0]
-    flat = _Laws(_linear(controller, axes, members), axes * members)
+    flat = _Laws(_linear(controller, axes, members), jnp.arange(axes * members))
     late = jnp.asarray(np.tile(np.asarray(delay), axes))
     loop = Loop(_flat(plant, axes, members), flat, delay=late, longest_delay=longest)
     found = analyse(loop, 0)

@@ -137,7 +137,7 @@ def _block(controller: PyTree, name: str, places: list[Place]) -> Block | None:
     transform = find_transform(controller, name)
     if transform is None:
         return None
-    mine = tuple(place for place in places if place.name.startswith(f"{name}["))
+    mine = tuple(p for p in places if p.name == name or p.name.startswith(f"{name}["))
     leaves = jax.tree.leaves(eqx.filter(controller, eqx.is_inexact_array))
     values = np.asarray(leaves[mine[0].leaf])
     start = np.asarray(transform.inverse(values))

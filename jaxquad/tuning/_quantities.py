@@ -50,7 +50,7 @@ class Quantity(NamedTuple):
 
 
 # To add one: an entry here, and a number of that name from what computes it, which is
-# `jaxquad.simulation.FlightCosts` for a flight, `jaxquad.loops.LoopNumbers` for a linear loop.
+# `jaxquad.simulation.FlightMetrics` for a flight, `jaxquad.loops.LoopNumbers` for a linear loop.
 QUANTITIES = {
     "itae": Quantity("ITAE", "deg s^2", _DEGREE, si_unit="rad s^2", summed=True),
     "iae": Quantity("IAE", "deg s", _DEGREE, si_unit="rad s", summed=True),

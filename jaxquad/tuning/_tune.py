@@ -8,7 +8,7 @@ from jaxtyping import Array, Key, PyTree
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
 from jaxquad.loops import Loop
-from jaxquad.simulation import Scenario
+from jaxquad.simulation import find_steps, Scenario
 
 from ._certificate import Certificate, lag_remark
 from ._certify import certify, require_same_rate
@@ -18,7 +18,7 @@ from ._lbfgs import LBFGS
 from ._objective import Limit, Objective
 from ._parameters import build_design, select_coordinates
 from ._phases import Solution, solve
-from ._problem import DeviceChoice, find_steps, make_problem, Problem, TimeSpan
+from ._problem import DeviceChoice, make_problem, Problem, TimeSpan
 from ._progress import Listener, Progress
 from ._quantities import QUANTITIES
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
@@ -283,7 +283,8 @@ def require_steps(problem: Problem, wanted: frozenset[str]) -> None:
     """Raise ValueError for an overshoot where there is no step."""
     if "overshoot" not in wanted:
         return
-    if not np.any(np.asarray(find_steps(problem.flight.reference, problem.parts).known)):
+    steps = find_steps(problem.flight.reference, problem.parts)
+    if not np.any(np.asarray(steps.known & (steps.target != steps.before))):
         raise ValueError(
             "overshoot is wanted, but the reference makes no step from event to event: give a "
             "scenario with one, and its times as Objective(events=...)"
