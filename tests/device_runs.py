@@ -15,9 +15,17 @@ from jaxquad._xla._devices import devices_for, where_put
 from jaxquad.control import LADRC, PD
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
-from jaxquad.simulation import evaluate, Pulse, Saturation, scenario, simulate, Step, WhiteNoise
+from jaxquad.simulation import (
+    evaluate,
+    Pulse,
+    Saturation,
+    scenario,
+    simulate,
+    Step,
+    WhiteNoise,
+    Window,
+)
 from jaxquad.simulation._evaluate import _run
-from jaxquad.simulation._meter import Window
 from jaxquad.simulation._over_devices import over_devices
 
 

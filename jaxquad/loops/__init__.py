@@ -1,3 +1,5 @@
+from jaxquad._core import per_member as per_member
+
 from ._analysis import (
     analyse as analyse,
     loop_qualities as loop_qualities,
@@ -11,6 +13,7 @@ from ._loop import Loop as Loop
 from ._protocols import (
     after_drive as after_drive,
     CarriesPayload as CarriesPayload,
+    ChecksState as ChecksState,
     Controller as Controller,
     Drive as Drive,
     Plant as Plant,

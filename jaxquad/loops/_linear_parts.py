@@ -6,15 +6,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxquad.control import LinearController
+from jaxquad._core import ensemble_shape
+from jaxquad.control import LinearController, LinearisableController
 from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.records import AXES
 
 from ._loop import Loop
-from ._protocols import HasLinear
 from ._sampled_axis import AxisParameters, parameters_of, sampled, SampledAxis
 
 
@@ -51,7 +50,7 @@ class LinearParts(eqx.Module):
     def _linear(self, place: Any) -> LinearController:
         if isinstance(self.controller, LinearController):
             return self.controller
-        own = len(getattr(self.controller, "ensemble", ()))
+        own = len(ensemble_shape(self.controller))
         return self.controller.linear(self.index, place[:own] if own else None)
 
 
@@ -62,8 +61,7 @@ def linear_parts(loop: Loop, axis: int | str, member: int | tuple[int, ...] | No
     _require_parts(plant, controller)
     axis = _index_of(axis, plant)
     memory = loop.memory
-    shapes = (plant.shape[1:], getattr(controller, "ensemble", ()), loop.delay.shape)
-    ensemble = _common(shapes)
+    ensemble = ensemble_shape(plant, controller, loop)
     if member is not None:
         member = member if isinstance(member, tuple) else (member,)
         _require_member(member, ensemble)
@@ -88,21 +86,11 @@ def _require_parts(plant: Any, controller: Any) -> None:
         raise ValueError(
             f"the plant is a {type(plant).__name__}: give jq.DecoupledAxes or a jq.models.Multirotor."
         )
-    if not isinstance(controller, LinearController | HasLinear):
+    if not isinstance(controller, LinearController | LinearisableController):
         raise ValueError(
             f"{type(controller).__name__} has no method linear(axis, member) that returns a "
             "jq.control.LinearController: give it one, or pass the LinearController itself."
         )
-
-
-def _common(shapes: tuple[tuple[int, ...], ...]) -> tuple[int, ...]:
-    longest = max(len(shape) for shape in shapes)
-    try:
-        return np.broadcast_shapes(*(shape + (1,) * (longest - len(shape)) for shape in shapes))
-    except ValueError:
-        raise ValueError(
-            f"plant, controller and delay are for the ensembles {shapes}, which do not match."
-        ) from None
 
 
 def _require_member(member: tuple[int, ...], ensemble: tuple[int, ...]) -> None:

@@ -7,10 +7,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad.control import LinearController
+from jaxquad._core import per_member
+from jaxquad.control import LinearController, LinearisableController
 from jaxquad.models import Multirotor
 
-from ._protocols import Controller, Drive, HasLinear, Plant, sample_interval, Sensor
+from ._protocols import Controller, Drive, Plant, sample_interval, Sensor
 
 
 _DEFAULT_DT = 0.002  # s
@@ -53,10 +54,10 @@ class Loop(eqx.Module):
     """
 
     plant: Any  # Plant; or one with `linearise` alone, to analyse
-    controller: Controller | HasLinear | LinearController
+    controller: Controller | LinearisableController | LinearController
     drive: Drive | None
     encoder: Sensor | None
-    delay: Float[Array, "..."]  # s
+    delay: Float[Array, "*ensemble"] = per_member(0)  # s
     dt: float = eqx.field(static=True)  # s
     substeps: int = eqx.field(static=True)
     bound: float = eqx.field(static=True)  # rad
@@ -66,7 +67,7 @@ class Loop(eqx.Module):
     def __init__(
         self,
         plant: Plant,
-        controller: Controller | HasLinear | LinearController,
+        controller: Controller | LinearisableController | LinearController,
         *,
         drive: Drive | None = None,
         encoder: Sensor | None = None,
@@ -107,7 +108,9 @@ class Loop(eqx.Module):
             return math.floor(longest / self.dt + 1e-9) + 1 if longest > 0 else 0
         return length + (0 < length and not splits)
 
-    def with_controller(self, controller: Controller | HasLinear | LinearController) -> "Loop":
+    def with_controller(
+        self, controller: Controller | LinearisableController | LinearController
+    ) -> "Loop":
         """The same loop with another controller. Raises ValueError for one of another `dt`."""
         loop = eqx.tree_at(lambda x: x.controller, self, controller)
         loop.__check_init__()

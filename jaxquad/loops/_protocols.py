@@ -2,9 +2,7 @@
 
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Array, Float, PyTree
-
-from jaxquad.control import LinearController
+from jaxtyping import Array, Bool, Float, PyTree
 
 
 Vector = Float[Array, " axes *ensemble"]
@@ -59,13 +57,6 @@ class Sensor(Protocol):
 
 
 @runtime_checkable
-class HasLinear(Protocol):
-    """A controller that can be analysed."""
-
-    def linear(self, axis: int, member: Any) -> LinearController: ...
-
-
-@runtime_checkable
 class _HasSampleInterval(Protocol):
     dt: float
 
@@ -90,6 +81,13 @@ class CarriesPayload(Protocol):
     """A plant that can carry a scenario's payload."""
 
     def with_added_inertia(self, inertia: Any) -> Plant: ...
+
+
+@runtime_checkable
+class ChecksState(Protocol):
+    """A plant that knows a state which integration has spoilt, such as a short quaternion."""
+
+    def is_resolved(self, state: Any) -> Bool[Array, "*ensemble"]: ...
 
 
 def sample_interval(controller: object) -> float | None:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import align, as_float, require_positive
+from jaxquad._core import align, as_float, per_member, require_positive
 
 
 class _Frame(NamedTuple):
@@ -37,9 +37,11 @@ class Allocation(eqx.Module):
     positive.
     """
 
-    arm: Float[Array, "..."] = eqx.field(converter=as_float)  # L, m
-    thrust_coefficient: Float[Array, "..."] = eqx.field(converter=as_float)  # K_t, N/V or N s^2
-    torque_coefficient: Float[Array, "..."] = eqx.field(converter=as_float)  # K_l, N m/V or N m s^2
+    arm: Float[Array, "..."] = per_member(0, converter=as_float)  # L, m
+    thrust_coefficient: Float[Array, "..."] = per_member(0, converter=as_float)  # K_t, N/V or N s^2
+    torque_coefficient: Float[Array, "..."] = per_member(
+        0, converter=as_float
+    )  # K_l, N m/V or N m s^2
     convention: str = eqx.field(static=True, default="frd-frbl")
     input: str = eqx.field(static=True, default="voltage")
 

@@ -6,6 +6,7 @@ from jaxquad._core import (
     align,
     as_float,
     as_float_or_none,
+    per_member,
     require_finite,
     require_nonnegative,
     require_positive,
@@ -34,12 +35,16 @@ class Attitude(eqx.Module):
     leaves it out. Raises ValueError for an inertia that is not positive.
     """
 
-    inertia: Float[Array, "3 ..."] = eqx.field(converter=as_float)  # kg m^2
-    damping: Float[Array, "3 ..."] = eqx.field(converter=as_float, default=(0.0,) * 3)  # N m s/rad
-    rotor_inertia: Float[Array, "..."] = eqx.field(converter=as_float, default=0.0)  # kg m^2
-    stiffness: Float[Array, "3 ..."] | None = eqx.field(converter=as_float_or_none, default=None)
-    coulomb: Float[Array, "3 ..."] | None = eqx.field(
-        converter=as_float_or_none, default=None
+    inertia: Float[Array, "3 ..."] = per_member(1, converter=as_float)  # kg m^2
+    damping: Float[Array, "3 ..."] = per_member(
+        1, converter=as_float, default=(0.0,) * 3
+    )  # N m s/rad
+    rotor_inertia: Float[Array, "..."] = per_member(0, converter=as_float, default=0.0)  # kg m^2
+    stiffness: Float[Array, "3 ..."] | None = per_member(
+        1, converter=as_float_or_none, default=None
+    )
+    coulomb: Float[Array, "3 ..."] | None = per_member(
+        1, converter=as_float_or_none, default=None
     )  # N m
 
     def __check_init__(self):

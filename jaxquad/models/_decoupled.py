@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._core import align, as_float, require_finite, require_nonnegative, require_positive
+from jaxquad._core import (
+    align,
+    as_float,
+    per_member,
+    require_finite,
+    require_nonnegative,
+    require_positive,
+)
 
 from ._attitude import friction
 
@@ -38,13 +45,15 @@ class DecoupledAxes(eqx.Module):
     or lag that is not positive, for friction that is not finite, and for shapes that do not match.
     """
 
-    torque_gain: Float[Array, "axes ..."] = eqx.field(converter=_per_axis)  # N m per unit of u
-    inertia: Float[Array, "axes ..."] = eqx.field(converter=_per_axis)  # kg m^2
-    lag: Float[Array, "axes ..."] | None = eqx.field(converter=_per_axis_or_none, default=None)  # s
-    damping: Float[Array, "axes ..."] = eqx.field(converter=_per_axis, default=0.0)  # N m s/rad
-    stiffness: Float[Array, "axes ..."] = eqx.field(converter=_per_axis, default=0.0)  # N m/rad
-    coulomb: Float[Array, "axes ..."] | None = eqx.field(
-        converter=_per_axis_or_none, default=None
+    torque_gain: Float[Array, "axes ..."] = per_member(1, converter=_per_axis)  # N m per unit of u
+    inertia: Float[Array, "axes ..."] = per_member(1, converter=_per_axis)  # kg m^2
+    lag: Float[Array, "axes ..."] | None = per_member(
+        1, converter=_per_axis_or_none, default=None
+    )  # s
+    damping: Float[Array, "axes ..."] = per_member(1, converter=_per_axis, default=0.0)  # N m s/rad
+    stiffness: Float[Array, "axes ..."] = per_member(1, converter=_per_axis, default=0.0)  # N m/rad
+    coulomb: Float[Array, "axes ..."] | None = per_member(
+        1, converter=_per_axis_or_none, default=None
     )  # N m
 
     def __check_init__(self):

@@ -2,9 +2,17 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jaxquad._core import align, as_float, is_concrete, is_zero, require_positive
+from jaxquad._core import (
+    align,
+    as_float,
+    ensemble_shape,
+    is_concrete,
+    is_zero,
+    per_member,
+    require_positive,
+)
 
 from ._allocation import Allocation
 from ._attitude import Attitude
@@ -18,7 +26,7 @@ class MotorLag(eqx.Module):
     Raises ValueError for a time constant that is not positive: a motor without lag has no state.
     """
 
-    time_constant: Float[Array, "..."] = eqx.field(converter=as_float)  # s
+    time_constant: Float[Array, "*ensemble"] = per_member(0, converter=as_float)  # s
 
     def __check_init__(self):
         remedy = "to model a motor without lag, leave the lag out (motor=None, lag=None)"
@@ -71,14 +79,12 @@ class Multirotor(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of the parameters, () for one vehicle."""
-        attitude, allocation = self.attitude, self.allocation
-        vectors = [attitude.inertia, attitude.damping]
-        scalars = [attitude.rotor_inertia, allocation.arm]
-        scalars += [allocation.thrust_coefficient, allocation.torque_coefficient]
-        vectors += [x for x in (attitude.stiffness, attitude.coulomb) if x is not None]
-        if self.motor is not None:
-            scalars.append(self.motor.time_constant)
-        return jnp.broadcast_shapes(*(v.shape[1:] for v in vectors), *(s.shape for s in scalars))
+        return ensemble_shape(self)
+
+    @property
+    def torque_gain(self) -> Float[Array, " 3 *ensemble"]:
+        """N m per unit of the command of an axis, see `Allocation.torque_per_difference`."""
+        return self.allocation.torque_per_difference
 
     def init(
         self, euler: ArrayLike | Sequence | None = None, *, ensemble: tuple[int, ...] = ()
@@ -116,6 +122,15 @@ class Multirotor(eqx.Module):
         """Euler angles in rad: what the encoders of a rig, or an attitude filter, report."""
         length = jnp.linalg.norm(state.quaternion, axis=0, keepdims=True)
         return euler_from_quaternion(state.quaternion / length)
+
+    def is_resolved(self, state: MultirotorState) -> Bool[Array, "*ensemble"]:
+        """Whether the quaternion still has about unit length.
+
+        It loses it where a vehicle turns through more than about a radian in an integration step.
+        """
+        w, x, y, z = state.quaternion
+        square = w * w + x * x + y * y + z * z
+        return (square > 0.25) & (square < 4)
 
     def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "Multirotor":
         """The same vehicle carrying a known extra `inertia` in kg m^2, such as a payload."""

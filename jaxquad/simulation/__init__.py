@@ -4,8 +4,7 @@ from ._authority import (
     AuthorityWarning as AuthorityWarning,
     find_authority as find_authority,
 )
-from ._check_run import check_run as check_run
-from ._compose import scenario as scenario
+from ._blocks import run_ensemble as run_ensemble
 from ._disturbances import (
     ceti_gust as ceti_gust,
     gauss_markov as gauss_markov,
@@ -13,16 +12,15 @@ from ._disturbances import (
     Pulse as Pulse,
     WhiteNoise as WhiteNoise,
 )
+from ._drives import MotorDrive as MotorDrive, Saturation as Saturation
 from ._evaluate import evaluate as evaluate, metrics as metrics
-from ._excite import excite as excite
-from ._hardware import Encoder as Encoder, MotorDrive as MotorDrive, Saturation as Saturation
-from ._meter import (
-    divisor as divisor,
-    makes_step as makes_step,
-    wide as wide,
+from ._flight_metrics import (
+    find_steps as find_steps,
+    FlightMetrics as FlightMetrics,
     Window as Window,
     window as window,
 )
+from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
 from ._over_devices import loop_over_devices as loop_over_devices, over_devices as over_devices
 from ._references import (
@@ -32,9 +30,9 @@ from ._references import (
     SmoothStep as SmoothStep,
     Step as Step,
 )
-from ._run import run_ensemble as run_ensemble, scan_loop as scan_loop
-from ._sample import runge_kutta as runge_kutta
-from ._scenario import Scenario as Scenario
+from ._run import check_run as check_run, scan_loop as scan_loop
+from ._scenario import excite as excite, Scenario as Scenario, scenario as scenario
+from ._sensors import Encoder as Encoder
 from ._signal import Clock as Clock, Motion as Motion, Signal as Signal
 from ._simulate import simulate as simulate, Simulation as Simulation
-from ._slices import in_slices as in_slices
+from ._step import runge_kutta as runge_kutta, SampleResult as SampleResult

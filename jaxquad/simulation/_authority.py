@@ -1,12 +1,13 @@
 import warnings
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._core import align, as_float, is_concrete
+from jaxquad._core import align, as_float, ensemble_shape, is_concrete, per_member
+from jaxquad.loops import Drive, Plant
 
 from ._metrics_text import axis_names
 from ._scenario import Scenario
@@ -22,10 +23,16 @@ class AuthorityWarning(UserWarning):
 class Authority(eqx.Module):
     """The torque that a drive can hold against a disturbance, one axis at a time."""
 
-    torque_gain: Float[Array, " axes *ensemble"]  # N m per unit of command
-    command: Float[Array, "axes ..."]  # greatest command, of the drive and the controller; or inf
-    torque: Float[Array, "axes ..."]  # N m, at the limit of the command; inf without one
-    forward: Float[Array, "axes ..."]  # N m, until a motor turns backwards; inf if none can
+    torque_gain: Float[Array, " axes *ensemble"] = per_member(1)  # N m per unit of command
+    command: Float[Array, "axes ..."] = per_member(
+        1
+    )  # greatest command, of the drive and the controller; or inf
+    torque: Float[Array, "axes ..."] = per_member(
+        1
+    )  # N m, at the limit of the command; inf without one
+    forward: Float[Array, "axes ..."] = per_member(
+        1
+    )  # N m, until a motor turns backwards; inf if none can
 
     def __str__(self) -> str:
         rows = []
@@ -37,32 +44,64 @@ class Authority(eqx.Module):
         return "\n".join(["torque authority", *rows])
 
 
-def authority(plant: Any, drive: Any = None, controller: Any = None) -> Authority:
+@runtime_checkable
+class HasTorqueGain(Protocol):
+    """A plant that knows its torque in N m per unit of command, [axes, *ensemble]."""
+
+    @property
+    def torque_gain(self) -> Float[Array, " axes *ensemble"]: ...
+
+
+@runtime_checkable
+class HasLimit(Protocol):
+    """A drive or controller that bounds the command, [axes, *ensemble]."""
+
+    @property
+    def limit(self) -> Float[ArrayLike, "..."]: ...
+
+
+@runtime_checkable
+class HasForwardLimit(Protocol):
+    """A drive whose motors have a direction."""
+
+    def forward_limit(self, axes: int) -> Float[Array, " axes *ensemble"]: ...
+
+
+def authority(
+    plant: Plant, drive: Drive | None = None, controller: object | None = None
+) -> Authority:
     """The torque in N m that `drive` gives on each axis of `plant` alone.
 
-    Limited by the drive's saturation and by the `limit` of a controller that has one. With motors
-    about a bias, such as `jq.simulation.MotorDrive`, `forward` is the torque at which the first of them would
-    have to turn backwards: 0.0936 N m in roll on the Quanser Hover at its bias of 2 V.
-    Raises ValueError for a plant whose torque per unit of command is not known.
+    **Arguments:**
+
+    - `plant`: with a `torque_gain` in N m per unit of command, as `jq.DecoupledAxes` has.
+    - `drive`: its saturation limits the command. With motors about a bias, such as
+        `jq.simulation.MotorDrive`, `forward` is the torque at which the first of them would have to
+        turn backwards: 0.0936 N m in roll on the Quanser Hover at its bias of 2 V.
+    - `controller`: its `limit` counts, if it has one.
+
+    **Raises:** ValueError for a plant whose torque per unit of command is not known.
     """
     found = eqx.filter_jit(find_authority)(plant, drive, controller)
     if found is None:
         raise ValueError(
-            f"a {type(plant).__name__} does not tell its torque per unit of command: give it a "
-            "torque_gain [axes] in N m per unit, as jq.DecoupledAxes has"
+            f"a {type(plant).__name__} has no torque_gain [axes] in N m per unit of command: add "
+            "one, as jq.DecoupledAxes has"
         )
     return found
 
 
-def find_authority(plant: Any, drive: Any, controller: Any) -> Authority | None:
+def find_authority(
+    plant: Plant, drive: Drive | None, controller: object | None
+) -> Authority | None:
     """`authority`, or None for a plant whose torque per unit of command is not known."""
-    gain = _torque_gain(plant)
-    if gain is None:
+    if not isinstance(plant, HasTorqueGain):
         return None
-    own = _controller_limit(controller)
-    axes = max(len(x) for x in (gain, own, jnp.atleast_1d(getattr(drive, "limit", 0.0))))
+    gain = jnp.atleast_1d(as_float(plant.torque_gain))
+    limits = [_limit_of(x) for x in (controller, drive)]
+    axes = max(len(x) for x in (gain, *limits))
     gain = jnp.broadcast_to(gain, (axes, *gain.shape[1:]))
-    command = jnp.minimum(*_same(_drive_limit(drive, gain), own))
+    command = jnp.minimum(*_same(_drive_limit(drive, gain), limits[0]))
     limits = (command, _forward_limit(drive, gain))
     return Authority(gain, command, *(jnp.multiply(*_same(gain, x)) for x in limits))
 
@@ -92,20 +131,19 @@ def warn_beyond_authority(found: Authority | None, scenario: Scenario) -> None:
                 break
 
 
-def _torque_gain(plant: Any) -> Float[Array, " axes *ensemble"] | None:
-    """N m per unit of command, where a plant says so."""
-    if hasattr(plant, "torque_gain"):
-        return jnp.atleast_1d(as_float(plant.torque_gain))
-    allocation = getattr(plant, "allocation", None)
-    return None if allocation is None else allocation.torque_per_difference
+def _limit_of(part: object | None) -> Float[Array, "axes ..."]:
+    """Of the command, by a controller or a drive; infinite without one."""
+    return jnp.atleast_1d(as_float(part.limit if isinstance(part, HasLimit) else jnp.inf))
 
 
-def _drive_limit(drive: Any, like: Float[Array, " axes *ensemble"]) -> Float[Array, "axes ..."]:
+def _drive_limit(
+    drive: Drive | None, like: Float[Array, " axes *ensemble"]
+) -> Float[Array, "axes ..."]:
     """The most that the drive gives of the command of each axis alone, by asking it for all."""
     if drive is None:
         return jnp.full_like(like, jnp.inf)
-    members = jnp.shape(getattr(drive, "limit", 0.0))[1:]
-    wide = jnp.zeros((like.shape[0], *jnp.broadcast_shapes(like.shape[1:], members)), like.dtype)
+    members = jnp.broadcast_shapes(like.shape[1:], ensemble_shape(drive))
+    wide = jnp.zeros((like.shape[0], *members), like.dtype)
     given = []
     for k, unit in enumerate(jnp.eye(like.shape[0], dtype=like.dtype)):
         command = _ALL * jnp.broadcast_to(align(unit, wide), wide.shape)
@@ -115,22 +153,13 @@ def _drive_limit(drive: Any, like: Float[Array, " axes *ensemble"]) -> Float[Arr
     return jnp.where(most < 0.99 * _ALL, most, jnp.inf)
 
 
-def _forward_limit(drive: Any, like: Float[Array, " axes *ensemble"]) -> Float[Array, "axes ..."]:
+def _forward_limit(
+    drive: Drive | None, like: Float[Array, " axes *ensemble"]
+) -> Float[Array, "axes ..."]:
     """The command of each axis alone at which the first motor stops."""
-    if not (hasattr(drive, "bias") and hasattr(drive, "allocation")):
+    if not isinstance(drive, HasForwardLimit):
         return jnp.full_like(like, jnp.inf)
-    units = jnp.eye(like.shape[0], dtype=like.dtype)
-    steepest = jnp.max(jnp.abs(drive.allocation.from_differences(units, 0.0)), axis=0)
-    return abs(drive.bias) / steepest
-
-
-def _controller_limit(controller: Any) -> Float[Array, "axes ..."]:
-    """That of a controller which has one, or of the LADRC in an adaptive one."""
-    for owner in (controller, getattr(controller, "ladrc", None)):
-        limit = getattr(owner, "limit", None)
-        if limit is not None:
-            return jnp.atleast_1d(as_float(limit))
-    return jnp.full((1,), jnp.inf)
+    return drive.forward_limit(like.shape[0]).astype(like.dtype)
 
 
 def _same(a: Array, b: Array) -> tuple[Array, Array]:
@@ -140,6 +169,6 @@ def _same(a: Array, b: Array) -> tuple[Array, Array]:
     return jnp.broadcast_to(a, shape), jnp.broadcast_to(b, shape)
 
 
-def _span(values: Any) -> str:
+def _span(values: ArrayLike) -> str:
     low, high = np.min(values), np.max(values)
     return f"{low:.4g}" if low == high else f"{low:.4g} .. {high:.4g}"

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxquad._core import per_member
 from jaxquad._xla import swap_row
 from jaxquad.loops import Loop
 
@@ -30,7 +31,7 @@ class DelayLine(eqx.Module):
     for the samples that every member waits at least; only the further ones differ by member.
     """
 
-    samples: Float[Array, "*members"]  # the delay, in sample intervals
+    samples: Float[Array, "*members"] = per_member(0)  # the delay, in sample intervals
     fewest: int = eqx.field(static=True)  # whole samples that every member waits
     further: int = eqx.field(static=True)  # how many inputs are kept beyond the queue
     splits: bool = eqx.field(static=True)  # whether there are early inputs at all

@@ -11,17 +11,24 @@ from jaxquad._xla import Devices, gathered, Jit
 from jaxquad.loops import Loop
 
 from ._authority import Authority, find_authority, warn_beyond_authority
-from ._check_run import check_run
-from ._meter import makes_step, Meter, share_beyond, Tally, wide, Window, window
-from ._metrics import Metrics, tallied
+from ._flight_metrics import (
+    find_steps,
+    FlightMetrics,
+    share_beyond,
+    Sums,
+    widened,
+    Window,
+    window,
+)
+from ._metrics import Metrics, NUMBERS
 from ._over_devices import loop_over_devices, placed, Run
-from ._run import scan_loop
+from ._run import check_run, scan_loop
 from ._scenario import Scenario
 from ._simulate import Simulation
 
 
 class _Sample(NamedTuple):
-    """What a `Meter` needs of a stored sample; see `SampleResult`."""
+    """What `FlightMetrics` need of a stored sample; see `SampleResult`."""
 
     index: Int[Array, ""]
     angle: Float[Array, " axes *ensemble"]
@@ -112,9 +119,9 @@ def _judge(run: Run, judged: Window) -> dict[str, Array]:
     loop, scenario = run
     found = find_authority(loop.plant, loop.drive, loop.controller)
     gain = None if found is None else found.torque_gain
-    meter = make_meter(scenario, judged, loop.dt, found, gain)
-    tally, _, running = scan_loop(loop, scenario, meter.update, meter.begin)
-    return _numbers(meter, tally, ~running, scenario, found)
+    sums = _accumulator(scenario, judged, loop.dt, found, gain)
+    total, _, running = scan_loop(loop, scenario, sums)
+    return _numbers(sums, total, ~running, scenario, found)
 
 
 @eqx.filter_jit
@@ -122,49 +129,54 @@ def _replay(simulation: Simulation, judged: Window, gain: Array | None) -> dict[
     scenario, found = simulation.scenario, simulation.authority
     if gain is None and found is not None:
         gain = found.torque_gain
-    meter = make_meter(scenario, judged, simulation.dt, found, gain)
+    sums = _accumulator(scenario, judged, simulation.dt, found, gain)
     like = jnp.zeros_like(simulation.angle[0])
 
-    def sample(tally: Tally, now: Any) -> tuple[Tally, None]:
+    def sample(total: Sums, now: Any) -> tuple[Sums, None]:
         index, reference, disturbance, angle, command, saturated, signals = now
-        parts = (angle, wide(reference, like), wide(disturbance, like), command, saturated)
-        return meter.update(tally, _Sample(index, *parts, signals))
+        parts = (angle, widened(reference, like), widened(disturbance, like), command, saturated)
+        return sums.update(total, _Sample(index, *parts, signals))
 
     index = jnp.arange(simulation.angle.shape[0])
     stored = (simulation.angle, simulation.command, simulation.saturated, simulation.signals)
     given = (index, scenario.reference, scenario.disturbance, *stored)
-    tally = jax.lax.scan(jax.checkpoint(sample), meter.begin(like), given)[0]
-    return _numbers(meter, tally, simulation.diverged, scenario, found)
+    total = jax.lax.scan(jax.checkpoint(sample), sums.begin(like), given)[0]
+    return _numbers(sums, total, simulation.diverged, scenario, found)
 
 
-def make_meter(
+def _accumulator(
     scenario: Scenario,
     judged: Window,
     dt: float,
     found: Authority | None,
     torque_gain: Array | None,
-) -> Meter:
-    reference, first = scenario.reference, judged.first
-    limit = None if found is None else found.command
-    before = reference[jnp.maximum(first - 1, 0)]
-    return Meter(judged, dt, reference[judged.until], before, first == 0, torque_gain, limit)
+) -> FlightMetrics:
+    return FlightMetrics(
+        wanted=(*NUMBERS, "step", "stepped"),
+        window=judged,
+        dt=dt,
+        steps=find_steps(scenario.reference, [(judged.first, judged.until)]),
+        from_first=judged.first == 0,
+        torque_gain=torque_gain,
+        limit=None if found is None else found.command,
+    )
 
 
 def _numbers(
-    meter: Meter,
-    tally: Tally,
+    sums: FlightMetrics,
+    total: Sums,
     diverged: Bool[Array, "*ensemble"],
     scenario: Scenario,
     found: Authority | None,
 ) -> dict[str, Array]:
-    """What `Metrics` hold, of a finished tally and of what the scenario asks of the drive."""
-    values = tallied(meter, tally, makes_step(scenario.reference, meter.judged))
+    """What `Metrics` hold, of finished sums and of what the scenario asks of the drive."""
+    values = sums.finish(total)
     for name in ("settling_time", "settling_time_5"):
         values[name] = jnp.where(diverged[None], jnp.nan, values[name])
     like, torque = values["itae"], scenario.disturbance
     shares = [jnp.full_like(like, jnp.nan)] * 2
     if found is not None:
         limits = (found.torque, found.forward)
-        shares = [wide(share_beyond(x, torque, meter.judged), like) for x in limits]
+        shares = [widened(share_beyond(x, torque, sums.window), like) for x in limits]
     named = {"beyond_authority": shares[0], "reversing": shares[1], "diverged": diverged}
     return values | named

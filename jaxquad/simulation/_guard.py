@@ -31,18 +31,6 @@ def are_numbers(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, "*ensemb
     return _members(tree, ensemble, lambda x: ~jnp.isnan(x))
 
 
-def are_resolved(state: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, "*ensemble"]:
-    """Whether a state's quaternion still has about unit length.
-
-    It loses it where a vehicle turns through more than about a radian in an integration step.
-    """
-    if not hasattr(state, "quaternion"):
-        return jnp.ones(ensemble, bool)
-    w, x, y, z = state.quaternion
-    square = w * w + x * x + y * y + z * z
-    return (square > 0.25) & (square < 4)
-
-
 def are_sound(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, ""]:
     """Whether the first number of every array is one."""
     firsts = [jnp.ravel(x)[:1] for x in jax.tree.leaves(tree)]

@@ -5,7 +5,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._meter import Meter, Tally, wide
 from ._metrics_text import described, remarks
 
 
@@ -145,41 +144,3 @@ class Metrics(eqx.Module):
 
     def __str__(self) -> str:
         return described(self)
-
-
-def tallied(
-    meter: Meter, tally: Tally, stepped: Bool[Array, "axes ..."]
-) -> dict[str, Float[Array, " axes *ensemble"]]:
-    """The fields of `Metrics` that a tally holds."""
-    judged, dtype = meter.judged, tally.iae.dtype
-    samples = (judged.last - judged.first + 1).astype(dtype)
-    under_load = (judged.last - judged.loaded + 1).astype(dtype)
-    step = wide(meter.target, tally.iae) - tally.before
-    stepped = wide(stepped, tally.iae) & (step != 0)
-    rose = stepped & (tally.left >= 0) & (tally.arrived >= 0)
-    return {
-        "itae": tally.itae,
-        "iae": tally.iae,
-        "ise": tally.ise,
-        "energy": tally.energy,
-        "activity": tally.activity,
-        "saturation_share": tally.saturated / samples,
-        "overshoot": _only(stepped, 100 * tally.overshoot),
-        "peak": tally.peak,
-        "rms": _root(tally.load / under_load),
-        "disturbance_rmse": _only(~jnp.isnan(tally.missed), _root(tally.missed / under_load)),
-        "rise_time": _only(rose, tally.arrived - tally.left),
-        "settling_time": _only(stepped & (tally.settled >= 0), tally.settled),
-        "settling_time_5": _only(stepped & (tally.settled_5 >= 0), tally.settled_5),
-        "step": step,
-        "stepped": stepped,
-    }
-
-
-def _only(there: Bool[Array, "..."], value: Float[Array, "..."]) -> Float[Array, "..."]:
-    return jnp.where(there, value, jnp.nan)
-
-
-def _root(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The square root, with the gradient 0 at 0."""
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, PyTree
 
+from jaxquad._core import ensemble_shape, mark_members
 from jaxquad._xla import (
     asked_devices,
     Devices,
@@ -21,7 +22,6 @@ from jaxquad._xla import (
 )
 from jaxquad.loops import Loop
 
-from ._members import count_members, members_of_run
 from ._scenario import Scenario
 
 
@@ -72,22 +72,14 @@ def loop_over_devices(
     """`function((loop, scenario), shared)`, each device with its members, as `over_devices`."""
     if not may_be_several(asked):
         return function(run, shared)
-    count = count_members(run)
+    ensemble = ensemble_shape(*run)
+    count = (1, *ensemble)[-1]
     places = devices_for(count, asked)
     if min(count, len(places)) < 2:
         return function(run, shared)
-    own = members_of_run(run)
-    if own is not None:
-        theirs, common = eqx.partition(run, own)
-        whole = lambda theirs, both: function(eqx.combine(theirs, both[0]), both[1])
-        return _split(whole, theirs, (common, shared), count, places)
-    if asked is None:
-        return function(run, shared)
-    raise ValueError(
-        f"a loop of {count} members cannot be split among {len(places)} devices: which of its "
-        "arrays have a member on the last axis cannot be told; give devices=1, or another number "
-        "of members if it is the length of another axis, too"
-    )
+    theirs, common = eqx.partition(run, mark_members(run, ensemble))
+    whole = lambda theirs, both: function(eqx.combine(theirs, both[0]), both[1])
+    return _split(whole, theirs, (common, shared), count, places)
 
 
 def _split(function: Any, members: PyTree, shared: PyTree, count: int, places: Devices) -> PyTree:

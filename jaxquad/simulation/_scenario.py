@@ -1,7 +1,19 @@
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from jaxquad._core import as_float, check_positive, ensemble_shape, per_member, whole_samples
+from jaxquad.records import AXES
+
+from ._disturbances import gauss_markov
+from ._memory import require_memory
+from ._signal import as_signal, Clock, fit, Motion, Signal
 
 
 class Scenario(eqx.Module):
@@ -14,24 +26,30 @@ class Scenario(eqx.Module):
     of different numbers of samples, axes or members.
     """
 
-    reference: Float[Array, "samples axes ..."]  # attitude set-point, rad
-    injection: Float[Array, "samples axes ..."]  # added to the command, V
-    disturbance: Float[Array, "samples axes ..."]  # torque, N m
-    noise: Float[Array, "samples axes ..."]  # on the measured angle, rad
-    rate: Float[Array, "samples axes ..."] | None = None  # of the reference, rad/s
-    acceleration: Float[Array, "samples axes ..."] | None = None  # of the reference, rad/s^2
-    payload: Float[Array, "samples axes ..."] | None = None  # added inertia, kg m^2
+    reference: Float[Array, "samples axes ..."] = per_member(2)  # attitude set-point, rad
+    injection: Float[Array, "samples axes ..."] = per_member(2)  # added to the command, V
+    disturbance: Float[Array, "samples axes ..."] = per_member(2)  # torque, N m
+    noise: Float[Array, "samples axes ..."] = per_member(2)  # on the measured angle, rad
+    rate: Float[Array, "samples axes ..."] | None = per_member(
+        2, default=None
+    )  # of the reference, rad/s
+    acceleration: Float[Array, "samples axes ..."] | None = per_member(
+        2, default=None
+    )  # of the reference, rad/s^2
+    payload: Float[Array, "samples axes ..."] | None = per_member(
+        2, default=None
+    )  # added inertia, kg m^2
 
     def __check_init__(self):
         parts = {name: part for name, part in vars(self).items() if part is not None}
         if not all(isinstance(part, jax.Array | np.ndarray) for part in parts.values()):
             return
         try:
-            np.broadcast_shapes(*(part.shape[2:] for part in parts.values()))
-            fit = len({part.shape[:2] for part in parts.values()}) == 1
+            fits = len({part.shape[:2] for part in parts.values()}) == 1
+            ensemble_shape(self)
         except ValueError:
-            fit = False
-        if not fit:
+            fits = False
+        if not fits:
             shapes = ", ".join(f"{name} {part.shape}" for name, part in parts.items())
             raise ValueError(
                 f"a scenario's arrays have different shapes: {shapes}; give all of them the same "
@@ -41,5 +59,189 @@ class Scenario(eqx.Module):
     @property
     def ensemble(self) -> tuple[int, ...]:
         """The trailing shape of all parts together, () for one loop."""
-        parts = [part for part in vars(self).values() if part is not None]
-        return np.broadcast_shapes(*(part.shape[2:] for part in parts))
+        return ensemble_shape(self)
+
+
+Given = Mapping[Any, Any] | Signal | None
+_PARTS = ("reference", "injection", "disturbance", "noise", "payload")
+
+
+def scenario(
+    *,
+    duration: float,
+    dt: float = 0.002,
+    axes: int | Sequence[str] = 3,
+    reference: Given = None,
+    injection: Given = None,
+    disturbance: Given = None,
+    noise: Given = None,
+    payload: Given = None,
+    feed_forward: bool = False,
+    ensemble: int | tuple[int, ...] = (),
+    key: Key[Array, ""] | None = None,
+) -> Scenario:
+    """A `Scenario` from signals of single axes, with zeros where nothing is said.
+
+    Each part maps an axis, by name or number, to a signal: `jq.Step`, `jq.simulation.Ramp`, `jq.simulation.SmoothStep`,
+    `jq.simulation.Sine`, `jq.Pulse`, `jq.simulation.ReferenceModel`, `jq.simulation.Gust`, `jq.simulation.WhiteNoise`, sums of them, a
+    `jq.excitation.Excitation`, or an array [samples, *ensemble]. One signal instead of a map goes to every
+    axis. The units are rad (`reference`, `noise`), N m (`disturbance`), those of the command
+    (`injection`) and kg m^2 (`payload`, added to the plant's inertia).
+
+        jq.scenario(
+            duration=10.0,
+            reference={"roll": jq.Step(np.radians(4))},
+            disturbance={"roll": jq.Pulse(0.05, period=5.0, share=0.5, at=2.0)},
+            noise=jq.simulation.WhiteNoise(np.radians(0.02)),
+            key=jax.random.key(0),
+        )
+
+    `duration`, `dt` and all times are in s and whole numbers of samples. `axes` is how many the
+    plant has, or their names (roll, pitch, yaw for up to three). With `feed_forward` the controller
+    also gets the reference's rate and acceleration, zero for signals that jump. `ensemble` is the
+    number of members, each of which draws its own noise from `key`; what an axis draws depends on
+    nothing but the key, the part and the axis (and on the precision: float32 draws other numbers).
+    Raises ValueError for unknown axes, for times outside, and for arrays that do not fit.
+    """
+    check_positive(duration=duration, dt=dt)
+    names = _names(axes)
+    members = (ensemble,) if isinstance(ensemble, int) else tuple(ensemble)
+    clock = Clock(whole_samples("duration", duration, 1 / dt, fewest=2), dt, members)
+    given = (reference, injection, disturbance, noise, payload)
+    _require_room(given, clock, len(names))
+    parts = {
+        name: _sampled(name, part, names, clock, _fold(key, k))
+        for k, (name, part) in enumerate(zip(_PARTS, given, strict=True))
+    }
+    arrays = {name: _stack(name, "value", part, clock) for name, part in parts.items()}
+    if payload is None:
+        del arrays["payload"]
+    if feed_forward:
+        for name in ("rate", "acceleration"):
+            arrays[name] = _stack("reference", name, parts["reference"], clock)
+    return Scenario(**arrays)
+
+
+def _require_room(given: tuple[Given, ...], clock: Clock, axes: int) -> None:
+    """For what each member draws for itself: as columns, and then side by side."""
+    signals = [list(x.values()) if isinstance(x, Mapping) else [x] for x in given]
+    drawn = sum(any(isinstance(x, Signal) and x.random for x in part) for part in signals)
+    numbers = drawn * clock.samples * axes * math.prod(clock.ensemble)
+    what = f"a scenario of {clock.samples} samples for {math.prod(clock.ensemble)} members"
+    remedy = "draw the noise of fewer members at a time, in jq.simulation.in_slices"
+    require_memory(what, 2 * numbers * as_float(0.0).dtype.itemsize, remedy)
+
+
+def _names(axes: int | Sequence[str]) -> tuple[str, ...]:
+    if isinstance(axes, int):
+        if axes < 1:
+            raise ValueError(f"axes is {axes}: a plant has at least one")
+        return AXES[:axes] if axes <= len(AXES) else tuple(str(k) for k in range(axes))
+    if isinstance(axes, str) or not axes or len(set(axes)) != len(axes):
+        raise ValueError(f"axes is {axes!r}: give their number, or their names, each once")
+    return tuple(axes)
+
+
+def _sampled(
+    name: str, given: Given, names: tuple[str, ...], clock: Clock, key: Key[Array, ""] | None
+) -> list[Motion | None]:
+    if given is not None and not isinstance(given, Mapping):
+        given = dict.fromkeys(names, given)
+    signals = {_place(name, axis, names): x for axis, x in (given or {}).items()}
+    if len(signals) < len(given or {}):
+        raise ValueError(f"{name}: an axis is given twice, by name and by number")
+    return [
+        _motion(f"{name} of {axis}", signals[k], clock, _fold(key, k)) if k in signals else None
+        for k, axis in enumerate(names)
+    ]
+
+
+def _place(name: str, axis: Any, names: tuple[str, ...]) -> int:
+    if axis in names:
+        return names.index(axis)
+    if isinstance(axis, int) and 0 <= axis < len(names):
+        return axis
+    raise ValueError(f"{name} of the axis {axis!r}: choose one of {', '.join(names)}")
+
+
+def _fold(key: Key[Array, ""] | None, k: int) -> Key[Array, ""] | None:
+    return None if key is None else jax.random.fold_in(key, k)
+
+
+def _motion(what: str, given: Any, clock: Clock, key: Key[Array, ""] | None) -> Motion:
+    try:
+        return as_signal(given).sample(clock, key)
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
+
+
+def _stack(
+    name: str, field: str, motions: list[Motion | None], clock: Clock
+) -> Float[Array, "samples axes ..."]:
+    """One column for each axis, zeros for None; as wide as the widest needs."""
+    signals = [None if motion is None else motion._asdict()[field] for motion in motions]
+    shapes = [x.shape[1:] for x in signals if x is not None]
+    try:
+        members = np.broadcast_shapes(*shapes)
+    except ValueError:
+        text = ", ".join(str(shape) for shape in shapes)
+        raise ValueError(f"{name}: the axes are for different ensembles, {text}") from None
+    zero = jnp.zeros((clock.samples, *members), as_float(0.0).dtype)
+    return jnp.stack([zero if x is None else fit(x, members) for x in signals], axis=1)
+
+
+def excite(
+    signal: Float[ArrayLike, " samples *ensemble"],
+    *,
+    key: Key[Array, ""],
+    dt: float,
+    axis: str = "roll",
+    torque_noise: float = 0.0,
+    torque_corner: float = 2.0,
+    sensor_noise: float = 0.0,
+) -> Scenario:
+    """An identification experiment: level flight with `signal` (V) injected into one axis.
+
+    The axis feels a Gauss-Markov torque of standard deviation `torque_noise` (N m) and bandwidth
+    `torque_corner` (rad/s), and its angle is measured with white `sensor_noise` (rad). A signal
+    with a trailing axis makes an ensemble, every member with noise of its own.
+    """
+    if axis not in AXES:
+        raise ValueError(f"axis {axis!r}: choose one of {', '.join(AXES)}")
+    _check_excitation(signal, dt, torque_noise, torque_corner, sensor_noise)
+    levels = jnp.asarray([torque_noise, torque_corner, sensor_noise], dtype=float)
+    return _excited(jnp.asarray(signal, dtype=float), key, levels, dt, AXES.index(axis))
+
+
+def _check_excitation(
+    signal: Float[ArrayLike, " samples *ensemble"],
+    dt: float,
+    torque_noise: float,
+    torque_corner: float,
+    sensor_noise: float,
+) -> None:
+    shape = np.shape(signal)
+    if not shape or shape[0] < 2 or not np.all(np.isfinite(np.asarray(signal))):
+        raise ValueError(
+            f"a signal of shape {shape} in V: give at least 2 finite samples, for instance the "
+            ".signal of jq.sweep(...)"
+        )
+    for name, value, least in (
+        ("dt", dt, 0.0),
+        ("torque_corner", torque_corner, 0.0),
+        ("torque_noise", torque_noise, -1e-300),
+        ("sensor_noise", sensor_noise, -1e-300),
+    ):
+        if not least < value < np.inf:
+            bound = "above 0" if least == 0 else "0 or above"
+            raise ValueError(f"{name} is {value}: it is {bound} and finite")
+
+
+@eqx.filter_jit
+def _excited(signal, key, levels, dt, axis) -> Scenario:
+    torque_key, sensor_key = jax.random.split(key)
+    torque = gauss_markov(torque_key, signal.shape, deviation=levels[0], corner=levels[1], dt=dt)
+    jitter = levels[2] * jax.random.normal(sensor_key, signal.shape, signal.dtype)
+    still = jnp.zeros((signal.shape[0], len(AXES), *signal.shape[1:]), signal.dtype)
+    injection, disturbance, noise = (still.at[:, axis].set(x) for x in (signal, torque, jitter))
+    return Scenario(still, injection, disturbance, noise)

@@ -13,12 +13,11 @@ from jaxquad.loops import Loop
 from jaxquad.records import AXES, Record
 
 from ._authority import Authority, find_authority, warn_beyond_authority
-from ._check_run import check_run
 from ._memory import require_memory, size_of
 from ._over_devices import loop_over_devices, placed, Run
-from ._run import scan_loop
-from ._sample import SampleResult
+from ._run import check_run, scan_loop
 from ._scenario import Scenario
+from ._step import SampleResult
 
 
 class Simulation(eqx.Module):
@@ -156,8 +155,14 @@ def _run(
 
 
 def _store(run: Run, nothing: None) -> tuple[PyTree, Bool[Array, "*ensemble"]]:
-    return scan_loop(*run, _keep, lambda like: None)[1:]
+    return scan_loop(*run, _Store())[1:]
 
 
-def _keep(nothing: None, now: SampleResult) -> tuple[None, PyTree]:
-    return nothing, (now.angle, now.measurement, now.command, now.saturated, now.signals)
+class _Store(eqx.Module):
+    """An accumulator that adds up nothing and stores what a `Simulation` has."""
+
+    def begin(self, like: Float[Array, " axes *ensemble"]) -> None:
+        return None
+
+    def update(self, total: None, now: SampleResult) -> tuple[None, PyTree]:
+        return None, (now.angle, now.measurement, now.command, now.saturated, now.signals)

@@ -13,7 +13,7 @@ import pytest
 
 from jaxquad._xla import _engine as _compile, compiler_options, engine
 from jaxquad.control import LADRC
-from jaxquad.loops import Loop
+from jaxquad.loops import Loop, per_member
 from jaxquad.models import DecoupledAxes
 from jaxquad.models._rotation import sincos
 from jaxquad.simulation import (
@@ -26,7 +26,8 @@ from jaxquad.simulation import (
     simulate,
     Step,
 )
-from jaxquad.simulation._run import in_chunks, scan_in_blocks, scan_loop
+from jaxquad.simulation._blocks import in_chunks, scan_in_blocks
+from jaxquad.simulation._run import scan_loop
 
 
 MEMBERS, SAMPLES, TAG = 150, 131, "xla_cpu_small_call"
@@ -47,7 +48,7 @@ def swing(state, parts, now):
     force = -gains[0] * (angle + 0.01 * noise) - gains[1] * rate + push
     sine, cosine = sincos(angle)
     rate = rate + 0.05 * (force * cosine - stiffness * sine - jnp.tanh(rate))
-    return jnp.stack([angle + 0.05 * rate, rate]), (angle, push)
+    return jnp.stack([angle + 0.05 * rate, rate]), (angle, push * angle)
 
 
 def engine_run(start, gains, chunk=48):
@@ -105,11 +106,11 @@ def test_a_kernel_computes_a_value_that_several_need_once():
     assert compiled.count(" sine(") + compiled.count(" tanh(") == 2
 
 
-def test_what_all_members_share_comes_back_once():
+def test_what_all_members_share_is_no_result_of_chunks():
     count = lambda given: {"each": 2 * given["each"], "all": given["all"] + 1}
-    given = {"each": jnp.arange(300.0), "all": jnp.ones(128)}  # as long as a chunk would be
-    own = {"each": True, "all": False}
-    close(in_chunks(count, given, own), {"each": 2 * given["each"], "all": given["all"] + 1})
+    given = {"each": jnp.arange(300.0), "all": jnp.ones(128)}
+    with pytest.raises(ValueError, match="members of a chunk belong on its last axis"):
+        in_chunks(count, given, {"each": True, "all": False})
 
 
 @pytest.mark.parametrize("count", [1, 128, 131, 1009])
@@ -160,13 +161,24 @@ def test_a_record_of_a_large_ensemble_has_every_member_in_its_place():
     close(metrics(record).itae, evaluate(Loop(rig(INERTIA), controller, drive=drive), HAPPENS).itae)
 
 
-def test_what_collects_may_hold_numbers_of_members_that_nobody_sees():
-    hidden = jnp.arange(float(MEMBERS))[None]
-    collect = lambda total, now: (total + hidden * now.angle, None)
+class Weighted(eqx.Module):
+    """An accumulator with a weight for each member."""
+
+    weight: jax.Array = per_member(1)
+
+    def begin(self, like):
+        return jnp.zeros_like(like)
+
+    def update(self, total, now):
+        return total + self.weight * now.angle, None
+
+
+def test_an_accumulator_may_have_numbers_of_each_member():
+    weight = jnp.arange(float(MEMBERS))[None]
     loop = Loop(rig(INERTIA), LADRC([10.0], [30.0], [0.8478]), drive=Saturation(20.0))
-    run = eqx.filter_jit(lambda: scan_loop(loop, HAPPENS, collect, jnp.zeros_like)[0])
+    run = eqx.filter_jit(lambda: scan_loop(loop, HAPPENS, Weighted(weight))[0])
     record = simulate(loop, HAPPENS)
-    close(run(), hidden * jnp.sum(record.angle, axis=0), rtol=1e-9)
+    close(run(), weight * jnp.sum(record.angle, axis=0), rtol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

@@ -18,8 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxquad.models._rotation import sincos
-from jaxquad.simulation import runge_kutta
-from jaxquad.simulation._run import run_ensemble
+from jaxquad.simulation import run_ensemble, runge_kutta
 
 
 HERE = pathlib.Path(__file__).parents[2]

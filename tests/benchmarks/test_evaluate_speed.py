@@ -17,9 +17,17 @@ import pytest
 from jaxquad.control import LADRC
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
-from jaxquad.simulation import evaluate, metrics, Pulse, Saturation, scenario, simulate, Step
+from jaxquad.simulation import (
+    evaluate,
+    metrics,
+    Pulse,
+    Saturation,
+    scenario,
+    simulate,
+    Step,
+    Window,
+)
 from jaxquad.simulation._evaluate import _run
-from jaxquad.simulation._meter import Window
 from jaxquad.simulation._run import scan_loop
 from jaxquad.simulation._simulate import _run as _run_stored
 
@@ -45,6 +53,16 @@ def plant(members):
 def reserved(compiled):
     memory = compiled.compiled.memory_analysis()
     return (memory.temp_size_in_bytes + memory.output_size_in_bytes) / 1e6
+
+
+class LastAngle(eqx.Module):
+    """An accumulator that keeps the angle only."""
+
+    def begin(self, like):
+        return like
+
+    def update(self, total, now):
+        return now.angle, None
 
 
 @pytest.fixture(scope="module", params=[1, MEMBERS])
@@ -74,8 +92,7 @@ def test_simulate_then_metrics(benchmark, rig):
 
 @pytest.mark.benchmark(group="evaluate")
 def test_alone(benchmark, rig):
-    keep = lambda angle, now: (now.angle, None)
-    run = eqx.filter_jit(lambda loop, happens: scan_loop(loop, happens, keep, lambda like: like)[0])
+    run = eqx.filter_jit(lambda loop, happens: scan_loop(loop, happens, LastAngle())[0])
     benchmark(lambda: jax.block_until_ready(run(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS)))
 
 

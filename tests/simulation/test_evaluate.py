@@ -42,6 +42,19 @@ def ladrc(b0):
     return LADRC([10.0], [30.0], jnp.asarray(b0)[None])
 
 
+class Silent(eqx.Module):
+    """A plant that does not say its torque per unit of command."""
+
+    def init(self, euler=None, *, ensemble=()):
+        return jnp.zeros((1, *ensemble))
+
+    def derivative(self, state, inputs, disturbance):
+        return inputs
+
+    def measure(self, state):
+        return state
+
+
 @pytest.fixture(scope="module")
 def ensemble():
     """Four values of b0 in gusts and noise, the last with too little voltage for the pulse."""
@@ -202,8 +215,8 @@ def test_the_authority_of_axes_is_that_of_the_nearest_limit():
     np.testing.assert_allclose(apart, [0.0936, 0.0468, 0.1872])
     told = LADRC([10.0], [30.0], [1.0], limit=1.0)
     assert authority(PLANT, Saturation(2.0), told).torque == pytest.approx(0.0468)
-    with pytest.raises(ValueError, match="torque_gain"):
-        authority(object())
+    with pytest.raises(ValueError, match="Silent has no torque_gain"):
+        authority(Silent())
 
 
 @pytest.mark.parametrize(("torque", "share"), [(0.2, 0.5), (0.3, 0.5), (0.09, 0.0)])

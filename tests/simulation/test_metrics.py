@@ -222,7 +222,7 @@ def test_float32_records_are_judged_in_float32(steps):
     "window", [{"start": 10.0}, {"stop": 12.0}, {"start": 5.0, "load_start": 4.0}, {"stop": 0.002}]
 )
 def test_a_window_outside_the_record_is_refused(window):
-    with pytest.raises(ValueError, match="of the 10 s that there are"):
+    with pytest.raises(ValueError, match="flight of 10 s: give at least two"):
         metrics(simulation(np.zeros((COUNT, 1, 4)), step_of(0.1)), **window)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxquad.control import LADRC, PD, Setpoint
-from jaxquad.loops import Loop
+from jaxquad.loops import Loop, per_member
 from jaxquad.models import Allocation, Attitude, DecoupledAxes, Multirotor
 from jaxquad.simulation import Saturation, Scenario, simulate
 
@@ -99,7 +99,7 @@ def test_ensembles_of_plants_laws_scenarios_and_delays_meet():
         np.testing.assert_allclose(together.angle[..., k], alone.angle, rtol=0, atol=1e-13)
 
 
-def test_gains_that_couple_the_axes_are_no_ensemble_and_bare_gains_of_two_dimensions_are():
+def test_gains_that_couple_the_axes_are_no_ensemble_and_declared_ones_are():
     class Coupled(eqx.Module):
         gain: jnp.ndarray
 
@@ -109,9 +109,11 @@ def test_gains_that_couple_the_axes_are_no_ensemble_and_bare_gains_of_two_dimens
         def step(self, state, reference, measurement):
             return None, jnp.sum(self.gain * (reference - measurement)[None], axis=1)
 
-    class PerMember(Coupled):
+    class PerMember(eqx.Module):
+        gain: jnp.ndarray = per_member(1)
+
         def init(self, like):
-            return jnp.zeros((2, *self.gain.shape[1:]))
+            return None
 
         def step(self, state, reference, measurement):
             return state, self.gain * (reference - measurement)
@@ -138,7 +140,7 @@ def rotors():
         ({"controller": PD([1.0] * 2, [1.0] * 2), "scenario": scenario(rate=0.1)}, "a PD feeds"),
         ({"scenario": scenario(noise=jnp.nan)}, "noise is not finite at sample 0"),
         ({"scenario": scenario(payload=-J)}, "must be above 0"),
-        ({"plant": axes(np.full((2, 3), J)), "delay": np.full(4, 0.001)}, r"plant \(3,\).*delay"),
+        ({"plant": axes(np.full((2, 3), J)), "delay": np.full(4, 0.001)}, r"Loop.plant.inertia \(3,\), Loop.delay \(4,\)"),
         ({"plant": DecoupledAxes([KT] * 4, J)}, "the scenario is for 2 axes"),
     ],
     ids=lambda x: next(iter(x)) if isinstance(x, dict) else "",

@@ -1,28 +1,10 @@
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import align, as_float, is_concrete
+from jaxquad._core import align, as_float, is_concrete, per_member
 from jaxquad.models import Allocation, QUANSER_HOVER
-
-
-class Encoder(eqx.Module):
-    """An optical encoder: angles in steps of one count, with the gradient of the angle itself."""
-
-    counts: int = eqx.field(static=True, default=8192)  # per revolution
-
-    def __check_init__(self):
-        if self.counts < 1:
-            raise ValueError(f"counts is {self.counts}: an encoder has at least 1 per revolution")
-
-    def __call__(self, angle: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The counted angle in rad."""
-        step = 2 * jnp.pi / self.counts
-        counted = step * jnp.round(angle / step)
-        # Straight through: the derivative of the rounding itself is zero or infinite.
-        return angle + jax.lax.stop_gradient(counted - angle)
 
 
 class MotorDrive(eqx.Module):
@@ -45,6 +27,12 @@ class MotorDrive(eqx.Module):
         volts = self.allocation.from_differences(command, self.bias)
         return jnp.clip(volts, -self.limit, self.limit)
 
+    def forward_limit(self, axes: int) -> Float[Array, " 3 *ensemble"]:
+        """The command of each axis alone at which the first motor would have to turn backwards."""
+        units = jnp.eye(axes, dtype=self.allocation.arm.dtype)
+        steepest = jnp.max(jnp.abs(self.allocation.from_differences(units, 0.0)), axis=0)
+        return abs(self.bias) / steepest
+
     def achieved(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
         """The command that these voltages amount to: less than was asked for where they clip."""
         return self.allocation.differences(inputs)
@@ -56,7 +44,7 @@ class Saturation(eqx.Module):
     Raises ValueError for a limit that is not above 0.
     """
 
-    limit: Float[Array, "..."] = eqx.field(converter=as_float)  # of |u|; [], [axes] or with members
+    limit: Float[Array, "..."] = per_member(1, converter=as_float)  # of |u|; [], [axes, ...]
 
     def __check_init__(self):
         if is_concrete(self.limit) and not np.all(np.asarray(self.limit) > 0):

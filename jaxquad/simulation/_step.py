@@ -11,6 +11,7 @@ from jaxquad.control import Setpoint
 from jaxquad.loops import (
     after_drive,
     CarriesPayload,
+    ChecksState,
     Controller,
     Drive,
     Loop,
@@ -21,7 +22,7 @@ from jaxquad.loops import (
 )
 
 from ._delay import delay_line, DelayLine, Queue
-from ._guard import are_numbers, are_resolved, are_tame, choose, within
+from ._guard import are_numbers, are_tame, choose, within
 from ._scenario import Scenario
 
 
@@ -132,7 +133,7 @@ class LoopStep(eqx.Module):
         angle = within(angle, bound)
         measurement = self._measured(angle + happens.noise)
         memory, asked, inputs, achieved, fine = self._answer(carry, measurement, happens, fine)
-        felt = inputs if oldest is None else oldest
+        felt, signals = inputs if oldest is None else oldest, signals_of(self.controller, memory)
         following = self._move(carry, memory, felt, happens, fine)
         if oldest is not None:
             following = following._replace(queue=Queue(None, inputs))
@@ -147,7 +148,7 @@ class LoopStep(eqx.Module):
             saturated=_falls_short(asked, achieved),
             injection=happens.injection,
             disturbance=happens.disturbance,
-            signals=signals_of(self.controller, memory),
+            signals={name: _wide_signal(x, angle) for name, x in signals.items()},
             running=fine,
         )
 
@@ -160,6 +161,7 @@ class LoopStep(eqx.Module):
     ) -> tuple[PyTree, Array, Array, Array, Array]:
         """The controller's memory, what it asked for, what the drive makes of it, who is fine."""
         memory, command = self.controller.step(carry.memory, _setpoint(happens), measurement)
+        _require_shape(command, measurement)
         fine = fine & are_tame(command, self.ensemble)
         asked = jnp.where(fine, command, 0) + happens.injection
         inputs, achieved = self._driven(asked)
@@ -172,7 +174,9 @@ class LoopStep(eqx.Module):
     ) -> Carry:
         """To the next sample, unless it leads out of what can be computed on."""
         past, state = self._held(carry, inputs, happens)
-        runs = fine & are_tame(state, self.ensemble) & are_resolved(state, self.ensemble)
+        runs = fine & are_tame(state, self.ensemble)
+        if isinstance(self.plant, ChecksState):
+            runs = runs & self.plant.is_resolved(state)
         state, past = choose(runs, (state, past), (carry.state, carry.past), self.ensemble)
         return Carry(state, memory, past, runs)
 
@@ -206,7 +210,7 @@ class LoopStep(eqx.Module):
         return past, hold(hold(carry.state, early, share * dt), late, (1 - share) * dt)
 
 
-def step_of(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
+def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
     """What runs `loop`, for members of the shape `ensemble`."""
     return LoopStep(
         plant=loop.plant,
@@ -219,6 +223,18 @@ def step_of(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
         bound=loop.bound,
         ensemble=ensemble,
     )
+
+
+def _require_shape(command: Array, like: Float[Array, " axes *ensemble"]) -> None:
+    if command.shape != like.shape:
+        raise ValueError(
+            f"the controller's command has the shape {command.shape}, but {like.shape} is expected: "
+            "make its fields that differ between members by jq.loops.per_member"
+        )
+
+
+def _wide_signal(x: Array, like: Float[Array, " axes *ensemble"]) -> Array:
+    return jnp.broadcast_to(align(x, like), like.shape)
 
 
 def _setpoint(happens: Scenario) -> Any:

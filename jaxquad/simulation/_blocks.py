@@ -1,0 +1,174 @@
+"""Long scans in blocks, large ensembles in chunks: what keeps gradients and caches small."""
+
+import functools as ft
+import math
+import sys
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxquad._xla import as_one_kernel
+
+from ._delay import Queue
+
+
+_SHORT = 128  # samples that need no blocks
+Step = Callable[..., tuple[PyTree, PyTree]]
+
+
+def scan_in_blocks(
+    step: Step, carry: PyTree, xs: PyTree, count: int, queue: Queue | None = None
+) -> tuple[PyTree, PyTree]:
+    """`jax.lax.scan` whose reverse keeps the carry of blocks only, and of the one it is in.
+
+    Twice the square root of `count` carries instead of all, for one forward pass more. With a
+    `queue`, of which only blocks are kept, `step(carry, x, oldest)` returns (carry, (newest, y)).
+    """
+    size = _block_size(count)
+    length = -(-count // size) * size
+    if length > count:
+        step, xs = _until(count, step), (jnp.arange(length), jax.tree.map(_lengthened(length), xs))
+    # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
+    step = jax.checkpoint(step, prevent_cse=False)
+    if queue is not None:
+        step, carry, xs = _with_queue(step), (queue, carry), (jnp.arange(length), xs)
+
+    @ft.partial(jax.checkpoint, prevent_cse=False)
+    def block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
+        return jax.lax.scan(step, carry, xs)
+
+    if length == size:
+        carry, out = block(carry, xs)
+    else:
+        in_rows = lambda x: x.reshape(length // size, size, *x.shape[1:])
+        carry, out = jax.lax.scan(block, carry, jax.tree.map(in_rows, xs))
+        out = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:])[:count], out)
+    return (carry if queue is None else carry[1]), out
+
+
+def _with_queue(step: Step) -> Step:
+    """The queue changes outside of what reverse mode computes again: that would have to keep it."""
+
+    def queued(both: tuple[Queue, PyTree], xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
+        (queue, carry), (index, now) = both, xs
+        queue, oldest = queue.exchange(index)
+        carry, (newest, out) = step(carry, now, oldest)
+        return (queue._replace(newest=newest), carry), out
+
+    return queued
+
+
+def _until(count: int, step: Step) -> Step:
+    """The step, which leaves the carry as it is after `count` samples.
+
+    A last block of another length would be compiled as a second loop.
+    """
+
+    def masked(carry: PyTree, xs: tuple[Array, PyTree], *oldest: Array) -> tuple[PyTree, PyTree]:
+        index, now = xs
+        after, out = step(carry, now, *oldest)
+        return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), after, carry), out
+
+    return masked
+
+
+def _lengthened(length: int) -> Callable[[Array], Array]:
+    """With the last sample repeated."""
+    return lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], length - x.shape[0], axis=0)])
+
+
+def _block_size(count: int) -> int:
+    """Near the square root of `count`, and a divisor if there is one."""
+    if count <= _SHORT:
+        return count
+    root = math.isqrt(count)
+    near = sorted(range(root // 2, 2 * root + 1), key=lambda size: abs(size - root))
+    return next((size for size in near if count % size == 0), root)
+
+
+_CHUNK = 128  # members: some hundred arrays of them fit a core's second cache
+_VECTOR = 16  # members that are computed at once
+
+
+def run_ensemble(
+    step: Callable[[PyTree, PyTree, PyTree], tuple[PyTree, PyTree]],
+    carry: PyTree,
+    parts: PyTree,
+    signals: PyTree,
+    *,
+    own: PyTree,
+    chunk: int | None = None,
+) -> tuple[PyTree, PyTree]:
+    """`jax.lax.scan` of an ensemble of loops: the last carry, and what each sample left.
+
+    On a CPU each chunk of members is one compiled kernel, if it is plain arithmetic; other devices
+    take all members at once. Reverse mode keeps blocks of samples of one chunk at a time. To be
+    called under `jax.jit`, with `compiler_options()` if that is the outermost one.
+
+    **Arguments:**
+
+    - `step`: `step(carry, parts, now)` returns the next carry and what is stored of a sample, for
+        any number of members, which are on the last axis of all that it returns.
+    - `carry`: before the first sample, with the members on the last axis.
+    - `parts`: what does not change with time.
+    - `signals`: [samples, ...], of which `now` is one sample.
+    - `own`: True for the arrays of (parts, signals) that have the members on their last axis; a
+        tree like these, or the top of one.
+    - `chunk`: members at a time; None is 128 on a CPU.
+
+    **Raises:** ValueError for a result that does not have the members on its last axis.
+    """
+
+    def loop(given: PyTree) -> tuple[PyTree, PyTree]:
+        carry, (parts, signals) = given
+        count = jax.tree.leaves(signals)[0].shape[0]
+        return scan_in_blocks(lambda carry, now: step(carry, parts, now), carry, signals, count)
+
+    theirs = (True, own)
+    return in_chunks(lambda x: as_one_kernel(loop, x), (carry, (parts, signals)), theirs, chunk)
+
+
+def in_chunks(
+    function: Callable[[PyTree], PyTree], given: PyTree, own: PyTree, chunk: int | None = None
+) -> PyTree:
+    """`function(given)` for `chunk` members after the others, where there are more than these.
+
+    None: 128 on a CPU, all of them elsewhere. `own` tells which arrays of `given` have the members
+    on the last axis; all results must have them there. Raises ValueError for one that has not.
+    """
+    theirs, common = eqx.partition(given, own)
+    members = jax.tree.leaves(theirs)[0].shape[-1]
+    most = chunk or most_at_once()
+    if members <= most:
+        return function(given)
+    number = -(-members // most)
+    size = -(-members // (number * _VECTOR)) * _VECTOR
+    split = jax.tree.map(lambda x: _split(x, -(-members // size), size), theirs)
+    # Within a map nothing can be merged with the forward pass, so no barriers are needed.
+    run = jax.checkpoint(lambda x: function(eqx.combine(x, common)), prevent_cse=False)
+    return jax.tree.map(lambda x: _joined(x, size, members), jax.lax.map(run, split))
+
+
+def most_at_once() -> int:
+    """Members of a chunk."""
+    return _CHUNK if jax.default_backend() == "cpu" else sys.maxsize
+
+
+def _split(x: Array, number: int, size: int) -> Array:
+    """[number, ..., size], the last member repeated where there are too few."""
+    missing = number * size - x.shape[-1]
+    x = jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, axis=-1)], axis=-1)
+    return jnp.moveaxis(x.reshape(*x.shape[:-1], number, size), -2, 0)
+
+
+def _joined(x: Array, size: int, members: int) -> Array:
+    if x.ndim < 2 or x.shape[-1] != size:
+        raise ValueError(
+            f"a result has the shape {x.shape[1:]}, but the {size} members of a chunk belong on "
+            "its last axis: return what each member gives, and nothing that they share"
+        )
+    x = jnp.moveaxis(x, 0, -2)
+    return x.reshape(*x.shape[:-2], -1)[..., :members]
