@@ -27,6 +27,8 @@ def fail(job: Job) -> dict:
     name = Path(job.log).name
     if name.startswith("unusable"):
         raise ValueError(f"{name}: <b>no clock</b>")
+    if name.startswith("lost"):
+        raise ValueError("lost \ud800")
     if name.startswith("defect"):
         raise ZeroDivisionError("a defect")
     if name.startswith("killed"):

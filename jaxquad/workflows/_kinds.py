@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from jaxquad.records import AXES, Mix, parse_mix
 
@@ -58,22 +58,25 @@ def _one_of(*choices: str) -> Kind:
 
 
 def _number(value: object) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+    if _is_number(value):
         return float(value)
     raise ValueError("give a number")
 
 
+def _is_number(value: object) -> TypeGuard[float | int]:
+    known = isinstance(value, int | float) and not isinstance(value, bool)
+    return known and math.isfinite(value)
+
+
 def _positive(value: object) -> float:
-    number = _number(value)
-    if number > 0:
-        return number
+    if _is_number(value) and value > 0:
+        return float(value)
     raise ValueError("give a number above 0")
 
 
 def _not_negative(value: object) -> float:
-    number = _number(value)
-    if number >= 0:
-        return number
+    if _is_number(value) and value >= 0:
+        return float(value)
     raise ValueError("give a number of at least 0")
 
 
@@ -159,7 +162,11 @@ def _units(value: object) -> dict[str, str]:
 
 def _patterns(value: object) -> tuple[str, ...]:
     found = (value,) if isinstance(value, str) else value
-    if not isinstance(found, Sequence) or not all(isinstance(g, str) and g for g in found):
+    if (
+        not isinstance(found, Sequence)
+        or not found
+        or not all(isinstance(each, str) and each for each in found)
+    ):
         raise ValueError('give a file pattern or a list of them, such as "**/*.ulg"')
     if any(pattern.startswith("/") for pattern in found):
         raise ValueError("give patterns relative to the folder of the logs, without a / in front")

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, TypeVar
 
 from . import _kinds as kinds
 from ._kinds import convert, Pair, SettingsError
@@ -40,8 +40,13 @@ _REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the plac
 }
 
 
+S = TypeVar("S", bound="_Settings")
+
+
 class _Settings:
-    """Frozen dataclasses whose fields are declared by `_option`."""
+    """Frozen dataclasses whose fields are declared by `_option`, which says what they take."""
+
+    __no_type_check__ = True  # in tests: fields are converted, such as a list to a tuple
 
     @classmethod
     def options(cls) -> dict[str, Option]:
@@ -57,7 +62,7 @@ class _Settings:
         return {f.name: {} if f.default is _REQUIRED else f.default for f in fields}
 
     @classmethod
-    def from_mapping(cls, content: Mapping[str, object], where: str = "") -> Self:
+    def from_mapping(cls: type[S], content: Mapping[str, object], where: str = "") -> S:
         """Settings from what TOML or JSON hold; `where` begins the message of an error.
 
         Raises SettingsError for an unknown key, with the most similar known one, for a required
@@ -77,7 +82,7 @@ class _Settings:
             raise _within(where, error) from error
 
     @classmethod
-    def from_toml(cls, path: str | Path) -> Self:
+    def from_toml(cls: type[S], path: str | Path) -> S:
         """As `from_mapping`, from a TOML file."""
         return cls.from_mapping(read_toml(path), str(path))
 
@@ -90,7 +95,7 @@ class _Settings:
         defaults = self.defaults()
         return {key: value for key, value in self.content().items() if value != defaults[key]}
 
-    def changed(self, changes: Mapping[str, object]) -> Self:
+    def changed(self: S, changes: Mapping[str, object]) -> S:
         """These settings with others for some keys; `band` takes the place of `band_rad`, etc."""
         return self.from_mapping(updated(self.given(), changes))
 
@@ -427,7 +432,7 @@ class BatchSettings(_Settings):
         return {name: each._replace(flag=f"--{name}") for name, each in found.items()}
 
     @classmethod
-    def from_mapping(cls, content: Mapping[str, object], where: str = "") -> Self:
+    def from_mapping(cls: type[S], content: Mapping[str, object], where: str = "") -> S:
         keys = [*cls.options(), *_LOG_KEYS]
         try:
             check_keys(content, [*keys, "override"])
@@ -455,7 +460,7 @@ class BatchSettings(_Settings):
                 "`timeout` is for processes of this machine: leave it out with `scheduler`"
             )
 
-    def changed(self, changes: Mapping[str, object]) -> Self:
+    def changed(self: S, changes: Mapping[str, object]) -> S:
         return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
 
     def of(self, log: str) -> IdentifySettings:

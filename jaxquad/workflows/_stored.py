@@ -145,6 +145,7 @@ def read_result(path: str | Path) -> StoredResult:
     except ValueError as error:
         raise ValueError(f"{path}: no result of jaxquad identify: {error}") from error
     try:
+        content = dict(content)
         settings = IdentifySettings.from_mapping(content["settings"], f"{path}, settings")
         files = content["provenance"]["files"]
         return StoredResult(
@@ -155,7 +156,7 @@ def read_result(path: str | Path) -> StoredResult:
             hashes=tuple(file["sha256"] for file in files),
             band=(float(content["band_rad_per_s"][0]), float(content["band_rad_per_s"][1])),
         )
-    except (KeyError, IndexError, TypeError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path}: no result of this version of jaxquad identify: identify the log again"
         ) from error

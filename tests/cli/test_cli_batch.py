@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxquad as jq
-from jaxquad.cli._main import main
+from jaxquad.cli import main
 
 
 GAIN = 100.0
@@ -31,7 +31,7 @@ def fleet(tmp_path_factory):
     return folder
 
 
-def test_a_fleet_gives_a_table_a_summary_and_reports(fleet, tmp_path, capfd):
+def test_a_fleet_gives_a_table_a_summary_and_reports(fleet, tmp_path, capfd, monkeypatch):
     out = tmp_path / "out"
     words = ["batch", str(fleet), "--config", str(fleet / "fleet.toml"), "--out", str(out)]
     assert main([*words, "--workers", "1", "--json"]) == 4
@@ -51,26 +51,12 @@ def test_a_fleet_gives_a_table_a_summary_and_reports(fleet, tmp_path, capfd):
     # The command in the report makes the same again.
     command = json.loads((report.parent / "result.json").read_text())["provenance"]["command"]
     assert "--input M --output q" in command and "--band 0.5 6" in command
-
-
-def test_a_second_run_is_done_at_once_without_a_process(fleet, tmp_path, monkeypatch, capsys):
-    from jaxquad.workflows._batch import _run
-
-    out = tmp_path / "out"
-    words = ["batch", str(fleet), "--config", str(fleet / "fleet.toml"), "--out", str(out)]
-    content = {"status": "identified"}
-    monkeypatch.setattr(_run, "performed", lambda jobs, *_: ((j, put(j, content)) for j in jobs))
-    assert main(words) == 0
-    monkeypatch.setattr(_run, "performed", lambda jobs, *_: ((j, pytest.fail()) for j in jobs))
-    assert main(words) == 0
-    assert "3 logs: 3 identified" in capsys.readouterr().out
-
-
-def put(job, content):
-    from jaxquad.workflows._batch._store import keep
-
-    keep(job, content)
-    return content
+    # A second run is done at once, without a process.
+    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", pytest.fail)
+    assert main(words) == 4
+    printed = capfd.readouterr()
+    assert "3 logs: 1 not identifiable, 1 failed, 1 identified" in printed.out
+    assert printed.err.splitlines()[-1] == "3/3 sweep.npz: identified"
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import shlex
 import pytest
 from conftest import ROOT
 
-from jaxquad.cli._main import main
+from jaxquad.cli import main
 
 
 PAGE = (ROOT / "docs" / "measured.md").read_text()

@@ -5,7 +5,9 @@ import pytest
 from flight_logs import ardupilot, CHIRP, IN_RUN, px4, TIME, WAVE
 from log_writers import DataFlash
 
-from jaxquad.records import propose, read, ReadError, RecordError
+from jaxquad.cli import make_parser
+from jaxquad.records import parse_mix, propose, read, ReadError, RecordError
+from jaxquad.workflows import IdentifySettings
 
 
 @pytest.mark.parametrize("place", range(1, 13))
@@ -29,16 +31,14 @@ def test_ardupilot_chirps_are_found_with_axis_time_band_and_summing_point(tmp_pa
 
 
 def test_the_printed_line_is_what_the_command_line_takes(tmp_path):
-    from jaxquad.cli._main import _parser
-
     proposal = propose(ardupilot(tmp_path, 10))
     line = str(proposal).splitlines()[-1].strip()
     words = shlex.split(line)
     assert words[:2] == ["jaxquad", "identify"]
-    options = _parser().parse_args(words[1:])
-    assert options.input == {"roll": {"RATE.ROut": 1.0, "SIDD.Targ": 1.0}}
-    assert options.reference == {"SIDD.Targ": {"SIDD.Targ": 1.0}}
-    assert (options.rate, options.band) == (400.0, [0.5, 8.0])
+    typed = settings_typed(words)
+    assert parse_mix(typed.input or "") == {"roll": {"RATE.ROut": 1.0, "SIDD.Targ": 1.0}}
+    assert typed.reference == "SIDD.Targ"
+    assert (typed.rate, typed.band) == (400.0, (0.5, 8.0))
 
 
 def test_an_integral_term_that_works_against_the_sweep_is_told(tmp_path):
@@ -47,17 +47,22 @@ def test_an_integral_term_that_works_against_the_sweep_is_told(tmp_path):
 
 
 def test_all_chirps_into_one_place_are_segments_of_the_printed_line(tmp_path):
-    from jaxquad.cli._main import _parser
-
     proposal = propose(ardupilot(tmp_path, 10, runs=((21, 24, 6.0), (25.5, 30, 8.0))))
     assert "2 times: 0.5 .. 8 Hz, 2.997 + 4.497 s" in str(proposal)
     assert np.allclose(proposal.segments, [(21, 24), (25.5, 30)], atol=0.01)
     # One record is that of the longest.
     assert proposal.options["start"] == pytest.approx(25.5)
     line = str(proposal).splitlines()[-1].strip()
-    options = _parser().parse_args(shlex.split(line)[1:])
-    np.testing.assert_allclose(options.segment, proposal.segments)
-    assert options.start is None and options.stop is None
+    typed = settings_typed(shlex.split(line))
+    np.testing.assert_allclose(typed.segments, proposal.segments)
+    assert typed.start is None and typed.stop is None
+
+
+def settings_typed(words):
+    """The settings of `jaxquad identify ...`."""
+    options = vars(make_parser().parse_args(words[1:]))
+    keys = IdentifySettings.options()
+    return IdentifySettings(**{key: value for key, value in options.items() if key in keys})
 
 
 def test_without_a_chirp_the_loops_set_point_is_no_reference(tmp_path):

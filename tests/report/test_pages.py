@@ -53,15 +53,16 @@ def test_no_control_character_reaches_a_page(code):
     assert not any(chr(code) == each for each in text) and "a\ufffdb" in text
 
 
+class Wide(eqx.Module):
+    """Two outputs of four inputs."""
+
+    def frequency_response(self, omega):
+        return jnp.tile(TRUTH.frequency_response(omega).reshape(-1, 1, 1), (1, 2, 4))
+
+
 def test_what_is_not_drawn_is_counted(tmp_path):
-    one = response_of(TRUTH, seed=0)
-    repeat = lambda x: jnp.tile(x, (1, 2, 4))
-    wide = jq.spectra.FrequencyResponse(
-        omega=one.omega, response=repeat(one.response), coherence=repeat(one.coherence),
-        random_error=repeat(one.random_error), input_names=tuple("abcd"), output_names=("x", "y"),
-        method="joint",
-    )  # fmt: skip
-    page = read_page(write_report(tmp_path / "r.html", fit=silent(one), frf=wide))
+    fit, wide = silent(response_of(TRUTH, seed=0)), response_of(Wide(), seed=0)
+    page = read_page(write_report(tmp_path / "r.html", fit=fit, frf=wide))
     assert len(page.of("img")) == 6 and "2 more responses are not drawn." in page.text("section")
 
 

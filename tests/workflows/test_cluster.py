@@ -3,8 +3,8 @@
 import pytest
 from batch_work import die_once, started
 
-from jaxquad.cli._main import main
-from jaxquad.workflows import run_batch, Settings
+from jaxquad.cli import main
+from jaxquad.workflows import batch, BatchSettings
 
 
 def test_a_killed_worker_of_a_cluster_loses_no_log(tmp_path):
@@ -16,9 +16,9 @@ def test_a_killed_worker_of_a_cluster_loses_no_log(tmp_path):
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL"
     ) as cluster:
-        address = cluster.scheduler_address
-        rows = run_batch(folder, Settings(), out=out, work=die_once, scheduler=address)
-        again = run_batch(folder, Settings(), out=out, work=die_once, scheduler=address)
+        settings = BatchSettings(scheduler=cluster.scheduler_address)
+        rows = batch(folder, settings, out=out, work=die_once)
+        again = batch(folder, settings, out=out, work=die_once)
     assert (out / "died").exists()
     assert [row["status"] for row in rows] == ["identified"] * 12
     assert len(list(out.glob("results/*.json"))) == 12
@@ -27,9 +27,7 @@ def test_a_killed_worker_of_a_cluster_loses_no_log(tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed", reason="needs pip install jaxquad[cluster]")
-    from jaxquad.workflows._batch import _cluster
-
-    monkeypatch.setattr(_cluster, "PATIENCE", 0.2)
+    monkeypatch.setattr("jaxquad.workflows._batch._cluster.PATIENCE", 0.2)
     (tmp_path / "a.csv").write_text("a")
     words = ["batch", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*words, "--scheduler", "tcp://127.0.0.1:9"]) == 2

@@ -1,0 +1,128 @@
+"""Figures of records, responses and verifications can be read."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from synthetic import OMEGA, response_of
+
+import jaxquad as jq
+from jaxquad.plot import bode, extremes, overlay, record_figure, residuals_of, short_names
+
+
+TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
+
+
+@pytest.fixture(scope="module")
+def frf():
+    return response_of(TRUTH, error=0.05, seed=0)
+
+
+@pytest.fixture(scope="module")
+def check():
+    time = np.arange(400) * 0.01
+    u = np.sign(np.sin(3 * time))
+    y = np.asarray(jq.models.simulate_linear(TRUTH.transfer_function(), u, 0.01))
+    record = jq.Record(time, u, y, output_names="q", output_units="rad/s")
+    return jq.verify(jq.LaggedIntegrator(250.0, 0.016, 0.011), record)
+
+
+def lines(axis):
+    return {line.get_label(): line for line in axis.get_lines()}
+
+
+def test_a_bode_figure_names_its_axes_with_units(frf):
+    magnitude, phase, coherence = bode(frf, {"truth": TRUTH}).axes[:3]
+    assert magnitude.get_ylabel() == "|y0 / u0|, dB"
+    assert phase.get_ylabel() == "phase, deg"
+    assert coherence.get_xlabel() == "frequency, rad/s" and coherence.get_xscale() == "log"
+
+
+def test_the_band_is_the_95_per_cent_band_of_the_random_error(frf):
+    magnitude = bode(frf).axes[0]
+    (band,) = magnitude.collections
+    corners = band.get_paths()[0].vertices
+    at_first = corners[np.isclose(corners[:, 0], OMEGA[0]), 1]
+    width = 2 * 1.96 * 0.05 * 20 / np.log(10)
+    assert np.ptp(at_first) == pytest.approx(width, rel=1e-9)
+
+
+def test_the_model_is_drawn_on_the_branch_of_the_measured_phase():
+    """A delay of many turns, and a response that starts beyond -180 deg."""
+    slow = jq.LaggedIntegrator(280.0, 0.016, 1.0)
+    figure = bode(response_of(slow), {"model": slow})
+    measured, model = (lines(figure.axes[1])[name] for name in ("joint estimate", "model"))
+    drawn = np.interp(measured.get_xdata(), model.get_xdata(), model.get_ydata())
+    assert np.max(np.abs(drawn - measured.get_ydata())) < 2  # deg, of linear interpolation
+
+
+def test_points_without_coherence_are_shown_apart(frf):
+    weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence.at[:5].set(0.3))
+    drawn = lines(bode(weak, others={"direct": frf}).axes[0])
+    assert len(drawn["joint estimate"].get_xdata()) == OMEGA.size - 5
+    assert len(drawn["joint estimate, coherence below 0.6"].get_xdata()) == 5
+    assert drawn["direct"].get_marker() != drawn["joint estimate"].get_marker()
+    with pytest.raises(ValueError, match=r"no response \('p', 'u0'\)"):
+        bode(frf, pair=("p", "u0"))
+
+
+def test_an_overlay_shows_degrees_and_the_measures(check):
+    figure = overlay(check)
+    top, bottom = figure.axes
+    assert top.get_ylabel() == "q, deg/s" and bottom.get_xlabel() == "time, s"
+    np.testing.assert_allclose(
+        lines(top)["measured"].get_ydata(), np.degrees(check.measured), rtol=1e-12
+    )
+    assert f"{check.fit_percent:.1f} %" in figure.get_suptitle()
+
+
+def test_every_channel_of_a_record_is_drawn():
+    time = np.arange(100) * 0.01
+    record = jq.Record(time, np.sin(time), np.cos(time), np.sin(2 * time), output_units="rad")
+    panels = record_figure(record).axes
+    assert [axis.get_title("left") for axis in panels] == ["reference: r", "input: u", "output: y"]
+    assert [axis.get_ylabel() for axis in panels] == ["", "", "deg"]
+
+
+def test_short_names_stay_distinct():
+    names = ["a" * 50, "a" * 25 + "b" + "a" * 25, "x\n y", "", "q"]
+    short = short_names(names)
+    assert len(set(short)) == len(names) and max(map(len, short)) <= 29
+    assert short[2:] == ("x y", "(no name)", "q")
+
+
+def test_residuals_are_in_units_of_the_random_error():
+    """The truth leaves white residuals of size 1; a model of half the gain is 6 dB off."""
+    many = [residuals_of(response_of(TRUTH, error=0.02, seed=k), TRUTH, 0, 0) for k in range(20)]
+    values = np.concatenate([np.concatenate([one.magnitude, one.phase]) for one in many])
+    assert np.std(values) == pytest.approx(1.0, abs=0.08)  # 3 sigma of 1200 samples: 0.06
+    assert np.mean([one.outside for one in many]) == pytest.approx(0.05, abs=0.025)
+    half = residuals_of(
+        response_of(TRUTH, error=0.005, seed=0), jq.LaggedIntegrator(140.0, 0.016, 0.011), 0, 0
+    )
+    assert np.mean(half.decibels) == pytest.approx(20 * np.log10(2), abs=0.2)
+    np.testing.assert_allclose(half.degrees, np.degrees(half.phase * 0.005), rtol=1e-9)
+
+
+def test_no_peak_of_a_long_record_is_lost():
+    values = np.random.default_rng(0).standard_normal(1_000_003)
+    values[[123_456, 1_000_002]] = 50.0, -60.0
+    kept = extremes(values)
+    assert kept.size <= 2 * 1201 and np.all(np.diff(kept) > 0)
+    assert {123_456, 1_000_002} <= set(kept.tolist())
+    np.testing.assert_array_equal(extremes(values[:2000]), np.arange(2000))
+
+
+def test_a_long_verification_keeps_the_extremes_of_every_curve():
+    time, noise = np.arange(200_001) * 0.01, np.random.default_rng(1).standard_normal(200_001)
+    simulated = np.sin(time)
+    measured = simulated + 0.1 * noise
+    one = jq.identify.Agreement("q", "", 0.1, 0.05, 90.0, 99.0)
+    none = np.zeros(0)
+    check = jq.identify.Verification(
+        time, measured, simulated, 0.1, 0.05, 90.0, 99.0, (one,), none, none, none, 0, None
+    )
+    top, bottom = overlay(check).axes
+    drawn = lines(top)["measured"]
+    assert len(drawn.get_xdata()) < 3000 and np.isin(drawn.get_xdata(), time).all()
+    assert np.ptp(drawn.get_ydata()) == np.ptp(measured)
+    assert np.ptp(bottom.get_lines()[0].get_ydata()) == np.ptp(measured - simulated)

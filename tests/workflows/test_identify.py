@@ -1,0 +1,106 @@
+"""`jq.workflows.identify` gives in Python what the command line gives, and can be made again."""
+
+import json
+
+import numpy as np
+import pytest
+from sweep_logs import GAIN, write_noise, write_sweep
+
+import jaxquad as jq
+from jaxquad.cli import main
+from jaxquad.workflows import (
+    identify,
+    identify_again,
+    IdentifySettings,
+    read_result,
+    verify_result,
+)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return write_sweep(tmp_path_factory.mktemp("flight") / "sweep.csv")
+
+
+@pytest.fixture(scope="module")
+def found(log):
+    settings = IdentifySettings(
+        input="M=right-left", output="q", band=(0.5, 6), units={"q": "rad/s"}
+    )
+    return identify(log, settings)
+
+
+@pytest.fixture(scope="module")
+def folder(found, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("result")
+    assert found.write(folder) == folder / "result.json"
+    return folder
+
+
+def test_python_gives_what_the_command_line_gives(log, found, folder, tmp_path, capsys):
+    words = ["identify", str(log), *found.settings.words(), "--out", str(tmp_path)]
+    assert main(words) == 0
+    assert str(found) in capsys.readouterr().out
+    typed, written = (json.loads((each / "result.json").read_text()) for each in (tmp_path, folder))
+    for content in (typed, written):
+        del content["provenance"]["date"]
+    assert typed == written
+    assert {each.name for each in tmp_path.iterdir()} == {each.name for each in folder.iterdir()}
+
+
+def test_numbers_and_figures_are_at_hand_without_a_folder(found):
+    assert found.fit.verdict.identifiable
+    assert found.fit.values[0] == pytest.approx(GAIN, rel=0.03)
+    assert found.fit.model.gain == found.fit.values[0]
+    [total] = found.combinations
+    assert total.value == pytest.approx(found.fit.values[1] + found.fit.values[2])
+    assert list(found.figures()) == ["record.png", "bode.png"]
+    assert found.formula == "q / M = K e^(-delay s) / (s (lag s + 1))"
+
+
+def test_a_result_is_made_again_from_its_settings(found, folder, log, tmp_path):
+    again = identify_again(folder)
+    assert again.settings == found.settings == read_result(folder).settings
+    np.testing.assert_array_equal(again.fit.values, found.fit.values)
+    moved = tmp_path / "moved.csv"
+    moved.write_bytes(log.read_bytes())
+    assert identify_again(folder, log=moved).path == moved
+    moved.write_bytes(log.read_bytes() + b"\n")
+    with pytest.raises(ValueError, match="not the log that was identified"):
+        identify_again(folder, log=moved)
+
+
+def test_a_stored_model_is_that_of_the_fit(found, folder):
+    stored = read_result(folder / "result.json")
+    assert stored.band == pytest.approx(found.band) and stored.doubts == ()
+    assert stored.model == found.fit.model
+
+
+def test_a_second_record_is_read_with_the_settings_of_the_first(found, folder, log):
+    check = verify_result(folder, log, {"start": 5, "stop": 30})
+    record = jq.read(log, inputs={"M": {"right": 1, "left": -1}}, outputs="q", start=5, stop=30)
+    same = jq.verify(found.fit.model, record, band=found.band)
+    assert check.fit_percent == pytest.approx(same.fit_percent) and check.fit_percent > 90
+    assert check.output_unit == "rad/s"
+    assert verify_result(folder, log, {"band": (1, 2)}).band == pytest.approx(
+        (2 * np.pi, 4 * np.pi)
+    )
+
+
+def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
+    noise = write_noise(tmp_path / "noise.npz")
+    found = identify(noise, IdentifySettings(input="M", output="q"))
+    assert not found.fit.verdict.identifiable and found.combinations == ()
+    assert any("jaxquad design sweep" in remedy for remedy in found.fit.verdict.remedies)
+    found.write(tmp_path)
+    stored = read_result(tmp_path)
+    assert "not identifiable from this record" in stored.doubts[0]
+    with pytest.raises(ValueError, match="the result holds no model: not identifiable"):
+        verify_result(stored, noise)
+
+
+@pytest.mark.parametrize("text", ["[1]", "{}", "no json", '{"fit": {}, "settings": {}}'])
+def test_a_file_that_is_no_result_is_refused(tmp_path, text):
+    (tmp_path / "result.json").write_text(text)
+    with pytest.raises(ValueError, match="no result of"):
+        read_result(tmp_path)
