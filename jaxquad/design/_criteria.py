@@ -15,7 +15,7 @@ class Criterion(Protocol):
 
     The amount has to be concave in the information matrix, and twice as large for two flights as
     for one, so that the ratio of two amounts is a ratio of flight times. `exponent` is that of the
-    multiplicative update under which it never falls.
+    multiplicative update under which it never falls. Any object with these two members will do.
     """
 
     @property
@@ -40,7 +40,7 @@ class DOptimal(eqx.Module):
 class AOptimal(eqx.Module):
     """The smallest sum of the relative variances of the named parameters, or of all.
 
-    Of a single one it is c-optimality: the sharpest estimate of that parameter alone.
+    With one name it is c-optimality: the smallest standard error of that parameter alone.
     """
 
     names: tuple[str, ...] = eqx.field(static=True, default=())
@@ -65,7 +65,9 @@ class LargestError(eqx.Module):
 
     def __check_init__(self):
         if not 1 <= self.power <= 32:
-            raise ValueError(f"power {self.power}: give 1 (the sum of variances) to 32; 8 is usual")
+            raise ValueError(
+                f"power is {self.power}: give 1 (the sum of variances) to 32; 8 is usual"
+            )
 
     @property
     def exponent(self) -> float:
@@ -80,5 +82,5 @@ class LargestError(eqx.Module):
 def _positions(wanted: tuple[str, ...], names: tuple[str, ...]) -> np.ndarray:
     for name in wanted:
         if name not in names:
-            raise ValueError(f"no free parameter {name!r} to sharpen; free are: {', '.join(names)}")
+            raise ValueError(f"{name!r} is no free parameter; free are: {', '.join(names)}")
     return np.array([names.index(name) for name in wanted])

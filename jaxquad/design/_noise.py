@@ -12,10 +12,14 @@ Matrices = Complex[np.ndarray, "frequencies outputs outputs"]
 
 
 class MeasuredNoise(eqx.Module):
-    """The noise of `outputs` in a measured spectral density, interpolated over log frequency.
+    """The noise of `outputs` from a measured spectral density, interpolated over log frequency.
 
-    From a record at rest, or from an excited one less what its channels `given` explain (an open
-    loop: fed back, part of the noise would count as explained).
+    **Arguments:**
+
+    - `density`: of a record at rest, or of an excited one.
+    - `outputs`: names of its channels.
+    - `given`: channels whose share is taken out, such as the input of an excited record. Only for
+        an open loop: with feedback, part of the noise would count as explained.
     """
 
     density: SpectralDensity
@@ -50,7 +54,7 @@ class MeasuredNoise(eqx.Module):
     def _places(self, names: tuple[str, ...]) -> np.ndarray:
         for name in names:
             if name not in self.density.names:
-                raise ValueError(f"no channel {name!r}: choose of {', '.join(self.density.names)}")
+                raise ValueError(f"no channel {name!r}; there are: {', '.join(self.density.names)}")
         return np.array([self.density.names.index(name) for name in names], int)
 
 
@@ -72,19 +76,18 @@ def noise_covariance(noise: Noise, omega: Lines, outputs: int) -> Matrices:
             ) from error
         found = powers[:, :, None] * np.eye(outputs)
     if found.shape != (omega.size, outputs, outputs):
-        raise ValueError(f"noise of {found.shape[1]} outputs, but the model has {outputs}")
+        raise ValueError(f"the noise is of {found.shape[1]} outputs, but the model has {outputs}")
     _check(found, omega)
     return found.astype(complex)
 
 
 def _check(covariance: np.ndarray, omega: Lines) -> None:
     if not np.all(np.isfinite(covariance)):
-        raise ValueError("the noise density is not finite: look for the NaN or inf in it")
+        raise ValueError("the noise density is not finite at every line: check it for NaN and inf")
     least = np.linalg.eigvalsh(covariance)[:, 0]
     if least.min() <= 0:
         worst = least.argmin()
         raise ValueError(
             f"the noise density at {omega[worst]:.4g} rad/s is {least[worst]:.4g} units^2/Hz, but "
-            "it must be above 0: without noise every excitation is perfect. White noise of "
-            "standard deviation s, sampled at f Hz, has 2 s^2 / f"
+            "it must be above 0. White noise of standard deviation s, sampled at f Hz, has 2 s^2/f"
         )

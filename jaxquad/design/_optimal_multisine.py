@@ -15,13 +15,13 @@ from ._search import gather_limits, multisine_signals, Plan, search, Trial
 
 
 class Design(eqx.Module):
-    """A multisine of the most informative spectrum within limits, with what it will tell.
+    """The most informative multisine within limits, and the accuracy to expect of it.
 
-    `dispersion` says, for each offered line, what information power there would add for the share
-    of the limits it takes, scaled as in the equivalence theorem: without a cap on the lines it
-    nowhere exceeds the number of parameters, and equals it at the lines of the best design.
-    `efficiency` is a lower bound on the flight time of the best spectrum with these limits, cap and
-    crest factors, over that of this one, for the same information.
+    `dispersion` is, for each line offered, the information that power there would add for its share
+    of the limits, scaled as in the equivalence theorem: without a cap on the lines it nowhere
+    exceeds the number of parameters, and equals it at the lines of the best design. `efficiency` is
+    a lower bound on the flight time of the best spectrum with these limits, cap and crest factors,
+    over that of this one, for the same information.
     """
 
     excitation: Excitation
@@ -104,21 +104,39 @@ def optimal_multisine(
     input: int = 0,
     seed: int = 0,
 ) -> Design:
-    """The multisine that tells most of a model's `free` parameters within the limits of a flight.
+    """The multisine that is most informative about a model's `free` parameters, within limits.
 
-    Offered are all harmonics of `period` (s) in the `band`, or those of `omega` (rad/s). The
-    signal's peak is at most `amplitude`, that of its derivative `rate` (per s), that of each
-    output, settled, `output_amplitude`. `noise` is the outputs' one-sided spectral density in
-    units^2/Hz, as in `predict_accuracy`. Information is that of `periods` settled periods: fly one
-    more before them, or estimate the transient.
+    Information is that of `periods` settled periods: fly one more before them, or estimate the
+    transient.
 
-    Several models stand for what is not known yet: the mean of their log information counts. No
-    line takes more than 1/`lines` of what the limits leave it alone, so that at least so many are
-    used: with 1, p parameters may get as few as p/2, which leave nothing to judge the model by. By
-    default two, four and eight to a parameter are tried, since more lines also peak less; the most
-    informative signal is taken. `seed` is that of the phases' random starts.
+    **Arguments:**
 
-    Raises ValueError for limits, lines and parameters that allow no design.
+    - `model`: as for `jq.fit`; its values are the best guess. A list of models stands for what is
+        not known yet: the mean of their log information counts.
+    - `noise`: one-sided spectral density of the outputs in units^2/Hz: a number, one for each
+        output, a function of omega in rad/s, or a `jq.design.MeasuredNoise`.
+    - `amplitude`: limit of the signal's peak, in the unit of the input.
+    - `period`: in s. `periods`: how many are flown. `sample_rate`: in Hz.
+    - `free`: as in `jq.fit`.
+    - `band`: (low, high) in rad/s; all harmonics of the period within it may be used.
+    - `omega`: the lines that may be used, in rad/s, instead of `band`.
+    - `rate`: limit of the peak of the signal's derivative, per s.
+    - `output_amplitude`: limit of the peak of each settled output.
+    - `criterion`: `DOptimal()`, `AOptimal(...)`, `LargestError()`, or an object like them.
+    - `lines`: no line takes more than 1/`lines` of what the limits leave it alone, so at least so
+        many are used. With 1, p parameters may get as few as p/2 lines, which leave none to judge
+        the model by. By default two, four and eight for each parameter are tried.
+    - `input`: which input of the model is excited.
+    - `seed`: of the random starts of the phases.
+
+    **Returns:**
+
+    `jq.design.Design`.
+
+    **Raises:**
+
+    - `ValueError`: limits, lines or parameters that allow no design.
+    - `PrecisionError`: JAX runs in 32 bits.
     """
     require_x64("a design")
     models = list(model) if isinstance(model, list | tuple) else [model]
@@ -126,7 +144,10 @@ def optimal_multisine(
     offered = _offered(band, omega, period, sample_rate)
     parameters = [select_parameters(each, free) for each in models]
     if len({each.names for each in parameters}) > 1:
-        raise ValueError(f"models with other parameters: {[each.names for each in parameters]}")
+        sets = "; ".join(", ".join(each.names) for each in parameters)
+        raise ValueError(
+            f"the models have different free parameters: {sets}; give models of one form"
+        )
     names, seconds = parameters[0].names, float(period * periods)
     found = [
         unit_information(m, p, offered, noise, input)
@@ -147,7 +168,7 @@ def _whole_period(
 ) -> int:
     """Samples of a period."""
     if not models:
-        raise ValueError("no model: a design needs one, or a list of those that may be true")
+        raise ValueError("the list of models is empty: give one, or several that may be true")
     check_positive(amplitude=amplitude, period=period, sample_rate=sample_rate)
     if periods < 1 or periods != int(periods):
         raise ValueError(f"periods is {periods}: give a whole number, 1 or more")
@@ -158,7 +179,9 @@ def _offered(
     band: tuple[Number, Number] | None, omega: Lines | None, period: Number, sample_rate: Number
 ) -> Lines:
     if (band is None) == (omega is None):
-        raise ValueError("give either a band in rad/s, or the lines omega of which to choose")
+        raise ValueError(
+            "give either band=(low, high) or omega=, the lines to choose from, in rad/s"
+        )
     omega = np.asarray(omega, float) if band is None else harmonics(*band, period=period)
     check_lines(omega, period, sample_rate)
     return omega
@@ -170,7 +193,7 @@ def _least_lines(lines: int | None, parameters: int, offered: int) -> tuple[int,
         tried = [each * parameters for each in _LINES if each * parameters <= offered // 2]
         return tuple(tried) or (max(1, offered // 2),)
     if not 1 <= lines <= offered:
-        raise ValueError(f"lines is {lines}: of {offered} offered lines, use 1 to {offered}")
+        raise ValueError(f"lines is {lines}, but {offered} lines are offered: give 1 to {offered}")
     return (int(lines),)
 
 

@@ -50,7 +50,7 @@ def information_per_energy(
 def check_distinct(
     total: Float[np.ndarray, "parameters parameters"], names: tuple[str, ...]
 ) -> None:
-    """Raise ValueError where no excitation of these lines can tell the parameters apart."""
+    """Raise ValueError where excitation at these lines does not determine every parameter."""
     size = np.sqrt(np.diagonal(total))
     for name, each in zip(names, size, strict=True):
         if not each > 0:
@@ -60,16 +60,17 @@ def check_distinct(
         direction = vectors[:, 0]
         mixed = [n for n, x in zip(names, direction, strict=True) if abs(x) > 0.05]
         raise ValueError(
-            f"no excitation at these lines can tell {', '.join(mixed)} apart: fix one of them "
-            "(leave it out of free=), or offer more lines"
+            f"no excitation at these lines determines {', '.join(mixed)} one by one: fix one of "
+            "them (leave it out of free=), or offer more lines"
         )
 
 
 class Prediction(eqx.Module):
     """The best standard errors that an experiment allows: the Cramer-Rao bound of its noise.
 
-    Relative to the parameters' values, or to the scale of a `jq.identify.Real`. `cramer_rao` is CIFER's, as
-    `jq.fit` with `jq.identify.MaximumLikelihood` prints it: sqrt(2) times the standard error, in per cent.
+    Errors are relative to the parameters' values, or to the scale of a `jq.identify.Real`.
+    `cramer_rao` is CIFER's, in per cent, as a fit with `jq.identify.MaximumLikelihood` prints it:
+    sqrt(2) times the standard error.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -103,9 +104,9 @@ class Prediction(eqx.Module):
 
     def __str__(self) -> str:
         width = max(9, *(len(name) for name in self.names))
-        head = f"{'parameter':<{width}} {'std.err. %':>11} {'CR %':>8}"
+        head = f"{'parameter':<{width}} {'std. error %':>12} {'CR %':>8}"
         rows = zip(self.names, 100 * self.standard_errors, self.cramer_rao, strict=True)
-        return "\n".join([head, *(f"{n:<{width}} {e:11.3f} {c:8.3f}" for n, e, c in rows)])
+        return "\n".join([head, *(f"{n:<{width}} {e:12.3f} {c:8.3f}" for n, e, c in rows)])
 
 
 def predict_accuracy(
@@ -117,13 +118,28 @@ def predict_accuracy(
     band: tuple[float, float] | None = None,
     input: int = 0,
 ) -> Prediction:
-    """What a test signal at one `input` of `model` will tell of its `free` parameters.
+    """The standard errors to expect from a test signal: the Cramer-Rao bound.
 
-    The signal's own transform weighs the information of each frequency in the `band` (rad/s), by
-    default that of the excitation; a multisine counts at its lines, settled from the first period.
-    `noise` is the outputs' one-sided spectral density in units^2/Hz: a number, one for each
-    output, a function of omega in rad/s, or a `jq.design.MeasuredNoise`.
-    Raises ValueError where the parameters cannot be told apart.
+    The signal's own transform weighs the information of each frequency; a multisine counts at its
+    lines, settled from the first period.
+
+    **Arguments:**
+
+    - `model`, `free`: as in `jq.fit`.
+    - `excitation`: a `jq.sweep`, `jq.multisine` or another `jq.excitation.Excitation`.
+    - `noise`: one-sided spectral density of the outputs in units^2/Hz: a number, one for each
+        output, a function of omega in rad/s, or a `jq.design.MeasuredNoise`.
+    - `band`: (low, high) in rad/s; by default that of the excitation.
+    - `input`: which input of the model is excited.
+
+    **Returns:**
+
+    `jq.design.Prediction`.
+
+    **Raises:**
+
+    - `ValueError`: the excitation does not determine every parameter.
+    - `PrecisionError`: JAX runs in 32 bits.
     """
     require_x64("a design")
     model = with_arrays(model)
@@ -132,7 +148,9 @@ def predict_accuracy(
     low, high = (excitation.omega_min, excitation.omega_max) if band is None else band
     inside = (omega >= low * (1 - 1e-9)) & (omega <= high * (1 + 1e-9)) & (omega > 0)
     if not inside.any():
-        raise ValueError(f"the band {low:.4g} .. {high:.4g} rad/s holds no frequency of the signal")
+        raise ValueError(
+            f"the band {low:.4g} .. {high:.4g} rad/s contains no frequency of the signal"
+        )
     _, unit = unit_information(model, parameters, omega[inside], noise, input)
     total = np.einsum("f,fpq->pq", energy[inside], unit)
     check_distinct(total, parameters.names)

@@ -24,7 +24,7 @@ Amplitudes = Complex[np.ndarray, "signals frequencies"]
 def least_peak_phases(
     orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes, *, seed: int
 ) -> Phase:
-    """Phases of the lines that lower the largest peak of several signals at once.
+    """Phases of the lines under which several signals peak least, relative to their limits.
 
     The signals are sums of `amplitudes` times cos(order 2 pi t + phase), `orders` per period, in
     units of their limits. The p-norm over all of them is lowered for a rising p, from several
@@ -35,7 +35,7 @@ def least_peak_phases(
     rng = np.random.default_rng(seed)
     starts = [_schroeder(few, heights[0])]
     starts += [rng.uniform(-np.pi, np.pi, used.size) for _ in range(_STARTS - 1)]
-    found = [_lowered(start, few, heights) for start in starts]
+    found = [_lower_norm(start, few, heights) for start in starts]
     highest = [multisine_peaks(few, phase, heights).max() for phase in found]
     phase = np.zeros(orders.size)
     phase[used] = found[int(np.argmin(highest))]
@@ -45,7 +45,7 @@ def least_peak_phases(
 def multisine_peaks(
     orders: Int[np.ndarray, " frequencies"], phase: Phase, amplitudes: Amplitudes
 ) -> Float[np.ndarray, " signals"]:
-    """The least bound on each signal's peak at any time that its values at many points give.
+    """A bound on each signal's peak at any time, from its values at many points.
 
     Between N points, a signal of order n exceeds them by 1 / cos(pi n / N) at most (Ehlich and
     Zeller, 1964): 0.1 %.
@@ -59,7 +59,7 @@ def multisine_signals(
     orders: Int[np.ndarray, " frequencies"], phase: Phase, amplitudes: Amplitudes, points: int
 ) -> Float[np.ndarray, "signals points"]:
     """One period of each signal, at evenly spaced points."""
-    return _waves(orders, amplitudes * np.exp(1j * phase), points)
+    return _synthesise(orders, amplitudes * np.exp(1j * phase), points)
 
 
 def _schroeder(
@@ -71,7 +71,7 @@ def _schroeder(
     return -2 * np.pi * np.concatenate([[0.0], np.cumsum(below[1:] * np.diff(orders))])
 
 
-def _lowered(
+def _lower_norm(
     phase: Phase, orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes
 ) -> Phase:
     from scipy.optimize import minimize
@@ -95,7 +95,7 @@ def _log_norm(
 ) -> tuple[float, Phase]:
     """Logarithm of the norm over all signals and points, and its gradient."""
     turned = amplitudes * np.exp(1j * phase)
-    signals = _waves(orders, turned, points)
+    signals = _synthesise(orders, turned, points)
     top = np.abs(signals).max()
     unit = signals / top
     powers = unit ** (norm - 2)
@@ -105,7 +105,7 @@ def _log_norm(
     return float(np.log(total / unit.size) / norm + np.log(top)), slope
 
 
-def _waves(
+def _synthesise(
     orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes, points: int
 ) -> Float[np.ndarray, "signals points"]:
     spectrum = np.zeros((len(amplitudes), points // 2 + 1), complex)
@@ -149,7 +149,7 @@ def optimal_powers(
     """
     price = jnp.full(costs.shape[0], 1 / costs.shape[0], costs.dtype)
     start = Powers(_feasible(_cap(costs, share), costs), price)
-    return _improved(start, per_power, costs, criterion, names, share, jnp.asarray(_STEPS))[0]
+    return _improve(start, per_power, costs, criterion, names, share, jnp.asarray(_STEPS))[0]
 
 
 def certify_powers(
@@ -164,11 +164,11 @@ def certify_powers(
 
     Weak duality; with one limit and no cap, the equivalence theorem of Kiefer and Wolfowitz (1960).
     """
-    return _improved(found, per_power, costs, criterion, names, share, jnp.asarray(0))[1]
+    return _improve(found, per_power, costs, criterion, names, share, jnp.asarray(0))[1]
 
 
 @eqx.filter_jit
-def _improved(
+def _improve(
     found: Powers,
     per_power: PerPower,
     costs: Costs,
@@ -186,7 +186,7 @@ def _improved(
         price = price / jnp.sum(price)
         cost = price @ costs
         gain = (slope(state.power) / cost) ** criterion.exponent
-        return Powers(_filled(state.power * gain, cost, cap), price)
+        return Powers(_fill_limits(state.power * gain, cost, cap), price)
 
     def certificate(state):
         power, cost = _feasible(state.power, costs), state.price @ costs
@@ -226,8 +226,8 @@ def _feasible(power: Power, costs: Costs) -> Power:
     return power / jnp.maximum(jnp.max(costs @ power), 1.0)
 
 
-def _filled(wanted: Power, cost: Power, cap: Power) -> Power:
-    """`wanted` scaled to a cost of 1, where what exceeds its cap goes to the others."""
+def _fill_limits(wanted: Power, cost: Power, cap: Power) -> Power:
+    """`wanted` scaled to a cost of 1; what exceeds a line's cap goes to the other lines."""
 
     def again(_, scale):
         full = scale * wanted >= cap
@@ -305,7 +305,7 @@ Lines = Float[np.ndarray, " frequencies"]
 
 
 class Plan(NamedTuple):
-    """What a design may use and what it is for."""
+    """The lines on offer, the limits, and the criterion of a design."""
 
     omega: Lines  # rad/s
     orders: np.ndarray
@@ -346,7 +346,7 @@ def _trial(
     costs, problem = plan.limits.costs(crest), jnp.asarray(plan.per_power)
     share = jnp.asarray(1 / lines, dtype=problem.dtype)
     found = optimal_powers(problem, jnp.asarray(costs), plan.criterion, plan.names, share)
-    power = _without_faint(np.asarray(found.power), costs)
+    power = _drop_faint(np.asarray(found.power), costs)
     phase = least_peak_phases(plan.orders, _signals(plan, power), seed=seed)
     reached = multisine_peaks(plan.orders, phase, _signals(plan, power))
     power, reached = power / reached.max() ** 2, reached / reached.max()
@@ -360,13 +360,13 @@ def _trial(
     return Trial(power, phase, reached, dispersion, efficiency, _value(plan, power), lines), crest
 
 
-def _without_faint(power: Lines, costs: Float[np.ndarray, "limits frequencies"]) -> Lines:
+def _drop_faint(power: Lines, costs: Float[np.ndarray, "limits frequencies"]) -> Lines:
     share = costs.max(axis=0) * power
     return np.where(share > _FAINT * share.max(), power, 0.0)
 
 
 def _signals(plan: Plan, power: Lines) -> Complex[np.ndarray, "limits frequencies"]:
-    """Complex amplitudes of what is limited, in units of the limits."""
+    """Complex amplitudes of the limited signals, in units of their limits."""
     return plan.limits.filters * np.sqrt(2 * power) / plan.limits.peaks[:, None]
 
 

@@ -93,7 +93,7 @@ class Fit(eqx.Module):
     average_cost: float  # per response
     information: float  # Takeuchi's criterion: cost plus what fitting the noise took off it, twice
     chi_squared: float  # cost over what the measured noise alone would leave: about 1
-    newton_decrement: float  # what one more Gauss-Newton step would lower the cost by
+    newton_decrement: float  # half of what one more Gauss-Newton step would take off the cost
     condition: float  # of the scaled Jacobian
     points: int  # frequencies used, over all responses
     steps: int

@@ -126,8 +126,7 @@ def remedies_for(lost: tuple[str, ...]) -> tuple[str, ...]:
     names = " or ".join(lost)
     return (
         f"fix {names} at a measured value (leave it out of free=)",
-        "give what a data sheet or a static test says of it: "
-        "priors=[jq.identify.Prior(name or function, value, standard error)]",
+        "give a known value: priors=[jq.identify.Prior(name or function, value, standard error)]",
         f"fit a second record under a known change of {names} (conditions=)",
     )
 

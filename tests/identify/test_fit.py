@@ -37,6 +37,11 @@ def test_the_cost_is_equation_14_and_its_minimum_that_of_scipy():
     frf = response_of(TRUTH, seed=0)
     fit = jq.fit(START, frf)
     assert fit.cost == pytest.approx(cost_14(fit.values, frf), rel=1e-10)
+    T, T_hat = (
+        np.asarray(r)[:, 0, 0] for r in (fit.model.frequency_response(frf.omega), frf.response)
+    )
+    gamma_squared = np.asarray(frf.coherence)[:, 0, 0]
+    assert fit.cost == pytest.approx(jq.identify.paper_cost(T, T_hat, gamma_squared), rel=1e-10)
 
     def root(log_values):
         ratio = jq.LaggedIntegrator(*np.exp(log_values)).frequency_response(jnp.asarray(OMEGA))
