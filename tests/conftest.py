@@ -27,7 +27,7 @@ def share_compiled_loops() -> None:
     """Let workers and their subprocesses take from disk what one of them has compiled."""
     if FOLDER not in os.environ:  # as in the workers, whose parent it is that removes it
         os.environ[FOLDER] = tempfile.mkdtemp(prefix="jaxquad-compiled-")
-        os.environ[LEAST] = "0.2"  # s of compile time
+        os.environ[LEAST] = "0.1"  # s of compile time: smaller programs take as long to store
         atexit.register(shutil.rmtree, os.environ[FOLDER], ignore_errors=True)
     jax.config.update(FOLDER.lower(), os.environ[FOLDER])
     jax.config.update(LEAST.lower(), float(os.environ.get(LEAST, 1.0)))
