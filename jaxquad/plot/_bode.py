@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from jaxquad.models import evaluate_response, Model
 from jaxquad.spectra import FrequencyResponse
 
-from ._labels import plain_ticks
+from ._labels import plain_ticks, Style
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
@@ -143,14 +143,14 @@ def _draw_measured(axes: Sequence[Axes], curve: _Curve, name: str) -> None:
 
 def _draw_other(axes: Sequence[Axes], curve: _Curve, name: str, k: int) -> None:
     mark, good = _MARKS[k % len(_MARKS)], curve.good
-    style = dict(ls="none", marker=mark, ms=5, mew=0.9, color="tab:red", label=name)
+    style: Style = dict(ls="none", marker=mark, ms=5, mew=0.9, color="tab:red", label=name)
     axes[0].plot(curve.omega[good], curve.magnitude[good], **style)
     axes[1].plot(curve.omega[good], curve.phase[good], **style)
     axes[2].plot(curve.omega, curve.coherence, ls=":", marker=mark, ms=3, lw=0.8, color="tab:red")
 
 
 def _draw_model(axes: Sequence[Axes], curve: _Curve, name: str, k: int) -> None:
-    style = dict(ls=_LINES[k % len(_LINES)], lw=1.6, color="tab:blue", label=name)
+    style: Style = dict(ls=_LINES[k % len(_LINES)], lw=1.6, color="tab:blue", label=name)
     axes[0].plot(curve.omega, curve.magnitude, **style)
     axes[1].plot(curve.omega, curve.phase, **style)
 
@@ -174,7 +174,9 @@ def _label(figure: Figure, axes: Sequence[Axes], name: str, title: str) -> None:
     axes[2].text(0.995, COHERENT + 0.02, f"{COHERENT}", ha="right", va="bottom", fontsize=8,
                  color="0.3", transform=axes[2].get_yaxis_transform())  # fmt: skip
     axes[2].set(ylim=(0, 1.02), xscale="log", xlabel="frequency, rad/s")
-    hertz = axes[0].secondary_xaxis("top", functions=(_to_hertz, _to_rad))
+    turn = 2 * np.pi
+    functions = (lambda omega: omega / turn, lambda hertz: hertz * turn)
+    hertz = axes[0].secondary_xaxis("top", functions=functions)
     hertz.set_xlabel("frequency, Hz")
     for axis in (axes[2].xaxis, hertz.xaxis):
         plain_ticks(axis)
@@ -183,11 +185,3 @@ def _label(figure: Figure, axes: Sequence[Axes], name: str, title: str) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9)
     if title:
         figure.suptitle(title)
-
-
-def _to_hertz(omega: Float[np.ndarray, " *frequencies"]) -> Float[np.ndarray, " *frequencies"]:
-    return omega / (2 * np.pi)
-
-
-def _to_rad(hertz: Float[np.ndarray, " *frequencies"]) -> Float[np.ndarray, " *frequencies"]:
-    return hertz * 2 * np.pi

@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxquad.tuning import Evaluation
 
-from ._labels import draw_limit
+from ._labels import draw_limit, Style
 
 
 Count = Int[np.ndarray, " evaluations"]
@@ -57,7 +57,10 @@ def _costs(panel: Axes, count: Count, cost: Values) -> None:
     for k, line in enumerate(above.T):
         known = np.isfinite(line)
         least = np.minimum.accumulate(np.where(known, line, np.inf))[known]
-        style = {"color": f"{0.5 * k / max(1, above.shape[1]):.2f}", "ls": _LINES[k % len(_LINES)]}
+        style: Style = {
+            "color": f"{0.5 * k / max(1, above.shape[1]):.2f}",
+            "ls": _LINES[k % len(_LINES)],
+        }
         panel.plot(count[known], least, lw=1.4, label=f"start {k + 1}", **style)
         panel.plot(count[known], line[known], "o", ms=3, mfc="none", mew=0.8, color=style["color"])
     panel.set(yscale="log", ylabel="cost above the best")
@@ -68,7 +71,10 @@ def _costs(panel: Axes, count: Count, cost: Values) -> None:
 def _shares(panel: Axes, count: Count, stable: Values) -> None:
     for k, line in enumerate(stable.T):
         known = np.isfinite(line)
-        style = {"color": f"{0.5 * k / max(1, stable.shape[1]):.2f}", "ls": _LINES[k % len(_LINES)]}
+        style: Style = {
+            "color": f"{0.5 * k / max(1, stable.shape[1]):.2f}",
+            "ls": _LINES[k % len(_LINES)],
+        }
         panel.plot(count[known], 100 * line[known], drawstyle="steps-mid", lw=1.4, **style)
     panel.set(ylabel="stable members, %", ylim=(-4, 104))
     panel.grid(True, which="major", color="0.9", lw=0.5)

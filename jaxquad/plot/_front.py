@@ -71,8 +71,9 @@ def _peer(
     panel: Axes, name: str, style: Style, design: DesignResult, over: str, edge: float
 ) -> None:
     effort, itae = front_point(design, over)
+    bold: Style = style | {"ms": 8.0, "mew": 1.4}
     x, y = min(effort, edge), QUANTITIES["itae"].number(itae)
-    panel.plot(x, y, ls="none", label=name, **(style | {"ms": 8.0, "mew": 1.4}))
+    panel.plot(x, y, ls="none", label=name, **bold)
     count = design.unstable_count
     if count:
         panel.plot(x, y, "x", color="black", ms=9, mew=1.2, zorder=4)

@@ -30,7 +30,7 @@ class Provenance(NamedTuple):
     versions: dict[str, str]
     date: str  # ISO 8601, UTC
 
-    def content(self) -> dict[str, object]:
+    def content(self) -> Mapping[str, object]:
         """For `result.json`, see `jaxquad.report.write_results`."""
         return self._asdict() | {"files": [file._asdict() for file in self.files]}
 

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from jaxquad.records import AXES, Mix, parse_mix
+from jaxquad.records import AXES, parse_mix
 
 
 Pair = tuple[float, float]
+Value = Any  # of a setting: a text, number, switch, pair, ... as its `Kind` converts it
 
 
 class SettingsError(ValueError):
@@ -24,16 +25,16 @@ class Kind:
     and written by `write`, and may repeat them if `repeated`.
     """
 
-    convert: Callable[[Any], Any]
+    convert: Callable[[object], Value]
     read: Callable[[str], object] = str
-    write: Callable[[Any], str] = str
+    write: Callable[[Value], str] = str
     words: int = 1
     repeated: bool = False
     metavar: str | tuple[str, ...] | None = None
     choices: tuple[str, ...] | None = None
 
 
-def convert(key: str, kind: Kind, value: object) -> Any:
+def convert(key: str, kind: Kind, value: object) -> Value:
     """Raises SettingsError where the value is none of its kind."""
     try:
         return kind.convert(value)
@@ -64,8 +65,9 @@ def _number(value: object) -> float:
 
 
 def _is_number(value: object) -> TypeGuard[float | int]:
-    known = isinstance(value, int | float) and not isinstance(value, bool)
-    return known and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return math.isfinite(value)
 
 
 def _positive(value: object) -> float:
@@ -104,7 +106,7 @@ def _mix(value: object) -> str:
     return text
 
 
-def mix_text(mix: Mix) -> str:
+def mix_text(mix: Mapping[str, Mapping[str, float]]) -> str:
     """A mix as `jaxquad.records.parse_mix` reads it."""
     [(name, weights)] = mix.items()
     if dict(weights) == {name: 1.0}:

@@ -6,10 +6,10 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 from . import _kinds as kinds
-from ._kinds import convert, Pair, SettingsError
+from ._kinds import convert, Pair, SettingsError, Value
 
 
 class Option(NamedTuple):
@@ -21,7 +21,9 @@ class Option(NamedTuple):
     flag: str
 
 
-def _option(kind: kinds.Kind, default: Any, help: str, *, group: str = "", flag: str = "") -> Any:
+def _option(
+    kind: kinds.Kind, default: Value, help: str, *, group: str = "", flag: str = ""
+) -> Value:
     metadata = {"option": Option(kind, help, group, flag)}
     if isinstance(default, dict):
         return dataclasses.field(default_factory=default.copy, metadata=metadata)
@@ -57,7 +59,7 @@ class _Settings:
         return {key: each._replace(flag=flags[key]) for key, each in found.items()}
 
     @classmethod
-    def defaults(cls) -> dict[str, Any]:
+    def defaults(cls) -> dict[str, Value]:
         fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
         return {f.name: {} if f.default is _REQUIRED else f.default for f in fields}
 
@@ -86,11 +88,11 @@ class _Settings:
         """As `from_mapping`, from a TOML file."""
         return cls.from_mapping(read_toml(path), str(path))
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, Value]:
         """All settings, for JSON; `from_mapping` reads them."""
         return {key: vars(self)[key] for key in self.options()}
 
-    def given(self) -> dict[str, Any]:
+    def given(self) -> dict[str, Value]:
         """The settings that differ from their defaults."""
         defaults = self.defaults()
         return {key: value for key, value in self.content().items() if value != defaults[key]}
@@ -109,7 +111,7 @@ class _Settings:
             object.__setattr__(self, key, self._converted(key, option.kind))
         self._check_together()
 
-    def _converted(self, key: str, kind: kinds.Kind) -> Any:
+    def _converted(self, key: str, kind: kinds.Kind) -> Value:
         value = vars(self)[key]
         if value is None and self.defaults()[key] is None:
             return None
@@ -119,7 +121,7 @@ class _Settings:
         pass
 
 
-def _words(option: Option, value: Any) -> list[str]:
+def _words(option: Option, value: Value) -> list[str]:
     kind, flag = option.kind, option.flag
     if kind.words == 0:
         return [flag]
@@ -203,7 +205,9 @@ class IdentifySettings(_Settings):
         flag="--unit",
     )
     time: str | None = _option(kinds.TEXT, None, "the channel that holds the time", group=_RUN)
-    time_unit: str | None = _option(kinds.TIME_UNIT, None, "its unit", group=_RUN)
+    time_unit: Literal["s", "ms", "us", "ns"] | None = _option(
+        kinds.TIME_UNIT, None, "its unit", group=_RUN
+    )
     rate: float | None = _option(
         kinds.HERTZ,
         None,
@@ -439,12 +443,10 @@ class BatchSettings(_Settings):
             tables = content.get("override", [])
             if not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
                 raise SettingsError("`override` is no list of tables: write [[override]]")
-            own = {key: value for key, value in content.items() if key in cls.options()}
-            return cls(
-                **own,  # pyright: ignore[reportArgumentType]
-                identify={key: content[key] for key in content if key in _LOG_KEYS},
-                overrides=tuple(_override(k, table) for k, table in enumerate(tables, start=1)),
-            )
+            found: dict[str, Value] = {k: content[k] for k in content if k in cls.options()}
+            found["identify"] = {key: content[key] for key in content if key in _LOG_KEYS}
+            found["overrides"] = [_override(k, table) for k, table in enumerate(tables, start=1)]
+            return cls(**found)
         except SettingsError as error:
             raise _within(where, error) from error
 

@@ -25,7 +25,7 @@ class Job(NamedTuple):
 
 
 Content = dict[str, Any]  # what JSON can hold; "status" at least
-Work = Callable[[Job], Mapping[str, Any]]
+Work = Callable[[Job], Mapping[str, object]]
 
 
 def perform(work: Work, job: Job) -> Content:
@@ -117,7 +117,7 @@ def stored_result(job: Job) -> Content | None:
     return content if isinstance(content, dict) and content.get("key") == job.key else None
 
 
-def store_result(job: Job, content: Mapping[str, Any]) -> None:
+def store_result(job: Job, content: Mapping[str, object]) -> None:
     """Put a result on the disk."""
     text = json.dumps(dict(content) | {"key": job.key}, indent=1, allow_nan=False)
     write_file(_path(job), text)

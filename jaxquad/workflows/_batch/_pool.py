@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from multiprocessing.process import BaseProcess
 
 from ._jobs import Content, failure, Job, perform, store_result, stored_result, Work
 
@@ -110,7 +110,7 @@ def _seconds_left(workers: Iterable[_Worker]) -> float | None:
 
 
 def _next(
-    busy: dict[Any, _Worker],
+    busy: dict[Connection, _Worker],
     worker: _Worker,
     jobs: Iterator[Job],
     work: Work,
@@ -126,7 +126,9 @@ def _next(
         _start(busy, worker, job, timeout)
 
 
-def _start(busy: dict[Any, _Worker], worker: _Worker, job: Job, timeout: float | None) -> None:
+def _start(
+    busy: dict[Connection, _Worker], worker: _Worker, job: Job, timeout: float | None
+) -> None:
     worker.give(job, timeout)
     busy[worker.connection] = worker
 
@@ -151,11 +153,11 @@ def _end_with_the_parent() -> None:
     _kill(None)
 
 
-def _kill(process: Any) -> None:
+def _kill(process: BaseProcess | None) -> None:
     """A process (None: this one) with the readers that it has started."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(OSError):  # It has no group of its own yet.
-            os.killpg(process.pid if process else os.getpid(), signal.SIGKILL)
+            os.killpg((process and process.pid) or os.getpid(), signal.SIGKILL)
     if process is None:
         os._exit(1)
     process.kill()

@@ -3,13 +3,14 @@ import io
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from jaxquad._core import write_file
 
+from ._jobs import Content
 
-Row = dict[str, Any]  # "log", "status", "key", and what the work returned
+
+Row = Content  # "log", "key", and what the work returned
 _FIRST = ("log", "status")
 _LAST = ("remarks", "seconds", "error", "report", "key")
 
@@ -42,7 +43,7 @@ def columns(flat: Sequence[Row]) -> list[str]:
     return [*_FIRST, *(n for n in found if n not in (*_FIRST, *_LAST)), *_LAST]
 
 
-def _cell(value: Any) -> Any:
+def _cell(value: object) -> object:
     """What a spreadsheet would take for a formula becomes a text."""
     risky = isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r")
     return f"'{value}" if risky else value
@@ -66,10 +67,10 @@ def _parquet(out: Path, flat: Sequence[Row], names: Sequence[str]) -> list[Path]
     return [out / "table.parquet"]
 
 
-def _typed(value: Any, is_text: bool) -> Any:
-    if value is None:
-        return None
-    return str(value).encode("utf-8", "replace").decode() if is_text else float(value)
+def _typed(value: object, is_text: bool) -> str | float | None:
+    if is_text and value is not None:
+        return str(value).encode("utf-8", "replace").decode()
+    return float(value) if isinstance(value, int | float) else None
 
 
 _STATES = ("failed", "not identifiable", "identified")  # what needs a look comes first
