@@ -2,8 +2,11 @@ from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._axis import AttitudeAxis as AttitudeAxis
 from ._connect import realise as realise, series as series, state_space as state_space
-from ._decoupled import AxesState as AxesState, DecoupledAxes as DecoupledAxes
-from ._discretise import split_delay as split_delay
+from ._decoupled import (
+    AxesState as AxesState,
+    DecoupledAxes as DecoupledAxes,
+    LinearAxis as LinearAxis,
+)
 from ._entry_slopes import Entry as Entry, logarithmic_slopes as logarithmic_slopes
 from ._modes import Mode as Mode, modes as modes
 from ._multirotor import (
@@ -26,7 +29,11 @@ from ._rotation import (
     quaternion_from_euler as quaternion_from_euler,
     rotation_matrix as rotation_matrix,
 )
-from ._simulate_linear import free_responses as free_responses, simulate_linear as simulate_linear
+from ._simulate_linear import (
+    free_responses as free_responses,
+    simulate_linear as simulate_linear,
+    split_delay as split_delay,
+)
 from ._state_space import explicit as explicit, matrices_of as matrices_of, StateSpace as StateSpace
 from ._transfer_function import (
     imaginary as imaginary,

@@ -26,15 +26,25 @@ _INPUTS = ("voltage", "omega2")
 class Allocation(eqx.Module):
     """From four motor inputs to three body torques, for "+" and "x" frames.
 
-    Source: Eq. (9), (10). `convention` names body axes and rotor order:
-    "frd-frbl", the paper's "+" (forward, right, down; front, right, back, left);
-    "quanser", a "+" of the maker of its rig (back, right, up; front, back, right, left);
-    "px4-x", and ArduPilot's (forward, right, down; front right, back left, front left, back right);
-    "crazyflie", an "x" (forward, left, up; front right, back right, back left, front left).
-    Seen from above, anticlockwise turn front and back, or front right and back left. In an "x" the
-    lever is arm / sqrt(2). `input` says what drives a motor: its "voltage", or the squared speed
-    "omega2". Raises ValueError for an unknown convention or input, and for a value that is not
-    positive.
+    Seen from above, the front and back rotors turn anticlockwise, or those at front right and back
+    left. In an "x" the lever is arm / sqrt(2).
+    Source: Eq. (9), (10) of the paper.
+
+    **Arguments:**
+
+    - `arm`: from centre to rotor in m.
+    - `thrust_coefficient`: in N/V or N s^2; `torque_coefficient`: in N m/V or N m s^2.
+    - `convention`: the body axes and the order of the rotors.
+        "frd-frbl", the paper's "+": forward, right, down; front, right, back, left.
+        "quanser", a "+" of the maker of the Hover: back, right, up; front, back, right, left.
+        "px4-x", ArduPilot's too: forward, right, down; front right, back left, front left, back
+        right.
+        "crazyflie", an "x": forward, left, up; front right, back right, back left, front left.
+    - `input`: the "voltage" of a motor, or its squared speed "omega2".
+
+    **Raises:**
+
+    - `ValueError`: convention or input is unknown, or a value is not positive.
     """
 
     arm: Float[Array, "..."] = per_member(0, converter=as_float)  # L, m
@@ -65,7 +75,7 @@ class Allocation(eqx.Module):
         return align(self.torque_per_difference, inputs) * self.differences(inputs)
 
     def differences(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
-        """What Eq. (9) multiplies by lever K_t (twice) and K_l: V4 - V2 and so on in the paper."""
+        """The differences of inputs that Eq. (9) multiplies by lever K_t and K_l: V4 - V2 etc."""
         return _product(self._signs, inputs)
 
     def inputs(
@@ -73,8 +83,8 @@ class Allocation(eqx.Module):
     ) -> Float[Array, " 4 *ensemble"]:
         """The four motor inputs that give a body `torque` in N m about a mean input `collective`.
 
-        Eq. (10) has no row for the thrust, so `collective` (the bias voltage on the rig) makes the
-        answer unique. The rows are orthogonal, hence the inverse is a scaled transpose.
+        Eq. (10) has no row for the thrust, so `collective` (the bias voltage of the Hover) makes
+        the answer unique. The rows are orthogonal, hence the inverse is a scaled transpose.
         """
         return self.from_differences(torque / align(self.torque_per_difference, torque), collective)
 
@@ -119,4 +129,4 @@ def _product(matrix: np.ndarray, vectors: Float[Array, " n *ensemble"]) -> Array
 
 def _require_known(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
-        raise ValueError(f"{name} is {value!r}, which does not exist: use one of {known}.")
+        raise ValueError(f"{name} is {value!r}, which does not exist: choose one of {known}.")

@@ -27,12 +27,21 @@ def friction(
 class Attitude(eqx.Module):
     """A rigid multirotor turning about its centre of mass, in principal body axes.
 
-    Source: Eq. (2) and (5)-(7), corrected, with `damping` for K_af and `rotor_inertia` for J_M.
-    Each parameter is one value per axis, with an optional trailing ensemble axis. `stiffness`, in
-    N m/rad, is the pull of a rig whose centre of mass hangs below its pivot: a body torque per
-    Euler angle, right to first order in the angles; None leaves it out, and the trigonometry too.
-    `coulomb` is the dry friction of a rig's bearings, coulomb * tanh(rate / 0.01 rad/s); None
-    leaves it out. Raises ValueError for an inertia that is not positive.
+    Source: Eq. (2) and (5)-(7) of the paper, corrected, with `damping` for K_af and `rotor_inertia`
+    for J_M.
+
+    **Arguments:** (one value per axis each, or `[3, *ensemble]`)
+
+    - `inertia`: in kg m^2; `damping`: in N m s/rad.
+    - `rotor_inertia`: of one rotor in kg m^2, one value or `[*ensemble]`; 0 leaves the spin out.
+    - `stiffness`: in N m/rad, of a test stand whose centre of mass is below its pivot: a body
+        torque per Euler angle, to first order in the angles. None leaves it out.
+    - `coulomb`: the dry friction of the bearings in N m, coulomb * tanh(rate / 0.01 rad/s); None
+        leaves it out.
+
+    **Raises:**
+
+    - `ValueError`: an inertia is not positive, or a value is not finite.
     """
 
     inertia: Float[Array, "3 ..."] = per_member(1, converter=as_float)  # kg m^2

@@ -13,10 +13,19 @@ from ._transfer_function import imaginary, TransferFunction
 class AttitudeAxis(eqx.Module):
     """One axis near hover, from the difference of two opposite motor inputs to the angle in rad.
 
-    Source: Eq. (28), with the lag, delay and damping that it neglects; all three 0 give it back.
-    Only the ratio L K_t / J_x enters the response: one record cannot tell J_x from K_t. That takes
-    a second record with a known added inertia (`with_added_inertia`), a known static torque, or a
-    prior. Raises ValueError for values outside their physical range.
+    Only the ratio L K_t / J_x enters the response: one record cannot separate J_x from K_t. That
+    takes a second record with a known added inertia (`with_added_inertia`), a known static torque,
+    or a prior.
+    Source: Eq. (28) of the paper with the lag, delay and damping that it neglects.
+
+    **Arguments:**
+
+    - `L`: the arm in m; `K_t`: the thrust in N/V; `J_x`: the inertia in kg m^2.
+    - `lag`: of motor and propeller in s; `delay`: in s; `K_af`: the damping in N m s/rad.
+
+    **Raises:**
+
+    - `ValueError`: a value is outside its physical range.
     """
 
     L: Float[Array, ""] = eqx.field(converter=as_float)  # arm, m

@@ -43,10 +43,14 @@ def _fastest(a: Float[Array, " states"], powers: Float[Array, " states"]) -> Flo
 
 
 def state_space(model: TransferFunction) -> StateSpace:
-    """A transfer function in states, those of `realise`; its delay becomes that of the input.
+    """A transfer function as a `StateSpace`; its delay becomes that of the input.
 
-    A direct passage from input to output, which H0 x + H1 x' has no place for, becomes a share of
-    x'. Raises ValueError for a pure gain, which has no states.
+    The states are those of `realise`. A direct passage from input to output, which H0 x + H1 x'
+    does not have, becomes a share of x'.
+
+    **Raises:**
+
+    - `ValueError`: the model is a pure gain, which has no states.
     """
     A, B, C, D = realise(model)
     if not len(A):
@@ -63,10 +67,16 @@ def state_space(model: TransferFunction) -> StateSpace:
 
 
 def series(first: StateSpace, second: StateSpace) -> StateSpace:
-    """The outputs of `first` drive the inputs of `second`; the response is second times first.
+    """Two models in series: the outputs of `first` drive the inputs of `second`.
 
-    Raises ValueError where their numbers differ, and where several signals between the two are late
-    by different times: then no delay of an input or output does the same.
+    **Returns:**
+
+    The model whose response is that of `second` times that of `first`.
+
+    **Raises:**
+
+    - `ValueError`: the numbers of outputs and inputs differ, or several signals between the two
+        models have different delays, which no delay of an input or output can replace.
     """
     made, taken = first.H0.shape[0], second.G.shape[1]
     if made != taken:
@@ -112,8 +122,8 @@ def _common(late: Float[Array, " signals"] | None) -> Float[Array, ""] | None:
     if is_concrete(late) and np.ptp(np.asarray(late)) == 0:
         return late[0]
     raise ValueError(
-        f"The signals between the models are late by {late} s: give them one known delay, or put "
-        "the delays on the first inputs and the last outputs."
+        f"The signals between the models have the delays {late} s: give them one known delay, or "
+        "put the delays on the first inputs and the last outputs."
     )
 
 

@@ -25,8 +25,21 @@ def _per_axis_or_none(x: ArrayLike | Sequence | None) -> Array | None:
     return None if x is None else _per_axis(x)
 
 
+class LinearAxis(eqx.Module):
+    """One axis of a plant about rest: x' = A x + command u + torque d, angle = x[0].
+
+    The states are the angle in rad, its rate in rad/s and, after these, those of the motors in units
+    of the command u; d is a disturbance torque in N m. All may have an ensemble on trailing axes.
+    """
+
+    A: Float[Array, "states states *ensemble"] = per_member(2)
+    command: Float[Array, "states *ensemble"] = per_member(1)
+    torque: Float[Array, "states *ensemble"] = per_member(1)
+    gain: Float[Array, "*ensemble"] = per_member(0)  # rad/s^2 per unit of a steady command
+
+
 class AxesState(eqx.Module):
-    """What `DecoupledAxes` remember, or the time derivative of it."""
+    """The state of `DecoupledAxes`, or its time derivative."""
 
     angle: Float[Array, " axes *ensemble"]  # rad
     rate: Float[Array, " axes *ensemble"]  # rad/s
@@ -34,15 +47,30 @@ class AxesState(eqx.Module):
 
 
 class DecoupledAxes(eqx.Module):
-    """Axes that do not feel each other: J angle'' = torque_gain u_m - friction + disturbance.
+    """Axes without coupling: J angle'' = torque_gain u_m - friction + disturbance.
 
     Friction is damping * rate + coulomb * tanh(rate / 0.01 rad/s) + stiffness * angle, and the
-    motors follow the command u by a first-order lag, u_m' = (u - u_m) / lag. Every parameter is one
-    value for all axes or one per axis, with an optional trailing ensemble axis; None leaves a term
-    out. On the Quanser Hover `torque_gain` is L K_f = 0.0234 N m/V for u = V4 - V2, and twice that
-    where +u and -u go to two motors.
-    Source: Eq. (28), with the terms that it neglects. Raises ValueError for an inertia, torque gain
-    or lag that is not positive, for friction that is not finite, and for shapes that do not match.
+    motors follow the command u by a first-order lag, u_m' = (u - u_m) / lag.
+    Source: Eq. (28) of the paper, with the terms that it neglects.
+
+    !!! example
+
+        ```python
+        plant = jq.DecoupledAxes(torque_gain=[0.0468], inertia=[0.0552], lag=0.02)
+        ```
+
+    **Arguments:** (one value for all axes, one per axis, or `[axes, *ensemble]`)
+
+    - `torque_gain`: in N m per unit of command. On the Quanser Hover it is L K_f = 0.0234 N m/V for
+        u = V4 - V2, and twice that for +u and -u on two motors.
+    - `inertia`: in kg m^2.
+    - `lag`: of the motors in s; None leaves it out.
+    - `damping`: in N m s/rad; `stiffness`: in N m/rad; `coulomb`: in N m, None leaves it out.
+
+    **Raises:**
+
+    - `ValueError`: an inertia, torque gain or lag is not positive, friction is not finite, or the
+        shapes do not match.
     """
 
     torque_gain: Float[Array, "axes ..."] = per_member(1, converter=_per_axis)  # N m per unit of u
@@ -121,9 +149,34 @@ class DecoupledAxes(eqx.Module):
         """The angles in rad."""
         return state.angle
 
+    def linearise(self, axis: int) -> LinearAxis:
+        """One axis about rest, without its dry friction, which has no linear part.
+
+        **Raises:** ValueError for an axis that the plant does not have.
+        """
+        axes, *ensemble = self.shape
+        if not 0 <= axis < axes and axes > 1:
+            raise ValueError(f"axis is {axis}, but the plant has axes 0 to {axes - 1}")
+        of_axis = lambda x: _on_axis(x, axis, tuple(ensemble))
+        inertia, lag = of_axis(self.inertia), None if self.lag is None else of_axis(self.lag)
+        one, zero = jnp.ones_like(inertia), jnp.zeros_like(inertia)
+        gain = of_axis(self.torque_gain) / inertia
+        pull, brake = -of_axis(self.stiffness) / inertia, -of_axis(self.damping) / inertia
+        rows, command, torque = [[zero, one], [pull, brake]], [zero, gain], [zero, 1 / inertia]
+        if lag is not None:
+            rows = [[zero, one, zero], [pull, brake, gain], [zero, zero, -1 / lag]]
+            command, torque = [zero, zero, 1 / lag], [*torque, zero]
+        return LinearAxis(jnp.array(rows), jnp.array(command), jnp.array(torque), gain)
+
     def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "DecoupledAxes":
         """The same axes carrying a known extra `inertia` in kg m^2, such as a payload."""
         return eqx.tree_at(lambda p: p.inertia, self, added(self.inertia, inertia))
+
+
+def _on_axis(x: Float[Array, "axes ..."], axis: int, ensemble: tuple[int, ...]) -> Array:
+    """The value of one axis for each member; where all axes share a value, that one."""
+    value = x[axis if x.shape[0] > 1 else 0]
+    return jnp.broadcast_to(value.reshape(value.shape + (1,) * (len(ensemble) - value.ndim)), ensemble)
 
 
 def added(inertia: Float[Array, "axes ..."], extra: Float[ArrayLike, "..."]) -> Array:

@@ -88,7 +88,13 @@ class Mode(NamedTuple):
 def modes(model: HasPoles) -> tuple[Mode, ...]:
     """Frequency, damping and time constant of each mode of a linear model, slowest first.
 
-    On the host, so not under jit.
+    **Arguments:**
+
+    - `model`: has `poles` in rad/s. They are computed by NumPy, so not under jit.
+
+    **Returns:**
+
+    One `Mode` for each real pole and each pair of complex ones.
     """
     poles = [complex(pole) for pole in np.asarray(model.poles)]
     upper = [pole for pole in poles if pole.imag >= 0]

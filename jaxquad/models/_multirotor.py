@@ -16,14 +16,20 @@ from jaxquad._core import (
 
 from ._allocation import Allocation
 from ._attitude import Attitude
-from ._decoupled import added, DecoupledAxes
+from ._decoupled import added, DecoupledAxes, LinearAxis
 from ._rotation import euler_from_quaternion, quaternion_derivative, quaternion_from_euler
 
 
 class MotorLag(eqx.Module):
     """Motor and propeller as a first-order lag from the commanded to the effective input.
 
-    Raises ValueError for a time constant that is not positive: a motor without lag has no state.
+    **Arguments:**
+
+    - `time_constant`: in s, one value or `[*ensemble]`.
+
+    **Raises:**
+
+    - `ValueError`: the time constant is not positive. A motor without lag has no state.
     """
 
     time_constant: Float[Array, "*ensemble"] = per_member(0, converter=as_float)  # s
@@ -49,7 +55,7 @@ class MotorLag(eqx.Module):
 
 
 class MultirotorState(eqx.Module):
-    """What a `Multirotor` remembers, or the time derivative of it."""
+    """The state of a `Multirotor`, or its time derivative."""
 
     quaternion: Float[Array, " 4 *ensemble"]  # body to earth, scalar first; any length but 0
     rate: Float[Array, " 3 *ensemble"]  # body axes, rad/s
@@ -57,10 +63,20 @@ class MultirotorState(eqx.Module):
 
 
 class Multirotor(eqx.Module):
-    """A multirotor's attitude from motor inputs to Euler angles: Eq. (1)-(10), as corrected.
+    """A multirotor's attitude from motor inputs to Euler angles.
 
     Every parameter may have a trailing ensemble axis; then states, inputs and outputs have it too.
-    Raises ValueError for spinning rotors driven by voltages, which do not tell the rotor speeds.
+    Source: Eq. (1)-(10) of the paper, corrected as docs/equations.md lists.
+
+    **Arguments:**
+
+    - `attitude`: the rigid body; `allocation`: from inputs to torques.
+    - `motor`: the lag of the motors, or None for none.
+
+    **Raises:**
+
+    - `ValueError`: the attitude has a rotor inertia, but the inputs are voltages, which do not
+        determine the rotor speeds.
     """
 
     attitude: Attitude
@@ -72,8 +88,8 @@ class Multirotor(eqx.Module):
         known = is_concrete(rotor_inertia) and not is_zero(rotor_inertia)
         if known and self.allocation.input == "voltage":
             raise ValueError(
-                f"rotor_inertia is {rotor_inertia}, but voltages do not tell the rotor speeds: "
-                'set it to 0, or use an Allocation with input="omega2".'
+                f"rotor_inertia is {rotor_inertia}, but voltages do not determine the rotor "
+                'speeds: set it to 0, or use an Allocation with input="omega2".'
             )
 
     @property
@@ -137,6 +153,10 @@ class Multirotor(eqx.Module):
         return eqx.tree_at(
             lambda p: p.attitude.inertia, self, added(self.attitude.inertia, inertia)
         )
+
+    def linearise(self, axis: int) -> LinearAxis:
+        """One axis near level flight, driven by the allocation's differences, see `decoupled`."""
+        return self.decoupled().linearise(axis)
 
     def decoupled(self) -> DecoupledAxes:
         """The three axes near level flight, driven by the allocation's differences.

@@ -1,15 +1,92 @@
+"""Exact simulation of a linear model with delayed inputs and outputs."""
+
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import expm
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxquad._core import check_positive
 
 from ._connect import realise
-from ._discretise import at_delay, dot, propagation, shifted, split_delay
 from ._state_space import explicit, StateSpace
 from ._transfer_function import TransferFunction
+
+
+_WHOLE = 1e-9  # samples; a delay this close to whole samples is whole, whatever the rounding
+
+
+def split_delay(
+    delay: Float[Array, "*n"], dt: float
+) -> tuple[Int[Array, "*n"], Float[Array, "*n"]]:
+    """Whole samples of a delay in s, and the rest in samples; differentiable through the rest."""
+    shift = jax.lax.stop_gradient(jnp.floor(delay / dt + _WHOLE))
+    return shift.astype(int), delay / dt - shift
+
+
+def propagation(
+    A: Float[Array, "states states"],
+    B: Float[Array, "states inputs"],
+    late: Float[Array, " inputs"],
+    span: Float[Array, ""],
+    dt: float,
+) -> tuple[Float[Array, "states states"], Float[Array, "segments states"]]:
+    """What the first `span` samples of a sample `dt` s long make of the state and of the inputs.
+
+    Each input goes over from one straight segment to the next after `late` samples. The second
+    result acts on value and change over a whole sample of the old and of the new segment, input by
+    input. A may be singular.
+    """
+    over = lambda b, late: _crossing(A, b[:, None], late, span, dt)
+    transition, drive = jax.vmap(over, in_axes=(1, 0))(B, late)
+    return transition[0], jnp.swapaxes(drive, 1, 2).reshape(4 * len(late), len(A))
+
+
+def _crossing(A, b, late, span, dt):
+    old = jnp.minimum(late, span)
+    new = span - old
+    zero, one = jnp.zeros_like(late), jnp.ones_like(late)
+    # From value and change of a segment to those over the part of it that acts.
+    last = jnp.stack([jnp.stack([one, 1 - late]), jnp.stack([zero, old])])
+    first = jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, new])])
+    (before, of_old), (after, of_new) = (_propagate(A, b, part * dt) for part in (old, new))
+    drive = [_dot(after, _dot(of_old, last)), _dot(of_new, first)]
+    return _dot(after, before), jnp.concatenate(drive, axis=1)
+
+
+def _propagate(
+    A: Float[Array, "states states"], B: Float[Array, "states 1"], time: Float[Array, ""]
+) -> tuple[Float[Array, "states states"], Float[Array, "states 2"]]:
+    # Van Loan's augmented exponential; the second part acts on value and change over `time`.
+    states = len(A)
+    plant = jnp.pad(jnp.concatenate([A, B], axis=1) * time, ((0, 0), (0, 1)))
+    line = jnp.eye(2, states + 2, k=states + 1, dtype=A.dtype)
+    step = expm(jnp.concatenate([plant, line]))[:states]
+    return step[:, :states], step[:, states:]
+
+
+def at_delay(
+    segments: Float[Array, "samples 2"], delay: Float[Array, ""], dt: float
+) -> Float[Array, " samples"]:
+    """The input itself, `delay` s late, at the samples; where it jumps, the value just after."""
+    shift, late = split_delay(delay, dt)
+    old, new = shifted(segments, shift + 1), shifted(segments, shift)
+    return jnp.where(late <= _WHOLE, new[:, 0], old[:, 0] + (1 - late) * old[:, 1])
+
+
+def shifted(
+    x: Float[Array, "samples columns"], shift: Int[Array, ""]
+) -> Float[Array, "samples columns"]:
+    """`x` so many samples later, and zero before."""
+    index = jnp.arange(len(x)) - shift
+    return jnp.where(index[:, None] >= 0, x[jnp.maximum(index, 0)], 0)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """The matrix product; a GPU would round float32 products to 10 bits."""
+    return jnp.dot(a, b, precision="highest")
 
 
 def recursion(
@@ -23,11 +100,11 @@ def recursion(
     by_place = jnp.swapaxes(padded.reshape(chunks, length, states), 0, 1)
 
     def sample(x, w):
-        return dot(x, A.T) + w, x
+        return _dot(x, A.T) + w, x
 
     ends, within = jax.lax.scan(sample, jnp.zeros((chunks, states), drive.dtype), by_place)
     steps, over = powers(A, length)
-    starts = jax.lax.scan(lambda x, w: (dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
+    starts = jax.lax.scan(lambda x, w: (_dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
     carried = jnp.einsum("lij,cj->lci", steps, starts, precision="highest")
     return jnp.swapaxes(within + carried, 0, 1).reshape(chunks * length, states)[:samples]
 
@@ -49,7 +126,7 @@ def powers(
 ) -> tuple[Float[Array, "count states states"], Float[Array, "states states"]]:
     """A^0 to A^(count - 1), and A^count."""
     one = jnp.eye(len(A), dtype=A.dtype)
-    last, found = jax.lax.scan(lambda P, _: (dot(A, P), P), one, length=count)
+    last, found = jax.lax.scan(lambda P, _: (_dot(A, P), P), one, length=count)
     return found, last
 
 
@@ -67,18 +144,30 @@ def simulate_linear(
     *,
     hold: str = "zero",
 ) -> Float[Array, " samples"] | Float[Array, "samples outputs"]:
-    """The outputs at the samples of an input `u`, which was 0 before the first: exact, from rest.
+    """Simulate a linear model from rest, exactly at the samples.
 
-    A `TransferFunction` takes and gives (samples,), a `StateSpace` (samples, inputs) and (samples,
-    outputs). Between samples `dt` seconds apart the inputs stay at the last one (`hold="zero"`) or
-    run straight to the next (`hold="first"`); they may be late by fractions of a sample, and the
-    outputs too. Where a held input jumps, x' jumps: H1 x' is the value just after. Raises
-    ValueError for another hold, a `dt` that is not positive and a `u` of another shape.
+    Delays may be any fraction of a sample. Where a held input jumps, x' jumps: H1 x' is the value
+    just after.
+
+    **Arguments:**
+
+    - `model`: a `TransferFunction`, or a `StateSpace`.
+    - `u`: the input, (samples,) for a `TransferFunction`, (samples, inputs) for a `StateSpace`; it
+        was 0 before the first sample.
+    - `dt`: the sample interval in s.
+    - `hold`: between samples the input stays at the last one ("zero") or is straight ("first").
+
+    **Returns:**
+
+    The outputs, (samples,) or (samples, outputs).
+
+    **Raises:**
+
+    - `ValueError`: `hold` is unknown, `dt` is not positive, or `u` has another shape.
     """
-    if not dt > 0:
-        raise ValueError(f"dt is {dt} s: give a positive sample interval")
+    check_positive(dt=dt)
     if hold not in _HOLDS:
-        raise ValueError(f"hold is {hold!r}, which does not exist: use one of {_HOLDS}.")
+        raise ValueError(f"hold is {hold!r}, which does not exist: choose one of {_HOLDS}.")
     inputs = _inputs(model, jnp.asarray(u))
     found = _respond(_plant(model), _segments(inputs, hold), dt)
     return found[:, 0] if isinstance(model, TransferFunction) else found
@@ -87,12 +176,22 @@ def simulate_linear(
 def free_responses(
     model: TransferFunction | StateSpace, samples: int, dt: float
 ) -> tuple[Float[Array, "samples *outputs states"], Float[Array, "samples *outputs states"]]:
-    """The outputs, `dt` seconds apart, of each unit initial state, and of each unit constant bias.
+    """The outputs due to each unit initial state, and due to each unit constant bias.
 
-    A bias adds to the derivative of a state, and so to H1 x'. An output that is late shows the same
-    motion, continued to before the first sample. Of a `StateSpace`, (samples, outputs, states); of
-    a `TransferFunction`, (samples, states), where the states are those of `realise`, so that only
-    the span of the columns has a meaning. They are regressors for a record's start and trim.
+    They are regressors for the start and the trim of a record. A bias adds to the derivative of a
+    state, and so to H1 x'. A delayed output shows the same motion, continued to before the first
+    sample.
+
+    **Arguments:**
+
+    - `model`: a `TransferFunction`, or a `StateSpace`.
+    - `samples`: how many, `dt` seconds apart.
+
+    **Returns:**
+
+    Two arrays, (samples, outputs, states) of a `StateSpace`, (samples, states) of a
+    `TransferFunction`. The states of the latter are those of `realise`, so that only the span of
+    the columns has a meaning.
     """
     start, bias = _free(_plant(model), samples, dt)
     if isinstance(model, TransferFunction):
@@ -126,7 +225,7 @@ def _inputs(model: TransferFunction | StateSpace, u: Array) -> Float[Array, "sam
         columns = model.G.shape[1]
         wanted, right = f"(samples, {columns})", u.ndim == 2 and u.shape[1] == columns
     if not right:
-        raise ValueError(f"u has shape {u.shape}, but this model takes {wanted}: reshape it.")
+        raise ValueError(f"u has the shape {u.shape}, but this model takes {wanted}: reshape it.")
     return u[:, None] if u.ndim == 1 else u
 
 
@@ -144,9 +243,9 @@ def _respond(
     acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
     acting = acting.reshape(segments.shape[1], 4 * len(segments))
     step, drive = propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
-    states = recursion(step, dot(acting, drive))
+    states = recursion(step, _dot(acting, drive))
     if plant.output_delay is None:
-        found = dot(states, plant.C.T)
+        found = _dot(states, plant.C.T)
     else:
         found = _late_outputs(plant, states, acting, late, dt)
     return found if plant.D is None else found + _passing(plant, plant.D, segments, dt)
@@ -163,7 +262,7 @@ def _late_outputs(
     def output(row, delay):
         shift, wait = split_delay(delay, dt)
         step, drive = propagation(plant.A, plant.B, late, 1 - wait, dt)
-        within = dot(states, dot(row, step)) + dot(acting, dot(drive, row))
+        within = _dot(states, _dot(row, step)) + _dot(acting, _dot(drive, row))
         return shifted(within[:, None], shift + 1)[:, 0]
 
     return jax.vmap(output, out_axes=1)(plant.C, plant.output_delay)

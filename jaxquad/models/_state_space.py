@@ -22,11 +22,21 @@ from ._response import Matrices, response
 class StateSpace(eqx.Module):
     """M x' = F x + G u(t - input_delay), y(t + output_delay) = H0 x + H1 x': CIFER's DERIVID form.
 
-    x' is the derivative that the late input causes, so H1 x' holds accelerations as they are
-    measured. None leaves a term out: an M of ones, no H1, no delay; what is left out is no
-    parameter of a fit. The entries are named `F[0][1]`, `input_delay[0]`.
-    Source: Tischler & Remple, eq. 12.6 to 12.12. Raises ValueError for shapes that do not fit
-    together, values that are not finite, a negative delay and a singular M.
+    x' is the derivative that the delayed input causes, so H1 x' holds accelerations as they are
+    measured. A term that is None is no parameter of a fit. In `free=` the entries are named
+    `F[0][1]`, `input_delay[0]`.
+    Source: Tischler & Remple, eq. 12.6 to 12.12; Eq. (11) and (29) of the paper.
+
+    **Arguments:**
+
+    - `F`: (states, states); `G`: (states, inputs); `H0`: (outputs, states).
+    - `H1`: (outputs, states), or None for none; `M`: (states, states), or None for the unit matrix.
+    - `input_delay`: (inputs,) in s; `output_delay`: (outputs,) in s; None for none.
+
+    **Raises:**
+
+    - `ValueError`: the shapes do not fit together, a value is not finite, a delay is negative, or M
+        is singular.
     """
 
     F: Float[Array, "states states"] = eqx.field(converter=as_float)
@@ -178,8 +188,8 @@ def _check_mass(M: Array | None) -> None:
     mass = mass / np.where(columns > 0, columns, 1)
     if np.linalg.matrix_rank(mass) < len(mass):
         raise ValueError(
-            f"M is {M}, which is singular: a row of it must tell each state's derivative apart; "
-            "eliminate states that obey no differential equation."
+            f"M is {M}, which is singular: its rows must determine the derivative of each state. "
+            "Eliminate states that have no differential equation."
         )
 
 

@@ -18,8 +18,22 @@ def imaginary(omega: Frequencies) -> Complex[Array, "..."]:
 class TransferFunction(eqx.Module):
     """One input to one output: numerator(s) / denominator(s) exp(-delay s).
 
-    Coefficients stand with the highest power of s first. Raises ValueError if the numerator has the
-    higher degree, if the denominator starts with 0, or if the delay is negative.
+    !!! example
+
+        ```python
+        # 10 e^(-0.02 s) / (s (s + 4))
+        model = jq.TransferFunction([10.0], [1.0, 4.0, 0.0], delay=0.02)
+        ```
+
+    **Arguments:**
+
+    - `numerator`, `denominator`: coefficients, the highest power of s first.
+    - `delay`: in s.
+
+    **Raises:**
+
+    - `ValueError`: the numerator has the higher degree, the denominator starts with 0, or the delay
+        is negative.
     """
 
     numerator: Float[Array, " zeros"] = eqx.field(converter=as_float)
@@ -72,11 +86,20 @@ class TransferFunction(eqx.Module):
 
 
 class LaggedIntegrator(eqx.Module):
-    """An axis in its fewest numbers: K e^(-delay s) / (s^integrators (lag s + 1)).
+    """The simplest model of an axis: K e^(-delay s) / (s^integrators (lag s + 1)).
 
-    From a moment command to a rate with one integration, to an angle with two. Lag and delay trade
-    off: over a narrow band a record determines only their sum.
-    Raises ValueError for a negative lag or delay.
+    From a moment command to a rate with one integration, to an angle with two. Over a narrow band a
+    record determines only the sum of lag and delay.
+
+    **Arguments:**
+
+    - `gain`: K, in units of the output per unit of input and s^integrators.
+    - `lag`, `delay`: in s.
+    - `integrators`: 0 to 3.
+
+    **Raises:**
+
+    - `ValueError`: lag or delay is negative.
     """
 
     gain: Float[Array, ""] = eqx.field(converter=as_float)  # K, output unit / s^integrators
@@ -89,7 +112,7 @@ class LaggedIntegrator(eqx.Module):
         for name, value in {"lag": self.lag, "delay": self.delay}.items():
             require_nonnegative(name, value, "give seconds, and 0 for none")
         if self.integrators not in (0, 1, 2, 3):
-            raise ValueError(f"integrators is {self.integrators}: give 0 to 3")
+            raise ValueError(f"integrators is {self.integrators}: give 0 to 3.")
 
     def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """Response at `omega` in rad/s."""

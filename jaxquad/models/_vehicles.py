@@ -7,10 +7,10 @@ from ._multirotor import MotorLag, Multirotor
 
 
 class HoverDataSheet(NamedTuple):
-    """What the maker says about the Quanser 3 DOF Hover.
+    """The data sheet of the Quanser 3 DOF Hover.
 
-    Source: user manual, Table 2.2, and `config_hover.m`. The inertias are computed there, from
-    point masses at the arm tips; they are no measurement.
+    Source: user manual, Table 2.2, and `config_hover.m`. The inertias are computed there from point
+    masses at the arm tips; they are no measurement.
     """
 
     arm: float = 0.197  # m, 7.75 in
@@ -34,10 +34,19 @@ def quanser_hover(
     coulomb: Sequence[float] | None = None,
     convention: str = "frd-frbl",
 ) -> Multirotor:
-    """The rig of the paper's section 5, the Quanser 3 DOF Hover, driven by four voltages.
+    """The test stand of the paper's section 5, the Quanser 3 DOF Hover, driven by four voltages.
 
-    The data sheet gives no propeller `lag`: 0.02 s is an assumption, and None leaves it out.
-    `damping` (N m s/rad), `stiffness` (N m/rad) and `coulomb` friction (N m) are not in it either.
+    Source: the data sheet, `QUANSER_HOVER`, which gives none of the arguments.
+
+    **Arguments:**
+
+    - `lag`: of the propellers in s; 0.02 s is an assumption. None leaves it out.
+    - `damping`: in N m s/rad; `stiffness`: in N m/rad; `coulomb`: dry friction in N m; per axis.
+    - `convention`: of `Allocation`.
+
+    **Returns:**
+
+    A `Multirotor`.
     """
     sheet = QUANSER_HOVER
     return Multirotor(
@@ -82,8 +91,17 @@ def crazyflie(
 ) -> Multirotor:
     """A Crazyflie 2.0, driven by four squared rotor speeds in rad^2/s^2.
 
-    An "x" frame in the firmware's axes (forward, left, up). The `lag` is that of the thrust; None
-    leaves it out. The spin of the rotors and `damping` (N m s/rad) are not in the data sheet.
+    An "x" frame in the axes of the firmware (forward, left, up), without the spin of the rotors.
+    Source: the data sheet, `CRAZYFLIE`.
+
+    **Arguments:**
+
+    - `lag`: of the thrust in s; None leaves it out.
+    - `damping`: in N m s/rad per axis, which the data sheet does not give.
+
+    **Returns:**
+
+    A `Multirotor`.
     """
     sheet = CRAZYFLIE
     return Multirotor(

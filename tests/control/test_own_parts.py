@@ -25,6 +25,13 @@ from jaxquad.control import (
 )
 
 
+@pytest.fixture(autouse=True)
+def usual_promotion():
+    """JAX as a user has it, where shapes and types are promoted."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
 KT, J, DT = 0.047, 0.055, 0.002
 PLANT = jq.DecoupledAxes([KT], [J])
 STEP = jq.scenario(duration=2.0, reference={"roll": jq.Step(0.1, at=0.1)}, axes=1)
@@ -194,3 +201,28 @@ def test_a_map_schedules_and_says_in_which_coordinates_it_is_tuned():
     transform = jq.control.find_transform(law, "map.exponent")
     assert transform.forward(transform.inverse(np.asarray(1.3))) == pytest.approx(1.3)
     assert jq.control.find_transform(law, "ladrc.wc") is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("controller", "names"),
+    [
+        (PositionFeedback(jnp.asarray(2.0), jnp.asarray(0.5)), ("kp", "kd")),
+        (
+            ScheduledLADRC(
+                LADRC(3.0, 15.0, 1.0, observer=TextbookObserver()), PowerMap(jnp.asarray(1.0))
+            ),
+            ("ladrc.wc", "ladrc.wo", "map.exponent"),
+        ),
+    ],
+    ids=["feedback", "scheduled"],
+)
+def test_they_are_tuned_and_certified(controller, names):
+    loop = jq.Loop(PLANT, controller, drive=jq.simulation.Saturation(10.0), delay=0.004)
+    ensemble = jq.Ensemble(inertia=jq.ensembles.LogUniform(0.7, 1.5))
+    tuned = jq.tune(loop, ensemble, STEP, members=4, fresh=8, progress=False)
+    assert tuple(tuned.values) == names
+    before = jq.evaluate(loop.with_controller(schedule_for_flight(controller, [J])), STEP)
+    after = jq.evaluate(loop.with_controller(schedule_for_flight(tuned.controller, [J])), STEP)
+    assert np.all(np.asarray(after.itae) < np.asarray(before.itae))
+    assert tuned.certificate.stable and not bool(np.any(np.asarray(after.diverged)))

@@ -173,6 +173,7 @@ def test_a_driven_damped_body_agrees_with_scipy():
     np.testing.assert_allclose(found, solution.y[:, -1], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_derivatives_with_respect_to_inertia_agree():
     def final(inertia):
         return tumble(Attitude(inertia), RATE, 0.005, steps=200)[1][-1]

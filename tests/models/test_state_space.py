@@ -69,6 +69,7 @@ def test_accelerations_a_mass_matrix_and_delays_answer_as_the_textbook_says():
     np.testing.assert_allclose(system().frequency_response(OMEGA), by_numpy(system()), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_twenty_states_with_poles_over_six_decades_keep_ten_digits():
     # Companion blocks with known factors: the product of the factors is the independent answer.
     poles = -np.geomspace(1e-3, 1e3, 20)
@@ -130,6 +131,7 @@ def loss_by_solve(model, omega):
     return jnp.sum(jnp.log(jnp.real(found * jnp.conj(found))) + jnp.imag(found))
 
 
+@pytest.mark.slow
 def test_the_reverse_gradient_by_everything_is_that_of_a_library_solver():
     found, expected = (
         jax.grad(f, argnums=(0, 1))(system(), OMEGA[10:20]) for f in (loss, loss_by_solve)
@@ -138,6 +140,7 @@ def test_the_reverse_gradient_by_everything_is_that_of_a_library_solver():
         np.testing.assert_allclose(mine, theirs, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_hessian_forward_over_reverse_is_that_of_a_library_solver():
     def along(f):
         def value(z):

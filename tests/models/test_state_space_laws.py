@@ -35,6 +35,7 @@ BOUNDED = arrays(float, (2,), elements=st.floats(-3, 3))
 CHECK = hypothesis.settings(deadline=None, max_examples=5, derandomize=True)
 
 
+@pytest.mark.slow
 @CHECK
 @hypothesis.given(seed=st.integers(0, 1000))
 def test_a_series_has_the_product_of_the_responses(seed):

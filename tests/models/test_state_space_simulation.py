@@ -110,6 +110,7 @@ def test_a_single_channel_is_the_transfer_function_it_came_from():
     np.testing.assert_allclose(found[:, 0], expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_output_changes_with_every_delay_as_finite_differences_say():
     none = lambda x: x is None
 
