@@ -9,11 +9,11 @@ Kind = Literal["sweep", "multisine", "doublet", "3-2-1-1"]
 
 
 class Excitation(eqx.Module):
-    """A test signal on its own uniform clock, which starts at 0 s.
+    """A test signal with uniform time stamps from 0 s.
 
-    The band `omega_min` .. `omega_max` is what a sweep runs through, the lowest and highest line
-    of a multisine, and for a pulse the band around the peak of its spectrum that stays within
-    3 dB of it. `duration` is that of the excited part, without the zeros before and after it.
+    The band `omega_min` .. `omega_max` is the range of a sweep, the lowest and highest line of a
+    multisine, and for a pulse the band around the peak of its spectrum within 3 dB. `duration` is
+    that of the excited part, without the zeros before and after it.
     """
 
     time: Float[np.ndarray, " samples"]  # s
@@ -31,11 +31,13 @@ class Excitation(eqx.Module):
 
     @property
     def samples(self) -> int:
+        """Number of samples."""
         return self.time.size
 
     def __str__(self) -> str:
         return (
-            f"{self.kind}: {self.omega_min:.4g} .. {self.omega_max:.4g} rad/s, amplitude "
-            f"{self.amplitude:.4g}, {self.duration:.6g} s excited of {self.time[-1]:.6g} s at "
-            f"{self.sample_rate:.6g} Hz"
+            f"{self.kind}: {self.omega_min:.4g} to {self.omega_max:.4g} rad/s "
+            f"({self.omega_min / (2 * np.pi):.3g} to {self.omega_max / (2 * np.pi):.3g} Hz), "
+            f"amplitude {self.amplitude:.4g}, {self.duration:.6g} s excited of "
+            f"{self.time[-1]:.6g} s at {self.sample_rate:.6g} Hz"
         )

@@ -8,7 +8,7 @@ from ._excitation import Excitation
 
 
 class Guideline(NamedTuple):
-    """One rule of the field, held against one design."""
+    """One rule of test design, checked for one excitation."""
 
     rule: str
     value: float
@@ -17,11 +17,11 @@ class Guideline(NamedTuple):
     message: str
 
     def __str__(self) -> str:
-        return f"{'kept  ' if self.ok else 'BROKEN'} {self.rule}: {self.message}"
+        return f"{'OK  ' if self.ok else 'FAIL'}  {self.message}"
 
 
 class Guidelines(tuple[Guideline, ...]):
-    """All rules that apply to a design; `ok` if none is broken."""
+    """All rules that apply to an excitation; `ok` if it follows all of them."""
 
     @property
     def ok(self) -> bool:
@@ -37,10 +37,18 @@ def check_guidelines(
     omega_bandwidth: Number | None = None,
     omega_180: Number | None = None,
 ) -> Guidelines:
-    """Hold a design against the rules of Tischler & Remple for identification from sweeps.
+    """Check an excitation against the guidelines for identification from frequency sweeps.
 
-    The expected `omega_bandwidth` and `omega_180` (rad/s) of the response add a rule each for
-    the ends of the band. Pulses serve for verification and are held to the sample rate only.
+    Source: Tischler and Remple, "Aircraft and Rotorcraft System Identification", ch. 5.
+
+    **Arguments:**
+
+    - `excitation`: a sweep or a multisine. Pulses serve for verification, and only their sample
+        rate is checked.
+    - `omega_bandwidth`, `omega_180`: the expected bandwidth and 180 deg crossover of the response
+        in rad/s; each adds a rule for one end of the band.
+
+    **Returns:** `Guidelines`, a tuple of `Guideline`, which prints as one line for each rule.
     """
     rules = [_sample_rate(excitation)]
     if excitation.kind in ("sweep", "multisine"):
@@ -58,63 +66,74 @@ def check_guidelines(
 
 def _sample_rate(design: Excitation) -> Guideline:
     value, limit = 2 * np.pi * design.sample_rate, 25 * design.omega_max
-    said = f"{design.sample_rate:.4g} Hz, 25 omega_max is {limit / (2 * np.pi):.4g} Hz"
-    return _judge("sample rate", value, limit, said, "sample faster or lower omega_max")
+    said = (
+        f"sample rate {design.sample_rate:.4g} Hz "
+        f"(rule: at least 25 f_max = {limit / (2 * np.pi):.4g} Hz)"
+    )
+    return _guideline("sample rate", value, limit, said, "Sample faster, or lower omega_max")
 
 
 def _record_length(design: Excitation) -> Guideline:
     longest = 2 * np.pi / design.omega_min
     said = (
-        f"{design.duration:.4g} s excited, 4 to 5 T_max is {4 * longest:.4g} to {5 * longest:.4g} s"
+        f"record length {design.duration:.4g} s excited (rule: at least 4 to 5 periods of "
+        f"omega_min = {4 * longest:.4g} to {5 * longest:.4g} s)"
     )
     if 4 * longest <= design.duration < 5 * longest:
-        said += ": within it, longer is safer"
-    advice = "lengthen the record or raise omega_min"
-    return _judge("record length", design.duration, 4 * longest, said, advice)
+        said += "; longer is safer"
+    advice = "Lengthen the record, or raise omega_min"
+    return _guideline("record length", design.duration, 4 * longest, said, advice)
 
 
 def _range(design: Excitation) -> Guideline:
     value = design.omega_max / design.omega_min
-    said = f"omega_max is {value:.4g} times omega_min, a decade is 10"
-    return _judge("range", value, 10.0, said, "widen the band, or a model of it stays ambiguous")
+    said = f"range omega_max / omega_min = {value:.4g} (rule: at least 10, a decade)"
+    advice = "Widen the band: a narrow band does not determine a model"
+    return _guideline("range", value, 10.0, said, advice)
 
 
 def _window(design: Excitation) -> Guideline:
     longest, shortest = design.duration / 2, 20 * 2 * np.pi / design.omega_max
-    said = f"half the record is {longest:.4g} s, 20 cycles of omega_max are {shortest:.4g} s"
-    return _judge("window", longest, shortest, said, "lengthen the record or raise omega_max")
+    said = (
+        f"window {longest:.4g} s, half the record "
+        f"(rule: at least 20 cycles of omega_max = {shortest:.4g} s)"
+    )
+    advice = "Lengthen the record, or raise omega_max"
+    return _guideline("window", longest, shortest, said, advice)
 
 
 def _low_end(design: Excitation, omega_bandwidth: Number) -> Guideline:
     value, limit = design.omega_min, 0.5 * omega_bandwidth
-    said = f"omega_min is {value:.4g} rad/s, half the bandwidth is {limit:.4g} rad/s"
-    advice = "lower omega_min"
-    return _judge("low end", value, limit, said, advice, highest=True)
+    said = f"low end {_in_hertz(value)} (rule: at most half the bandwidth = {_in_hertz(limit)})"
+    return _guideline("low end", value, limit, said, "Lower omega_min", highest=True)
 
 
 def _high_end(design: Excitation, omega_180: Number) -> Guideline:
     value, limit = design.omega_max, 2.5 * omega_180
-    said = f"omega_max is {value:.4g} rad/s, 2.5 omega_180 is {limit:.4g} rad/s"
-    return _judge("high end", value, limit, said, "raise omega_max")
+    said = f"high end {_in_hertz(value)} (rule: at least 2.5 omega_180 = {_in_hertz(limit)})"
+    return _guideline("high end", value, limit, said, "Raise omega_max")
 
 
 def _lead_in(design: Excitation) -> Guideline:
     cycles = design.lead_in * design.omega_min / (2 * np.pi)
-    said = f"{cycles:.3g} cycles at omega_min, 2 are the rule"
-    return _judge("lead-in", cycles, 2.0, said, "start with lead_in_cycles=2")
+    said = f"lead-in {cycles:.3g} cycles of omega_min (rule: at least 2)"
+    return _guideline("lead-in", cycles, 2.0, said, "Use lead_in_cycles=2")
 
 
 def _trim(design: Excitation) -> Guideline:
     value = min(design.lead, design.tail)
-    said = f"{value:.3g} s of trim at each end, 3 s are the rule"
-    return _judge("trim", value, 3.0, said, "add trim, or trim the record there by hand")
+    said = f"trim {value:.3g} s of zeros at each end (rule: at least 3 s)"
+    return _guideline("trim", value, 3.0, said, "Use trim=3, or record 3 s of trim at each end")
 
 
-def _judge(
+def _in_hertz(omega: Number) -> str:
+    return f"{omega:.4g} rad/s = {omega / (2 * np.pi):.3g} Hz"
+
+
+def _guideline(
     rule: str, value: float, limit: float, said: str, advice: str, *, highest: bool = False
 ) -> Guideline:
     slack = 1e-9 * limit
     ok = value <= limit + slack if highest else value >= limit - slack
-    return Guideline(
-        rule, float(value), float(limit), bool(ok), said if ok else f"{said}: {advice}"
-    )
+    message = said if ok else f"{said}. {advice}"
+    return Guideline(rule, float(value), float(limit), bool(ok), message)

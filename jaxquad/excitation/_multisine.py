@@ -20,11 +20,22 @@ def harmonics(
     lines: int | None = None,
     spacing: Literal["log", "linear"] = "log",
 ) -> Lines:
-    """Harmonics of a `period` (s) between `omega_min` and `omega_max`, all in rad/s.
+    """Choose harmonics of a period for a multisine.
 
-    All of them, or about `lines` distinct ones: where log spacing asks for lines closer than
-    the harmonics are, fewer come back. `omega[0::2]` and `omega[1::2]` excite two axes at once
-    without either showing in the other.
+    **Arguments:**
+
+    - `omega_min`, `omega_max`: ends of the band in rad/s.
+    - `period`: in s.
+    - `lines`: about how many; by default all harmonics in the band. Log spacing gives fewer where
+        the lines would be closer than the harmonics.
+    - `spacing`: of the lines, `"log"` or `"linear"`.
+
+    **Returns:** frequencies in rad/s, increasing. `omega[0::2]` and `omega[1::2]` excite two axes
+    at once without influencing each other's lines.
+
+    **Raises:**
+
+    - `ValueError`: where the band holds fewer than two harmonics, or fewer than `lines`.
     """
     check_positive(omega_min=omega_min, omega_max=omega_max, period=period)
     base = 2 * np.pi / period
@@ -32,16 +43,19 @@ def harmonics(
     last = int(np.floor(omega_max / base + 1e-9))
     if last <= first:
         raise ValueError(
-            f"fewer than two harmonics of {base:.6g} rad/s lie in {omega_min:.6g} .. "
-            f"{omega_max:.6g} rad/s: lengthen the period of {period:.6g} s or widen the band."
+            f"fewer than two harmonics of {base:.6g} rad/s lie between {omega_min:.6g} and "
+            f"{omega_max:.6g} rad/s: lengthen the period of {period:.6g} s, or widen the band."
         )
     if lines is None:
         return base * np.arange(first, last + 1)
     if not 2 <= lines <= last - first + 1:
-        raise ValueError(f"{lines} lines: the band holds 2 to {last - first + 1} harmonics.")
+        raise ValueError(
+            f"lines is {lines}: the band holds {last - first + 1} harmonics; use 2 to "
+            f"{last - first + 1}."
+        )
     space = {"log": np.geomspace, "linear": np.linspace}
     if spacing not in space:
-        raise ValueError(f"spacing {spacing!r}: it is 'log' or 'linear'.")
+        raise ValueError(f"spacing is {spacing!r}: use 'log' or 'linear'.")
     return base * np.unique(np.round(space[spacing](first, last, lines)))
 
 
@@ -53,19 +67,31 @@ def multisine(
     sample_rate: Number,
     amplitude: Number,
 ) -> Excitation:
-    """A sum of equal sines at the lines `omega` (rad/s), with peak `amplitude`.
+    """Make a multisine, a periodic sum of sines of equal amplitude with a low crest factor.
 
-    The lines are harmonics of the `period` (s), which is a whole number of samples and repeated
-    `periods` times, so each line falls on one point of a Fourier transform. The phases are
-    Schroeder's (1970), here for lines however spaced, improved by clipping (van der Ouderaa et
-    al., 1988) to keep the peak low. The period starts at the sample nearest to zero.
+    The phases are those of Schroeder (1970), generalised to any spacing of the lines and improved
+    by clipping (van der Ouderaa et al., 1988). The period starts at the sample nearest to zero.
 
-    Raises ValueError for lines that are no harmonics, and for a period of no whole samples.
+    **Arguments:**
+
+    - `omega`: lines in rad/s, increasing; harmonics of the period, as `harmonics` gives them.
+    - `period`: in s, a whole number of samples, so that each line is one point of a Fourier
+        transform.
+    - `periods`: how many of them.
+    - `sample_rate`: in Hz.
+    - `amplitude`: peak value.
+
+    **Returns:** an `Excitation`.
+
+    **Raises:**
+
+    - `ValueError`: for lines that are not harmonics or not below half the sample rate, and for a
+        period that is not a whole number of samples.
     """
     omega = np.asarray(omega, dtype=np.float64)
     check_positive(period=period, amplitude=amplitude, sample_rate=sample_rate)
     if periods < 1:
-        raise ValueError(f"periods is {periods}: at least one is needed, three to judge noise.")
+        raise ValueError(f"periods is {periods}: use at least 1, and 3 or more to estimate noise.")
     check_lines(omega, period, sample_rate)
     count = whole_samples("period", period, sample_rate)
     time = np.arange(count * periods) / sample_rate
@@ -94,7 +120,7 @@ def _schroeder(omega: Lines, period: Number) -> Lines:
 def _least_peak(
     orders: Int[np.ndarray, " frequencies"], phase: Lines, count: int
 ) -> Float[np.ndarray, " samples"]:
-    """The flattest of 500 waves, each with the phases that clipping the one before left."""
+    """The wave with the lowest peak of 500, each with the phases of the clipped previous one."""
     spectrum = np.zeros(count // 2 + 1, dtype=np.complex128)
     best, lowest = np.zeros(count), np.inf
     for _ in range(500):
@@ -109,8 +135,9 @@ def _least_peak(
 
 
 def check_lines(omega: Lines, period: Number, sample_rate: Number) -> None:
+    """Raise ValueError unless the lines (rad/s) are increasing harmonics of the period (s)."""
     if omega.size < 2 or not (np.diff(omega) > 0).all():
-        raise ValueError(f"{omega.size} lines: give two or more in rising order, in rad/s.")
+        raise ValueError(f"{omega.size} lines: give two or more in increasing order, in rad/s.")
     check_band(float(omega[0]), float(omega[-1]), sample_rate)
     order = omega * period / (2 * np.pi)
     off = np.abs(order - np.round(order))
@@ -118,5 +145,5 @@ def check_lines(omega: Lines, period: Number, sample_rate: Number) -> None:
         i = off.argmax()
         raise ValueError(
             f"the line {omega[i]:.6g} rad/s is {order[i]:.6g} times the fundamental of the period "
-            f"{period:.6g} s, not a whole number: take the lines from jq.excitation.harmonics."
+            f"{period:.6g} s, not a whole number: choose lines with jq.excitation.harmonics."
         )

@@ -16,10 +16,22 @@ def doublet(
     lead: Number = 1.0,
     tail: Number = 3.0,
 ) -> Excitation:
-    """Up for `width` (s), down for as long: no net input, for verification of a model.
+    """Make a doublet: up for `width`, then down for `width`.
 
-    `lead` and `tail` (s) of zeros stand before and after. All are whole numbers of samples, or
-    ValueError is raised.
+    It has no net input, and serves to verify a model.
+
+    **Arguments:**
+
+    - `width`: of each half, in s.
+    - `amplitude`: peak value.
+    - `sample_rate`: in Hz.
+    - `lead`, `tail`: zeros before and after, in s.
+
+    **Returns:** an `Excitation`.
+
+    **Raises:**
+
+    - `ValueError`: for times that are not whole numbers of samples.
     """
     return _pulses("doublet", [1, -1], width, amplitude, sample_rate, lead, tail)
 
@@ -32,11 +44,22 @@ def three_two_one_one(
     lead: Number = 1.0,
     tail: Number = 3.0,
 ) -> Excitation:
-    """Up for three times `width` (s), down for two, up for one, down for one.
+    """Make a 3-2-1-1: up for three times `width`, down for two, up for one, down for one.
 
-    It excites a wider band than a doublet does, and leaves a net input of `amplitude` times
-    `width`. `lead` and `tail` (s) of zeros stand before and after. All are whole numbers of
-    samples, or ValueError is raised.
+    It excites a wider band than a doublet, and has a net input of `amplitude` times `width`.
+
+    **Arguments:**
+
+    - `width`: of the shortest pulse, in s.
+    - `amplitude`: peak value.
+    - `sample_rate`: in Hz.
+    - `lead`, `tail`: zeros before and after, in s.
+
+    **Returns:** an `Excitation`.
+
+    **Raises:**
+
+    - `ValueError`: for times that are not whole numbers of samples.
     """
     steps = [1, 1, 1, -1, -1, 1, -1]
     return _pulses("3-2-1-1", steps, width, amplitude, sample_rate, lead, tail)

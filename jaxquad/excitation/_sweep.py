@@ -22,18 +22,37 @@ def sweep(
     fade_out: Number | None = None,
     trim: Number = 3.0,
 ) -> Excitation:
-    """Exponential sine sweep from `omega_min` to `omega_max` (rad/s).
+    """Make an exponential sine sweep.
 
     The frequency is omega_min + K (omega_max - omega_min), K = C2 (exp(C1 t/T) - 1), C1 = 4.0,
-    C2 = 0.0187 (Tischler & Remple, eq. 5.15-5.17), and the phase is its integral in closed form.
-    With the constants as published the last frequency is 0.23 % of the band above omega_max.
+    C2 = 0.0187 (Tischler and Remple, "Aircraft and Rotorcraft System Identification", eq. 5.15 to
+    5.17), and the phase is its integral in closed form. With the published constants the last
+    frequency exceeds omega_max by 0.23 % of the band.
 
-    `duration` (s) is T_rec: the lead-in cycles at omega_min and the sweep, which gets what they
-    leave of it. `trim` (s) of zeros stands before and after. The raised-cosine fades last
-    `fade_in` (s, by default the first half of the lead-in) and `fade_out` (s, by default two
-    cycles at omega_max, so that the highest frequencies keep their amplitude).
+    **Arguments:**
 
-    Raises ValueError for values that make no sweep.
+    - `omega_min`, `omega_max`: ends of the band in rad/s.
+    - `duration`: T_rec, the lead-in and the sweep together, in s.
+    - `sample_rate`: in Hz.
+    - `amplitude`: peak value.
+    - `lead_in_cycles`: whole cycles at `omega_min` before the sweep.
+    - `fade_in`, `fade_out`: lengths of the raised-cosine fades in s; by default half the lead-in,
+        and two cycles of `omega_max`, so that the highest frequencies keep their amplitude.
+    - `trim`: zeros before and after, in s.
+
+    **Returns:** an `Excitation`.
+
+    **Raises:**
+
+    - `ValueError`: for an empty band or one above half the sample rate, and for a duration that the
+        lead-in and the fades exceed.
+
+    !!! Example
+
+        ```python
+        sweep = jq.sweep(0.3, 12.0, duration=90.0, sample_rate=100.0, amplitude=0.1)
+        print(jq.excitation.check_guidelines(sweep))
+        ```
     """
     check_band(omega_min, omega_max, sample_rate)
     check_positive(duration=duration, amplitude=amplitude)
@@ -63,9 +82,22 @@ def sweep(
 
 
 def sweep_frequency(excitation: Excitation) -> Samples:
-    """Instantaneous frequency of a sweep in rad/s; NaN in the zeros before and after it."""
+    """Instantaneous frequency of a sweep.
+
+    **Arguments:**
+
+    - `excitation`: made by `sweep`.
+
+    **Returns:** frequency in rad/s for each sample; NaN in the zeros before and after the sweep.
+
+    **Raises:**
+
+    - `ValueError`: for another kind of excitation.
+    """
     if excitation.kind != "sweep":
-        raise ValueError(f"a {excitation.kind} has no one frequency at a time, only a sweep has.")
+        raise ValueError(
+            f"a {excitation.kind} has no instantaneous frequency: use a sweep (jq.sweep)."
+        )
     clock = excitation.time - excitation.lead
     span = excitation.duration - excitation.lead_in
     omega = _frequency(clock - excitation.lead_in, excitation.omega_min, excitation.omega_max, span)
@@ -74,12 +106,13 @@ def sweep_frequency(excitation: Excitation) -> Samples:
 
 def _lead_in(cycles: int, omega_min: Number, duration: Number) -> float:
     if cycles != round(cycles):
-        raise ValueError(f"lead_in_cycles is {cycles}: whole cycles start at zero, so round it.")
+        raise ValueError(f"lead_in_cycles is {cycles}: use a whole number of cycles.")
     longest = 2 * np.pi / omega_min
     if cycles * longest >= duration:
         raise ValueError(
-            f"duration {duration:.6g} s leaves no sweep after {cycles} lead-in cycles of "
-            f"{longest:.6g} s: take 4 to 5 cycles of omega_min, {4 * longest:.6g} s or more."
+            f"duration {duration:.6g} s leaves no time for the sweep after {cycles} lead-in cycles "
+            f"of {longest:.6g} s: use at least 4 to 5 cycles of omega_min, {4 * longest:.6g} s or "
+            f"more."
         )
     return cycles * longest
 
@@ -89,7 +122,7 @@ def _check_fades(fade_in: Number, fade_out: Number, duration: Number) -> None:
     if fade_in + fade_out > duration:
         raise ValueError(
             f"fade_in {fade_in:.6g} s and fade_out {fade_out:.6g} s do not fit into the duration "
-            f"of {duration:.6g} s: shorten them."
+            f"of {duration:.6g} s: use shorter fades."
         )
 
 

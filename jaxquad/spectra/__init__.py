@@ -1,4 +1,8 @@
-from ._closed_loop import deembed as deembed, Feedback as Feedback, feedback_pull as feedback_pull
+from ._closed_loop import (
+    deembed as deembed,
+    feedback_bias as feedback_bias,
+    FeedbackBias as FeedbackBias,
+)
 from ._density import spectral_density as spectral_density, SpectralDensity as SpectralDensity
 from ._error_covariance import (
     ErrorCovariance as ErrorCovariance,

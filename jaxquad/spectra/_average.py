@@ -103,15 +103,15 @@ def noise_root(
     freedom: Float[Array, " groups"],
     weights: Float[Array, "frequencies outputs groups"],
 ) -> Complex[Array, "frequencies outputs outputs"]:
-    """Hermitian root of the covariance of noise that would leave these residuals.
+    """Hermitian root of the covariance of the noise, from the residuals, smooth along frequency.
 
-    `member` says which window is of which length. Each length has the energy `trace` that unit
-    noise would leave in its residuals, and the complex degrees of `freedom` of that energy;
-    `weights` say how much it counts. Smooth along frequency.
+    `member` says which window is of which length. For each length, `trace` is the energy that unit
+    noise would leave in the residuals, `freedom` its complex degrees of freedom, and `weights` how
+    much it counts.
     """
     place = jnp.log(omega)
     energy, floor = (jnp.swapaxes(jnp.abs(x) ** 2, 1, 2) @ member for x in (residuals, outputs))
-    # The logarithm of a chi-squared variable is low on average: digamma(f) - ln(f).
+    # The logarithm of a chi-squared variable is biased by digamma(f) - ln(f).
     low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
     levels = jnp.log(jnp.maximum(energy, _FLOOR * floor + 1e-280) / trace) - low[None, None, :]
     weight, level = weights @ freedom, jnp.sum(weights * levels, axis=2)
@@ -134,7 +134,7 @@ def _local_line(
     kernel = weight[None, :] * jnp.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
     m0, m1, m2 = (jnp.sum(kernel * offset**k, axis=1) for k in (0, 1, 2))
     l0, l1 = (jnp.sum(kernel * offset**k * level[None, :], axis=1) for k in (0, 1))
-    # One lone frequency has no slope: the small term keeps the line flat there.
+    # A single frequency has no slope: the small term keeps the line flat there.
     spread = m2 + 1e-9 * m0
     return (spread * l0 - m1 * l1) / (spread * m0 - m1**2)
 
@@ -174,8 +174,8 @@ class Combined(NamedTuple):
     share: Float[Array, "frequencies outputs inputs groups"]  # of each length in the response
 
 
-def alone(part: Conditioned) -> Combined:
-    """One window length by itself."""
+def single_length(part: Conditioned) -> Combined:
+    """The response of one window length, without a combination."""
     response, coherence = part.response[0], part.coherence[0]
     lesser = jnp.minimum(coherence, part.moved[0][:, None, :])
     return Combined(response, lesser, jnp.ones((*response.shape, 1)))
@@ -187,7 +187,7 @@ def combine(
     freedom: Float[Array, " groups"],
     resolved: Bool[ArrayLike, "groups frequencies"],
 ) -> Combined:
-    """Weigh spectra of several window lengths by (eps_i / eps_min)^-4 and fit one set to them.
+    """Weight spectra of several window lengths by (eps_i / eps_min)^-4 and fit one set to them.
 
     `scales` turn powers into densities, `freedom` are the independent windows less the inputs
     that share them; `resolved` says where a window holds enough cycles. The cost is
@@ -251,7 +251,7 @@ def _fit_spectra(
     return jax.lax.fori_loop(0, _STEPS, step, start)
 
 
-_ALIKE = 1e-4  # share of an input's power below which it cannot be told from the others
+_DEPENDENT = 1e-4  # share of an input's power below which it cannot be separated from the others
 
 
 class Averaged(NamedTuple):
@@ -289,10 +289,10 @@ def average(
     products = jnp.stack([jnp.conj(jnp.swapaxes(row, 1, 2)) @ row for row in rows])
     counts = jnp.asarray(many, float)
     parts = _conditioned(products, channels, counts)
-    combined = combine(parts, scales, averages, resolved) if len(many) > 1 else alone(parts)
+    combined = combine(parts, scales, averages, resolved) if len(many) > 1 else single_length(parts)
     apart = jnp.einsum("fig,gfi->fi", jnp.mean(combined.share, axis=1), parts.alone)
-    lost = ~(apart >= _ALIKE)
-    parts, combined = _without(jnp.any(lost, axis=1), parts, combined)
+    lost = ~(apart >= _DEPENDENT)
+    parts, combined = _with_placeholders(jnp.any(lost, axis=1), parts, combined)
     z, inputs, outputs = channels.split(flat)
     split = jnp.split(jnp.conj(jnp.swapaxes(z, 1, 2)), np.cumsum(many)[:-1], axis=2)
     effect = jnp.concatenate([s @ c for s, c in zip(parts.solver, split, strict=True)], axis=2)
@@ -323,10 +323,10 @@ def _conditioned(products, channels: Channels, counts: Float[Array, " groups"]) 
     return jax.vmap(lambda p, count: condition(p, channels, count))(products, counts)
 
 
-def _without(
+def _with_placeholders(
     lost: Bool[Array, " frequencies"], parts: Conditioned, combined: Combined
 ) -> tuple[Conditioned, Combined]:
-    """Finite numbers where inputs cannot be told apart, which are marked as lost elsewhere."""
+    """Finite placeholders where inputs cannot be separated; `average` marks them as nan."""
     gone = lost[:, None, None]
     clean = parts._replace(
         solver=jnp.where(gone[None], 0.0, parts.solver),
@@ -346,7 +346,7 @@ def _unit_noise(
 ) -> tuple[Float[Array, "frequencies outputs inputs"], Float[Array, "frequencies outputs groups"]]:
     """Variance of the responses under noise of unit power, and the residual energy it leaves.
 
-    Sums over windows are taken group by group, since each output has shares of its own.
+    Sums over windows are taken group by group, since the shares differ between outputs.
     """
     ends, count = np.cumsum(counts)[:-1], effect.shape[1]
     rows = zip(jnp.split(effect, ends, axis=2), jnp.split(overlap, ends), strict=True)
@@ -375,7 +375,7 @@ def _times_real(
 
 
 def _direct(products, counts, combined: Combined, channels: Channels):
-    """Partial coherence of inputs and outputs, whatever the instruments say of it."""
+    """Partial coherence of inputs and outputs, without the instruments."""
     if not channels.instruments:
         return combined.coherence
     plain = channels._replace(instruments=0)

@@ -11,34 +11,44 @@ from jaxquad.records import Record
 _MOST_FREQUENCIES = 1024  # the covariance of a pair is made between all of them
 
 
-def check_alike(records: Sequence[Record]) -> None:
-    """Raise `ValueError` unless the records can be averaged."""
+def in_hertz(omega: Float[np.ndarray, " frequencies"]) -> str:
+    """The range of frequencies as messages give it: `2.3 to 619 rad/s (0.37 to 98.5 Hz)`."""
+    ends = np.unique([np.min(omega), np.max(omega)])
+    rad, hertz = (" to ".join(f"{x:.3g}" for x in each) for each in (ends, ends / (2 * np.pi)))
+    return f"{rad} rad/s ({hertz} Hz)"
+
+
+def check_compatible(records: Sequence[Record]) -> None:
+    """Raise `ValueError` unless the records have the same channels and sample rate."""
     if not records:
-        raise ValueError("no record given: pass one jq.Record or a list of them")
+        raise ValueError("no record is given: pass one jq.Record or a list of them")
     first = records[0]
     for other in records[1:]:
         if not math.isclose(other.dt, first.dt, rel_tol=1e-6):
             raise ValueError(
-                f"records sampled at {first.sample_rate:.6g} and {other.sample_rate:.6g} Hz cannot "
-                "be averaged: read them with the same sample_rate"
+                f"the records are sampled at {first.sample_rate:.6g} and {other.sample_rate:.6g} "
+                "Hz: read them with the same sample rate (sample_rate=, --rate)"
             )
         names = (other.input_names, other.output_names, other.reference_names)
         if names != (first.input_names, first.output_names, first.reference_names):
-            raise ValueError(f"records hold different channels: {first} and {other}")
+            raise ValueError(f"the records have different channels: {first} and {other}")
 
 
 def check_distinct(records: Sequence[Record]) -> None:
     """Raise `ValueError` for a record given twice, or a channel that is another one."""
     for k, record in enumerate(records):
         if any(_same(record.outputs, other.outputs) for other in records[:k]):
-            raise ValueError(f"record {k} of {len(records)} is there twice: its noise counts once")
+            raise ValueError(
+                f"record {k} of {len(records)} is given twice: its errors would seem smaller than "
+                "they are"
+            )
         columns = [record.channel(name) for name in record.names]
         for a, name in enumerate(record.names):
             for b in range(a):
                 if _same(columns[a], columns[b]):
                     raise ValueError(
-                        f"{name!r} is the same signal as {record.names[b]!r}: a response needs an "
-                        "input and an output, and a reference that comes from outside"
+                        f"{name!r} is the same signal as {record.names[b]!r}: choose different "
+                        "channels for input, output and reference"
                     )
 
 
@@ -48,21 +58,21 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def check_references(records: Sequence[Record]) -> None:
-    """Raise `ValueError` unless there is one outside reference for each input."""
+    """Raise `ValueError` unless there is one external reference for each input."""
     names, inputs = records[0].reference_names, records[0].input_names
     if len(names) != len(inputs):
         raise ValueError(
-            f"the joint estimate needs one outside reference for each input, the record has "
-            f"{len(names)} references {list(names)} for {len(inputs)} inputs {list(inputs)}: name "
-            "them with references=[...], pick channels with jq.records.select, or use "
-            "estimator=jq.spectra.Composite()"
+            f"the joint estimate needs one external reference for each input, but the record has "
+            f"{len(names)} references {list(names)} for {len(inputs)} inputs {list(inputs)}. Name "
+            "them (references=, --reference), select other channels with jq.records.select, or use "
+            "a direct estimate (estimator=jq.spectra.LocalPolynomial())"
         )
 
 
-def check_moving(
+def check_excitation(
     records: Sequence[Record], method: Literal["direct", "joint"]
 ) -> Float[np.ndarray, " channels"]:
-    """About the largest value of each channel; `ValueError` for one that never moves."""
+    """About the largest value of each channel; `ValueError` for one that is constant."""
     first = records[0]
     names = first.input_names + (first.reference_names if method == "joint" else ())
     largest = []
@@ -73,7 +83,9 @@ def check_moving(
         still = all(np.ptp(part) == 0 for part in thin)
         if still and all(np.ptp(column) == 0 for column in columns):
             if name in names + first.output_names:
-                raise ValueError(f"no excitation: {name!r} is constant; check that it was logged")
+                raise ValueError(
+                    f"no excitation: {name!r} is constant. Check that it was excited and logged"
+                )
         largest.append(max(float(np.max(np.abs(part))) for part in thin))
     return np.array(largest)
 
@@ -90,6 +102,7 @@ def check_band(omega: Float[ArrayLike, " frequencies"] | None, dt: float) -> Non
         )
     if not (np.all(np.diff(omega) > 0) and omega[0] > 0 and omega[-1] < nyquist):
         raise ValueError(
-            f"omega must rise from above 0 to below the Nyquist frequency {nyquist:.4g} rad/s; "
-            f"it runs from {omega.min():.4g} to {omega.max():.4g}"
+            f"the frequencies must increase, from above 0 to below the Nyquist frequency of "
+            f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz); they run from "
+            f"{omega.min():.4g} to {omega.max():.4g} rad/s"
         )

@@ -7,17 +7,17 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from jaxquad.records import Record
 
-from ._checks import check_alike
+from ._checks import check_compatible
 from ._estimators import Welch
-from ._welch import checked_omega, transform_records
+from ._welch import frequencies_for, transform_records
 from ._window import window
 
 
 class SpectralDensity(eqx.Module):
-    """Power and cross spectral densities of all channels of a record, one-sided.
+    """One-sided power and cross spectral densities of all channels of a record.
 
-    `density[:, a, b]` is the average of conj(X_a) X_b, scaled so that its integral over
-    the positive frequencies in Hz is a power; its unit is that of a times that of b, per Hz.
+    `density[:, a, b]` is the average of conj(X_a) X_b, scaled so that its integral over the
+    positive frequencies in Hz is a power; its unit is that of a times that of b, per Hz.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s
@@ -29,7 +29,7 @@ class SpectralDensity(eqx.Module):
         return jnp.real(self.cross(name, name))
 
     def cross(self, a: str, b: str) -> Complex[Array, " frequencies"]:
-        """Cross-spectral density from channel `a` to `b`: the phase is that of b less that of a."""
+        """Cross-spectral density of `a` and `b`: its phase is that of b minus that of a."""
         return self.density[:, self._position(a), self._position(b)]
 
     def coherence(self, a: str, b: str) -> Float[Array, " frequencies"]:
@@ -38,7 +38,9 @@ class SpectralDensity(eqx.Module):
 
     def _position(self, name: str) -> int:
         if name not in self.names:
-            raise ValueError(f"no channel {name!r}: choose one of {', '.join(self.names)}")
+            raise ValueError(
+                f"there is no channel {name!r}: the channels are {', '.join(self.names)}"
+            )
         return self.names.index(name)
 
 
@@ -48,16 +50,28 @@ def spectral_density(
     *,
     welch: Welch | None = None,
 ) -> SpectralDensity:
-    """Power and cross spectra of every channel of one record, or of several taken together.
+    """Estimate the power and cross spectral densities of all channels.
 
-    `omega` in rad/s, by default 100 log-spaced values within what the window can resolve. The
-    integrators and the delay of `welch` (default `Welch()`) apply to the outputs only.
-    Raises `ValueError` for an unusable band or record, `PrecisionError` in 32 bits.
+    **Arguments:**
+
+    - `record`: one `Record`, or several with the same channels and sample rate, which are taken
+        together.
+    - `omega`: frequencies in rad/s, increasing; by default 100 log-spaced ones from three cycles in
+        a window to a tenth of the sample rate.
+    - `welch`: window and overlap, by default `jq.spectra.Welch()`. Its integrators and delay apply
+        to the outputs only.
+
+    **Returns:** a `SpectralDensity`.
+
+    **Raises:**
+
+    - `ValueError`: for frequencies that the window does not resolve, and records that differ.
+    - `jq.PrecisionError`: in 32 bits; call `jq.enable_x64()` first.
     """
     records = [record] if isinstance(record, Record) else list(record)
-    check_alike(records)
+    check_compatible(records)
     welch = Welch() if welch is None else welch
-    omega = checked_omega(omega, records, welch)
+    omega = frequencies_for(omega, records, welch)
     [transforms], [(length, _)] = transform_records(records, omega, [welch])
     energy = np.sum(window(welch.shape, length) ** 2)
     density = _averaged(transforms, np.asarray(2 * records[0].dt / energy))

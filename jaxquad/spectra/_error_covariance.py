@@ -11,11 +11,11 @@ from ._window import coefficients
 
 
 _POINTS = 32  # times to the shortest window, on which overlaps are summed
-_APART = 8  # windows' resolutions beyond which a tapered window shows nothing of a frequency
+_APART = 8  # window resolutions beyond which a tapered window has no response to a frequency
 
 
 class Placement(eqx.Module):
-    """Where the windows of an estimate lie in the records, laid end to end with gaps."""
+    """Where the windows of an estimate lie in the records, which follow one another with gaps."""
 
     starts: Float[np.ndarray, " windows"]  # s
     lengths: Float[np.ndarray, " windows"]  # s
@@ -24,7 +24,7 @@ class Placement(eqx.Module):
     shape: str = eqx.field(static=True)
 
     def at(self, times: Float[Array, " times"]) -> Float[Array, "windows times"]:
-        """Values of all windows, scaled so that a sum over `self.times` is one over samples."""
+        """Values of all windows, scaled so that a sum over `self.times` equals one over samples."""
         level, cosine = coefficients(self.shape)
         into = (times[None, :] - self.starts[:, None]) / self.lengths[:, None]
         values = level - cosine * jnp.cos(2 * np.pi * into)
@@ -35,7 +35,7 @@ class Placement(eqx.Module):
 def place_windows(
     groups: tuple[tuple[int, tuple[int, ...]], ...], shape: str, dt: float, band: float
 ) -> Placement:
-    """Windows of several lengths (samples) and their starts; `band` is what omega spans, rad/s."""
+    """The places of windows of several lengths (samples); `band` is the range of omega, rad/s."""
     starts = np.concatenate([np.asarray(mine, float) for _, mine in groups]) * dt
     lengths = np.concatenate([np.full(len(mine), float(n)) for n, mine in groups]) * dt
     shortest, end = lengths.min(), np.max(starts + lengths)
@@ -46,10 +46,10 @@ def place_windows(
 
 
 @ft.lru_cache(maxsize=16)
-def overlaps(
+def window_products(
     groups: tuple[tuple[int, tuple[int, ...]], ...], shape: str
 ) -> Float[np.ndarray, "windows windows"]:
-    """What two windows share: the sum over samples of their product."""
+    """Sums over samples of the product of any two windows."""
     level, cosine = coefficients(shape)
     step = max(min(length for length, _ in groups) / _POINTS, 1.0)
     last = max(mine[-1] + length for length, mine in groups)
@@ -67,17 +67,17 @@ _CHUNK = 512  # times taken at once, so that a long record fits the memory
 
 
 class ErrorCovariance(eqx.Module):
-    """Covariance of the random errors of all responses of an estimate, kept as factors.
+    """Covariance of the random errors of all responses of an estimate, stored as factors.
 
-    The error of the response of output o to input i at a frequency f is a sum over atoms of noise,
+    The error of the response of output o to input i at frequency f is a sum over atoms of noise,
 
         dT[f, o, i] = sum_a share[f, o, i, g(a)] effect[f, i, a] V[a, o](f)
 
     where atoms come in groups g of `counts` each. V[a, o] is the transform of the noise of output
     o in window a of `windows`, or, without windows, independent noise of unit power. `noise[f]` is
     the root of the outputs' noise covariance: cov(V[o], V[p]) = sum_c noise[f, o, c]
-    conj(noise[f, p, c]). Whole, the covariance of 20 outputs and 10 inputs would fill gigabytes;
-    what a fit needs of it is a product with a few columns.
+    conj(noise[f, p, c]). The full covariance matrix of 20 outputs and 10 inputs would fill
+    gigabytes, but a fit needs only its product with a few columns.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s
@@ -106,9 +106,12 @@ class ErrorCovariance(eqx.Module):
         return jax.lax.scan(add, start, self._times())[0]
 
     def variance(self) -> Float[Array, "frequencies outputs inputs"]:
-        """Mean squared error E|dT|^2 of each response, of atoms that are not windows."""
+        """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
         if self.windows is not None or self.share is not None:
-            raise ValueError("windows overlap: take the diagonal of errors.between(pair, pair)")
+            raise ValueError(
+                "the errors of overlapping windows are correlated: use the diagonal of "
+                "errors.between(pair, pair)"
+            )
         gain = jnp.sum(jnp.abs(self.effect) ** 2, axis=2)
         power = jnp.sum(jnp.abs(self.noise) ** 2, axis=2)
         return power[:, :, None] * gain[:, None, :]
@@ -130,7 +133,7 @@ class ErrorCovariance(eqx.Module):
         return jnp.ones(shape) if self.share is None else self.share
 
     def _times(self) -> Float[Array, "chunks chunk"]:
-        """Places of independent noise: times in s, or the number of an atom; -1 is none."""
+        """Places of independent noise: times in s, or numbers of atoms; -1 is padding."""
         atoms = np.arange(float(self.effect.shape[2]))
         places = jnp.asarray(atoms if self.windows is None else self.windows.times)
         chunk = min(_CHUNK, places.size)
@@ -139,7 +142,7 @@ class ErrorCovariance(eqx.Module):
     def _at(
         self, times: Float[Array, " times"]
     ) -> Complex[Array, "frequencies groups inputs times"]:
-        """What unit noise at these times adds to the errors, by group of atoms."""
+        """Contribution of unit noise at these times to the errors, by group of atoms."""
         if self.windows is None:
             place = jnp.maximum(times, 0.0).astype(int)
             inside = (times >= 0).astype(self.effect.dtype)
@@ -159,7 +162,15 @@ class ErrorCovariance(eqx.Module):
 def independent_errors(
     omega: Float[Array, " frequencies"], variance: Float[Array, "frequencies outputs inputs"]
 ) -> ErrorCovariance:
-    """Errors of variance E|dT|^2 that no two frequencies, outputs or inputs share."""
+    """The covariance of uncorrelated errors.
+
+    **Arguments:**
+
+    - `omega`: frequencies in rad/s.
+    - `variance`: E|dT|^2 of each response, shape `(frequencies, outputs, inputs)`.
+
+    **Returns:** an `ErrorCovariance`.
+    """
     share = jnp.sqrt(jnp.asarray(variance))
     count, outputs, inputs = share.shape
     effect = np.eye(count * inputs, dtype=complex).reshape(count, inputs, count * inputs)

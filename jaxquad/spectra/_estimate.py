@@ -8,13 +8,19 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
 
-from ._checks import check_alike, check_band, check_distinct, check_moving, check_references
+from ._checks import (
+    check_band,
+    check_compatible,
+    check_distinct,
+    check_excitation,
+    check_references,
+)
 from ._estimators import Composite, JointInputOutput, LocalPolynomial, Periodic, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
 from ._local_estimate import estimate_local_polynomial, LocalEstimate
 from ._periodic import estimate_periodic, PeriodicEstimate
-from ._welch import by_windows
+from ._welch import average_windows
 
 
 _CYCLES = 5.0  # of the longest record, in the lowest frequency by default
@@ -24,11 +30,11 @@ Grid = Float[np.ndarray, " frequencies"]
 
 
 @one_blas_thread()
-def by_polynomial(
+def _by_polynomial(
     records: Sequence[Record], omega: Grid | None, options: LocalPolynomial, method: Method
 ) -> FrequencyResponse:
-    """Local polynomials in frequency, which leakage does not bias."""
-    check_moving(records, method)
+    """Response by local polynomials in frequency."""
+    check_excitation(records, method)
     if omega is None:
         lowest = 2 * np.pi * _CYCLES / max(record.duration for record in records)
         omega = np.geomspace(lowest, 2 * np.pi / (10 * records[0].dt), 100)
@@ -36,11 +42,11 @@ def by_polynomial(
     return _result(records, omega, found, method, options.integrators)
 
 
-def by_period(
+def _by_period(
     records: Sequence[Record], omega: Grid | None, options: Periodic, method: Method
 ) -> FrequencyResponse:
-    """Averages over the periods of a periodic excitation, at its lines."""
-    check_moving(records, method)
+    """Response by averages over the periods of a periodic excitation, at its lines."""
+    check_excitation(records, method)
     found = estimate_periodic(records, omega, options, method)
     return _result(records, found.omega, found, method, 0)
 
@@ -88,17 +94,39 @@ def frequency_response(
     *,
     estimator: Estimator | None = None,
 ) -> FrequencyResponse:
-    """Frequency responses of all outputs to all inputs, of one record or of several together.
+    """Estimate the frequency responses of all outputs to all inputs.
 
-    `omega` in rad/s, by default 100 log-spaced values within what the records can resolve.
-    Several inputs are conditioned on each other. Without an `estimator`, local polynomials, by the
-    joint input-output method where the record has references, otherwise direct, from input to
-    output (H1, Eq. 13), which then says that feedback may bias it.
-    Raises `ValueError` for an unusable band or record, `PrecisionError` in 32 bits.
+    **Arguments:**
+
+    - `record`: one `Record`, or several with the same channels and sample rate, which are taken
+        together.
+    - `omega`: frequencies in rad/s, increasing; by default 100 log-spaced ones from five cycles of
+        the longest record to a tenth of the sample rate (the excited lines with
+        `jq.spectra.Periodic`).
+    - `estimator`: one of `jq.spectra.LocalPolynomial`, `Composite`, `Welch`, `Periodic` and
+        `JointInputOutput`. By default local polynomials, by the joint input-output method where the
+        record has references, else directly from input to output (H1, equation (13) in
+        docs/equations.md). The direct estimate is biased by feedback, and a remark says so.
+
+    **Returns:** a `FrequencyResponse`. Several inputs are conditioned on each other.
+
+    **Raises:**
+
+    - `ValueError`: for frequencies that the records do not resolve, a channel that is constant or
+        given twice, and a joint estimate without one reference for each input.
+    - `jq.PrecisionError`: in 32 bits; call `jq.enable_x64()` first.
+
+    !!! Example
+
+        ```python
+        record = jq.read("log15.npz", inputs="M", outputs="q", references="x0", start=50, stop=76)
+        response = jq.frequency_response(record, np.geomspace(1.0, 60.0, 80))
+        print(response)
+        ```
     """
     require_x64("a frequency response")
     records = [record] if isinstance(record, Record) else list(record)
-    check_alike(records)
+    check_compatible(records)
     check_distinct(records)
     check_band(omega, records[0].dt)
     if estimator is None:
@@ -107,9 +135,9 @@ def frequency_response(
     if isinstance(estimator, JointInputOutput):
         check_references(records)
         method, estimator = "joint", estimator.spectra
-    asked = None if omega is None else np.asarray(omega, float)
+    grid = None if omega is None else np.asarray(omega, float)
     if isinstance(estimator, LocalPolynomial):
-        return by_polynomial(records, asked, estimator, method)
+        return _by_polynomial(records, grid, estimator, method)
     if isinstance(estimator, Periodic):
-        return by_period(records, asked, estimator, method)
-    return by_windows(records, asked, estimator, method)
+        return _by_period(records, grid, estimator, method)
+    return average_windows(records, grid, estimator, method)

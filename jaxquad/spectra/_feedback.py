@@ -3,13 +3,16 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ._checks import in_hertz
+
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
 
 DIRECT = (
-    "direct estimate (H1): where a controller feeds the output back to this input it is biased "
-    "towards -1/C; an outside reference (references=[...]) gives the unbiased joint estimate"
+    "direct estimate (H1): if a controller C feeds the output back to this input, the estimate is "
+    "biased towards -1/C. Name an external reference (references=, --reference) for the joint "
+    "estimate, which is unbiased"
 )
 
 
@@ -26,10 +29,10 @@ def phase_rises(
     error: Float[np.ndarray, " frequencies"],
     coherence: Float[np.ndarray, " frequencies"],
 ) -> bool:
-    """Whether the phase rises, beyond two standard errors, at the top of the coherent band.
+    """Whether the phase increases, by two standard errors, at the top of the coherent band.
 
-    Every actuator lags, so a plant's phase falls there. That of -1/C, with a controller that
-    filters and delays, rises.
+    Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller that
+    filters and delays, increases.
     """
     good = np.flatnonzero(coherence >= COHERENT)
     top = good[omega[good] >= omega[good[-1]] / _TOP] if len(good) else good
@@ -54,16 +57,16 @@ def remarks_on_feedback(
     coherence: Float[np.ndarray, "frequencies outputs"],
     direct: Float[np.ndarray, "frequencies outputs"],
 ) -> tuple[str, ...]:
-    """What a reader of the response has to know about feedback, in words."""
+    """Remarks on feedback that a user of the response has to know."""
     remarks = [DIRECT] if method == "direct" else []
     for o in range(direct.shape[1]):
         if method == "joint":
             remarks += _explained_by_reference(omega, coherence[:, o], direct[:, o])
         elif phase_rises(omega, phase[:, o], error[:, o], coherence[:, o]):
             remarks.append(
-                "feedback-dominated: the phase rises with frequency at the top of the coherent "
-                "band, as that of -1/C does and no actuator's; the coherence there comes from the "
-                "controller"
+                "feedback-dominated: the phase increases with frequency at the top of the coherent "
+                "band, like that of -1/C and unlike that of any actuator; the coherence there "
+                "comes from the controller. Add excitation, and name it as the reference"
             )
     return tuple(dict.fromkeys(remarks))
 
@@ -73,13 +76,13 @@ def _explained_by_reference(
     coherence: Float[np.ndarray, " frequencies"],
     direct: Float[np.ndarray, " frequencies"],
 ) -> list[str]:
-    mine = dominated_by_feedback(direct, coherence)
-    if 2 * np.sum(mine) <= np.sum(direct >= COHERENT):
+    dominated = dominated_by_feedback(direct, coherence)
+    if 2 * np.sum(dominated) <= np.sum(direct >= COHERENT):
         return []
-    span = omega[mine]
+    span = omega[dominated]
     return [
         f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
-        f"frequencies, but at {np.sum(mine)} of them ({span[0]:.3g}..{span[-1]:.3g} rad/s) the "
-        "reference explains neither: there the controller feeds noise back, and nothing tells "
-        "about the plant"
+        f"frequencies, but at {np.sum(dominated)} of them ({in_hertz(span)}) the reference "
+        "explains neither. There the controller feeds back noise, and the record holds no "
+        "information on the plant. Excite these frequencies by the reference"
     ]

@@ -6,17 +6,18 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from jaxquad._core import require_float64
 
+from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
 
 
 class Distortion(eqx.Module):
-    """What scatters around the best linear approximation: noise, and nonlinear distortion.
+    """Scatter around the best linear approximation: noise and nonlinear distortion.
 
-    Amplitudes per line of the average over a record's periods, in output units as in
-    `amplitude`, the output that the response explains. `total` is what scatters between
-    realisations, `nonlinear` what of it the noise does not explain; both are nan where one
-    realisation shows neither. Source: Pintelon and Schoukens, System Identification, 2nd ed.,
-    section 4.3.1.
+    All are amplitudes in output units, for each line, of the average over a record's periods:
+    `amplitude` is that of the output that the response explains, `noise` the scatter between
+    periods, `total` that between realisations, and `nonlinear` the part of it that the noise does
+    not explain. The last two are nan for a single realisation. Source: Pintelon and Schoukens,
+    "System Identification", 2nd ed., section 4.3.1.
     """
 
     omega: Float[np.ndarray, " frequencies"]  # rad/s
@@ -24,14 +25,14 @@ class Distortion(eqx.Module):
     noise: Float[np.ndarray, "frequencies outputs"]
     total: Float[np.ndarray, "frequencies outputs"]
     nonlinear: Float[np.ndarray, "frequencies outputs"]
-    significant: Bool[np.ndarray, " outputs"]  # whether noise alone would seldom scatter so much
+    significant: Bool[np.ndarray, " outputs"]  # whether the scatter exceeds that of the noise
     output_names: tuple[str, ...] = eqx.field(static=True)
     realisations: int = eqx.field(static=True)
 
     def __str__(self) -> str:
         lines = [
-            f"scatter of the period averages at {self.omega.size} lines, "
-            f"{self.realisations} realisation(s), relative to the output"
+            f"scatter of the period averages relative to the output: {self.omega.size} lines, "
+            f"{self.realisations} realisation{'s' if self.realisations > 1 else ''}"
         ]
         for o, name in enumerate(self.output_names):
             output = np.sqrt(np.mean(self.amplitude[:, o] ** 2))
@@ -40,27 +41,27 @@ class Distortion(eqx.Module):
                 for part in (self.noise, self.nonlinear)
             )
             if np.isnan(nonlinear):
-                told = "nonlinear distortion unknown: record other phases of the same lines"
+                distortion = "unknown (record the same lines with other phases)"
             elif self.significant[o]:
-                told = f"nonlinear distortion {nonlinear:.1f} dB"
+                distortion = f"{nonlinear:.1f} dB"
             else:
-                told = "no nonlinear distortion beyond the noise"
-            lines.append(f"  {name}: noise {noise:.1f} dB, {told}")
+                distortion = "below the noise"
+            lines.append(f"  {name}: noise {noise:.1f} dB, nonlinear distortion {distortion}")
         return "\n".join(lines)
 
 
 class FrequencyResponse(eqx.Module):
-    """Measured frequency responses of every output to every input, with their random error.
+    """Measured frequency responses of every output to every input, with their random errors.
 
     With several inputs, responses are conditioned on the other inputs and `coherence` is partial.
-    Where inputs could not be told apart, the response is nan and its random error infinite.
-    `errors` holds how the noise enters all of them at once: neighbouring frequencies of
-    overlapping windows share their noise.
+    Where the inputs cannot be separated, the response is nan and its random error infinite.
+    `errors` is the covariance of all random errors: neighbouring frequencies share part of their
+    noise. `remarks` are what a user of the response should know, as sentences.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s
     response: Complex[Array, "frequencies outputs inputs"]  # output unit per input unit
-    coherence: Float[Array, "frequencies outputs inputs"]  # of the joint estimate: the lesser one
+    coherence: Float[Array, "frequencies outputs inputs"]  # of the joint estimate: the smaller one
     random_error: Float[Array, "frequencies outputs inputs"]  # 1 sigma: relative, and in rad
     errors: ErrorCovariance
     direct_coherence: Float[Array, "frequencies outputs inputs"]  # input to output, no reference
@@ -69,8 +70,8 @@ class FrequencyResponse(eqx.Module):
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
     remarks: tuple[str, ...] = eqx.field(static=True, default=())
-    integrators: int = eqx.field(static=True, default=0)  # taken out before windowing
-    resolution: float = eqx.field(static=True, default=0.0)  # one cycle to a window, rad/s
+    integrators: int = eqx.field(static=True, default=0)  # removed before windowing
+    resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
 
     def __check_init__(self):
@@ -105,6 +106,8 @@ class FrequencyResponse(eqx.Module):
         for o, output in enumerate(self.output_names):
             for i, source in enumerate(self.input_names):
                 good = omega[coherence[:, o, i] >= 0.6]
-                where = f"{good[0]:.3g}..{good[-1]:.3g} rad/s" if good.size else "nowhere"
-                lines.append(f"  {source} -> {output}: coherence above 0.6 at {good.size}: {where}")
+                where = f", {in_hertz(good)}" if good.size else ""
+                lines.append(
+                    f"  {source} -> {output}: coherence above 0.6 at {good.size} frequencies{where}"
+                )
         return "\n".join(lines + [f"  ! {remark}" for remark in self.remarks])

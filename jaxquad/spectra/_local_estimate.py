@@ -7,17 +7,18 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
+from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
 from ._estimators import LocalPolynomial
 from ._local_fit import (
     Bins,
     check_bins,
-    enough_bins,
     local_fit,
     LocalFit,
     recolour,
     record_bins,
-    replaced,
+    replace_rows,
+    smallest_widths,
 )
 from ._local_noise import (
     error_covariance,
@@ -66,7 +67,7 @@ def coherence_of_references(
     fit: LocalFit,
     inputs: int,
 ) -> Float[np.ndarray, "frequencies outputs inputs"]:
-    """The lesser of what all references explain of each input's power and of each output's."""
+    """The smaller of the shares of each input's and each output's power that references explain."""
     noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
     explained = _diagonal(fit.response @ fit.power @ _adjoint(fit.response))
     coherence = explained / (explained + noise.power)
@@ -85,20 +86,20 @@ Grid = Float[np.ndarray, " frequencies"]
 
 
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
-_NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are judged
-_SHARPER = 0.5  # of a residual's power, that noise alone seldom leaves of it
+_NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are estimated
+_SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
 _WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
-_PER_OCTAVE = 4  # frequencies that help to judge, beside those asked for
+_PER_OCTAVE = 4  # further frequencies, which help to choose the widths
 
 Method = Literal["direct", "joint"]
 
 
 class LocalEstimate(NamedTuple):
-    """What the local polynomial method finds; nan and infinite errors where undetermined.
+    """Result of the local polynomial method; nan and infinite errors where undetermined.
 
-    `coherence` is what an input explains of an output's power near each frequency, less what the
-    other inputs explain; of the joint estimate, the lesser of what the references explain of the
-    input and of the output. `direct_coherence` is always that from input to output.
+    `coherence` is the share of an output's power near each frequency that an input explains beyond
+    the other inputs; in the joint estimate, the smaller of the shares of input and output that the
+    references explain. `direct_coherence` is always from input to output.
     """
 
     response: Complex[Array, "frequencies outputs inputs"]
@@ -107,17 +108,17 @@ class LocalEstimate(NamedTuple):
     multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
     errors: ErrorCovariance
     half_width: Grid  # rad/s
-    rational: Bool[np.ndarray, " frequencies"]  # where a resonance asked for it
+    rational: Bool[np.ndarray, " frequencies"]  # where a rational function is used, at a resonance
     remarks: tuple[str, ...]
 
 
 def estimate_local_polynomial(
     records: Sequence[Record], omega: Grid, options: LocalPolynomial, method: Method
 ) -> LocalEstimate:
-    """Responses of all outputs to all inputs at rising `omega` in rad/s, records taken together.
+    """Responses of all outputs to all inputs at increasing `omega` in rad/s, from all records.
 
-    "joint" goes by way of the references, of which there are as many as inputs. Raises
-    `ValueError` for records too short, a band they do not hold, another number of references.
+    "joint" uses the references, of which there must be as many as inputs. Raises `ValueError` for
+    records that are too short or do not cover the band, and for another number of references.
     """
     bins = record_bins(records, options.integrators, options.delay)
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
@@ -126,17 +127,17 @@ def estimate_local_polynomial(
     coefficients, order = inputs * (options.order + 1), options.order
     check_bins(omega, bins, coefficients, order + 1, _FREEDOM)
     grid, at = _with_neighbours(omega, bins)
-    least = enough_bins(grid, bins, coefficients, order + 1, _FREEDOM)
+    least = smallest_widths(grid, bins, coefficients, order + 1, _FREEDOM)
     respond = _responder(bins, inputs, outputs, order, method)
     narrow_width = np.maximum(least, _NARROW * grid)
-    narrow = _determined(grid, narrow_width, respond)
-    narrow = _least_residual(narrow, respond(grid, narrow_width, "rational"))
+    narrow = _fit_widened(grid, narrow_width, respond)
+    narrow = _smaller_residual(narrow, respond(grid, narrow_width, "rational"))
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
     first = inputs + outputs if method == "joint" else 0
-    far = reach(grid, narrow_width, _widest(grid, least), bins, slice(first, first + inputs))
-    chosen = _widths(grid, least, far, noise, respond, options)
-    width, rational, doubted = (each[at] for each in chosen)
-    fit = _merged(omega, width, rational, respond)
+    widest = reach(grid, narrow_width, _widest(grid, least), bins, slice(first, first + inputs))
+    chosen = _widths(grid, least, widest, noise, respond, options)
+    width, rational, unresolved = (each[at] for each in chosen)
+    fit = _fit_chosen(omega, width, rational, respond)
     direct, multiple = _direct_coherence(bins, inputs, outputs, order, grid, narrow_width)
     direct = direct[at]
     coherence = direct
@@ -153,7 +154,8 @@ def estimate_local_polynomial(
         error_covariance(omega, fit, noise, at, bins, back),
         width,
         rational,
-        _remarks(omega, np.all(known, axis=(1, 2)), least[at], options) + _doubts(omega[doubted]),
+        _remark_on_lost(omega, np.all(known, axis=(1, 2)), least[at], options)
+        + _remark_on_resolution(omega[unresolved]),
     )
 
 
@@ -162,14 +164,14 @@ def _check_references(record: Record, inputs: int) -> None:
     if count != inputs:
         raise ValueError(
             f"the joint estimate of {inputs} inputs {list(record.input_names)} needs as many "
-            f"outside references; the record has {count}: {list(record.reference_names)}"
+            f"external references; the record has {count}: {list(record.reference_names)}"
         )
 
 
 def _with_neighbours(
     omega: Grid, bins: Bins
 ) -> tuple[Float[np.ndarray, " grid"], Int[np.ndarray, " frequencies"]]:
-    """`omega` among others, to an octave beyond, and the places it has there."""
+    """A grid of `omega` and others to an octave beyond, and the places of `omega` in it."""
     first, last = max(omega[0] / 2, bins.omega[0]), min(omega[-1] * 2, bins.omega[-1])
     steps = _PER_OCTAVE * np.log2([first, last])
     lattice = 2 ** (np.arange(np.ceil(steps[0]), np.floor(steps[1]) + 1) / _PER_OCTAVE)
@@ -197,13 +199,15 @@ def _stack(
     return local_fit(omega, half_width, bins, references, both, order, shape)
 
 
-def _least_residual(polynomial: LocalFit, rational: LocalFit) -> LocalFit:
-    """The rational fit where it leaves so much less that a resonance must be in the window."""
+def _smaller_residual(polynomial: LocalFit, rational: LocalFit) -> LocalFit:
+    """The rational fit where its residual is so much smaller that there must be a resonance."""
     left = [np.real(np.diagonal(fit.scatter, axis1=1, axis2=2)) for fit in (polynomial, rational)]
     with np.errstate(invalid="ignore"):
         sharper = np.any(left[1] < _SHARPER * left[0], axis=1)
     return (
-        replaced(polynomial, sharper, _rows(rational, sharper)) if np.any(sharper) else polynomial
+        replace_rows(polynomial, sharper, _rows(rational, sharper))
+        if np.any(sharper)
+        else polynomial
     )
 
 
@@ -211,15 +215,15 @@ def _rows(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"]) -> LocalFit:
     return LocalFit(*(field[rows] for field in fit))
 
 
-def _determined(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
-    """The fit within `width`, or, between the lines of a multisine, the least that is enough."""
+def _fit_widened(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
+    """The fit within `width`, widened where it is undetermined, as between multisine lines."""
     fit = respond(grid, width, "polynomial")
     for _ in range(6):
         lost = ~np.isfinite(fit.response[:, 0, 0])
         if not np.any(lost):
             break
         width = np.where(lost, 1.5 * width, width)
-        fit = replaced(fit, lost, respond(grid[lost], width[lost], "polynomial"))
+        fit = replace_rows(fit, lost, respond(grid[lost], width[lost], "polynomial"))
     return fit
 
 
@@ -228,22 +232,22 @@ def _widest(grid: Grid, least: Grid) -> Grid:
 
 
 def _widths(
-    grid: Grid, least: Grid, far: Grid, noise: Noise, respond: Respond, options: LocalPolynomial
+    grid: Grid, least: Grid, widest: Grid, noise: Noise, respond: Respond, options: LocalPolynomial
 ) -> tuple[Grid, Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
     if options.width is None:
-        return choose_widths(grid, least, far, noise, respond)
+        return choose_widths(grid, least, widest, noise, respond)
     no = np.zeros(grid.size, bool)
     return np.full(grid.size, float(options.width)), no, no
 
 
-def _merged(
+def _fit_chosen(
     omega: Grid, width: Grid, rational: Bool[np.ndarray, " frequencies"], respond: Respond
 ) -> LocalFit:
     """Polynomials, and rational functions where `rational`."""
     fit = respond(omega, width, "polynomial")
     if not np.any(rational):
         return fit
-    return replaced(fit, rational, respond(omega[rational], width[rational], "rational"))
+    return replace_rows(fit, rational, respond(omega[rational], width[rational], "rational"))
 
 
 def _direct_coherence(
@@ -257,27 +261,29 @@ def _direct_coherence(
     return partial_coherence(fit, noise.power), multiple_coherence(fit, noise.power)
 
 
-def _remarks(
+def _remark_on_lost(
     omega: Grid, known: Bool[np.ndarray, " frequencies"], least: Grid, options: LocalPolynomial
 ) -> tuple[str, ...]:
     lost = omega[~known]
     if lost.size == 0:
         return ()
     remark = (
-        f"undetermined at {lost.size} of {omega.size} frequencies ({lost[0]:.4g}..{lost[-1]:.4g} "
-        "rad/s): the inputs are not excited there, or not distinguishable from each other or "
-        "from transients"
+        f"undetermined at {lost.size} of {omega.size} frequencies ({in_hertz(lost)}): the inputs "
+        "are not excited there, or cannot be separated from each other or from transients. Excite "
+        "them there, or leave these frequencies out"
     )
     if options.width is not None:
-        remark += f"; or the width is too small: {np.max(least[~known]):.4g} rad/s holds enough"
+        enough = np.max(least[~known])
+        remark += f"; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins"
     return (remark,)
 
 
-def _doubts(omega: Grid) -> tuple[str, ...]:
+def _remark_on_resolution(omega: Grid) -> tuple[str, ...]:
     if omega.size == 0:
         return ()
+    count = f"at {omega.size} frequencies from {in_hertz(omega)}"
+    where = f"near {in_hertz(omega)}" if omega.size == 1 else count
     return (
-        f"between {omega[0]:.4g} and {omega[-1]:.4g} rad/s what is measured changes faster with "
-        "frequency than the record resolves, as lines in the noise do, or a mode that still rings "
-        "when it ends: errors may be too small there; record longer, or rest at the end",
+        f"the estimate {where} is under-resolved (narrow-band noise or a ringing mode); its error "
+        "bars may be too small. Record longer, or add rest at the end",
     )

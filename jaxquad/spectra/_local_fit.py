@@ -10,14 +10,14 @@ from jaxquad.records import Record
 
 
 class Bins(NamedTuple):
-    """Transforms of whole records, all bins in rising order of frequency.
+    """Transforms of whole records, all bins in increasing order of frequency.
 
-    Scaled by the root of the record's length: the noise is the same in a short record as in a
-    long one. Neither the mean nor the Nyquist bin is there.
+    Scaled by the root of the record's length: the noise is the same in a short record as in a long
+    one. The mean and the Nyquist bin are left out.
     """
 
     omega: Float[np.ndarray, " bins"]  # rad/s
-    record: Int[np.ndarray, " bins"]  # which one it is of
+    record: Int[np.ndarray, " bins"]  # number of the record that it belongs to
     values: Complex[np.ndarray, "bins channels"]
     records: int
 
@@ -50,7 +50,7 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
 def recolour(
     omega: Float[np.ndarray, " frequencies"], integrators: int, delay: float, dt: float
 ) -> Complex[np.ndarray, " frequencies"]:
-    """What turns a response to the outputs of `record_bins` into one to the recorded outputs."""
+    """Factor from a response to the outputs of `record_bins` to one to the recorded outputs."""
     lag = integrators // 2 * dt + delay
     return np.exp(-1j * lag * omega) / (1 - np.exp(-1j * dt * omega)) ** integrators
 
@@ -69,33 +69,36 @@ def check_bins(
     transient: int,
     freedom: int,
 ) -> None:
-    """Raise `ValueError` where the records hold too few bins, or not the band of `omega`."""
+    """Raise `ValueError` where the records hold too few bins, or do not cover `omega`."""
     counts = np.bincount(bins.record, minlength=bins.records)
     spare = int(np.sum(np.maximum(counts - transient, 0)))
     if spare < columns + freedom:
         raise ValueError(
-            f"records of {counts.tolist()} Fourier bins leave {spare} beside their transients, the "
-            f"local fit needs {columns + freedom}: record longer, or lower the order"
+            f"the records have {counts.tolist()} Fourier bins, {spare} more than their transients "
+            f"need; the local fit needs {columns + freedom}. Record longer, or use a lower order"
         )
     if not (omega.size and np.all(np.diff(omega) > 0)):
-        raise ValueError(f"{omega.size} frequencies: give one or more, in rising order, in rad/s")
+        raise ValueError(
+            f"{omega.size} frequencies: give one or more, in increasing order, in rad/s"
+        )
     if omega[0] < 0.999 * bins.omega[0] or omega[-1] > 1.001 * bins.omega[-1]:
         raise ValueError(
-            f"omega runs from {omega[0]:.4g} to {omega[-1]:.4g} rad/s, the records from one cycle, "
-            f"{bins.omega[0]:.4g}, to {bins.omega[-1]:.4g} rad/s: keep it within, or record longer"
+            f"the frequencies run from {omega[0]:.4g} to {omega[-1]:.4g} rad/s, but the records "
+            f"hold one cycle of {bins.omega[0]:.4g} rad/s and reach {bins.omega[-1]:.4g} rad/s. "
+            "Keep the frequencies within, or record longer"
         )
 
 
-def enough_bins(
+def smallest_widths(
     omega: Float[np.ndarray, " frequencies"],
     bins: Bins,
     columns: int,
     transient: int,
     freedom: int,
 ) -> Float[np.ndarray, " frequencies"]:
-    """Half-widths in rad/s of the smallest windows that leave `freedom` residuals over.
+    """Half-widths in rad/s of the smallest windows with `freedom` more bins than coefficients.
 
-    `columns` is the number of coefficients of the response, `transient` that of each record's own.
+    `columns` is the number of coefficients of the response, `transient` that of each record.
     """
     least, most = np.zeros_like(omega), np.full_like(omega, bins.omega[-1])
     for _ in range(40):
@@ -140,7 +143,7 @@ Columns = Complex[np.ndarray, "frequencies window columns"]
 
 
 class Solution(NamedTuple):
-    """Response at place 0, how each bin's noise enters it, and what is left over."""
+    """Response at place 0, how the noise of each bin enters it, and the residual."""
 
     response: Complex[np.ndarray, "frequencies outputs inputs"]
     effect: Complex[np.ndarray, "frequencies inputs window"]
@@ -151,7 +154,7 @@ class Solution(NamedTuple):
 
 
 def solve_polynomial(place: Places, u: Inputs, y: Outputs, own: Own, order: int) -> Solution:
-    """Y = sum_s (g_s U + t_s) place^s, t_s of each record its own.
+    """Y = sum_s (g_s U + t_s) place^s, with different t_s for each record.
 
     Source: Pintelon and Schoukens, System Identification, 2nd ed., section 7.2.
     """
@@ -159,12 +162,12 @@ def solve_polynomial(place: Places, u: Inputs, y: Outputs, own: Own, order: int)
 
 
 def solve_rational(place: Places, u: Inputs, y: Outputs, own: Own, order: int) -> Solution:
-    """The same over a denominator 1 + a place, each output its own.
+    """The same over a denominator 1 + a place, with a different `a` for each output.
 
-    `a` comes from the linear equation error, then from Gauss-Newton steps on the output's error;
-    the last step's regressors tell how the noise enters by way of `a`. Outputs share the effect of
-    the first, boosted to their own variance. Source: local rational method, McKelvey and
-    Guerin, 2012.
+    `a` is first estimated from the linear equation error, then by Gauss-Newton steps on the output
+    error; the regressors of the last step say how the noise enters through `a`. All outputs use the
+    effect of the first, scaled to their own variance. Source: local rational method, McKelvey and
+    Guerin (2012).
     """
     columns, inputs = _regressors(place, u, own, order), u.shape[2]
     each = [
@@ -206,7 +209,7 @@ def _regressors(place: Places, u: Inputs, own: Own, order: int) -> Columns:
 def _decomposed(columns: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Q and R of columns of unit length, their lengths, and which were empty.
 
-    A record without bins here has empty columns: a row of its own keeps each from mattering.
+    A record without bins here has empty columns: an extra row for each makes them harmless.
     """
     length = np.sqrt(np.einsum("fwc,fwc->fc", columns, np.conj(columns)).real)
     empty = length == 0
@@ -255,15 +258,16 @@ def _adjoint(x: np.ndarray) -> np.ndarray:
     return np.conj(np.swapaxes(x, 1, 2))
 
 
-_SILENT = 1e-12  # of an input's largest bin: below, it is rounding errors
+_UNEXCITED = 1e-12  # of an input's largest bin: below, it is rounding errors
 _CHUNK = 32  # frequencies solved at once, padded to the longest window among them
 
 
 class LocalFit(NamedTuple):
-    """Responses at the centre of each window, and what noise does to them.
+    """Responses at the centre of each window, and the effect of noise on them.
 
     The error of output o to input i at f is `boost[f, o] sum_k effect[f, i, k] V_o[first[f] + k]`,
-    V the transform of the output's noise. Where the inputs do not determine it, all is nan.
+    V the transform of the output's noise. Where the inputs do not determine the response, all
+    fields are nan.
     """
 
     response: Complex[np.ndarray, "frequencies outputs inputs"]
@@ -291,7 +295,7 @@ def local_fit(
     denominator of the first degree.
     """
     first, last = window_slices(omega, half_width, bins)
-    loudest = np.max(np.abs(bins.values[:, inputs]), axis=0)
+    largest = np.max(np.abs(bins.values[:, inputs]), axis=0)
     longest = max(int(np.max(last - first)), 1)
     parts, places = [], np.argsort(last - first, kind="stable")
     for chunk in np.array_split(places, -(-omega.size // _CHUNK)):
@@ -301,7 +305,7 @@ def local_fit(
         u, y = (values[:, :, each] * used[:, :, None] for each in (inputs, outputs))
         solve = solve_polynomial if shape == "polynomial" else solve_rational
         solution = solve(window.place, u, y, own, order)
-        excited = np.all(np.max(np.abs(u), axis=1) > _SILENT * loudest, axis=1)
+        excited = np.all(np.max(np.abs(u), axis=1) > _UNEXCITED * largest, axis=1)
         size = np.maximum(np.sum(used, axis=1), 1)[:, None, None]
         parts.append((*_padded(solution, excited, longest), products(u) / size))
     back = np.argsort(places)
@@ -312,8 +316,8 @@ def local_fit(
     return LocalFit(response, effect, boost, gain, first, scatter, freedom, power)
 
 
-def replaced(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"], part: LocalFit) -> LocalFit:
-    """`fit`, but at the frequencies `rows` it is `part`."""
+def replace_rows(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"], part: LocalFit) -> LocalFit:
+    """`fit` with the frequencies `rows` replaced by `part`."""
     longest = max(fit.effect.shape[2], part.effect.shape[2])
     whole, part = (
         each._replace(
@@ -365,9 +369,9 @@ def _gather(
 def _own_records(
     window: _Window, order: int, records: int
 ) -> tuple[Bool[np.ndarray, "frequencies window"], Bool[np.ndarray, "frequencies window records"]]:
-    """Bins that tell about the response, and which record each is of.
+    """Bins that carry information on the response, and the record of each.
 
-    A record with no more bins here than its transient has coefficients tells nothing.
+    A record with no more bins here than its transient has coefficients carries none.
     """
     own = window.inside[:, :, None] & (window.record[:, :, None] == np.arange(records))
     own &= (np.sum(own, axis=1) > order + 1)[:, None, :]

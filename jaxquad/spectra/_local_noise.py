@@ -44,9 +44,9 @@ def smooth_noise(
 ) -> Noise:
     """Smooth residual covariances, each of `freedom` complex degrees of freedom, along frequency.
 
-    Powers by local lines in log-log, less the bias of the logarithm of a chi-squared variable;
-    correlations by positive weights, so that they stay positive semidefinite. Where a residual is
-    larger than chance allows it takes no part.
+    Powers are smoothed by local lines in log-log, corrected for the bias of the logarithm of a
+    chi-squared variable; correlations by positive weights, so that they stay positive semidefinite.
+    Residuals larger than chance allows are left out.
     """
     from scipy.special import digamma, gammaincinv
 
@@ -62,7 +62,7 @@ def smooth_noise(
     for _ in range(3):
         outlier = known[:, None] & (np.log(raw) > smooth + high)
         smooth = _local_lines(place, level, np.where(outlier, 1e-9 * weight, weight))
-    if np.any(known):  # Far from all that is known the kernel fades to nothing.
+    if np.any(known):  # Far from all known frequencies the kernel vanishes.
         lone = np.interp(place, place[known], np.arange(np.sum(known)))
         lone = np.abs(place - place[known][np.round(lone).astype(int)]) > 3 * _BANDWIDTH
         nearest = [np.interp(place, place[known], column[known]) for column in smooth.T]
@@ -82,7 +82,7 @@ def _local_lines(
     kernel = np.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
     m0, m1, m2 = ((kernel * offset**k) @ weight for k in (0, 1, 2))
     l0, l1 = ((kernel * offset**k) @ (weight * level) for k in (0, 1))
-    # A lone frequency has no slope: a prior on it keeps the line flat there.
+    # A single frequency has no slope: a prior on the slope keeps the line flat there.
     spread = m2 + 1e-3 * _BANDWIDTH**2 * m0 + 1e-300
     return (spread * l0 - m1 * l1) / (spread * m0 - m1**2 + 1e-300)
 
@@ -102,7 +102,7 @@ def _correlation(
     return mixed / (size[:, :, None] * size[:, None, :])
 
 
-_CHANCE = 1e-5  # of taking a residual for a misfit
+_CHANCE = 1e-5  # of calling a residual a misfit
 _UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
 
 
@@ -136,7 +136,7 @@ def error_covariance(
 def partial_coherence(
     fit: LocalFit, noise: Float[np.ndarray, "frequencies outputs"]
 ) -> Float[np.ndarray, "frequencies outputs inputs"]:
-    """What each input explains of each output beyond the other inputs, from 0 to 1."""
+    """Share of each output's power that an input explains beyond the other inputs, 0 to 1."""
     known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
     power = np.where(known, fit.power, np.eye(fit.power.shape[1]))
     alone = 1 / np.real(np.diagonal(np.linalg.inv(power), axis1=1, axis2=2))
@@ -147,7 +147,7 @@ def partial_coherence(
 def multiple_coherence(
     fit: LocalFit, noise: Float[np.ndarray, "frequencies outputs"]
 ) -> Float[np.ndarray, "frequencies outputs"]:
-    """What all inputs together explain of each output, from 0 to 1."""
+    """Share of each output's power that all inputs together explain, 0 to 1."""
     known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
     response, power = np.where(known, fit.response, 0), np.where(known, fit.power, 0)
     explained = np.real(np.einsum("foi,fij,foj->fo", response, power, np.conj(response)))
@@ -161,7 +161,7 @@ def _misfit(
     colour: Float[np.ndarray, "frequencies window outputs"],
     inside: np.ndarray,
 ) -> Float[np.ndarray, "frequencies outputs"]:
-    """Ratio of residuals to the noise, where it is beyond chance; else 1."""
+    """Ratio of residuals to the noise where it is larger than chance allows, else 1."""
     from scipy.special import fdtri
 
     count = np.maximum(np.sum(inside, axis=1), 1)[:, None]

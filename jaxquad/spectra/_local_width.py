@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ._local_fit import Bins, LocalFit, replaced, window_slices
+from ._local_fit import Bins, LocalFit, replace_rows, window_slices
 from ._local_noise import Noise
 
 
@@ -14,9 +14,9 @@ _RATIO = 1.8  # of successive half-widths
 _SMOOTHING = 0.2  # of the tests for bias, in ln(omega)
 _CHANCE = 3e-4  # of refusing a window whose differences, averaged over neighbours, are noise
 _CHANCE_ALONE = 1e-5  # of refusing it for the difference at one frequency
-_DOUBTED = 4.0  # ratio of variances from which a narrower window's word counts for less
-_FAR_OFF = 10.0  # residual power over that of the noise from which a response is doubted
-_KNOWN = 0.1  # largest relative error of a rational function that is trusted
+_NOISIER = 4.0  # ratio of variances from which a narrower window counts for less
+_FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
+_KNOWN = 0.1  # largest relative error of a rational function that is used
 
 Grid = Float[np.ndarray, " frequencies"]
 Powers = Float[np.ndarray, "frequencies outputs"]
@@ -29,36 +29,36 @@ def choose_widths(
 ) -> tuple[Grid, Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
     """Half-widths from `least` to `reach`, by intersecting confidence intervals.
 
-    Beside them, where a rational function is taken, and where the response is doubted.
-    A wider window is taken while its response agrees with those of all narrower ones within the
+    Also returns where a rational function is used, and where the response is unresolved.
+    A wider window is used while its response agrees with those of all narrower ones within the
     variance of their difference (Goldenshluger and Nemirovski, 1997), at the frequency and on
-    average over its neighbours. A bias of the size of the noise would hide from that: the window
-    used is one rung lower, where it is some five times smaller. Where the least window leaves
-    more than noise, as at a resonance, a rational function takes the polynomial's place; where that
-    is not well known either, the response is doubted.
+    average over its neighbours. This test cannot see a bias of the size of the noise, so the window
+    used is one step smaller, where the bias is about five times smaller. Where the smallest window
+    leaves more than noise, as at a resonance, a rational function replaces the polynomial; where
+    that is not accurate either, the response is unresolved.
     """
     widest = np.maximum(reach, least)
-    rungs = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
-    widths = np.stack([np.minimum(least * _RATIO**m, widest) for m in range(rungs)])
+    steps = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
+    widths = np.stack([np.minimum(least * _RATIO**m, widest) for m in range(steps)])
     fits = [respond(omega, widths[0], "polynomial")]
     for below, width in zip(widths[:-1], widths[1:], strict=True):
         wider = width > below
         part = respond(omega[wider], width[wider], "polynomial")
-        fits.append(replaced(fits[-1], wider, part))
-    rational, doubted = _resonant(fits, respond(omega, least, "rational"), noise)
-    rung, each = _climb(omega, widths, fits, noise), np.arange(omega.size)
+        fits.append(replace_rows(fits[-1], wider, part))
+    rational, unresolved = _resonant(fits, respond(omega, least, "rational"), noise)
+    step, each = _widest_unbiased(omega, widths, fits, noise), np.arange(omega.size)
     gain = np.stack([np.mean(fit.gain, axis=(1, 2)) for fit in fits])
-    # At the lowest frequencies one rung less can cost more than any bias.
-    below = gain[np.maximum(rung - 1, 0), each]
-    dear = ~(below <= _DOUBTED * gain[rung, each])
-    climbed = widths[rung, each] / np.where(dear, 1.0, _RATIO)
-    return np.where(rational, least, np.maximum(climbed, least)), rational, doubted
+    # At the lowest frequencies one step less can cost more than any bias.
+    below = gain[np.maximum(step - 1, 0), each]
+    costly = ~(below <= _NOISIER * gain[step, each])
+    climbed = widths[step, each] / np.where(costly, 1.0, _RATIO)
+    return np.where(rational, least, np.maximum(climbed, least)), rational, unresolved
 
 
 def _resonant(
     fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise
 ) -> tuple[Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
-    """Where the least polynomial is certainly wrong, and a rational function well known or not.
+    """Where a polynomial is wrong and a rational function accurate, and where neither is right.
 
     The error of a rational function is linear in the noise only while it is small.
     """
@@ -74,13 +74,13 @@ def _resonant(
     return wrong & known, ~known & np.any(left > _FAR_OFF, axis=1)
 
 
-def _climb(
+def _widest_unbiased(
     omega: Grid,
-    widths: Float[np.ndarray, "rungs frequencies"],
+    widths: Float[np.ndarray, "steps frequencies"],
     fits: Sequence[LocalFit],
     noise: Noise,
 ) -> Int[np.ndarray, " frequencies"]:
-    rung, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
+    step, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
     kernel = np.exp(-0.5 * ((np.log(omega)[:, None] - np.log(omega)) / _SMOOTHING) ** 2)
     pairs = noise.power.shape[1] * fits[0].response.shape[2]
     alone = _quantile(np.full(omega.size, float(pairs)), noise, _CHANCE_ALONE)
@@ -93,12 +93,12 @@ def _climb(
             total = kernel @ np.minimum(statistic, alone * count)
             going &= total <= shared * (kernel @ count)
             going &= statistic <= alone * pairs
-        rung = np.where(going, m, rung)
-    return rung
+        step = np.where(going, m, step)
+    return step
 
 
 def _quantile(count: Grid, noise: Noise, chance: float) -> Grid:
-    """What the mean of `count` squared differences over their estimated variance seldom exceeds."""
+    """Quantile of the mean of `count` squared differences over their estimated variance."""
     from scipy.special import fdtri
 
     return fdtri(2 * count, 2 * np.maximum(noise.freedom, 1.0), 1 - chance)
@@ -106,8 +106,8 @@ def _quantile(count: Grid, noise: Noise, chance: float) -> Grid:
 
 def _differences(wide: LocalFit, narrow: LocalFit, noise: Powers) -> tuple[Grid, Grid]:
     """Sums over the pairs of squared differences over their variance, and how many pairs count."""
-    # A narrow window much noisier than the wide one tells little of its bias, and costs much.
-    doubt = np.maximum(1.0, narrow.gain / (_DOUBTED * np.maximum(wide.gain, 1e-300)))
+    # A narrow window much noisier than the wide one says little about its bias.
+    doubt = np.maximum(1.0, narrow.gain / (_NOISIER * np.maximum(wide.gain, 1e-300)))
     variance = noise[:, :, None] * (narrow.gain - wide.gain) * doubt
     tested = variance > 0.02 * noise[:, :, None] * wide.gain
     tested &= np.isfinite(wide.response) & np.isfinite(narrow.response)
@@ -123,12 +123,12 @@ _STEP = 1.3  # of the half-widths that are tried
 
 
 def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -> Grid:
-    """Half-widths in rad/s up to which what excites stands about `omega`, `widest` at most.
+    """Half-widths in rad/s within which the excitation is even, `widest` at most.
 
-    Where a sweep has ended, a window that reaches back into its band takes the response from there:
-    smooth, with a small error, and wrong. The mean power of each of the `columns` on either side of
-    `centre` (half-width) must not outweigh that at the centre, unless both sides do: between the
-    lines of a multisine a response is interpolated.
+    Beyond the end of a sweep, a window that reaches back into the sweep's band takes the response
+    from there: smooth, with a small error, and wrong. So the mean power of each of the `columns` on
+    one side of `centre` (half-width) must not outweigh that at the centre, unless both sides do, as
+    between the lines of a multisine, where the response is interpolated.
     """
     running = np.cumsum(np.abs(bins.values[:, columns]) ** 2, axis=0)
     running = np.concatenate([np.zeros((1, running.shape[1])), running])

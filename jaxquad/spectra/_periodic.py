@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
+from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
 from ._estimators import Periodic
 from ._frequency_response import Distortion
@@ -23,13 +24,14 @@ _FAINT = 1e-4  # power of a line, to that of the strongest, below which it count
 class Periods(eqx.Module):
     """Transforms of one record's periods: their mean, and the covariance of a single one.
 
-    Scaled so that noise of unit variance has unit power; channels stand as in `Record.names`.
+    Scaled so that noise of unit variance has unit power; channels are in the order of
+    `Record.names`.
     """
 
     mean: Complex[np.ndarray, "lines channels"]
     covariance: Complex[np.ndarray, "lines channels channels"]  # of a single period
     count: int = eqx.field(static=True)
-    settled: float = eqx.field(static=True)  # first period's departure from the rest, to the noise
+    settled: float = eqx.field(static=True)  # difference of the first period, relative to noise
 
 
 def record_periods(record: Record, options: Periodic) -> Periods:
@@ -42,7 +44,8 @@ def record_periods(record: Record, options: Periodic) -> Periods:
     if count < 2:
         raise ValueError(
             f"the record holds {record.samples / samples:.3g} periods of {options.period:.6g} s, "
-            f"of which {options.discard} are discarded: two have to remain, four or more are better"
+            f"of which {options.discard} are discarded: at least two must remain, better four or "
+            "more. Record longer, or discard fewer"
         )
     columns = np.hstack([record.inputs, record.outputs, record.references])
     kept = columns[options.discard * samples :][: count * samples]
@@ -55,7 +58,7 @@ def record_periods(record: Record, options: Periodic) -> Periods:
 
 
 def _departure(spectra: Complex[np.ndarray, "periods lines channels"], inputs: int) -> float:
-    """Power by which the first period differs from the later ones, over what noise makes of it."""
+    """Power of the first period's difference from the later ones, relative to that by noise."""
     if len(spectra) < 3:
         return 1.0
     first, later = spectra[0], spectra[1:]
@@ -116,10 +119,10 @@ class Scatter(NamedTuple):
     """Powers per line of the averages over a record's periods, smooth along frequency."""
 
     noise: Levels
-    total: Levels | None  # of one realisation more than inputs, or more
+    total: Levels | None  # needs more realisations than inputs
     significant: Bool[np.ndarray, " outputs"]
-    root: Covariances  # of the larger of the two that counts
-    periods: float  # to an average
+    root: Covariances  # of the larger of the two
+    periods: float  # in an average
 
     def nonlinear(self) -> Levels:
         """Power that the noise does not explain."""
@@ -140,13 +143,13 @@ def instrumental(u: Averaged, y: Averaged, z: Averaged) -> Averages:
     return Averages(u, y, response, effect, known)
 
 
-def judge_scatter(
+def estimate_scatter(
     omega: Float[np.ndarray, " frequencies"],
     fit: Averages,
     periods: Sequence[Periods],
     lines: Lines,
 ) -> Scatter:
-    """Noise from period to period, seen through v = y - G u, and scatter between realisations.
+    """Noise between periods, from v = y - G u, and scatter between realisations.
 
     With input noise and feedback, v is what perturbs G: its variance is that of Pintelon and
     Schoukens, eq. 2-25, with the covariance of input and output.
@@ -188,7 +191,7 @@ def _smooth(
     freedom: float,
     known: Bool[np.ndarray, " frequencies"],
 ) -> tuple[Levels, Covariances]:
-    """Powers and roots, smooth along frequency but for lines that stand out."""
+    """Powers and roots, smooth along frequency except at lines that stand out."""
     from scipy.special import gammaincinv
 
     spacing = np.gradient(omega) if omega.size > 1 else omega
@@ -210,7 +213,7 @@ Coherence = Float[np.ndarray, "frequencies outputs inputs"]
 
 
 class PeriodicEstimate(NamedTuple):
-    """Responses at the excited lines; nan and an immense error where undetermined."""
+    """Responses at the excited lines; nan and a huge error where undetermined."""
 
     omega: Float[np.ndarray, " frequencies"]  # rad/s
     response: Complex[Array, "frequencies outputs inputs"]
@@ -231,9 +234,9 @@ def estimate_periodic(
     """Responses of all outputs to all inputs, by default at all lines that are excited.
 
     With Z the period averages of the references ("joint") or of the inputs ("direct") over the
-    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which noise fed
-    back to the input does not bias either: only its average over the periods remains. Raises
-    `ValueError` for fewer records than inputs, and for an `omega` that is no excited line.
+    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which is not biased
+    by noise that is fed back to the input either: only its average over the periods remains. Raises
+    `ValueError` for fewer records than inputs, and for an `omega` that is not an excited line.
     """
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
     _check(records, inputs, options, method)
@@ -245,7 +248,7 @@ def estimate_periodic(
     averages = np.stack([each.mean[lines] for each in periods], axis=2)
     u, y, z = averages[:, :inputs], averages[:, inputs : inputs + outputs], averages[:, instruments]
     fit = instrumental(u, y, z)
-    scatter = judge_scatter(grid[lines], fit, periods, lines)
+    scatter = estimate_scatter(grid[lines], fit, periods, lines)
     direct, lesser = _coherence(fit, scatter, periods, lines)
     return PeriodicEstimate(
         grid[lines],
@@ -264,16 +267,18 @@ def _check(
 ) -> None:
     sizes = {options.samples(record) for record in records}
     if len(sizes) > 1:
-        raise ValueError(f"periods of {sorted(sizes)} samples: read the records at one sample_rate")
+        raise ValueError(
+            f"the periods have {sorted(sizes)} samples: read all records with one sample rate"
+        )
     if len(records) < inputs:
         raise ValueError(
-            f"{inputs} inputs at once need as many records, with other phases in each; there are "
-            f"{len(records)}: record more, or use jq.spectra.LocalPolynomial()"
+            f"{inputs} simultaneous inputs need at least as many records with different phases; "
+            f"there are {len(records)}. Record more, or use jq.spectra.LocalPolynomial()"
         )
     count = records[0].references.shape[1]
     if method == "joint" and count != inputs:
         raise ValueError(
-            f"the joint estimate of {inputs} inputs needs as many outside references; the record "
+            f"the joint estimate of {inputs} inputs needs as many external references; the record "
             f"has {count}: {list(records[0].reference_names)}"
         )
 
@@ -286,8 +291,8 @@ def _chosen(
     """The excited lines, or those of `omega`."""
     if lines.size == 0:
         raise ValueError(
-            "no harmonic of the period stands out of the noise in the input: check the period, or "
-            "use another estimator for an excitation that is not periodic"
+            "no harmonic of the period exceeds the noise in the input. Check the period; for an "
+            "excitation that is not periodic use another estimator"
         )
     if omega is None:
         return lines
@@ -295,8 +300,8 @@ def _chosen(
     off = np.abs(grid[nearest] - omega) > 1e-6 * omega + 1e-6 * grid[0]
     if np.any(off):
         raise ValueError(
-            f"{omega[off][0]:.6g} rad/s is no excited line: the nearest one is "
-            f"{grid[nearest][off][0]:.6g} rad/s; without omega all {lines.size} lines are taken"
+            f"{omega[off][0]:.6g} rad/s is not an excited line; the nearest one is "
+            f"{grid[nearest][off][0]:.6g} rad/s. Without omega all {lines.size} lines are used"
         )
     return nearest
 
@@ -304,8 +309,8 @@ def _chosen(
 def _coherence(
     fit: Averages, scatter: Scatter, periods: Sequence[Periods], lines: Lines
 ) -> tuple[Coherence, Coherence]:
-    """Of one period: what an input explains of an output, and the lesser of that and of the
-    repeated part of the input."""
+    """Of one period: the share of an output that an input explains, and the smaller of that and
+    of the repeated share of the input."""
     inputs = fit.u.shape[1]
     power = np.einsum("fir,fjr->fij", fit.u, np.conj(fit.u)) / fit.u.shape[2]
     power = np.where(fit.known[:, None, None], power, np.eye(inputs))
@@ -319,7 +324,7 @@ def _coherence(
 
 
 def _multiple(fit: Averages, scatter: Scatter) -> Float[np.ndarray, "frequencies outputs"]:
-    """Of one period: what all inputs together explain of an output."""
+    """Of one period: the share of an output that all inputs together explain."""
     explained = np.mean(np.abs(np.nan_to_num(fit.response) @ fit.u) ** 2, axis=2)
     return explained / (explained + scatter.noise * scatter.periods + scatter.nonlinear())
 
@@ -327,7 +332,7 @@ def _multiple(fit: Averages, scatter: Scatter) -> Float[np.ndarray, "frequencies
 def _errors(
     omega: Float[np.ndarray, " frequencies"], fit: Averages, scatter: Scatter
 ) -> ErrorCovariance:
-    """Each line has noise of its own, as many atoms as inputs."""
+    """The noise of each line is independent: as many atoms as inputs at each."""
     count, inputs, _ = fit.effect.shape
     kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
     kernel = np.where(fit.known[:, None, None], kernel, _UNKNOWN**2 * np.eye(inputs))
@@ -371,20 +376,23 @@ def _remarks(
     remarks, lost = [], omega[~fit.known]
     if lost.size:
         remarks.append(
-            f"undetermined at {lost.size} of {omega.size} lines ({lost[0]:.4g}..{lost[-1]:.4g} "
-            "rad/s): the records excite the inputs too much alike there"
+            f"undetermined at {lost.size} of {omega.size} lines ({in_hertz(lost)}): the inputs "
+            "cannot be separated there. Use different phases in each record"
         )
     unsettled = [each.settled for each in periods if each.settled > _UNSETTLED]
     if unsettled:
         remarks.append(
-            f"the first period kept differs from the later ones by {max(unsettled):.3g} times the "
-            "power of the noise: a transient is left; discard more periods"
+            f"the first period differs from the later ones by {max(unsettled):.3g} times the noise "
+            "power, because a transient remains: discard more periods"
         )
     if scatter.total is None:
         remarks.append(
-            "no more records than inputs: errors hold the noise only; nonlinear distortion shows "
-            "between records whose lines have other phases"
+            "no more records than inputs: the error bars cover noise only. To include nonlinear "
+            "distortion, record the same lines with other phases"
         )
     elif np.any(scatter.significant):
-        remarks.append("nonlinear distortion: errors are those of the best linear approximation")
+        remarks.append(
+            "nonlinear distortion exceeds the noise: the error bars are those of the best linear "
+            "approximation"
+        )
     return tuple(remarks)

@@ -19,7 +19,7 @@ _FULL = 0.7  # functions to a sample of a block, beyond which compression does n
 
 
 class WindowTables(eqx.Module):
-    """What turns samples into the Fourier sums of all windows of one length."""
+    """Tables that convert samples to the Fourier sums of all windows of one length."""
 
     tables: tuple[Float[Array, "2 _ _"], ...]  # one to a band of the compressed blocks
     taper: Float[Array, " window"]  # for the frequencies above the bands
@@ -48,7 +48,7 @@ def plan_transform(
     shape: str,
     detrend: str,
 ) -> Plan:
-    """Make the tables, or find them: they depend on the layout of a record, not on its samples."""
+    """The tables of a transform, cached: they depend on the layout of a record, not on samples."""
     _check(samples, angle, windows, detrend)
     forward = np.argsort(np.abs(angle), kind="stable")
     omega = np.asarray(angle, float)[forward]
@@ -75,21 +75,21 @@ def _check(
     detrend: str,
 ) -> None:
     if detrend not in ("none", "constant", "linear"):
-        raise ValueError(f"detrend {detrend!r}: choose none, constant or linear")
+        raise ValueError(f"detrend is {detrend!r}: use none, constant or linear")
     if not angle or not np.all(np.abs(angle) <= np.pi):
         worst = max(angle, key=abs, default=None)
         raise ValueError(
-            f"angle {worst} rad per sample is not within +-pi, the Nyquist frequency: give at "
+            f"angle {worst} rad per sample is not within -pi to pi, the Nyquist frequency: give at "
             "least one frequency, and none above half the sample rate"
         )
     if not windows:
-        raise ValueError("no windows: give at least one (length, starts)")
+        raise ValueError("there are no windows: give at least one pair (length, starts)")
     for length, starts in windows:
         if length < 2 or not starts or min(starts) < 0 or max(starts) + length > samples:
             raise ValueError(
-                f"windows of {length} samples from {min(starts, default=None)} to "
+                f"windows of {length} samples that start at {min(starts, default=None)} to "
                 f"{max(starts, default=None)} do not fit a record of {samples} samples: starts "
-                f"must lie between 0 and {samples - length}, and a window hold 2 samples"
+                f"must lie between 0 and {samples - length}, and a window must hold 2 samples"
             )
 
 
@@ -143,14 +143,14 @@ def transform_windows(
 
     `sum_n taper[n] x[start + n] exp(-j angle (origin + start + n))`, one array for each pair
     (length, starts) of `windows`, with `angle` in rad per sample: the phase is absolute, of a
-    record whose first sample is number `origin`. `detrend` takes the "constant" or the "linear"
-    least-squares trend out of every window before the taper, or "none". Tables are made at the
-    first call of a layout and kept. Raises `ValueError` for windows outside the record or
-    frequencies above Nyquist's, `PrecisionError` in 32 bits.
+    record whose first sample is number `origin`. `detrend` removes the "constant" or the "linear"
+    least-squares trend of every window before the taper, or "none". Tables are made at the first
+    call for a layout and cached. Raises `ValueError` for windows outside the record or frequencies
+    above the Nyquist frequency, `PrecisionError` in 32 bits.
 
-    Blocks of samples are compressed once, for all windows, to what is seen of them at these
-    frequencies; each length is then a small matrix product. Exact to about 2e-13 of the largest
-    sum. Fast where lengths are multiples of a block: see `lattice_windows`.
+    Blocks of samples are compressed once, for all windows, to the few functions that these
+    frequencies can distinguish; each length is then a small matrix product. Accurate to about 2e-13
+    of the largest sum. Fast where lengths are multiples of a block: see `lattice_windows`.
     """
     require_x64("a transform")
     plan = plan_transform(
@@ -162,7 +162,7 @@ def transform_windows(
 def apply_plan(
     plan: Plan, signals: Float[Array, "samples channels"], origin: Float[Array, ""]
 ) -> list[Complex[Array, "segments frequencies channels"]]:
-    """`transform_windows` with its tables made, to be called inside a compiled function."""
+    """`transform_windows` with tables at hand, to be called inside a compiled function."""
     if plan.detrend != "none":  # No trend is left of a constant, but its rounding errors would be.
         signals = signals - jnp.mean(signals, axis=0)[None, :]
     lattice, rows = plan.lattice, signals.T
@@ -229,7 +229,7 @@ def _compressed_sums(
 def _compress(
     plan: Plan, segments: Float[Array, "segments channels window"]
 ) -> Float[Array, "segments channels blocks rank"]:
-    """Windows that do not lie on whole blocks are cut into blocks of their own."""
+    """Blocks of windows that do not lie on whole blocks of the record."""
     block = plan.lattice.block
     padding = -segments.shape[2] % block
     whole = jnp.pad(segments, ((0, 0), (0, 0), (0, padding)))

@@ -12,8 +12,8 @@ from jaxquad.records import Record
 
 from ._average import average, Averaged, Channels
 from ._blocks import lattice_windows
-from ._checks import check_band, check_moving
-from ._error_covariance import ErrorCovariance, overlaps, place_windows
+from ._checks import check_band, check_excitation, in_hertz
+from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
@@ -27,8 +27,9 @@ Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each se
 class Segments(NamedTuple):
     """Transforms of one set of windows for each length, in absolute phase.
 
-    Channels stand as in `Record.names`: inputs, outputs, references. `groups` are the lengths and
-    the starts in samples, of the records one after the other, with gaps wider than any window.
+    Channels are in the order of `Record.names`: inputs, outputs, references. `groups` are the
+    lengths and starts in samples, of the records one after the other, with gaps wider than any
+    window.
     """
 
     transforms: tuple[Complex[Array, "windows frequencies channels"], ...]
@@ -38,7 +39,7 @@ class Segments(NamedTuple):
 def transform_records(
     records: Sequence[Record], omega: Float[np.ndarray, " frequencies"], members: Sequence[Welch]
 ) -> Segments:
-    """Transform all channels of all records; no window spans the seam of two records."""
+    """Transform all channels of all records; no window spans two records."""
     require_x64("a frequency response")
     layouts = _layouts(records, omega, members)
     parts, starts, origin = [], [[] for _ in members], 0
@@ -56,9 +57,10 @@ def transform_records(
 def _layouts(
     records: Sequence[Record], omega: Float[np.ndarray, " frequencies"], members: Sequence[Welch]
 ) -> list[Layout]:
-    """Lengths and starts for each record. One window keeps its length to the sample.
+    """Lengths and starts for each record.
 
-    Several, whose lengths are a choice of ours, take lengths that share blocks of samples.
+    A single window keeps its length to the sample; several take lengths that share blocks of
+    samples, because their exact lengths do not matter.
     """
     lengths = tuple(member.length(records) for member in members)
     samples = [record.samples - members[0].integrators for record in records]
@@ -77,10 +79,10 @@ def _transform_record(
     layout: Layout,
     origin: int,
 ) -> list[Complex[Array, "_ frequencies channels"]]:
-    n, late = welch.integrators, welch.late(record)
+    n, late = welch.integrators, welch.delay_samples(record)
     outputs = np.diff(record.outputs, n, axis=0)
     outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
-    # A difference looks back by n/2 samples, which the window would weigh like any other delay.
+    # A difference delays by n/2 samples, and the window would act on it like on any delay.
     centre = slice(n - n // 2, record.samples - n // 2)
     columns = np.hstack([record.inputs[centre], outputs, record.references[centre]])
     angle = omega * record.dt
@@ -100,40 +102,40 @@ _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
 
 
 def check_windows(independent: Sequence[float], segments: Segments, channels: Channels) -> None:
-    """Raise `ValueError` where there are too few windows to tell the inputs apart."""
+    """Raise `ValueError` where there are too few windows to separate the inputs."""
     for count, (_, starts) in zip(independent, segments.groups, strict=True):
         if len(starts) <= channels.inputs or count < channels.inputs:
             raise ValueError(
-                f"{count:.1f} independent windows cannot tell {channels.inputs} inputs apart: use "
-                f"a window below a {channels.inputs + 2}th of the record, or record longer"
+                f"{count:.1f} independent windows are too few for {channels.inputs} inputs: use "
+                f"a window shorter than 1/{channels.inputs + 2} of the record, or record longer"
             )
 
 
-def check_excited(
+def check_spectrum(
     omega: Float[np.ndarray, " frequencies"],
     power: Float[np.ndarray, "channels frequencies"],
     records: Sequence[Record],
     welch: Welch,
     method: Literal["direct", "joint"],
 ) -> None:
-    """Raise `ValueError` for a channel that never moves, or a spectrum of mere rounding errors."""
+    """Raise `ValueError` for a constant channel, or a spectrum of rounding errors only."""
     first = records[0]
     names = first.input_names + (first.reference_names if method == "joint" else ())
-    largest = check_moving(records, method)
+    largest = check_excitation(records, method)
     gain = np.sum(window(welch.shape, welch.length(records)))
     for name, level in zip(names, np.sqrt(power), strict=False):
         lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[first.names.index(name)]))
         if lost.size:
             raise ValueError(
-                f"no excitation at {omega[lost[0]]:.4g} rad/s: the spectrum of {name!r} is zero "
-                "there; keep omega within the band that was excited"
+                f"no excitation at {in_hertz(omega[lost[:1]])}: the spectrum of {name!r} is zero "
+                "there. Keep the frequencies within the band that was excited"
             )
 
 
-def checked_omega(
+def frequencies_for(
     omega: Float[ArrayLike, " frequencies"] | None, records: Sequence[Record], welch: Welch
 ) -> Float[np.ndarray, " frequencies"]:
-    """Frequencies in rad/s, by default `welch`'s; `ValueError` unless the window resolves them."""
+    """`omega` or the default of `welch`, rad/s; `ValueError` where the window is too short."""
     if omega is None:
         return welch.default_omega(records)
     check_band(omega, records[0].dt)
@@ -142,14 +144,14 @@ def checked_omega(
     lowest = 2 * np.pi / seconds
     if omega[0] < 0.999 * lowest:
         raise ValueError(
-            f"{omega[0]:.4g} rad/s is below the {lowest:.4g} rad/s of which one cycle fits the "
-            f"window of {seconds:.4g} s: raise it, or set a window above "
-            f"{2 * np.pi / omega[0]:.4g} s"
+            f"{in_hertz(omega[:1])} is below the lowest frequency that the window of "
+            f"{seconds:.4g} s resolves, {lowest:.4g} rad/s (one cycle). Raise it, or use a window "
+            f"longer than {2 * np.pi / omega[0]:.4g} s"
         )
     return omega
 
 
-_TOGETHER = 0.5  # average coherence between inputs above which the textbook warns
+_TOGETHER = 0.5  # average coherence between inputs above which Tischler & Remple, ch. 9, warn
 _LOST = 0.9999
 
 
@@ -167,14 +169,15 @@ def remarks_on_inputs(
         if np.any(lost):
             span = omega[lost]
             remarks.append(
-                f"input {name} cannot be told from the others at {lost.sum()} of {omega.size} "
-                f"frequencies ({span[0]:.3g}..{span[-1]:.3g} rad/s), which are left out: move the "
-                "inputs independently, one sweep after the other or with interleaved multisines"
+                f"input {name} cannot be separated from the other inputs at {lost.sum()} of "
+                f"{omega.size} frequencies ({in_hertz(span)}); they are left out. Excite the "
+                "inputs independently, one after the other or with interleaved multisines"
             )
         elif np.mean(coherence[:, i]) > _TOGETHER:
             remarks.append(
-                f"input {name} moves with the others: their coherence averages "
-                f"{coherence[:, i].mean():.2f}, above 0.5; conditioned responses have larger errors"
+                f"input {name} is correlated with the other inputs: their average coherence is "
+                f"{coherence[:, i].mean():.2f} (limit {_TOGETHER}), so the errors of conditioned "
+                f"responses are larger. Excite the inputs independently"
             )
     return tuple(remarks)
 
@@ -182,30 +185,30 @@ def remarks_on_inputs(
 Method = Literal["direct", "joint"]
 _CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
-    "only {count:.1f} independent windows: coherence is near 1 whatever the signals do, and errors "
-    "are rough; record longer, or use a shorter window"
+    "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
+    "bars are rough. Record longer, or use a shorter window"
 )
 
 
-def by_windows(
+def average_windows(
     records: Sequence[Record],
     omega: Float[np.ndarray, " frequencies"] | None,
     spectra: Welch | Composite,
     method: Method,
 ) -> FrequencyResponse:
-    """Averages over tapered windows of one or of several lengths."""
-    members = (spectra,) if isinstance(spectra, Welch) else spectra.members(records, omega)
-    omega = checked_omega(omega, records, members[0])
+    """Response by averages over tapered windows of one or several lengths."""
+    members = (spectra,) if isinstance(spectra, Welch) else spectra.windowed(records, omega)
+    omega = frequencies_for(omega, records, members[0])
     segments = transform_records(records, omega, members)
     channels = _channels(records[0], method)
     independent = _independent(records, segments)
     check_windows(independent, segments, channels)
     found = average(
-        segments.transforms, channels, omega, overlaps(segments.groups, members[0].shape),
+        segments.transforms, channels, omega, window_products(segments.groups, members[0].shape),
         _scales(segments, members[0], records[0].dt), _resolved(segments, omega * records[0].dt),
         _freedom(independent, segments, members[0], channels.inputs),
     )  # fmt: skip
-    check_excited(omega, np.asarray(found.excitation), records, members[0], method)
+    check_spectrum(omega, np.asarray(found.excitation), records, members[0], method)
     return _result(records, omega, members, segments, found, method)
 
 
@@ -229,7 +232,7 @@ def _scales(segments: Segments, welch: Welch, dt: float) -> Float[np.ndarray, " 
 def _resolved(
     segments: Segments, angle: Float[np.ndarray, " frequencies"]
 ) -> Bool[np.ndarray, "groups frequencies"]:
-    """Where a window holds `_CYCLES`; the longest serves everywhere."""
+    """Where a window holds `_CYCLES` cycles; the longest window is used everywhere."""
     lengths = np.array([length for length, _ in segments.groups], float)
     lengths[0] = np.inf
     return angle[None, :] * lengths[:, None] >= 2 * np.pi * _CYCLES
@@ -238,8 +241,8 @@ def _resolved(
 def _freedom(
     independent: list[float], segments: Segments, welch: Welch, inputs: int
 ) -> Float[np.ndarray, "groups 2"]:
-    """Independent windows and the residuals' degrees of freedom, less those that inputs take."""
-    shared, at, rows = overlaps(segments.groups, welch.shape), 0, []
+    """Independent windows and the residuals' degrees of freedom, less those of the inputs."""
+    shared, at, rows = window_products(segments.groups, welch.shape), 0, []
     for count, (_, starts) in zip(independent, segments.groups, strict=True):
         mine = shared[at : at + len(starts), at : at + len(starts)]
         left = np.trace(mine) ** 2 / np.sum(mine**2) - inputs

@@ -14,15 +14,15 @@ def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
 def coefficients(name: str) -> tuple[float, float]:
     """Level and cosine amplitude of a window: level - cosine cos(2 pi n / samples)."""
     if name not in _SHAPES:
-        raise ValueError(f"no window {name!r}: choose one of {', '.join(_SHAPES)}")
+        raise ValueError(f"there is no window {name!r}: use one of {', '.join(_SHAPES)}")
     return _SHAPES[name]
 
 
 def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]:
     """First samples of windows of `length` that overlap by at least `overlap` and reach both ends.
 
-    The windows are spread evenly over the record, so that no tail is dropped: the top of a
-    frequency sweep is in its last seconds.
+    The windows are spread evenly over the record, so that its end is not lost: the highest
+    frequencies of a sweep are in its last seconds.
     """
     step = max(int(round(length * (1 - overlap))), 1)
     count = -(-(samples - length) // step) + 1

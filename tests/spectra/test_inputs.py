@@ -152,14 +152,19 @@ def test_inputs_that_cannot_be_told_apart_are_marked_where_they_cannot():
     assert lost[0] and not lost[-1]
     assert np.all(np.isinf(np.asarray(found.random_error)[lost]))
     assert np.all(np.isfinite(np.asarray(found.random_error)[~lost]))
-    assert any("cannot be told from the others at" in remark for remark in found.remarks)
+    assert any("cannot be separated from the other inputs at" in remark for remark in found.remarks)
 
 
 def test_inputs_that_move_together_are_remarked():
     u = together(share=2.0)
     found = respond(u, answer(u, seed=1))
-    assert any(remark.startswith("input u1 moves with the others") for remark in found.remarks)
-    assert not any("moves with" in r for r in respond(noise(1, 2), answer(noise(1, 2))).remarks)
+    assert any(
+        remark.startswith("input u1 is correlated with the other inputs")
+        for remark in found.remarks
+    )
+    assert not any(
+        "is correlated with" in r for r in respond(noise(1, 2), answer(noise(1, 2))).remarks
+    )
 
 
 def test_ten_inputs_and_twenty_outputs_are_estimated_at_once():

@@ -1,5 +1,7 @@
 """An integrating plant behind a window, from record to fit."""
 
+import functools as ft
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ TRUTH = jq.LaggedIntegrator(gain=80.0, lag=0.03, delay=0.02)
 SWEEP = jq.sweep(0.5, 30.0, duration=60.0, sample_rate=100.0, amplitude=1.0)
 
 
+@ft.cache
 def fit(integrators):
     rate = np.asarray(jq.models.simulate_linear(TRUTH.transfer_function(), SWEEP.signal, 0.01))
     rate = rate + 0.01 * np.std(rate) * np.random.default_rng(0).standard_normal(rate.size)

@@ -101,12 +101,14 @@ def test_predicted_errors_are_those_of_repeated_draws(name):
     check_calibrated(draws(name), PLANT[:, None, None])
 
 
+@pytest.mark.slow
 def test_predicted_errors_hold_in_coloured_noise():
     noise = [filtered([0.03], [1.0, -0.98], draw(k)) for k in range(DRAWS)]
     found = [estimate(WHITE, plant(WHITE) + each) for each in noise]
     check_calibrated(found, PLANT[:, None, None])
 
 
+@pytest.mark.slow
 def test_two_inputs_at_once_and_two_outputs_with_shared_noise():
     u = np.stack([WHITE, draw(99)], axis=1)
     clean = np.stack([plant(u[:, 0]) + 0.5 * u[:, 1], plant(u[:, 1])], axis=1)
@@ -157,9 +159,9 @@ def test_the_joint_estimate_holds_in_closed_loop_and_the_direct_one_is_biased():
     joint = [estimate(u, y, WHITE, method="joint") for u, y in loops]
     exact = (0.4 / (Z - 0.8))[:, None, None]
     check_calibrated(joint, exact)
-    direct = np.mean([estimate(u, y).response for u, y in loops], axis=0)
-    # The noise that is fed back pulls it towards -1/C = -2.
-    spread = np.sqrt(np.mean([variance(each) for each in joint], axis=0) / DRAWS)
+    direct = np.mean([estimate(u, y).response for u, y in loops[:20]], axis=0)
+    # The noise that is fed back biases it towards -1/C = -2.
+    spread = np.sqrt(np.mean([variance(each) for each in joint], axis=0) / 20)
     assert np.median(np.abs(direct - exact) / spread) > 5
     coherence = np.asarray(joint[0].coherence)
     assert np.all((coherence > 0.3) & (coherence < 1.0))
@@ -211,13 +213,13 @@ def test_what_is_not_excited_is_unknown_and_said_to_be():
     silent = estimate(np.stack([WHITE, 2 * WHITE], axis=1), plant(WHITE))
     assert np.all(np.isnan(silent.response)) and np.all(np.asarray(silent.coherence) == 0)
     assert np.all(variance(silent) > 1e100)
-    assert "not distinguishable" in silent.remarks[0]
+    assert "cannot be separated" in silent.remarks[0]
 
 
 def test_a_width_that_holds_too_few_bins_says_what_would_do():
     found = estimate(WHITE, plant(WHITE), options=LocalPolynomial(width=0.2))
     assert np.all(np.isnan(found.response))
-    assert "the width is too small: " in found.remarks[0]
+    assert "use a larger width: " in found.remarks[0]
 
 
 @pytest.mark.parametrize(
@@ -230,9 +232,9 @@ def test_options_out_of_range_are_refused(options):
 
 
 def test_records_that_cannot_hold_the_fit_are_refused():
-    with pytest.raises(ValueError, match="record longer"):
+    with pytest.raises(ValueError, match="Record longer"):
         estimate(WHITE[:30], plant(WHITE[:30]))
     with pytest.raises(ValueError, match="one cycle"):
         estimate(WHITE, plant(WHITE), omega=np.array([0.01, 1.0]))
-    with pytest.raises(ValueError, match="as many outside references"):
+    with pytest.raises(ValueError, match="as many external references"):
         estimate(WHITE, plant(WHITE), method="joint")

@@ -65,7 +65,14 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES, ids=lambda name: name.replace(" ", "-"))
+SLOW = ("white input", "sweep")  # The other two differ from them in the noise and in the loop.
+PARAMETERS = [
+    pytest.param(name, id=name.replace(" ", "-"), marks=[pytest.mark.slow] * (name in SLOW))
+    for name in CASES
+]
+
+
+@pytest.fixture(scope="module", params=PARAMETERS)
 def draws(request):
     """Relative errors of all draws, the predicted errors, and the mean predicted covariance."""
     exact, found = CASES[request.param]()

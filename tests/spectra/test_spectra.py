@@ -86,7 +86,7 @@ def test_the_density_matrix_is_hermitian():
 
 
 def test_an_unknown_channel_is_named_with_the_known_ones():
-    with pytest.raises(ValueError, match="no channel 'q': choose one of u, y"):
+    with pytest.raises(ValueError, match="there is no channel 'q': the channels are u, y"):
         spectral_density(record(), BINS, welch=WELCH).power("q")
 
 

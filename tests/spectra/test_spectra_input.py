@@ -31,11 +31,14 @@ def still(channel):
     [
         (np.array([]), r"omega has shape \(0,\): give 1 to 1024 frequencies"),
         (np.geomspace(4, 100, 1025), r"omega has shape \(1025,\)"),
-        (np.array([5.0, 200.0]), r"Nyquist frequency 157.1 rad/s; it runs from 5 to 200"),
-        (np.array([9.0, 5.0]), "omega must rise"),
-        (np.array([0.0, 5.0]), "omega must rise from above 0"),
-        (np.array([np.nan, 5.0]), "omega must rise"),
-        (np.array([0.2, 5.0]), "runs from 0.2 to 5 rad/s, the records from one cycle, 0.6283"),
+        (
+            np.array([5.0, 200.0]),
+            r"of 157.1 rad/s .25 Hz.; they run from 5 to 200",
+        ),
+        (np.array([9.0, 5.0]), "the frequencies must increase"),
+        (np.array([0.0, 5.0]), "the frequencies must increase, from above 0"),
+        (np.array([np.nan, 5.0]), "the frequencies must increase"),
+        (np.array([0.2, 5.0]), "run from 0.2 to 5 rad/s, but the records hold one cycle of 0.6283"),
     ],
 )
 def test_an_unusable_band_is_refused_with_its_limits(omega, message):
@@ -46,8 +49,11 @@ def test_an_unusable_band_is_refused_with_its_limits(omega, message):
 @pytest.mark.parametrize(
     "estimator, message",
     [
-        (Welch(2.0), r"1.5 rad/s is below the 3.142 rad/s .* a window above 4.189 s"),
-        (Composite(), r"1.5 rad/s is below the 1.881 rad/s of which one cycle fits"),
+        (
+            Welch(2.0),
+            r"1.5 rad/s .* resolves, 3.142 rad/s .* a window longer than 4.189 s",
+        ),
+        (Composite(), r"1.5 rad/s .* resolves, 1.881 rad/s .one cycle."),
     ],
 )
 def test_a_band_below_what_the_window_resolves_is_refused(estimator, message):
@@ -58,11 +64,14 @@ def test_a_band_below_what_the_window_resolves_is_refused(estimator, message):
 @pytest.mark.parametrize(
     "welch, message",
     [
-        (Welch(10.0), "a window of 10 s has 500 samples, the shortest record 500"),
-        (Welch(12.0), "has 600 samples, the shortest record 500: .* below 5 s"),
+        (Welch(10.0), "a window of 10 s has 500 samples, and the shortest record 500"),
+        (Welch(12.0), "has 600 samples, and the shortest record 500: .* shorter than 5 s"),
         (Welch(0.1), "has 5 samples"),
-        (Welch(0.2), "a window of 10 samples resolves nothing below a tenth of the sample rate"),
-        (Welch(2.0, delay=3.0), "a delay of 3 s is not shorter than the window of 2 s"),
+        (
+            Welch(0.2),
+            "a window of 10 samples is too short for frequencies up to a tenth",
+        ),
+        (Welch(2.0, delay=3.0), "delay is 3 s: it must be below the window's 2 s"),
     ],
 )
 def test_a_window_that_does_not_fit_is_refused(welch, message):
@@ -73,12 +82,15 @@ def test_a_window_that_does_not_fit_is_refused(welch, message):
 @pytest.mark.parametrize(
     "options, message",
     [
-        (dict(shape="blackman"), "no window 'blackman': choose one of hann, hamming, rectangular"),
-        (dict(overlap=1.0), r"overlap 1.0 is not in \[0, 1\)"),
-        (dict(detrend="cubic"), "detrend 'cubic': choose none, constant or linear"),
-        (dict(integrators=4), "integrators 4: give 0 to 3"),
-        (dict(delay=-0.1), "delay -0.1 s: give 0 to 10 s"),
-        (dict(window_length=0.0), "window_length 0.0 s must be positive"),
+        (
+            dict(shape="blackman"),
+            "no window 'blackman': use one of hann, hamming, rectangular",
+        ),
+        (dict(overlap=1.0), r"overlap is 1.0: it must be at least 0 and below 1"),
+        (dict(detrend="cubic"), "detrend is 'cubic': use none, constant or linear"),
+        (dict(integrators=4), "integrators is 4: use 0 to 3"),
+        (dict(delay=-0.1), "delay is -0.1 s: use 0 to 10 s"),
+        (dict(window_length=0.0), "window_length is 0.0 s: it must be positive"),
     ],
 )
 def test_impossible_options_are_refused_with_their_value(options, message):
@@ -88,7 +100,7 @@ def test_impossible_options_are_refused_with_their_value(options, message):
 
 def test_too_short_a_record_is_refused():
     with pytest.raises(
-        ValueError, match="a window of 0.08 s has 4 samples, the shortest record 20"
+        ValueError, match="a window of 0.08 s has 4 samples, and the shortest record 20"
     ):
         frequency_response(Record(TIME[:20], DRAW[:20, 0], DRAW[:20, 1]), estimator=Welch())
 
@@ -101,7 +113,9 @@ def test_a_constant_channel_is_no_excitation(channel, name):
 
 def test_a_trend_that_detrending_removes_is_no_excitation():
     ramp = Record(TIME, 1e6 + 3 * TIME, DRAW[:, 1])
-    with pytest.raises(ValueError, match="no excitation at 4 rad/s: the spectrum of 'u' is zero"):
+    with pytest.raises(
+        ValueError, match="no excitation at 4 rad/s .*: the spectrum of 'u' is zero"
+    ):
         frequency_response(ramp, OMEGA, estimator=Welch(detrend="linear"))
 
 
@@ -115,7 +129,7 @@ def test_the_joint_estimate_needs_one_reference():
 
 def test_too_few_windows_for_the_inputs_are_refused():
     two = Record(TIME, DRAW[:, :2], DRAW[:, 2])
-    with pytest.raises(ValueError, match="1.2 independent windows cannot tell 2 inputs apart"):
+    with pytest.raises(ValueError, match="1.2 independent windows are too few for 2 inputs"):
         frequency_response(two, estimator=Welch(8.0))
 
 
@@ -123,11 +137,11 @@ def test_too_few_windows_for_the_inputs_are_refused():
 def test_records_that_differ_are_not_averaged(estimate):
     faster = Record(TIME / 2, DRAW[:, 0], DRAW[:, 1], DRAW[:, 2])
     renamed = Record(TIME, DRAW[:, 0], DRAW[:, 1], DRAW[:, 2], output_names="q")
-    with pytest.raises(ValueError, match="sampled at 50 and 100 Hz cannot be averaged"):
+    with pytest.raises(ValueError, match="sampled at 50 and 100 Hz: read them with the same"):
         estimate([RECORD, faster])
     with pytest.raises(ValueError, match="different channels"):
         estimate([RECORD, renamed])
-    with pytest.raises(ValueError, match="no record given"):
+    with pytest.raises(ValueError, match="no record is given"):
         estimate([])
 
 
@@ -157,7 +171,7 @@ def test_a_response_prints_its_method_band_and_remarks():
     found = frequency_response(RECORD, OMEGA, estimator=Welch())
     text = str(found)
     assert text.startswith("frequency response, direct estimate, 20 frequencies")
-    assert "u -> y: coherence above 0.6 at 0: nowhere" in text
+    assert "u -> y: coherence above 0.6 at 0 frequencies" in text
     assert "! direct estimate (H1)" in text
     response = 10 ** (found.magnitude_db / 20) * np.exp(1j * np.radians(found.phase_deg))
     np.testing.assert_allclose(response, found.response, rtol=1e-12)
