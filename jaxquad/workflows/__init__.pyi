@@ -1,19 +1,14 @@
 from ._batch._jobs import Job as Job
 from ._batch._run import batch as batch, find_logs as find_logs
+from ._batch._settings import BatchSettings as BatchSettings, Override as Override
 from ._demo import DEMO as DEMO, DEMO_TRUTH as DEMO_TRUTH, write_demo_log as write_demo_log
 from ._identify import (
-    default_folder as default_folder,
     Identification as Identification,
     identify as identify,
     propose_settings as propose_settings,
 )
 from ._kinds import SettingsError as SettingsError
-from ._settings import (
-    BatchSettings as BatchSettings,
-    IdentifySettings as IdentifySettings,
-    Override as Override,
-    TuneSettings as TuneSettings,
-)
+from ._settings import IdentifySettings as IdentifySettings, TuneSettings as TuneSettings
 from ._stored import (
     identify_again as identify_again,
     read_result as read_result,

@@ -4,7 +4,6 @@ import dataclasses
 import difflib
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar
 
@@ -21,7 +20,7 @@ class Option(NamedTuple):
     flag: str
 
 
-def _option(
+def option_field(
     kind: kinds.Kind, default: Value, help: str, *, group: str = "", flag: str = ""
 ) -> Value:
     metadata = {"option": Option(kind, help, group, flag)}
@@ -33,7 +32,7 @@ def _option(
 _REQUIRED = dataclasses.MISSING
 _RUN, _PART, _MODEL = "signals", "part of the record", "model"
 _ESTIMATE, _CHECK = "estimate", "check on a second record"
-_REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the place of
+REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the place of
     "segments": ("start", "stop"),
     "start": ("segments",),
     "stop": ("segments",),
@@ -42,11 +41,11 @@ _REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the plac
 }
 
 
-S = TypeVar("S", bound="_Settings")
+S = TypeVar("S", bound="Settings")
 
 
-class _Settings:
-    """Frozen dataclasses whose fields are declared by `_option`, which says what they take."""
+class Settings:
+    """Frozen dataclasses whose fields are declared by `option_field`, which says what they take."""
 
     __no_type_check__ = True  # in tests: fields are converted, such as a list to a tuple
 
@@ -81,7 +80,7 @@ class _Settings:
                 raise SettingsError(f"{' and '.join(f'`{key}`' for key in missing)} missing")
             return cls(**content)
         except SettingsError as error:
-            raise _within(where, error) from error
+            raise within_file(where, error) from error
 
     @classmethod
     def from_toml(cls: type[S], path: str | Path) -> S:
@@ -125,13 +124,16 @@ def _words(option: Option, value: Value) -> list[str]:
     kind, flag = option.kind, option.flag
     if kind.words == 0:
         return [flag]
-    if kind.repeated:  # as one word, or a negative start would be taken for an option
+    if kind.repeated:
         items = value.items() if isinstance(value, Mapping) else value
-        return [f"{flag}={kind.write(each)}" for each in items]
+        texts = [kind.write(each) for each in items]
+        # A negative start by itself would be taken for an option.
+        each = [[f"{flag}={text}"] if text.startswith("-") else [flag, text] for text in texts]
+        return [word for words in each for word in words]
     return [flag, *(kind.write(each) for each in (value if kind.words > 1 else [value]))]
 
 
-def _within(where: str, error: SettingsError) -> SettingsError:
+def within_file(where: str, error: SettingsError) -> SettingsError:
     """In a file, keys are what they are: no flags of the command line stand for them."""
     return SettingsError(f"{where}: {error}".replace("`", "") if where else str(error))
 
@@ -156,12 +158,12 @@ def read_toml(path: str | Path) -> dict[str, object]:
 
 def updated(content: Mapping[str, object], changes: Mapping[str, object]) -> dict[str, object]:
     """`content` with `changes`; keys that say the same in another way go (band for band_rad)."""
-    gone = {old for key in changes for old in _REPLACED.get(key, ()) if old not in changes}
+    gone = {old for key in changes for old in REPLACED.get(key, ()) if old not in changes}
     return {key: value for key, value in content.items() if key not in gone} | dict(changes)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class IdentifySettings(_Settings):
+class IdentifySettings(Settings):
     """How one log is identified: signals, part of the record, model and estimate.
 
     The keyword arguments are the keys of the TOML file; `jaxquad identify --help` lists them as
@@ -179,107 +181,109 @@ class IdentifySettings(_Settings):
         ```
     """
 
-    input: str | None = _option(
+    input: str | None = option_field(
         kinds.MIX,
         None,
         "a channel, or a weighted sum NAME=-a+b+0.5*c, also with powers: NAME=0.1*a^2; "
         "by default the log of a known autopilot proposes input and output",
         group=_RUN,
     )
-    output: str | None = _option(kinds.MIX, None, "likewise", group=_RUN)
-    reference: str | None = _option(
+    output: str | None = option_field(kinds.MIX, None, "likewise", group=_RUN)
+    reference: str | None = option_field(
         kinds.MIX,
         None,
         "an external signal that no feedback computes; with it, the joint input-output "
         "estimate is made beside the direct one",
         group=_RUN,
     )
-    axis: str | None = _option(
+    axis: str | None = option_field(
         kinds.AXIS, None, "the axis to propose input and output for", group=_RUN
     )
-    units: Mapping[str, str] = _option(
+    units: Mapping[str, str] = option_field(
         kinds.UNITS,
         {},
         "the unit of a channel, such as q=rad/s; may be repeated",
         group=_RUN,
         flag="--unit",
     )
-    time: str | None = _option(kinds.TEXT, None, "the channel that holds the time", group=_RUN)
-    time_unit: Literal["s", "ms", "us", "ns"] | None = _option(
+    time: str | None = option_field(kinds.TEXT, None, "the channel that holds the time", group=_RUN)
+    time_unit: Literal["s", "ms", "us", "ns"] | None = option_field(
         kinds.TIME_UNIT, None, "its unit", group=_RUN
     )
-    rate: float | None = _option(
+    rate: float | None = option_field(
         kinds.HERTZ,
         None,
         "resample to this rate; by default the slowest channel's own",
         group=_PART,
     )
-    start: float | None = _option(
+    start: float | None = option_field(
         kinds.TIME, None, "first time to use, in the file's time", group=_PART
     )
-    stop: float | None = _option(kinds.TIME, None, "last time to use", group=_PART)
-    segments: tuple[Pair, ...] = _option(
+    stop: float | None = option_field(kinds.TIME, None, "last time to use", group=_PART)
+    segments: tuple[Pair, ...] = option_field(
         kinds.SEGMENTS,
         (),
         "instead of start and stop; repeat it to analyse several parts together",
         group=_PART,
         flag="--segment",
     )
-    integrators: int = _option(
+    integrators: int = option_field(
         kinds.COUNT,
         1,
         "n in K e^(-delay s) / (s^n (lag s + 1)): 1 from a moment to a rate, 2 to an "
         "angle; 1 by default",
         group=_MODEL,
     )
-    lag: bool = _option(
+    lag: bool = option_field(
         kinds.SWITCH, True, "fit a model without the lag", group=_MODEL, flag="--no-lag"
     )
-    delay: bool = _option(
+    delay: bool = option_field(
         kinds.SWITCH, True, "fit a model without the delay", group=_MODEL, flag="--no-delay"
     )
-    poles: int | None = _option(
+    poles: int | None = option_field(
         kinds.COUNT,
         None,
         "fit a transfer function with this many poles beside the integrators, "
         "instead of gain and lag",
         group=_MODEL,
     )
-    zeros: int = _option(kinds.COUNT, 0, "and with this many zeros; 0 by default", group=_MODEL)
-    band: Pair | None = _option(
+    zeros: int = option_field(
+        kinds.COUNT, 0, "and with this many zeros; 0 by default", group=_MODEL
+    )
+    band: Pair | None = option_field(
         kinds.BAND,
         None,
         "fit between these frequencies, in Hz; by default what the record resolves",
         group=_ESTIMATE,
     )
-    band_rad: Pair | None = _option(kinds.BAND, None, "the same in rad/s", group=_ESTIMATE)
-    estimator: str = _option(
+    band_rad: Pair | None = option_field(kinds.BAND, None, "the same in rad/s", group=_ESTIMATE)
+    estimator: str = option_field(
         kinds.ESTIMATOR,
         "local",
         "of the frequency response: local "
         "polynomials, composite windows, or windows of one length; local by default",
         group=_ESTIMATE,
     )
-    window: float | None = _option(
+    window: float | None = option_field(
         kinds.DURATION,
         None,
         "length of welch's window; a fifth of the record by default",
         group=_ESTIMATE,
     )
-    cost: str = _option(
+    cost: str = option_field(
         kinds.COST,
         "ml",
         "maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default",
         group=_ESTIMATE,
     )
-    verify: str | None = _option(
+    verify: str | None = option_field(
         kinds.FILE,
         None,
         "simulate the model on this record, which has the same channels",
         group=_CHECK,
     )
-    verify_start: float | None = _option(kinds.TIME, None, "in that file's time", group=_CHECK)
-    verify_stop: float | None = _option(kinds.TIME, None, "in that file's time", group=_CHECK)
+    verify_start: float | None = option_field(kinds.TIME, None, "in that file's time", group=_CHECK)
+    verify_stop: float | None = option_field(kinds.TIME, None, "in that file's time", group=_CHECK)
 
     def _check_together(self) -> None:
         one_of_two = (self.input is None) != (self.output is None)
@@ -300,7 +304,7 @@ class IdentifySettings(_Settings):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TuneSettings(_Settings):
+class TuneSettings(Settings):
     """How a controller is tuned on an identified axis: what the record does not tell.
 
     The keyword arguments are the keys of the TOML file; `jaxquad tune --help` lists them as
@@ -309,198 +313,67 @@ class TuneSettings(_Settings):
     **Raises:** `SettingsError` (a ValueError) for values that cannot be.
     """
 
-    inertia: float = _option(
+    inertia: float = option_field(
         kinds.INERTIA, _REQUIRED, "nominal inertia of the axis, in kg m^2", group="vehicle"
     )
-    limit: float = _option(
+    limit: float = option_field(
         kinds.POSITIVE, _REQUIRED, "largest command, to either side, in its unit", group="vehicle"
     )
-    spread: Pair = _option(
+    spread: Pair = option_field(
         kinds.BAND,
         (0.5, 3.0),
         "range of the true inertia, as factors of the nominal one; 0.5 3 by default",
         group="vehicle",
     )
-    inertia_error: float = _option(
+    inertia_error: float = option_field(
         kinds.NOT_NEGATIVE,
         0.1,
         "relative standard error of the inertia that the controller's gains "
         "are scheduled with; 0.1 by default",
         group="vehicle",
     )
-    noise: float = _option(
+    noise: float = option_field(
         kinds.DEVIATION,
         0.02,
         "standard deviation of the measured angle; 0.02 by default",
         group="vehicle",
     )
-    step: float = _option(
+    step: float = option_field(
         kinds.DEGREES, 4.0, "step of the reference; 4 by default", group="simulated flight"
     )
-    disturbance: float | None = _option(
+    disturbance: float | None = option_field(
         kinds.TORQUE,
         None,
         "torque pulse; by default a tenth of the torque at the limit",
         group="simulated flight",
     )
-    duration: float = _option(
+    duration: float = option_field(
         kinds.DURATION, 4.0, "of one flight; 4 by default", group="simulated flight"
     )
-    dt: float | None = _option(
+    dt: float | None = option_field(
         kinds.DURATION,
         None,
         "sampling interval of the controller; by default that of the record",
         group="controller",
     )
-    sensitivity: float = _option(
+    sensitivity: float = option_field(
         kinds.POSITIVE, 3.6, "upper limit of the peak of |S|; 3.6 by default", group="controller"
     )
-    name: str = _option(
+    name: str = option_field(
         kinds.TEXT,
         "attitude",
         "prefix of the functions in the C header; attitude by default",
         group="controller",
     )
-    members: int = _option(
+    members: int = option_field(
         kinds.SIZE, 64, "number of plants to tune on; 64 by default", group="ensemble of plants"
     )
-    fresh: int = _option(
+    fresh: int = option_field(
         kinds.SIZE,
         256,
         "number of new plants to certify on; 256 by default",
         group="ensemble of plants",
     )
-    seed: int = _option(
+    seed: int = option_field(
         kinds.COUNT, 0, "of the random draws; 0 by default", group="ensemble of plants"
     )
-
-
-class Override(NamedTuple):
-    """Settings of the logs whose paths match one of the patterns."""
-
-    logs: tuple[str, ...]
-    changes: Mapping[str, object]
-
-
-_ONE_LOG = ("verify", "verify_start", "verify_stop")
-_EVERY_LOG = ("**/*",)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BatchSettings(_Settings):
-    """Which logs of a folder are identified, how each of them, and by how many processes.
-
-    In TOML the keys of `identify` stand beside the others, and each override is a table
-    `[[override]]` with `logs` and the keys that it changes.
-
-    **Raises:** `SettingsError` (a ValueError) for values that cannot be.
-
-    !!! example
-
-        ```python
-        settings = jq.workflows.BatchSettings(
-            logs="**/*.ulg",
-            identify={"band": (0.7, 12), "integrators": 1},
-            overrides=[jq.workflows.Override(("flight_07*",), {"stop": 80})],
-        )
-        ```
-    """
-
-    logs: tuple[str, ...] = _option(
-        kinds.PATTERNS,
-        _EVERY_LOG,
-        "file patterns below the folder; by default every file but hidden ones",
-    )
-    timeout: float | None = _option(
-        kinds.DURATION,
-        None,
-        "limit for one log, which has failed if it takes longer; 1800 by default, "
-        "none with a scheduler",
-    )
-    workers: int | None = _option(
-        kinds.SIZE, None, "processes of this machine; by default one for each core"
-    )
-    scheduler: str | None = _option(
-        kinds.ADDRESS,
-        None,
-        "of a Dask cluster that sees the same files, such as tcp://10.0.0.1:8786",
-    )
-    identify: Mapping[str, object] = dataclasses.field(default_factory=dict)
-    overrides: tuple[Override, ...] = ()
-
-    @classmethod
-    def options(cls) -> dict[str, Option]:
-        names = ("logs", "timeout", "workers", "scheduler")
-        fields = {field.name: field for field in dataclasses.fields(cls)}
-        found = {name: fields[name].metadata["option"] for name in names}
-        return {name: each._replace(flag=f"--{name}") for name, each in found.items()}
-
-    @classmethod
-    def from_mapping(cls: type[S], content: Mapping[str, object], where: str = "") -> S:
-        keys = [*cls.options(), *_LOG_KEYS]
-        try:
-            check_keys(content, [*keys, "override"])
-            tables = content.get("override", [])
-            if not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
-                raise SettingsError("`override` is no list of tables: write [[override]]")
-            found: dict[str, Value] = {k: content[k] for k in content if k in cls.options()}
-            found["identify"] = {key: content[key] for key in content if key in _LOG_KEYS}
-            found["overrides"] = [_override(k, table) for k, table in enumerate(tables, start=1)]
-            return cls(**found)
-        except SettingsError as error:
-            raise _within(where, error) from error
-
-    def __post_init__(self):
-        super().__post_init__()
-        common = self.identify
-        if isinstance(common, IdentifySettings):
-            common = common.given()
-        object.__setattr__(self, "identify", _checked(common))
-        object.__setattr__(self, "overrides", tuple(Override(*each) for each in self.overrides))
-        if self.timeout is not None and self.scheduler is not None:
-            raise SettingsError(
-                "`timeout` is for processes of this machine: leave it out with `scheduler`"
-            )
-
-    def changed(self: S, changes: Mapping[str, object]) -> S:
-        return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
-
-    def of(self, log: str) -> IdentifySettings:
-        """The settings of one log, by its path below the folder.
-
-        Later overrides change earlier ones. A key that says the same in another way takes the
-        place of the other: `segments` that of `start` and `stop`, `band` that of `band_rad`.
-
-        **Raises:** `SettingsError` for settings that exclude each other.
-        """
-        found: Mapping[str, object] = self.identify
-        for patterns, changes in self.overrides:
-            if any(fnmatchcase(log, pattern) for pattern in patterns):
-                found = updated(found, changes)
-        return IdentifySettings.from_mapping(found, f"settings of {log}")
-
-
-_LOG_KEYS = tuple(key for key in IdentifySettings.options() if key not in _ONE_LOG)
-
-
-def _override(k: int, table: Mapping[str, object]) -> Override:
-    try:
-        check_keys(table, [*_LOG_KEYS, "logs"])
-        if "logs" not in table:
-            raise SettingsError('`logs` is missing: add logs = "flight_07*"')
-        patterns = convert("logs", kinds.PATTERNS, table["logs"])
-        return Override(patterns, _checked({k: v for k, v in table.items() if k != "logs"}))
-    except SettingsError as error:
-        raise SettingsError(f"override {k}: {error}") from error
-
-
-def _checked(content: Mapping[str, object]) -> dict[str, object]:
-    """The values converted; whether they go together is known once overrides are applied."""
-    check_keys(content, _LOG_KEYS)
-    options = IdentifySettings.options()
-    found = {key: convert(key, options[key].kind, value) for key, value in content.items()}
-    for key, others in _REPLACED.items():
-        if key in found and any(other in found for other in others):
-            clash = next(other for other in others if other in found)
-            raise SettingsError(f"`{key}` and `{clash}` are both given: keep one")
-    return found

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 
-from .._settings import BatchSettings, IdentifySettings
+from .._settings import IdentifySettings
 from ._cluster import perform_on_cluster
 from ._jobs import (
     Content,
@@ -18,6 +18,7 @@ from ._jobs import (
     Work,
 )
 from ._pool import perform_locally
+from ._settings import BatchSettings
 from ._tables import Row, write_summary, write_tables
 
 
