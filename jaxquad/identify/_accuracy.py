@@ -22,17 +22,17 @@ class Block(NamedTuple):
     error: Float[np.ndarray, " frequencies"]  # random error relative to the model
 
 
-class Known(NamedTuple):
+class PriorRows(NamedTuple):
     """Prior knowledge, in standard errors."""
 
     misfit: Float[np.ndarray, " priors"]
     slopes: Float[np.ndarray, "priors all"]
 
 
-def gauss_newton(blocks: list[Block], known: Known, count: int) -> tuple[Matrix, np.ndarray]:
+def gauss_newton(blocks: list[Block], prior: PriorRows, count: int) -> tuple[Matrix, np.ndarray]:
     """`J'J` and `J'r` of the weighted residuals over the free parameters."""
-    jacobian = [known.slopes[:, :count]]
-    residual = [known.misfit]
+    jacobian = [prior.slopes[:, :count]]
+    residual = [prior.misfit]
     for block in blocks:
         weighted = block.weights[..., None] * block.slopes[..., :count]
         jacobian.append(weighted.reshape(-1, count))
@@ -49,7 +49,7 @@ class Noise(NamedTuple):
     cost: float  # expected cost of the noise before any parameter is fitted to it
 
 
-class Record(NamedTuple):
+class ResponseTerm(NamedTuple):
     """One frequency response as the fit sees it."""
 
     frf: FrequencyResponse
@@ -63,7 +63,7 @@ class Record(NamedTuple):
         return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
 
 
-def blocks_of(records: Sequence[Record]) -> list[Block]:
+def blocks_of(records: Sequence[ResponseTerm]) -> list[Block]:
     """One block per response pair that has usable frequencies."""
     blocks = []
     for record in records:
@@ -75,7 +75,9 @@ def blocks_of(records: Sequence[Record]) -> list[Block]:
     return [block for block in blocks if np.any(block.weights)]
 
 
-def noise_effect(records: Sequence[Record], blocks: list[Block], known: Known, count: int) -> Noise:
+def noise_effect(
+    records: Sequence[ResponseTerm], blocks: list[Block], prior: PriorRows, count: int
+) -> Noise:
     """The responses' errors, with all their correlation, seen through weights and slopes."""
     data = np.sum([_through_fit(record, count) for record in records], axis=0)
     used = [block.weights[:, 0] > 0 for block in blocks]
@@ -83,10 +85,10 @@ def noise_effect(records: Sequence[Record], blocks: list[Block], known: Known, c
         float(np.sum(block.weights[mine] ** 2 * block.error[mine, None] ** 2))
         for block, mine in zip(blocks, used, strict=True)
     )
-    return Noise(data, known.slopes[:, :count].T @ known.slopes[:, :count], cost)
+    return Noise(data, prior.slopes[:, :count].T @ prior.slopes[:, :count], cost)
 
 
-def _through_fit(record: Record, count: int) -> Matrix:
+def _through_fit(record: ResponseTerm, count: int) -> Matrix:
     weighted = record.weights[..., None] ** 2 * record.slopes[..., :count]
     model = np.asarray(record.frf.response) / record.ratio
     used = record.weights[..., :1] > 0

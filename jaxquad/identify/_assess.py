@@ -19,10 +19,10 @@ from ._accuracy import (
     gauss_newton,
     information_root,
     insensitivity,
-    Known,
     misfit_ratio,
     noise_effect,
-    Record,
+    PriorRows,
+    ResponseTerm,
     scaled_inverse,
 )
 from ._identifiability import assess_identifiability, Information, LIMIT
@@ -44,11 +44,11 @@ def assess(
     parameters, count = problem.parameters, problem.parameters.count
     units = _units(problem, solution)
     records = _records(problem, frfs, solution, units)
-    blocks, known = blocks_of(records), _known(solution, units)
-    bread, gradient = gauss_newton(blocks, known, count)
-    noise = noise_effect(records, blocks, known, count)
+    blocks, prior = blocks_of(records), _prior_rows(solution, units)
+    bread, gradient = gauss_newton(blocks, prior, count)
+    noise = noise_effect(records, blocks, prior, count)
     data_cost = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
-    cost = data_cost + float(np.sum(known.misfit**2))
+    cost = data_cost + float(np.sum(prior.misfit**2))
     misfit = misfit_ratio(data_cost, bread, noise)
     # A misfit beyond the noise is in no covariance of the noise: widen the errors to match it.
     inflation = misfit if misfit > MISFIT**2 else 1.0
@@ -58,7 +58,7 @@ def assess(
         verdict = by_data = no_minimum(parameters.names, decrement, cost)
     else:
         facts = _information(problem, solution, blocks, covariance, units, inflation)
-        verdict, by_data = _identifiability(facts, known)
+        verdict, by_data = _identifiability(facts, prior)
     values, slopes = np.asarray(solution.values)[:count], units[:count]
     physical, unbounded = physical_covariance(covariance, slopes, parameters.names, verdict)
     percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
@@ -86,7 +86,7 @@ def assess(
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_leakage(problem, frfs, solution),
-            *remarks_on_priors(known.misfit, verdict, by_data),
+            *remarks_on_priors(prior.misfit, verdict, by_data),
         ),
         parameters=parameters,
         units=units[:count],
@@ -194,18 +194,18 @@ def _records(
     frfs: Sequence[FrequencyResponse],
     solution: Solution,
     units: Float[np.ndarray, " all"],
-) -> list[Record]:
+) -> list[ResponseTerm]:
     scale, parts = _rescale(solution, units), solution.sensitivity
     weights = [np.asarray(each) for each in problem.weights]
     misfits = [np.asarray(each) for each in parts.misfits]
     slopes = [np.asarray(each) * scale for each in parts.slopes]
-    return [Record(*each) for each in zip(frfs, misfits, slopes, weights, strict=True)]
+    return [ResponseTerm(*each) for each in zip(frfs, misfits, slopes, weights, strict=True)]
 
 
-def _known(solution: Solution, units: Float[np.ndarray, " all"]) -> Known:
+def _prior_rows(solution: Solution, units: Float[np.ndarray, " all"]) -> PriorRows:
     derivatives = solution.sensitivity
     slopes = np.asarray(derivatives.prior_slopes) * _rescale(solution, units)
-    return Known(np.asarray(derivatives.prior_misfits), slopes)
+    return PriorRows(np.asarray(derivatives.prior_misfits), slopes)
 
 
 def _information(
@@ -229,13 +229,13 @@ def _information(
     )
 
 
-def _identifiability(facts: Information, known: Known) -> tuple[Verdict, Verdict]:
+def _identifiability(facts: Information, prior: PriorRows) -> tuple[Verdict, Verdict]:
     """What data and priors determine together, and what the data determine alone."""
-    if not len(known.misfit):
+    if not len(prior.misfit):
         verdict = assess_identifiability(facts)
         return verdict, verdict
     # Rows come in pairs of magnitude and phase; a prior's row counts once.
-    priors = np.repeat(known.slopes, 2, axis=0) / np.sqrt(2)
+    priors = np.repeat(prior.slopes, 2, axis=0) / np.sqrt(2)
     return assess_identifiability(
         facts._replace(root=np.concatenate([facts.root, priors]))
     ), assess_identifiability(facts)

@@ -116,7 +116,9 @@ def fit(
         remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
         return unfitted(model, parameters, too_few, tuple(remarks))
     problem = make_problem(model, parameters, frfs, conditions, priors)
-    problem, solution, minima = _solved(problem, frfs, used, cost, (starts, solver, max_steps))
+    problem, solution, minima = _solve_reweighted(
+        problem, frfs, used, cost, (starts, solver, max_steps)
+    )
     _check_finite(solution)
     check_priors(problem, solution)
     return assess(problem, frfs, solution, minima)
@@ -144,7 +146,7 @@ def _too_few_points(
     return without_numbers("too few points", parameters.names, reason, remedy)
 
 
-def _solved(
+def _solve_reweighted(
     problem: Problem,
     frfs: Sequence[FrequencyResponse],
     used: Sequence[Mask],
@@ -180,9 +182,10 @@ def _ratios(solution: Solution) -> list[Ratio]:
 
 def require_responses(frf: object) -> list[FrequencyResponse]:
     """One response or several, as a list. Raise ValueError for anything else, and for repeats."""
-    frfs = list(frf) if isinstance(frf, Sequence) else [frf]
-    if not frfs or not all(isinstance(one, FrequencyResponse) for one in frfs):
-        kinds = ", ".join(sorted({type(one).__name__ for one in frfs})) or "nothing"
+    given = list(frf) if isinstance(frf, Sequence) else [frf]
+    frfs = [one for one in given if isinstance(one, FrequencyResponse)]
+    if not given or len(frfs) < len(given):
+        kinds = ", ".join(sorted({type(one).__name__ for one in given})) or "nothing"
         raise ValueError(
             f"a fit needs a jq.spectra.FrequencyResponse or a list of them, not {kinds}: make one "
             "with jq.frequency_response(record), and call jq.fit(model, response)"
@@ -194,7 +197,7 @@ def require_responses(frf: object) -> list[FrequencyResponse]:
     return frfs
 
 
-def check_options(cost: object, band: object, min_coherence: float, max_steps: int) -> None:
+def check_options(cost: PyTree, band: PyTree, min_coherence: float, max_steps: int) -> None:
     """Check `cost`, `band`, `min_coherence` and `max_steps`; raise ValueError."""
     if isinstance(cost, type) or not isinstance(cost, Cost):
         raise ValueError(

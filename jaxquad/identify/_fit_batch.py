@@ -133,7 +133,7 @@ def _point(model, parameters, z, omega, inverse, weights) -> list[Float[Array, "
     """Weighted slopes by each parameter, and then the weighted misfit, at one frequency."""
 
     def response(z):
-        return evaluate_response(_inserted(model, parameters, z), omega[None])[0]
+        return evaluate_response(_insert(model, parameters, z), omega[None])[0]
 
     here = response(z)
     columns = []
@@ -148,17 +148,17 @@ def _point(model, parameters, z, omega, inverse, weights) -> list[Float[Array, "
     return [*columns, jnp.stack([0.5 * jnp.log(size), phase], axis=-1) * weights]
 
 
-def _inserted(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) -> PyTree:
+def _insert(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) -> PyTree:
     """As `Parameters.insert`, but without a vector that would make each depend on all."""
     logs, scale = parameters.logarithmic, parameters.scale
     values = [scale[k] * (jnp.exp(x) if logs[k] else x) for k, x in enumerate(z)]
-    model = _written(model, parameters.places, values)
+    model = _write(model, parameters.places, values)
     for place, tie in parameters.ties:
-        model = _written(model, (place,), [jnp.asarray(tie(model))])
+        model = _write(model, (place,), [jnp.asarray(tie(model))])
     return model
 
 
-def _written(model: PyTree, places: tuple[Place, ...], values: list[Float[Array, ""]]) -> PyTree:
+def _write(model: PyTree, places: tuple[Place, ...], values: list[Float[Array, ""]]) -> PyTree:
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     for leaf in {place.leaf for place, _ in zip(places, values, strict=False)}:
@@ -273,7 +273,7 @@ def fit_batch(
     check_options(cost, band, min_coherence, max_steps)
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
-    data = _common(frfs, band, min_coherence)
+    data = _stack_responses(frfs, band, min_coherence)
     ones = [np.ones(mask.shape) for mask in data.used]
     weights = _weights(cost, frfs, data, ones)
     found = _solve(model, parameters, data, weights, max_steps)
@@ -288,7 +288,7 @@ def fit_batch(
     )  # fmt: skip
 
 
-def _common(frfs: Sequence[FrequencyResponse], band: Range | None, least: float) -> _Data:
+def _stack_responses(frfs: Sequence[FrequencyResponse], band: Range | None, least: float) -> _Data:
     omega, shape = np.asarray(frfs[0].omega), frfs[0].response.shape
     for k, frf in enumerate(frfs):
         if frf.response.shape != shape or not np.allclose(np.asarray(frf.omega), omega):

@@ -11,7 +11,7 @@ from jaxquad._core import require_x64
 from jaxquad.records import Record
 
 from ._fit import check_priors
-from ._output_error_problem import descend_by_turns, found_at, OutputError, Trial
+from ._output_error_problem import descend_by_turns, evaluate_misfits, OutputError, RecordTerm
 from ._output_error_result import assess_output_error
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of
@@ -25,7 +25,7 @@ from ._simulated import (
     DifferentialModel,
     Linear,
     linear_model,
-    motions_of,
+    unknown_motions,
 )
 
 
@@ -76,8 +76,8 @@ def refine(
     records = _checked(record, max_steps, hold)
     parameters = select_parameters(model, free, tied)
     base = _base(model, parameters, priors)
-    trials = tuple(_trial(model, one, hold, band) for one in records)
-    problem = _with_units(OutputError(base, trials, _fixed_zeros(model, parameters)))
+    terms = tuple(_term(model, one, hold, band) for one in records)
+    problem = _with_units(OutputError(base, terms, _fixed_zeros(model, parameters)))
     descent = descend_by_turns(problem, max_steps)
     check_priors(base, descent.solution)
     return assess_output_error(descent, records)
@@ -121,7 +121,7 @@ def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Pro
     )
 
 
-def _trial(model: PyTree, record: Record, hold: str, band: tuple[float, float] | None) -> Trial:
+def _term(model: PyTree, record: Record, hold: str, band: tuple[float, float] | None) -> RecordTerm:
     gain = band_gain(band, record)
     gain = None if gain is None else jnp.asarray(gain)
     if isinstance(model, DifferentialModel) and not isinstance(model, Linear):
@@ -131,11 +131,11 @@ def _trial(model: PyTree, record: Record, hold: str, band: tuple[float, float] |
         plant = linear_model(model)
         check_channels(plant, record)
         check_growth(plant, record)
-        found = motions_of(plant, record.duration)
+        found = unknown_motions(plant, record.duration)
         motions, start = (found.slow, found.fast), jnp.zeros(0)
     y = band_filter(jnp.asarray(record.outputs), gain)
     weights = 1 / jnp.std(y, axis=0)
-    return Trial(jnp.asarray(record.inputs), y, weights, gain, motions, start, record.dt, hold)
+    return RecordTerm(jnp.asarray(record.inputs), y, weights, gain, motions, start, record.dt, hold)
 
 
 def _check_measured(model: DifferentialModel, record: Record) -> None:
@@ -153,10 +153,10 @@ def _with_units(problem: OutputError) -> OutputError:
         return problem
     count = problem.base.parameters.count
     z = jnp.concatenate([problem.base.parameters.start[:count], jnp.zeros(problem.unknown)])
-    slopes = found_at(z, problem).slopes
-    trials, at = [], count
-    for trial, one in zip(problem.trials, slopes, strict=True):
-        mine = np.asarray(one)[:, :, at : at + trial.start.size]
+    slopes = evaluate_misfits(z, problem).slopes
+    terms, at = [], count
+    for term, one in zip(problem.terms, slopes, strict=True):
+        mine = np.asarray(one)[:, :, at : at + term.start.size]
         sizes = np.sqrt(np.mean(mine**2, axis=(0, 1)))
         if not np.all(np.isfinite(sizes)):
             raise ValueError(
@@ -166,9 +166,9 @@ def _with_units(problem: OutputError) -> OutputError:
             )
         seen = sizes > 1e-6 * np.max(sizes, initial=0.0)
         start = jnp.asarray(np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0))
-        trials.append(dataclasses.replace(trial, start=start))
-        at += trial.start.size
-    return dataclasses.replace(problem, trials=tuple(trials))
+        terms.append(dataclasses.replace(term, start=start))
+        at += term.start.size
+    return dataclasses.replace(problem, terms=tuple(terms))
 
 
 def _fixed_zeros(model: PyTree, parameters: Parameters) -> tuple[int, ...]:

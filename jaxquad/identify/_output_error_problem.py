@@ -13,7 +13,14 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import minimise_on_host, Normal, RUNNING, solve_definite, STALLED
 
 from ._problem import prior_misfits, Problem
-from ._simulated import band_filter, forced, free, integrate_plant, linear_model, Motions
+from ._simulated import (
+    band_filter,
+    forced_response,
+    free_response,
+    integrate_plant,
+    linear_model,
+    Motions,
+)
 from ._solve import describe, Solution
 
 
@@ -21,7 +28,7 @@ _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refi
 _LOOSE = 1e-2  # standard errors per unit of initial state: holds what has no effect
 
 
-class Trial(eqx.Module):
+class RecordTerm(eqx.Module):
     """A record as the fit sees it."""
 
     u: Float[Array, "samples inputs"]
@@ -38,31 +45,31 @@ class OutputError(eqx.Module):
     """Residuals of all records as a function of the free parameters and the initial states."""
 
     base: Problem  # model, parameters and priors
-    trials: tuple[Trial, ...]
+    terms: tuple[RecordTerm, ...]
     zeros: tuple[int, ...] = eqx.field(static=True)  # arrays of the model that are known to be 0
 
     def reweighted(self, sizes: Sequence[Float[np.ndarray, " outputs"]]) -> "OutputError":
         """The same problem with its residuals divided by `sizes`."""
-        trials = [
-            dataclasses.replace(trial, weights=trial.weights / jnp.asarray(size))
-            for trial, size in zip(self.trials, sizes, strict=True)
+        terms = [
+            dataclasses.replace(term, weights=term.weights / jnp.asarray(size))
+            for term, size in zip(self.terms, sizes, strict=True)
         ]
-        return dataclasses.replace(self, trials=tuple(trials))
+        return dataclasses.replace(self, terms=tuple(terms))
 
     @property
     def unknown(self) -> int:
         """How many initial states follow the parameters in z."""
-        return sum(trial.start.size for trial in self.trials)
+        return sum(term.start.size for term in self.terms)
 
 
 def split(z: Float[Array, " n"], problem: OutputError) -> list[Float[Array, " part"]]:
     """The parameters, and then each record's initial state."""
-    ends = np.cumsum([0, *(trial.start.size for trial in problem.trials)])
+    ends = np.cumsum([0, *(term.start.size for term in problem.terms)])
     count = z.size - problem.unknown
     return [z[:count], *(z[count + a : count + b] for a, b in zip(ends, ends[1:], strict=False))]
 
 
-def inserted(z: Float[Array, " n"], problem: OutputError) -> PyTree:
+def insert_parameters(z: Float[Array, " n"], problem: OutputError) -> PyTree:
     """The model at these parameters; what is 0 and fixed stays known to be 0 under jit."""
     model = problem.base.parameters.insert(problem.base.model, z)
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
@@ -72,25 +79,25 @@ def inserted(z: Float[Array, " n"], problem: OutputError) -> PyTree:
     return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
 
-def parts(
-    model: PyTree, start: Float[Array, " unknown"], trial: Trial
+def misfit_and_columns(
+    model: PyTree, start: Float[Array, " unknown"], term: RecordTerm
 ) -> tuple[Float[Array, "samples outputs"], Float[Array, "samples outputs unknowns"]]:
     """Weighted misfit at zero start and trim, and what each unit of them adds to the output."""
-    if trial.motions is None:
-        simulated = integrate_plant(model, trial.u, trial.start * start, trial.dt, trial.hold)
-        shifts = jnp.eye(trial.y.shape[1])[None]
-        columns = jnp.broadcast_to(shifts, (*trial.y.shape, trial.y.shape[1]))
+    if term.motions is None:
+        simulated = integrate_plant(model, term.u, term.start * start, term.dt, term.hold)
+        shifts = jnp.eye(term.y.shape[1])[None]
+        columns = jnp.broadcast_to(shifts, (*term.y.shape, term.y.shape[1]))
     else:
         plant = linear_model(model)
-        simulated = forced(plant, trial.u, trial.dt, trial.hold)
-        motions = Motions(*trial.motions, ())
-        columns = free(plant, motions, len(trial.u), trial.dt)
-    weights = trial.weights[None]
-    misfit = (trial.y - band_filter(simulated, trial.gain)) * weights
-    return misfit, band_filter(columns, trial.gain) * weights[:, :, None]
+        simulated = forced_response(plant, term.u, term.dt, term.hold)
+        motions = Motions(*term.motions, ())
+        columns = free_response(plant, motions, len(term.u), term.dt)
+    weights = term.weights[None]
+    misfit = (term.y - band_filter(simulated, term.gain)) * weights
+    return misfit, band_filter(columns, term.gain) * weights[:, :, None]
 
 
-def unexplained(
+def project_out(
     found: Float[Array, "samples outputs"], columns: Float[Array, "samples outputs unknowns"]
 ) -> Float[Array, "samples outputs"]:
     """The misfit that no start, trim or shift explains (variable projection)."""
@@ -108,7 +115,7 @@ def unexplained(
     return found - (flat @ unknowns).reshape(found.shape)
 
 
-class Found(NamedTuple):
+class Evaluation(NamedTuple):
     """Misfits, slopes and columns at one place, record by record; all weighted."""
 
     misfits: list[Float[Array, "samples outputs"]]
@@ -116,32 +123,34 @@ class Found(NamedTuple):
     columns: list[Float[Array, "samples outputs unknowns"]]  # of start, trim and shift
     normal: Normal  # of these, of the priors and of a hold on the initial states
 
-    def reweighted(self, sizes: Sequence[Float[np.ndarray, " outputs"]]) -> "Found":
+    def reweighted(self, sizes: Sequence[Float[np.ndarray, " outputs"]]) -> "Evaluation":
         """The same, divided by `sizes`; the normal equations as they were."""
         divided = lambda parts: [
             part / jnp.asarray(size).reshape(1, -1, *(1,) * (part.ndim - 2))
             for part, size in zip(parts, sizes, strict=True)
         ]
         parts = (divided(self.misfits), divided(self.slopes), divided(self.columns))
-        return Found(*parts, normal=self.normal)
+        return Evaluation(*parts, normal=self.normal)
 
 
 @eqx.filter_jit
-def found_at(z: Float[Array, " n"], problem: OutputError) -> Found:
+def evaluate_misfits(z: Float[Array, " n"], problem: OutputError) -> Evaluation:
     """Everything at the first parameters and the initial states `z`."""
 
     def simulated(z):
         values, *starts = split(z, problem)
-        model = inserted(values, problem)
-        pairs = [parts(model, *each) for each in zip(starts, problem.trials, strict=True)]
-        left = [unexplained(*pair) for pair in pairs]
+        model = insert_parameters(values, problem)
+        pairs = [
+            misfit_and_columns(model, *each) for each in zip(starts, problem.terms, strict=True)
+        ]
+        left = [project_out(*pair) for pair in pairs]
         rest = [prior_misfits(values, problem.base), *(_LOOSE * start for start in starts)]
         return (left, rest), (left, rest, [columns for _, columns in pairs])
 
     (slopes, others), (left, rest, columns) = jax.jacfwd(simulated, has_aux=True)(z)
     r = jnp.concatenate([one.reshape(-1) for one in (*left, *rest)])
     J = jnp.concatenate([one.reshape(-1, z.size) for one in (*slopes, *others)])
-    return Found(left, slopes, columns, Normal(0.5 * jnp.sum(r**2), J.T @ r, J.T @ J))
+    return Evaluation(left, slopes, columns, Normal(0.5 * jnp.sum(r**2), J.T @ r, J.T @ J))
 
 
 _PASSES = 4  # of noise level and parameters by turns
@@ -154,7 +163,7 @@ class Descent(NamedTuple):
     problem: OutputError  # under the final noise level
     z: Float[Array, " n"]  # free parameters and initial states
     solution: Solution
-    found: Found
+    found: Evaluation
 
 
 class _Point(NamedTuple):
@@ -162,7 +171,7 @@ class _Point(NamedTuple):
 
     problem: OutputError
     z: Float[np.ndarray, " n"]
-    found: Found
+    found: Evaluation
 
     @property
     def cost(self) -> float:
@@ -177,7 +186,7 @@ class _Point(NamedTuple):
 
 
 def _point(problem: OutputError, z: Float[np.ndarray, " n"]) -> _Point:
-    return _Point(problem, z, found_at(jnp.asarray(z), problem))
+    return _Point(problem, z, evaluate_misfits(jnp.asarray(z), problem))
 
 
 def descend_by_turns(problem: OutputError, max_steps: int) -> Descent:
@@ -186,7 +195,7 @@ def descend_by_turns(problem: OutputError, max_steps: int) -> Descent:
     count = base.parameters.count
     z = np.concatenate([np.asarray(base.parameters.start)[:count], np.zeros(problem.unknown)])
     # A factor common to all residuals moves no minimum.
-    common = len(problem.trials) == problem.trials[0].weights.size == 1
+    common = len(problem.terms) == problem.terms[0].weights.size == 1
     common = common and not base.quantities and not problem.unknown
     for turn in range(_PASSES):
         stop, status, taken = _descend(problem, z, max_steps)
@@ -205,12 +214,12 @@ def descend_by_turns(problem: OutputError, max_steps: int) -> Descent:
 _describe = eqx.filter_jit(describe)
 
 
-def _sizes(problem: OutputError, found: Found) -> list[Float[np.ndarray, " outputs"]]:
+def _sizes(problem: OutputError, found: Evaluation) -> list[Float[np.ndarray, " outputs"]]:
     """Standard deviations of the weighted residuals."""
     sizes = []
-    for trial, misfit in zip(problem.trials, found.misfits, strict=True):
+    for term, misfit in zip(problem.terms, found.misfits, strict=True):
         size = np.sqrt(np.mean(np.asarray(misfit) ** 2, axis=0))
-        least = 1e-9 * np.std(np.asarray(trial.y), axis=0) * np.asarray(trial.weights)
+        least = 1e-9 * np.std(np.asarray(term.y), axis=0) * np.asarray(term.weights)
         sizes.append(np.maximum(size, least))
     return sizes
 
@@ -244,7 +253,7 @@ def _message(status: int, steps: int) -> str:
 _STEP_FIXED_SLOPES = 1e-5  # relative; its square is the error
 
 
-def with_fixed_slopes(descent: Descent) -> Found:
+def with_fixed_slopes(descent: Descent) -> Evaluation:
     """The misfits' slopes by the free parameters, then the fixed, then the initial states.
 
     Central differences: they serve for names alone, and compile nothing anew.
@@ -267,7 +276,7 @@ def _slopes(descent: Descent, k: int, values: np.ndarray) -> list:
         moved[k] *= np.exp(step)
         model = problem.base.parameters.replace(problem.base.model, jnp.asarray(moved))
         base = dataclasses.replace(problem.base, model=model)
-        ends.append(found_at(descent.z, dataclasses.replace(problem, base=base)).misfits)
+        ends.append(evaluate_misfits(descent.z, dataclasses.replace(problem, base=base)).misfits)
     return [
         (after - before) / (2 * _STEP_FIXED_SLOPES) for after, before in zip(*ends, strict=True)
     ]

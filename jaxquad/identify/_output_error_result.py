@@ -16,16 +16,16 @@ from ._accuracy import (
     condition_number,
     cramer_rao,
     insensitivity,
-    Known,
     Matrix,
     Noise,
     orthonormal,
+    PriorRows,
     projected_noise,
     scaled_inverse,
 )
 from ._assess import (
     _identifiability,
-    _known,
+    _prior_rows,
     _ranks,
     _rescale,
     _units,
@@ -35,7 +35,14 @@ from ._assess import (
     runaways,
 )
 from ._identifiability import Information
-from ._output_error_problem import Descent, Found, found_at, OutputError, Trial, with_fixed_slopes
+from ._output_error_problem import (
+    Descent,
+    evaluate_misfits,
+    Evaluation,
+    OutputError,
+    RecordTerm,
+    with_fixed_slopes,
+)
 from ._problem import Problem
 from ._result import Fit
 from ._solve import Solution
@@ -109,13 +116,13 @@ class Reduced(NamedTuple):
 
 
 def project_records(
-    problem: OutputError, found: Found, rescale: Float[np.ndarray, " all"]
+    problem: OutputError, found: Evaluation, rescale: Float[np.ndarray, " all"]
 ) -> list[Projected]:
     """Each record with slopes by relative changes, orthogonal to its initial state and trim."""
     projected, at = [], rescale.size
-    parts = zip(problem.trials, found.misfits, found.slopes, found.columns, strict=True)
-    for trial, misfit, slopes, columns in parts:
-        slopes, states = np.asarray(slopes), trial.start.size
+    parts = zip(problem.terms, found.misfits, found.slopes, found.columns, strict=True)
+    for term, misfit, slopes, columns in parts:
+        slopes, states = np.asarray(slopes), term.start.size
         own = np.concatenate([np.asarray(columns), slopes[:, :, at : at + states]], axis=2)
         basis = orthonormal(own)
         mine = slopes[:, :, : rescale.size] * rescale
@@ -125,15 +132,17 @@ def project_records(
     return projected
 
 
-def reduced_rows(projected: Sequence[Projected], trials: Sequence[Trial], count: int) -> Reduced:
+def reduced_rows(
+    projected: Sequence[Projected], terms: Sequence[RecordTerm], count: int
+) -> Reduced:
     """Slopes, misfit, noise and output in one orthonormal basis of the slopes of all records."""
     every = projected[0].slopes.shape[2]
     stacked = np.concatenate([one.slopes.reshape(-1, every) for one in projected])
     basis, root = np.linalg.qr(np.concatenate([stacked, np.zeros((every, every))]))
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
-    for one, trial in zip(projected, trials, strict=True):
+    for one, term in zip(projected, terms, strict=True):
         mine = basis[at : at + one.misfit.size].reshape(one.slopes.shape)
-        measured = np.asarray(trial.y * trial.weights[None])
+        measured = np.asarray(term.y * term.weights[None])
         aim += np.einsum("tok,to->k", mine, one.misfit)
         output += np.einsum("tok,to->k", mine, measured)
         fitted = np.concatenate([mine[:, :, :count], one.nuisance], axis=2)
@@ -142,12 +151,14 @@ def reduced_rows(projected: Sequence[Projected], trials: Sequence[Trial], count:
     return Reduced(root, aim, noise, output)
 
 
-def gauss_newton(reduced: Reduced, known: Known, count: int) -> tuple[Matrix, np.ndarray, Noise]:
+def gauss_newton(
+    reduced: Reduced, prior: PriorRows, count: int
+) -> tuple[Matrix, np.ndarray, Noise]:
     """`J'J` and `J'r` over the free parameters, and what the noise does to the latter."""
-    root, prior = reduced.root[:, :count], known.slopes[:, :count]
-    bread = root.T @ root + prior.T @ prior
-    gradient = root.T @ reduced.aim + prior.T @ known.misfit
-    return bread, gradient, Noise(root.T @ reduced.noise @ root, prior.T @ prior, 0.0)
+    root, slopes = reduced.root[:, :count], prior.slopes[:, :count]
+    bread = root.T @ root + slopes.T @ slopes
+    gradient = root.T @ reduced.aim + slopes.T @ prior.misfit
+    return bread, gradient, Noise(root.T @ reduced.noise @ root, slopes.T @ slopes, 0.0)
 
 
 def signed_root(reduced: Reduced) -> Float[np.ndarray, "rows all"]:
@@ -172,15 +183,15 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     problem, solution = descent.problem, descent.solution
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
     units, rescale = _units(base, solution), _rescale(solution, _units(base, solution))
-    projected, known = (
+    projected, prior = (
         project_records(problem, descent.found, rescale[:count]),
-        _known(solution, units),
+        _prior_rows(solution, units),
     )
-    reduced = reduced_rows(projected, problem.trials, count)
-    bread, gradient, noise = gauss_newton(reduced, known, count)
+    reduced = reduced_rows(projected, problem.terms, count)
+    bread, gradient, noise = gauss_newton(reduced, prior, count)
     rows = sum(one.misfit.size for one in projected)
     data_cost = sum(float(np.sum(one.misfit**2)) for one in projected)
-    cost = data_cost + float(np.sum(known.misfit**2))
+    cost = data_cost + float(np.sum(prior.misfit**2))
     covariance = calibrated_covariance(bread, noise)
     taken = float(np.trace(scaled_inverse(bread) @ noise.data))
     decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
@@ -188,7 +199,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     if decrement > count * max(taken, 1.0):
         verdict = by_data = no_minimum(parameters.names, decrement, cost)
     else:
-        verdict, by_data = _verdict(descent, reduced, known, covariance, units)
+        verdict, by_data = _verdict(descent, reduced, prior, covariance, units)
     values, slopes = np.asarray(solution.values)[:count], units[:count]
     if runaways(base, solution):
         verdict = dataclasses.replace(verdict, remedies=())
@@ -215,7 +226,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         remarks=(
             *remarks_on_output_error(base, solution, records, decrement, taken),
             *remarks_on_colour([one.misfit for one in projected], bread, covariance),
-            *remarks_on_priors(known.misfit, verdict, by_data),
+            *remarks_on_priors(prior.misfit, verdict, by_data),
         ),
         parameters=parameters,
         units=units[:count],
@@ -226,19 +237,19 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
 def _verdict(
     descent: Descent,
     reduced: Reduced,
-    known: Known,
+    prior: PriorRows,
     covariance: Float[np.ndarray, "parameters parameters"],
     units: Float[np.ndarray, " all"],
 ) -> tuple[Verdict, Verdict]:
     """What data and priors determine; fixed parameters are looked at for names alone."""
     problem, solution, count = descent.problem, descent.solution, len(covariance)
-    free = known._replace(slopes=known.slopes[:, :count])
+    free = prior._replace(slopes=prior.slopes[:, :count])
     found = _identifiability(_information(descent, reduced, covariance, units), free)
     if units.size == count or not any(verdict.undetermined for verdict in found):
         return found
     projected = project_records(problem, with_fixed_slopes(descent), _rescale(solution, units))
-    reduced = reduced_rows(projected, problem.trials, count)
-    return _identifiability(_information(descent, reduced, covariance, units), known)
+    reduced = reduced_rows(projected, problem.terms, count)
+    return _identifiability(_information(descent, reduced, covariance, units), prior)
 
 
 def _information(
@@ -262,7 +273,7 @@ def _information(
 
 def _deviance(problem: OutputError) -> float:
     """Twice the logarithms of the noise levels, over all samples."""
-    return sum(-2 * len(t.y) * float(np.sum(np.log(np.asarray(t.weights)))) for t in problem.trials)
+    return sum(-2 * len(t.y) * float(np.sum(np.log(np.asarray(t.weights)))) for t in problem.terms)
 
 
 def _same(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:
@@ -274,13 +285,13 @@ def _same(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:
     if np.any(logarithmic & (ratio <= 0)):
         return False
     z = np.where(logarithmic, np.log(np.where(logarithmic, ratio, 1.0)), ratio)
-    other = found_at(jnp.concatenate([jnp.asarray(z), descent.z[count:]]), problem).misfits
+    other = evaluate_misfits(jnp.concatenate([jnp.asarray(z), descent.z[count:]]), problem).misfits
     return all(
-        _close(np.asarray(new), np.asarray(old), trial)
-        for new, old, trial in zip(other, found.misfits, problem.trials, strict=True)
+        _close(np.asarray(new), np.asarray(old), term)
+        for new, old, term in zip(other, found.misfits, problem.terms, strict=True)
     )
 
 
-def _close(new: np.ndarray, old: np.ndarray, trial: Trial) -> bool:
-    size = np.std(np.asarray(trial.y), axis=0) * np.asarray(trial.weights)
+def _close(new: np.ndarray, old: np.ndarray, term: RecordTerm) -> bool:
+    size = np.std(np.asarray(term.y), axis=0) * np.asarray(term.weights)
     return bool(np.all(np.abs(new - old) < 1e-6 * size))

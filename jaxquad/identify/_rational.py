@@ -50,7 +50,7 @@ def misfit(samples: Samples, model: Rational) -> Float[np.ndarray, "frequencies 
     return samples.weights * np.stack([np.real(log), np.imag(log)], axis=1)
 
 
-def assessed(samples: Samples, model: Rational) -> Rational:
+def with_cost(samples: Samples, model: Rational) -> Rational:
     """The same model with its cost, infinite where it has no finite response."""
     with np.errstate(all="ignore"):
         cost = float(np.sum(misfit(samples, model) ** 2))
@@ -96,7 +96,7 @@ def sanathanan_koerner(samples: Samples, zeros: int, poles: int, delay: float) -
             above, below = _linear_fit(samples, target, last, zeros, poles)
         if not (np.all(np.isfinite(above)) and np.all(np.isfinite(below))):
             break
-        found = assessed(samples, Rational(above, below, delay))
+        found = with_cost(samples, Rational(above, below, delay))
         best = min(best, found, key=lambda model: model.cost)
         last = polyval(samples.s, below)
     return best
@@ -153,13 +153,13 @@ class _Point:
         return jacobian.T @ misfit(self.samples, self.model).reshape(-1), jacobian.T @ jacobian
 
     def moved(self, change: Float[np.ndarray, " unknowns"]) -> "_Point":
-        model = _changed(self.samples, self.model, self.tangent, change)
-        return _Point(self.samples, assessed(self.samples, model), self.free_delay)
+        model = _apply_step(self.samples, self.model, self.tangent, change)
+        return _Point(self.samples, with_cost(self.samples, model), self.free_delay)
 
 
 def descend(samples: Samples, start: Rational, *, steps: int, free_delay: bool) -> Rational:
     """Lower the cost of `start` by Levenberg-Marquardt; a delay stops at 0."""
-    point = _Point(samples, assessed(samples, start), free_delay)
+    point = _Point(samples, with_cost(samples, start), free_delay)
     if not (np.isfinite(point.cost) and np.all(np.isfinite(point.tangent.jacobian))):
         return point.model
     return minimise_on_host(point, _Point.moved, steps, tolerance=_CONVERGED, saving=1e-14)[0].model
@@ -178,7 +178,7 @@ def _tangent(samples: Samples, model: Rational, free_delay: bool) -> _Tangent:
     return _Tangent(from_over, from_under, parts.reshape(2 * s.size, -1))
 
 
-def _changed(
+def _apply_step(
     samples: Samples, model: Rational, tangent: _Tangent, step: Float[np.ndarray, " unknowns"]
 ) -> Rational:
     parts = [tangent.over.shape[1], tangent.over.shape[1] + tangent.under.shape[1]]

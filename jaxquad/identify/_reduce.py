@@ -109,14 +109,14 @@ def reduce_structure(
             f"null names {', '.join(sorted(unknown))}, which is not free; free are: "
             f"{', '.join(parameters.names)}"
         )
-    first = best = _fitted(model, frf, kinds, options)
+    first = best = _fit_free(model, frf, kinds, options)
     steps, needed = [], set()
     while len(best.names) > 1 and best.verdict.fitted:
-        worst = _worst(best, needed, insensitivity, cramer_rao)
+        worst = _least_needed(best, needed, insensitivity, cramer_rao)
         if worst is None:
             break
         name, reason = worst
-        trial = _without(best, frf, kinds, name, options)
+        trial = _fit_without(best, frf, kinds, name, options)
         step = _decide(best, trial, name, reason, rise)
         steps.append(step)
         needed.add(name)
@@ -131,7 +131,7 @@ def _kinds(parameters: Parameters) -> dict[str, Positive | Real]:
     return {name: Positive(name) if log else Real(name, float(size)) for name, log, size in rows}
 
 
-def _fitted(model: PyTree, frf, kinds: Mapping[str, Positive | Real], options: _Options) -> Fit:
+def _fit_free(model: PyTree, frf, kinds: Mapping[str, Positive | Real], options: _Options) -> Fit:
     return fit(
         model,
         frf,
@@ -143,7 +143,7 @@ def _fitted(model: PyTree, frf, kinds: Mapping[str, Positive | Real], options: _
     )
 
 
-def _worst(
+def _least_needed(
     best: Fit, needed: set[str], insensitivity: float, cramer_rao: float
 ) -> tuple[str, str] | None:
     """The parameter to try without, and why: insensitivity comes first."""
@@ -158,7 +158,7 @@ def _worst(
     return None
 
 
-def _without(
+def _fit_without(
     best: Fit, frf, kinds: Mapping[str, Positive | Real], name: str, options: _Options
 ) -> Fit | None:
     """The fit without one parameter, or None where the model has no response then."""
@@ -167,7 +167,7 @@ def _without(
     model = alone.replace(best.model, jnp.asarray([options.null.get(name, 0.0)]))
     rest = {each: kinds[each] for each in best.names if each != name}
     try:
-        return _fitted(model, frf, rest, options)
+        return _fit_free(model, frf, rest, options)
     except ValueError:
         return None
 

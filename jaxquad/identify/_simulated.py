@@ -196,7 +196,7 @@ def check_growth(plant: TransferFunction | StateSpace, record: Record) -> None:
         )
 
 
-def forced(
+def forced_response(
     plant: TransferFunction | StateSpace, u: Float[Array, "samples inputs"], dt: float, hold: str
 ) -> Float[Array, "samples outputs"]:
     """The outputs under inputs that stood at their first values before the record, from rest."""
@@ -206,7 +206,7 @@ def forced(
     return simulate_linear(plant, u, dt, hold=hold)
 
 
-def motions_of(plant: TransferFunction | StateSpace, duration: float) -> Motions:
+def unknown_motions(plant: TransferFunction | StateSpace, duration: float) -> Motions:
     """The invariant subspaces of all speeds; slow is what a fifth of the record does not damp."""
     A = _dynamics(plant)
     if not len(A):
@@ -220,7 +220,7 @@ def motions_of(plant: TransferFunction | StateSpace, duration: float) -> Motions
     return Motions(jnp.asarray(slow), jnp.asarray(np.concatenate(parts, axis=1)), groups)
 
 
-def free(
+def free_response(
     plant: TransferFunction | StateSpace, motions: Motions, samples: int, dt: float
 ) -> Float[Array, "samples outputs unknowns"]:
     """The outputs of a unit shift of each output, of unit biases and of unit initial values."""

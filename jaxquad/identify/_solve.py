@@ -187,22 +187,26 @@ def least_squares(
     from ._gauss_newton import DampedGaussNewton
 
     ours = solver is None
-    if ours:
-        solver = DampedGaussNewton(tolerance, normal)
-    function = residual if ours else _walled(residual)
-    found = optx.least_squares(function, solver, z0, args=args, max_steps=max_steps, throw=False)
+    chosen = DampedGaussNewton(tolerance, normal) if solver is None else solver
+    if not isinstance(chosen, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
+        raise ValueError(
+            f"solver is a {type(chosen).__name__}: give an optimistix least-squares solver, for "
+            "instance optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)"
+        )
+    function = residual if ours else _without_nan(residual)
+    found = optx.least_squares(function, chosen, z0, args=args, max_steps=max_steps, throw=False)
     converged = found.result == optx.RESULTS.successful
     reason = found.state.status if ours else found.result
     return Stop(found.value, converged, reason, found.stats["num_steps"])
 
 
-def _walled(residual: Residual) -> Residual:
-    def walled(z, args):
+def _without_nan(residual: Residual) -> Residual:
+    def finite(z, args):
         # A wall of NaN would look like a minimum to the solver: make it a high one instead.
         r = residual(z, args)
         return jnp.where(jnp.isfinite(r), r, 1e6)
 
-    return walled
+    return finite
 
 
 def _reason(reason: PyTree) -> str:

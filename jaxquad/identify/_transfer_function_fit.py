@@ -58,7 +58,7 @@ def _cancelling_pair(
     less = search(samples, smaller, (_without_nearest(full),))
     freedom = max(2 * samples.s.size - structure.unknowns, 1)
     # A misfit beyond the noise counts as noise here, as it does in the standard errors.
-    noise = max(full.cost / freedom, 1.0) * _shared(pair)
+    noise = max(full.cost / freedom, 1.0) * _correlated_points(pair)
     gained = (less.cost - full.cost) / noise
     if gained > _CHANCE:
         return None
@@ -131,7 +131,7 @@ def _without_nearest(model: Rational) -> Rational:
     return Rational(above, np.real(polyfromroots(np.delete(poles, p))), model.delay)
 
 
-def _shared(pair: FrequencyResponse) -> float:
+def _correlated_points(pair: FrequencyResponse) -> float:
     """How many neighbouring frequencies share their noise."""
     covariance = pair.relative_covariance()
     size = np.sqrt(np.maximum(np.real(np.diagonal(covariance)), 1e-300))

@@ -25,7 +25,7 @@ _TRIED = 8  # linear starts that are refined
 _SHORT, _LONG = 12, 200  # steps of a descent: to compare starts, and to finish
 
 
-def lowest(
+def lowest_minimum(
     samples: Samples, zeros: int, poles: int, delay: float | None, extra: tuple[Rational, ...] = ()
 ) -> Rational:
     """The best minimum found; `delay` is free where it is None.
@@ -44,7 +44,7 @@ def lowest(
         best = descend(samples, best, steps=_LONG, free_delay=free)
         if not np.isfinite(best.cost):
             return best
-        others = _reflected(best) + _relocated(samples, best)
+        others = _with_reflected_roots(best) + _with_moved_pair(samples, best)
         again = [descend(samples, each, steps=_SHORT, free_delay=free) for each in others]
         better = min(again, key=lambda model: model.cost, default=best)
         if not better.cost < 0.999 * best.cost:
@@ -62,7 +62,7 @@ def _delays(samples: Samples) -> Float[np.ndarray, " delays"]:
     return np.linspace(0.0, limit, count)
 
 
-def _reflected(model: Rational) -> list[Rational]:
+def _with_reflected_roots(model: Rational) -> list[Rational]:
     """One zero or pole, or a pair, mirrored in the imaginary axis."""
     found = []
     for above, odd in _mirrored(model.above):
@@ -85,7 +85,7 @@ def _mirrored(coefficients: Coefficients) -> list[tuple[Coefficients, bool]]:
     return found
 
 
-def _relocated(samples: Samples, model: Rational) -> list[Rational]:
+def _with_moved_pair(samples: Samples, model: Rational) -> list[Rational]:
     """The outermost real zero and pole as a near-cancelling pair within the band."""
     zeros, poles = polyroots(model.above), polyroots(model.below)
     if not (np.any(zeros.imag == 0) and np.any(poles.imag == 0)):
@@ -269,7 +269,7 @@ def search(samples: Samples, structure: Structure, extra: tuple[Rational, ...] =
     """The lowest minimum found, in frequencies over the samples' unit."""
     delay = None if structure.delay is None else structure.delay * samples.unit
     poles = structure.poles - structure.integrators
-    found = lowest(samples, structure.zeros, poles, delay, extra)
+    found = lowest_minimum(samples, structure.zeros, poles, delay, extra)
     if not np.isfinite(found.cost):
         raise ValueError(
             f"no transfer function of {structure.zeros} zeros and {structure.poles} poles has a "

@@ -14,11 +14,11 @@ from ._simulated import (
     band_gain,
     check_channels,
     check_growth,
-    forced,
-    free,
+    forced_response,
+    free_response,
     linear_model,
     Motions,
-    motions_of,
+    unknown_motions,
 )
 
 
@@ -168,11 +168,11 @@ def verify(
     check_channels(plant, record)
     gain, shares = band_gain(band, record), _weights(weights, record)
     check_growth(plant, record)
-    motions = motions_of(plant, record.duration)
+    motions = unknown_motions(plant, record.duration)
     parts = [
         jnp.asarray(record.outputs),
-        forced(plant, jnp.asarray(record.inputs), record.dt, hold),
-        free(plant, motions, record.samples, record.dt),
+        forced_response(plant, jnp.asarray(record.inputs), record.dt, hold),
+        free_response(plant, motions, record.samples, record.dt),
     ]
     gain = None if gain is None else jnp.asarray(gain)
     measured, driven, columns = (np.asarray(band_filter(part, gain)) for part in parts)

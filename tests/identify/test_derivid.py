@@ -96,6 +96,7 @@ def test_responses_that_span_six_decades_are_fitted():
     assert apart.max() < 4
 
 
+@pytest.mark.slow
 def test_a_mass_matrix_and_accelerations_are_identified():
     truth = jq.StateSpace(
         M=[[2.0, 0.1], [0.1, 0.5]],
@@ -110,6 +111,7 @@ def test_a_mass_matrix_and_accelerations_are_identified():
     assert fit.identifiable and apart.max() < 4
 
 
+@pytest.mark.slow
 def test_gain_and_mass_together_are_refused_as_a_ratio():
     truth = jq.StateSpace(M=[[2.0]], F=[[-1.0]], G=[[3.0]], H0=[[1.0]])
     frf = response_of(truth, error=0.01, seed=0, omega=OMEGA)

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from jaxquad._xla import evaluate_once
 
 import jaxquad as jq
+from jaxquad._xla import evaluate_once
 from jaxquad.identify._fit_batch import solve_batch
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._problem import Problem, residuals, unchanged

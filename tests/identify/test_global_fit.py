@@ -103,12 +103,12 @@ def test_a_member_of_a_batch_has_all_its_doubts(fleet):
     member, one = batch.fit(2), jq.fit(TRUTH, frfs[2], cost=ML)
     np.testing.assert_allclose(member.standard_errors, one.standard_errors, rtol=1e-5)
     assert member.names == one.names == ("gain", "lag", "delay")
-    assert "6 fits, 0 of which reached no minimum" in str(batch)
+    assert "6 fits; 0 of them reached no minimum" in str(batch)
 
 
 def test_a_batch_refuses_other_frequencies_and_names_the_response():
     other = response_of(TRUTH, omega=OMEGA * 1.1)
     with pytest.raises(ValueError, match="response 1 has shape"):
         jq.identify.fit_batch(TRUTH, [response_of(TRUTH), other])
-    with pytest.raises(ValueError, match="needs one jq.spectra.FrequencyResponse or more"):
+    with pytest.raises(ValueError, match="fit_batch needs a list of jq.spectra.FrequencyResponse"):
         jq.identify.fit_batch(TRUTH, [])

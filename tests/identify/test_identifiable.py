@@ -141,6 +141,7 @@ def test_a_well_posed_fit_says_nothing_of_the_kind():
     assert fit.identifiable and not fit.verdict.null_directions and "NOT" not in str(fit)
 
 
+@pytest.mark.slow
 def test_what_is_fixed_takes_part_in_names_only_where_it_acts_alike():
     """The arm acts as the thrust does; the lag does not."""
     frf = response_of(RIG, seed=0)

@@ -126,7 +126,7 @@ def _check(values, slopes, misfits, certified, total):
 NEEDS_OTHER_STARTS = ("MGH17", 0)  # the first start leads every local method tried to b4 = infinity
 
 
-QUICK = ("BoxBOD", "MGH10", "Thurber")  # one of two parameters, one that is hard, one of seven
+QUICK = ("BoxBOD", "MGH10")  # one of two parameters, and one that is hard
 
 
 @pytest.mark.parametrize(

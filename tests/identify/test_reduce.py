@@ -64,7 +64,7 @@ def test_the_protocol_is_printed(reduced):
     text = str(reduced)
     assert text.startswith("start: 4 parameters, J_ave")
     assert text.count("dropped") == 2
-    assert "2 parameters are left:" in text
+    assert "2 parameters left:" in text
 
 
 @pytest.mark.slow

@@ -51,6 +51,7 @@ def test_starts_that_mean_nothing_are_refused(options, message):
         spread_starts(parameters, **{"count": 4, "fastest": 20.0, **options})
 
 
+@pytest.mark.slow
 def test_many_starts_find_the_minimum_that_one_misses_and_list_the_local_ones():
     frf = response_of(TRUTH, seed=0)
     problem = problem_of(FAR, frf)
@@ -94,6 +95,7 @@ def constant_response():
     return eqx.tree_at(lambda f: f.response, frf, jnp.ones_like(frf.response))
 
 
+@pytest.mark.slow
 def test_a_stationary_point_that_is_no_minimum_says_so():
     problem = problem_of(Folded(jnp.asarray(1.0)), constant_response(), (jq.identify.Real("b"),))
     best, points = solve_from_many(problem, np.array([[1.0], [1.5], [0.4]]), None, 256)
@@ -108,7 +110,7 @@ def test_a_stop_at_a_wall_says_so_and_is_not_converged():
     best, points = solve_from_many(problem, np.array([[1.0], [0.5], [3.0]]), None, 256)
     *points, nowhere = points
     assert nowhere.starts == (2,) and nowhere.kind.startswith("the model is not finite")
-    assert not best.converged and "not finite nearby" in best.message
+    assert not best.converged and "not finite or not smooth nearby" in best.message
     assert all(
         point.kind.startswith("no minimum: no shorter step") and not point.is_minimum
         for point in points

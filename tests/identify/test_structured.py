@@ -53,19 +53,15 @@ def problem(**options):
     return make_problem(MODEL, parameters, frfs, **options).weighted(list(jnp.asarray(weights)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param({}, id="every kind of entry"),
-        pytest.param(
-            {"priors": [jq.identify.Prior("G[1][0]", 3.5, 0.2)]},
-            id="a prior",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"tied": {"F[2][1]": lambda m: -m.F[1, 1] / 2}}, id="a tie", marks=pytest.mark.slow
-        ),
+        {},
+        {"priors": [jq.identify.Prior("G[1][0]", 3.5, 0.2)]},
+        {"tied": {"F[2][1]": lambda m: -m.F[1, 1] / 2}},
     ],
+    ids=["every kind of entry", "a prior", "a tie"],
 )
 def test_normal_equations_are_those_of_the_differentiated_residuals(options):
     made = problem(**options)

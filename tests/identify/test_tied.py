@@ -59,7 +59,7 @@ def test_without_free_all_but_the_tied_numbers_are_free():
     [
         ({"gain": lambda m: m.gains[0]}, "no parameter 'gain' to tie; the model has: gains"),
         ({"gains[0]": lambda m: -m.gains[1]}, "cannot be free and tied at once"),
-        ({"gains[1]": lambda m: m.gains}, r"tied to something of shape \(2,\): give one number"),
+        ({"gains[1]": lambda m: m.gains}, r"tied to an array of shape \(2,\): return one number"),
     ],
 )
 def test_an_impossible_tie_is_refused(tied, message):

@@ -1,0 +1,81 @@
+"""Fits are solved through optimistix: the same minimum by three solvers, and derivatives of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from scipy.optimize import least_squares
+from synthetic import OMEGA, response_of
+
+import jaxquad as jq
+from jaxquad.identify._gauss_newton import DampedGaussNewton
+from jaxquad.identify._solve import least_squares as minimum_of
+
+
+TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
+START = jq.LaggedIntegrator(150.0, 0.03, 0.02)
+
+
+def equation_14(log_values, response):
+    """The residuals of Eq. (14), written out with numpy."""
+    gain, lag, delay = np.exp(log_values)
+    s = 1j * OMEGA
+    log = np.log(gain * np.exp(-delay * s) / (s * (lag * s + 1)) / response)
+    weight = np.sqrt(20 / OMEGA.size) * 1.58 * (1 - np.exp(-0.95))
+    decibels, degrees = np.real(log) * 20 / np.log(10), np.degrees(np.imag(log))
+    return weight * np.concatenate([decibels, np.sqrt(0.01745) * degrees])
+
+
+@pytest.mark.parametrize(
+    "solver", [None, optx.GaussNewton(rtol=1e-10, atol=1e-10)], ids=["default", "gn"]
+)
+def test_the_minimum_of_equation_14_is_that_of_scipy(solver):
+    frf = response_of(TRUTH, seed=0)
+    fit = jq.fit(START, frf, solver=solver)
+    response = np.asarray(frf.response)[:, 0, 0]
+    start = np.log([150.0, 0.03, 0.02])
+    peer = least_squares(equation_14, start, args=(response,), method="lm", xtol=1e-12, ftol=1e-12)
+    # MINPACK differentiates numerically: its minimum has seven digits or so.
+    np.testing.assert_allclose(fit.values, np.exp(peer.x), rtol=1e-6)
+    assert fit.cost == pytest.approx(2 * peer.cost, rel=1e-9)
+
+
+def decay(z, data):
+    """Residuals of an exponential; the data do not follow it, so their minimum is not zero."""
+    time = jnp.linspace(0.0, 2.0, data.size)
+    return z[0] * jnp.exp(-z[1] * time) - data
+
+
+DATA = 2 * np.exp(-0.7 * np.linspace(0.0, 2.0, 8)) + 0.05 * np.cos(9 * np.arange(8))
+
+
+def test_the_minimum_has_the_derivatives_of_finite_differences():
+    def found(data):
+        solver = DampedGaussNewton(1e-12)
+        return optx.least_squares(decay, solver, jnp.ones(2), args=data).value
+
+    slopes = jax.jit(jax.jacrev(found))(jnp.asarray(DATA))
+    moved = DATA + 1e-3 * np.concatenate([np.eye(8), -np.eye(8)])
+    above, below = np.split(np.asarray(jax.jit(jax.vmap(found))(moved)), 2)
+    # Rounding of the cost leaves the minimum open by 1e-9, and the step's square is 1e-6.
+    np.testing.assert_allclose(slopes, (above - below).T / 2e-3, atol=1e-5)
+
+
+def test_a_wall_of_nan_is_divergence_and_a_start_in_it_ends_there():
+    def walled(z, _):
+        # falls towards the wall at 1, behind which there is nothing
+        return jnp.where(z < 1, 3 - z, jnp.nan)
+
+    solver = DampedGaussNewton(1e-8)
+    for start in (0.0, 2.0):
+        found = optx.least_squares(walled, solver, jnp.asarray([start]), throw=False)
+        assert found.result == optx.RESULTS.nonlinear_divergence
+        # the best point that it reached, just before the wall, or the start itself
+        assert found.value[0] == pytest.approx(start if start > 1 else 1.0, abs=1e-6)
+
+
+def test_too_few_steps_are_told_apart_from_a_minimum():
+    stop = minimum_of(decay, jnp.ones(2), jnp.asarray(DATA), max_steps=1)
+    assert not stop.converged and int(stop.steps) == 1
+    assert minimum_of(decay, jnp.ones(2), jnp.asarray(DATA), max_steps=64).converged
