@@ -1,13 +1,5 @@
-from ._adaptive_ladrc import (
-    AdaptiveLADRC as AdaptiveLADRC,
-    AdaptiveLADRCState as AdaptiveLADRCState,
-)
-from ._ladrc import (
-    LADRC as LADRC,
-    LADRCGains as LADRCGains,
-    LADRCLaw as LADRCLaw,
-    LADRCState as LADRCState,
-)
+from ._adaptive_ladrc import AdaptiveLADRC as AdaptiveLADRC
+from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
 from ._observers import (
     CurrentObserver as CurrentObserver,
     EulerObserver as EulerObserver,
@@ -18,8 +10,6 @@ from ._pid import (
     Clamping as Clamping,
     PD as PD,
     PID as PID,
-    PIDLaw as PIDLaw,
-    PIDState as PIDState,
     place_pd as place_pd,
 )
 from ._protocols import (

@@ -18,7 +18,7 @@ class Setpoint(NamedTuple):
 
 
 Reference = Setpoint | Float[Array, " axes *ensemble"]  # angles in rad have no feed-forward
-Member = int | tuple[int, ...] | Array | None  # one member of an ensemble; None where there is none
+Member = int | tuple[int | Array, ...] | Array | None  # None where there is no ensemble
 
 
 def as_setpoint(reference: Reference) -> Setpoint:

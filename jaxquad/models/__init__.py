@@ -2,11 +2,7 @@ from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._axis import AttitudeAxis as AttitudeAxis
 from ._connect import realise as realise, series as series, state_space as state_space
-from ._decoupled import (
-    AxesState as AxesState,
-    DecoupledAxes as DecoupledAxes,
-    LinearAxis as LinearAxis,
-)
+from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
 from ._entry_slopes import Entry as Entry, logarithmic_slopes as logarithmic_slopes
 from ._modes import Mode as Mode, modes as modes
 from ._multirotor import (
@@ -43,8 +39,6 @@ from ._transfer_function import (
 from ._vehicles import (
     CRAZYFLIE as CRAZYFLIE,
     crazyflie as crazyflie,
-    CrazyflieDataSheet as CrazyflieDataSheet,
-    HoverDataSheet as HoverDataSheet,
     QUANSER_HOVER as QUANSER_HOVER,
     quanser_hover as quanser_hover,
 )
