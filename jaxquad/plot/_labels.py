@@ -58,7 +58,7 @@ def raise_powers(text: str) -> str:
     return re.sub(r"\^(\d+)", r"$^{\1}$", text)
 
 
-def plain_ticks(axis: Axis, subs: Sequence[float] = (1, 2, 5)) -> None:
+def plain_ticks(axis: Axis, subs: Sequence[float | int] = (1, 2, 5)) -> None:
     """Ticks at `subs` of every decade as plain numbers, not as 2 x 10^1."""
     axis.set_major_locator(LogLocator(subs=subs))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

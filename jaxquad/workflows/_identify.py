@@ -146,7 +146,9 @@ class Identification:
                 parts += [_text_or_reason(lambda n=name, q=quantity: self.fit.derived(q, n))]
         if self.parts:
             whole = {f"{self.band[0]:.3g} .. {self.band[1]:.3g} rad/s": self.fit}
-            parts += [f"\n{compare_fits(whole | dict(self.parts), sums)}"]
+            parts += [
+                f"\nFits to parts of the band:\n{compare_fits(whole | dict(self.parts), sums)}"
+            ]
         return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
 
 
