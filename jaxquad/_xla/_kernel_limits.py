@@ -7,11 +7,12 @@ from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func, stablehlo
 
 
+Op = ir.Operation | ir.OpView
 ATTRIBUTE = "mhlo.frontend_attributes"
 
 
 def hold_in_kernel(
-    call: ir.Operation, module: ir.Module, symbols: ir.SymbolTable, attributes: ir.Attribute
+    call: Op, module: ir.Module, symbols: ir.SymbolTable, attributes: ir.Attribute
 ) -> None:
     """Turn a plain call into one of a function that calls a kernel which does the same.
 
@@ -49,7 +50,7 @@ def _new_function(
     name: str,
     given: list[ir.Type],
     kinds: list[ir.Type],
-    call: ir.Operation,
+    call: Op,
     module: ir.Module,
     symbols: ir.SymbolTable,
 ) -> tuple[func.FuncOp, str]:
@@ -101,21 +102,25 @@ _NARROW = 128  # numbers that XLA never divides among threads
 _SUMS = {"reduce", "reduce_window", "dot_general", "dot"}
 _MOST_SUMMED = 4096
 _WIDEST = 2**15  # numbers of one operation: one thread is the slower way for more
-_MOST_OPERATIONS = 12_000  # of one kernel: the time to compile them grows faster than their number
+# Operations of one kernel: the time to compile them grows faster than their number. At 6800 wide
+# ones it is four times that of a plain loop, at 3200 twice; narrow ones compile faster than plain.
+_MOST_OPERATIONS, _MOST_WIDE = 12_000, 4_000
+_WIDE = 32  # numbers
 
 
-def why_not(call: ir.Operation, module: ir.Module) -> str | None:
+def why_not(call: Op, module: ir.Module) -> str | None:
     """What `call` takes, leads to or returns that a kernel cannot hold; None if all of it fits."""
     functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
     for value in (*call.operands, *call.results):
         if not _holds_numbers(value.type):
             return f"values of {value.type}"
-    counts: dict[str, int] = {}
     try:
-        count = _count(text(call, "callee"), functions, counts)
+        count, wide = _count(text(call, "callee"), functions, {})
     except _DoesNotFit as reason:
         return str(reason)
-    return f"{count} operations" if count > _MOST_OPERATIONS else None
+    if count > _MOST_OPERATIONS or wide > _MOST_WIDE:
+        return f"{count} operations, {wide} of them on {_WIDE} numbers or more"
+    return None
 
 
 class _DoesNotFit(Exception):
@@ -129,25 +134,32 @@ def _holds_numbers(kind: ir.Type) -> bool:
     return real and array.has_static_shape and size_of(kind) > 0
 
 
-def text(op: ir.Operation, attribute: str) -> str:
+def text(op: Op, attribute: str) -> str:
     return str(op.attributes[attribute]).strip('@"')
 
 
-def _count(name: str, functions: dict[str, ir.Operation], counts: dict[str, int]) -> int:
+_Counts = tuple[int, int]  # all operations, and those on many numbers
+
+
+def _count(name: str, functions: dict[str, Op], known: dict[str, _Counts]) -> tuple[int, int]:
     """Operations of a function and of all that it calls, once for every call: XLA inlines them."""
-    if name not in counts:
-        counts[name] = 0
-        for op in _operations(functions[name]):
-            if op.name == "func.call":
-                counts[name] += _count(text(op, "callee"), functions, counts)
-            elif not _fits(op):
-                raise _DoesNotFit(f"{op.name} of {', '.join(str(x.type) for x in op.operands)}")
-            else:
-                counts[name] += 1
-    return counts[name]
+    if name in known:
+        return known[name]
+    count = wide = 0
+    for op in _operations(functions[name]):
+        if op.name == "func.call":
+            more, wider = _count(text(op, "callee"), functions, known)
+            count, wide = count + more, wide + wider
+        elif not _fits(op):
+            raise _DoesNotFit(f"{op.name} of {', '.join(str(x.type) for x in op.operands)}")
+        else:
+            count += 1
+            wide += kind_of(op) != "while" and any(size_of(x.type) >= _WIDE for x in op.results)
+    known[name] = count, wide
+    return known[name]
 
 
-def _operations(parent: ir.Operation) -> Iterator[ir.Operation]:
+def _operations(parent: Op) -> Iterator[Op]:
     for region in parent.regions:
         for block in region:
             for op in block:
@@ -155,7 +167,7 @@ def _operations(parent: ir.Operation) -> Iterator[ir.Operation]:
                 yield from _operations(op.operation)
 
 
-def _fits(op: ir.Operation) -> bool:
+def _fits(op: Op) -> bool:
     kind = kind_of(op)
     if kind not in _HELD or (kind[:3] == "dot" and not _is_thin(op)):
         return False
@@ -174,11 +186,11 @@ def size_of(kind: ir.Type) -> int:
     return size
 
 
-def kind_of(op: ir.Operation) -> str:
+def kind_of(op: Op) -> str:
     return op.name.split(".")[-1]
 
 
-def _is_thin(dot: ir.Operation) -> bool:
+def _is_thin(dot: Op) -> bool:
     """Whether a product has a vector on one side: XLA writes a plain loop for it."""
     dims = stablehlo.DotDimensionNumbers(dot.attributes["dot_dimension_numbers"])
     shared = (

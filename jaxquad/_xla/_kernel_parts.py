@@ -8,7 +8,7 @@ merges nothing across the calls of functions, so what is needed twice becomes a 
 from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func, stablehlo
 
-from ._kernel_limits import ATTRIBUTE, kind_of, size_of, text
+from ._kernel_limits import ATTRIBUTE, kind_of, Op, size_of, text
 
 
 MOVES = set("broadcast_in_dim convert iota reshape slice".split())  # nothing to save in these
@@ -150,11 +150,11 @@ def _zero() -> ir.Attribute:
     )
 
 
-def operations(block: ir.Block) -> list[ir.Operation]:
+def operations(block: ir.Block) -> list[Op]:
     return [op.operation for op in block.operations]
 
 
-def _operands(op: ir.Operation) -> list[ir.Value]:
+def _operands(op: Op) -> list[ir.Value]:
     """Also those that an operation's regions take from around them."""
     found = list(op.operands)
     for region in op.regions:
@@ -171,7 +171,7 @@ _FEW = 10  # operations of a function, such as `jnp.clip`, that can be within a 
 
 def in_parts(name: str, module: ir.Module, symbols: ir.SymbolTable) -> str:
     """The name of a copy of a function, its loops included, that is made of parts."""
-    made: list[ir.Operation] = []
+    made: list[Op] = []
     try:
         return _Copies(module, symbols, made).copy(name)
     except Exception:
@@ -181,7 +181,7 @@ def in_parts(name: str, module: ir.Module, symbols: ir.SymbolTable) -> str:
 
 
 class _Copies:
-    def __init__(self, module: ir.Module, symbols: ir.SymbolTable, made: list[ir.Operation]):
+    def __init__(self, module: ir.Module, symbols: ir.SymbolTable, made: list[Op]):
         self.module, self.symbols, self.made = module, symbols, made
         self.functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
         self.named: dict[str, str] = {}
@@ -195,12 +195,12 @@ class _Copies:
             self._divide(function.operation)
         return self.named[name]
 
-    def insert(self, function: ir.Operation) -> str:
+    def insert(self, function: Op) -> str:
         name = ir.StringAttr(self.symbols.insert(function)).value
         self.made.append(function)
         return name
 
-    def _divide(self, op: ir.Operation) -> None:
+    def _divide(self, op: Op) -> None:
         for place, region in enumerate(op.regions):
             for block in region:
                 for inner in operations(block):
@@ -220,12 +220,12 @@ class _Copies:
             self.small[name] = 0 < len(ops) <= _FEW and all(map(self._is_light, ops[:-1]))
         return self.small[name]
 
-    def _is_light(self, op: ir.Operation) -> bool:
+    def _is_light(self, op: Op) -> bool:
         called = op.name == "func.call" and ATTRIBUTE not in op.attributes
         light = self.is_small(text(op, "callee")) if called else kind_of(op) in ELEMENTWISE
         return light and len(op.results) == 1
 
-    def is_in_a_part(self, op: ir.Operation) -> bool:
+    def is_in_a_part(self, op: Op) -> bool:
         return self._is_light(op) and (
             kind_of(op) == "constant" or _SHORT <= size_of(op.results[0].type) < _LONG
         )

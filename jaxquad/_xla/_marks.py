@@ -5,7 +5,7 @@ from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
-from ._kernel_limits import ATTRIBUTE, hold_in_kernel, text, why_not
+from ._kernel_limits import ATTRIBUTE, hold_in_kernel, Op, text, why_not
 from ._kernel_parts import in_parts
 from ._switch import note, warn_once
 
@@ -44,11 +44,11 @@ def _tag(ctx: mlir.LoweringRuleContext, x: ir.Value) -> list[ir.Value]:
     return [x]
 
 
-def _owner(x: ir.Value) -> ir.Operation:
+def _owner(x: ir.Value) -> Op | ir.Block:
     return getattr(x.owner, "operation", x.owner)
 
 
-def _forward_passes(call: ir.Operation) -> Iterator[ir.Operation]:
+def _forward_passes(call: Op) -> Iterator[Op]:
     """The calls whose results a call takes, without their marks where nothing else was asked of."""
     for operand in call.operands:
         owner = _owner(operand)
@@ -56,7 +56,7 @@ def _forward_passes(call: ir.Operation) -> Iterator[ir.Operation]:
             yield owner
 
 
-def _make_kernel(call: ir.Operation, whole: mlir.ModuleContext) -> None:
+def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:
     if not _is_plain_call(call):
         return
     reason = why_not(call, whole.module)
@@ -69,7 +69,7 @@ def _make_kernel(call: ir.Operation, whole: mlir.ModuleContext) -> None:
     hold_in_kernel(call, whole.module, whole.symbol_table, ir.DictAttr.get(tags))
 
 
-def _is_plain_call(op: ir.Operation | ir.Block) -> bool:
+def _is_plain_call(op: Op | ir.Block) -> bool:
     if not isinstance(op, ir.Operation) or op.name != "func.call" or ATTRIBUTE in op.attributes:
         return False
     return text(op, "callee").startswith("jaxquad_kernel")

@@ -16,7 +16,7 @@ plain_loops = jax.make_user_context(False)
 _said: dict[str, None] = {}
 
 
-def set_kernel(kernel: Kernel) -> None:
+def set_kernel(kernel: str) -> None:
     """Raises ValueError for another word."""
     plain_loops.set_global(_checked(kernel, "kernel") == "off")
 
@@ -38,10 +38,10 @@ def note(what: str) -> None:
 
 
 def warn_once(what: str) -> None:
-    """Keep for `engine()`, and warn of, what should have become a kernel and could not."""
+    """Keep for `engine()`, and warn of, what should have become a kernel and did not."""
     if what not in _said:
         _said[what] = None
-        warnings.warn(f"loops are compiled plain, so they take longer: {what}", stacklevel=3)
+        warnings.warn(f"loops take longer than they could: {what}", stacklevel=3)
 
 
 def left_plain() -> tuple[str, ...]:

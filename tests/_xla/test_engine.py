@@ -1,227 +1,184 @@
-"""The ensemble engine computes what one plain scan does: in chunks, in blocks, in kernels."""
+"""How loops are compiled: the switch, the trial of an unknown jaxlib, and what a failure leads to."""
 
+import json
 import subprocess
 import sys
 import warnings
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import _engine as _compile, compiler_options, engine
-from jaxquad.control import LADRC
-from jaxquad.loops import Loop, per_member
-from jaxquad.models import DecoupledAxes
-from jaxquad.models._rotation import sincos
-from jaxquad.simulation import (
-    evaluate,
-    metrics,
-    Pulse,
-    run_ensemble,
-    Saturation,
-    scenario,
-    simulate,
-    Step,
+import jaxquad as jq
+from jaxquad._xla import (
+    _canary,
+    _engine,
+    _kernel_limits,
+    _switch,
+    as_one_kernel,
+    compiler_options,
+    engine,
+    Jit,
 )
-from jaxquad.simulation._blocks import in_chunks, scan_in_blocks
-from jaxquad.simulation._run import scan_loop
 
 
-MEMBERS, SAMPLES, TAG = 150, 131, "xla_cpu_small_call"
-RNG = np.random.default_rng(0)
-GAINS, STIFFNESS = jnp.asarray([0.8, 0.3]), jnp.asarray(RNG.uniform(0.5, 2.0, MEMBERS))
-START = jnp.asarray(RNG.normal(size=(2, MEMBERS)))
-SIGNAL, NOISE = (
-    jnp.asarray(RNG.normal(size=SAMPLES)),
-    jnp.asarray(RNG.normal(size=(SAMPLES, MEMBERS))),
-)
-OWN = ((False, True), (False, True))
+TAG = "xla_cpu_small_call"
+ONE = jnp.asarray(1.0)
 
 
-def swing(state, parts, now):
-    """A pendulum under a controller, with a push that all feel and noise of its own."""
-    (gains, stiffness), (push, noise) = parts, now
-    angle, rate = state
-    force = -gains[0] * (angle + 0.01 * noise) - gains[1] * rate + push
-    sine, cosine = sincos(angle)
-    rate = rate + 0.05 * (force * cosine - stiffness * sine - jnp.tanh(rate))
-    return jnp.stack([angle + 0.05 * rate, rate]), (angle, push * angle)
+def loop(x):
+    return jax.lax.scan(lambda x, _: (jnp.sin(x) + 0.1, None), x, None, length=40)[0]
 
 
-def engine_run(start, gains, chunk=48):
-    parts, signals = (gains, STIFFNESS), (SIGNAL, NOISE)
-    return run_ensemble(swing, start, parts, signals, own=OWN, chunk=chunk)
+def is_kernel():
+    return TAG in jax.jit(lambda x: as_one_kernel(loop, x)).lower(ONE).as_text()
 
 
-def plain_run(start, gains):
-    step = lambda state, now: swing(state, (gains, STIFFNESS), now)
-    return jax.lax.scan(step, start, (SIGNAL, NOISE))
+@pytest.fixture
+def silence(monkeypatch):
+    """Nothing was said yet."""
+    monkeypatch.setattr(_switch, "_said", {})
+    yield
+    _switch.set_kernel("auto")
 
 
-def close(found, expected, rtol=1e-11):
-    same = lambda a, b: np.testing.assert_allclose(a, b, rtol=rtol, atol=1e-12)
-    jax.tree.map(same, found, expected)
+def test_a_switch_compiles_loops_plain_and_back(silence):
+    assert is_kernel() and jq.engine().one_kernel
+    off = jq.engine(kernel="off")
+    assert (off.one_kernel, off.why_not) == (False, "switched off")
+    assert not is_kernel()
+    assert jq.engine(kernel="auto").why_not is None and is_kernel()
 
 
-@pytest.mark.parametrize("chunk", [48, 1000])
-def test_an_ensemble_in_chunks_is_the_plain_scan(chunk):
-    run = jax.jit(lambda *args: engine_run(*args, chunk=chunk))
-    close(run(START, GAINS), jax.jit(plain_run)(START, GAINS))
-    assert TAG in run.lower(START, GAINS).as_text()
+def test_a_change_of_the_switch_reaches_programs_that_are_compiled_already(silence):
+    seen = []
+    run = jax.jit(lambda x: (seen.append(engine().one_kernel), as_one_kernel(loop, x))[1])
+    first = run(ONE)
+    engine(kernel="off")
+    np.testing.assert_allclose(run(ONE), first, rtol=1e-12)
+    assert seen == [True, False]
 
 
-def cost_of(run):
-    return lambda start, gains: jnp.sum(run(start, gains)[1][0] ** 2)
+def test_the_environment_switches_kernels_off(silence, monkeypatch):
+    monkeypatch.setenv("JAXQUAD_KERNEL", "off")
+    assert engine().why_not == "switched off" and not is_kernel()
+    monkeypatch.setenv("JAXQUAD_KERNEL", "yes")
+    with pytest.raises(ValueError, match='JAXQUAD_KERNEL is "yes", but it must be "auto" or "off"'):
+        engine()
 
 
-def test_derivatives_through_chunks_blocks_and_kernels_are_those_of_the_plain_scan():
-    for transform in (jax.grad, lambda f, argnums: jax.jacfwd(lambda g: f(START, g))):
-        args = (START, GAINS) if transform is jax.grad else (GAINS,)
-        fast, slow = (
-            jax.jit(transform(cost_of(f), argnums=(0, 1))) for f in (engine_run, plain_run)
-        )
-        close(fast(*args), slow(*args), rtol=1e-9)
-
-
-def test_a_gradient_alone_has_both_passes_in_kernels():
-    """Nothing asks for the forward pass's own result there, which is where its mark is."""
-    last = lambda start, gains: jnp.sum(engine_run(start, gains, chunk=1000)[0])
-    text = jax.jit(jax.grad(last)).lower(START, GAINS).as_text()
-    assert text.count(TAG) == 2
-
-
-def test_a_kernel_computes_a_value_that_several_need_once():
-    def shared(x):
-        y = jnp.tanh(jnp.sin(x) * x)
-        return y * x, y + x, y - 2 * x
-
-    step = lambda x, _: (sum(shared(x)) / 9, None)
-    run = jax.jit(
-        lambda x: run_ensemble(lambda x, _, now: step(x, now), x, (), SIGNAL, own=False)[0]
-    )
-    compiled = str(run.lower(START).compile().as_text())
-    assert compiled.count(" sine(") + compiled.count(" tanh(") == 2
-
-
-def test_what_all_members_share_is_no_result_of_chunks():
-    count = lambda given: {"each": 2 * given["each"], "all": given["all"] + 1}
-    given = {"each": jnp.arange(300.0), "all": jnp.ones(128)}
-    with pytest.raises(ValueError, match="members of a chunk belong on its last axis"):
-        in_chunks(count, given, {"each": True, "all": False})
-
-
-@pytest.mark.parametrize("count", [1, 128, 131, 1009])
-def test_blocks_of_any_number_of_samples_are_one_scan(count):
-    step = lambda x, u: (0.9 * x + jnp.sin(u * x), u * x)
-    inputs = jnp.linspace(0.0, 1.0, count)
-    blocks = jax.jit(lambda x, u: scan_in_blocks(step, x, u, count))
-    scan = jax.jit(lambda x, u: jax.lax.scan(step, x, u))
-    both = [jax.value_and_grad(lambda x, u, f=f: f(x, u)[0] + jnp.sum(f(x, u)[1] ** 2), (0, 1))
-            for f in (blocks, scan)]  # fmt: skip
-    found, expected = (f(jnp.asarray(0.7), inputs) for f in both)
-    close(found, expected)
-    text = blocks.lower(0.7, inputs).as_text()
-    assert text.count("stablehlo.sine") == 1  # no second copy of the step for the last samples
-
-
-HAPPENS = scenario(
-    duration=0.5,
-    axes=1,
-    reference={0: Step(np.radians(4.0))},
-    disturbance={0: Pulse(0.1, width=0.1, at=0.2)},
-)
-INERTIA = 0.0552 * np.geomspace(0.5, 2.0, MEMBERS)[None]
-
-
-def rig(inertia):
-    return DecoupledAxes([0.0468], inertia, lag=[0.005])
-
-
-def flown(inertia, gains):
-    controller = LADRC(*(gain[None] for gain in gains))
-    return evaluate(Loop(rig(inertia), controller, drive=Saturation(20.0)), HAPPENS)
-
-
-def test_members_of_a_large_ensemble_fly_as_in_a_small_one():
-    gains = jnp.asarray([10.0, 30.0, 0.8478])
-    many = lambda gains: flown(INERTIA, gains).itae[:, -20:]
-    few = lambda gains: flown(INERTIA[:, -20:], gains).itae
-    mean = lambda f: jax.jit(jax.value_and_grad(lambda gains: jnp.mean(f(gains))))
-    close(mean(many)(gains), mean(few)(gains), rtol=1e-9)
-
-
-def test_a_record_of_a_large_ensemble_has_every_member_in_its_place():
-    controller, drive = LADRC([10.0], [30.0], [0.8478]), Saturation(20.0)
-    record = simulate(Loop(rig(INERTIA), controller, drive=drive), HAPPENS)
-    alone = simulate(Loop(rig(INERTIA[:, -1]), controller, drive=drive), HAPPENS)
-    close(record.angle[..., -1], alone.angle)
-    close(metrics(record).itae, evaluate(Loop(rig(INERTIA), controller, drive=drive), HAPPENS).itae)
-
-
-class Weighted(eqx.Module):
-    """An accumulator with a weight for each member."""
-
-    weight: jax.Array = per_member(1)
-
-    def begin(self, like):
-        return jnp.zeros_like(like)
-
-    def update(self, total, now):
-        return total + self.weight * now.angle, None
-
-
-def test_an_accumulator_may_have_numbers_of_each_member():
-    weight = jnp.arange(float(MEMBERS))[None]
-    loop = Loop(rig(INERTIA), LADRC([10.0], [30.0], [0.8478]), drive=Saturation(20.0))
-    run = eqx.filter_jit(lambda: scan_loop(loop, HAPPENS, Weighted(weight))[0])
-    record = simulate(loop, HAPPENS)
-    close(run(), weight * jnp.sum(record.angle, axis=0), rtol=1e-9)
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_sines_and_cosines_are_right_to_the_last_bits(dtype):
-    exact = np.longdouble if dtype == np.float64 else np.float64
-    for span in (1e-3, 2.0, 100.0, 1e6):
-        x = RNG.uniform(-span, span, 20_000).astype(dtype)
-        for found, of in zip(jax.jit(sincos)(jnp.asarray(x)), (np.sin, np.cos), strict=True):
-            error = np.abs(np.asarray(found).astype(exact) - of(x.astype(exact)))
-            assert error.max() < 1.5 * np.finfo(dtype).eps
-    far = np.array([1e300 if dtype == np.float64 else 1e30, np.inf, np.nan], dtype)
-    assert np.isnan(sincos(jnp.asarray(far))).all()
-
-
-def test_sines_differentiate_as_sines():
-    third = jax.grad(jax.grad(jax.grad(lambda x: sincos(x)[0])))
-    assert third(jnp.asarray(0.7)) == pytest.approx(-np.cos(0.7), rel=1e-15)
+def test_another_word_for_the_switch_is_refused():
+    with pytest.raises(ValueError, match='kernel is "on", but it must be "auto" or "off"'):
+        _switch.set_kernel("on")
 
 
 def test_an_outermost_loop_has_the_compilers_options_and_others_have_none():
-    doubled = _compile.Jit(lambda x: 2 * x)
-    one = jnp.asarray(1.0)
-    assert doubled(one) == 2
-    assert jax.jit(doubled)(one) == jax.jit(lambda: doubled(one))() == jax.grad(doubled)(one) == 2
-    close(jax.vmap(doubled)(jnp.ones(3)), 2 * jnp.ones(3))
+    doubled = Jit(lambda x: 2 * x)
+    assert doubled(ONE) == 2
+    assert jax.jit(doubled)(ONE) == jax.jit(lambda: doubled(ONE))() == jax.grad(doubled)(ONE) == 2
+    np.testing.assert_array_equal(jax.vmap(doubled)(jnp.ones(3)), 2)
 
 
 def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch):
     here = compiler_options()
-    assert engine() == ("cpu", True, here["xla_cpu_prefer_vector_width"])
-    monkeypatch.setattr(_compile, "_WIDEST", {"xla_of_another_age": 1})
-    _compile._known.cache_clear()
+    assert engine().vector_bits == here["xla_cpu_prefer_vector_width"]
+    monkeypatch.setattr(_engine, "_WIDEST", {"xla_of_another_age": 1})
+    _engine._known.cache_clear()
     with pytest.warns(UserWarning, match="up to a tenth slower.*xla_of_another_age"):
         assert compiler_options() == {}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert engine().vector_bits is None
     monkeypatch.undo()
-    _compile._known.cache_clear()
+    _engine._known.cache_clear()
     assert compiler_options() == here
 
 
-def test_random_loops_are_the_same_as_kernels_and_no_process_ends():
-    program = [sys.executable, Path(__file__).parents[1] / "random_loops.py", "1", "3"]
+def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silence, monkeypatch):
+    monkeypatch.setattr(_kernel_limits, "_MOST_SUMMED", 10**9)  # lets in what XLA cannot compile
+    traced = []
+
+    def totals(x):
+        traced.append(engine().one_kernel)
+        step = lambda x, _: (jnp.sin(x) + 1e-4 * jnp.sum(x), None)
+        return as_one_kernel(lambda x: jax.lax.scan(step, x, None, length=9)[0], x)
+
+    run, x = Jit(totals), jnp.linspace(0.0, 1.0, 9_000)
+    with pytest.warns(UserWarning, match="totals did not compile as one kernel"):
+        found = run(x)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(run(x), found)
+    with _switch.plain_loops(True):
+        np.testing.assert_allclose(jax.jit(totals)(x), found, rtol=1e-12)
+    assert traced[:2] == [True, False]
+    assert "totals did not compile" in engine().left_plain[0]
+
+
+@pytest.fixture
+def untested(silence, monkeypatch, tmp_path):
+    """A jaxlib that no test ran on, and an empty cache folder."""
+    monkeypatch.setattr(_canary, "TESTED", ())
+    monkeypatch.setattr(_canary.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
+    monkeypatch.delenv("JAXQUAD_CACHE", raising=False)
+    _canary.why_not_trusted.cache_clear()
+    yield tmp_path
+    _canary.why_not_trusted.cache_clear()
+
+
+def test_kernels_pass_their_trial_with_this_jaxlib(untested):
+    assert engine().one_kernel
+    (answer,) = untested.glob("jaxquad/kernel-*.json")
+    assert json.loads(answer.read_text()) == {"why_not": ""}
+
+
+def test_an_answer_is_kept_and_a_failed_trial_is_warned_of(untested, monkeypatch):
+    asked = []
+    monkeypatch.setattr(_canary, "_ask_child", lambda: asked.append(1) or "status -6: aborted")
+    for _ in range(2):
+        _switch._said.clear()
+        _canary.why_not_trusted.cache_clear()
+        with pytest.warns(UserWarning, match="did not pass the trial.*status -6: aborted"):
+            assert not engine().one_kernel
+        assert not is_kernel()
+    assert asked == [1]
+
+
+def test_without_a_cache_every_process_asks_anew(untested, monkeypatch):
+    monkeypatch.setenv("JAXQUAD_CACHE", "off")
+    monkeypatch.setattr(_canary, "_ask_child", lambda: "")
+    assert engine().one_kernel and not list(untested.iterdir())
+
+
+def test_an_answer_that_cannot_be_read_is_asked_for_again(untested, monkeypatch):
+    path = _canary._answer_path()
+    path.parent.mkdir(parents=True)
+    path.write_text("{")
+    monkeypatch.setattr(_canary, "_ask_child", lambda: "")
+    with pytest.warns(UserWarning, match="cannot be read"):
+        assert engine().one_kernel
+    assert json.loads(path.read_text()) == {"why_not": ""}
+
+
+def test_a_child_that_dies_tells_its_last_words(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/no/such/python")
+    assert "/no/such/python" in _canary._ask_child()
+
+
+def run_program(name, first, last):
+    program = [sys.executable, Path(__file__).parents[1] / name, str(first), str(last)]
     ran = subprocess.run(program, capture_output=True, text=True)
     assert ran.stdout.endswith("same\n"), ran.stdout + ran.stderr[-2000:]
+
+
+@pytest.mark.slow
+def test_random_loops_are_the_same_as_kernels_and_no_process_ends():
+    run_program("random_loops.py", 1, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_loops_with_random_delays_are_the_same_as_kernels_and_compile_in_time():
+    run_program("random_delays.py", 0, 25)

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import _kernel_limits as _small_call_uses
-from jaxquad._xla._kernel import as_one_kernel
+from jaxquad._xla import _kernel_limits, as_one_kernel, engine
 
 
 STEPS = 40
@@ -113,11 +112,35 @@ def test_what_a_kernel_cannot_hold_is_left_to_the_plain_compiler(name):
     fast, slow = (jax.jit(lambda x, p, f=f: f(x, p, step)) for f in (kernel, plain))
     assert TAG not in fast.lower(START, GAIN).as_text()
     np.testing.assert_allclose(fast(START, GAIN), slow(START, GAIN), rtol=1e-12)
+    assert any(line.startswith("a kernel does not hold") for line in engine().left_plain)
+
+
+def test_more_operations_than_compile_in_time_are_left_to_the_plain_compiler(monkeypatch):
+    run = jax.jit(lambda x, p: kernel(x, p))
+    monkeypatch.setattr(_kernel_limits, "_MOST_OPERATIONS", 10)
+    assert TAG not in run.lower(START, GAIN).as_text()
+    assert any(" operations, " in line for line in engine().left_plain)
+
+
+@pytest.mark.parametrize("numbers", [20_000, 90_000])
+@pytest.mark.parametrize("kind", ["carried", "stored", "branched"])
+def test_arrays_that_xla_would_divide_among_threads_do_not_end_the_compiler(numbers, kind):
+    """A kernel has one thread; XLA divides a function's only result from 256 KiB on."""
+    x = jnp.linspace(0.0, 1.0, numbers)
+
+    def step(x, p):
+        if kind == "branched":
+            return jax.lax.cond(x[0] > 0.5, lambda: jnp.sin(p * x), lambda: x + p)
+        return jnp.sin(p * x) if kind == "carried" else jnp.broadcast_to(p * x[:3].sum(), x.shape)
+
+    fast = jax.jit(lambda x, p: as_one_kernel(lambda x, p: march(step, x, p), x, p))
+    found, expected = fast(x, GAIN)[-1], march(step, x, GAIN)[-1]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 ABORTING = """
 import jax, jax.numpy as jnp
-from jaxquad.simulate._small_call import as_one_kernel
+from jaxquad._xla import as_one_kernel
 
 def march(step, x):
     return jax.lax.scan(lambda x, _: (step(x),) * 2, x, None, length=40)[1]
@@ -156,7 +179,7 @@ def test_constants_and_arguments_whose_use_is_simplified_away_do_not_end_the_pro
 SHARDED = """
 import jax, jax.numpy as jnp
 from jax.sharding import AxisType, NamedSharding, PartitionSpec as P
-from jaxquad.simulate._small_call import as_one_kernel
+from jaxquad._xla import as_one_kernel
 
 jax.config.update("jax_num_cpu_devices", 2)
 mesh = jax.make_mesh((2,), ("members",), axis_types=(AxisType.Auto,))
@@ -185,8 +208,15 @@ MISSING = """
 import sys
 import equinox, jax  # equinox needs some of them itself
 {how}
-from jaxquad.simulate._small_call import as_one_kernel, enter
+from jaxquad._xla import as_one_kernel, engine
+from jaxquad._xla._kernel import enter
 assert enter is None
+import warnings
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter('always')
+    told = engine()
+assert not told.one_kernel and 'lacks what kernels are made with' in told.why_not
+assert told.why_not in str(said[-1].message)
 x = jax.numpy.ones(3)
 assert jax.numpy.allclose(jax.jit(lambda x: as_one_kernel(jax.numpy.sin, x))(x), jax.numpy.sin(1.0))
 print("plain")
@@ -203,11 +233,13 @@ def test_without_the_compilers_interfaces_a_loop_is_plain(what):
     assert in_a_process(MISSING.format(how=WITHOUT[what])) == "plain"
 
 
-def test_an_interface_that_fails_leaves_a_program_that_runs(monkeypatch):
-    monkeypatch.setattr(_small_call_uses, "_unless_impossible", None)
+def test_an_interface_that_fails_leaves_a_program_that_runs_and_is_warned_of(monkeypatch):
+    monkeypatch.setattr(_kernel_limits, "_sum_of_firsts", None)
     run = jax.jit(lambda x, p: 2 * kernel(x, p))
-    assert TAG not in run.lower(START, GAIN).as_text()
+    with pytest.warns(UserWarning, match="cannot mark a kernel"):
+        assert TAG not in run.lower(START, GAIN).as_text()
     np.testing.assert_allclose(run(START, GAIN), 2 * plain(START, GAIN), rtol=1e-12)
+    assert any("cannot mark a kernel" in line for line in engine().left_plain)
 
 
 @pytest.mark.parametrize("odd", [jnp.zeros(0), jnp.ones(3, complex)], ids=["empty", "complex"])
