@@ -86,6 +86,7 @@ class Parameters(eqx.Module):
 
 
 def with_values(model: PyTree, places: Sequence[Place], values: Float[Array, " n"]) -> PyTree:
+    """Return `model` with the numbers at `places` replaced by `values`."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     for leaf in {place.leaf for place in places}:
