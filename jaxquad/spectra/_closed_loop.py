@@ -79,8 +79,8 @@ def _remark_on_errors(omega: np.ndarray, amplified: np.ndarray) -> tuple[str, ..
     if not lost.size:
         return ()
     return (
-        f"the closed loop hardly depends on the plant at {lost.size} of {omega.size} frequencies "
-        f"({in_hertz(lost)}): its errors are amplified more than {_AMPLIFIED:g} times there",
+        f"the closed loop hardly depends on the plant at {lost.size} of {omega.size} frequencies, "
+        f"{in_hertz(lost)}: its errors are amplified more than {_AMPLIFIED:g} times there",
     )
 
 

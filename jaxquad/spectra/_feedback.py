@@ -82,7 +82,7 @@ def _explained_by_reference(
     span = omega[dominated]
     return [
         f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
-        f"frequencies, but at {np.sum(dominated)} of them ({in_hertz(span)}) the reference "
+        f"frequencies, but at {np.sum(dominated)} of them, {in_hertz(span)}, the reference "
         "explains neither. There the controller feeds back noise, and the record holds no "
         "information on the plant. Excite these frequencies by the reference"
     ]

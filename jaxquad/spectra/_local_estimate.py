@@ -268,7 +268,7 @@ def _remark_on_lost(
     if lost.size == 0:
         return ()
     remark = (
-        f"undetermined at {lost.size} of {omega.size} frequencies ({in_hertz(lost)}): the inputs "
+        f"undetermined at {lost.size} of {omega.size} frequencies, {in_hertz(lost)}: the inputs "
         "are not excited there, or cannot be separated from each other or from transients. Excite "
         "them there, or leave these frequencies out"
     )

@@ -376,7 +376,7 @@ def _remarks(
     remarks, lost = [], omega[~fit.known]
     if lost.size:
         remarks.append(
-            f"undetermined at {lost.size} of {omega.size} lines ({in_hertz(lost)}): the inputs "
+            f"undetermined at {lost.size} of {omega.size} lines, {in_hertz(lost)}: the inputs "
             "cannot be separated there. Use different phases in each record"
         )
     unsettled = [each.settled for each in periods if each.settled > _UNSETTLED]

@@ -170,7 +170,7 @@ def remarks_on_inputs(
             span = omega[lost]
             remarks.append(
                 f"input {name} cannot be separated from the other inputs at {lost.sum()} of "
-                f"{omega.size} frequencies ({in_hertz(span)}); they are left out. Excite the "
+                f"{omega.size} frequencies, {in_hertz(span)}; they are left out. Excite the "
                 "inputs independently, one after the other or with interleaved multisines"
             )
         elif np.mean(coherence[:, i]) > _TOGETHER:

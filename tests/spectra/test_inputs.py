@@ -158,13 +158,10 @@ def test_inputs_that_cannot_be_told_apart_are_marked_where_they_cannot():
 def test_inputs_that_move_together_are_remarked():
     u = together(share=2.0)
     found = respond(u, answer(u, seed=1))
-    assert any(
-        remark.startswith("input u1 is correlated with the other inputs")
-        for remark in found.remarks
-    )
-    assert not any(
-        "is correlated with" in r for r in respond(noise(1, 2), answer(noise(1, 2))).remarks
-    )
+    correlated = "input u1 is correlated with the other inputs"
+    assert any(remark.startswith(correlated) for remark in found.remarks)
+    independent = respond(noise(1, 2), answer(noise(1, 2)))
+    assert not any("is correlated with" in remark for remark in independent.remarks)
 
 
 def test_ten_inputs_and_twenty_outputs_are_estimated_at_once():

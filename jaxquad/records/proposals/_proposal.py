@@ -110,7 +110,7 @@ class Proposal(NamedTuple):
 
     def __str__(self) -> str:
         setup = self.setup
-        none = "none: feedback biases the direct estimate, and the joint one needs a reference"
+        none = "none (feedback biases the direct estimate; the joint one needs a reference)"
         lines = [
             f"Proposal for the {setup.axis} axis of {self.path} ({self.vehicle})",
             f"  excitation: {setup.excitation}",
