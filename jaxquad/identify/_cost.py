@@ -18,7 +18,7 @@ Ratio = Float[np.ndarray, "frequencies outputs inputs"]
 Weights = Float[np.ndarray, "frequencies outputs inputs 2"]
 
 
-def coherence_weight(gamma_squared: Ratio) -> Ratio:
+def coherence_weight(gamma_squared: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Eq. (14), the weight of a point: W_gamma = [1.58 (1 - exp(-gamma^2))]^2.
 
     The paper prints it without the square. Source: docs/equations.md.

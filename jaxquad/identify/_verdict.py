@@ -73,7 +73,8 @@ class Verdict(eqx.Module):
         if self.kind == "no minimum":
             return f"no minimum was found, so no parameter is determined: {'; '.join(self.reasons)}"
         known = ", ".join(str(combination) for combination in self.combinations)
-        rest = f"only {known}" if known else "nothing of them is determined"
+        it = "it" if len(self.undetermined) == 1 else "them"
+        rest = f"only {known}" if known else f"nothing about {it} is determined"
         lost = " and ".join(self.undetermined)
         return f"not identifiable from this record, each by itself: {lost}; {rest}"
 
@@ -96,7 +97,8 @@ class Verdict(eqx.Module):
         return "\n".join([*lines, *self._remedied()])
 
     def _determined(self) -> list[str]:
-        lines = ["  nothing about them is determined by this record"]
+        it = "it" if len(self.undetermined) == 1 else "them"
+        lines = [f"  nothing about {it} is determined by this record"]
         if self.combinations:
             known = " and ".join(combination.name for combination in self.combinations)
             rows = self.null_directions
