@@ -252,8 +252,8 @@ def test_mixing_the_outputs_and_their_noise_changes_nothing():
     omega = np.linspace(1.0, 10.0, 5)
     mixing = np.array([[1.0, 0.5], [-0.3, 2.0]])
     cross = np.array([[1.0, 0.4 + 0.2j], [0.4 - 0.2j, 2.0]])
-    signal = jq.multisine(jq.excitation.harmonics(1.0, 10.0, period=PERIOD), period=PERIOD, periods=1,
-                          sample_rate=RATE, amplitude=1.0)  # fmt: skip
+    lines = jq.excitation.harmonics(1.0, 10.0, period=PERIOD)
+    signal = jq.multisine(lines, period=PERIOD, periods=1, sample_rate=RATE, amplitude=1.0)
     one, other = (
         predict_accuracy(
             TwoOutputs(PLANT, m), signal, free=("plant.gain", "plant.lag"),
@@ -320,7 +320,7 @@ def test_the_signal_repeats_and_starts_near_zero(sharp):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (dict(amplitude=0.0), "amplitude is 0.0: it has to be positive"),
+        (dict(amplitude=0.0), "amplitude is 0.0, but it must be above 0"),
         (dict(rate=-1.0), "the limit of rate is -1.0"),
         (dict(output_amplitude=[1.0, 2.0]), "output_amplitude has 2 values for 1 outputs"),
         (dict(noise=0.0), "the noise density at .* is 0 units"),

@@ -132,7 +132,7 @@ def test_a_parameter_without_effect_is_named():
     frf = response_of(RIG, seed=0)
     fit = jq.fit(start(), frf, free=("K_t", "lag", jq.identify.Real("K_af", scale=1e-9)), cost=ML)
     assert fit.verdict.undetermined == ("K_af",)
-    assert "nothing about them is determined" in str(fit)
+    assert "nothing about it is determined" in str(fit)
     assert np.isfinite(fit.values[:2]).all()
 
 
