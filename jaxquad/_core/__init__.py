@@ -4,19 +4,30 @@ from ._arrays import (
     as_float_or_none as as_float_or_none,
     is_concrete as is_concrete,
     is_zero as is_zero,
+)
+from ._checks import (
+    Number as Number,
+    require_all_nonnegative as require_all_nonnegative,
+    require_all_positive as require_all_positive,
+    require_band as require_band,
     require_finite as require_finite,
     require_nonnegative as require_nonnegative,
     require_positive as require_positive,
     require_vector as require_vector,
-)
-from ._checks import (
-    check_band as check_band,
-    check_not_negative as check_not_negative,
-    check_positive as check_positive,
-    Number as Number,
     whole_samples as whole_samples,
 )
 from ._files import write_file as write_file
+from ._gains import (
+    broadcast_gain as broadcast_gain,
+    match_reference as match_reference,
+    multiply_gains as multiply_gains,
+    pick_gain as pick_gain,
+    require_below_sampling as require_below_sampling,
+    require_common_shape as require_common_shape,
+    require_limit as require_limit,
+    require_sample_interval as require_sample_interval,
+    signal_shape as signal_shape,
+)
 from ._levenberg_marquardt import (
     advance as advance,
     begin as begin,
@@ -37,17 +48,6 @@ from ._members import (
     ensemble_shape as ensemble_shape,
     mark_members as mark_members,
     per_member as per_member,
-)
-from ._per_axis import (
-    fit as fit,
-    full_shape as full_shape,
-    matched as matched,
-    pick as pick,
-    require_below as require_below,
-    require_limit as require_limit,
-    require_sample as require_sample,
-    require_shapes as require_shapes,
-    times as times,
 )
 from ._precision import (
     enable_x64 as enable_x64,

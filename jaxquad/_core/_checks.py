@@ -1,26 +1,67 @@
+"""Numbers and arrays that a user gives: refused at once, by name and with the remedy."""
+
+from collections.abc import Callable
+
 import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ._arrays import is_concrete
 
 
 Number = float | int
 
 
-def check_positive(**values: Number) -> None:
-    """Raise ValueError for the first of the named values that is not a positive number."""
+def require_vector(name: str, value: Array, length: int) -> None:
+    """Raise ValueError unless `value` is `[length]` or `[length, members]`."""
+    if value.ndim == 0 or value.shape[0] != length:
+        raise ValueError(
+            f"{name} has shape {value.shape}, but it must be ({length},), or ({length}, members) "
+            "for an ensemble: give one value for each axis."
+        )
+
+
+def require_finite(name: str, value: ArrayLike) -> None:
+    """Raise ValueError for an inf or nan in `value`."""
+    _require(name, value, np.isfinite, "finite", "look for the NaN or inf in it")
+
+
+def require_positive(name: str, value: ArrayLike, remedy: str = "") -> None:
+    """Raise ValueError unless all of `value` is above 0 and finite."""
+    _require(name, value, lambda x: (x > 0) & np.isfinite(x), "above 0 and finite", remedy)
+
+
+def require_nonnegative(name: str, value: ArrayLike, remedy: str = "") -> None:
+    """Raise ValueError unless all of `value` is 0 or above, and finite."""
+    _require(name, value, lambda x: (x >= 0) & np.isfinite(x), "0 or above and finite", remedy)
+
+
+def require_all_positive(**values: ArrayLike) -> None:
+    """`require_positive` for each of the named values."""
     for name, value in values.items():
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name} is {value}: it has to be positive and finite.")
+        require_positive(name, value)
 
 
-def check_not_negative(**values: Number) -> None:
-    """Raise ValueError for the first of the named values that is negative or not finite."""
+def require_all_nonnegative(**values: ArrayLike) -> None:
+    """`require_nonnegative` for each of the named values."""
     for name, value in values.items():
-        if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} is {value}: it has to be zero or positive, and finite.")
+        require_nonnegative(name, value)
 
 
-def check_band(omega_min: Number, omega_max: Number, sample_rate: Number) -> None:
+def _require(
+    name: str,
+    value: ArrayLike,
+    valid: Callable[[np.ndarray], np.ndarray],
+    limit: str,
+    remedy: str,
+) -> None:
+    if is_concrete(value) and not np.all(valid(np.asarray(value))):
+        text = f"{name} is {value}, but it must be {limit}"
+        raise ValueError(f"{text}: {remedy}." if remedy else f"{text}.")
+
+
+def require_band(omega_min: Number, omega_max: Number, sample_rate: Number) -> None:
     """Raise ValueError unless 0 < omega_min < omega_max < Nyquist (rad/s, Hz)."""
-    check_positive(omega_min=omega_min, omega_max=omega_max, sample_rate=sample_rate)
+    require_all_positive(omega_min=omega_min, omega_max=omega_max, sample_rate=sample_rate)
     if omega_max <= omega_min:
         raise ValueError(
             f"omega_max {omega_max:.6g} rad/s is not above omega_min {omega_min:.6g} rad/s."

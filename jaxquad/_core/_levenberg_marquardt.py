@@ -164,8 +164,8 @@ def minimise_on_host(
     """The descent of `minimise` for one problem, as a loop of Python; also its status and steps.
 
     `move` makes the next point from a point and a step, whose coordinates may be those of that
-    point alone. For a few steps whose evaluation is compiled already, or is NumPy: compiling the loop would
-    take longer than running it. It ends at a step below `tolerance` relative to 1 + |z|, or one
+    point alone. For a few steps whose evaluation is compiled already, or is NumPy: compiling the
+    loop would take longer than running it. It ends at a step below `tolerance` relative to 1 + |z|, or one
     that would save less than `saving` of the cost. RUNNING means that the steps are used up.
     """
     here, damping, growth = start, 1e-3, 2.0

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import check_positive, ensemble_shape, fit, full_shape
+from jaxquad._core import broadcast_gain, ensemble_shape, require_all_positive, signal_shape
 
 from ._ladrc import LADRC, LADRCLaw, LADRCState
 from ._protocols import InertiaEstimator, ProbingEstimator, Reference, Transform
@@ -55,7 +55,7 @@ class AdaptiveLADRC(eqx.Module):
     settling: float = eqx.field(static=True, default=0.5)  # s
 
     def __check_init__(self):
-        check_positive(settling=self.settling)
+        require_all_positive(settling=self.settling)
         if not isinstance(self.estimator, InertiaEstimator):
             raise ValueError(
                 f"estimator is {self.estimator!r}: give an object with the methods init, update "
@@ -135,7 +135,7 @@ class AdaptiveLADRC(eqx.Module):
         measurement: Float[Array, " axes *ensemble"] | None = None,
     ) -> AdaptiveLADRCState:
         """At rest at angle 0, or at `measurement` in rad; shaped as `like` and the ensemble."""
-        full = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        full = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         return AdaptiveLADRCState(self.ladrc.init(full, measurement), self.estimator.init(full))
 
     def step(
@@ -149,7 +149,7 @@ class AdaptiveLADRC(eqx.Module):
         b0 = self._adapt(state.ladrc.b0, memory)
         ladrc, command = self.ladrc.step_with(state.ladrc, reference, measurement, b0)
         if isinstance(self.estimator, ProbingEstimator):
-            limit = fit(self.ladrc.limit, command)
+            limit = broadcast_gain(self.ladrc.limit, command)
             command = jnp.clip(command + self.estimator.probe(memory), -limit, limit)
             ladrc = self.ladrc.applied(ladrc, command)
         return AdaptiveLADRCState(ladrc, memory), command

@@ -10,18 +10,18 @@ from jaxtyping import Array, Float
 from jaxquad._core import (
     align,
     as_float,
+    broadcast_gain,
     ensemble_shape,
-    fit,
-    full_shape,
-    matched,
+    match_reference,
+    multiply_gains,
     per_member,
-    pick,
-    require_below,
+    pick_gain,
+    require_below_sampling,
+    require_common_shape,
     require_limit,
     require_positive,
-    require_sample,
-    require_shapes,
-    times,
+    require_sample_interval,
+    signal_shape,
 )
 from jaxquad.models import TransferFunction
 
@@ -100,10 +100,10 @@ class LADRCLaw(eqx.Module):
         like: Float[Array, " axes *ensemble"],
         measurement: Float[Array, " axes *ensemble"] | None = None,
     ) -> LADRCState:
-        zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         first = zero if measurement is None else zero + align(measurement, zero)
         estimate = jnp.stack([first] + [zero] * (len(self.gains.correction) - 1))
-        return LADRCState(estimate, zero, zero + fit(self.b0, zero))
+        return LADRCState(estimate, zero, zero + broadcast_gain(self.b0, zero))
 
     def step(
         self, state: LADRCState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
@@ -118,7 +118,7 @@ class LADRCLaw(eqx.Module):
         b0: Float[Array, "..."],
     ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
         # f = y'' - b0 u: another b0 moves the disturbance, so that y'' and u stay as they are.
-        unknown = state.estimate[-1] + (state.b0 - fit(b0, measurement)) * state.command
+        unknown = state.estimate[-1] + (state.b0 - broadcast_gain(b0, measurement)) * state.command
         return self._advance(state, unknown, reference, measurement, b0)
 
     def applied(self, state: LADRCState, achieved: Float[Array, " axes *ensemble"]) -> LADRCState:
@@ -128,16 +128,16 @@ class LADRCLaw(eqx.Module):
         return {"disturbance": state.estimate[-1] / state.b0}
 
     def _advance(self, state, unknown, reference, measurement, b0):
-        reference = matched(reference, measurement, state.command)
+        reference = match_reference(reference, measurement, state.command)
         # Row by row: stacks and slices of the estimate cost most of a reverse pass.
-        b0 = jnp.broadcast_to(fit(b0, measurement), measurement.shape)
+        b0 = jnp.broadcast_to(broadcast_gain(b0, measurement), measurement.shape)
         estimate = [*state.estimate[:-1], unknown]
         predicted = self.observer.predict(estimate, b0 * state.command, self.dt)
         error = measurement - predicted[0]
-        gains = [fit(row, measurement) for row in self.gains.correction]
+        gains = [broadcast_gain(row, measurement) for row in self.gains.correction]
         corrected = [x + l * error for x, l in zip(predicted, gains, strict=True)]
         command = self._feedback(corrected if self.observer.current else predicted, reference) / b0
-        limit = fit(self.limit, command)
+        limit = broadcast_gain(self.limit, command)
         command = jnp.clip(command, -limit, limit)
         return LADRCState(jnp.stack(corrected), command, b0), command
 
@@ -145,11 +145,11 @@ class LADRCLaw(eqx.Module):
         """The wanted b0 u in rad/s^2; order 1 in rad/s."""
         ahead = isinstance(reference, Setpoint)
         angle = reference.angle if ahead else reference
-        drive = fit(self.gains.proportional, angle) * (angle - estimate[0]) - estimate[-1]
+        drive = broadcast_gain(self.gains.proportional, angle) * (angle - estimate[0]) - estimate[-1]
         if self.gains.derivative is None:
             return drive + reference.rate if ahead else drive
         error = reference.rate - estimate[1] if ahead else -estimate[1]
-        drive = drive + fit(self.gains.derivative, angle) * error
+        drive = drive + broadcast_gain(self.gains.derivative, angle) * error
         return drive + reference.acceleration if ahead else drive
 
 
@@ -252,15 +252,15 @@ class LADRC(eqx.Module):
 
     def __check_init__(self):
         _require_choices(self)
-        require_sample(self.dt)
+        require_sample_interval(self.dt)
         for name, gain in _gains(self).items():
             if name == "limit":
                 require_limit(gain)
             else:
-                require_positive(name, gain, _REMEDIES.get(name, "1 leaves the gains, 0.5 halves"))
-        require_shapes(_gains(self))
-        require_below("wc", self.wc, fastest_feedback(self.order, self.placement), self.dt)
-        require_below("wo", self.wo, self.observer.fastest, self.dt)
+                require_positive(name, gain, _REMEDIES.get(name, "1 keeps the gains, 0.5 halves them"))
+        require_common_shape(_gains(self))
+        require_below_sampling("wc", self.wc, fastest_feedback(self.order, self.placement), self.dt)
+        require_below_sampling("wo", self.wo, self.observer.fastest, self.dt)
 
     @property
     def gains(self) -> LADRCGains:
@@ -268,9 +268,9 @@ class LADRC(eqx.Module):
         kp, kd = feedback_gains(self.wc, self.dt, self.order, self.placement)
         correction = self.observer.correction(self.wo, self.dt, self.order)
         return LADRCGains(
-            times(kp, self.feedback_factor),
-            None if kd is None else times(kd, self.feedback_factor),
-            times(correction, self.observer_factor[None]),
+            multiply_gains(kp, self.feedback_factor),
+            None if kd is None else multiply_gains(kd, self.feedback_factor),
+            multiply_gains(correction, self.observer_factor[None]),
         )
 
     @property
@@ -323,7 +323,7 @@ class LADRC(eqx.Module):
 
     def linear(self, axis: int = 0, member: Member = None) -> LinearController:
         """One axis without its limit, exactly; `member` picks one member of an ensemble."""
-        at = lambda gain: pick(gain, axis, member)
+        at = lambda gain: pick_gain(gain, axis, member)
         whole = self.gains
         correction = jnp.stack([at(row) for row in whole.correction])
         slope = None if whole.derivative is None else at(whole.derivative)
@@ -379,7 +379,7 @@ class LADRC(eqx.Module):
         C is a PID with a second-order filter (order 1: PI with one of first order), F/C the
         prefilter of the reference.
         """
-        at = lambda gain: pick(gain, axis, member)
+        at = lambda gain: pick_gain(gain, axis, member)
         factors = at(self.feedback_factor), at(self.observer_factor)
         return continuous_ladrc(at(self.wc), at(self.wo), at(self.b0), self.order, factors)
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import times
+from jaxquad._core import multiply_gains
 
 from ._protocols import Observer
 
@@ -168,7 +168,7 @@ def slowness_in_words(
     error: Float[Array, "... states states"], wc: Float[Array, "..."], dt: float, named: str
 ) -> str:
     """Empty for an observer whose error decays at least as fast as exp(-wc t)."""
-    ratio = np.asarray(times(1 / wc, jnp.asarray(-np.log(_radius(error)) / dt)))
+    ratio = np.asarray(multiply_gains(1 / wc, jnp.asarray(-np.log(_radius(error)) / dt)))
     if np.all(ratio >= 1):
         return ""
     return (
@@ -190,7 +190,7 @@ def barrier(
     where it is unstable. NaN for a slower observer.
     """
     pairs = zip(_room(error, wc, dt), _room(full, 0 * wc, dt), strict=True)
-    share = [times(x, 1 / whole) for x, whole in pairs]
+    share = [multiply_gains(x, 1 / whole) for x, whole in pairs]
     return sum((jnp.mean(0.5 * jnp.log1p(x**2) - jnp.log(x)) for x in share), jnp.zeros(()))
 
 
@@ -199,18 +199,18 @@ def _room(
 ) -> list[Float[Array, "..."]]:
     """What is above 0 while every root of the error's polynomial is within exp(-decay dt)."""
     states, closer = error.shape[-1], jnp.exp(decay * dt)
-    trace = times(jnp.trace(error, axis1=-2, axis2=-1), closer)
-    determinant = times(jnp.linalg.det(error), closer**states)
+    trace = multiply_gains(jnp.trace(error, axis1=-2, axis2=-1), closer)
+    determinant = multiply_gains(jnp.linalg.det(error), closer**states)
     if states == 2:
         return [1 - trace + determinant, 1 - determinant]
-    square = times(jnp.trace(error @ error, axis1=-2, axis2=-1), closer**2)
+    square = multiply_gains(jnp.trace(error @ error, axis1=-2, axis2=-1), closer**2)
     minors = 0.5 * (trace**2 - square)
     real = 1 - trace + minors - determinant
     return [real, 1 - minors + determinant * (trace - determinant)]
 
 
 def _radius(error: Float[Array, "... states states"]) -> Float[np.ndarray, "..."]:
-    return np.max(np.abs(np.linalg.eigvals(np.asarray(error))), axis=-1)
+    return np.asarray(np.max(np.abs(np.linalg.eigvals(np.asarray(error))), axis=-1))
 
 
 def list_range(values: Float[Array, "..."]) -> str:

@@ -10,19 +10,19 @@ from jaxquad._core import (
     align,
     as_float,
     as_float_or_none,
-    check_positive,
+    broadcast_gain,
     ensemble_shape,
-    fit,
-    full_shape,
-    matched,
+    match_reference,
     per_member,
-    pick,
-    require_below,
+    pick_gain,
+    require_all_positive,
+    require_below_sampling,
+    require_common_shape,
     require_finite,
     require_limit,
     require_positive,
-    require_sample,
-    require_shapes,
+    require_sample_interval,
+    signal_shape,
 )
 
 from ._protocols import AntiWindup, LinearController, Member, Reference, Setpoint, Transform
@@ -69,7 +69,7 @@ class BackCalculation(eqx.Module):
         given: Float[Array, " axes *ensemble"],
         dt: float,
     ) -> Float[Array, " axes *ensemble"]:
-        follow = -jnp.expm1(-dt / fit(self.time, given))  # a sample's part, whatever the time
+        follow = -jnp.expm1(-dt / broadcast_gain(self.time, given))  # a sample's part, whatever the time
         return growth + follow * (given - wanted)
 
 
@@ -93,7 +93,7 @@ def filtered(
     transition: Transition, before: Filtered, measurement: Float[Array, " axes *ensemble"]
 ) -> Filtered:
     """A sample later, exactly for a measurement that was held over the sample before it."""
-    (aa, ar), (ra, rr) = [[fit(gain, measurement) for gain in row] for row in transition]
+    (aa, ar), (ra, rr) = [[broadcast_gain(gain, measurement) for gain in row] for row in transition]
     away, rate = before[0] - measurement, before[1]
     return measurement + aa * away + ar * rate, ra * away + rr * rate
 
@@ -128,7 +128,7 @@ class PIDLaw(eqx.Module):
         like: Float[Array, " axes *ensemble"],
         measurement: Float[Array, " axes *ensemble"] | None = None,
     ) -> PIDState:
-        zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         first = zero if measurement is None else zero + align(measurement, zero)
         smooth = None if self.transition is None else (first, zero)
         return PIDState(zero, zero, jnp.zeros((), like.dtype), smooth)
@@ -136,8 +136,8 @@ class PIDLaw(eqx.Module):
     def step(
         self, state: PIDState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
     ) -> tuple[PIDState, Float[Array, " axes *ensemble"]]:
-        reference = matched(reference, measurement, state.integral)
-        gain = lambda name: fit(self.gains[name], measurement)
+        reference = match_reference(reference, measurement, state.integral)
+        gain = lambda name: broadcast_gain(self.gains[name], measurement)
         angle = reference.angle if isinstance(reference, Setpoint) else reference
         smooth, seen = state.filtered, measurement
         if self.transition is not None and smooth is not None:
@@ -162,7 +162,7 @@ class PIDLaw(eqx.Module):
 
     def _rate(self, state, reference, measurement, smooth):
         """What the filter of the derivative remembers, and the filtered rate of the error."""
-        keep = jnp.exp(-self.dt * fit(self.gains["filter"], measurement))
+        keep = jnp.exp(-self.dt * broadcast_gain(self.gains["filter"], measurement))
         sharp = (1 - keep) / self.dt
         differenced = measurement if smooth is None else jnp.zeros_like(measurement)
         if isinstance(reference, Setpoint):
@@ -170,7 +170,7 @@ class PIDLaw(eqx.Module):
             ahead = reference.rate - 0.5 * self.dt * reference.acceleration
             change, given = -differenced, (1 - keep) * ahead
         else:
-            weight = fit(self.gains["derivative_weight"], measurement)
+            weight = broadcast_gain(self.gains["derivative_weight"], measurement)
             change = weight * reference - differenced
             given = jnp.zeros_like(measurement)
         rate = state.started * (state.rate + sharp * change + given)
@@ -274,7 +274,7 @@ class PID(eqx.Module):
                 f"anti_windup is {self.anti_windup!r}: choose Clamping(), BackCalculation(time), "
                 "None, or give a function as jq.control.AntiWindup describes it."
             )
-        require_sample(self.dt)
+        require_sample_interval(self.dt)
         for name, gain in _gains(self).items():
             if name == "limit":
                 require_limit(gain)
@@ -282,9 +282,9 @@ class PID(eqx.Module):
                 require_positive(name, gain, _BANDWIDTHS[name])
             else:
                 require_finite(name, gain)
-        require_shapes(_gains(self))
+        require_common_shape(_gains(self))
         if self.measurement_filter is not None:
-            require_below("measurement_filter", self.measurement_filter, _FASTEST, self.dt)
+            require_below_sampling("measurement_filter", self.measurement_filter, _FASTEST, self.dt)
 
     @property
     def ensemble(self) -> tuple[int, ...]:
@@ -320,7 +320,7 @@ class PID(eqx.Module):
 
     def linear(self, axis: int = 0, member: Member = None) -> LinearController:
         """One axis without its limit, exactly; `member` picks one of an ensemble."""
-        gains = {name: pick(gain, axis, member) for name, gain in _gains(self).items()}
+        gains = {name: pick_gain(gain, axis, member) for name, gain in _gains(self).items()}
         return linear_pid(gains, self.dt)
 
     def tunable(self) -> dict[str, Transform | None]:
@@ -380,8 +380,8 @@ class PD(eqx.Module):
     dt: float = eqx.field(static=True, default=0.002)
 
     def __check_init__(self):
-        check_positive(dt=self.dt, bandwidth=self.bandwidth)
-        require_shapes({"proportional": self.proportional, "derivative": self.derivative})
+        require_all_positive(dt=self.dt, bandwidth=self.bandwidth)
+        require_common_shape({"proportional": self.proportional, "derivative": self.derivative})
 
     @property
     def ensemble(self) -> tuple[int, ...]:
@@ -390,7 +390,7 @@ class PD(eqx.Module):
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> PDState:
         """At rest; shaped as the measurement `like` and the ensemble of the gains."""
-        zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         return PDState(zero, zero, jnp.zeros((), like.dtype))
 
     def step(
@@ -413,7 +413,7 @@ class PD(eqx.Module):
         keep = jnp.exp(jnp.asarray(-self.bandwidth * self.dt, measurement.dtype))
         slope = (measurement - state.measurement) * (state.started / self.dt)
         rate = keep * state.rate + (1 - keep) * slope
-        gain, damping = fit(self.proportional, measurement), fit(self.derivative, measurement)
+        gain, damping = broadcast_gain(self.proportional, measurement), broadcast_gain(self.derivative, measurement)
         command = gain * (reference - measurement) - damping * rate
         return PDState(measurement, rate, jnp.ones_like(state.started)), command
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._core import as_float, ensemble_shape, full_shape, require_positive, times
+from jaxquad._core import as_float, ensemble_shape, multiply_gains, require_positive, signal_shape
 
 from ._ladrc import LADRC
 from ._pid import PID
@@ -100,8 +100,8 @@ class ScheduledPID(eqx.Module):
         """
         per_gain, pid = 1 / gain_at(self.map, inertia), self.pid
         return dataclasses.replace(
-            pid, kp=times(pid.kp, per_gain), ki=times(pid.ki, per_gain),
-            kd=times(pid.kd, per_gain), feedforward=times(pid.feedforward, per_gain),
+            pid, kp=multiply_gains(pid.kp, per_gain), ki=multiply_gains(pid.ki, per_gain),
+            kd=multiply_gains(pid.kd, per_gain), feedforward=multiply_gains(pid.feedforward, per_gain),
         )  # fmt: skip
 
     def tunable(self) -> dict[str, Transform | None]:
@@ -119,7 +119,7 @@ def gain_at(map: InertiaToGain, inertia: Float[ArrayLike, "..."]) -> Array:
     require_positive("inertia", inertia, "give kg m^2")
     if inertia.ndim == 0:
         raise ValueError(f"inertia is {inertia}: give one value per axis, in kg m^2.")
-    shape = full_shape(inertia, ensemble_shape(map))
+    shape = signal_shape(inertia, ensemble_shape(map))
     wide = inertia.reshape(inertia.shape + (1,) * (len(shape) - inertia.ndim))
     return as_float(map(jnp.broadcast_to(wide, shape)))
 

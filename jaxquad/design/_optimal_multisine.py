@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxquad._core import check_positive, require_x64, whole_samples
+from jaxquad._core import require_all_positive, require_x64, whole_samples
 from jaxquad.excitation import check_lines, Excitation, harmonics
 from jaxquad.identify import Free, select_parameters
 
@@ -169,7 +169,7 @@ def _whole_period(
     """Samples of a period."""
     if not models:
         raise ValueError("the list of models is empty: give one, or several that may be true")
-    check_positive(amplitude=amplitude, period=period, sample_rate=sample_rate)
+    require_all_positive(amplitude=amplitude, period=period, sample_rate=sample_rate)
     if periods < 1 or periods != int(periods):
         raise ValueError(f"periods is {periods}: give a whole number, 1 or more")
     return whole_samples("period", period, sample_rate)

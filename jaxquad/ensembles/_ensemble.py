@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Key
 
-from jaxquad._core import check_positive
+from jaxquad._core import require_all_positive
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 
@@ -88,7 +88,7 @@ def _check_ensemble(ensemble: "Ensemble") -> None:
         raise ValueError(
             f"payload is {ensemble.payload!r}: give a jq.ensembles.Payload(added, at=...)"
         )
-    check_positive(gust_corner=ensemble.gust_corner)
+    require_all_positive(gust_corner=ensemble.gust_corner)
     given = ensemble.distributions
     _check_names(ensemble, given)
     for name, one in given.items():

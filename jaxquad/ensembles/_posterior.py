@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import as_float, check_positive, is_zero, require_positive
+from jaxquad._core import as_float, is_zero, require_all_positive, require_positive
 from jaxquad.identify import check_drawable, draw_models, Fit, known_covariance, UndeterminedError
 from jaxquad.models import (
     AttitudeAxis,
@@ -190,7 +190,7 @@ class Posterior(eqx.Module):
         - `ValueError`: the fit found no minimum or has no finite errors, or its model is not known.
         """
         if recorded_dt is not None:
-            check_positive(recorded_dt=recorded_dt)
+            require_all_positive(recorded_dt=recorded_dt)
         check_drawable(fit, hold_undetermined=True)
         self.fit, self.build = fit, _choose_builder(fit.model, believed, plant)
         self.held_back = 0.0 if recorded_dt is None else recorded_dt / 2

@@ -2,7 +2,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxquad._core import check_positive, Number
+from jaxquad._core import Number, require_all_positive
 
 from ._excitation import Excitation
 
@@ -54,10 +54,10 @@ def check_guidelines(
     if excitation.kind in ("sweep", "multisine"):
         rules += [_record_length(excitation), _range(excitation), _window(excitation)]
         if omega_bandwidth is not None:
-            check_positive(omega_bandwidth=omega_bandwidth)
+            require_all_positive(omega_bandwidth=omega_bandwidth)
             rules.append(_low_end(excitation, omega_bandwidth))
         if omega_180 is not None:
-            check_positive(omega_180=omega_180)
+            require_all_positive(omega_180=omega_180)
             rules.append(_high_end(excitation, omega_180))
     if excitation.kind == "sweep":
         rules += [_lead_in(excitation), _trim(excitation)]

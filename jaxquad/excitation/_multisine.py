@@ -4,7 +4,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxquad._core import check_band, check_positive, Number, whole_samples
+from jaxquad._core import Number, require_all_positive, require_band, whole_samples
 
 from ._excitation import Excitation
 
@@ -37,7 +37,7 @@ def harmonics(
 
     - `ValueError`: where the band holds fewer than two harmonics, or fewer than `lines`.
     """
-    check_positive(omega_min=omega_min, omega_max=omega_max, period=period)
+    require_all_positive(omega_min=omega_min, omega_max=omega_max, period=period)
     base = 2 * np.pi / period
     first = int(np.ceil(omega_min / base - 1e-9))
     last = int(np.floor(omega_max / base + 1e-9))
@@ -89,7 +89,7 @@ def multisine(
         period that is not a whole number of samples.
     """
     omega = np.asarray(omega, dtype=np.float64)
-    check_positive(period=period, amplitude=amplitude, sample_rate=sample_rate)
+    require_all_positive(period=period, amplitude=amplitude, sample_rate=sample_rate)
     if periods < 1:
         raise ValueError(f"periods is {periods}: use at least 1, and 3 or more to estimate noise.")
     check_lines(omega, period, sample_rate)
@@ -138,7 +138,7 @@ def check_lines(omega: Lines, period: Number, sample_rate: Number) -> None:
     """Raise ValueError unless the lines (rad/s) are increasing harmonics of the period (s)."""
     if omega.size < 2 or not (np.diff(omega) > 0).all():
         raise ValueError(f"{omega.size} lines: give two or more in increasing order, in rad/s.")
-    check_band(float(omega[0]), float(omega[-1]), sample_rate)
+    require_band(float(omega[0]), float(omega[-1]), sample_rate)
     order = omega * period / (2 * np.pi)
     off = np.abs(order - np.round(order))
     if off.max() > 1e-6:

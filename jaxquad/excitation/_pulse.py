@@ -3,7 +3,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import check_positive, Number, whole_samples
+from jaxquad._core import Number, require_all_positive, whole_samples
 
 from ._excitation import Excitation, Kind
 
@@ -74,7 +74,7 @@ def _pulses(
     lead: Number,
     tail: Number,
 ) -> Excitation:
-    check_positive(width=width, amplitude=amplitude, sample_rate=sample_rate)
+    require_all_positive(width=width, amplitude=amplitude, sample_rate=sample_rate)
     before = whole_samples("lead", lead, sample_rate, fewest=0)
     after = whole_samples("tail", tail, sample_rate, fewest=0)
     shape = np.repeat(

@@ -1,7 +1,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import check_band, check_not_negative, check_positive, Number
+from jaxquad._core import Number, require_all_nonnegative, require_all_positive, require_band
 
 from ._excitation import Excitation
 
@@ -54,9 +54,9 @@ def sweep(
         print(jq.excitation.check_guidelines(sweep))
         ```
     """
-    check_band(omega_min, omega_max, sample_rate)
-    check_positive(duration=duration, amplitude=amplitude)
-    check_not_negative(lead_in_cycles=lead_in_cycles, trim=trim)
+    require_band(omega_min, omega_max, sample_rate)
+    require_all_positive(duration=duration, amplitude=amplitude)
+    require_all_nonnegative(lead_in_cycles=lead_in_cycles, trim=trim)
     lead_in = _lead_in(lead_in_cycles, omega_min, duration)
     default = min(4 * np.pi / omega_max, duration - lead_in)
     fade_in = lead_in / 2 if fade_in is None else fade_in
@@ -118,7 +118,7 @@ def _lead_in(cycles: int, omega_min: Number, duration: Number) -> float:
 
 
 def _check_fades(fade_in: Number, fade_out: Number, duration: Number) -> None:
-    check_not_negative(fade_in=fade_in, fade_out=fade_out)
+    require_all_nonnegative(fade_in=fade_in, fade_out=fade_out)
     if fade_in + fade_out > duration:
         raise ValueError(
             f"fade_in {fade_in:.6g} s and fade_out {fade_out:.6g} s do not fit into the duration "

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import expm
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from jaxquad._core import check_positive
+from jaxquad._core import require_all_positive
 
 from ._connect import realise
 from ._state_space import explicit, StateSpace
@@ -165,7 +165,7 @@ def simulate_linear(
 
     - `ValueError`: `hold` is unknown, `dt` is not positive, or `u` has another shape.
     """
-    check_positive(dt=dt)
+    require_all_positive(dt=dt)
     if hold not in _HOLDS:
         raise ValueError(f"hold is {hold!r}, which does not exist: choose one of {_HOLDS}.")
     inputs = _inputs(model, jnp.asarray(u))

@@ -4,7 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from jaxquad._core import as_float, check_positive, Number, require_finite, require_nonnegative
+from jaxquad._core import (
+    as_float,
+    Number,
+    require_all_positive,
+    require_finite,
+    require_nonnegative,
+)
 
 from ._signal import Clock, Motion, Signal, spread
 
@@ -50,7 +56,7 @@ class Pulse(Signal):
         if (self.width is None) == (self.share is None):
             raise ValueError("a pulse has either a width in s or a share of its period: give one")
         if self.period is not None:
-            check_positive(period=self.period)
+            require_all_positive(period=self.period)
         if self.share is not None:
             _check_share(self.share, self.period)
         if self.width is not None:
@@ -84,7 +90,7 @@ class Gust(Signal):
 
     def __check_init__(self):
         require_nonnegative("deviation", self.deviation, "it is a standard deviation")
-        check_positive(corner=self.corner)
+        require_all_positive(corner=self.corner)
 
     @property
     def random(self) -> bool:
@@ -123,7 +129,7 @@ def ceti_gust(gain: ArrayLike, pole: float, *, torque_gain: ArrayLike = 1.0) -> 
     of command per sqrt(s), without it in N m per sqrt(s).
     Source: Lusardi et al., J. American Helicopter Society 49 (2004), for a helicopter in hover.
     """
-    check_positive(pole=pole)
+    require_all_positive(pole=pole)
     return Gust(as_float(gain) * as_float(torque_gain) / np.sqrt(2 * pole), corner=pole)
 
 
@@ -148,6 +154,6 @@ def _check_share(share: Number, period: Number | None) -> None:
 
 
 def _check_width(width: Number, period: Number | None) -> None:
-    check_positive(width=width)
+    require_all_positive(width=width)
     if period is not None and width > period:
         raise ValueError(f"a pulse of {width} s is longer than its period of {period} s")

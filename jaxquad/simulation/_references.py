@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxquad._core import as_float, check_positive, require_finite
+from jaxquad._core import as_float, require_all_positive, require_finite
 
 from ._signal import as_signal, Clock, Motion, Signal, spread
 
@@ -34,7 +34,7 @@ class Ramp(Signal):
     at: float = eqx.field(static=True, default=0.0, kw_only=True)  # s
 
     def __check_init__(self):
-        check_positive(within=self.within)
+        require_all_positive(within=self.within)
         require_finite("after", self.after)
         require_finite("before", self.before)
 
@@ -58,7 +58,7 @@ class SmoothStep(Signal):
     at: float = eqx.field(static=True, default=0.0, kw_only=True)  # s
 
     def __check_init__(self):
-        check_positive(within=self.within)
+        require_all_positive(within=self.within)
         require_finite("after", self.after)
         require_finite("before", self.before)
 
@@ -83,7 +83,7 @@ class Sine(Signal):
     at: float = eqx.field(static=True, default=0.0, kw_only=True)  # s
 
     def __check_init__(self):
-        check_positive(period=self.period)
+        require_all_positive(period=self.period)
         require_finite("amplitude", self.amplitude)
 
     def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
@@ -110,7 +110,7 @@ class ReferenceModel(Signal):
     damping: float = eqx.field(static=True, default=1.0, kw_only=True)
 
     def __check_init__(self):
-        check_positive(natural_frequency=self.natural_frequency, damping=self.damping)
+        require_all_positive(natural_frequency=self.natural_frequency, damping=self.damping)
 
     @property
     def random(self) -> bool:

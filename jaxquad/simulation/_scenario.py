@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from jaxquad._core import as_float, check_positive, ensemble_shape, per_member, whole_samples
+from jaxquad._core import as_float, ensemble_shape, per_member, require_all_positive, whole_samples
 from jaxquad.records import AXES
 
 from ._disturbances import gauss_markov
@@ -103,7 +103,7 @@ def scenario(
     nothing but the key, the part and the axis (and on the precision: float32 draws other numbers).
     Raises ValueError for unknown axes, for times outside, and for arrays that do not fit.
     """
-    check_positive(duration=duration, dt=dt)
+    require_all_positive(duration=duration, dt=dt)
     names = _names(axes)
     members = (ensemble,) if isinstance(ensemble, int) else tuple(ensemble)
     clock = Clock(whole_samples("duration", duration, 1 / dt, fewest=2), dt, members)

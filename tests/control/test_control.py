@@ -111,5 +111,5 @@ def commands_once(pilot):
 
 @pytest.mark.parametrize("options", [dict(dt=0.0), dict(bandwidth=-1.0)])
 def test_an_impossible_filter_is_refused_with_its_values(options):
-    with pytest.raises(ValueError, match="has to be positive"):
+    with pytest.raises(ValueError, match="must be above 0"):
         PD(np.ones(3), np.ones(3), **options)

@@ -8,12 +8,12 @@ from jaxtyping import Array, Float
 
 from jaxquad._core import (
     as_float,
-    check_positive,
+    broadcast_gain,
     ensemble_shape,
-    fit,
     per_member,
+    require_all_positive,
+    require_common_shape,
     require_positive,
-    require_shapes,
 )
 
 from .._protocols import InertiaEstimate
@@ -50,8 +50,8 @@ class AbstractInertia(eqx.Module):
         remedy = "give N m per unit of command: L Kf of the Hover"
         require_positive("torque_gain", self.torque_gain, remedy)
         require_positive("nominal", self.nominal, "give the design's inertia in kg m^2")
-        require_shapes({"torque_gain": self.torque_gain, "nominal": self.nominal})
-        check_positive(dt=self.dt)
+        require_common_shape({"torque_gain": self.torque_gain, "nominal": self.nominal})
+        require_all_positive(dt=self.dt)
 
     @property
     def ensemble(self) -> tuple[int, ...]:
@@ -70,7 +70,7 @@ class AbstractInertia(eqx.Module):
     def _start(self, like: Float[Array, " axes *ensemble"]) -> LastEstimate:
         """The nominal inertia, before any excitation."""
         zero = jnp.zeros_like(like)
-        return LastEstimate(jnp.broadcast_to(fit(self.nominal, like), like.shape), zero, zero, zero)
+        return LastEstimate(jnp.broadcast_to(broadcast_gain(self.nominal, like), like.shape), zero, zero, zero)
 
     def _assess(self, last: LastEstimate) -> InertiaEstimate:
         """100 % of deviation before any excitation; it grows while the estimate ages.
@@ -82,7 +82,7 @@ class AbstractInertia(eqx.Module):
         deviation = jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 0)
         informed = last.informed > 0
         deviation = jnp.where(informed, deviation, jnp.abs(last.inertia))
-        ratio = last.inertia / fit(self.nominal, last.inertia)
+        ratio = last.inertia / broadcast_gain(self.nominal, last.inertia)
         plausible = (ratio > 1 / PLAUSIBLE) & (ratio < PLAUSIBLE)
         sure = informed & plausible & (deviation <= self.trust * last.inertia)
         return InertiaEstimate(last.inertia, deviation, sure.astype(deviation.dtype))

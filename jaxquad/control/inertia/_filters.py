@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxquad._core import as_float, fit, per_member, require_positive
+from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
 
 
 class Past(NamedTuple):
@@ -45,7 +45,7 @@ def motion(
     change = measurement - past.angle
     equation = Equation(
         (change - past.change) / dt**2,
-        fit(torque_gain, measurement) * (command + past.command) / 2,
+        broadcast_gain(torque_gain, measurement) * (command + past.command) / 2,
         (change + past.change) / (2 * dt),
         past.angle,
         (past.seen >= 2).astype(measurement.dtype),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxquad._core import check_positive, full_shape
+from jaxquad._core import require_all_positive, signal_shape
 
 from ._estimate import AbstractInertia, LastEstimate
 from ._filters import empty_past, motion, Past
@@ -257,7 +257,7 @@ class LockInInertia(AbstractInertia):
     contrast: float = eqx.field(static=True, default=10.0)
 
     def __check_init__(self):
-        check_positive(dt=self.dt, window=self.window)
+        require_all_positive(dt=self.dt, window=self.window)
         if self.nuisance not in ((), ("angle",)):
             raise ValueError(f"nuisance is {self.nuisance}: give () or ('angle',).")
         if self.nuisance and len(self.tones.frequencies) < 2:
@@ -272,7 +272,7 @@ class LockInInertia(AbstractInertia):
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> LockInState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
-        like = zero = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        like = zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         sums = self._windows().init(like)
         return LockInState(empty_past(like), sums, self._start(like), zero, zero + 1)
 

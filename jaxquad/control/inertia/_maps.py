@@ -6,14 +6,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxquad._core import (
     as_float,
+    broadcast_gain,
     ensemble_shape,
-    fit,
     is_concrete,
+    multiply_gains,
     per_member,
+    require_common_shape,
     require_finite,
     require_positive,
-    require_shapes,
-    times,
 )
 
 from .._protocols import Transform
@@ -82,12 +82,12 @@ class FuzzyMap(eqx.Module):
 
     def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
-        require_shapes({"inertia": inertia, "nominal": self.nominal, "b0": self.b0})
-        delta = inertia / fit(self.nominal, inertia)
+        require_common_shape({"inertia": inertia, "nominal": self.nominal, "b0": self.b0})
+        delta = inertia / broadcast_gain(self.nominal, inertia)
         P = self.memberships(delta)
         increments = self.increments.astype(P.dtype).reshape((-1,) + (1,) * inertia.ndim)
         db0 = jnp.sum(P * increments, axis=0) / jnp.sum(P, axis=0)  # the average weight method
-        return fit(self.b0, inertia) + db0
+        return broadcast_gain(self.b0, inertia) + db0
 
     def tunable(self) -> dict[str, Transform | None]:
         """b0; the increments may cross 0, so they need `jq.identify.Real`."""
@@ -168,8 +168,8 @@ class InertiaMap(eqx.Module):
 
     def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
-        require_shapes({"inertia": inertia, "nominal": self.nominal, "values": self.values[0]})
-        nominal = fit(self.nominal, inertia)
+        require_common_shape({"inertia": inertia, "nominal": self.nominal, "values": self.values[0]})
+        nominal = broadcast_gain(self.nominal, inertia)
         x = jnp.log(jnp.maximum(inertia / nominal, 1e-6))
         return jnp.exp(interpolate(x, self.knots, self.values))
 
@@ -190,7 +190,7 @@ def interpolate(
 ) -> Float[Array, " axes *ensemble"]:
     """Straight between the knots and constant beyond, without a search: a sum of clipped ramps."""
     knots = knots.astype(x.dtype)
-    rows = [fit(row, x) for row in values]
+    rows = [broadcast_gain(row, x) for row in values]
     y = jnp.broadcast_to(rows[0], x.shape)
     for k in range(len(rows) - 1):
         share = jnp.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0, 1)
@@ -234,5 +234,5 @@ def certainty_equivalence(
             "2 knots or more."
         )
     places = np.linspace(np.log(low), np.log(high), knots)
-    top = jnp.log(factor * times(torque_gain, 1 / nominal))
+    top = jnp.log(factor * multiply_gains(torque_gain, 1 / nominal))
     return InertiaMap(nominal, places, top[None] - places.reshape((-1,) + (1,) * top.ndim))

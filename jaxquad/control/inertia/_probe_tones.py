@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxquad._core import as_float, fit, per_member, require_nonnegative
+from jaxquad._core import as_float, broadcast_gain, per_member, require_nonnegative
 
 from .._protocols import InertiaEstimate
 
@@ -82,7 +82,7 @@ class ProbeTones(eqx.Module):
 
     def _amplitude(self, like):
         amplitude = self.amplitude[None] if self.amplitude.ndim == 0 else self.amplitude
-        return fit(amplitude, like)
+        return broadcast_gain(amplitude, like)
 
 
 class NoProbe(eqx.Module):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxquad._core import as_float, check_positive, full_shape
+from jaxquad._core import as_float, require_all_positive, signal_shape
 
 from ._estimate import AbstractInertia, LastEstimate
 from ._filters import FilterState, has_settled, MatchedFilters
@@ -123,7 +123,7 @@ class AbstractRegression(AbstractInertia):
     correlation: float = eqx.field(static=True, default=0.5, kw_only=True)  # s
 
     def __check_init__(self):
-        check_positive(correlation=self.correlation)
+        require_all_positive(correlation=self.correlation)
         unknown = set(self.nuisance) - set(NUISANCES)
         if unknown or len(set(self.nuisance)) != len(self.nuisance):
             raise ValueError(
@@ -199,7 +199,7 @@ class WindowedInertia(AbstractRegression):
     window: float = eqx.field(static=True, default=5.0)  # s
 
     def __check_init__(self):
-        check_positive(dt=self.dt, window=self.window)
+        require_all_positive(dt=self.dt, window=self.window)
         if self.samples < 50:
             raise ValueError(
                 f"A window of {self.window} s holds {self.samples} samples of {self.dt} s: give "
@@ -212,7 +212,7 @@ class WindowedInertia(AbstractRegression):
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> WindowedState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
-        like = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        like = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         filters = self._filters()
         return WindowedState(
             filters.init(like), empty_sums(filters.signals, like), self._start(like),
@@ -276,7 +276,7 @@ class RecursiveInertia(AbstractRegression):
     memory: float = eqx.field(static=True, default=3.0)  # s
 
     def __check_init__(self):
-        check_positive(dt=self.dt, memory=self.memory)
+        require_all_positive(dt=self.dt, memory=self.memory)
         if self.memory < 100 * self.dt:
             raise ValueError(
                 f"A memory of {self.memory} s is short for samples of {self.dt} s: give it "
@@ -285,7 +285,7 @@ class RecursiveInertia(AbstractRegression):
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> RecursiveState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
-        like = jnp.zeros(full_shape(like, self.ensemble), like.dtype)
+        like = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         filters = self._filters()
         return RecursiveState(
             filters.init(like), jnp.zeros_like(like), empty_sums(filters.signals, like),

@@ -11,12 +11,12 @@ from ._arrays import align, is_concrete
 from ._members import ensemble_shape
 
 
-def fit(gain: Float[Array, "..."], signal: Float[Array, "..."]) -> Float[Array, "..."]:
+def broadcast_gain(gain: Float[Array, "..."], signal: Float[Array, "..."]) -> Float[Array, "..."]:
     """A gain that broadcasts over `signal`, in its precision."""
     return align(gain, signal).astype(signal.dtype)
 
 
-def matched(
+def match_reference(
     reference: Any, measurement: Float[Array, " axes *ensemble"], state: Float[Array, "..."]
 ) -> Any:
     """A set-point that broadcasts over the `measurement`, in its precision.
@@ -28,23 +28,23 @@ def matched(
             f"The measurement has shape {measurement.shape}, but the controller was started for "
             f"{state.shape}: give init() an array of the measurements' shape."
         )
-    return jax.tree.map(lambda x: fit(x, measurement), reference)
+    return jax.tree.map(lambda x: broadcast_gain(x, measurement), reference)
 
 
-def times(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+def multiply_gains(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
     """The product of two gains; the one with fewer trailing axes holds for all members."""
     rank = max(a.ndim, b.ndim)
     a, b = (x.reshape(x.shape + (1,) * (rank - x.ndim)) for x in (a, b))
     return a * b
 
 
-def full_shape(like: Float[Array, " axes ..."], ensemble: tuple[int, ...]) -> tuple[int, ...]:
+def signal_shape(like: Float[Array, " axes ..."], ensemble: tuple[int, ...]) -> tuple[int, ...]:
     """Of a signal as wide as `like` and as the `ensemble` of the gains."""
     gains = jax.ShapeDtypeStruct((1, *ensemble), like.dtype)
     return like.shape[:1] + ensemble_shape(like, gains, rank=1)
 
 
-def pick(
+def pick_gain(
     gain: Float[Array, "..."], axis: int, member: int | tuple[int, ...] | Any
 ) -> Float[Array, ""]:
     """The value for one axis of one member. Raises ValueError for one that does not exist."""
@@ -69,7 +69,7 @@ def _index(member: Any, size: int) -> Any:
     return 0 if size == 1 else member
 
 
-def require_shapes(gains: Mapping[str, Array]) -> None:
+def require_common_shape(gains: Mapping[str, Array]) -> None:
     """Raises ValueError unless the gains fit together."""
     shapes = {name: gain.shape for name, gain in gains.items() if gain.ndim}
     text = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
@@ -90,12 +90,12 @@ def require_limit(limit: Float[Array, "..."]) -> None:
         )
 
 
-def require_sample(dt: float) -> None:
+def require_sample_interval(dt: float) -> None:
     if not (dt > 0 and np.isfinite(dt)):
         raise ValueError(f"dt is {dt} s, but it must be above 0 and finite: give seconds.")
 
 
-def require_below(name: str, value: Array, bound: float, dt: float) -> None:
+def require_below_sampling(name: str, value: Array, bound: float, dt: float) -> None:
     """Raises ValueError unless `value` times `dt` is below `bound`."""
     if is_concrete(value) and not np.all(np.asarray(value) * dt < bound):
         raise ValueError(

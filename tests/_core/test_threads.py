@@ -1,0 +1,21 @@
+"""An estimate gives NumPy's small matrices one thread, and puts back what was there."""
+
+import pytest
+import threadpoolctl
+
+from jaxquad._core import one_blas_thread
+
+
+def threads():
+    return [x["num_threads"] for x in threadpoolctl.threadpool_info() if x["user_api"] == "blas"]
+
+
+def test_within_there_is_one_thread_and_after_an_error_too_as_many_as_before():
+    if not threads():
+        pytest.skip("NumPy's BLAS is not one that threadpoolctl knows")
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        before = threads()
+        with pytest.raises(KeyError), one_blas_thread():
+            assert set(threads()) == {1}
+            raise KeyError
+        assert threads() == before
