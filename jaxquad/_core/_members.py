@@ -1,13 +1,13 @@
 """The members of an ensemble: which axes of which arrays they are on.
 
-A field declares it: `per_member(rank)` says that the first `rank` axes of its arrays are the
+A field declares it: `per_member(rank=...)` says that the first `rank` axes of its arrays are the
 field's own (1 for `[axes]`, 2 for `[samples, axes]`), and that all axes after them are the
 ensemble's. What is not declared is the same for all members.
 """
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -20,29 +20,34 @@ Path = tuple[Any, ...]
 _ARRAYS = (jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 
-def per_member(rank: int, **options: Any) -> Any:
-    """An `equinox.field` whose arrays may have one value for each member of an ensemble.
+if TYPE_CHECKING:  # a checker then knows that the arguments of a module pass the converter
+    from equinox import field as per_member
+else:
 
-    **Arguments:**
+    def per_member(rank: int, **options: Any) -> Any:
+        """An `equinox.field` whose arrays may have one value for each member of an ensemble.
 
-    - `rank`: how many leading axes are the field's own. All axes after these are the ensemble's.
-    - `options`: those of `equinox.field`, such as `converter` and `default`.
+        **Arguments:**
 
-    **Returns:**
+        - `rank`: how many leading axes are the field's own. All axes after these are the
+            ensemble's.
+        - `options`: those of `equinox.field`, such as `converter` and `default`.
 
-    The field. It may hold one array or a tree of them: `rank` holds for all of its arrays, except
-    for those of a module within it that has declarations of its own.
+        **Returns:**
 
-    !!! example
+        The field. It may hold one array or a tree of them: `rank` holds for all of its arrays,
+        except for those of a module within it that has declarations of its own.
 
-        ```python
-        class Plant(eqx.Module):
-            inertia: Float[Array, "axes *ensemble"] = per_member(1)
-            delay: Float[Array, "*ensemble"] = per_member(0, default=0.0)
-        ```
-    """
-    metadata = {**options.pop("metadata", {}), _KEY: rank}
-    return eqx.field(metadata=metadata, **options)
+        !!! example
+
+            ```python
+            class Plant(eqx.Module):
+                inertia: Float[Array, "axes *ensemble"] = per_member(rank=1)
+                delay: Float[Array, "*ensemble"] = per_member(rank=0, default=0.0)
+            ```
+        """
+        metadata = {**options.pop("metadata", {}), _KEY: rank}
+        return eqx.field(metadata=metadata, **options)
 
 
 def ensemble_shape(*trees: PyTree, rank: int | None = None) -> tuple[int, ...]:

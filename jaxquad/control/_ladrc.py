@@ -43,9 +43,9 @@ Placement = Literal["discrete", "continuous"]
 class LADRCGains(eqx.Module):
     """The gains on errors of the angle, of the rate and of the observer, half gains included."""
 
-    proportional: Float[Array, "..."] = per_member(1)  # 1/s^2; order 1: 1/s
-    derivative: Float[Array, "..."] | None = per_member(1)  # 1/s; None for order 1
-    correction: Float[Array, "states ..."] = per_member(2)  # of the observer's prediction
+    proportional: Float[Array, "..."] = per_member(rank=1)  # 1/s^2; order 1: 1/s
+    derivative: Float[Array, "..."] | None = per_member(rank=1)  # 1/s; None for order 1
+    correction: Float[Array, "states ..."] = per_member(rank=2)  # of the observer's prediction
 
 
 def feedback_gains(
@@ -81,8 +81,8 @@ class LADRCLaw(eqx.Module):
     """A `LADRC` with its gains computed, for a loop to run sample by sample."""
 
     gains: LADRCGains
-    b0: Float[Array, "..."] = per_member(1)
-    limit: Float[Array, "..."] = per_member(1)
+    b0: Float[Array, "..."] = per_member(rank=1)
+    limit: Float[Array, "..."] = per_member(rank=1)
     observer: Observer
     dt: float = eqx.field(static=True)
 
@@ -145,7 +145,9 @@ class LADRCLaw(eqx.Module):
         """The wanted b0 u in rad/s^2; order 1 in rad/s."""
         ahead = isinstance(reference, Setpoint)
         angle = reference.angle if ahead else reference
-        drive = broadcast_gain(self.gains.proportional, angle) * (angle - estimate[0]) - estimate[-1]
+        drive = (
+            broadcast_gain(self.gains.proportional, angle) * (angle - estimate[0]) - estimate[-1]
+        )
         if self.gains.derivative is None:
             return drive + reference.rate if ahead else drive
         error = reference.rate - estimate[1] if ahead else -estimate[1]
@@ -239,15 +241,19 @@ class LADRC(eqx.Module):
         order, placement or observer is unknown.
     """
 
-    wc: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s
-    wo: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s
-    b0: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s^2 (order 1: rad/s) per unit
+    wc: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # rad/s
+    wo: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # rad/s
+    b0: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float
+    )  # rad/s^2 (order 1: rad/s) per unit
     order: int = eqx.field(static=True, default=2)
     observer: Observer = CurrentObserver()
     placement: Placement = eqx.field(static=True, default="discrete")
-    feedback_factor: Float[Array, "..."] = per_member(1, converter=as_float, default=1.0)
-    observer_factor: Float[Array, "..."] = per_member(1, converter=as_float, default=1.0)
-    limit: Float[Array, "..."] = per_member(1, converter=as_float, default=float("inf"))  # of |u|
+    feedback_factor: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
+    observer_factor: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
+    limit: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float, default=float("inf")
+    )  # of |u|
     dt: float = eqx.field(static=True, default=0.002)  # s
 
     def __check_init__(self):
@@ -257,7 +263,9 @@ class LADRC(eqx.Module):
             if name == "limit":
                 require_limit(gain)
             else:
-                require_positive(name, gain, _REMEDIES.get(name, "1 keeps the gains, 0.5 halves them"))
+                require_positive(
+                    name, gain, _REMEDIES.get(name, "1 keeps the gains, 0.5 halves them")
+                )
         require_common_shape(_gains(self))
         require_below_sampling("wc", self.wc, fastest_feedback(self.order, self.placement), self.dt)
         require_below_sampling("wo", self.wo, self.observer.fastest, self.dt)

@@ -56,7 +56,7 @@ class BackCalculation(eqx.Module):
     """
 
     time: Float[Array, "..."] = per_member(
-        1, converter=as_float
+        rank=1, converter=as_float
     )  # s; usually between kd/kp and kp/ki
 
     def __check_init__(self):
@@ -69,7 +69,9 @@ class BackCalculation(eqx.Module):
         given: Float[Array, " axes *ensemble"],
         dt: float,
     ) -> Float[Array, " axes *ensemble"]:
-        follow = -jnp.expm1(-dt / broadcast_gain(self.time, given))  # a sample's part, whatever the time
+        follow = -jnp.expm1(
+            -dt / broadcast_gain(self.time, given)
+        )  # a sample's part, whatever the time
         return growth + follow * (given - wanted)
 
 
@@ -113,8 +115,8 @@ class PIDLaw(eqx.Module):
     Without that filter the state's integral is ahead by half a sample, by the trapezoidal rule.
     """
 
-    gains: Mapping[str, Float[Array, "..."]] = per_member(1)
-    transition: Transition | None = per_member(3)
+    gains: Mapping[str, Float[Array, "..."]] = per_member(rank=1)
+    transition: Transition | None = per_member(rank=3)
     anti_windup: AntiWindup | None
     dt: float = eqx.field(static=True)
 
@@ -254,17 +256,23 @@ class PID(eqx.Module):
         `dt` is not above 0.
     """
 
-    kp: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad
-    ki: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad s
-    kd: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad/s
-    filter: Float[Array, "..."] = per_member(1, converter=as_float, default=125.0)  # rad/s: 20 Hz
-    proportional_weight: Float[Array, "..."] = per_member(1, converter=as_float, default=1.0)
-    derivative_weight: Float[Array, "..."] = per_member(1, converter=as_float, default=0.0)
-    feedforward: Float[Array, "..."] = per_member(1, converter=as_float, default=0.0)  # per rad/s^2
+    kp: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad
+    ki: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad s
+    kd: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad/s
+    filter: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float, default=125.0
+    )  # rad/s: 20 Hz
+    proportional_weight: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
+    derivative_weight: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    feedforward: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float, default=0.0
+    )  # per rad/s^2
     measurement_filter: Float[Array, "..."] | None = per_member(  # rad/s
-        1, converter=as_float_or_none, default=None
+        rank=1, converter=as_float_or_none, default=None
     )
-    limit: Float[Array, "..."] = per_member(1, converter=as_float, default=float("inf"))  # of |u|
+    limit: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float, default=float("inf")
+    )  # of |u|
     anti_windup: AntiWindup | None = Clamping()  # None: the integral winds up
     dt: float = eqx.field(static=True, default=0.002)  # s
 
@@ -374,8 +382,8 @@ class PD(eqx.Module):
     - `ValueError`: `dt` or `bandwidth` is not positive.
     """
 
-    proportional: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad
-    derivative: Float[Array, "..."] = per_member(1, converter=as_float)  # per rad/s
+    proportional: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad
+    derivative: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad/s
     bandwidth: float = eqx.field(static=True, default=125.0)  # 20 Hz
     dt: float = eqx.field(static=True, default=0.002)
 
@@ -413,7 +421,10 @@ class PD(eqx.Module):
         keep = jnp.exp(jnp.asarray(-self.bandwidth * self.dt, measurement.dtype))
         slope = (measurement - state.measurement) * (state.started / self.dt)
         rate = keep * state.rate + (1 - keep) * slope
-        gain, damping = broadcast_gain(self.proportional, measurement), broadcast_gain(self.derivative, measurement)
+        gain, damping = (
+            broadcast_gain(self.proportional, measurement),
+            broadcast_gain(self.derivative, measurement),
+        )
         command = gain * (reference - measurement) - damping * rate
         return PDState(measurement, rate, jnp.ones_like(state.started)), command
 

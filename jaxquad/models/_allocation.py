@@ -47,10 +47,12 @@ class Allocation(eqx.Module):
     - `ValueError`: convention or input is unknown, or a value is not positive.
     """
 
-    arm: Float[Array, "..."] = per_member(0, converter=as_float)  # L, m
-    thrust_coefficient: Float[Array, "..."] = per_member(0, converter=as_float)  # K_t, N/V or N s^2
+    arm: Float[Array, "..."] = per_member(rank=0, converter=as_float)  # L, m
+    thrust_coefficient: Float[Array, "..."] = per_member(
+        rank=0, converter=as_float
+    )  # K_t, N/V or N s^2
     torque_coefficient: Float[Array, "..."] = per_member(
-        0, converter=as_float
+        rank=0, converter=as_float
     )  # K_l, N m/V or N m s^2
     convention: str = eqx.field(static=True, default="frd-frbl")
     input: str = eqx.field(static=True, default="voltage")

@@ -32,10 +32,10 @@ class LinearAxis(eqx.Module):
     of the command u; d is a disturbance torque in N m. All may have an ensemble on trailing axes.
     """
 
-    A: Float[Array, "states states *ensemble"] = per_member(2)
-    command: Float[Array, "states *ensemble"] = per_member(1)
-    torque: Float[Array, "states *ensemble"] = per_member(1)
-    gain: Float[Array, "*ensemble"] = per_member(0)  # rad/s^2 per unit of a steady command
+    A: Float[Array, "states states *ensemble"] = per_member(rank=2)
+    command: Float[Array, " states *ensemble"] = per_member(rank=1)
+    torque: Float[Array, " states *ensemble"] = per_member(rank=1)
+    gain: Float[Array, "*ensemble"] = per_member(rank=0)  # rad/s^2 per unit of a steady command
 
 
 class AxesState(eqx.Module):
@@ -73,15 +73,21 @@ class DecoupledAxes(eqx.Module):
         shapes do not match.
     """
 
-    torque_gain: Float[Array, "axes ..."] = per_member(1, converter=_per_axis)  # N m per unit of u
-    inertia: Float[Array, "axes ..."] = per_member(1, converter=_per_axis)  # kg m^2
+    torque_gain: Float[Array, "axes ..."] = per_member(
+        rank=1, converter=_per_axis
+    )  # N m per unit of u
+    inertia: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)  # kg m^2
     lag: Float[Array, "axes ..."] | None = per_member(
-        1, converter=_per_axis_or_none, default=None
+        rank=1, converter=_per_axis_or_none, default=None
     )  # s
-    damping: Float[Array, "axes ..."] = per_member(1, converter=_per_axis, default=0.0)  # N m s/rad
-    stiffness: Float[Array, "axes ..."] = per_member(1, converter=_per_axis, default=0.0)  # N m/rad
+    damping: Float[Array, "axes ..."] = per_member(
+        rank=1, converter=_per_axis, default=0.0
+    )  # N m s/rad
+    stiffness: Float[Array, "axes ..."] = per_member(
+        rank=1, converter=_per_axis, default=0.0
+    )  # N m/rad
     coulomb: Float[Array, "axes ..."] | None = per_member(
-        1, converter=_per_axis_or_none, default=None
+        rank=1, converter=_per_axis_or_none, default=None
     )  # N m
 
     def __check_init__(self):
@@ -176,7 +182,9 @@ class DecoupledAxes(eqx.Module):
 def _on_axis(x: Float[Array, "axes ..."], axis: int, ensemble: tuple[int, ...]) -> Array:
     """The value of one axis for each member; where all axes share a value, that one."""
     value = x[axis if x.shape[0] > 1 else 0]
-    return jnp.broadcast_to(value.reshape(value.shape + (1,) * (len(ensemble) - value.ndim)), ensemble)
+    return jnp.broadcast_to(
+        value.reshape(value.shape + (1,) * (len(ensemble) - value.ndim)), ensemble
+    )
 
 
 def added(inertia: Float[Array, "axes ..."], extra: Float[ArrayLike, "..."]) -> Array:

@@ -32,7 +32,7 @@ class MotorLag(eqx.Module):
     - `ValueError`: the time constant is not positive. A motor without lag has no state.
     """
 
-    time_constant: Float[Array, "*ensemble"] = per_member(0, converter=as_float)  # s
+    time_constant: Float[Array, "*ensemble"] = per_member(rank=0, converter=as_float)  # s
 
     def __check_init__(self):
         remedy = "to model a motor without lag, leave the lag out (motor=None, lag=None)"

@@ -12,7 +12,7 @@ from jaxquad._core import as_float, ensemble_shape, mark_members, per_member
 
 
 class Rotor(eqx.Module):
-    lag: jax.Array = per_member(1, converter=as_float, default=0.02)
+    lag: jax.Array = per_member(rank=1, converter=as_float, default=0.02)
     curve: jax.Array = eqx.field(converter=as_float, default=(0.0, 1.0))  # of all members
 
 
@@ -24,9 +24,9 @@ class Gains(NamedTuple):
 class Plant(eqx.Module):
     """A plant as a user would write it, outside of the package."""
 
-    inertia: jax.Array = per_member(1, converter=as_float)
-    delay: jax.Array = per_member(0, converter=as_float, default=0.0)
-    gains: Gains | dict | None = per_member(1, default=None)
+    inertia: jax.Array = per_member(rank=1, converter=as_float)
+    delay: jax.Array = per_member(rank=0, converter=as_float, default=0.0)
+    gains: Gains | dict | None = per_member(rank=1, default=None)
     rotor: Rotor | None = None
     name: str = eqx.field(static=True, default="roll")
 

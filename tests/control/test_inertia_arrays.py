@@ -71,7 +71,12 @@ def test_axes_without_an_ensemble_are_heard_as_members_are(estimator):
     np.testing.assert_allclose(last[1], 2 * last[0], rtol=1e-9)
 
 
-@pytest.mark.parametrize("estimator", ALL, ids=lambda e: type(e).__name__)
+@pytest.mark.parametrize(
+    "estimator",
+    [pytest.param(ALL[0], marks=pytest.mark.slow), ALL[1],
+     pytest.param(ALL[2], marks=pytest.mark.slow)],
+    ids=lambda e: type(e).__name__,
+)  # fmt: skip
 def test_the_estimate_is_proportional_to_the_torque_gain_and_its_gradient_says_so(estimator):
     """dJ/dKT = J/KT, and dJ/ds = -J for an angle scaled by s: exact, and finite at the start."""
     record = jax.tree.map(lambda x: jnp.asarray(x[:3000, :, :1]), exact())

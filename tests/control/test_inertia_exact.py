@@ -85,6 +85,7 @@ def test_a_stiffness_of_the_rig_reads_as_less_inertia_at_one_tone():
     assert not np.any(unsure[2])
 
 
+@pytest.mark.slow
 def test_two_tones_tell_stiffness_from_inertia():
     record = fly(duration=15.02, stiffness=0.05, tones=((1.0, 1.0), (1.0, 3.0)), **EXACT)
     stiff = lock_in(tones=ProbeTones((1.0, 3.0), above=0.0), nuisance=("angle",))

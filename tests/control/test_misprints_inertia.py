@@ -1,5 +1,6 @@
 """Eq. (15)-(25), the inertia from a disturbance observer: printed against derived."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -30,12 +31,16 @@ def torque(time):
 
 def observer(time, state):
     """Derivatives of the rate under drag and load, of z in Eq. (17), of q0 and q1 in (19)."""
-    rate, z, q0, q1 = jnp.asarray(state)
-    u = jnp.asarray(torque(time))
+    return np.asarray(slopes(jnp.asarray(state), jnp.asarray(torque(time))))
+
+
+@jax.jit
+def slopes(state, u):
+    rate, z, q0, q1 = state
     A, B, _ = disturbed_axis(J)
     acceleration = A[0, 1] * (-DRAG * rate - LOAD) + B[0] * u
     z_dot, _ = observe_disturbance(z, rate, u, J_n=NOMINAL, lam=POLE)
-    return np.stack([acceleration, z_dot, *filter_signals(q0, q1, rate, u, lam=POLE)])
+    return jnp.stack([acceleration, z_dot, *filter_signals(q0, q1, rate, u, lam=POLE)])
 
 
 @pytest.fixture(scope="module")

@@ -35,6 +35,9 @@ def compiler():
         pytest.skip("no gcc to compile the headers with")
 
 
+QUICK = {"scheduled LADRC": "float"}  # double for the others; the other precision is slow
+
+
 def agree(found, expected, precision):
     scale = np.abs(expected).max(axis=0)
     within = 1e-6 if precision == "float" else 1e-12
@@ -55,8 +58,14 @@ def test_the_header_is_the_step(tmp_path, name, precision):
     agree(in_c(tmp_path, law, precision, flight=flight)[0], expected, precision)
 
 
-@pytest.mark.parametrize("precision", ["float", "double"])
-@pytest.mark.parametrize("name", list(SCHEDULED))
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [
+        pytest.param(name, kind, marks=[pytest.mark.slow] * (kind != QUICK.get(name, "double")))
+        for name in SCHEDULED
+        for kind in ("float", "double")
+    ],
+)
 def test_a_header_that_is_told_inertias_is_the_scheduled_step(tmp_path, name, precision):
     law, flight = LAWS[name], Flight(told=True)
     found, b0 = in_c(tmp_path, law, precision, flight=flight)

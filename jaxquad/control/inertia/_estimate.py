@@ -40,8 +40,10 @@ class AbstractInertia(eqx.Module):
     A plant of the inertia J answers a command u with J angle'' = `torque_gain` u + disturbances.
     """
 
-    torque_gain: Float[Array, "..."] = per_member(1, converter=as_float)  # N m per unit of command
-    nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2
+    torque_gain: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float
+    )  # N m per unit of command
+    nominal: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # kg m^2
     trust: float = eqx.field(static=True, default=0.1, kw_only=True)
     drift: float = eqx.field(static=True, default=0.01, kw_only=True)  # 1/sqrt(s)
     dt: float = eqx.field(static=True, default=0.002, kw_only=True)  # s
@@ -70,7 +72,9 @@ class AbstractInertia(eqx.Module):
     def _start(self, like: Float[Array, " axes *ensemble"]) -> LastEstimate:
         """The nominal inertia, before any excitation."""
         zero = jnp.zeros_like(like)
-        return LastEstimate(jnp.broadcast_to(broadcast_gain(self.nominal, like), like.shape), zero, zero, zero)
+        return LastEstimate(
+            jnp.broadcast_to(broadcast_gain(self.nominal, like), like.shape), zero, zero, zero
+        )
 
     def _assess(self, last: LastEstimate) -> InertiaEstimate:
         """100 % of deviation before any excitation; it grows while the estimate ages.

@@ -68,7 +68,9 @@ class MatchedFilters(eqx.Module):
     under zero-order hold, q0' = bandwidth (rate - q0), would bias the inertia by bandwidth dt / 2.
     """
 
-    torque_gain: Float[Array, "..."] = per_member(1, converter=as_float)  # N m per unit of command
+    torque_gain: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float
+    )  # N m per unit of command
     bandwidth: Float[Array, ""] = eqx.field(converter=as_float)  # rad/s
     order: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)

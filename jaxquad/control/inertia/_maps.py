@@ -40,8 +40,8 @@ class FuzzyMap(eqx.Module):
     - `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
     """
 
-    nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2
-    b0: Float[Array, "..."] = per_member(1, converter=as_float)  # rad/s^2 per unit of command
+    nominal: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # kg m^2
+    b0: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # rad/s^2 per unit of command
     centres: Float[Array, " sets"] = eqx.field(converter=as_float)  # of delta
     increments: Float[Array, " sets"] = eqx.field(converter=as_float)  # of b0
 
@@ -144,9 +144,11 @@ class InertiaMap(eqx.Module):
     - `ValueError`: the knots do not rise, or the shapes do not fit.
     """
 
-    nominal: Float[Array, "..."] = per_member(1, converter=as_float)  # kg m^2; axes *ensemble
+    nominal: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # kg m^2; axes *ensemble
     knots: Float[Array, " knots"] = eqx.field(converter=as_float)  # ln(J / nominal)
-    values: Float[Array, " knots ..."] = per_member(2, converter=as_float)  # ln b0; axes *ensemble
+    values: Float[Array, " knots ..."] = per_member(
+        rank=2, converter=as_float
+    )  # ln b0; axes *ensemble
 
     def __check_init__(self):
         require_positive("nominal", self.nominal, "give the design's inertia in kg m^2")
@@ -168,7 +170,9 @@ class InertiaMap(eqx.Module):
 
     def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
-        require_common_shape({"inertia": inertia, "nominal": self.nominal, "values": self.values[0]})
+        require_common_shape(
+            {"inertia": inertia, "nominal": self.nominal, "values": self.values[0]}
+        )
         nominal = broadcast_gain(self.nominal, inertia)
         x = jnp.log(jnp.maximum(inertia / nominal, 1e-6))
         return jnp.exp(interpolate(x, self.knots, self.values))

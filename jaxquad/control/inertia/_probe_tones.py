@@ -36,7 +36,9 @@ class ProbeTones(eqx.Module):
     """
 
     frequencies: tuple[float, ...] = eqx.field(static=True, default=(2.0,))  # Hz
-    amplitude: Float[Array, "..."] = per_member(1, converter=as_float, default=0.3)  # of each sine
+    amplitude: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float, default=0.3
+    )  # of each sine
     above: float = eqx.field(static=True, default=0.08)
     below: float = eqx.field(static=True, default=0.04)
 
