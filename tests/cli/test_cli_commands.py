@@ -10,13 +10,6 @@ import jaxquad as jq
 from jaxquad.cli import main
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("demo")
-    assert main(["demo", "--out", str(folder)]) == 0
-    return folder
-
-
 def test_the_demo_finds_the_truth_of_its_log_within_its_error_bars(demo):
     """The lag's mean over a sample and half a sample of hold are exact: no bias is allowed."""
     rows = {row["name"]: row for row in result(demo)["fit"]["parameters"]}
@@ -114,6 +107,7 @@ def test_an_autopilots_log_needs_no_channels(tmp_path, capsys):
     assert "belong together" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_all_chirps_of_a_log_are_used_together(tmp_path, capsys):
     path, out = chirped(tmp_path, starts=(22, 45)), tmp_path / "out"
     assert main(["identify", str(path), "--out", str(out), "--no-lag"]) == 0

@@ -77,6 +77,7 @@ def test_a_model_without_a_lag_has_the_whole_of_it_as_delay(flight, tmp_path, ca
     assert delay["value"] == pytest.approx(TOTAL, rel=0.05)
 
 
+@pytest.mark.slow
 def test_poles_and_zeros_of_given_orders_are_fitted(flight, tmp_path, capsys):
     orders = ("--poles", "1", "--zeros", "0", "--band", "0.5", "6")
     assert identify(flight, "--out", str(tmp_path), *orders) == 0

@@ -10,6 +10,7 @@ from conftest import ROOT
 from jaxquad.cli import main
 
 
+pytestmark = pytest.mark.slow
 PAGE = (ROOT / "docs" / "measured.md").read_text()
 COMMANDS = [
     shlex.split(block.replace("\\\n", " "))[1:]

@@ -7,30 +7,24 @@ import pytest
 from jaxquad.cli import main
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("demo")
-    assert main(["demo", "--out", str(folder)]) == 0
-    return folder
-
-
 PLANT = ["--inertia", "0.01", "--limit", "0.2"]
 SMALL = ["--noise", "0.05", "--members", "8", "--fresh", "32", "--duration", "1.6"]
 
 
-def test_a_result_becomes_gains_with_a_certificate(demo, capsys):
-    code = main(["tune", str(demo), *PLANT, *SMALL, "--json"])
-    told = json.loads(capsys.readouterr().out)
+@pytest.mark.slow
+def test_a_result_becomes_gains_with_a_certificate(demo, tmp_path, capsys):
+    code = main(["tune", str(demo), *PLANT, *SMALL, "--out", str(tmp_path), "--json"])
+    printed = json.loads(capsys.readouterr().out)
     # Whichever way it falls, the code says what the certificate says.
-    assert code == (0 if told["holds"] else 4)
-    assert told["holds"] == told["certificate"]["holds"] and told["stabilised"]
-    assert {"ladrc.wc", "ladrc.wo"} <= {name.partition("[")[0] for name in told["values"]}
-    folder = demo / "tuned"
-    assert json.loads((folder / "tuned.json").read_text())["values"] == told["values"]
-    assert "attitude" in (folder / "attitude.h").read_text()
-    page = (folder / "report.html").read_text()
+    assert code == (0 if printed["holds"] else 4)
+    assert printed["holds"] == printed["certificate"]["holds"] and printed["stabilised"]
+    assert {"ladrc.wc", "ladrc.wo"} <= {name.partition("[")[0] for name in printed["values"]}
+    assert printed["settings"]["inertia"] == 0.01
+    assert json.loads((tmp_path / "tuned.json").read_text())["values"] == printed["values"]
+    assert "attitude" in (tmp_path / "attitude.h").read_text()
+    page = (tmp_path / "report.html").read_text()
     assert "Tuned gains" in page and "SHA-256" in page
-    assert (folder / "certificate.png").stat().st_size > 10_000
+    assert (tmp_path / "certificate.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,7 @@ def test_ten_thousand_logs_are_planned_and_none_is_opened(tmp_path):
     assert not [path for path in opened if str(path).endswith(".bin")]
 
 
+@pytest.mark.slow
 def test_a_batch_that_is_killed_loses_nothing_and_does_nothing_twice(tmp_path):
     folder, out = logs(tmp_path / "logs", [f"{k}.csv" for k in range(60)]), tmp_path / "out"
     moments, before = random.Random(7), set()
@@ -103,6 +104,7 @@ def test_one_failing_log_is_a_row_and_stops_no_other(tmp_path):
     assert "3 failed" in page and "&lt;b&gt;no clock" in page and "<b>no clock" not in page
 
 
+@pytest.mark.slow
 def test_a_log_that_hangs_has_failed_and_stops_no_other(tmp_path):
     names = ["a.csv", "b.csv", "c.csv", "hangs.csv", "killed.csv"]
     folder, out = logs(tmp_path / "logs", names), tmp_path / "out"

@@ -7,6 +7,7 @@ from jaxquad.cli import main
 from jaxquad.workflows import batch, BatchSettings
 
 
+@pytest.mark.slow
 def test_a_killed_worker_of_a_cluster_loses_no_log(tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs pip install jaxquad[cluster]")
     folder, out = tmp_path / "logs", tmp_path / "out"
