@@ -62,7 +62,18 @@ Noise = float | int | Sequence[float] | Callable[[Lines], np.ndarray] | Measured
 
 
 def noise_covariance(noise: Noise, omega: Lines, outputs: int) -> Matrices:
-    """The outputs' noise at each line as covariances, one-sided per Hz; ValueError if unusable."""
+    """The outputs' noise at each line as covariance matrices, one-sided per Hz.
+
+    **Arguments:**
+
+    - `noise`: as in `predict_accuracy`.
+    - `omega`: lines in rad/s.
+    - `outputs`: how many.
+
+    **Raises:**
+
+    - `ValueError`: a density of another shape, not finite or not above 0.
+    """
     found = np.asarray(noise(omega) if callable(noise) else noise)
     if found.ndim == 1 and callable(noise):
         found = found[:, None]

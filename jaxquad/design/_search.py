@@ -58,7 +58,15 @@ def multisine_peaks(
 def multisine_signals(
     orders: Int[np.ndarray, " frequencies"], phase: Phase, amplitudes: Amplitudes, points: int
 ) -> Float[np.ndarray, "signals points"]:
-    """One period of each signal, at evenly spaced points."""
+    """One period of each multisine, at evenly spaced points.
+
+    **Arguments:**
+
+    - `orders`: whole cycles per period of each line.
+    - `phase`: of each line, rad.
+    - `amplitudes`: complex, one row for each signal.
+    - `points`: how many.
+    """
     return _synthesise(orders, amplitudes * np.exp(1j * phase), points)
 
 

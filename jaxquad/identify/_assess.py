@@ -3,6 +3,7 @@
 import dataclasses
 import functools as ft
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, PyTree
@@ -19,6 +20,7 @@ from ._accuracy import (
     gauss_newton,
     information_root,
     insensitivity,
+    Matrix,
     misfit_ratio,
     noise_effect,
     PriorRows,
@@ -55,32 +57,18 @@ def assess(
     covariance = calibrated_covariance(bread, noise, inflation)
     decrement = _decrement(bread, gradient, ran_to_zero(problem, solution))
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
-        verdict = by_data = no_minimum(parameters.names, decrement, cost)
+        remedies = ("start from other values", "try many starts at once (starts=20)")
+        verdict = by_data = no_minimum(parameters.names, decrement, cost, *remedies)
     else:
         facts = _information(problem, solution, blocks, covariance, units, inflation)
         verdict, by_data = _identifiability(facts, prior)
-    values, slopes = np.asarray(solution.values)[:count], units[:count]
-    physical, unbounded = physical_covariance(covariance, slopes, parameters.names, verdict)
-    percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
-    if runaways(problem, solution):
-        verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
-    return Fit(
-        model=solution.model,
-        names=parameters.names,
-        values=values,
-        standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
-        covariance=physical,
-        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
-        insensitivity=insensitivity(bread) * percent,
-        cost=cost,
-        average_cost=cost / len(blocks),
-        information=cost + 2 * inflation * fitted_noise(bread, noise),
-        chi_squared=misfit,
-        newton_decrement=decrement,
-        condition=condition_number(bread),
+    average, information = cost / len(blocks), cost + 2 * inflation * fitted_noise(bread, noise)
+    return make_fit(
+        problem,
+        solution,
+        Estimate(bread, covariance, units[:count], verdict, decrement),
+        Costs(cost, average, information, misfit),
         points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in blocks),
-        steps=solution.steps,
-        verdict=verdict,
         remarks=(
             *dict.fromkeys(remark for frf in frfs for remark in frf.remarks),
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
@@ -88,25 +76,78 @@ def assess(
             *remarks_on_leakage(problem, frfs, solution),
             *remarks_on_priors(prior.misfit, verdict, by_data),
         ),
-        parameters=parameters,
-        units=units[:count],
+        minima=minima,
+    )
+
+
+class Estimate(NamedTuple):
+    """What the derivatives at the solution say about the parameters."""
+
+    bread: Matrix  # J'J
+    covariance: Matrix  # calibrated, of relative changes
+    units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
+    verdict: Verdict
+    decrement: float
+
+
+class Costs(NamedTuple):
+    """As in `Fit`."""
+
+    cost: float
+    average_cost: float
+    information: float
+    chi_squared: float
+
+
+def make_fit(
+    problem: Problem,
+    solution: Solution,
+    estimate: Estimate,
+    costs: Costs,
+    *,
+    points: int,
+    remarks: tuple[str, ...],
+    minima: tuple[Minimum, ...] = (),
+) -> Fit:
+    """A result in physical units."""
+    bread, covariance, units, verdict, decrement = estimate
+    names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
+    if runaways(problem, solution):
+        verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
+    physical, unbounded = _physical_covariance(covariance, units, names, verdict)
+    percent = 100 * np.abs(units) / np.maximum(np.abs(values), 1e-3 * np.abs(units))
+    return Fit(
+        model=solution.model,
+        names=names,
+        values=values,
+        standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
+        covariance=physical,
+        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
+        insensitivity=insensitivity(bread) * percent,
+        cost=costs.cost,
+        average_cost=costs.average_cost,
+        information=costs.information,
+        chi_squared=costs.chi_squared,
+        newton_decrement=decrement,
+        condition=condition_number(bread),
+        points=points,
+        steps=solution.steps,
+        verdict=verdict,
+        remarks=remarks,
+        parameters=problem.parameters,
+        units=units,
         relative_covariance=covariance,
         minima=minima,
     )
 
 
-def no_minimum(names: tuple[str, ...], decrement: float, cost: float) -> Verdict:
+def no_minimum(names: tuple[str, ...], decrement: float, cost: float, *remedies: str) -> Verdict:
     """The verdict on a stop from which a step would still lower the cost."""
-    return without_numbers(
-        "no minimum",
-        names,
-        f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}",
-        "start from other values",
-        "try many starts at once (starts=20)",
-    )
+    reason = f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}"
+    return without_numbers("no minimum", names, reason, *remedies)
 
 
-def physical_covariance(
+def _physical_covariance(
     relative: Float[np.ndarray, "parameters parameters"],
     slopes: Float[np.ndarray, " parameters"],
     names: tuple[str, ...],

@@ -96,8 +96,15 @@ Band = Range | Mapping[tuple[str, str], Range | None] | None
 def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     """Which points of a response a fit uses.
 
-    A point counts if it is known, lies within the band of its pair (rad/s), and the coherence,
-    averaged over a third of an octave, is at least `least`.
+    **Arguments:**
+
+    - `frf`: a measured response.
+    - `band`: as in `jq.fit`.
+    - `least`: the least coherence, averaged over a third of an octave.
+
+    **Returns:**
+
+    True for known points within the band of their pair that are coherent enough.
     """
     known = np.isfinite(np.asarray(frf.response)) & np.isfinite(np.asarray(frf.random_error))
     coherent = _local_mean(np.asarray(frf.omega), np.asarray(frf.coherence)) >= least

@@ -1,6 +1,5 @@
 """From the stop of an output-error fit to a result that states what it is worth."""
 
-import dataclasses
 import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,9 +12,6 @@ from jaxquad.records import Record
 
 from ._accuracy import (
     calibrated_covariance,
-    condition_number,
-    cramer_rao,
-    insensitivity,
     Matrix,
     Noise,
     orthonormal,
@@ -29,8 +25,10 @@ from ._assess import (
     _ranks,
     _rescale,
     _units,
+    Costs,
+    Estimate,
+    make_fit,
     no_minimum,
-    physical_covariance,
     remarks_on_priors,
     runaways,
 )
@@ -183,10 +181,8 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     problem, solution = descent.problem, descent.solution
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
     units, rescale = _units(base, solution), _rescale(solution, _units(base, solution))
-    projected, prior = (
-        project_records(problem, descent.found, rescale[:count]),
-        _prior_rows(solution, units),
-    )
+    projected = project_records(problem, descent.found, rescale[:count])
+    prior = _prior_rows(solution, units)
     reduced = reduced_rows(projected, problem.terms, count)
     bread, gradient, noise = gauss_newton(reduced, prior, count)
     rows = sum(one.misfit.size for one in projected)
@@ -197,40 +193,28 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
     # In units of what the noise moves: a share of the cost would grow with the record.
     if decrement > count * max(taken, 1.0):
-        verdict = by_data = no_minimum(parameters.names, decrement, cost)
+        verdict = by_data = no_minimum(
+            parameters.names,
+            decrement,
+            cost,
+            "start from other values, for instance those of jq.fit",
+        )
     else:
         verdict, by_data = _verdict(descent, reduced, prior, covariance, units)
-    values, slopes = np.asarray(solution.values)[:count], units[:count]
-    if runaways(base, solution):
-        verdict = dataclasses.replace(verdict, remedies=())
-    physical, unbounded = physical_covariance(covariance, slopes, parameters.names, verdict)
-    percent = 100 * np.abs(slopes) / np.maximum(np.abs(values), 1e-3 * np.abs(slopes))
     fitted = count + sum(one.nuisance.shape[2] for one in projected)
-    return Fit(
-        model=solution.model,
-        names=parameters.names,
-        values=values,
-        standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
-        covariance=physical,
-        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
-        insensitivity=insensitivity(bread) * percent,
-        cost=cost,
-        average_cost=cost / sum(one.misfit.shape[1] for one in projected),
-        information=_deviance(problem) + cost + 2 * taken,
-        chi_squared=data_cost / max(rows - fitted, 1),
-        newton_decrement=decrement,
-        condition=condition_number(bread),
+    average = cost / sum(one.misfit.shape[1] for one in projected)
+    information = _deviance(problem) + cost + 2 * taken
+    return make_fit(
+        base,
+        solution,
+        Estimate(bread, covariance, units[:count], verdict, decrement),
+        Costs(cost, average, information, data_cost / max(rows - fitted, 1)),
         points=rows,
-        steps=solution.steps,
-        verdict=verdict,
         remarks=(
             *remarks_on_output_error(base, solution, records, decrement, taken),
             *remarks_on_colour([one.misfit for one in projected], bread, covariance),
             *remarks_on_priors(prior.misfit, verdict, by_data),
         ),
-        parameters=parameters,
-        units=units[:count],
-        relative_covariance=covariance,
     )
 
 

@@ -73,7 +73,17 @@ def make_problem(
     conditions: Sequence[Condition | None] | None = None,
     priors: Sequence[Prior] = (),
 ) -> Problem:
-    """The problem of these responses, under weights of zero."""
+    """The least-squares problem of a fit, under weights of zero: see `Problem.weighted`.
+
+    **Arguments:**
+
+    - `model`, `frfs`, `conditions`, `priors`: as in `jq.fit`.
+    - `parameters`: of `jq.identify.select_parameters`.
+
+    **Raises:**
+
+    - `ValueError`: another number of conditions than of responses.
+    """
     conditions = [None] * len(frfs) if conditions is None else list(conditions)
     if len(conditions) != len(frfs):
         raise ValueError(

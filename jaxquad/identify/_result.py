@@ -213,7 +213,18 @@ class Fit(eqx.Module):
 def draw_models(
     fit: Fit, scores: Float[Array, "parameters members"], *, hold_undetermined: bool = False
 ) -> PyTree:
-    """The models at standard normal `scores`, as `Fit.ensemble` draws and refuses them."""
+    """Draw models from a fit at given standard normal numbers, as `Fit.ensemble` does.
+
+    **Arguments:**
+
+    - `fit`: what to draw from.
+    - `scores`: one column for each model.
+    - `hold_undetermined`: as in `Fit.ensemble`.
+
+    **Raises:**
+
+    - `UndeterminedError`, `ValueError`: as `Fit.ensemble`.
+    """
     values = _drawn_values(fit, scores, hold_undetermined=hold_undetermined)
     replaced = _replaced(fit.parameters, fit.model, values)
     places = (*fit.parameters.places[: len(fit.names)], *(p for p, _ in fit.parameters.ties))

@@ -109,10 +109,21 @@ def integrate_plant(
     dt: float,
     hold: str,
 ) -> Float[Array, "samples outputs"]:
-    """The outputs from `start` beyond `plant.init()`, without disturbance.
+    """Simulate a differential equation over sampled inputs, without disturbance.
 
     Tsit5 within each sample, so that steps end where a held input jumps or a straight one bends.
-    Not finite where a sample takes too many steps.
+
+    **Arguments:**
+
+    - `plant`: with `init()`, `derivative(state, inputs, disturbance)` and `measure(state)`.
+    - `u`: the inputs.
+    - `start`: change of `plant.init()`, flattened.
+    - `dt`: sample interval in s.
+    - `hold`: "first" (straight between samples) or "zero" (held).
+
+    **Returns:**
+
+    The outputs; not finite where a sample takes too many steps.
     """
     # Imported late: diffrax triples the time of `import jaxquad`.
     import diffrax as dfx

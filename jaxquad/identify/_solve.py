@@ -24,10 +24,15 @@ from ._problem import (
 
 
 def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:
-    """Cost, gradient and Gauss-Newton Hessian of `residuals`.
+    """Cost, gradient and Gauss-Newton Hessian of the residuals of a fit.
 
-    Of a plain `StateSpace` with nothing tied, each slope is a product of what the response is made
-    of already, at a quarter of the price; any other model is differentiated.
+    For a plain `jq.StateSpace` with nothing tied, slopes are products of the resolvent's columns
+    and rows, at a quarter of the cost of differentiation; any other model is differentiated.
+
+    **Arguments:**
+
+    - `z`: the free parameters as the solver sees them.
+    - `problem`: of `jq.identify.make_problem`.
     """
     plain = type(problem.model) is StateSpace and not problem.parameters.ties
     if not plain or any(condition is not unchanged for condition in problem.conditions):

@@ -11,7 +11,7 @@ Kind = Literal["identifiable", "not identifiable", "no minimum", "too few points
 
 
 class UndeterminedError(ValueError):
-    """A number was asked for that the record does not determine."""
+    """A number was asked for that the record does not determine; a ValueError."""
 
 
 class Combination(NamedTuple):
