@@ -6,9 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from jaxquad.control import LinearController
-from jaxquad.loops import analyse, gain_window, Loop, LoopAnalysis
+from jaxquad.loops import analyse, gain_window, Loop, LoopAnalysis, per_member
 from jaxquad.models import DecoupledAxes
 
 
@@ -19,17 +20,14 @@ class LinearLaws(eqx.Module):
     """The linear forms of an ensemble of controllers of one axis, stacked along the first axis."""
 
     stacked: LinearController
+    index: Int[Array, " members"] = per_member(0)  # in the stack
 
     @property
     def dt(self) -> float:
         return self.stacked.dt
 
-    @property
-    def ensemble(self) -> tuple[int, ...]:
-        return self.stacked.C.shape[:1]
-
     def linear(self, axis: int = 0, member: Any = None) -> LinearController:
-        return jax.tree.map(lambda x: x[member], self.stacked)
+        return jax.tree.map(lambda x: x[self.index[member]], self.stacked)
 
 
 class Late(NamedTuple):
@@ -41,13 +39,13 @@ class Late(NamedTuple):
 
 def analysed(axis: DecoupledAxes, law: Any, late: Late) -> LoopAnalysis:
     """`jq.analyse` of a law [1, members]."""
-    laws = LinearLaws(_stack(law))
+    laws = LinearLaws(_stack(law), jnp.arange(law.ensemble[0]))
     return analyse(Loop(axis, laws, delay=late.delay, longest_delay=late.longest))
 
 
 def stable_gains(axis: DecoupledAxes, law: Any, late: Late) -> tuple[np.ndarray, np.ndarray]:
     """The gains b in rad/s^2 per unit of command between which each loop is stable; nan if none."""
-    laws = LinearLaws(_stack(law))
+    laws = LinearLaws(_stack(law), jnp.arange(law.ensemble[0]))
     found = gain_window(Loop(axis, laws, delay=late.delay, longest_delay=late.longest))
     return np.asarray(found.low), np.asarray(found.high)
 

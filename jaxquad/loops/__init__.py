@@ -1,14 +1,14 @@
-from jaxquad._core import per_member as per_member
+from jaxquad._core import align as align, per_member as per_member
 
 from ._analysis import (
     analyse as analyse,
-    loop_qualities as loop_qualities,
+    loop_numbers as loop_numbers,
     LoopAnalysis as LoopAnalysis,
+    LoopNumbers as LoopNumbers,
     LoopResponse as LoopResponse,
 )
-from ._closed_loop import close as close, join as join, OpenLoop as OpenLoop
 from ._gain_window import gain_window as gain_window, GainWindow as GainWindow
-from ._linear_parts import without_idle_states as without_idle_states
+from ._linear_numbers import linear_numbers as linear_numbers
 from ._loop import Loop as Loop
 from ._protocols import (
     after_drive as after_drive,
@@ -16,18 +16,12 @@ from ._protocols import (
     ChecksState as ChecksState,
     Controller as Controller,
     Drive as Drive,
+    LinearisablePlant as LinearisablePlant,
     Plant as Plant,
     prepared as prepared,
     sample_interval as sample_interval,
     Sensor as Sensor,
     signals_of as signals_of,
-)
-from ._sampled_axis import AxisParameters as AxisParameters, sampled as sampled
-from ._spectrum import (
-    abscissa as abscissa,
-    noise_gain as noise_gain,
-    powers as powers,
-    sharpest as sharpest,
 )
 from .qualities._bandwidth import attitude_bandwidth as attitude_bandwidth, Bandwidth as Bandwidth
 from .qualities._margins import Margins as Margins, margins as margins

@@ -1,3 +1,6 @@
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -5,11 +8,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from ._closed_loop import close, ClosedLoopMatrix, join, OpenLoop
-from ._linear_parts import linear_parts, LinearParts
+from ._linear_numbers import NUMBERS, numbers_of
+from ._linear_parts import axis_index, linear_parts, LinearParts
 from ._loop import Loop
-from ._spectrum import abscissa, noise_gain, powers, sharpest
-from .qualities._margins import margins
-from .qualities._rejection import disturbance_rejection
 from .qualities._text import decibels, degrees, lines, shown
 
 
@@ -147,11 +148,6 @@ def _summary(loop: LoopAnalysis) -> str:
     return "\n".join([share, "worst of the stable ones:", lines(rows, [])])
 
 
-_LOWEST, _BEYOND, _POINTS = 1e-5, 1.0005, 500  # of pi / dt; a crossing may lie at pi / dt itself
-_NOTHING = 1e-9  # a static gain margin that is rounding: the loop integrates
-_STABLE = 1.0  # 1/s, what an unstable loop is made to decay at where only its gradient must exist
-
-
 def analyse(
     loop: Loop,
     axis: int | str = "roll",
@@ -189,61 +185,52 @@ def analyse(
         raise ValueError(
             f"smoothing is {smoothing} 1/s: give a rate above 0, as 1e-5 or, to tune, 0.1."
         )
-    return _analysed(linear_parts(loop, axis, member), smoothing)
+    parts, ensemble = linear_parts(loop, [axis_index(axis)], member)
+    found = analyse_parts(parts, smoothing)
+    return jax.tree.map(lambda x: x.reshape(ensemble + x.shape[1:]), found)
 
 
 @eqx.filter_jit
-def _analysed(parts: LinearParts, smoothing: float) -> LoopAnalysis:
-    if parts.member is not None or not parts.ensemble:
-        return _one(parts, parts.member or (), smoothing)
-    places = jnp.unravel_index(jnp.arange(int(np.prod(parts.ensemble))), parts.ensemble)
-    flat = jax.vmap(lambda *place: _one(parts, place, smoothing))(*places)
-    return jax.tree.map(lambda x: x.reshape(parts.ensemble + x.shape[1:]), flat)
+def analyse_parts(parts: LinearParts, smoothing: float) -> LoopAnalysis:
+    """The analysis of each loop, on a first axis."""
+    if parts.count == 1:
+        return jax.tree.map(lambda x: x[None], _analyse_one(parts.at(0), smoothing))
+    return jax.vmap(lambda one: _analyse_one(one, smoothing))(parts)
 
 
-def _one(parts: LinearParts, place: tuple, smoothing: float) -> LoopAnalysis:
-    plant, controller = parts.of_member(place)
+def _analyse_one(parts: LinearParts, smoothing: float) -> LoopAnalysis:
+    plant, controller = parts.sampled()
     loop, closed = join(plant, controller), close(plant, controller, parts.memory).balanced()
-    smoothing = sharpest(smoothing, parts.dt, closed.matrix.dtype)
-    ladder = powers(closed.matrix, parts.dt, smoothing)
-    slowest = abscissa(closed.matrix, ladder, parts.dt, smoothing)
-    rate = jax.lax.stop_gradient(slowest)
-    stable = rate < 0
-    shift = jnp.where(stable, 0.0, (rate + _STABLE) * parts.dt)
-    noise = noise_gain(closed.matrix, closed.noise, closed.command, closed.through, ladder, shift)
-    return LoopAnalysis(
-        abscissa=slowest,
-        stable=stable,
-        noise_gain=jnp.where(stable, noise, jnp.inf),
-        **loop_qualities(loop, stable),
-        closed=closed,
-        loop=loop,
-        dt=parts.dt,
-    )
+    numbers = numbers_of(loop, closed, NUMBERS, smoothing)
+    stable = jax.lax.stop_gradient(numbers["abscissa"]) < 0
+    return LoopAnalysis(**numbers, stable=stable, closed=closed, loop=loop, dt=parts.dt)
 
 
-def loop_qualities(loop: OpenLoop, stable: Bool[Array, ""]) -> dict[str, Array]:
-    grid = np.geomspace(_LOWEST, _BEYOND, _POINTS) * np.pi / loop.dt
-    omega = jnp.asarray(grid, loop.shift.dtype)
-    margin, rejection = margins(loop, omega=omega), disturbance_rejection(loop, omega=omega)
-    # The grid holds all frequencies but 0: a crossing that is missing does not exist.
-    static = loop.static_gain_margin()
-    up, down = _or(jnp.inf, margin.gain_margin), _or(0.0, margin.gain_reduction)
-    found = {
-        "gain_margin": jnp.where(static >= 1, jnp.minimum(up, static), up),
-        "gain_reduction": jnp.where(
-            (static < 1) & (static > _NOTHING), jnp.maximum(down, static), down
-        ),
-        "phase_margin": _or(jnp.inf, margin.phase_margin),
-        "crossover": margin.crossover,
-        "delay_margin": _or(jnp.inf, margin.delay_margin),
-        "rejection_bandwidth": rejection.bandwidth,
+_STATES = 5  # all controllers get as many: then they share what is compiled
+
+
+class LoopNumbers(NamedTuple):
+    """Numbers of the linear loops of an ensemble; NaN where an unstable loop has no such number."""
+
+    stable: Bool[np.ndarray, " axes *ensemble"]
+    abscissa: Float[np.ndarray, " axes *ensemble"]  # 1/s
+    sensitivity_peak: Float[np.ndarray, " axes *ensemble"]
+    gain_margin: Float[np.ndarray, " axes *ensemble"]  # factor
+    gain_reduction: Float[np.ndarray, " axes *ensemble"]  # factor
+    phase_margin: Float[np.ndarray, " axes *ensemble"]  # rad
+    delay_margin: Float[np.ndarray, " axes *ensemble"]  # s
+    noise_gain: Float[np.ndarray, " axes *ensemble"]  # rms of the command per rad rms
+
+
+def loop_numbers(loop: Loop, axes: Sequence[int]) -> LoopNumbers:
+    """`analyse` of some axes of all members at once; stability by the eigenvalues themselves."""
+    parts, ensemble = linear_parts(loop, axes, states=_STATES)
+    found = analyse_parts(parts, 1e-5)
+    slowest = np.real(found.poles[:, 0])
+    stable = np.asarray(found.stable) & (slowest < 0)
+    numbers = {
+        name: np.where(stable, np.asarray(vars(found)[name]), np.nan)
+        for name in LoopNumbers._fields[2:]
     }
-    found = {name: jnp.where(stable, value, jnp.nan) for name, value in found.items()}
-    found["sensitivity_peak"] = jnp.where(stable, rejection.peak, jnp.inf)
-    found["sensitivity_frequency"] = jnp.where(stable, rejection.peak_frequency, jnp.nan)
-    return found
-
-
-def _or(missing: float, value: Float[Array, ""]) -> Float[Array, ""]:
-    return jnp.where(jnp.isnan(value), missing, value)
+    rows = (stable, slowest, *numbers.values())
+    return LoopNumbers(*(x.reshape(len(axes), *ensemble) for x in rows))

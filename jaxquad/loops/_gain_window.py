@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jaxquad.control import LinearController
 
 from ._closed_loop import close
-from ._linear_parts import linear_parts, LinearParts
+from ._linear_parts import axis_index, linear_parts, LinearParts
 from ._loop import Loop
 from ._sampled_axis import SampledAxis
 from ._spectrum import abscissa, growth, powers, sharpest
@@ -58,20 +58,19 @@ def gain_window(
 
     **Raises:** ValueError as `jq.analyse` does.
     """
-    return _windows(linear_parts(loop, axis, member))
+    parts, ensemble = linear_parts(loop, [axis_index(axis)], member)
+    return GainWindow(*(edge.reshape(ensemble) for edge in _windows(parts)))
 
 
 @eqx.filter_jit
 def _windows(parts: LinearParts) -> GainWindow:
-    if parts.member is not None or not parts.ensemble:
-        return _window(parts, parts.member or ())
-    places = jnp.unravel_index(jnp.arange(int(np.prod(parts.ensemble))), parts.ensemble)
-    flat = jax.vmap(lambda *place: _window(parts, place))(*places)
-    return GainWindow(*(edge.reshape(parts.ensemble) for edge in flat))
+    if parts.count == 1:
+        return jax.tree.map(lambda x: x[None], _window(parts.at(0)))
+    return jax.vmap(_window)(parts)
 
 
-def _window(parts: LinearParts, place: tuple) -> GainWindow:
-    plant, controller = parts.of_member(place)
+def _window(parts: LinearParts) -> GainWindow:
+    plant, controller = parts.sampled()
     sharp = sharpest(_SHARP, parts.dt, plant.fresh.dtype)
     ladder = lambda matrix: powers(matrix, parts.dt, sharp)
     held = jax.lax.stop_gradient((plant, controller))
@@ -85,7 +84,7 @@ def _window(parts: LinearParts, place: tuple) -> GainWindow:
     factors = _candidates(rate, plant.fresh.dtype)
     rates = rate(factors)
     inside = _run(rates < 0, _anchor(factors, rates))
-    exists, ratio = jnp.any(inside), parts.ratio(place)
+    exists, ratio = jnp.any(inside), parts.ratio
 
     crossed = jnp.stack([~inside[:-1] & inside[1:], inside[:-1] & ~inside[1:]])
     roots = jax.lax.stop_gradient(jax.vmap(lambda where: first(rate, factors, where))(crossed))

@@ -1,96 +1,160 @@
-"""What a loop is analysed from, checked once, for one member or an ensemble."""
+"""The linear loops of some axes of all members: what stability and margins are computed from."""
 
 import dataclasses
-from typing import Any
+import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxquad._core import ensemble_shape
 from jaxquad.control import LinearController, LinearisableController
-from jaxquad.models import DecoupledAxes, Multirotor
+from jaxquad.models import LinearAxis
 from jaxquad.records import AXES
 
 from ._loop import Loop
-from ._sampled_axis import AxisParameters, parameters_of, sampled, SampledAxis
+from ._protocols import assumed_gain, LinearisablePlant
+from ._sampled_axis import sample_axis, SampledAxis
+
+
+Place = tuple[Int[Array, ""], ...]  # of a member
 
 
 class LinearParts(eqx.Module):
-    """One axis with its controller and delay; every part may have the shape of an ensemble."""
+    """Plant, controller and delay of many linear loops, one after the other on a first axis."""
 
-    axis: AxisParameters
-    controller: Any
-    delay: Float[Array, "..."] | None  # s; None without
-    ensemble: tuple[int, ...] = eqx.field(static=True)
-    member: tuple[int, ...] | None = eqx.field(static=True)
-    index: int = eqx.field(static=True)  # of the axis
+    plant: LinearAxis
+    controller: LinearController
+    delay: Float[Array, " loops"] | None  # s; None without
+    ratio: Float[Array, " loops"]  # b/b0, with a b0 of 1 for a controller that has none
     memory: int = eqx.field(static=True)  # samples that a command may be on its way
-    dt: float = eqx.field(static=True)
+    dt: float = eqx.field(static=True)  # s
 
-    def of_member(self, place: Any) -> tuple[SampledAxis, LinearController]:
-        """Plant and controller of the member with the indices `place`."""
-        axis = jax.tree.map(lambda x: _at(x, place), self.axis)
-        delay = None if self.delay is None else _at(self.delay, place)
-        plant = sampled(axis, delay, self.dt)
-        if delay is not None:  # a traced one may be longer than it was said to be
+    @property
+    def count(self) -> int:
+        """How many loops there are."""
+        return len(self.ratio)
+
+    def at(self, k: int) -> "LinearParts":
+        """One of the loops."""
+        return jax.tree.map(lambda x: x[k], self)
+
+    def sampled(self) -> tuple[SampledAxis, LinearController]:
+        """Plant and controller of a single loop, from sample to sample."""
+        plant = sample_axis(self.plant, self.delay, self.dt)
+        if self.delay is not None:  # a traced one may be longer than it was said to be
             fresh = jnp.where(plant.shift < self.memory, plant.fresh, jnp.nan)
             plant = plant._replace(fresh=fresh)
-        return plant, without_idle_states(self._linear(place))
-
-    def ratio(self, place: Any) -> Float[Array, ""]:
-        """b/b0 of a member, with a b0 of 1 for a controller that has none."""
-        gain = _at(self.axis.torque_gain, place) / _at(self.axis.inertia, place)
-        b0 = getattr(self.controller, "b0", None)
-        if b0 is None:
-            return gain
-        return gain / _at(b0[self.index] if b0.ndim else b0, place)
-
-    def _linear(self, place: Any) -> LinearController:
-        if isinstance(self.controller, LinearController):
-            return self.controller
-        own = len(ensemble_shape(self.controller))
-        return self.controller.linear(self.index, place[:own] if own else None)
+        return plant, self.controller
 
 
-def linear_parts(loop: Loop, axis: int | str, member: int | tuple[int, ...] | None) -> LinearParts:
-    """The checked parts of one axis. Raises ValueError for what has no linear form."""
+def linear_parts(
+    loop: Loop,
+    axes: Sequence[int],
+    member: int | tuple[int, ...] | None = None,
+    *,
+    states: int = 0,
+) -> tuple[LinearParts, tuple[int, ...]]:
+    """The linear loops of all members, or of one, axis by axis; and the shape of the ensemble.
+
+    Controllers get as many `states` at least, of which those in excess do nothing: then controllers
+    of any kind share what is compiled. Raises ValueError for what has no linear form.
+    """
     plant, controller = loop.plant, loop.controller
-    plant = plant.decoupled() if isinstance(plant, Multirotor) else plant
-    _require_parts(plant, controller)
-    axis = _index_of(axis, plant)
-    memory = loop.memory
-    ensemble = ensemble_shape(plant, controller, loop)
-    if member is not None:
-        member = member if isinstance(member, tuple) else (member,)
-        _require_member(member, ensemble)
-    delay = None if memory == 0 else loop.delay.astype(plant.inertia.dtype)
-    parameters = parameters_of(plant, axis)
-    return LinearParts(parameters, controller, delay, ensemble, member, axis, memory, loop.dt)
-
-
-def _index_of(axis: int | str, plant: DecoupledAxes) -> int:
-    if isinstance(axis, str):
-        if axis not in AXES:
-            raise ValueError(f"axis is {axis!r}: choose one of {', '.join(AXES)}, or a number")
-        axis = AXES.index(axis)
-    axes = max(plant.shape[0], axis + 1) if plant.shape[0] == 1 else plant.shape[0]
-    if not 0 <= axis < axes:
-        raise ValueError(f"axis is {axis}, but the plant has axes 0 to {axes - 1}.")
-    return axis
-
-
-def _require_parts(plant: Any, controller: Any) -> None:
-    if not isinstance(plant, DecoupledAxes):
+    if not isinstance(plant, LinearisablePlant):
         raise ValueError(
-            f"the plant is a {type(plant).__name__}: give jq.DecoupledAxes or a jq.models.Multirotor."
+            f"{type(plant).__name__} has no method linearise(axis) that returns a "
+            "jq.models.LinearAxis: add it, as jq.DecoupledAxes has it"
         )
     if not isinstance(controller, LinearController | LinearisableController):
         raise ValueError(
             f"{type(controller).__name__} has no method linear(axis, member) that returns a "
             "jq.control.LinearController: give it one, or pass the LinearController itself."
         )
+    ensemble = ensemble_shape(loop)
+    if member is not None:
+        member = member if isinstance(member, tuple) else (member,)
+        _require_member(member, ensemble)
+    places = _places_of(ensemble, member)
+    dt, delay = loop.dt, loop.delay if loop.memory else None
+    given = _linearised(plant, controller, delay, tuple(axes), places, states, dt)
+    return LinearParts(*given, loop.memory, dt), () if member is not None else ensemble
+
+
+def _places_of(
+    ensemble: tuple[int, ...], member: tuple[int, ...] | None
+) -> tuple[Int[np.ndarray, " members"], ...]:
+    """The indices of the members, one array for each axis of the ensemble."""
+    if member is not None:
+        return tuple(np.array([k]) for k in member)
+    return tuple(x.ravel() for x in np.indices(ensemble)) if ensemble else ()
+
+
+@eqx.filter_jit
+def _linearised(
+    plant: LinearisablePlant,
+    controller: LinearController | LinearisableController,
+    delay: Float[Array, "..."] | None,
+    axes: tuple[int, ...],
+    places: tuple[Int[Array | np.ndarray, " members"], ...],
+    states: int,
+    dt: float,
+) -> tuple[LinearAxis, LinearController, Float[Array, " loops"] | None, Float[Array, " loops"]]:
+    own = len(ensemble_shape(controller))
+
+    def of_axis(axis: int) -> tuple:
+        linear, b0 = plant.linearise(axis), jnp.asarray(assumed_gain(controller, axis))
+
+        def of_member(*place: Int[Array, ""]) -> tuple:
+            at = lambda x, rank: _at(x, rank, place)
+            physical = LinearAxis(
+                at(linear.A, 2), at(linear.command, 1), at(linear.torque, 1), at(linear.gain, 0)
+            )
+            late = None if delay is None else at(delay.astype(linear.A.dtype), 0)
+            law = _law_of(controller, axis, place[:own] if own else None)
+            _require_interval(law, dt)
+            return (
+                physical,
+                _padded(_without_idle_states(law), states),
+                late,
+                at(linear.gain, 0) / (at(b0.astype(linear.gain.dtype), 0)),
+            )
+
+        if not places:
+            return jax.tree.map(lambda x: jnp.asarray(x)[None], of_member())
+        return jax.vmap(of_member)(*(jnp.asarray(x) for x in places))
+
+    return jax.tree.map(lambda *rows: jnp.concatenate(rows), *(of_axis(k) for k in axes))
+
+
+def _law_of(
+    controller: LinearController | LinearisableController, axis: int, place: Place | None
+) -> LinearController:
+    if isinstance(controller, LinearController):
+        return controller
+    return controller.linear(axis, place)
+
+
+def _require_interval(law: LinearController, dt: float) -> None:
+    if not math.isclose(law.dt, dt, rel_tol=1e-6):
+        raise ValueError(
+            f"the controller's linear form is for samples of {law.dt} s, the loop's are {dt} s: "
+            f"give the loop dt={law.dt}"
+        )
+
+
+def axis_index(axis: int | str) -> int:
+    """The number of an axis. Raises ValueError for a name that it does not have."""
+    if isinstance(axis, int):
+        if axis < 0:
+            raise ValueError(f"axis is {axis}: give 0 or above, or one of {', '.join(AXES)}")
+        return axis
+    if axis not in AXES:
+        raise ValueError(f"axis is {axis!r}: choose one of {', '.join(AXES)}, or a number")
+    return AXES.index(axis)
 
 
 def _require_member(member: tuple[int, ...], ensemble: tuple[int, ...]) -> None:
@@ -100,7 +164,7 @@ def _require_member(member: tuple[int, ...], ensemble: tuple[int, ...]) -> None:
         raise ValueError(f"member is {member}, but the ensemble has the shape {ensemble}.")
 
 
-def without_idle_states(controller: LinearController) -> LinearController:
+def _without_idle_states(controller: LinearController) -> LinearController:
     # A state that nothing drives, as the integral of a PID with ki = 0, stays at 0: it is no mode.
     A = controller.A
     others = jnp.where(jnp.eye(len(A), dtype=bool), 0, A)
@@ -109,5 +173,20 @@ def without_idle_states(controller: LinearController) -> LinearController:
     return dataclasses.replace(controller, A=jnp.where(driven[:, None], A, 0))
 
 
-def _at(x: Array, place: tuple[int | Int[Array, ""], ...]) -> Array:
-    return x[tuple(0 if n == 1 else p for p, n in zip(place, x.shape, strict=False))]
+def _padded(controller: LinearController, states: int) -> LinearController:
+    """With further states that nothing drives and nothing reads."""
+    room = max(0, states - len(controller.C))
+    longer = lambda x: jnp.pad(x, (0, room))
+    return dataclasses.replace(
+        controller,
+        A=jnp.pad(controller.A, ((0, room), (0, room))),
+        reference_in=longer(controller.reference_in),
+        measurement_in=longer(controller.measurement_in),
+        C=longer(controller.C),
+    )
+
+
+def _at(x: Array, rank: int, place: Place) -> Array:
+    """The value of a member, of an array whose ensemble axes follow the first `rank`."""
+    own = (slice(None),) * rank
+    return x[own + tuple(0 if n == 1 else p for p, n in zip(place, x.shape[rank:], strict=False))]

@@ -8,13 +8,15 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import per_member
-from jaxquad.control import LinearController, LinearisableController
+from jaxquad.control import LinearController, LinearisableController, ScheduledController
 from jaxquad.models import Multirotor
 
 from ._protocols import Controller, Drive, Plant, sample_interval, Sensor
 
 
 _DEFAULT_DT = 0.002  # s
+# A scheduled controller is tuned and certified: its members fly it at the inertia they are told.
+AnyController = Controller | LinearisableController | ScheduledController | LinearController
 
 
 class DelayQueue(NamedTuple):
@@ -54,10 +56,10 @@ class Loop(eqx.Module):
     """
 
     plant: Any  # Plant; or one with `linearise` alone, to analyse
-    controller: Controller | LinearisableController | LinearController
+    controller: AnyController
     drive: Drive | None
     encoder: Sensor | None
-    delay: Float[Array, "*ensemble"] = per_member(0)  # s
+    delay: Float[Array, "*ensemble"] = per_member(rank=0)  # s
     dt: float = eqx.field(static=True)  # s
     substeps: int = eqx.field(static=True)
     bound: float = eqx.field(static=True)  # rad
@@ -67,7 +69,7 @@ class Loop(eqx.Module):
     def __init__(
         self,
         plant: Plant,
-        controller: Controller | LinearisableController | LinearController,
+        controller: AnyController,
         *,
         drive: Drive | None = None,
         encoder: Sensor | None = None,
@@ -108,9 +110,7 @@ class Loop(eqx.Module):
             return math.floor(longest / self.dt + 1e-9) + 1 if longest > 0 else 0
         return length + (0 < length and not splits)
 
-    def with_controller(
-        self, controller: Controller | LinearisableController | LinearController
-    ) -> "Loop":
+    def with_controller(self, controller: AnyController) -> "Loop":
         """The same loop with another controller. Raises ValueError for one of another `dt`."""
         loop = eqx.tree_at(lambda x: x.controller, self, controller)
         loop.__check_init__()

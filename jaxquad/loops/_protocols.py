@@ -4,6 +4,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad.models import LinearAxis
+
 
 Vector = Float[Array, " axes *ensemble"]
 
@@ -57,6 +59,20 @@ class Sensor(Protocol):
 
 
 @runtime_checkable
+class LinearisablePlant(Protocol):
+    """A plant that `jq.analyse`, `jq.tune` and `jq.certify` can analyse as a linear loop."""
+
+    def linearise(self, axis: int) -> LinearAxis:
+        """One axis about rest."""
+        ...
+
+
+@runtime_checkable
+class _HasPlantGain(Protocol):
+    b0: Float[Array, "..."]
+
+
+@runtime_checkable
 class _HasSampleInterval(Protocol):
     dt: float
 
@@ -93,6 +109,14 @@ class ChecksState(Protocol):
 def sample_interval(controller: object) -> float | None:
     """The interval in s that a controller was made for; None where it has no `dt`."""
     return controller.dt if isinstance(controller, _HasSampleInterval) else None
+
+
+def assumed_gain(controller: object, axis: int) -> Float[Array, "..."] | float:
+    """The b0 of a controller on one axis, rad/s^2 per unit of command; 1 where it has none."""
+    if not isinstance(controller, _HasPlantGain):
+        return 1.0
+    b0 = controller.b0
+    return b0[axis if b0.shape[0] > 1 else 0] if b0.ndim else b0
 
 
 def prepared(controller: Controller) -> Controller:

@@ -4,30 +4,21 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxquad.models import DecoupledAxes, split_delay
+from jaxquad.models import LinearAxis, split_delay
 
 
 _TERMS = 18  # of the series at a norm of 1: 1 / 19! is below the last bit
 _SQUARINGS = 30
 
 
-class AxisParameters(NamedTuple):
-    """One axis of `DecoupledAxes` without its dry friction, which has no linear part."""
-
-    torque_gain: Float[Array, "*ensemble"]
-    inertia: Float[Array, "*ensemble"]
-    lag: Float[Array, "*ensemble"] | None
-    damping: Float[Array, "*ensemble"]
-    stiffness: Float[Array, "*ensemble"]
-
-
 class SampledAxis(NamedTuple):
     """x+ = transition x + fresh u[k - shift] + stale u[k - shift - 1] + push d, angle = x[0].
 
-    The states are the angle, the rate times dt and, with a lag, the effective command. The command
-    u and the disturbance torque d are held over a sample; the command acts late.
+    The states are those of a `LinearAxis`, its rate times dt. The command u and the disturbance
+    torque d are held over a sample; the command acts late.
     """
 
     transition: Float[Array, "states states"]
@@ -37,21 +28,9 @@ class SampledAxis(NamedTuple):
     shift: Int[Array, ""]  # whole samples of the delay
 
 
-def parameters_of(plant: DecoupledAxes, axis: int) -> AxisParameters:
-    """The parameters of one axis; where all axes share a value, that one."""
-    of_axis = lambda x: x[axis if x.shape[0] > 1 else 0]
-    return AxisParameters(
-        of_axis(plant.torque_gain),
-        of_axis(plant.inertia),
-        None if plant.lag is None else of_axis(plant.lag),
-        of_axis(plant.damping),
-        of_axis(plant.stiffness),
-    )
-
-
-def sampled(axis: AxisParameters, delay: Float[Array, ""] | None, dt: float) -> SampledAxis:
+def sample_axis(axis: LinearAxis, delay: Float[Array, ""] | None, dt: float) -> SampledAxis:
     """The axis between samples `dt` seconds apart, its command `delay` seconds late."""
-    flow, command, torque = _normalised(axis, dt)
+    flow, command, torque = _in_samples(axis, dt)
     whole = _propagate(flow, jnp.stack([command, torque], axis=1), jnp.ones((), flow.dtype))
     states = len(flow)
     transition, driven, push = whole[:, :states], whole[:, states], whole[:, states + 1]
@@ -62,21 +41,15 @@ def sampled(axis: AxisParameters, delay: Float[Array, ""] | None, dt: float) -> 
     return SampledAxis(transition, fresh, driven - fresh, push, shift)
 
 
-def _normalised(
-    axis: AxisParameters, dt: float
+def _in_samples(
+    axis: LinearAxis, dt: float
 ) -> tuple[Float[Array, "states states"], Float[Array, " states"], Float[Array, " states"]]:
     # Time in samples, so that the entries have one size whatever the sample interval.
-    one = jnp.ones_like(axis.inertia)
-    zero = jnp.zeros_like(one)
-    pull, brake = -axis.stiffness * dt**2 / axis.inertia, -axis.damping * dt / axis.inertia
-    gain = axis.torque_gain * dt**2 / axis.inertia
-    rows = [[zero, one], [pull, brake]]
-    command, torque = [zero, gain], [zero, dt**2 / axis.inertia]
-    if axis.lag is not None:
-        keep = -dt / axis.lag
-        rows = [[zero, one, zero], [pull, brake, gain], [zero, zero, keep]]
-        command, torque = [zero, zero, -keep], [*torque, zero]
-    return jnp.array(rows), jnp.array(command), jnp.array(torque)
+    unit = np.ones(len(axis.command))
+    unit[1] = dt  # of the rate
+    entries = jnp.asarray(dt * unit[:, None] / unit[None], axis.A.dtype)
+    inputs = jnp.asarray(dt * unit, axis.A.dtype)
+    return axis.A * entries, axis.command * inputs, axis.torque * inputs
 
 
 def _propagate(

@@ -23,15 +23,15 @@ class AuthorityWarning(UserWarning):
 class Authority(eqx.Module):
     """The torque that a drive can hold against a disturbance, one axis at a time."""
 
-    torque_gain: Float[Array, " axes *ensemble"] = per_member(1)  # N m per unit of command
+    torque_gain: Float[Array, " axes *ensemble"] = per_member(rank=1)  # N m per unit of command
     command: Float[Array, "axes ..."] = per_member(
-        1
+        rank=1
     )  # greatest command, of the drive and the controller; or inf
     torque: Float[Array, "axes ..."] = per_member(
-        1
+        rank=1
     )  # N m, at the limit of the command; inf without one
     forward: Float[Array, "axes ..."] = per_member(
-        1
+        rank=1
     )  # N m, until a motor turns backwards; inf if none can
 
     def __str__(self) -> str:

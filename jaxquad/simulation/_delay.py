@@ -31,7 +31,7 @@ class DelayLine(eqx.Module):
     for the samples that every member waits at least; only the further ones differ by member.
     """
 
-    samples: Float[Array, "*members"] = per_member(0)  # the delay, in sample intervals
+    samples: Float[Array, "*members"] = per_member(rank=0)  # the delay, in sample intervals
     fewest: int = eqx.field(static=True)  # whole samples that every member waits
     further: int = eqx.field(static=True)  # how many inputs are kept beyond the queue
     splits: bool = eqx.field(static=True)  # whether there are early inputs at all

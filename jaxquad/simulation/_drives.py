@@ -44,7 +44,7 @@ class Saturation(eqx.Module):
     Raises ValueError for a limit that is not above 0.
     """
 
-    limit: Float[Array, "..."] = per_member(1, converter=as_float)  # of |u|; [], [axes, ...]
+    limit: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # of |u|; [], [axes, ...]
 
     def __check_init__(self):
         if is_concrete(self.limit) and not np.all(np.asarray(self.limit) > 0):

@@ -147,10 +147,12 @@ class FlightMetrics(eqx.Module):
     wanted: tuple[str, ...] = eqx.field(static=True)
     window: Window
     dt: float = eqx.field(static=True)
-    steps: Steps = per_member(2)
+    steps: Steps = per_member(rank=2)
     from_first: Bool[Array, ""] | None = None  # the first step starts from the first angle
-    torque_gain: Float[Array, "axes ..."] | None = per_member(1, default=None)  # N m per command
-    limit: Float[Array, "axes ..."] | None = per_member(1, default=None)  # of the command
+    torque_gain: Float[Array, "axes ..."] | None = per_member(
+        rank=1, default=None
+    )  # N m per command
+    limit: Float[Array, "axes ..."] | None = per_member(rank=1, default=None)  # of the command
     smooth: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):

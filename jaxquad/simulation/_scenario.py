@@ -26,18 +26,18 @@ class Scenario(eqx.Module):
     of different numbers of samples, axes or members.
     """
 
-    reference: Float[Array, "samples axes ..."] = per_member(2)  # attitude set-point, rad
-    injection: Float[Array, "samples axes ..."] = per_member(2)  # added to the command, V
-    disturbance: Float[Array, "samples axes ..."] = per_member(2)  # torque, N m
-    noise: Float[Array, "samples axes ..."] = per_member(2)  # on the measured angle, rad
+    reference: Float[Array, "samples axes ..."] = per_member(rank=2)  # attitude set-point, rad
+    injection: Float[Array, "samples axes ..."] = per_member(rank=2)  # added to the command, V
+    disturbance: Float[Array, "samples axes ..."] = per_member(rank=2)  # torque, N m
+    noise: Float[Array, "samples axes ..."] = per_member(rank=2)  # on the measured angle, rad
     rate: Float[Array, "samples axes ..."] | None = per_member(
-        2, default=None
+        rank=2, default=None
     )  # of the reference, rad/s
     acceleration: Float[Array, "samples axes ..."] | None = per_member(
-        2, default=None
+        rank=2, default=None
     )  # of the reference, rad/s^2
     payload: Float[Array, "samples axes ..."] | None = per_member(
-        2, default=None
+        rank=2, default=None
     )  # added inertia, kg m^2
 
     def __check_init__(self):

@@ -16,13 +16,12 @@ from jaxquad.control import (
     schedule_for_analysis,
 )
 from jaxquad.ensembles import Ensemble, Members
-from jaxquad.loops import Loop
+from jaxquad.loops import Loop, loop_numbers, LoopNumbers
 from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.simulation import evaluate, Metrics, Scenario
 
 from ._certificate import Certificate, lag_remark, Provenance
 from ._design_result import DesignResult, measure_distances
-from ._loop_numbers import loop_numbers, LoopNumbers, worst_of
 from ._objective import Limit
 from ._problem import DeviceChoice, TimeSpan
 from ._quantities import LINEAR, QUANTITIES
@@ -248,12 +247,22 @@ def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbe
     if not isinstance(law, LinearisableController):
         return None
     axes = flight.reference.shape[1]
-    law, late = _widen(law, axes, members.size), members.delay
-    plants = [decouple(plant) for plant in _with_payloads(members.plant, flight)]
-    loops = [
-        loop_numbers(plant, law, late, longest=members.longest_delay, axes=axes) for plant in plants
-    ]
-    return worst_of(loops)
+    loop = members.loop(controller).with_controller(_widen(law, axes, members.size))
+    plants = _with_payloads(members.plant, flight)
+    return _worst([loop_numbers(loop.with_plant(x), range(axes)) for x in plants], members.size)
+
+
+def _worst(loops: Sequence[LoopNumbers], members: int) -> LoopNumbers:
+    """Of the same members as different plants: stable where all are, else NaN as one of them."""
+    each = lambda x: np.broadcast_to(x.reshape(len(x), -1), (len(x), members))
+    loops = [LoopNumbers(*map(each, loop)) for loop in loops]
+    stable = np.all([loop.stable for loop in loops], axis=0)
+    worst = {"abscissa": np.max([loop.abscissa for loop in loops], axis=0)}
+    for name in LoopNumbers._fields[2:]:
+        find = np.min if name.endswith("margin") else np.max
+        found = find([loop._asdict()[name] for loop in loops], axis=0)
+        worst[name] = np.where(stable, found, np.nan)
+    return LoopNumbers(stable, **worst)
 
 
 def _with_payloads(plant: Plant, flight: Scenario) -> list[Plant]:

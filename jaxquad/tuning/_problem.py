@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._xla import asked_devices, Devices, devices_for
 from jaxquad.control import schedule_for_analysis, schedule_for_flight
 from jaxquad.ensembles import Members
-from jaxquad.loops import Loop
+from jaxquad.loops import linear_numbers, Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.simulation import (
     check_run,
@@ -27,7 +27,6 @@ from jaxquad.simulation import (
     window,
 )
 
-from ._linear_numbers import linear_numbers
 from ._objective import Objective
 
 
@@ -68,6 +67,7 @@ class LinearLoops(eqx.Module):
     delay: Float[Array, " members"]  # s
     inertia_told: Float[Array, "axes members"]  # kg m^2
     longest_delay: float = eqx.field(static=True)  # s
+    dt: float = eqx.field(static=True)  # s
     devices: Devices = eqx.field(static=True, default=())
 
     @property
@@ -82,10 +82,17 @@ class LinearLoops(eqx.Module):
 
         def run(own: PyTree, controller: PyTree) -> dict[str, Array]:
             axes, delay, inertia = own
-            return linear_numbers(
-                axes, schedule_for_analysis(controller, inertia), delay,
-                longest=self.longest_delay, wanted=wanted, smoothing=smoothing,
-            )  # fmt: skip
+            loop = Loop(
+                axes,
+                schedule_for_analysis(controller, inertia),
+                delay=delay if self.longest_delay else 0.0,
+                longest_delay=self.longest_delay or None,
+                dt=self.dt,
+            )
+            places = range(len(inertia))
+            found = linear_numbers(loop, places, wanted, smoothing=smoothing, smooth=True)
+            each = lambda x: jnp.broadcast_to(x.reshape(len(x), -1), inertia.shape)
+            return {name: each(x) for name, x in found.items()}
 
         if len(self.devices) < 2:
             return run((self.axes, self.delay, self.inertia_told), controller)
@@ -185,4 +192,4 @@ def _linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
     axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
     places = devices_for(members.size, asked_devices(devices))
     longest = float(members.longest_delay)
-    return LinearLoops(axes, members.delay, members.inertia_told, longest, places)
+    return LinearLoops(axes, members.delay, members.inertia_told, longest, members.dt, places)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from loop_members import analysed, windows
 
-from jaxquad.control import PID
-from jaxquad.loops import gain_window, Loop
+from jaxquad.control import LADRC, PID
+from jaxquad.loops import gain_window, linear_numbers, Loop, loop_numbers
 from jaxquad.models import DecoupledAxes
 
 
@@ -92,3 +92,31 @@ def test_the_printed_pid_needs_a_gain_above_33_and_an_unstable_plant_one_that_ho
     assert low[0] == pytest.approx(0.05 / (0.01 * 0.15), rel=0.01)  # its filter, its samples
     assert low[1] == pytest.approx(2.0 / 10.0, rel=1e-6)
     assert np.all(np.asarray(high) > 1e3)
+
+
+def three_axes(law):
+    """8 members of 3 axes."""
+    plant = DecoupledAxes([1.0, 2.0, 0.5], np.geomspace(0.5, 2, 8)[None])
+    return Loop(plant, law)
+
+
+def test_three_axes_are_analysed_as_each_alone():
+    """8 members of 3 axes and 24 of one: the same loops, in one compile."""
+    wo, b0 = np.array([24.0, 40.0, 60.0]), np.array([1, 2, 3.0])
+    together = loop_numbers(three_axes(LADRC(8.0, wo, b0)), range(3))
+    row = lambda x: np.repeat(x, 8)[None]
+    flat = DecoupledAxes(row([1.0, 2.0, 0.5]), np.tile(np.geomspace(0.5, 2, 8), 3)[None])
+    alone = loop_numbers(Loop(flat, LADRC(8.0, row(wo), row(b0))), [0])
+    for a, b in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(a.reshape(1, 24), b)
+    assert 0 < np.sum(together.stable) < together.stable.size
+    assert np.isnan(together.phase_margin[~together.stable]).all()
+
+
+@pytest.mark.parametrize(
+    "law", [LADRC([10.0, 8.0, 6.0], 30.0, 0.8), PID([5.0, 2.0, 3.0], [3.0] * 3, [1.0] * 3)]
+)
+def test_states_that_fill_up_a_controller_change_no_loop(law):
+    filled = loop_numbers(three_axes(law), range(3))
+    bare = linear_numbers(three_axes(law), range(3), ["abscissa"])["abscissa"]
+    np.testing.assert_allclose(filled.abscissa, bare, rtol=1e-3)  # one is smoothed

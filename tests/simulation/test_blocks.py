@@ -158,7 +158,7 @@ def test_a_record_of_a_large_ensemble_has_every_member_in_its_place():
 class Weighted(eqx.Module):
     """An accumulator with a weight for each member."""
 
-    weight: jax.Array = per_member(1)
+    weight: jax.Array = per_member(rank=1)
 
     def begin(self, like):
         return jnp.zeros_like(like)

@@ -132,7 +132,7 @@ def test_parts_that_do_not_fit_are_refused_with_a_remedy():
         analyse(Loop(quanser_hover(), LADRC(10.0, 30.0, 1.0), drive=drive), axis=3)
     with pytest.raises(ValueError, match=r"member is \(99,\).*\(20,\)"):
         analyse(Loop(axis, controller), member=99)
-    with pytest.raises(ValueError, match="ensembles.*do not match"):
+    with pytest.raises(ValueError, match="for ensembles of different shapes.*Loop.delay .4,"):
         analyse(Loop(axis, controller, delay=jnp.zeros(4)))
     with pytest.raises(ValueError, match="delay is -0.001 s"):
         analyse(Loop(axis, controller, delay=-0.001))

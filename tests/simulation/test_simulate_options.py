@@ -110,7 +110,7 @@ def test_gains_that_couple_the_axes_are_no_ensemble_and_declared_ones_are():
             return None, jnp.sum(self.gain * (reference - measurement)[None], axis=1)
 
     class PerMember(eqx.Module):
-        gain: jnp.ndarray = per_member(1)
+        gain: jnp.ndarray = per_member(rank=1)
 
         def init(self, like):
             return None
@@ -140,7 +140,10 @@ def rotors():
         ({"controller": PD([1.0] * 2, [1.0] * 2), "scenario": scenario(rate=0.1)}, "a PD feeds"),
         ({"scenario": scenario(noise=jnp.nan)}, "noise is not finite at sample 0"),
         ({"scenario": scenario(payload=-J)}, "must be above 0"),
-        ({"plant": axes(np.full((2, 3), J)), "delay": np.full(4, 0.001)}, r"Loop.plant.inertia \(3,\), Loop.delay \(4,\)"),
+        (
+            {"plant": axes(np.full((2, 3), J)), "delay": np.full(4, 0.001)},
+            r"Loop.plant.inertia \(3,\), Loop.delay \(4,\)",
+        ),
         ({"plant": DecoupledAxes([KT] * 4, J)}, "the scenario is for 2 axes"),
     ],
     ids=lambda x: next(iter(x)) if isinstance(x, dict) else "",
