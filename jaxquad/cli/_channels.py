@@ -7,7 +7,7 @@ from ._options import add_json, add_log, add_settings, Command, print_json, prin
 
 def _add(declared: argparse.ArgumentParser) -> None:
     add_log(declared)
-    add_settings(declared, IdentifySettings, only=("time", "time_unit"))
+    add_settings(declared, IdentifySettings, only={"time": "", "time_unit": ""})
     add_json(declared, "the list")
 
 

@@ -73,7 +73,8 @@ IDENTIFY = Command(
   jaxquad identify a.npz --input "cmd[0]" --output "rate[0]" --verify b.npz --json > fit.json
 
 Without --input and --output, the log of a known autopilot proposes them, and the full command line
-is printed. Powers of a channel describe motors with a thrust curve.
+is printed. Powers of a channel describe motors with a thrust curve. In a file for --config, keys are
+the names of the options, but units, segments, lag = false and delay = false.
 """
     + _CODES,
     _add_identify,
@@ -110,7 +111,16 @@ The log is identified again with the settings in result.json. It has to be the s
 )
 
 
-_OF_A_RECORD = ("input", "output", "time", "time_unit", "rate", "start", "stop", "band")
+_OF_A_RECORD = {
+    "input": "the input, if it has another name in this file",
+    "output": "the output, likewise",
+    "time": "",
+    "time_unit": "",
+    "rate": "resample to this rate; by default that of the result",
+    "start": "",
+    "stop": "",
+    "band": "compare between these frequencies, in Hz; by default those that were fitted",
+}
 
 
 def _add_verify(declared: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ import contextlib
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -63,14 +63,17 @@ def add_json(declared: argparse.ArgumentParser, what: str) -> None:
 
 
 def add_config(declared: argparse.ArgumentParser) -> None:
-    text = "settings, with the names of the options as keys; options take precedence"
+    text = "a file of settings; options take precedence"
     declared.add_argument("--config", type=Path, metavar="TOML", help=text)
 
 
 def add_settings(
-    declared: argparse.ArgumentParser, settings: Settings, *, only: Sequence[str] | None = None
+    declared: argparse.ArgumentParser, settings: Settings, *, only: Mapping[str, str] | None = None
 ) -> None:
-    """Declare an option for each setting; an option that is not given stays out of the result."""
+    """Declare an option for each setting; an option that is not given stays out of the result.
+
+    `only` names the settings that are declared, each with its own help or "".
+    """
     groups = {}
     for key, option in settings.options().items():
         if only is not None and key not in only:
@@ -78,7 +81,11 @@ def add_settings(
         group = groups.setdefault(option.group, declared.add_argument_group(option.group) if
                                   option.group and only is None else declared)  # fmt: skip
         kind = option.kind
-        how: dict[str, Any] = {"dest": key, "default": argparse.SUPPRESS, "help": option.help}
+        how: dict[str, Any] = {
+            "dest": key,
+            "default": argparse.SUPPRESS,
+            "help": (only or {}).get(key) or option.help,
+        }
         if kind.words == 0:
             group.add_argument(option.flag, action="store_false", **how)
             continue

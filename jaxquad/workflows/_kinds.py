@@ -185,8 +185,8 @@ def _joined(parts: Sequence[object]) -> str:
 
 TEXT, FILE = Kind(_text), Kind(_text, metavar="FILE")
 MIX = Kind(_mix, metavar="CHANNEL")
-POSITIVE = Kind(_positive, float, _plain)
-NOT_NEGATIVE = Kind(_not_negative, float, _plain)
+POSITIVE = Kind(_positive, float, _plain, metavar="NUMBER")
+NOT_NEGATIVE = Kind(_not_negative, float, _plain, metavar="NUMBER")
 TIME = Kind(_number, float, _plain, metavar="S")
 DURATION = Kind(_positive, float, _plain, metavar="S")
 HERTZ = Kind(_positive, float, _plain, metavar="HZ")

@@ -77,7 +77,8 @@ class Settings:
                 if each.default is each.default_factory is _REQUIRED and each.name not in content
             ]
             if missing:
-                raise SettingsError(f"{' and '.join(f'`{key}`' for key in missing)} missing")
+                keys = " and ".join(f"`{key}`" for key in missing)
+                raise SettingsError(f"{keys} must be given")
             return cls(**content)
         except SettingsError as error:
             raise within_file(where, error) from error
@@ -314,10 +315,16 @@ class TuneSettings(Settings):
     """
 
     inertia: float = option_field(
-        kinds.INERTIA, _REQUIRED, "nominal inertia of the axis, in kg m^2", group="vehicle"
+        kinds.INERTIA,
+        _REQUIRED,
+        "nominal inertia of the axis, in kg m^2; required",
+        group="vehicle",
     )
     limit: float = option_field(
-        kinds.POSITIVE, _REQUIRED, "largest command, to either side, in its unit", group="vehicle"
+        kinds.POSITIVE,
+        _REQUIRED,
+        "largest command, to either side, in its unit; required",
+        group="vehicle",
     )
     spread: Pair = option_field(
         kinds.BAND,

@@ -64,7 +64,8 @@ class Tuning:
         """Write `tuned.json`, a C header, `report.html` and the figures; returns their paths."""
         folder, found, tuned = Path(folder), self.identification, self.tuned
         name = self.settings.name
-        origin = provenance(found.path, settings=self.settings.content())
+        known = {k: v for k, v in self.settings.content().items() if v is not None}
+        origin = provenance(found.path, settings=known)
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         figures = {"convergence.png": convergence_figure(tuned.history)}
