@@ -14,7 +14,7 @@ from jaxquad.control import ObserverController
 from ._objective import Limit, Objective, soft
 from ._parameters import Coordinates
 from ._problem import Problem
-from ._quantities import combine_axes, QUANTITIES, split_quantities
+from ._quantities import QUANTITIES, split_quantities
 
 
 _BARRIER = 0.01  # weight of the barrier before observers that are slower than the feedback
@@ -114,7 +114,7 @@ def _cost(
         fly = lambda c: problem.in_time(c, in_flight)
         numbers |= jax.lax.cond(subproblem.fly, fly, lambda c: unknown, controller)
     costs = objective.costs(numbers)
-    seen = {name: combine_axes(name, x, worst=True) for name, x in numbers.items()}
+    seen = {name: QUANTITIES[name].combine_axes(x, worst=True) for name, x in numbers.items()}
     limited = _limited(controller, problem, limits, seen)
     beyond = tuple(limit.beyond(x) for limit, x in zip(limits, limited, strict=True))
     cost = objective.risk(costs)
@@ -132,7 +132,7 @@ def _limited(
     if problem.limited is None or not names:
         return tuple(seen[limit.quantity] for limit in limits)
     wide = problem.limited.numbers(controller, names, SMOOTHING)
-    found = seen | {name: combine_axes(name, wide[name], worst=True) for name in names}
+    found = seen | {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
     return tuple(found[limit.quantity] for limit in limits)
 
 

@@ -22,7 +22,7 @@ from ._objective import (
 )
 from ._parameters import Coordinates
 from ._problem import Problem
-from ._quantities import combine_axes, split_quantities
+from ._quantities import QUANTITIES, split_quantities
 
 
 _LEAST = 1e-12
@@ -113,7 +113,10 @@ def _residuals(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
         numbers |= given.problem.in_time(controller, flights)
     gate = stability_gate(numbers["abscissa"])
     costs = [
-        p(combine_axes(p.quantity, numbers[p.quantity]), gate if is_gated(p.quantity) else gate + 1)
+        p(
+            QUANTITIES[p.quantity].combine_axes(numbers[p.quantity]),
+            gate if is_gated(p.quantity) else gate + 1,
+        )
         for p in given.penalties
     ]
     bounds = jnp.sqrt(jnp.stack(costs) + _LEAST) if costs else jnp.zeros((0, members))

@@ -18,9 +18,10 @@ from jaxquad._core import (
     require_positive,
 )
 
-from ._quantities import combine_axes, level, QUANTITIES, require_quantity
+from ._quantities import QUANTITIES, require_quantity
 
 
+@runtime_checkable
 class Risk(Protocol):
     """Makes one number of those of all members; larger is worse."""
 
@@ -162,8 +163,9 @@ class Penalty(eqx.Module):
         self, values: Float[Array, " members"], gate: Float[Array, " members"]
     ) -> Float[Array, " members"]:
         """The cost of each member; `gate` is 1 where its loop is stable, 0 where it is not."""
-        beyond = level(self.quantity, values) - level(self.quantity, self.knee)
-        cost = self.weight * soft(QUANTITIES[self.quantity].sign * beyond)
+        quantity = QUANTITIES[self.quantity]
+        beyond = quantity.level(values) - quantity.level(self.knee)
+        cost = self.weight * soft(quantity.sign * beyond)
         return gate * cost if is_gated(self.quantity) else cost
 
 
@@ -236,7 +238,8 @@ class Limit(eqx.Module):
 
         The worst member is within the bound if every member is, and that is a smooth constraint.
         """
-        beyond = self.sign * (level(self.quantity, values) - level(self.quantity, self.bound))
+        level = QUANTITIES[self.quantity].level
+        beyond = self.sign * (level(values) - level(self.bound))
         if isinstance(self.over, Worst):
             return beyond
         return jnp.broadcast_to(self.over(beyond), beyond.shape)
@@ -318,11 +321,11 @@ class Objective(eqx.Module):
         gate = stability_gate(numbers["abscissa"])
         total = jnp.zeros_like(gate)
         for name, weight in self.terms.items():
-            term = weight * level(name, combine_axes(name, numbers[name]))
-            signed = QUANTITIES[name].sign * term
+            quantity = QUANTITIES[name]
+            signed = quantity.sign * (weight * quantity.level(quantity.combine_axes(numbers[name])))
             total = total + (gate * signed if is_gated(name) else signed)
         for penalty in self.penalties:
-            values = combine_axes(penalty.quantity, numbers[penalty.quantity])
+            values = QUANTITIES[penalty.quantity].combine_axes(numbers[penalty.quantity])
             total = total + penalty(values, gate)
         return total
 

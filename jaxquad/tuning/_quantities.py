@@ -32,6 +32,21 @@ class Quantity(NamedTuple):
         """-1 where a smaller number is the worse one, else 1."""
         return -1.0 if self.smaller_is_worse else 1.0
 
+    def level(self, value: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+        """What weights and penalties act on: ln of the value, or the value over its `scale`."""
+        bounded = jnp.minimum(jnp.asarray(value), self.most)
+        if not self.logarithmic:
+            return bounded / self.scale
+        return jnp.log(jnp.maximum(bounded, self.least))
+
+    def combine_axes(
+        self, value: Float[Array, "axes members"], *, worst: bool = False
+    ) -> Float[Array, " members"]:
+        """One number for each member: the sum over its axes, or that of its worst axis."""
+        if self.summed and not worst:
+            return jnp.sum(value, axis=0)
+        return jnp.min(value, axis=0) if self.smaller_is_worse else jnp.max(value, axis=0)
+
     def number(self, value: float) -> float:
         """The value in the printed unit."""
         if self.decibels:
@@ -94,22 +109,3 @@ def require_quantity(name: str) -> None:
     """Raise ValueError for a quantity that does not exist."""
     if name not in QUANTITIES:
         raise ValueError(f"there is no quantity {name!r}: choose one of {', '.join(QUANTITIES)}")
-
-
-def level(name: str, value: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """What weights and penalties act on: ln of the value, or the value over its scale."""
-    quantity, value = QUANTITIES[name], jnp.asarray(value)
-    bounded = jnp.minimum(value, quantity.most)
-    if not quantity.logarithmic:
-        return bounded / quantity.scale
-    return jnp.log(jnp.maximum(bounded, quantity.least))
-
-
-def combine_axes(
-    name: str, value: Float[Array, "axes members"], *, worst: bool = False
-) -> Float[Array, " members"]:
-    """One number for each member: the sum over its axes, or that of its worst axis."""
-    quantity = QUANTITIES[name]
-    if quantity.summed and not worst:
-        return jnp.sum(value, axis=0)
-    return jnp.min(value, axis=0) if quantity.smaller_is_worse else jnp.max(value, axis=0)

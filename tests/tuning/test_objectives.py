@@ -1,21 +1,24 @@
 """What a tune minimises: quantities, penalties, limits and risks."""
 
-from typing import Any
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from loop_members import analysed, columns, LONGEST, MEMBERS, parts
-from tuning_case import ensemble, EVENTS, flight, ladrc, objective
+from tuning_case import ensemble, ladrc, loop
 
-from jaxquad.simulation import evaluate
-from jaxquad.tuning import CVaR, Limit, Mean, Mix, Objective, Penalty, Worst
-from jaxquad.tuning._linear_numbers import linear_numbers
-from jaxquad.tuning._objective import stability_gate
-from jaxquad.tuning._problem import problem_of
-from jaxquad.tuning._quantities import IN_TIME, level, OF_THE_LOOP, per_member
+from jaxquad.ensembles import LogUniform, Uniform
+from jaxquad.simulation import evaluate, Pulse, scenario, Step
+from jaxquad.tuning import (
+    CVaR,
+    LBFGS,
+    Limit,
+    Mean,
+    Mix,
+    Objective,
+    QUANTITIES,
+    tune,
+    Worst,
+)
 
 
 VALUES = np.random.default_rng(0).normal(size=37)
@@ -54,21 +57,22 @@ def test_the_standard_cost_is_that_of_section_3():
 
 
 def test_the_peak_of_an_unstable_member_counts_for_nothing_and_pulls_nowhere():
-    abscissa = jnp.array([[-2.0, -0.1, 0.5]])
-    np.testing.assert_allclose(stability_gate(abscissa), [1.0, 0.4, 0.0])
-    cost = lambda peak: jnp.sum(Penalty("sensitivity_peak", 2.0)(peak, stability_gate(abscissa)))
-    slope = jax.grad(cost)(jnp.array([3.0, 3.0, 3.0]))
-    assert slope[2] == 0 and slope[0] > slope[1] > 0
-    moved = jax.grad(lambda a: jnp.sum(stability_gate(a)))(abscissa)
-    np.testing.assert_array_equal(moved, 0.0)
+    peaks = Objective({"sensitivity_peak": 1.0}, ())
+    cost = lambda a, peak: peaks.costs({"abscissa": a[None], "sensitivity_peak": peak[None]})
+    abscissa, e = jnp.array([-2.0, -0.1, 0.5]), jnp.full(3, jnp.e)
+    np.testing.assert_allclose(cost(abscissa, e), [1.0, 0.4, 0.0])
+    of_abscissa, of_peak = jax.grad(lambda a, p: jnp.sum(cost(a, p)), (0, 1))(abscissa, e)
+    assert of_peak[2] == 0 and of_peak[0] > of_peak[1] > 0
+    np.testing.assert_array_equal(of_abscissa, 0.0)
 
 
 def test_axes_add_up_in_an_objective_and_the_worst_one_counts_in_a_limit():
     values = jnp.array([[1.0, 2.0], [3.0, 1.0]])
-    np.testing.assert_array_equal(per_member("itae", values), [4.0, 3.0])
-    np.testing.assert_array_equal(per_member("itae", values, worst=True), [3.0, 2.0])
-    np.testing.assert_array_equal(per_member("phase_margin", values), [1.0, 1.0])
-    np.testing.assert_array_equal(per_member("overshoot", values), [3.0, 2.0])
+    combined = lambda name, **options: QUANTITIES[name].combine_axes(values, **options)
+    np.testing.assert_array_equal(combined("itae"), [4.0, 3.0])
+    np.testing.assert_array_equal(combined("itae", worst=True), [3.0, 2.0])
+    np.testing.assert_array_equal(combined("phase_margin"), [1.0, 1.0])
+    np.testing.assert_array_equal(combined("overshoot"), [3.0, 2.0])
 
 
 def test_limits_say_by_how_much_and_their_constraints_agree():
@@ -85,8 +89,8 @@ def test_limits_say_by_how_much_and_their_constraints_agree():
 
 def test_levels_stay_finite_where_quantities_are_not():
     for name, value in (("gain_margin", np.inf), ("sensitivity_peak", np.inf), ("itae", 0.0)):
-        assert np.isfinite(float(level(name, value)))
-    assert float(level("abscissa", -2.5)) == -2.5
+        assert np.isfinite(float(QUANTITIES[name].level(value)))
+    assert float(QUANTITIES["abscissa"].level(-2.5)) == -2.5
 
 
 def test_bad_choices_are_refused_with_what_there_is():
@@ -104,47 +108,38 @@ def test_bad_choices_are_refused_with_what_there_is():
         Objective(events=(-1.0,))
 
 
-def test_numbers_of_linear_loops_are_those_of_the_analysis():
-    c = columns(MEMBERS)
-    plant, controller = parts(c)
-    wanted = OF_THE_LOOP.keys()
-    run = eqx.filter_jit(
-        lambda p, k, d: linear_numbers(p, k, d, longest=LONGEST, wanted=wanted, smoothing=1e-5)
-    )
-    found, exact = run(plant, controller, jnp.asarray(c["delay"])), analysed(*MEMBERS)
-    stable = np.asarray(exact.stable)
-    assert 4 <= stable[: len(MEMBERS)].sum()
-    for name in wanted:
-        # The parabola through three of 160 frequencies misses a peak of 13 by 1 %.
-        tolerance = 1.5e-2 if name == "sensitivity_peak" else 1e-9
-        there = stable if name != "abscissa" else np.ones_like(stable)
-        np.testing.assert_allclose(
-            found[name][0][there], getattr(exact, name)[there], rtol=tolerance, err_msg=name
-        )
-
-
-def test_numbers_of_flights_are_those_of_the_metrics():
-    members = ensemble().draw(8, jax.random.key(0))
-    span: Any = {"start": 0.2, "stop": 4.4, "load_start": 2.5}
-    problem = problem_of(ladrc(10.0, 30.0), members, flight(), **span)
-    found = eqx.filter_jit(lambda p, c: p.in_time(c, tuple(IN_TIME)))(problem, ladrc(10.0, 30.0))
-    metrics = evaluate(
-        members.plant, ladrc(10.0, 30.0), members.flight(flight()), drive=members.drive,
-        delay=members.delay, **span,
+def test_numbers_of_flights_are_those_of_the_metrics_between_events():
+    """Of all members in the mean, as a listener hears them at the start."""
+    around, parts = loop(ladrc(10.0, 30.0)), [(0.0, 2.5), (2.5, 4.5), (4.5, 6.5)]
+    quick = ensemble(lag=Uniform(0.001, 0.012), inertia=LogUniform(0.5, 1.5))
+    members, heard = quick.draw(around, 8, jax.random.key(0)), []
+    large = scenario(
+        duration=7.0, axes=1, disturbance=Pulse(0.2, width=0.5, at=2.5),
+        reference=Step(np.radians(20.0)) + Step(np.radians(-15.0), at=4.5),
     )  # fmt: skip
-    for name in IN_TIME.keys() - {"activity_rate", "overshoot", "saturation_share"}:
-        np.testing.assert_allclose(found[name], getattr(metrics, name), rtol=1e-9, err_msg=name)
-    np.testing.assert_allclose(found["activity_rate"], np.asarray(metrics.activity) / 4.2)
-    # The window begins within the step: of a set-point that stands still there is no overshoot.
+    span = {"stop": 6.5, "load_start": 2.6}
+    names = [name for name, quantity in QUANTITIES.items() if not quantity.linear]
+    tune(
+        around, members, large, fresh=None, progress=False, method=LBFGS(evaluations=1),
+        objective=Objective(dict.fromkeys(names, 1.0), (), events=(0.0, 2.5, 4.5), **span),
+        listener=heard.append,
+    )  # fmt: skip
+    found = {name: float(heard[-1].means[name][0]) for name in names}
+    happens, flown = members.flight(large), members.loop(around.controller)
+    whole = evaluate(flown, happens, **span)
+    each = [evaluate(flown, happens, start=start, stop=stop) for start, stop in parts]
+    mean = lambda x: float(np.mean(np.asarray(x)))
+    rate = mean(whole.activity) / 6.5
+    assert found.pop("activity_rate") == pytest.approx(rate, rel=1e-9)
+    overshoot = mean(np.nanmax([np.asarray(part.overshoot) for part in each], axis=0))
+    assert found.pop("overshoot") == pytest.approx(overshoot, rel=1e-9) and overshoot > 1.0
+    for name in ("itae", "iae", "ise"):  # ITAE's clock starts again with each part
+        total = sum(mean(vars(part)[name]) for part in each)
+        assert found.pop(name) == pytest.approx(total, rel=2e-3), name
     # A command within 1 % of the limit counts in part, so that the share has a gradient.
-    assert np.ptp(metrics.saturation_share) > 0.5
-    np.testing.assert_allclose(found["saturation_share"], metrics.saturation_share, atol=0.01)
-
-
-def test_the_clock_of_itae_starts_again_at_each_event():
-    members = ensemble(noise=0.0).draw(8, jax.random.key(0))
-    run = eqx.filter_jit(lambda p: p.in_time(ladrc(10.0, 30.0), ("itae", "iae"))["itae"])
-    of = lambda events: problem_of(ladrc(10.0, 30.0), members, flight(), events=events)
-    once, often = run(of(())), run(of(EVENTS))
-    assert np.all(np.asarray(often) < 0.6 * np.asarray(once))
-    assert objective().events == EVENTS
+    assert np.ptp(np.asarray(whole.saturation_share)) > 0.01
+    assert heard[-1].phase == "optimise"
+    share = mean(whole.saturation_share)
+    assert found.pop("saturation_share") == pytest.approx(share, abs=0.01)
+    for name, value in found.items():
+        assert value == pytest.approx(mean(vars(whole)[name]), rel=1e-9), name

@@ -15,9 +15,8 @@ from jaxquad.tuning import LBFGS, Objective, paper_designs, pareto, Penalty
 
 MEMBERS = 24  # as many as in test_certificate.py, whose compiles are shared
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
-OPEN = Ensemble(
-    RIG, inertia=LogUniform(0.7, 1.5), drive=jq.simulation.Saturation(10), noise=np.radians(0.02)
-)
+OPEN = Ensemble(inertia=LogUniform(0.7, 1.5), noise=np.radians(0.02))
+LOOP = jq.Loop(RIG, jq.LADRC(5.0, 30.0, 1.2), drive=jq.simulation.Saturation(10.0))
 FLIGHT = jq.scenario(duration=2.0, axes=1, reference={0: jq.Step(np.radians(4))})
 LEVELS = (2.0, 10.0, 50.0)
 
@@ -28,7 +27,7 @@ PLAIN = Objective(penalties=(Penalty("abscissa", -0.5, 5.0),))  # no Ms: it comp
 def swept(levels=LEVELS, **options):
     options = {"objective": PLAIN, "members": MEMBERS, "fresh": MEMBERS} | options
     return pareto(
-        jq.LADRC(5.0, 30.0, 1.2), OPEN, FLIGHT, levels=levels, key=jax.random.key(1),
+        LOOP, OPEN, FLIGHT, levels=levels, key=jax.random.key(1),
         progress=False, method=LBFGS(evaluations=12), **options,
     )  # fmt: skip
 
@@ -57,7 +56,7 @@ def test_all_points_and_peers_fly_the_same_fresh_members(found):
     inertias = [c.facts["inertia"] for c in found.certificates]
     for other in inertias[1:]:
         np.testing.assert_array_equal(inertias[0], other)
-    trained = np.asarray(OPEN.draw(MEMBERS, jax.random.key(1)).inertia_told)
+    trained = np.asarray(OPEN.draw(LOOP, MEMBERS, jax.random.key(1)).inertia_told)
     assert not np.isin(inertias[0], trained).any()
     assert list(found.peers) == ["paper b0 = 3", "paper b0 = 1.6"]
     assert list(found.certificates[0].designs) == ["tuned"]

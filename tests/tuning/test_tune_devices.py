@@ -13,16 +13,16 @@ import json, jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 import numpy as np
-from tuning_case import DT, ensemble, ladrc
-from jaxquad.simulate import scenario, Step
-from jaxquad.tune import LBFGS, Objective, Penalty, tune
+from tuning_case import DT, ensemble, ladrc, loop
+from jaxquad.simulation import scenario, Step
+from jaxquad.tuning import LBFGS, Objective, Penalty, tune
 
 calm = Objective({"iae": 1.0}, (Penalty("abscissa", -0.5, 5.0),))
 step = scenario(duration=0.2, dt=DT, axes=1, reference=Step(0.1))
 # Nine members are no multiple of two.
-drawn = ensemble().draw(9, jax.random.key(0))
+drawn = ensemble().draw(loop(), 9, jax.random.key(0))
 ends = [
-    tune(ladrc(5.0, 30.0), drawn, step, objective=calm, fresh=None, progress=False,
+    tune(loop(ladrc(5.0, 30.0)), drawn, step, objective=calm, fresh=None, progress=False,
          method=LBFGS(evaluations=2), devices=count)
     for count in (1, 2)
 ]
@@ -31,9 +31,13 @@ print(json.dumps([[[e.phase, *e.cost, *e.gradient_norm, *map(float, e.z[0])] for
 """
 
 
+@pytest.mark.slow
 def test_the_cost_and_its_gradient_are_the_same_on_two_devices():
     out = subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=Path(__file__).parents[1], capture_output=True, text=True
+        [sys.executable, "-c", PROGRAM],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
     )
     assert out.returncode == 0, out.stderr
     one, two = json.loads(out.stdout)
