@@ -210,7 +210,7 @@ def _behind_a_filter(gains: Mapping[str, Float[Array, ""]], dt: float) -> Linear
     transition = butterworth(gains["measurement_filter"], dt)
     entry = jnp.array([1.0, 0.0], kp.dtype) - transition[:, 0]  # of the measurement
     bare = linear_pid({k: x for k, x in gains.items() if k != "measurement_filter"}, dt)
-    heard = jnp.stack([kp + dt * ki, kd])  # u = ... - heard (v, v')
+    on_filter = jnp.stack([kp + dt * ki, kd])  # u = ... - on_filter (v, v')
     none, zeros = jnp.zeros((2, 2), kp.dtype), jnp.zeros(2, kp.dtype)
     grown = none.at[0, 0].set(-dt * ki)  # of the integral, by v
     dot = lambda a, b: jnp.dot(a, b, precision="highest")
@@ -218,9 +218,9 @@ def _behind_a_filter(gains: Mapping[str, Float[Array, ""]], dt: float) -> Linear
         A=jnp.block([[bare.A, dot(grown, transition)], [none, transition]]),
         reference_in=jnp.concatenate([bare.reference_in, zeros]),
         measurement_in=jnp.concatenate([dot(grown, entry), entry]),
-        C=jnp.concatenate([bare.C, -dot(heard, transition)]),
+        C=jnp.concatenate([bare.C, -dot(on_filter, transition)]),
         reference_through=bare.reference_through + 0.5 * dt * ki,
-        measurement_through=-dot(heard, entry),
+        measurement_through=-dot(on_filter, entry),
         dt=dt,
     )
 

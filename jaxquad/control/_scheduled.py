@@ -101,7 +101,8 @@ class ScheduledPID(eqx.Module):
         per_gain, pid = 1 / gain_at(self.map, inertia), self.pid
         return dataclasses.replace(
             pid, kp=multiply_gains(pid.kp, per_gain), ki=multiply_gains(pid.ki, per_gain),
-            kd=multiply_gains(pid.kd, per_gain), feedforward=multiply_gains(pid.feedforward, per_gain),
+            kd=multiply_gains(pid.kd, per_gain),
+            feedforward=multiply_gains(pid.feedforward, per_gain),
         )  # fmt: skip
 
     def tunable(self) -> dict[str, Transform | None]:

@@ -26,13 +26,17 @@ def number(value: float | np.floating, name: str, precision: Precision) -> str:
     """
     kind = type_of(precision)
     with np.errstate(over="ignore", under="ignore"):
-        held = kind(value)
-    if np.isnan(value) or (np.isinf(held) and not np.isinf(value)) or (held == 0 and value != 0):
+        rounded = kind(value)
+    if (
+        np.isnan(value)
+        or (np.isinf(rounded) and not np.isinf(value))
+        or (rounded == 0 and value != 0)
+    ):
         raise ValueError(f"{name} is {value}, which a C {precision} cannot hold: check the gains.")
-    if np.isinf(held):
+    if np.isinf(rounded):
         most = "FLT_MAX" if precision == "float" else "DBL_MAX"
-        return most if held > 0 else f"-{most}"
-    text = str(held)  # the shortest that reads back
+        return most if rounded > 0 else f"-{most}"
+    text = str(rounded)  # the shortest that reads back
     text = text if any(mark in text for mark in ".e") else f"{text}.0"
     return text + "f" * (precision == "float")
 

@@ -28,8 +28,9 @@ def _per_axis_or_none(x: ArrayLike | Sequence | None) -> Array | None:
 class LinearAxis(eqx.Module):
     """One axis of a plant about rest: x' = A x + command u + torque d, angle = x[0].
 
-    The states are the angle in rad, its rate in rad/s and, after these, those of the motors in units
-    of the command u; d is a disturbance torque in N m. All may have an ensemble on trailing axes.
+    The states are the angle in rad, its rate in rad/s and, after these, those of the motors in
+    units of the command u; d is a disturbance torque in N m. All may have an ensemble on trailing
+    axes.
     """
 
     A: Float[Array, "states states *ensemble"] = per_member(rank=2)

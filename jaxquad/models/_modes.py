@@ -35,13 +35,13 @@ def _without_rows(A, B, C, D, limit):
         if not bound.size:
             return A, B, free, D
         _, size, right = np.linalg.svd(bound)
-        held = int(np.sum(size > limit))
-        if not held:
+        bound_count = int(np.sum(size > limit))
+        if not bound_count:
             return A, B, free, D
         A, B, free = right @ A @ right.T, right @ B, free @ right.T
-        C = np.vstack([A[:held, held:], free[:, held:]])
-        D = np.vstack([B[:held], D])
-        A, B = A[held:, held:], B[held:]
+        C = np.vstack([A[:bound_count, bound_count:], free[:, bound_count:]])
+        D = np.vstack([B[:bound_count], D])
+        A, B = A[bound_count:, bound_count:], B[bound_count:]
 
 
 def _balanced(A, B, C, D):

@@ -135,7 +135,7 @@ class Multirotor(eqx.Module):
         )
 
     def measure(self, state: MultirotorState) -> Float[Array, " 3 *ensemble"]:
-        """Euler angles in rad: what the encoders of a rig, or an attitude filter, report."""
+        """Euler angles in rad: what encoders or an attitude filter report."""
         length = jnp.linalg.norm(state.quaternion, axis=0, keepdims=True)
         return euler_from_quaternion(state.quaternion / length)
 

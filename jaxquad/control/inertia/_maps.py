@@ -99,8 +99,8 @@ def printed_map(nominal: Float[Array, "..."] | float, *, b0: float = 3.0) -> Fuz
 
     Eight sets over 1 < delta < 22 and 0 <= db0 <= 24 can only raise b0, while the paper's own b0
     falls from 3 to 1.6, which is delta = 1.875. There this map says 4.0, past the stability limit
-    of LADRC(10, 30) on the rig: the ITAE of a step over 10 s grows from 1.4 to 21. At delta = 22 it
-    says 27, and the loop diverges.
+    of LADRC(10, 30) on the Hover: the ITAE of a step over 10 s grows from 1.4 to 21. At delta = 22
+    it says 27, and the loop diverges.
     """
     return FuzzyMap(nominal, b0, np.linspace(1.0, 22.0, 8), np.linspace(0.0, 24.0, 8))
 
@@ -229,7 +229,7 @@ def certainty_equivalence(
     - `ValueError`: a value is not positive, or the span is not one.
     """
     torque_gain, nominal = as_float(torque_gain), as_float(nominal)
-    require_positive("torque_gain", torque_gain, "give N m per unit of command, on the rig L Kf")
+    require_positive("torque_gain", torque_gain, "give N m per unit of command, L Kf of the Hover")
     require_positive("factor", as_float(factor), "1 is certainty equivalence")
     low, high = span
     if not 0 < low < high < float("inf") or knots < 2:

@@ -66,9 +66,9 @@ class ProbeTones(eqx.Module):
         if self.above == 0:
             return jnp.ones_like(exciting)
         doubt, known = jax.lax.stop_gradient((estimate.deviation, jnp.abs(estimate.inertia)))
-        held = jnp.where(doubt < self.below * known, 0, exciting)
+        staying = jnp.where(doubt < self.below * known, 0, exciting)
         needed = (doubt > self.above * known) | (self._amplitude(exciting) == 0)
-        return jnp.where(needed, 1, held)
+        return jnp.where(needed, 1, staying)
 
     def signal(self, state: ProbeState, dt: float) -> Float[Array, " axes *ensemble"]:
         """The sines, where they are on, in units of the command."""
