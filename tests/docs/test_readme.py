@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from conftest import ROOT
+from test_notebooks import words
 
 
 README = (ROOT / "README.md").read_text()
@@ -32,6 +33,19 @@ def test_the_python_examples_print_what_they_promise(example, words):
     run = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert all(word in run.stdout for word in words), run.stdout
+
+
+@pytest.mark.slow
+def test_the_main_job_prints_what_the_readme_shows(tmp_path):
+    part = README.partition("## What the main job prints")[2]
+    shown = words(re.findall(r"```\n(.*?)```", part, flags=re.S)[0])
+    command = [sys.executable, str(ROOT / "fits" / "hover_roll.py"), "--out", str(tmp_path)]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    printed = words(run.stdout[run.stdout.index("One record, asked") :])
+    assert printed[: len(shown)] == shown
+    files = {"result.json", "report.html", "bode.png", "verification.png"}
+    assert files <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_there_are_exactly_two_commands_to_set_up():
