@@ -73,8 +73,8 @@ IDENTIFY = Command(
   jaxquad identify a.npz --input "cmd[0]" --output "rate[0]" --verify b.npz --json > fit.json
 
 Without --input and --output, the log of a known autopilot proposes them, and the full command line
-is printed. Powers of a channel describe motors with a thrust curve. In a file for --config, keys are
-the names of the options, but units, segments, lag = false and delay = false.
+is printed. Powers of a channel describe motors with a thrust curve. The keys of a file for --config
+are the names of the options, but units, segments, lag = false and delay = false.
 """
     + _CODES,
     _add_identify,

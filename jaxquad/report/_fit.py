@@ -63,13 +63,13 @@ def _factored(fit: Fit) -> str:
 
 def _quality(fit: Fit) -> dict[str, str]:
     condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
-    ratio = np.sqrt(fit.chi_squared)
+    ratio, plural = np.sqrt(fit.chi_squared), "s" * (fit.steps != 1)
     facts = {
         "misfit / random error": f"{ratio:.2f} (about 1 if the model explains the response)",
         "cost": f"{fit.cost:.4g}, on average {fit.average_cost:.4g} for each response",
         "points": f"{fit.points} frequencies",
         "condition of the Jacobian": condition,
-        "solver": f"{fit.steps} steps, Newton decrement {fit.newton_decrement:.1e}",
+        "solver": f"{fit.steps} step{plural}, Newton decrement {fit.newton_decrement:.1e}",
     }
     if fit.minima:
         facts["starts"] = count_starts([len(point.starts) for point in fit.minima])

@@ -134,16 +134,21 @@ class Identification:
     def __str__(self) -> str:
         first, *others = map(str, self.records)
         record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
+        remarks = tuple(each for each in self.fit.remarks if each not in self.frf.remarks)
+        fit = dataclasses.replace(self.fit, remarks=remarks)  # those of the response stand above
         parts = [f"{record}\n\n{self.frf}"]
-        parts += [f"\n{self.formula}, {self.method} estimate:\n{self.fit}"]
-        sums = _sums(self.settings)
+        parts += [f"\n{self.formula}, {self.method} estimate:\n{fit}"]
+        sums, known = _sums(self.settings), [each.name for each in self.fit.combinations]
         if self.settings.poles is not None and self.fit.verdict.fitted:
             parts += [_text_or_reason(lambda: factors(self.fit))]
         if self.settings.reference:
             parts += [f"\n{compare_fits(self.fits, sums)}"]
         elif self.fit.verdict.fitted:
-            for name, quantity in sums.items():
-                parts += [_text_or_reason(lambda n=name, q=quantity: self.fit.derived(q, n))]
+            parts += [
+                _text_or_reason(lambda n=name, q=quantity: self.fit.derived(q, n))
+                for name, quantity in sums.items()
+                if name not in known
+            ]
         if self.parts:
             whole = {f"{self.band[0]:.3g} .. {self.band[1]:.3g} rad/s": self.fit}
             parts += [
