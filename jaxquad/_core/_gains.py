@@ -1,14 +1,16 @@
 """Gains given once, per axis `[axes]`, or per axis and member `[axes, *ensemble]`."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, PyTree
 
 from ._arrays import align, is_concrete
 from ._members import ensemble_shape
+
+
+Member = int | Int[Array, ""]  # an index, which may be traced
 
 
 def broadcast_gain(gain: Float[Array, "..."], signal: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -17,8 +19,8 @@ def broadcast_gain(gain: Float[Array, "..."], signal: Float[Array, "..."]) -> Fl
 
 
 def match_reference(
-    reference: Any, measurement: Float[Array, " axes *ensemble"], state: Float[Array, "..."]
-) -> Any:
+    reference: PyTree, measurement: Float[Array, " axes *ensemble"], state: Float[Array, "..."]
+) -> PyTree:
     """A set-point that broadcasts over the `measurement`, in its precision.
 
     Raises ValueError for a measurement of another shape than the state.
@@ -45,7 +47,7 @@ def signal_shape(like: Float[Array, " axes ..."], ensemble: tuple[int, ...]) -> 
 
 
 def pick_gain(
-    gain: Float[Array, "..."], axis: int, member: int | tuple[int, ...] | Any
+    gain: Float[Array, "..."], axis: int, member: Member | tuple[Member, ...] | None
 ) -> Float[Array, ""]:
     """The value for one axis of one member. Raises ValueError for one that does not exist."""
     if gain.ndim == 0:
@@ -55,15 +57,17 @@ def pick_gain(
     ensemble = gain.shape[1:]
     if ensemble and member is None:
         raise ValueError(f"The gains are for an ensemble of {ensemble}: pick one, as member=0.")
-    members = member if isinstance(member, tuple) else (member,) * bool(ensemble)
-    if ensemble and len(members) != len(ensemble):
+    if member is None or not ensemble:
+        return gain[axis]
+    members = member if isinstance(member, tuple) else (member,)
+    if len(members) != len(ensemble):
         raise ValueError(
             f"member is {member}, but the ensemble has the shape {ensemble}: give one index each."
         )
     return gain[axis][tuple(map(_index, members, ensemble))]
 
 
-def _index(member: Any, size: int) -> Any:
+def _index(member: Member, size: int) -> Member:
     if isinstance(member, int) and not 0 <= member < size and size > 1:
         raise ValueError(f"member is {member}, but the ensemble's are 0 to {size - 1}.")
     return 0 if size == 1 else member

@@ -4,12 +4,12 @@ Built without LAPACK: `vmap` over LAPACK calls inside a loop can hang on few cor
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable, TypeVar
+from typing import NamedTuple, Protocol, runtime_checkable, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
 TOLERANCE = 1e-8  # of a step, relative to 1 + |z|, and of the root of the cost it would save
@@ -165,8 +165,9 @@ def minimise_on_host(
 
     `move` makes the next point from a point and a step, whose coordinates may be those of that
     point alone. For a few steps whose evaluation is compiled already, or is NumPy: compiling the
-    loop would take longer than running it. It ends at a step below `tolerance` relative to 1 + |z|, or one
-    that would save less than `saving` of the cost. RUNNING means that the steps are used up.
+    loop would take longer than running it. It ends at a step below `tolerance` relative to
+    1 + |z|, or one that would save less than `saving` of the cost. RUNNING means that the steps
+    are used up.
     """
     here, damping, growth = start, 1e-3, 2.0
     gradient, hessian = here.slopes()
@@ -201,7 +202,7 @@ def _relative(
 
 
 def normal_equations(
-    residual: Callable[..., Any], z: Float[Array, " parameters"], args: Any
+    residual: Callable[..., Array], z: Float[Array, " parameters"], args: PyTree
 ) -> Normal:
     """Cost, gradient and Gauss-Newton Hessian, by one forward derivative for each parameter."""
     along = lambda change: jax.jvp(lambda z: residual(z, args), (z,), (change,))

@@ -12,11 +12,11 @@ from typing import Any, TYPE_CHECKING
 import equinox as eqx
 import jax
 import numpy as np
+from jax.tree_util import KeyPath
 from jaxtyping import PyTree
 
 
 _KEY = "axes before the ensemble's"
-Path = tuple[Any, ...]
 _ARRAYS = (jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 
@@ -100,7 +100,7 @@ def mark_members(tree: PyTree, ensemble: tuple[int, ...], rank: int | None = Non
     `ensemble`, and `False` for all others, such as those of length 1 on it.
     """
 
-    def has(leaf: Any, own: int | None) -> bool:
+    def has(leaf: object, own: int | None) -> bool:
         if own is None or not ensemble or not isinstance(leaf, _ARRAYS):
             return False
         shape = leaf.shape[own:]
@@ -111,8 +111,8 @@ def mark_members(tree: PyTree, ensemble: tuple[int, ...], rank: int | None = Non
 
 
 def _leaves(
-    tree: PyTree, rank: int | None, at: Path = ()
-) -> Iterator[tuple[Path, Any, int | None]]:
+    tree: PyTree, rank: int | None, at: KeyPath = ()
+) -> Iterator[tuple[KeyPath, object, int | None]]:
     """The path, the leaf and its declared rank, in the order of `jax.tree.leaves`."""
     if jax.tree_util.all_leaves([tree]):
         yield at, tree, rank
@@ -130,7 +130,7 @@ def _declared(tree: PyTree) -> dict[str | None, int]:
     return {x.name: x.metadata[_KEY] for x in dataclasses.fields(tree) if _KEY in x.metadata}
 
 
-def _name(tree: PyTree, path: Path) -> str:
+def _name(tree: PyTree, path: KeyPath) -> str:
     within = jax.tree_util.keystr(path, simple=True, separator=".")
     if isinstance(tree, eqx.Module):
         return f"{type(tree).__name__}.{within}"

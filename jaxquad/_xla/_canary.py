@@ -15,7 +15,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import jaxlib
+import jaxlib.version
 import numpy as np
 import platformdirs
 from jaxtyping import Array
@@ -31,7 +31,7 @@ _SECONDS = 300.0
 @ft.cache
 def why_not_trusted() -> str | None:
     """What speaks against kernels with this version of jaxlib; None if nothing does."""
-    version = jaxlib.__version__
+    version = jaxlib.version.__version__
     if version in TESTED or _CHILD in os.environ:
         return None
     path = _answer_path()
@@ -47,8 +47,9 @@ def why_not_trusted() -> str | None:
 def _answer_path() -> Path | None:
     if os.environ.get("JAXQUAD_CACHE") == "off":
         return None
-    name = f"kernel-jax-{jax.__version__}-jaxlib-{jaxlib.__version__}-{platform.machine()}.json"
-    return Path(platformdirs.user_cache_dir("jaxquad")) / name
+    versions = f"jax-{jax.__version__}-jaxlib-{jaxlib.version.__version__}"
+    folder = Path(platformdirs.user_cache_dir("jaxquad"))
+    return folder / f"kernel-{versions}-{platform.machine()}.json"
 
 
 def _stored(path: Path | None) -> str | None:

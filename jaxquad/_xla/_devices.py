@@ -3,22 +3,23 @@
 import re
 import zlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TypeGuard
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Device
 from jaxtyping import PyTree
 
 from jaxquad._core import is_concrete
 
 
-Devices = tuple[Any, ...]
+Devices = tuple[Device, ...]
 _FEWEST = {"cpu": 32}  # members that make a device worth its while
 _FEWEST_ELSEWHERE = 4096
 
 
-def asked_devices(devices: int | Sequence[Any] | None) -> Devices | None:
+def asked_devices(devices: int | Sequence | None) -> Devices | None:
     """The devices that a user names. Raises ValueError for those that JAX does not have."""
     if devices is None:
         return None
@@ -84,7 +85,7 @@ def gathered(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda x: _unbound(x) if spread(x) else x, tree)
 
 
-def is_concrete_array(x: Any) -> bool:
+def is_concrete_array(x: object) -> TypeGuard[jax.Array]:
     return isinstance(x, jax.Array) and is_concrete(x)
 
 
@@ -125,15 +126,15 @@ def _are_concrete(tree: PyTree) -> bool:
 
 def _digest(tree: PyTree) -> int:
     leaves, structure = jax.tree.flatten(tree)
-    told = re.sub("0x[0-9a-f]+", "", str(structure))  # without addresses, which differ
-    digest = zlib.crc32(told.encode())
+    words = re.sub("0x[0-9a-f]+", "", str(structure))  # without addresses, which differ
+    digest = zlib.crc32(words.encode())
     for leaf in leaves:
         digest = zlib.crc32(_bytes(leaf), digest)
     return digest
 
 
-def _bytes(leaf: Any) -> bytes:
-    if jnp.issubdtype(getattr(leaf, "dtype", float), jax.dtypes.prng_key):
+def _bytes(leaf: object) -> bytes:
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
     if isinstance(leaf, jax.Array | np.ndarray):
         array = np.ascontiguousarray(leaf)

@@ -3,7 +3,7 @@
 import functools as ft
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -69,6 +69,7 @@ class Jit:
 
     def __init__(self, function: Callable[..., PyTree]):
         ft.update_wrapper(self, function)
+        self._name = function.__name__
         self._plain = eqx.filter_jit(function)
         self._function = function
         self._failed: set[tuple] = set()
@@ -76,7 +77,8 @@ class Jit:
     @ft.cached_property
     def _tuned(self) -> Callable[..., PyTree]:
         options = compiler_options()
-        return eqx.filter_jit(self._function, **({"compiler_options": options} if options else {}))
+        given: dict[str, Any] = {"compiler_options": options} if options else {}
+        return eqx.filter_jit(self._function, **given)
 
     def __call__(self, *args: PyTree) -> PyTree:
         if not _is_outermost(args):
@@ -92,14 +94,14 @@ class Jit:
         except jax.errors.JaxRuntimeError as error:
             result = self._without_kernels(*args)  # If the kernel is not at fault, this raises too.
             self._failed.add(_shapes(args))
-            warn_once(f"{self.__name__} did not compile as one kernel ({_first_line(error)})")
+            warn_once(f"{self._name} did not compile as one kernel ({_first_line(error)})")
             return result
 
     def _without_kernels(self, *args: PyTree) -> PyTree:
         with plain_loops(True):
             return self._tuned(*args)
 
-    def lower(self, *args: PyTree) -> eqx._jit.Lowered:
+    def lower(self, *args: PyTree) -> PyTree:
         return (self._tuned if _is_outermost(args) else self._plain).lower(*args)
 
 

@@ -1,7 +1,6 @@
 """What a kernel can hold, read from the StableHLO that XLA is about to compile."""
 
-import functools as ft
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func, stablehlo
@@ -30,7 +29,9 @@ def hold_in_kernel(
         made.append(kernel)
         with call.location, ir.InsertionPoint(kernel.add_entry_block()):
             arguments = list(kernel.arguments)
-            found = func.CallOp(kinds, call.attributes["callee"], arguments).results
+            found = func.CallOp(
+                kinds, ir.FlatSymbolRefAttr(call.attributes["callee"]), arguments
+            ).results
             func.ReturnOp([*found, _sum_of_firsts(arguments)])
         whole, outer = _new_function("in_kernel", given, kinds, call, module, symbols)
         made.append(whole)
@@ -64,7 +65,10 @@ def _like(kind: ir.Type, shape: tuple[int, ...]) -> ir.Type:
 
 
 def _sum_of_firsts(values: list[ir.Value]) -> ir.Value:
-    return ft.reduce(lambda x, y: stablehlo.AddOp(x, y).result, map(_first, values))
+    total, *others = map(_first, values)
+    for other in others:
+        total = stablehlo.AddOp(total, other).result
+    return total
 
 
 def _first(value: ir.Value) -> ir.Value:
@@ -141,7 +145,7 @@ def text(op: Op, attribute: str) -> str:
 _Counts = tuple[int, int]  # all operations, and those on many numbers
 
 
-def _count(name: str, functions: dict[str, Op], known: dict[str, _Counts]) -> tuple[int, int]:
+def _count(name: str, functions: Mapping[str, Op], known: dict[str, _Counts]) -> tuple[int, int]:
     """Operations of a function and of all that it calls, once for every call: XLA inlines them."""
     if name in known:
         return known[name]

@@ -38,7 +38,9 @@ class Division:
     def __init__(self, block: ir.Block, copies: "_Copies"):
         self.copies = copies
         *self.ops, self.end = operations(block)
-        self.source = {value: k for k, op in enumerate(self.ops) for value in op.results}
+        self.source: dict[ir.Value, int] = {
+            value: k for k, op in enumerate(self.ops) for value in op.results
+        }
         self.light = [copies.is_in_a_part(op) for op in self.ops]
         self.fixed = [kind_of(op) == "constant" for op in self.ops]
         self.kept = self._kept()

@@ -1,4 +1,5 @@
 from collections.abc import Callable, Iterator
+from typing import TypeGuard
 
 import jax
 from jax.extend.core import Primitive
@@ -65,11 +66,13 @@ def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:
         return
     name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-    tags = {name: ir.StringAttr.get(value) for name, value in _TAGS.items()}
+    tags: dict[str, ir.Attribute] = {
+        name: ir.StringAttr.get(value) for name, value in _TAGS.items()
+    }
     hold_in_kernel(call, whole.module, whole.symbol_table, ir.DictAttr.get(tags))
 
 
-def _is_plain_call(op: Op | ir.Block) -> bool:
+def _is_plain_call(op: Op | ir.Block) -> TypeGuard[ir.Operation]:
     if not isinstance(op, ir.Operation) or op.name != "func.call" or ATTRIBUTE in op.attributes:
         return False
     return text(op, "callee").startswith("jaxquad_kernel")
@@ -77,11 +80,11 @@ def _is_plain_call(op: Op | ir.Block) -> bool:
 
 def _is_for_one_cpu(whole: mlir.ModuleContext) -> bool:
     """Whether XLA has nothing to split among devices: a kernel cannot be split."""
-    mesh = getattr(whole.axis_context, "mesh", None)
-    if mesh is None:
-        alone = whole.axis_context.num_devices == 1
+    where = whole.axis_context
+    if isinstance(where, mlir.SPMDAxisContext):
+        alone = where.manual_axes == frozenset(where.mesh.axis_names)
     else:
-        alone = whole.axis_context.manual_axes == frozenset(mesh.axis_names)
+        alone = isinstance(where, mlir.ShardingContext) and where.num_devices == 1
     return alone and tuple(whole.platforms) == ("cpu",)
 
 

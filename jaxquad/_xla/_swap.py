@@ -4,7 +4,7 @@
 whole arrays: a queue of many samples then costs its length in every sample of a reverse pass.
 """
 
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +22,12 @@ def swap_row(
 
     Linear in `rows` and `row`, and its own transpose.
     """
-    if _swap is None:
-        return _compute(rows, row, place)
-    changed, old = _swap.bind(rows, row, place)
+    changed, old = _exchange(rows, row, place)
     return changed, old
+
+
+def _exchange(rows: Array, row: Array, place: Array) -> list[Array]:
+    return list(_compute(rows, row, place)) if _swap is None else _swap.bind(rows, row, place)
 
 
 def _compute(rows: Array, row: Array, place: Array) -> tuple[Array, Array]:
@@ -33,22 +35,28 @@ def _compute(rows: Array, row: Array, place: Array) -> tuple[Array, Array]:
     return jax.lax.dynamic_update_index_in_dim(rows, row, place, 0), old
 
 
-def _derivative(primals: Any, tangents: Any) -> tuple[list[Array], list[Any]]:
+def _derivative(
+    primals: Sequence[Array], tangents: Sequence[Array | ad.Zero]
+) -> tuple[Sequence[Array], Sequence[Array | ad.Zero]]:
     rows, row, place = primals
     *moved, _ = tangents
-    out = _swap.bind(rows, row, place)
+    out = _exchange(rows, row, place)
     if all(isinstance(x, ad.Zero) for x in moved):
-        return out, [ad.Zero.from_primal_value(x) for x in out]
-    return out, _swap.bind(*map(ad.instantiate_zeros, moved), place)
+        return out, [ad.Zero(jax.typeof(x)) for x in out]
+    rows, row = map(ad.instantiate_zeros, moved)
+    return out, _exchange(rows, row, place)
 
 
-def _transpose(cotangents: Any, rows: Any, row: Any, place: Array) -> list[Any]:
+def _transpose(
+    cotangents: Sequence[Array | ad.Zero], rows: object, row: object, place: Array
+) -> list[Array | None]:
     if all(isinstance(x, ad.Zero) for x in cotangents):
         return [None, None, None]
-    return [*_swap.bind(*map(ad.instantiate_zeros, cotangents), place), None]
+    changed, old = map(ad.instantiate_zeros, cotangents)
+    return [*_exchange(changed, old, place), None]
 
 
-def _batch(values: Any, axes: Any) -> tuple[list[Array], list[int]]:
+def _batch(values: Sequence[Array], axes: Sequence[int | None]) -> tuple[list[Array], list[int]]:
     rows, row, place = values
     size = next(x.shape[k] for x, k in zip(values, axes, strict=True) if k is not None)
     if axes[2] is not None:  # every one at a place of its own
@@ -57,7 +65,7 @@ def _batch(values: Any, axes: Any) -> tuple[list[Array], list[int]]:
     last = lambda x, k: (
         jnp.broadcast_to(x[..., None], (*x.shape, size)) if k is None else jnp.moveaxis(x, k, -1)
     )
-    changed, old = _swap.bind(last(rows, axes[0]), last(row, axes[1]), place)
+    changed, old = _exchange(last(rows, axes[0]), last(row, axes[1]), place)
     return [changed, old], [changed.ndim - 1, old.ndim - 1]
 
 
