@@ -14,5 +14,4 @@ from ._segments import (
     read_segments as read_segments,
     Segment as Segment,
 )
-from .proposals._proposal import AXES as AXES, Proposal as Proposal
-from .proposals._propose import propose as propose
+from .proposals import AXES as AXES, Proposal as Proposal, propose as propose

@@ -66,7 +66,7 @@ Term = tuple[str, int, float]  # channel, power, weight
 
 
 class _Options(NamedTuple):
-    """What `read` is told of a file."""
+    """Options of `read` for a file."""
 
     time: str | None
     time_unit: TimeUnit | None

@@ -103,7 +103,7 @@ class Timebases:
 
 
 def column_values(signal: Signal, column: int | None, *, raw: bool = False) -> np.ndarray:
-    """One column in its unit; `raw` as it stands in the file."""
+    """One column in its unit; `raw` as in the file."""
     values = signal.values if column is None else signal.values[:, column]
     return values if raw or signal.scale == 1.0 else values * signal.scale
 

@@ -32,10 +32,10 @@ class Conditioned(NamedTuple):
     response: Complex[Array, "*groups frequencies outputs inputs"]
     solver: Complex[Array, "*groups frequencies inputs inputs"]  # (Z* X)^-1
     power: Float[Array, "*groups frequencies inputs"]  # of an input that no other input explains
-    alone: Float[Array, "*groups frequencies inputs"]  # the share of its power that this is
-    answer: Float[Array, "*groups frequencies outputs inputs"]  # output without the other inputs
+    own_share: Float[Array, "*groups frequencies inputs"]  # share of the input's power
+    output_power: Float[Array, "*groups frequencies outputs inputs"]  # less the other inputs'
     coherence: Float[Array, "*groups frequencies outputs inputs"]  # partial
-    moved: Float[Array, "*groups frequencies inputs"]  # share of an input that instruments move
+    instrument_share: Float[Array, "*groups frequencies inputs"]  # of an input's power
     multiple: Float[Array, "*groups frequencies outputs"]  # coherence of the output with all inputs
 
 
@@ -177,7 +177,7 @@ class Combined(NamedTuple):
 def single_length(part: Conditioned) -> Combined:
     """The response of one window length, without a combination."""
     response, coherence = part.response[0], part.coherence[0]
-    lesser = jnp.minimum(coherence, part.moved[0][:, None, :])
+    lesser = jnp.minimum(coherence, part.instrument_share[0][:, None, :])
     return Combined(response, lesser, jnp.ones((*response.shape, 1)))
 
 
@@ -201,7 +201,7 @@ def combine(
     known = jnp.asarray(resolved)[:, :, None, None]
     weight = jnp.where(known, _weights(parts.coherence, freedom), 0.0)
     scale = jnp.asarray(scales)[:, None, None, None]
-    gain, answer = parts.power[:, :, None, :] * scale, parts.answer * scale
+    gain, answer = parts.power[:, :, None, :] * scale, parts.output_power * scale
     cross = parts.response * gain.astype(parts.response.dtype)
     pilot, mean = (w / jnp.sum(w, axis=0, keepdims=True) for w in (weight**2, weight))
     xx, yy, seen = (jnp.sum(pilot * each, axis=0) for each in (gain, answer, parts.coherence))
@@ -216,7 +216,7 @@ def combine(
     ])  # fmt: skip
     whole = xy**2 / (xx * yy)
     a, b, r = _fit_spectra(targets, whole / seen)
-    moved = jnp.sum(mean * parts.moved[:, :, None, :], axis=0)
+    moved = jnp.sum(mean * parts.instrument_share[:, :, None, :], axis=0)
     share = mean * gain / jnp.sum(mean * gain, axis=0, keepdims=True)
     return Combined(
         along * (r / a * xy / xx / size).astype(along.dtype),
@@ -245,8 +245,8 @@ def _fit_spectra(
         slopes = jnp.stack([-q / u[0], -q / u[1], 2 * q / u[2]])
         # Normal equations of identity plus one rank, by Sherman and Morrison.
         norm, away = jnp.sum(slopes**2, axis=0), jnp.sum((start - u) * slopes, axis=0)
-        pull = _COHERENCE_WEIGHT * (q0 - q - away) / (1 + _COHERENCE_WEIGHT * norm)
-        return start + pull[None] * slopes
+        correction = _COHERENCE_WEIGHT * (q0 - q - away) / (1 + _COHERENCE_WEIGHT * norm)
+        return start + correction[None] * slopes
 
     return jax.lax.fori_loop(0, _STEPS, step, start)
 
@@ -290,8 +290,8 @@ def average(
     counts = jnp.asarray(many, float)
     parts = _conditioned(products, channels, counts)
     combined = combine(parts, scales, averages, resolved) if len(many) > 1 else single_length(parts)
-    apart = jnp.einsum("fig,gfi->fi", jnp.mean(combined.share, axis=1), parts.alone)
-    lost = ~(apart >= _DEPENDENT)
+    own_share = jnp.einsum("fig,gfi->fi", jnp.mean(combined.share, axis=1), parts.own_share)
+    lost = ~(own_share >= _DEPENDENT)
     parts, combined = _with_placeholders(jnp.any(lost, axis=1), parts, combined)
     z, inputs, outputs = channels.split(flat)
     split = jnp.split(jnp.conj(jnp.swapaxes(z, 1, 2)), np.cumsum(many)[:-1], axis=2)
@@ -311,7 +311,7 @@ def average(
         jnp.where(gone, jnp.inf, error),
         _direct(products, counts, combined, channels),
         jnp.einsum("fog,gfo->fo", weights, parts.multiple),
-        1 - jnp.nan_to_num(apart),
+        1 - jnp.nan_to_num(own_share),
         effect,
         combined.share,
         noise,

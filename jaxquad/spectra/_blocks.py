@@ -73,7 +73,7 @@ def window_tables(
 ) -> list[Float[np.ndarray, "2 frequencies blocks_times_rank"]]:
     """What turns the compressed blocks of a window into its Fourier sums, one table to a band.
 
-    Real and imaginary parts apart; the taper and the removal of a trend are in the numbers.
+    Real and imaginary parts are separate; the taper and the removal of a trend are included.
     """
     tables = []
     for angle, size in zip(bands, ranks, strict=True):

@@ -63,10 +63,10 @@ def smooth_noise(
         outlier = known[:, None] & (np.log(raw) > smooth + high)
         smooth = _local_lines(place, level, np.where(outlier, 1e-9 * weight, weight))
     if np.any(known):  # Far from all known frequencies the kernel vanishes.
-        lone = np.interp(place, place[known], np.arange(np.sum(known)))
-        lone = np.abs(place - place[known][np.round(lone).astype(int)]) > 3 * _BANDWIDTH
+        isolated = np.interp(place, place[known], np.arange(np.sum(known)))
+        isolated = np.abs(place - place[known][np.round(isolated).astype(int)]) > 3 * _BANDWIDTH
         nearest = [np.interp(place, place[known], column[known]) for column in smooth.T]
-        smooth = np.where(lone[:, None], np.stack(nearest, axis=1), smooth)
+        smooth = np.where(isolated[:, None], np.stack(nearest, axis=1), smooth)
     freedom = np.where(known, freedom, 0.0)
     windows = 1 + np.sqrt(np.pi) * _BANDWIDTH * omega / half_width
     correlation = _correlation(place, scatter, raw, freedom)

@@ -111,8 +111,8 @@ def _differences(wide: LocalFit, narrow: LocalFit, noise: Powers) -> tuple[Grid,
     variance = noise[:, :, None] * (narrow.gain - wide.gain) * doubt
     tested = variance > 0.02 * noise[:, :, None] * wide.gain
     tested &= np.isfinite(wide.response) & np.isfinite(narrow.response)
-    apart = np.abs(wide.response - narrow.response) ** 2
-    statistic = np.where(tested, apart / np.where(tested, variance, 1.0), 0.0)
+    difference = np.abs(wide.response - narrow.response) ** 2
+    statistic = np.where(tested, difference / np.where(tested, variance, 1.0), 0.0)
     return np.sum(statistic, axis=(1, 2)), np.sum(tested, axis=(1, 2)).astype(float)
 
 

@@ -52,8 +52,8 @@ def record_periods(record: Record, options: Periodic) -> Periods:
     periods = kept.reshape(count, samples, -1) - kept.mean(axis=0)
     spectra = np.fft.rfft(periods, axis=1)[:, 1 : (samples - 1) // 2 + 1] / np.sqrt(samples)
     mean = spectra.mean(axis=0)
-    apart = spectra - mean
-    covariance = np.einsum("mka,mkb->kab", apart, np.conj(apart)) / (count - 1)
+    deviation = spectra - mean
+    covariance = np.einsum("mka,mkb->kab", deviation, np.conj(deviation)) / (count - 1)
     return Periods(mean, covariance, count, _departure(spectra, record.inputs.shape[1]))
 
 
@@ -63,9 +63,9 @@ def _departure(spectra: Complex[np.ndarray, "periods lines channels"], inputs: i
         return 1.0
     first, later = spectra[0], spectra[1:]
     scatter = np.sum(np.abs(later - later.mean(axis=0)) ** 2, axis=0) / (len(later) - 1)
-    apart = np.abs(first - later.mean(axis=0)) ** 2 / (1 + 1 / len(later))
+    deviation = np.abs(first - later.mean(axis=0)) ** 2 / (1 + 1 / len(later))
     slow = slice(0, max(len(first) // 20, 8))  # A transient is slow, most noise is not.
-    ratio = np.sum(apart[slow], axis=0) / np.maximum(np.sum(scatter[slow], axis=0), 1e-300)
+    ratio = np.sum(deviation[slow], axis=0) / np.maximum(np.sum(scatter[slow], axis=0), 1e-300)
     return float(np.max(ratio[inputs:]))
 
 

@@ -84,10 +84,10 @@ def spectra(seed, groups=3, frequencies=7):
         response=jnp.asarray(response),
         solver=jnp.zeros((groups, frequencies, 1, 1), complex),
         power=jnp.asarray(gain),
-        alone=ones,
-        answer=jnp.asarray(np.abs(response) ** 2 * gain[..., None] / coherence),
+        own_share=ones,
+        output_power=jnp.asarray(np.abs(response) ** 2 * gain[..., None] / coherence),
         coherence=jnp.asarray(coherence),
-        moved=ones,
+        instrument_share=ones,
         multiple=ones,
     )
 
@@ -96,7 +96,7 @@ def published(parts, freedom, f):
     """T&R eq. 10.4 at one frequency, minimised by scipy over four unknowns."""
     xx, yy, tt, g2 = (
         np.asarray(getattr(parts, name))[:, f].reshape(-1)
-        for name in ("power", "answer", "response", "coherence")
+        for name in ("power", "output_power", "response", "coherence")
     )
     xy = tt * xx
     error = np.sqrt((1 - g2) / (g2 * 2 * freedom))

@@ -9,8 +9,7 @@ from scipy import signal
 
 from jaxquad.excitation import harmonics, multisine, sweep
 from jaxquad.records import Record
-from jaxquad.spectra import LocalPolynomial
-from jaxquad.spectra._local_estimate import estimate_local_polynomial
+from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
 
 
 Method = Literal["direct", "joint"]
@@ -37,7 +36,8 @@ def draw(k, *shape):
 
 def estimate(u, y, r=None, *, omega=OMEGA, options=AUTO, method: Method = "direct"):
     record = Record(np.arange(len(u)) / RATE, u, y, r)
-    return estimate_local_polynomial([record], omega, options, method)
+    estimator = JointInputOutput(options) if method == "joint" else options
+    return frequency_response(record, omega, estimator=estimator)
 
 
 def variance(found):
@@ -81,10 +81,9 @@ def test_a_given_width_gives_the_least_squares_of_numpy(order):
     pairs = [(WHITE, plant(WHITE) + 0.1 * draw(1)), (SWEEP[:2000], plant(SWEEP[:2000]))]
     records = [Record(np.arange(len(u)) / RATE, u, y) for u, y in pairs]
     options = LocalPolynomial(order=order, width=1.1)
-    found = estimate_local_polynomial(records, OMEGA, options, "direct")
+    found = frequency_response(records, OMEGA, estimator=options)
     expected = [by_lstsq(pairs, w, 1.1, order)[0] for w in OMEGA]
     np.testing.assert_allclose(found.response[:, 0, 0], expected, rtol=1e-9)
-    np.testing.assert_array_equal(found.half_width, 1.1)
 
 
 SIGNALS = {"sweep": SWEEP, "white noise": WHITE}
@@ -183,7 +182,9 @@ def test_a_long_delay_taken_out_leaves_wide_windows():
         np.sqrt(np.mean(np.abs(each.response[:, 0, 0] - exact) ** 2)) for each in (plain, helped)
     ]
     assert error[1] < 0.8 * error[0]
-    assert np.median(helped.half_width) > 2 * np.median(plain.half_width)
+    # Each Fourier bin of a window is one atom of noise.
+    bins = [np.count_nonzero(each.errors.effect, axis=(1, 2)) for each in (plain, helped)]
+    assert np.median(bins[1]) > 2 * np.median(bins[0])
 
 
 def test_between_the_lines_of_a_multisine_windows_grow_until_they_hold_enough():
@@ -213,13 +214,13 @@ def test_what_is_not_excited_is_unknown_and_said_to_be():
     silent = estimate(np.stack([WHITE, 2 * WHITE], axis=1), plant(WHITE))
     assert np.all(np.isnan(silent.response)) and np.all(np.asarray(silent.coherence) == 0)
     assert np.all(variance(silent) > 1e100)
-    assert "cannot be separated" in silent.remarks[0]
+    assert any("cannot be separated" in remark for remark in silent.remarks)
 
 
 def test_a_width_that_holds_too_few_bins_says_what_would_do():
     found = estimate(WHITE, plant(WHITE), options=LocalPolynomial(width=0.2))
     assert np.all(np.isnan(found.response))
-    assert "use a larger width: " in found.remarks[0]
+    assert any("use a larger width: " in remark for remark in found.remarks)
 
 
 @pytest.mark.parametrize(
@@ -236,5 +237,5 @@ def test_records_that_cannot_hold_the_fit_are_refused():
         estimate(WHITE[:30], plant(WHITE[:30]))
     with pytest.raises(ValueError, match="one cycle"):
         estimate(WHITE, plant(WHITE), omega=np.array([0.01, 1.0]))
-    with pytest.raises(ValueError, match="as many external references"):
+    with pytest.raises(ValueError, match="one external reference for each input"):
         estimate(WHITE, plant(WHITE), method="joint")

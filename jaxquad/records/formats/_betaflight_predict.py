@@ -207,7 +207,7 @@ def short(
 def until_time_leaps(
     main: Found, begin: Int[np.ndarray, " segments"], usable: Int[np.ndarray, " segments"]
 ) -> Int[np.ndarray, " segments"]:
-    """Cut segments where time stands still, leaps, or passes that of the next key frame."""
+    """Cut segments where time does not increase, jumps, or passes that of the next key frame."""
     usable = usable.copy()
     rows = spread(begin, usable)
     segment = np.repeat(np.arange(begin.size), usable)

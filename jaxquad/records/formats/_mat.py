@@ -36,7 +36,7 @@ _DEEPEST = 8  # structs within structs
 
 
 class _Element(NamedTuple):
-    """A typed piece of the file: its type, its bytes, and where it stands."""
+    """A typed piece of the file: its type, its bytes, and its place."""
 
     kind: int
     body: memoryview
@@ -126,7 +126,7 @@ def _variable(matrix: _Element, order: str, prefix: str, depth: int) -> dict[str
         return _struct(parts, order, name, depth)
     if kind not in _CLASSES or is_complex or len(parts) < 4:
         return {}
-    # Numbers are stored as small as they fit, whatever their class.
+    # Numbers are stored in the smallest type that fits, regardless of their class.
     numbers = _numbers(parts[3], order, name).astype(_CLASSES[kind])
     return {name: _squeezed(numbers, shape, name, matrix.offset)}
 

@@ -1,0 +1,2 @@
+from ._proposal import AXES as AXES, Proposal as Proposal
+from ._propose import propose as propose
