@@ -95,7 +95,7 @@ def draws(name):
     return [estimate(u, plant(u) + 0.3 * draw(k)) for k in range(DRAWS)]
 
 
-@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize("name", [pytest.param("sweep", marks=pytest.mark.slow), "white noise"])
 def test_predicted_errors_are_those_of_repeated_draws(name):
     check_calibrated(draws(name), PLANT[:, None, None])
 

@@ -133,7 +133,7 @@ def test_two_inputs_at_once_need_as_many_records():
 
 
 def test_a_linear_plant_shows_no_distortion():
-    told = [estimate([record(1000 * r + k) for r in range(4)]).distortion for k in range(20)]
+    told = [distortion(estimate([record(1000 * r + k) for r in range(4)])) for k in range(20)]
     assert not any(each.significant[0] for each in told)
     assert "nonlinear distortion below the noise" in str(told[0])
     noise = np.mean([np.mean(each.noise**2) for each in told])

@@ -65,7 +65,7 @@ CASES = {
 }
 
 
-SLOW = ("white input", "sweep")  # The other two differ from them in the noise and in the loop.
+SLOW = ("white input", "sweep", "sweep under drifting noise")  # The loop holds all of them.
 PARAMETERS = [
     pytest.param(name, id=name.replace(" ", "-"), marks=[pytest.mark.slow] * (name in SLOW))
     for name in CASES
