@@ -84,16 +84,16 @@ def series(first: StateSpace, second: StateSpace) -> StateSpace:
             f"The first model has {made} outputs, the second {taken} inputs: pick channels with "
             "model.select."
         )
-    between = _common(_sum(first.output_delay, second.input_delay))
+    between = _common_delay(_add_delays(first.output_delay, second.input_delay))
     late = first.input_delay
     if between is not None:
-        late = _sum(late, jnp.broadcast_to(between, (first.G.shape[1],)))
-    driven = -_dot(second.G, _some(first.H1, first.H0))
+        late = _add_delays(late, jnp.broadcast_to(between, (first.G.shape[1],)))
+    driven = -_dot(second.G, _zeros_if_none(first.H1, first.H0))
     return StateSpace(
         F=_blocks(first.F, _dot(second.G, first.H0), second.F),
         G=jnp.concatenate([first.G, jnp.zeros((len(second.F), first.G.shape[1]), first.G.dtype)]),
-        H0=_behind(first, second.H0),
-        H1=None if second.H1 is None else _behind(first, second.H1),
+        H0=_pad_left(first, second.H0),
+        H1=None if second.H1 is None else _pad_left(first, second.H1),
         M=_mass(first, second, driven),
         input_delay=late,
         output_delay=second.output_delay,
@@ -104,7 +104,7 @@ def _mass(first: StateSpace, second: StateSpace, driven: Array) -> Array | None:
     if first.M is None and second.M is None and first.H1 is None:
         return None
     ones = [jnp.eye(len(each.F), dtype=each.F.dtype) for each in (first, second)]
-    return _blocks(_given(first.M, ones[0]), driven, _given(second.M, ones[1]))
+    return _blocks(_default(first.M, ones[0]), driven, _default(second.M, ones[1]))
 
 
 def _blocks(upper: Array, across: Array, lower: Array) -> Float[Array, "states states"]:
@@ -112,11 +112,11 @@ def _blocks(upper: Array, across: Array, lower: Array) -> Float[Array, "states s
     return jnp.block([[upper, none], [across, lower]])
 
 
-def _behind(first: StateSpace, H: Array) -> Float[Array, "outputs states"]:
+def _pad_left(first: StateSpace, H: Array) -> Float[Array, "outputs states"]:
     return jnp.concatenate([jnp.zeros((len(H), len(first.F)), H.dtype), H], axis=1)
 
 
-def _common(late: Float[Array, " signals"] | None) -> Float[Array, ""] | None:
+def _common_delay(late: Float[Array, " signals"] | None) -> Float[Array, ""] | None:
     if late is None or late.size == 1:
         return None if late is None else late[0]
     if is_concrete(late) and np.ptp(np.asarray(late)) == 0:
@@ -127,15 +127,15 @@ def _common(late: Float[Array, " signals"] | None) -> Float[Array, ""] | None:
     )
 
 
-def _sum(a: Array | None, b: Array | None) -> Array | None:
+def _add_delays(a: Array | None, b: Array | None) -> Array | None:
     return b if a is None else a if b is None else a + b
 
 
-def _some(matrix: Array | None, like: Array) -> Array:
+def _zeros_if_none(matrix: Array | None, like: Array) -> Array:
     return jnp.zeros_like(like) if matrix is None else matrix
 
 
-def _given(matrix: Array | None, otherwise: Array) -> Array:
+def _default(matrix: Array | None, otherwise: Array) -> Array:
     return otherwise if matrix is None else matrix
 
 

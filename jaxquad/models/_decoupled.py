@@ -119,7 +119,7 @@ class DecoupledAxes(eqx.Module):
     @property
     def gain(self) -> Float[Array, " axes *ensemble"]:
         """b, the acceleration that a unit of command causes: rad/s^2 per unit."""
-        return _widest(self.torque_gain, self.inertia) / _widest(self.inertia, self.torque_gain)
+        return _align_to(self.torque_gain, self.inertia) / _align_to(self.inertia, self.torque_gain)
 
     def init(
         self, euler: ArrayLike | Sequence | None = None, *, ensemble: tuple[int, ...] = ()
@@ -177,7 +177,7 @@ class DecoupledAxes(eqx.Module):
 
     def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "DecoupledAxes":
         """The same axes carrying a known extra `inertia` in kg m^2, such as a payload."""
-        return eqx.tree_at(lambda p: p.inertia, self, added(self.inertia, inertia))
+        return eqx.tree_at(lambda p: p.inertia, self, add_inertia(self.inertia, inertia))
 
 
 def _on_axis(x: Float[Array, "axes ..."], axis: int, ensemble: tuple[int, ...]) -> Array:
@@ -188,13 +188,13 @@ def _on_axis(x: Float[Array, "axes ..."], axis: int, ensemble: tuple[int, ...]) 
     )
 
 
-def added(inertia: Float[Array, "axes ..."], extra: Float[ArrayLike, "..."]) -> Array:
+def add_inertia(inertia: Float[Array, "axes ..."], extra: Float[ArrayLike, "..."]) -> Array:
     """The sum, in the precision of `inertia`, where either may have a trailing ensemble axis."""
     extra = jnp.atleast_1d(jnp.asarray(extra, inertia.dtype))
-    total = _widest(inertia, extra) + _widest(extra, inertia)
-    require_positive("inertia with what was added", total, "add kg m^2 that leave it above 0")
+    total = _align_to(inertia, extra) + _align_to(extra, inertia)
+    require_positive("the inertia with what was added", total, "add kg m^2 that leave it above 0")
     return total
 
 
-def _widest(x: Array, other: Array) -> Array:
+def _align_to(x: Array, other: Array) -> Array:
     return x if x.ndim >= other.ndim else align(x, other)

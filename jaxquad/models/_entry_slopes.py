@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxquad._xla import no_fuse
 
-from ._response import Matrices, output_of, solved, Split
+from ._response import Matrices, output_of, solve_states, Split
 
 
 class Entry(NamedTuple):
@@ -39,12 +39,12 @@ def logarithmic_slopes(
 
     Both without a look at rounding near a pole; the slope of a response of 0 is not finite.
     """
-    found = solved(matrices, omega)
+    found = solve_states(matrices, omega)
     seen, undelayed = (output_of(matrices, omega, x) for x in (found.resolvent, found.states))
-    picked = _picked(entries, seen, found.states, omega)
+    picked = _pick_vectors(entries, seen, found.states, omega)
     delays = picked.late[..., None] * omega[None, None, None]
     over = no_fuse(_reciprocal, undelayed)
-    return found.value, no_fuse(_multiplied, picked.left, picked.right, over, delays)
+    return found.value, no_fuse(_relative_slopes, picked.left, picked.right, over, delays)
 
 
 def _reciprocal(response: Split) -> Split:
@@ -52,7 +52,7 @@ def _reciprocal(response: Split) -> Split:
     return Split(response.real / power, -response.imag / power)
 
 
-def _multiplied(left: Split, right: Split, over: Split, delays: Array) -> Split:
+def _relative_slopes(left: Split, right: Split, over: Split, delays: Array) -> Split:
     a, b = Split(*(x[:, :, None] for x in left)), Split(*(x[:, None] for x in right))
     change = Split(a.real * b.real - a.imag * b.imag, a.real * b.imag + a.imag * b.real)
     over = Split(*(x[None] for x in over))
@@ -62,15 +62,15 @@ def _multiplied(left: Split, right: Split, over: Split, delays: Array) -> Split:
     )
 
 
-def _picked(
+def _pick_vectors(
     entries: Sequence[Entry], seen: Split, states: Split, omega: Float[Array, " frequencies"]
 ) -> Slopes:
     """Columns from L and unit vectors, rows from X, s X and unit vectors."""
     (outputs, count, _), inputs = seen.real.shape, states.real.shape[1]
     rate = Split(-omega[None, None] * states.imag, omega[None, None] * states.real)
-    left = _with_units(Split(*(jnp.moveaxis(part, 1, 0) for part in seen)))
-    right = _with_units(Split(*map(jnp.concatenate, zip(states, rate, strict=True))))
-    column, row, sign = np.array([_place(entry, count) for entry in entries]).T
+    left = _append_units(Split(*(jnp.moveaxis(part, 1, 0) for part in seen)))
+    right = _append_units(Split(*map(jnp.concatenate, zip(states, rate, strict=True))))
+    column, row, sign = np.array([_find_vectors(entry, count) for entry in entries]).T
     sign = jnp.asarray(sign, omega.dtype)[:, None, None]
     late = np.zeros((len(entries), outputs, inputs))
     for k, (field, which, _) in enumerate(entries):
@@ -82,7 +82,7 @@ def _picked(
     return Slopes(Split(*(sign * x for x in columns)), rows, late)
 
 
-def _place(entry: Entry, count: int) -> tuple[int, int, int]:
+def _find_vectors(entry: Entry, count: int) -> tuple[int, int, int]:
     """Which column, which row and with which sign; a delay has none of its own."""
     _, row, column = entry
     places = {
@@ -95,7 +95,7 @@ def _place(entry: Entry, count: int) -> tuple[int, int, int]:
     return places.get(entry.field, (0, 0, 0))
 
 
-def _with_units(rows: Split) -> Split:
+def _append_units(rows: Split) -> Split:
     """The unit vectors of the second axis below the rows."""
     _, width, frequencies = rows.real.shape
     unit = jnp.eye(width, dtype=rows.real.dtype)[:, :, None]

@@ -16,7 +16,7 @@ from jaxquad._core import (
 
 from ._allocation import Allocation
 from ._attitude import Attitude
-from ._decoupled import added, DecoupledAxes, LinearAxis
+from ._decoupled import add_inertia, DecoupledAxes, LinearAxis
 from ._rotation import euler_from_quaternion, quaternion_derivative, quaternion_from_euler
 
 
@@ -151,7 +151,7 @@ class Multirotor(eqx.Module):
     def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "Multirotor":
         """The same vehicle carrying a known extra `inertia` in kg m^2, such as a payload."""
         return eqx.tree_at(
-            lambda p: p.attitude.inertia, self, added(self.attitude.inertia, inertia)
+            lambda p: p.attitude.inertia, self, add_inertia(self.attitude.inertia, inertia)
         )
 
     def linearise(self, axis: int) -> LinearAxis:

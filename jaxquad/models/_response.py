@@ -41,7 +41,7 @@ def inverse(matrix: Split, scales: Scales) -> Split:
     """
     rows, columns = scales
     scaled = Split(*(rows[:, None] * part * columns[None] for part in matrix))
-    return Split(*(columns[:, None] * part * rows[None] for part in _exchange(scaled)))
+    return Split(*(columns[:, None] * part * rows[None] for part in _invert_in_place(scaled)))
 
 
 @inverse.defjvp
@@ -68,7 +68,7 @@ def equilibrium(
 _ROUNDS = 5  # units 12 decades apart end within a factor of 2.4
 
 
-def _exchange(matrix: Split) -> Split:
+def _invert_in_place(matrix: Split) -> Split:
     # Each step exchanges one unknown with one right side, in place: what was the matrix from x to y
     # becomes that from y to x. Rows stay where they are and are put in order at the end.
     states, _, frequencies = matrix.real.shape
@@ -77,14 +77,14 @@ def _exchange(matrix: Split) -> Split:
     def step(carry, k):
         table, unused = carry
         row = _pivot_row(table, unused, k)
-        return (_exchanged(table, row, k), jnp.where(_is(row, states), 0, unused)), row
+        return (_exchange_pivot(table, row, k), jnp.where(_is_row(row, states), 0, unused)), row
 
     (table, _), row = jax.lax.scan(step, (matrix, unused), jnp.arange(states))
     # Column k belongs to the right side row[k], and row[k] holds the unknown k.
     number = jnp.arange(states)
     place = jnp.sum(jnp.where(row[:, None] == number[None, :, None], number[:, None, None], 0), 0)
     index = (row[:, None] * states + place[None]).reshape(-1, frequencies)
-    order = lambda part: _taken(part.reshape(-1, frequencies), index, 0).reshape(part.shape)
+    order = lambda part: _take_along(part.reshape(-1, frequencies), index, 0).reshape(part.shape)
     return Split(order(table.real), order(table.imag))
 
 
@@ -99,10 +99,10 @@ def _pivot_row(
     return jnp.min(jnp.where(best, jnp.arange(states)[:, None], states - 1), axis=0)
 
 
-def _exchanged(table: Split, row: Int[Array, " frequencies"], k: Int[Array, ""]) -> Split:
+def _exchange_pivot(table: Split, row: Int[Array, " frequencies"], k: Int[Array, ""]) -> Split:
     states = len(table.real)
-    mine, diagonal = _is(row, states), (jnp.arange(states) == k)[:, None]
-    pivots = [_taken(part, row[None, None], 0)[0] for part in table]
+    mine, diagonal = _is_row(row, states), (jnp.arange(states) == k)[:, None]
+    pivots = [_take_along(part, row[None, None], 0)[0] for part in table]
     here = [jax.lax.dynamic_index_in_dim(part, k) for part in pivots]
     real, imag = _reciprocal(*here)
     a, b = jnp.where(diagonal, 1, pivots[0]), jnp.where(diagonal, 0, pivots[1])
@@ -133,11 +133,11 @@ def _column(table: Split, k: Int[Array, ""]) -> Split:
     return Split(*(jax.lax.dynamic_index_in_dim(part, k, 1, keepdims=False) for part in table))
 
 
-def _is(row: Int[Array, " frequencies"], states: int) -> Array:
+def _is_row(row: Int[Array, " frequencies"], states: int) -> Array:
     return jnp.arange(states)[:, None] == row[None]
 
 
-def _taken(x: Array, index: Array, axis: int) -> Array:
+def _take_along(x: Array, index: Array, axis: int) -> Array:
     shape = list(x.shape)
     shape[axis] = index.shape[axis]
     index = jnp.broadcast_to(index, shape)
@@ -162,7 +162,7 @@ def response(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
     Infinite, with an undefined phase, where a pole lies so near that more than a hundredth of the
     states may be rounding. Source: Tischler & Remple, eq. 12.11 and 12.12.
     """
-    return _guarded(matrices, omega, solved(matrices, omega))
+    return _mark_rounding(matrices, omega, solve_states(matrices, omega))
 
 
 class Solved(NamedTuple):
@@ -174,17 +174,17 @@ class Solved(NamedTuple):
     scales: Scales
 
 
-def solved(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Solved:
+def solve_states(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Solved:
     """The response without a look at its rounding error."""
     scales = jax.lax.stop_gradient(_scales(matrices, omega))
     resolvent = inverse(_pencil(matrices, omega), scales)
-    states = Split(*(_times(part, matrices.G) for part in resolvent))
-    value = _turned(output_of(matrices, omega, states), matrices.late, omega)
+    states = Split(*(_multiply_columns(part, matrices.G) for part in resolvent))
+    value = _apply_delay(output_of(matrices, omega, states), matrices.late, omega)
     return Solved(value, resolvent, states, scales)
 
 
-def _guarded(matrices: Matrices, omega: Float[Array, " frequencies"], found: Solved) -> Split:
-    lost = _lost(*jax.lax.stop_gradient((matrices, omega, found)))
+def _mark_rounding(matrices: Matrices, omega: Float[Array, " frequencies"], found: Solved) -> Split:
+    lost = _find_rounding(*jax.lax.stop_gradient((matrices, omega, found)))
     real, imag = found.value
     return Split(jnp.where(lost, jnp.inf, real), jnp.where(lost, jnp.nan, imag))
 
@@ -194,29 +194,33 @@ def _response_jvp(primals, tangents):
     # With the states X = R G and L = (H0 + s H1) R, both small, instead of the products R dF R:
     # dT = L (dG + dF X - d(s M) X) + d(H0 + s H1) X, late, and -j d(omega late) T.
     matrices, omega = primals
-    d, d_omega = (_present(each) for each in tangents)
-    found = solved(matrices, omega)
-    value, states = _guarded(matrices, omega, found), found.states
+    d, d_omega = (_drop_zeros(each) for each in tangents)
+    found = solve_states(matrices, omega)
+    value, states = _mark_rounding(matrices, omega, found), found.states
     rate = _derivative(states, omega)
-    push = [_applied(d.F, states), _negative(_applied(d.M, rate)), _real(d.G, states)]
-    change = [_applied(d.H0, states), _applied(d.H1, rate)]
+    push = [
+        _multiply(d.F, states),
+        _negative(_multiply(d.M, rate)),
+        _real_if_given(d.G, states),
+    ]
+    change = [_multiply(d.H0, states), _multiply(d.H1, rate)]
     if d_omega is not None:
         turned = _derivative(states, d_omega)
-        push.append(_negative(turned if matrices.M is None else _applied(matrices.M, turned)))
-        change.append(_applied(matrices.H1, turned))
-    pushed = _sum(push)
+        push.append(_negative(turned if matrices.M is None else _multiply(matrices.M, turned)))
+        change.append(_multiply(matrices.H1, turned))
+    pushed = _add_given(push)
     if pushed is not None:
         change.append(no_fuse(product, output_of(matrices, omega, found.resolvent), pushed))
-    changed = _sum(change)
-    moved = [None if changed is None else _turned(changed, matrices.late, omega)]
+    changed = _add_given(change)
+    moved = [None if changed is None else _apply_delay(changed, matrices.late, omega)]
     for late, frequency in ((d.late, omega), (matrices.late, d_omega)):
         if late is not None and frequency is not None:
             angle = late[:, :, None] * frequency[None, None]
             moved.append(Split(angle * value.imag, -angle * value.real))
-    return value, _added(Split(*(jnp.zeros_like(part) for part in value)), *moved)
+    return value, _add(Split(*(jnp.zeros_like(part) for part in value)), *moved)
 
 
-def _turned(parts: Split, late: Array | None, omega: Float[Array, " frequencies"]) -> Split:
+def _apply_delay(parts: Split, late: Array | None, omega: Float[Array, " frequencies"]) -> Split:
     if late is None:
         return parts
     angle = late[:, :, None] * omega[None, None]
@@ -245,11 +249,11 @@ def _mass(matrices: Matrices) -> Float[Array, "states states"]:
 
 def output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
     """(H0 + s H1) times `states`, or times the resolvent."""
-    rates = _applied(matrices.H1, _derivative(states, omega))
-    return _added(_real_times(matrices.H0, states), rates)
+    rates = _multiply(matrices.H1, _derivative(states, omega))
+    return _add(_multiply_real(matrices.H0, states), rates)
 
 
-def _lost(
+def _find_rounding(
     matrices: Matrices, omega: Float[Array, " frequencies"], found: Solved
 ) -> Bool[Array, "outputs inputs frequencies"]:
     # A first-order bound of the rounding error in the states, beside the largest state in the
@@ -278,18 +282,18 @@ def _derivative(states: Split, omega: Float[Array, " frequencies"]) -> Split:
     return Split(-factor * states.imag, factor * states.real)
 
 
-def _applied(matrix: Array | None, states: Split) -> Split | None:
-    return None if matrix is None else _real_times(matrix, states)
+def _multiply(matrix: Array | None, states: Split) -> Split | None:
+    return None if matrix is None else _multiply_real(matrix, states)
 
 
-def _real_times(matrix: Array, states: Split) -> Split:
+def _multiply_real(matrix: Array, states: Split) -> Split:
     """A real matrix times both parts, in one product."""
     both = jnp.concatenate(states, axis=1)
     found, inputs = _dot(matrix, both), states.real.shape[1]
     return Split(found[:, :inputs], found[:, inputs:])
 
 
-def _real(matrix: Array | None, like: Split) -> Split | None:
+def _real_if_given(matrix: Array | None, like: Split) -> Split | None:
     if matrix is None:
         return None
     return Split(jnp.broadcast_to(matrix[:, :, None], like.real.shape), jnp.zeros_like(like.imag))
@@ -299,12 +303,12 @@ def _negative(parts: Split | None) -> Split | None:
     return None if parts is None else Split(-parts.real, -parts.imag)
 
 
-def _sum(terms: Sequence[Split | None]) -> Split | None:
+def _add_given(terms: Sequence[Split | None]) -> Split | None:
     present = [term for term in terms if term is not None]
-    return _added(*present) if present else None
+    return _add(*present) if present else None
 
 
-def _added(first: Split, *others: Split | None) -> Split:
+def _add(first: Split, *others: Split | None) -> Split:
     """The sum, without what is None."""
     present = [term for term in others if term is not None]
     return ft.reduce(lambda a, b: Split(a.real + b.real, a.imag + b.imag), present, first)
@@ -313,13 +317,13 @@ def _added(first: Split, *others: Split | None) -> Split:
 _Tree = TypeVar("_Tree")
 
 
-def _present(tangents: _Tree) -> _Tree:
+def _drop_zeros(tangents: _Tree) -> _Tree:
     """The tangents, with None for those that are known to be zero."""
     absent = lambda x: isinstance(x, SymbolicZero)
     return jax.tree.map(lambda x: None if absent(x) else x, tangents, is_leaf=absent)
 
 
-def _times(array: Array, matrix: Array) -> Array:
+def _multiply_columns(array: Array, matrix: Array) -> Array:
     terms = [array[:, k, None] * matrix[k][None, :, None] for k in range(len(matrix))]
     return ft.reduce(jnp.add, terms)
 

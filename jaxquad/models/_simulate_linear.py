@@ -67,16 +67,16 @@ def _propagate(
     return step[:, :states], step[:, states:]
 
 
-def at_delay(
+def delay_input(
     segments: Float[Array, "samples 2"], delay: Float[Array, ""], dt: float
 ) -> Float[Array, " samples"]:
     """The input itself, `delay` s late, at the samples; where it jumps, the value just after."""
     shift, late = split_delay(delay, dt)
-    old, new = shifted(segments, shift + 1), shifted(segments, shift)
+    old, new = shift_samples(segments, shift + 1), shift_samples(segments, shift)
     return jnp.where(late <= _WHOLE, new[:, 0], old[:, 0] + (1 - late) * old[:, 1])
 
 
-def shifted(
+def shift_samples(
     x: Float[Array, "samples columns"], shift: Int[Array, ""]
 ) -> Float[Array, "samples columns"]:
     """`x` so many samples later, and zero before."""
@@ -169,7 +169,7 @@ def simulate_linear(
     if hold not in _HOLDS:
         raise ValueError(f"hold is {hold!r}, which does not exist: choose one of {_HOLDS}.")
     inputs = _inputs(model, jnp.asarray(u))
-    found = _respond(_plant(model), _segments(inputs, hold), dt)
+    found = _simulate(_plant(model), _segments(inputs, hold), dt)
     return found[:, 0] if isinstance(model, TransferFunction) else found
 
 
@@ -193,7 +193,7 @@ def free_responses(
     `TransferFunction`. The states of the latter are those of `realise`, so that only the span of
     the columns has a meaning.
     """
-    start, bias = _free(_plant(model), samples, dt)
+    start, bias = _free_outputs(_plant(model), samples, dt)
     if isinstance(model, TransferFunction):
         return start[:, 0], bias[:, 0]
     return start, bias
@@ -235,11 +235,11 @@ def _segments(u: Float[Array, "samples inputs"], hold: str) -> Float[Array, "inp
 
 
 @eqx.filter_jit
-def _respond(
+def _simulate(
     plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: float
 ) -> Float[Array, "samples outputs"]:
     shift, late = split_delay(plant.input_delay, dt)
-    parts = [jax.vmap(shifted)(segments, shift + n) for n in (1, 0)]
+    parts = [jax.vmap(shift_samples)(segments, shift + n) for n in (1, 0)]
     acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
     acting = acting.reshape(segments.shape[1], 4 * len(segments))
     step, drive = propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
@@ -248,7 +248,7 @@ def _respond(
         found = _dot(states, plant.C.T)
     else:
         found = _late_outputs(plant, states, acting, late, dt)
-    return found if plant.D is None else found + _passing(plant, plant.D, segments, dt)
+    return found if plant.D is None else found + _direct_outputs(plant, plant.D, segments, dt)
 
 
 def _late_outputs(
@@ -263,23 +263,23 @@ def _late_outputs(
         shift, wait = split_delay(delay, dt)
         step, drive = propagation(plant.A, plant.B, late, 1 - wait, dt)
         within = _dot(states, _dot(row, step)) + _dot(acting, _dot(drive, row))
-        return shifted(within[:, None], shift + 1)[:, 0]
+        return shift_samples(within[:, None], shift + 1)[:, 0]
 
     return jax.vmap(output, out_axes=1)(plant.C, plant.output_delay)
 
 
-def _passing(
+def _direct_outputs(
     plant: _Plant, D: Array, segments: Float[Array, "inputs samples 2"], dt: float
 ) -> Float[Array, "samples outputs"]:
     wait = jnp.zeros(len(D), D.dtype) if plant.output_delay is None else plant.output_delay
-    one = lambda wait, late, segments: at_delay(segments, wait + late, dt)
+    one = lambda wait, late, segments: delay_input(segments, wait + late, dt)
     by_input = jax.vmap(one, in_axes=(None, 0, 0))
     by_both = jax.vmap(by_input, in_axes=(0, None, None))(wait, plant.input_delay, segments)
     return jnp.einsum("oi,oik->ko", D, by_both, precision="highest")
 
 
 @eqx.filter_jit
-def _free(
+def _free_outputs(
     plant: _Plant, samples: int, dt: float
 ) -> tuple[Float[Array, "samples outputs states"], Float[Array, "samples outputs states"]]:
     A, states = plant.A, len(plant.A)

@@ -108,6 +108,7 @@ def test_b0_follows_a_payload_taken_up_in_flight():
     np.testing.assert_allclose(b0[round(17.5 / DT)], GAIN / heavy, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_without_trust_it_is_the_ladrc_alone():
     """An inertia 100 times below the nominal one is not believed; the probe is silent."""
     step = np.where(TIME >= 1.0, 0.05, 0.0)
@@ -117,6 +118,7 @@ def test_without_trust_it_is_the_ladrc_alone():
     np.testing.assert_allclose(runs[0].command, runs[1].command, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_the_printed_map_does():
     """At delta = 1.875, where 1.6 is right, b0 = 4: past the loop's limit of b / 0.217 = 3.9."""
     step = np.where(TIME >= 0.0, np.radians(3.0), 0.0)

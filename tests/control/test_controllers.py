@@ -1,5 +1,7 @@
 """What every controller owes a loop: ensembles, precision, gradients, plain refusals."""
 
+import functools as ft
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -50,7 +52,10 @@ value_and_slope = eqx.filter_jit(
 )
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+slow = ft.partial(pytest.param, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("name", ["current", slow("predictive"), "clamped", slow("following")])
 def test_the_slope_of_a_saturated_loop_agrees_with_central_differences(name):
     controller = CONTROLLERS[name]
     _, slopes = value_and_slope(controller)

@@ -1,12 +1,14 @@
 """Inertia estimators on the rig as it is: encoder, noise, gusts, lag and the paper's sine."""
 
 import numpy as np
+import pytest
 from inertia_runs import gusty, heard, lock_in, recursive, RIG, swung, windowed
 from rig_records import DT, fly, INERTIA
 
 from jaxquad.control import ProbeTones
 
 
+@pytest.mark.slow
 def test_the_printed_first_order_filter_fails_on_the_encoder():
     """Twice differenced counts through one stage: noise in the regressor buries the motion."""
     printed = windowed(bandwidth=50.0, order=1, nuisance=(), window=1.0)
@@ -66,6 +68,7 @@ def test_nothing_is_learnt_in_the_dead_zone():
         assert not np.any(trusted) and np.all(deviation > 0.1)
 
 
+@pytest.mark.slow
 def test_nothing_is_learnt_while_the_tones_are_off():
     """A loop that only its gusts move shows the controller: torque = -C angle."""
     off = ProbeTones(above=2.0, below=1.5)  # never more in doubt than 100 %

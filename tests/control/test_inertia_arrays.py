@@ -50,7 +50,10 @@ def test_an_estimator_can_be_told_to_excite():
 ALL = [windowed(window=1.0), recursive(), lock_in()]
 
 
-@pytest.mark.parametrize("estimator", ALL, ids=lambda e: type(e).__name__)
+SOME = [pytest.param(ALL[0], marks=pytest.mark.slow), *ALL[1:]]
+
+
+@pytest.mark.parametrize("estimator", SOME, ids=lambda e: type(e).__name__)
 def test_single_precision_agrees(estimator):
     single = RigRecord(*(x.astype(np.float32) for x in gusty()))
     double = RigRecord(*(x.astype(float) for x in single))

@@ -76,6 +76,7 @@ def test_a_constant_torque_biases_the_papers_integral_unless_windows_hold_whole_
     np.testing.assert_allclose(three_terms, 1.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_stiffness_of_the_rig_reads_as_less_inertia_at_one_tone():
     record = fly(duration=15.02, stiffness=0.5, tones=TONE, **EXACT)
     expected = 1 - 0.5 / (4 * np.pi) ** 2 / INERTIA

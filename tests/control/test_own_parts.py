@@ -156,6 +156,24 @@ def test_they_have_the_methods_and_are_no_classes_of_the_package():
         assert isinstance(part, protocol) and type(part).__mro__[1] is eqx.Module
 
 
+def run(controller, measurements):
+    """The commands that a controller answers a record of measurements with."""
+    step = lambda state, y: controller.step(state, jnp.zeros_like(y), y)
+    return jax.lax.scan(step, controller.init(measurements[0]), measurements)[1]
+
+
+def test_a_linear_form_gives_the_commands_of_the_controller():
+    law = PositionFeedback(jnp.asarray(4.0), jnp.asarray(1.0))
+    angle = np.sin(np.arange(50.0))
+    commands = np.asarray(run(law, jnp.asarray(angle)[:, None]))[:, 0]
+    linear, state, expected = law.linear(), np.zeros(1), []
+    for y in angle:
+        expected.append(np.asarray(linear.C) @ state + float(linear.measurement_through) * y)
+        state = np.asarray(linear.A) @ state + np.asarray(linear.measurement_in) * y
+    np.testing.assert_allclose(commands, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_a_controller_flies_as_its_linear_form_says():
     loop = jq.Loop(PLANT, PositionFeedback(jnp.asarray(4.0), jnp.asarray(1.0)), delay=0.003)
     flight, found = jq.simulate(loop, STEP), jq.analyse(loop)
@@ -163,12 +181,6 @@ def test_a_controller_flies_as_its_linear_form_says():
     assert bool(found.stable) and left < 0.1 * np.exp(1.7 * float(found.abscissa))
     unstable = loop.with_controller(PositionFeedback(jnp.asarray(4.0), jnp.asarray(-0.1)))
     assert not bool(jq.analyse(unstable).stable)
-
-
-def run(controller, measurements):
-    """The commands that a controller answers a record of measurements with."""
-    step = lambda state, y: controller.step(state, jnp.zeros_like(y), y)
-    return jax.lax.scan(step, controller.init(measurements[0]), measurements)[1]
 
 
 def test_an_observer_of_the_same_matrices_flies_and_is_linearised_as_the_librarys():

@@ -147,7 +147,7 @@ def test_free_responses_continue_a_state_and_add_a_bias_to_its_derivative():
 
 
 def test_inputs_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match=r"u has shape \(200, 1\).*\(samples, 2\)"):
+    with pytest.raises(ValueError, match=r"u has the shape \(200, 1\).*\(samples, 2\)"):
         simulate_linear(plant(), U[:, :1], DT)
-    with pytest.raises(ValueError, match=r"u has shape \(200, 2\).*\(samples,\)"):
+    with pytest.raises(ValueError, match=r"u has the shape \(200, 2\).*\(samples,\)"):
         simulate_linear(TransferFunction([1.0], [1.0, 1.0]), U, DT)
