@@ -60,8 +60,8 @@ class Identification:
     - `records`: one for each segment.
     - `responses`: the frequency response by method, the one to trust first.
     - `fits`: the fit to each of them.
-    - `parts`: where the misfit is large, fits to the upper and to the lower part of the band; None
-      for one that diverged.
+    - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
+      the band; None for one that diverged.
     - `check`: the second record simulated, where `settings.verify` names one.
     - `proposal`: where the log itself said what is input and output.
     """
@@ -150,10 +150,7 @@ class Identification:
                 if name not in known
             ]
         if self.parts:
-            whole = {f"{self.band[0]:.3g} .. {self.band[1]:.3g} rad/s": self.fit}
-            parts += [
-                f"\nFits to parts of the band:\n{compare_fits(whole | dict(self.parts), sums)}"
-            ]
+            parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, sums)}"]
         return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
 
 
@@ -378,8 +375,8 @@ def _fit_parts(
     }
     parts = {name: _refitted(found, frf, settings, band) for name, band in bands.items()}
     remarks = [_gain_change(name, part, found) for name, part in parts.items()]
-    remarks = (*found.remarks, *filter(None, remarks))
-    return dataclasses.replace(found, remarks=remarks), parts
+    found = dataclasses.replace(found, remarks=(*found.remarks, *filter(None, remarks)))
+    return found, {f"{low:.3g} .. {high:.3g} rad/s": found} | parts
 
 
 def _refitted(
