@@ -15,7 +15,7 @@ from .qualities._text import decibels, degrees, lines, shown
 
 
 class LoopResponse(eqx.Module):
-    """One response of a closed sampled loop, for `jq.loops.attitude_bandwidth`, plots and the like."""
+    """One response of a closed sampled loop, a model for `jq.loops.attitude_bandwidth`."""
 
     loop: OpenLoop
     kind: str = eqx.field(static=True)

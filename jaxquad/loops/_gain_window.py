@@ -1,10 +1,11 @@
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxquad.control import LinearController
@@ -43,14 +44,14 @@ class GainWindow(NamedTuple):
 def gain_window(
     loop: Loop, axis: int | str = "roll", *, member: int | tuple[int, ...] | None = None
 ) -> GainWindow:
-    """The values of r = b/b0 for which the controller keeps the plant stable, whatever its own gain.
+    """The values of r = b/b0 for which the controller keeps the plant stable.
 
-    b is the plant's gain, torque per unit of command over inertia, of which all values are tried
-    with the same lag, delay, damping/inertia and stiffness/inertia; b0 is the controller's. For a
-    controller without b0 the window is that of b itself, in rad/s^2 per unit of command. The edges
-    are roots of the abscissa, exact to 1e-5 1/s and differentiable. Of several windows it is the
-    one that holds the plant's own gain, else the one with the most stable loop. A window narrower
-    than a thousandth of its place may be missed.
+    b is the plant's gain, torque per unit of command over inertia. All values are tried, whatever
+    the plant's own, with the same lag, delay, damping/inertia and stiffness/inertia; b0 is the
+    controller's. For a controller without b0 the window is that of b itself, in rad/s^2 per unit of
+    command. The edges are roots of the abscissa, exact to 1e-5 1/s and differentiable. Of several
+    windows it is the one that holds the plant's own gain, else the one with the most stable loop. A
+    window narrower than a thousandth of its place may be missed.
 
     **Arguments:** those of `jq.analyse`.
 
@@ -109,7 +110,7 @@ def _closed(
     return close(scaled, controller, memory).balanced().matrix
 
 
-def _candidates(rate: Callable[[Array], Array], dtype: Any) -> Float[Array, " points"]:
+def _candidates(rate: Callable[[Array], Array], dtype: DTypeLike) -> Float[Array, " points"]:
     # Closer looks at the most stable gain, for windows that a coarse search steps over.
     factors = jnp.asarray(np.geomspace(1 / _REACH, _REACH, _COARSE), dtype)
     share = jnp.linspace(0, 1, _FINE + 2, dtype=dtype)[1:-1]

@@ -1,5 +1,5 @@
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,14 @@ from jaxquad._core import per_member
 from jaxquad.control import LinearController, LinearisableController, ScheduledController
 from jaxquad.models import Multirotor
 
-from ._protocols import Controller, Drive, Plant, sample_interval, Sensor
+from ._protocols import (
+    Controller,
+    Drive,
+    LinearisablePlant,
+    Plant,
+    sample_interval,
+    Sensor,
+)
 
 
 _DEFAULT_DT = 0.002  # s
@@ -55,7 +62,7 @@ class Loop(eqx.Module):
     a `jq.models.Multirotor` without a drive.
     """
 
-    plant: Any  # Plant; or one with `linearise` alone, to analyse
+    plant: Plant | LinearisablePlant
     controller: AnyController
     drive: Drive | None
     encoder: Sensor | None
@@ -68,7 +75,7 @@ class Loop(eqx.Module):
 
     def __init__(
         self,
-        plant: Plant,
+        plant: Plant | LinearisablePlant,
         controller: AnyController,
         *,
         drive: Drive | None = None,
@@ -116,7 +123,7 @@ class Loop(eqx.Module):
         loop.__check_init__()
         return loop
 
-    def with_plant(self, plant: Plant) -> "Loop":
+    def with_plant(self, plant: Plant | LinearisablePlant) -> "Loop":
         """The same loop around another plant."""
         loop = eqx.tree_at(lambda x: x.plant, self, plant)
         loop.__check_init__()
@@ -128,7 +135,7 @@ def _require_positive_number(value: float, message: str) -> None:
         raise ValueError(message)
 
 
-def _queue_of(delay: Any, dt: float, longest: float | None) -> DelayQueue:
+def _queue_of(delay: ArrayLike, dt: float, longest: float | None) -> DelayQueue:
     """The queue of a delay in s. Raises ValueError for a delay that makes no sense."""
     if isinstance(delay, Tracer):
         if longest is None or not 0 < longest < math.inf:

@@ -1,9 +1,10 @@
 """What the parts of a loop need: methods, and nothing else. Optional ones are asked for here."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
+from jaxquad.control import Reference
 from jaxquad.models import LinearAxis
 
 
@@ -12,7 +13,7 @@ Vector = Float[Array, " axes *ensemble"]
 
 @runtime_checkable
 class Plant(Protocol):
-    """What a loop is closed around: `jq.models.Multirotor`, `jq.DecoupledAxes`, or a user's own module.
+    """What a loop is closed around: `jq.DecoupledAxes`, `jq.models.Multirotor`, or your own module.
 
     `init` gives the state at rest at the angles `euler` in rad, as wide as `ensemble` and the
     plant's own arrays ask for; `derivative` its rate of change under held inputs and a disturbance
@@ -20,9 +21,9 @@ class Plant(Protocol):
     a scenario's payload.
     """
 
-    def init(self, euler: Any = None, *, ensemble: tuple[int, ...] = ()) -> PyTree: ...
-    def derivative(self, state: Any, inputs: Any, disturbance: Any) -> PyTree: ...
-    def measure(self, state: Any) -> Vector: ...
+    def init(self, euler: ArrayLike | None = None, *, ensemble: tuple[int, ...] = ()) -> PyTree: ...
+    def derivative(self, state: PyTree, inputs: Vector, disturbance: Vector) -> PyTree: ...
+    def measure(self, state: PyTree) -> Vector: ...
 
 
 @runtime_checkable
@@ -39,23 +40,25 @@ class Controller(Protocol):
     - `linear(axis, member)`: a `jq.control.LinearController` to analyse.
     """
 
-    def init(self, like: Any) -> PyTree: ...
-    def step(self, state: Any, reference: Any, measurement: Any) -> tuple[PyTree, Array]: ...
+    def init(self, like: Vector) -> PyTree: ...
+    def step(
+        self, state: PyTree, reference: Reference, measurement: Vector
+    ) -> tuple[PyTree, Vector]: ...
 
 
 @runtime_checkable
 class Drive(Protocol):
-    """From a command to what the plant's inputs can be: `jq.simulation.MotorDrive`, `jq.simulation.Saturation`."""
+    """From a command to the plant's inputs within their limits, as `jq.simulation.MotorDrive`."""
 
-    def inputs(self, command: Any) -> Float[Array, " inputs *ensemble"]: ...
-    def achieved(self, inputs: Any) -> Vector: ...
+    def inputs(self, command: Vector) -> Float[Array, " inputs *ensemble"]: ...
+    def achieved(self, inputs: Vector) -> Vector: ...
 
 
 @runtime_checkable
 class Sensor(Protocol):
     """From true angles to measured ones, rad: `jq.simulation.Encoder`."""
 
-    def __call__(self, angle: Any) -> Vector: ...
+    def __call__(self, angle: Vector) -> Vector: ...
 
 
 @runtime_checkable
@@ -79,12 +82,12 @@ class _HasSampleInterval(Protocol):
 
 @runtime_checkable
 class _HasApplied(Protocol):
-    def applied(self, state: Any, achieved: Any) -> PyTree: ...
+    def applied(self, state: PyTree, achieved: Vector) -> PyTree: ...
 
 
 @runtime_checkable
 class _HasSignals(Protocol):
-    def signals(self, state: Any) -> dict[str, Array]: ...
+    def signals(self, state: PyTree) -> dict[str, Array]: ...
 
 
 @runtime_checkable
@@ -96,14 +99,14 @@ class _HasPrepared(Protocol):
 class CarriesPayload(Protocol):
     """A plant that can carry a scenario's payload."""
 
-    def with_added_inertia(self, inertia: Any) -> Plant: ...
+    def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> Plant: ...
 
 
 @runtime_checkable
 class ChecksState(Protocol):
     """A plant that knows a state which integration has spoilt, such as a short quaternion."""
 
-    def is_resolved(self, state: Any) -> Bool[Array, "*ensemble"]: ...
+    def is_resolved(self, state: PyTree) -> Bool[Array, "*ensemble"]: ...
 
 
 def sample_interval(controller: object) -> float | None:

@@ -4,10 +4,11 @@ Values come from repeated squaring, derivatives from Lyapunov equations: only fi
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 
@@ -23,7 +24,7 @@ class Powers(NamedTuple):
     logs: Float[Array, " powers"]
 
 
-def sharpest(smoothing: float, dt: float, dtype: Any) -> float:
+def sharpest(smoothing: float, dt: float, dtype: DTypeLike) -> float:
     """`smoothing` in 1/s, or what the rounding of a sample leaves of it."""
     return max(smoothing, _ROUNDINGS * float(jnp.finfo(dtype).eps) / dt)
 

@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from ._flight_metrics import (
     window,
 )
 from ._metrics import Metrics, NUMBERS
-from ._over_devices import loop_over_devices, placed, Run
+from ._over_devices import DeviceChoice, loop_over_devices, placed, Run
 from ._run import check_run, scan_loop
 from ._scenario import Scenario
 from ._simulate import Simulation
@@ -45,16 +45,26 @@ def metrics(
     start: float = 0.0,
     stop: float | None = None,
     load_start: float | None = None,
-    torque_gain: ArrayLike | Sequence[Any] | None = None,
+    torque_gain: ArrayLike | Sequence[float] | None = None,
 ) -> Metrics:
-    """The `Metrics` of a stored `jq.simulation.Simulation`, for start <= t < stop (in s; None: to the end).
+    """The `Metrics` of a stored `jq.simulation.Simulation`, for start <= t < stop.
 
-    ITAE counts time from `start`, which is best the instant of a step. Peak, rms and the error of
-    the disturbance's estimate count from `load_start` on (`start` if None), where the step's
-    overshoot, rise and settling end, if that is later than `start`. `torque_gain` is the N m
-    per unit of command [axes] that make a torque of the estimate, where the simulation does not
-    know it from its plant. Differentiable with respect to the simulation.
-    Raises ValueError for a window that does not lie in the simulation.
+    Differentiable with respect to the simulation.
+
+    **Arguments:**
+
+    - `simulation`: from `jq.simulate`.
+    - `start`, `stop`: s; None is the end. ITAE counts time from `start`, which is best the instant
+        of a step.
+    - `load_start`: s. Peak, rms and the error of the disturbance's estimate count from here on
+        (None: from `start`); the step's overshoot, rise and settling end here, if that is later
+        than `start`.
+    - `torque_gain`: N m per unit of command [axes], to make a torque of the estimate where the
+        simulation does not know it from its plant.
+
+    **Returns:** `jq.simulation.Metrics` of each axis and member.
+
+    **Raises:** ValueError for a window that does not lie in the simulation.
     """
     gain = None if torque_gain is None else jnp.atleast_1d(as_float(torque_gain))
     dt, samples = simulation.dt, len(simulation.angle)
@@ -70,7 +80,7 @@ def evaluate(
     start: float = 0.0,
     stop: float | None = None,
     load_start: float | None = None,
-    devices: int | Sequence[Any] | None = None,
+    devices: DeviceChoice = None,
 ) -> Metrics:
     """The `Metrics` of a loop without its trajectories: what is kept does not grow with time.
 
@@ -102,7 +112,7 @@ def evaluate(
     return _metrics(numbers, place, loop.dt)
 
 
-def _metrics(numbers: dict[str, Any], place: tuple[int, int, int, int], dt: float) -> Metrics:
+def _metrics(numbers: dict[str, Array], place: tuple[int, int, int, int], dt: float) -> Metrics:
     first, last, loaded, _ = place
     return Metrics(**numbers, start=first * dt, stop=(last + 1) * dt, load_start=loaded * dt)
 
@@ -132,7 +142,7 @@ def _replay(simulation: Simulation, judged: Window, gain: Array | None) -> dict[
     sums = _accumulator(scenario, judged, simulation.dt, found, gain)
     like = jnp.zeros_like(simulation.angle[0])
 
-    def sample(total: Sums, now: Any) -> tuple[Sums, None]:
+    def sample(total: Sums, now: tuple) -> tuple[Sums, None]:
         index, reference, disturbance, angle, command, saturated, signals = now
         parts = (angle, widened(reference, like), widened(disturbance, like), command, saturated)
         return sums.update(total, _Sample(index, *parts, signals))

@@ -51,9 +51,9 @@ def window(
     )
     if not (first + 2 <= end <= samples and first <= loaded < end):
         raise ValueError(
-            f"the window from {start:.6g} to {end * dt:.6g} s, under load from {loaded * dt:.6g} s, "
-            f"does not lie in the flight of {samples * dt:.6g} s: give at least two samples, and "
-            "start <= load_start < stop"
+            f"the window from {start:.6g} to {end * dt:.6g} s, under load from "
+            f"{loaded * dt:.6g} s, does not lie in the flight of {samples * dt:.6g} s: give at "
+            "least two samples, and start <= load_start < stop"
         )
     return first, end - 1, loaded, (loaded if loaded > first else end) - 1
 

@@ -19,7 +19,7 @@ def require_memory(what: str, needed: float | int, remedy: str) -> None:
 
     Where a machine does not tell what that is, nothing is refused.
     """
-    chosen = getattr(jax.config, "jax_default_device", None)
+    chosen = jax.config.jax_default_device
     free = free_memory(chosen if isinstance(chosen, jax.Device) else jax.local_devices()[0])
     if free is not None and needed > free:
         raise ValueError(
@@ -61,19 +61,25 @@ def _container_limit() -> float | None:
 def in_slices(
     function: Callable[[Int[Array, " at_once"]], PyTree], members: int, *, at_once: int
 ) -> PyTree:
-    """`function(indices)` of `at_once` members at a time, its results joined on the last axis.
+    """`function(indices)` of a few members at a time, its results joined on the last axis.
 
     For ensembles that do not fit the memory together: what is drawn in the function, such as the
-    noise of each member, exists for one slice only. All results have the members last, as
-    `jq.simulation.Metrics` have. Every call is given equally many indices, so that it compiles once; where
-    they run out, the last is repeated, and what that gives is dropped.
+    noise of each member, exists for one slice only. Every call is given equally many indices, so
+    that it compiles once; where they run out, the last is repeated, and what that gives is dropped.
 
         fly = lambda few: jq.evaluate(few.loop(ladrc), few.flight(scenario))
         found = jq.simulation.in_slices(lambda k: fly(members.take(k)), members.size, at_once=4096)
 
     A loop in Python whose results wait in the host's memory. It saves none under `jax.grad`: for
-    the gradient of a mean, sum those of its slices. Raises ValueError for counts below 1 and for
-    results of other shapes.
+    the gradient of a mean, sum those of its slices.
+
+    **Arguments:**
+
+    - `function`: of indices; all its results have the members last, as `Metrics` have.
+    - `members`: how many there are.
+    - `at_once`: how many indices a call gets.
+
+    **Raises:** ValueError for counts below 1 and for results of other shapes.
     """
     if members < 1 or at_once < 1:
         raise ValueError(f"{members} members, {at_once} at once: give 1 or more of both")

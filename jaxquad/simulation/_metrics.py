@@ -1,5 +1,5 @@
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,11 +47,11 @@ class Summary(eqx.Module):
     members: int = eqx.field(static=True)
 
 
-def summarise(metrics: Any) -> Summary:
+def summarise(metrics: "Metrics") -> Summary:
     """`Metrics.summary`. A time that a member never reaches counts as infinite."""
     spreads = {}
     for name in NUMBERS:
-        values = getattr(metrics, name)
+        values = vars(metrics)[name]
         if name in _TIMES:
             never = metrics.stepped & jnp.isnan(values)
             values = jnp.where(never, jnp.inf, values)

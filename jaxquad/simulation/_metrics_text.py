@@ -1,10 +1,15 @@
 """`Metrics` for print: angles in degrees, what does not exist as a dash."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import ArrayLike
 
 from jaxquad.records import AXES
+
+
+if TYPE_CHECKING:
+    from ._metrics import Metrics
 
 
 _NOTHING = 1e-9  # in every unit of the table
@@ -28,7 +33,7 @@ _ROWS = (
 _STATISTICS = (("mean", "mean"), ("p95", "p95"), ("worst", "worst"), ("cvar20", "CVaR20"))
 
 
-def described(metrics: Any) -> str:
+def described(metrics: "Metrics") -> str:
     """A table of one loop, or one for each axis of an ensemble, and the remarks."""
     names = axis_names(metrics.itae.shape[0])
     members = metrics.diverged.size
@@ -41,7 +46,7 @@ def described(metrics: Any) -> str:
         head += f", {members} member{'s' * (members > 1)}"
         table = _ensemble_tables(metrics, names)
     else:
-        values = [np.asarray(getattr(metrics, row[0])) for row in _ROWS]
+        values = [np.asarray(vars(metrics)[row[0]]) for row in _ROWS]
         table = _table("", list(names), values, metrics.per_step)
     return "\n".join([head, *table, *(f"  ! {remark}" for remark in remarks(metrics))])
 
@@ -50,7 +55,7 @@ def axis_names(count: int) -> tuple[str, ...]:
     return AXES[:count] if count <= len(AXES) else tuple(f"axis {k}" for k in range(count))
 
 
-def _ensemble_tables(metrics: Any, names: tuple[str, ...]) -> list[str]:
+def _ensemble_tables(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
     summary, lines, still = metrics.summary(), [], at_rest(metrics)
     for k, name in enumerate(names):
         if still[k]:
@@ -58,16 +63,16 @@ def _ensemble_tables(metrics: Any, names: tuple[str, ...]) -> list[str]:
             continue
         values = []
         for row in _ROWS:
-            spread = getattr(summary, row[0])
-            values.append(np.array([getattr(spread, field)[k] for field, _ in _STATISTICS]))
+            spread = vars(summary)[row[0]]._asdict()
+            values.append(np.array([spread[field][k] for field, _ in _STATISTICS]))
         lines += _table(name, [title for _, title in _STATISTICS], values, metrics.per_step)
     return lines
 
 
-def at_rest(metrics: Any) -> np.ndarray:
+def at_rest(metrics: "Metrics") -> np.ndarray:
     """Axes in which nothing happens."""
     names = ("itae", "activity", "energy")
-    moved = [np.nan_to_num(_flat(getattr(metrics, name))).any(axis=1) for name in names]
+    moved = [np.nan_to_num(_flat(vars(metrics)[name])).any(axis=1) for name in names]
     return ~np.any(moved, axis=0)
 
 
@@ -86,14 +91,14 @@ def _text(x: float) -> str:
     return "never" if np.isinf(x) else f"{x if abs(x) > _NOTHING else 0:.4g}"
 
 
-def remarks(metrics: Any) -> list[str]:
+def remarks(metrics: "Metrics") -> list[str]:
     """Why a number is missing, who diverged, and what the drive cannot do."""
     names = axis_names(metrics.itae.shape[0])
     found = _divergence(metrics) + _steps(metrics, names)
     return found + _estimate(metrics) + _torque(metrics, names)
 
 
-def _divergence(metrics: Any) -> list[str]:
+def _divergence(metrics: "Metrics") -> list[str]:
     count, members = int(np.sum(metrics.diverged)), metrics.diverged.size
     if not count:
         return []
@@ -101,7 +106,7 @@ def _divergence(metrics: Any) -> list[str]:
     return [f"{who} diverged: the numbers are those of an angle held where it left the bound"]
 
 
-def _steps(metrics: Any, names: tuple[str, ...]) -> list[str]:
+def _steps(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
     stepped = _flat(metrics.stepped)
     missing = ~stepped.any(axis=1) & ~at_rest(metrics)
     without = [name for name, there in zip(names, missing, strict=True) if there]
@@ -115,7 +120,7 @@ def _steps(metrics: Any, names: tuple[str, ...]) -> list[str]:
         ("rise_time", "does not reach 90 % of the step"),
         ("settling_time", "is outside 2 % of the step at the end"),
     ):
-        never = np.isnan(_flat(getattr(metrics, field))) & stepped
+        never = np.isnan(_flat(vars(metrics)[field])) & stepped
         found += _shares(names, never.mean(axis=1), what, never.shape[1])
     return found
 
@@ -127,7 +132,7 @@ def _shares(names: tuple[str, ...], shares: np.ndarray, what: str, members: int)
     return [f"{name}: {share:.1%} of the members: the angle {what}" for name, share in where]
 
 
-def _estimate(metrics: Any) -> list[str]:
+def _estimate(metrics: "Metrics") -> list[str]:
     if not np.isnan(np.asarray(metrics.disturbance_rmse)).all():
         return []
     return [
@@ -136,19 +141,19 @@ def _estimate(metrics: Any) -> list[str]:
     ]
 
 
-def _torque(metrics: Any, names: tuple[str, ...]) -> list[str]:
+def _torque(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
     found = []
     for field, what in (
         ("beyond_authority", "ask for more torque than the drive has"),
         ("reversing", "take motors that turn backwards"),
     ):
-        shares = np.nan_to_num(_flat(getattr(metrics, field))).mean(axis=1)
+        shares = np.nan_to_num(_flat(vars(metrics)[field])).mean(axis=1)
         where = [f"{x:.1%} on {name}" for name, x in zip(names, shares, strict=True) if x]
         if where:
             found.append(f"disturbances {what}: samples {', '.join(where)}")
     return found
 
 
-def _flat(values: Any) -> np.ndarray:
+def _flat(values: ArrayLike) -> np.ndarray:
     array = np.asarray(values)
     return array.reshape(array.shape[0], -1)

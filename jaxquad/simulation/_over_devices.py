@@ -1,7 +1,6 @@
 """An ensemble computed on several devices, of one host or of several."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,25 +26,33 @@ from ._scenario import Scenario
 
 _AXIS = "members"
 _PARTS = ("plant", "controller", "drive", "encoder", "delay")
+_SHAPED = (jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 Run = tuple[Loop, Scenario]
+DeviceChoice = int | Sequence[jax.Device] | None  # see `jq.simulate`
 
 
 def over_devices(
-    function: Callable[[Any, Any], PyTree],
+    function: Callable[[PyTree, PyTree], PyTree],
     members: PyTree,
     shared: PyTree = None,
     *,
-    devices: int | Sequence[Any] | None = None,
+    devices: DeviceChoice = None,
 ) -> PyTree:
     """`function(members, shared)`, with each device computing its part of the members.
 
-    Every array of `members` and of the result has the members on its last axis; `shared` is the
-    same on every device. Members must not feel each other in the function: take means and quantiles
-    of its result. Differentiable; the gradient with respect to `shared` is the sum over devices.
-    To be called under `jax.jit`. `devices` are those of `jq.evaluate`. Where the members are no
-    multiple of the devices, the last member fills the gap, and its copies are dropped.
+    Members must not feel each other in the function: take means and quantiles of its result.
+    Differentiable; the gradient with respect to `shared` is the sum over devices. To be called
+    under `jax.jit`. Where the members are no multiple of the devices, the last member fills the
+    gap, and its copies are dropped.
 
-    Raises ValueError for devices that JAX does not have, and for arrays that do not have the
+    **Arguments:**
+
+    - `function`: every array of its result has the members on its last axis.
+    - `members`: every array has the members on its last axis.
+    - `shared`: the same on every device.
+    - `devices`: those of `jq.simulate`.
+
+    **Raises:** ValueError for devices that JAX does not have, and for arrays that do not have the
     members on the last axis.
     """
     count = _members_of(members, "members")
@@ -55,19 +62,19 @@ def over_devices(
     return _split(function, members, shared, count, places)
 
 
-def placed(loop: Loop, scenario: Scenario, devices: Any) -> tuple[Run, Devices | None]:
+def placed(loop: Loop, scenario: Scenario, devices: DeviceChoice) -> tuple[Run, Devices | None]:
     """Loop and scenario, and the devices that are asked for, else those their data were put on."""
     asked = asked_devices(devices)
     run = (loop, scenario)
     if not may_be_several(asked):
         return run, asked
     asked = where_put(run) if asked is None else asked
-    require_same({name: getattr(loop, name) for name in _PARTS} | {"scenario": scenario}, asked)
+    require_same({name: vars(loop)[name] for name in _PARTS} | {"scenario": scenario}, asked)
     return movable(run, asked), asked
 
 
 def loop_over_devices(
-    function: Callable[[Run, Any], PyTree], run: Run, shared: Any, asked: Devices | None
+    function: Callable[[Run, PyTree], PyTree], run: Run, shared: PyTree, asked: Devices | None
 ) -> PyTree:
     """`function((loop, scenario), shared)`, each device with its members, as `over_devices`."""
     if not may_be_several(asked):
@@ -82,7 +89,9 @@ def loop_over_devices(
     return _split(whole, theirs, (common, shared), count, places)
 
 
-def _split(function: Any, members: PyTree, shared: PyTree, count: int, places: Devices) -> PyTree:
+def _split(
+    function: Callable, members: PyTree, shared: PyTree, count: int, places: Devices
+) -> PyTree:
     (members, shared), static = eqx.partition((members, shared), _is_array)
     own = -(-count // len(places))
     padded = jax.tree.map(lambda x: _lengthened(x, own * len(places) - count), members)
@@ -105,11 +114,11 @@ def _split(function: Any, members: PyTree, shared: PyTree, count: int, places: D
     return jax.tree.map(lambda x: x[..., :count], out)
 
 
-def _is_array(x: Any) -> bool:
+def _is_array(x: object) -> bool:
     return isinstance(x, jax.Array | np.ndarray)
 
 
-def _on_last(x: Any) -> PartitionSpec:
+def _on_last(x: Array | jax.ShapeDtypeStruct) -> PartitionSpec:
     return PartitionSpec(*(None,) * (len(x.shape) - 1), _AXIS)
 
 
@@ -120,7 +129,7 @@ def _lengthened(x: Array, more: int) -> Array:
 
 
 def _members_of(tree: PyTree, name: str) -> int:
-    shapes = [x.shape for x in jax.tree.leaves(tree) if hasattr(x, "shape")]
+    shapes = [x.shape for x in jax.tree.leaves(tree) if isinstance(x, _SHAPED)]
     if not shapes or len({shape[-1:] for shape in shapes}) > 1 or () in shapes:
         raise ValueError(
             f"the arrays of {name} have the shapes {', '.join(map(str, shapes))}: each needs the "

@@ -1,6 +1,5 @@
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from jaxquad._core import as_float, ensemble_shape, per_member, require_all_positive, whole_samples
+from jaxquad.excitation import Excitation
 from jaxquad.records import AXES
 
 from ._disturbances import gauss_markov
@@ -20,10 +20,11 @@ class Scenario(eqx.Module):
     """What happens to a loop, sample by sample; a trailing axis makes an ensemble.
 
     A part that is the same for all members need not have that axis. With `rate` or `acceleration`
-    of the reference the controller gets a `jq.control.Setpoint` and can feed them forward; one that is None
-    counts as zero. `payload` is inertia that the plant carries in addition to its own.
-    `jq.scenario(...)` builds a scenario from signals of single axes. Raises ValueError for arrays
-    of different numbers of samples, axes or members.
+    of the reference the controller gets a `jq.control.Setpoint` and can feed them forward; one that
+    is None counts as zero. `payload` is inertia that the plant carries in addition to its own.
+    `jq.scenario(...)` builds a scenario from signals of single axes.
+
+    **Raises:** ValueError for arrays of different numbers of samples, axes or members.
     """
 
     reference: Float[Array, "samples axes ..."] = per_member(rank=2)  # attitude set-point, rad
@@ -62,7 +63,8 @@ class Scenario(eqx.Module):
         return ensemble_shape(self)
 
 
-Given = Mapping[Any, Any] | Signal | None
+One = Signal | Excitation | ArrayLike  # of one axis
+Given = Mapping[str | int, One] | One | None
 _PARTS = ("reference", "injection", "disturbance", "noise", "payload")
 
 
@@ -80,13 +82,7 @@ def scenario(
     ensemble: int | tuple[int, ...] = (),
     key: Key[Array, ""] | None = None,
 ) -> Scenario:
-    """A `Scenario` from signals of single axes, with zeros where nothing is said.
-
-    Each part maps an axis, by name or number, to a signal: `jq.Step`, `jq.simulation.Ramp`, `jq.simulation.SmoothStep`,
-    `jq.simulation.Sine`, `jq.Pulse`, `jq.simulation.ReferenceModel`, `jq.simulation.Gust`, `jq.simulation.WhiteNoise`, sums of them, a
-    `jq.excitation.Excitation`, or an array [samples, *ensemble]. One signal instead of a map goes to every
-    axis. The units are rad (`reference`, `noise`), N m (`disturbance`), those of the command
-    (`injection`) and kg m^2 (`payload`, added to the plant's inertia).
+    """A `Scenario` from signals of single axes, with zeros where nothing is given.
 
         jq.scenario(
             duration=10.0,
@@ -96,12 +92,22 @@ def scenario(
             key=jax.random.key(0),
         )
 
-    `duration`, `dt` and all times are in s and whole numbers of samples. `axes` is how many the
-    plant has, or their names (roll, pitch, yaw for up to three). With `feed_forward` the controller
-    also gets the reference's rate and acceleration, zero for signals that jump. `ensemble` is the
-    number of members, each of which draws its own noise from `key`; what an axis draws depends on
-    nothing but the key, the part and the axis (and on the precision: float32 draws other numbers).
-    Raises ValueError for unknown axes, for times outside, and for arrays that do not fit.
+    **Arguments:**
+
+    - `duration`, `dt`: s. All times are whole numbers of samples.
+    - `axes`: how many the plant has, or their names (roll, pitch, yaw for up to three).
+    - `reference` (rad), `noise` (rad), `disturbance` (N m), `injection` (units of the command) and
+        `payload` (kg m^2, added to the plant's inertia): a map from an axis, by name or number, to
+        a signal, or one signal for every axis. A signal is a `jq.Step`, `jq.Pulse`,
+        `jq.simulation.Ramp`, `.SmoothStep`, `.Sine`, `.ReferenceModel`, `.Gust`, `.WhiteNoise`, a
+        sum of them, a `jq.excitation.Excitation`, or an array [samples, *ensemble].
+    - `feed_forward`: the controller also gets the reference's rate and acceleration, which are zero
+        for signals that jump.
+    - `ensemble`: the number of members, each of which draws its own noise from `key`.
+    - `key`: what an axis draws depends on nothing but the key, the part and the axis (and on the
+        precision: float32 draws other numbers).
+
+    **Raises:** ValueError for unknown axes, for times outside, and for arrays that do not fit.
     """
     require_all_positive(duration=duration, dt=dt)
     names = _names(axes)
@@ -156,7 +162,7 @@ def _sampled(
     ]
 
 
-def _place(name: str, axis: Any, names: tuple[str, ...]) -> int:
+def _place(name: str, axis: str | int, names: tuple[str, ...]) -> int:
     if axis in names:
         return names.index(axis)
     if isinstance(axis, int) and 0 <= axis < len(names):
@@ -168,7 +174,7 @@ def _fold(key: Key[Array, ""] | None, k: int) -> Key[Array, ""] | None:
     return None if key is None else jax.random.fold_in(key, k)
 
 
-def _motion(what: str, given: Any, clock: Clock, key: Key[Array, ""] | None) -> Motion:
+def _motion(what: str, given: One, clock: Clock, key: Key[Array, ""] | None) -> Motion:
     try:
         return as_signal(given).sample(clock, key)
     except ValueError as error:
@@ -200,11 +206,19 @@ def excite(
     torque_corner: float = 2.0,
     sensor_noise: float = 0.0,
 ) -> Scenario:
-    """An identification experiment: level flight with `signal` (V) injected into one axis.
+    """An identification experiment: level flight with a `signal` injected into one axis.
 
-    The axis feels a Gauss-Markov torque of standard deviation `torque_noise` (N m) and bandwidth
-    `torque_corner` (rad/s), and its angle is measured with white `sensor_noise` (rad). A signal
-    with a trailing axis makes an ensemble, every member with noise of its own.
+    **Arguments:**
+
+    - `signal`: V; a trailing axis makes an ensemble, every member with noise of its own.
+    - `key`: of the noise.
+    - `dt`: s, the sample interval of the signal.
+    - `axis`: roll, pitch or yaw.
+    - `torque_noise`, `torque_corner`: standard deviation in N m and bandwidth in rad/s of a
+        Gauss-Markov torque on the axis.
+    - `sensor_noise`: rad, standard deviation of white noise on the measured angle.
+
+    **Raises:** ValueError for another axis, for a signal that is not finite, and for noise below 0.
     """
     if axis not in AXES:
         raise ValueError(f"axis {axis!r}: choose one of {', '.join(AXES)}")

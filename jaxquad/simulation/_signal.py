@@ -1,11 +1,11 @@
 import abc
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from jaxquad._core import as_float, require_finite, whole_samples
 from jaxquad.excitation import Excitation
@@ -57,7 +57,7 @@ class Signal(eqx.Module):
     def random(self) -> bool:
         return False
 
-    def __add__(self, other: Any) -> "Signal":
+    def __add__(self, other: "Signal | Excitation | ArrayLike") -> "Signal":
         return Sum(self, as_signal(other))
 
 
@@ -119,7 +119,7 @@ class Excited(Signal):
         return Motion(as_float(np.pad(kept, (0, clock.samples - kept.size))))
 
 
-def as_signal(given: Any) -> Signal:
+def as_signal(given: Signal | Excitation | ArrayLike) -> Signal:
     """A signal as it is, of an array of samples, or of a `jq.excitation.Excitation`."""
     if isinstance(given, Signal):
         return given

@@ -1,6 +1,4 @@
 import math
-from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,7 +12,7 @@ from jaxquad.records import AXES, Record
 
 from ._authority import Authority, find_authority, warn_beyond_authority
 from ._memory import require_memory, size_of
-from ._over_devices import loop_over_devices, placed, Run
+from ._over_devices import DeviceChoice, loop_over_devices, placed, Run
 from ._run import check_run, scan_loop
 from ._scenario import Scenario
 from ._step import SampleResult
@@ -89,14 +87,12 @@ class Simulation(eqx.Module):
         return jnp.broadcast_to(align(x, self.angle), self.angle.shape)
 
 
-def simulate(
-    loop: Loop, scenario: Scenario, *, devices: int | Sequence[Any] | None = None
-) -> Simulation:
+def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) -> Simulation:
     """Run a sampled-data loop: measure, control, hold the inputs for `dt` seconds, repeat.
 
     Between samples the plant is integrated by the loop's `substeps` fourth-order Runge-Kutta steps
     under constant inputs. The injected signal is added to the controller's command, so that a sweep
-    can excite a plant that needs stabilising. Inputs reach the plant `delay` seconds later, exactly.
+    can excite a plant that needs stabilising. Inputs reach the plant exactly `delay` seconds later.
     A member whose angle leaves +-`bound` rad, or whose numbers grow beyond 1e9, is held there and
     flagged in `diverged`, so that values and gradients of the others, and its own, stay finite.
 

@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._core import align
-from jaxquad.control import Setpoint
+from jaxquad.control import Reference, Setpoint
 from jaxquad.loops import (
     after_drive,
     CarriesPayload,
@@ -197,7 +197,7 @@ class LoopStep(eqx.Module):
         if happens.payload is not None and isinstance(plant, CarriesPayload):
             plant = plant.with_added_inertia(happens.payload)
 
-        def hold(state: PyTree, inputs: Array, duration: Any) -> PyTree:
+        def hold(state: PyTree, inputs: Array, duration: Float[ArrayLike, "*ensemble"]) -> PyTree:
             slope = lambda x: plant.derivative(x, inputs, happens.disturbance)
             return integrate(slope, state, duration, self.substeps)
 
@@ -228,8 +228,8 @@ def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
 def _require_shape(command: Array, like: Float[Array, " axes *ensemble"]) -> None:
     if command.shape != like.shape:
         raise ValueError(
-            f"the controller's command has the shape {command.shape}, but {like.shape} is expected: "
-            "make its fields that differ between members by jq.loops.per_member"
+            f"the controller's command has the shape {command.shape}, but {like.shape} is "
+            "expected: make its fields that differ between members by jq.loops.per_member"
         )
 
 
@@ -237,7 +237,7 @@ def _wide_signal(x: Array, like: Float[Array, " axes *ensemble"]) -> Array:
     return jnp.broadcast_to(align(x, like), like.shape)
 
 
-def _setpoint(happens: Scenario) -> Any:
+def _setpoint(happens: Scenario) -> Reference:
     if happens.rate is None and happens.acceleration is None:
         return happens.reference
     still = jnp.zeros_like(happens.reference)
@@ -249,7 +249,7 @@ def _wide(happens: Scenario, like: Float[Array, " axes *ensemble"]) -> Scenario:
     """One scenario for all members of an ensemble."""
     parts = {name: x for name, x in vars(happens).items() if x is not None}
     wide = {name: widen(x, like) for name, x in parts.items()}
-    return eqx.tree_at(lambda h: [getattr(h, name) for name in wide], happens, list(wide.values()))
+    return eqx.tree_at(lambda h: [vars(h)[name] for name in wide], happens, list(wide.values()))
 
 
 def widen(x: Float[Array, "axes ..."], like: Float[Array, " axes *ensemble"]) -> Array:

@@ -1,5 +1,3 @@
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,16 +6,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
 from ._crossings import crossed, first
-from ._curve import ambiguous, Curve, curve_of
+from ._curve import ambiguous, Curve, curve_of, Response
 from ._text import degrees, lines, shown
 
 
-def missing_bandwidth(result: Any) -> list[str]:
+def missing_bandwidth(result: "Bandwidth") -> list[str]:
     """Why each number that is `nan` does not exist."""
     basis = result.basis
     reasons: list[str] = []
     for name, angle in (("phase_bandwidth", -135), ("omega_180", -180)):
-        if not np.isfinite(getattr(result, name)) and bool(basis.finite):
+        if not np.isfinite(vars(result)[name]) and bool(basis.finite):
             below = np.degrees(float(basis.start_phase)) <= angle
             how = (
                 f"starts at {degrees(basis.start_phase, None)} already,"
@@ -48,7 +46,7 @@ def _reach(basis: Basis) -> str:
     )
 
 
-def doubtful_bandwidth(result: Any) -> list[str]:
+def doubtful_bandwidth(result: "Bandwidth") -> list[str]:
     """What may be wrong with the numbers that exist."""
     doubts, start = [], float(result.basis.start_phase)
     given = start + (np.pi / 2 if result.quantity == "rate" else 0.0)
@@ -172,7 +170,7 @@ class Bandwidth(eqx.Module):
         names = ("bandwidth", *_PLACES, "phase_delay", "phase_delay_fit")
         units = ["rad/s"] * 4 + ["s"] * 2
         rows = [
-            (name, shown(getattr(self, name), self.standard_errors.get(name), unit))
+            (name, shown(vars(self)[name], self.standard_errors.get(name), unit))
             for name, unit in zip(names, units, strict=True)
         ]
         phase = f"{degrees(self.basis.start_phase, None)} ({self.branch})"
@@ -181,7 +179,7 @@ class Bandwidth(eqx.Module):
 
 
 def attitude_bandwidth(
-    response: Any,
+    response: Response,
     *,
     quantity: str = "attitude",
     omega: Float[ArrayLike, " frequencies"] | None = None,
@@ -191,18 +189,28 @@ def attitude_bandwidth(
 ) -> Bandwidth:
     """Bandwidth, phase delay and w180 of an attitude's response to the pilot's or tester's input.
 
-    `response` is a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase straight
-    in ln omega) and carry standard errors, or any model with `frequency_response(omega)`, whose
-    numbers are exact and differentiable, also under jit. `quantity` says what it is the response
-    of: the "attitude", or the "rate", which is divided by s. A model is searched at `omega`, rad/s,
-    by default 2000 log-spaced values from 0.01 to 1000; of a measured response, `omega` picks some
-    of its own frequencies.
-    The phase is unwrapped upwards from the lowest frequency, where it has its principal value, or
-    the one nearest to `phase_at_start` (rad, of the response as given): give it where the response
-    starts near -180 deg or behind a delay. The lowest crossings downwards count; for the gain
-    bandwidth the nearest below w180. Nothing is found where the phase turns by more than 115 deg
-    between neighbours. The standard errors are first-order, from the covariance of the measured
-    errors. Raises ValueError for an unknown quantity, channel or grid.
+    The phase is unwrapped upwards from the lowest frequency. The lowest crossings downwards count;
+    for the gain bandwidth the nearest below w180. Nothing is found where the phase turns by more
+    than 115 deg between neighbours. Standard errors are first-order, from the covariance of the
+    measured errors.
+
+    **Arguments:**
+
+    - `response`: a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase
+        straight in ln omega) and carry standard errors, or any model with
+        `frequency_response(omega)`, whose numbers are exact and differentiable, also under jit.
+    - `quantity`: what it is the response of, the "attitude" or the "rate", which is divided by s.
+    - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
+        1000; of a measured response it picks some of its own frequencies.
+    - `phase_at_start`: rad, of the response as given: the phase at the lowest frequency is the one
+        nearest to it. Give it where the response starts near -180 deg or behind a delay; None is
+        the principal value.
+    - `output`, `input`: the channel, by name or number; None where there is one.
+
+    **Returns:** a `Bandwidth`.
+
+    **Raises:** ValueError for an unknown quantity, channel or grid.
+
     Source: ADS-33E-PRF fig. 2; Tischler & Remple, handling-qualities chapter.
     """
     if quantity not in ("attitude", "rate"):

@@ -1,7 +1,6 @@
 """What a number rests on: the band, the phase's branch, coherence and random error."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,6 +14,7 @@ from ._curve import ambiguous, around, Curve
 
 
 Numbers = dict[str, Array]
+Argument = Array | str | float | Callable | None
 
 
 class Basis(eqx.Module):
@@ -60,7 +60,7 @@ def basis_of(
 
 
 def found(
-    numbers: Callable[..., tuple[Numbers, Numbers, Basis]], curve: Curve, *args: Any
+    numbers: Callable[..., tuple[Numbers, Numbers, Basis]], curve: Curve, *args: Argument
 ) -> tuple[Numbers, Basis, Numbers]:
     """Numbers, basis and standard errors of a curve; the last are empty for a model.
 
@@ -103,13 +103,13 @@ def with_coherence(basis: Basis, curve: Curve, places: Mapping[str, ArrayLike]) 
 
 
 @eqx.filter_jit
-def _evaluated(numbers: Callable, curve: Curve, *args: Any) -> tuple[Numbers, Numbers, Basis]:
+def _evaluated(numbers: Callable, curve: Curve, *args: Argument) -> tuple[Numbers, Numbers, Basis]:
     return numbers(curve, *args)
 
 
 @eqx.filter_jit
 def _propagated(
-    numbers: Callable, curve: Curve, *args: Any
+    numbers: Callable, curve: Curve, *args: Argument
 ) -> tuple[Numbers, Numbers, Basis, Numbers]:
 
     def perturbed(change):

@@ -1,7 +1,5 @@
 """One response, measured or of a model, that can be asked at any frequency."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,10 +7,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
 from jaxquad._core import is_concrete
-from jaxquad.models import imaginary
+from jaxquad.models import imaginary, Model
 from jaxquad.spectra import FrequencyResponse
 
 
+Response = FrequencyResponse | Model
 AMBIGUOUS = 2.0  # rad between neighbours, from which the sense of a turn is a guess
 _GRID = (0.01, 1000.0, 2000)  # rad/s, rad/s, points
 
@@ -48,7 +47,7 @@ class Curve(eqx.Module):
     `coherence` is None for a model, which is exact at any frequency.
     """
 
-    model: Any
+    model: Model
     omega: Float[Array, " frequencies"]  # rad/s
     coherence: Float[Array, " frequencies"] | None
     pair: tuple[int, int] = eqx.field(static=True)
@@ -78,12 +77,12 @@ class Curve(eqx.Module):
 class _Opaque:
     """A model that is no pytree: new at every call, so that no compiled answer outlives it."""
 
-    def __init__(self, model: Any):
+    def __init__(self, model: Model):
         self.frequency_response = model.frequency_response
 
 
 def curve_of(
-    response: Any,
+    response: Response,
     omega: Float[ArrayLike, " frequencies"] | None,
     output: str | int | None,
     input: str | int | None,
@@ -92,10 +91,10 @@ def curve_of(
     """The curve of a `FrequencyResponse` or of a model, searched at `omega` in rad/s."""
     if isinstance(response, FrequencyResponse):
         return _measured(response, omega, output, input, integrations)
-    if not hasattr(response, "frequency_response"):
+    if not isinstance(response, Model):
         raise ValueError(
-            f"{type(response).__name__} is no frequency response: give a jq.spectra.FrequencyResponse, or "
-            "a model with a method frequency_response(omega)"
+            f"a {type(response).__name__} is no frequency response: give a "
+            "jq.spectra.FrequencyResponse, or a model with a method frequency_response(omega)"
         )
     grid = np.geomspace(*_GRID) if omega is None else omega
     _require_grid(grid)
@@ -161,7 +160,7 @@ def _wanted(
     return np.isin(measured, chosen)
 
 
-def _channels(model: Any, omega: Float[Array, " frequencies"]) -> tuple[int, int]:
+def _channels(model: Model, omega: Float[Array, " frequencies"]) -> tuple[int, int]:
     shape = eqx.filter_eval_shape(lambda m, w: m.frequency_response(w), model, omega).shape
     if len(shape) != 3 or shape[0] != omega.size:
         raise ValueError(

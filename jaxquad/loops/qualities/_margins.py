@@ -1,5 +1,3 @@
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
 from ._crossings import crossed, crossings
-from ._curve import Curve, curve_of
+from ._curve import Curve, curve_of, Response
 from ._nyquist import remarks_on_roots, unstable_roots
 from ._text import decibels, degrees, lines, shown
 
@@ -61,11 +59,11 @@ class Margins(eqx.Module):
         rows = [
             (
                 title,
-                f"{text(getattr(self, name), error(name))} at "
-                f"{shown(getattr(self, place), error(place), 'rad/s')}",
+                f"{text(vars(self)[name], error(name))} at "
+                f"{shown(vars(self)[place], error(place), 'rad/s')}",
             )
             for title, name, place, text in named
-            if np.isfinite(getattr(self, name))
+            if np.isfinite(vars(self)[name])
         ]
         rows.append(("crossovers", _listed(self.crossovers)))
         rows.append(("crossings of -180 deg", _listed(self.phase_crossovers)))
@@ -73,7 +71,7 @@ class Margins(eqx.Module):
 
 
 def margins(
-    loop: Any,
+    loop: Response,
     *,
     omega: Float[ArrayLike, " frequencies"] | None = None,
     unstable_poles: int = 0,
@@ -82,15 +80,25 @@ def margins(
 ) -> Margins:
     """Gain, phase and delay margins of a loop's response L, with negative feedback.
 
-    `loop` is a `jq.spectra.FrequencyResponse`, whose numbers are interpolated and carry standard errors, or
-    a model with `frequency_response(omega)`, whose numbers are exact and differentiable, also under
-    jit; it is searched at `omega`, rad/s, by default 2000 log-spaced values from 0.01 to 1000. A
-    missing crossing gives `nan`, not infinity: it may lie beyond the frequencies given. Two
-    crossings between the same neighbours of `omega` go unseen. Of a measured response, `omega`
-    picks some of its own frequencies.
     Margins are distances to -1 in gain, phase and delay, whatever the branch of the phase, and mean
-    what their names say where the closed loop is stable. That is counted by Nyquist's criterion,
-    with `unstable_poles` of the loop. Raises ValueError for an unknown channel or grid.
+    what their names say where the closed loop is stable, which is counted by Nyquist's criterion. A
+    missing crossing gives `nan`, not infinity: it may lie beyond the frequencies given. Two
+    crossings between the same neighbours of `omega` are not seen.
+
+    **Arguments:**
+
+    - `loop`: a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase
+        straight in ln omega) and carry standard errors, or any model with
+        `frequency_response(omega)`, whose numbers are exact and differentiable, also under jit.
+    - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
+        1000; of a measured response it picks some of its own frequencies.
+    - `unstable_poles`: how many the loop L has.
+    - `output`, `input`: the channel, by name or number; None where there is one.
+
+    **Returns:** `Margins`.
+
+    **Raises:** ValueError for an unknown channel or grid.
+
     Source: Tischler & Remple, broken-loop responses; delay margin = phase margin / crossover.
     """
     curve = curve_of(loop, omega, output, input)

@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
 from ._crossings import between, crossed, first
-from ._curve import Curve, curve_of
+from ._curve import Curve, curve_of, Response
 from ._nyquist import remarks_on_roots, unstable_roots
 from ._text import decibels, lines, shown
 
@@ -54,8 +53,8 @@ class Rejection(eqx.Module):
         error = self.standard_errors.get
         rows = [("DRB", shown(self.bandwidth, error("bandwidth"), "rad/s"))]
         for title, name in (("DRP = Ms", "peak"), ("Mt", "complementary_peak")):
-            place = float(getattr(self, f"{name}_frequency"))
-            height = decibels(getattr(self, name), error(name))
+            place = float(vars(self)[f"{name}_frequency"])
+            height = decibels(vars(self)[name], error(name))
             rows.append((title, f"{height} at {place:.4g} rad/s"))
         return "\n".join(
             [f"disturbance rejection, {self.basis.where}", lines(rows, [*self.remarks])]
@@ -63,7 +62,7 @@ class Rejection(eqx.Module):
 
 
 def disturbance_rejection(
-    response: Any,
+    response: Response,
     *,
     quantity: str = "loop",
     omega: Float[ArrayLike, " frequencies"] | None = None,
@@ -73,14 +72,26 @@ def disturbance_rejection(
 ) -> Rejection:
     """Disturbance rejection bandwidth and peak, and the complementary peak, of a control loop.
 
-    `quantity` says what the response is: the "loop" L, with negative feedback, or the
-    "sensitivity" S, from a disturbance at the output to the output. `response` is a
-    `jq.spectra.FrequencyResponse`, with standard errors, or a model with `frequency_response(omega)`, exact
-    and differentiable, also under jit, and searched at `omega`, rad/s, by default 2000 log-spaced
-    values from 0.01 to 1000. The peak of a measured response is its greatest value at a
-    measured frequency: noise pushes it up. Whether the closed loop is stable is counted by
-    Nyquist's criterion, with `unstable_poles` of the loop. Raises ValueError for an unknown
-    quantity, channel or grid. Source: MIL-DTL-32742 / CONDUIT's DRB (-3 dB) and DRP.
+    The peak of a measured response is its greatest value at a measured frequency: noise pushes it
+    up. Whether the closed loop is stable is counted by Nyquist's criterion.
+
+    **Arguments:**
+
+    - `response`: a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase
+        straight in ln omega) and carry standard errors, or any model with
+        `frequency_response(omega)`, whose numbers are exact and differentiable, also under jit.
+    - `quantity`: what the response is, the "loop" L, with negative feedback, or the "sensitivity"
+        S, from a disturbance at the output to the output.
+    - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
+        1000; of a measured response it picks some of its own frequencies.
+    - `unstable_poles`: how many the loop L has.
+    - `output`, `input`: the channel, by name or number; None where there is one.
+
+    **Returns:** a `Rejection`.
+
+    **Raises:** ValueError for an unknown quantity, channel or grid.
+
+    Source: MIL-DTL-32742 / CONDUIT's DRB (-3 dB) and DRP.
     """
     if quantity not in ("loop", "sensitivity"):
         raise ValueError(f'quantity is {quantity!r}: say "loop" or "sensitivity"')
@@ -174,7 +185,7 @@ def _missing(result: Rejection) -> list[str]:
 def _edges(result: Rejection) -> list[str]:
     remarks, ends = [], np.asarray(result.basis.band)
     for title, name in (("S", "peak"), ("T", "complementary_peak")):
-        if float(getattr(result, f"{name}_frequency")) in ends:
+        if float(vars(result)[f"{name}_frequency"]) in ends:
             remarks.append(
                 f"the greatest |{title}| is on the edge of the band: no peak, or one beyond"
             )

@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxquad._core import is_concrete
 
 from ._basis import Basis, basis_of, found, Numbers, only_finite
-from ._curve import Curve, curve_of
+from ._curve import Curve, curve_of, Response
 from ._text import lines, shown
 
 
@@ -96,7 +95,7 @@ class RmsResponse(eqx.Module):
 
 
 def rms_response(
-    response: Any,
+    response: Response,
     spectrum: Callable | Float[ArrayLike, " frequencies"] | Float[ArrayLike, ""],
     *,
     sides: str = "one",
@@ -106,17 +105,30 @@ def rms_response(
 ) -> RmsResponse:
     """Root mean square of the output for an input of known spectrum, within the frequencies given.
 
-    `spectrum` is the input's power spectral density per Hz at `omega` in rad/s: a function of
-    omega, values on the grid, or one value for white noise. It is one-sided, as
-    `jq.spectra.spectral_density` gives it, so that rms^2 = integral |T|^2 S domega / (2 pi) over the
-    positive frequencies; `sides="two"` takes it as two-sided, which doubles rms^2. White noise of
-    two-sided density 1 gives the H2 norm of a stable model.
-    A model (`frequency_response(omega)`) is integrated by Gauss' rule in ln omega between the
-    neighbours of `omega`, rad/s, by default 2000 log-spaced values from 0.01 to 1000; its result is
-    differentiable, also under jit. A measured response is a power law between its frequencies, and
-    the part that its random error adds to |T|^2 is taken out. Nothing outside the band is counted:
-    see `edges`. Stability cannot be seen here: an unstable model has no rms. Raises ValueError for
-    a spectrum of another length or below 0, and an unknown channel or grid.
+    A model is integrated by Gauss' rule in ln omega between the neighbours of `omega`. A measured
+    response is a power law between its frequencies, and the part that its random error adds to
+    |T|^2 is taken out. Nothing outside the band is counted, see `edges`. An unstable model has no
+    rms, which cannot be seen here.
+
+    **Arguments:**
+
+    - `response`: a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase
+        straight in ln omega) and carry standard errors, or any model with
+        `frequency_response(omega)`, whose numbers are exact and differentiable, also under jit.
+    - `spectrum`: the input's power spectral density per Hz: a function of omega in rad/s, values on
+        the grid, or one value for white noise.
+    - `sides`: "one" takes it as one-sided, as `jq.spectra.spectral_density` gives it: rms^2 is the
+        integral of |T|^2 S domega / (2 pi) over the positive frequencies. "two" doubles rms^2;
+        white noise of two-sided density 1 gives the H2 norm of a stable model.
+    - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
+        1000; of a measured response it picks some of its own frequencies.
+    - `output`, `input`: the channel, by name or number; None where there is one.
+
+    **Returns:** an `RmsResponse`.
+
+    **Raises:** ValueError for a spectrum of another length or below 0, and an unknown channel or
+    grid.
+
     Source: Wiener-Khinchin; Tischler & Remple, spectral analysis.
     """
     if sides not in _SIDES:
