@@ -89,20 +89,21 @@ def draw_members(
     ensemble: "Ensemble", loop: Loop, n: int, key: Key[Array, ""], sampling: str
 ) -> Members:
     """`n` members of an `Ensemble` around a `Loop`."""
-    given, axes = ensemble.absolute(loop), count_axes(loop.plant)
+    nominal, given = ensemble.resolve(loop)
+    axes = count_axes(nominal)
     rows = _count_rows(given, ensemble.independent, axes)
     deviates = 0 if ensemble.plants is None else ensemble.plants.deviates
     points = _points(given, rows, deviates, n, key, sampling)
     drawn = _values(given, rows, points, axes)
     wide: Wide = lambda x: np.broadcast_to(x if x.ndim > 1 else x[:, None], (axes, n))
-    plant, delay = loop.plant, np.atleast_1d(np.asarray(loop.delay))
+    plant, delay = nominal, np.atleast_1d(np.asarray(loop.delay))
     longest = loop.longest_delay or float(np.max(delay))
     if ensemble.plants is not None:
         scores = normal_scores(points[sum(rows.values()) :])
         plant, delay, longest = ensemble.plants.draw(scores, loop.dt)
     if "delay" in given:
         delay, longest = drawn["delay"], _latest(given["delay"])
-    believed = multiply(plant_inertia(loop.plant), drawn["inertia"])
+    believed = multiply(plant_inertia(nominal), drawn["inertia"])
     return Members(
         plant=vary_plant(plant, drawn),
         delay=as_float(wide(delay)[0]),
@@ -110,7 +111,7 @@ def draw_members(
         keys=make_member_keys(key, n),
         noise=as_float(wide(drawn["noise"])) if "noise" in given else None,
         gust=as_float(wide(drawn["gust"])) if "gust" in given else None,
-        payload=_payload(plant_inertia(loop.plant), given, drawn, wide),
+        payload=_payload(plant_inertia(nominal), given, drawn, wide),
         drive=loop.drive,
         encoder=loop.encoder,
         longest_delay=longest,

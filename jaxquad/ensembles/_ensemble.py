@@ -281,8 +281,8 @@ class Ensemble(eqx.Module):
         names = ("lag", "delay", "damping", "stiffness", "coulomb")
         return tuple(name for name in names if name in self.distributions)
 
-    def absolute(self, loop: Loop) -> dict[str, Distribution]:
-        """The distributions in SI units: those relative to nominal values get these from `loop`.
+    def resolve(self, loop: Loop) -> tuple[VariablePlant, dict[str, Distribution]]:
+        """The nominal plant, and the distributions in SI units or as factors of nominal values.
 
         Raise ValueError for a loop that they do not fit.
         """
@@ -292,16 +292,18 @@ class Ensemble(eqx.Module):
             _check_axes(name, one, plant)
             if name in self.independent and isinstance(plant, Multirotor) and name in _OF_ROTORS:
                 raise ValueError(f"{name} is one for all axes, and cannot be independent")
-            found[name] = one if name in FACTORS else one.about(self._nominal(loop, name), name)
+            found[name] = (
+                one if name in FACTORS else one.about(self._nominal(loop, plant, name), name)
+            )
             _check_support(name, found[name])
-        return found
+        return plant, found
 
-    def _nominal(self, loop: Loop, name: str) -> np.ndarray | None:
+    def _nominal(self, loop: Loop, plant: VariablePlant, name: str) -> np.ndarray | None:
         if self.plants is not None:
             return None
         if name == "delay":
             return np.asarray(loop.delay) if np.any(np.asarray(loop.delay)) else None
-        return nominal_value(loop.plant, name)
+        return nominal_value(plant, name)
 
     def draw(self, loop: Loop, n: int, key: Key[Array, ""]) -> Members:
         """Draw members to tune on.

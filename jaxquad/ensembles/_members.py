@@ -45,9 +45,9 @@ class Payload(eqx.Module):
 class MemberPayload(eqx.Module):
     """The payload of each member."""
 
-    inertia: Float[Array, "axes members"] = per_member(1)  # kg m^2
-    at: Float[Array, " members"] = per_member(0)  # s
-    until: Float[Array, " members"] = per_member(0)  # s
+    inertia: Float[Array, "axes members"] = per_member(rank=1)  # kg m^2
+    at: Float[Array, " members"] = per_member(rank=0)  # s
+    until: Float[Array, " members"] = per_member(rank=0)  # s
     latest: float = eqx.field(static=True)  # s, that `at` can be
 
     def signal(self, samples: int, dt: float) -> Float[Array, "samples axes members"]:
@@ -73,11 +73,13 @@ class Members(eqx.Module):
     """
 
     plant: VariablePlant
-    delay: Float[Array, " members"] = per_member(0)  # s, of the command
-    inertia_told: Float[Array, "axes members"] = per_member(1)  # kg m^2, for scheduled controllers
-    keys: Key[Array, " members"] = per_member(0)  # of noise and gusts
-    noise: Float[Array, "axes members"] | None = per_member(1, default=None)  # rad, deviation
-    gust: Float[Array, "axes members"] | None = per_member(1, default=None)  # N m, deviation
+    delay: Float[Array, " members"] = per_member(rank=0)  # s, of the command
+    inertia_told: Float[Array, "axes members"] = per_member(
+        rank=1
+    )  # kg m^2, for scheduled controllers
+    keys: Key[Array, " members"] = per_member(rank=0)  # of noise and gusts
+    noise: Float[Array, "axes members"] | None = per_member(rank=1, default=None)  # rad, deviation
+    gust: Float[Array, "axes members"] | None = per_member(rank=1, default=None)  # N m, deviation
     payload: MemberPayload | None = None
     drive: Drive | None = None
     encoder: Sensor | None = None

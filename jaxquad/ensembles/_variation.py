@@ -31,7 +31,8 @@ def vary_plant(plant: VariablePlant, drawn: Drawn) -> VariablePlant:
     Quantities that were not drawn keep the plant's value.
     """
     names = ("damping", "stiffness", "coulomb")
-    own = {name: drawn.get(name, nominal_value(plant, name)) for name in names}
+    values = {name: drawn.get(name, nominal_value(plant, name)) for name in names}
+    own = {name: value for name, value in values.items() if value is not None}
     inertia = multiply(plant_inertia(plant), drawn["inertia"])
     if isinstance(plant, DecoupledAxes):
         gain = multiply(np.asarray(plant.torque_gain), drawn["torque_gain"])

@@ -1,6 +1,7 @@
 """What a design was shown to do on fresh members, and how that is printed."""
 
-from typing import TypedDict
+from collections.abc import Mapping
+from typing import NotRequired, TypedDict
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from ._design_result import DesignResult, DesignSummary, Distance, summarise_des
 from ._quantities import QUANTITIES
 
 
-class Provenance(TypedDict, total=False):
+class Provenance(TypedDict):
     """What a certificate was made from."""
 
     members: int
@@ -24,7 +25,7 @@ class Provenance(TypedDict, total=False):
     ensemble: list[str] | None
     device: str
     versions: dict[str, str]
-    controller: dict[str, object]
+    controller: NotRequired[dict[str, object]]
 
 
 _NAMED = (
@@ -177,7 +178,7 @@ def _cell(row: DesignSummary, quantity: str, statistic: str) -> str:
     unknown = linear and row.unstable
     if unknown or quantity not in row.statistics:
         return "n/a"
-    return QUANTITIES[quantity].text(getattr(row.statistics[quantity], statistic), unit=False)
+    return QUANTITIES[quantity].text(row.statistics[quantity]._asdict()[statistic], unit=False)
 
 
 def _provenance(known: Provenance) -> str:
@@ -298,6 +299,6 @@ class Certificate(eqx.Module):
         return describe(self)
 
 
-def _arrays(design: DesignResult) -> dict[str, object]:
+def _arrays(design: DesignResult) -> Mapping[str, object]:
     flags = {"unstable": design.unstable, "diverged": design.diverged}
     return flags | {name: design.of(name) for name in design.by_axis}

@@ -78,9 +78,9 @@ def certify(
     - `ValueError`: parts do not fit together, or a limit is on what is not computed.
     """
     key = jax.random.key(0) if key is None else key
-    drawn = ensemble
-    if isinstance(ensemble, Ensemble):
-        drawn = ensemble.fresh(loop, members, key)  # independent, as the bound of a share needs
+    given = isinstance(ensemble, Members)
+    # Independent draws, as the bound of a share needs.
+    drawn = ensemble if given else ensemble.fresh(loop, members, key)
     require_same_rate(loop, drawn)
     flight = drawn.flight(scenario)
     designs = {name: loop.controller} | _named(peers or {}, name)
@@ -165,9 +165,11 @@ def _remarks(found: Certificate, controller: PyTree, drawn: Members) -> list[str
     return remarks + [f"of {n}: {why}" for n, why in others if why]
 
 
-def decouple(plant: Plant) -> DecoupledAxes:
+def decouple(plant: object) -> DecoupledAxes:
     """The plant near level flight, one axis at a time."""
-    return plant.decoupled() if isinstance(plant, Multirotor) else plant
+    axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
+    assert isinstance(axes, DecoupledAxes)
+    return axes
 
 
 def evaluate_design(

@@ -1,6 +1,6 @@
 """The numbers of one design on every member, their statistics, and how far they are from limits."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -128,7 +128,7 @@ class DesignSummary(NamedTuple):
     diverged: int
     statistics: dict[str, Statistics]
 
-    def content(self) -> dict[str, object]:
+    def content(self) -> Mapping[str, object]:
         """Everything, for `jaxquad.report.write_json`."""
         plain = {name: one._asdict() for name, one in self.statistics.items()}
         return self._asdict() | {"statistics": plain}

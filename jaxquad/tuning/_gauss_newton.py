@@ -153,7 +153,7 @@ def _errors(z: Float[Array, " n"], given: _Given) -> Float[Array, "points axes m
     problem, stride = given.problem, given.stride
     loop = problem.loop_around(given.coordinates.controller_at(z))
     stored = scan_loop(loop, problem.flight, _Errors())[1]
-    index = np.arange(problem.window.first, problem.window.last + 1, stride)
+    index = np.arange(int(problem.window.first), int(problem.window.last) + 1, stride)
     since = np.min([np.where(index >= a, index - a, np.inf) for a, _ in problem.parts], axis=0)
     weight = np.sqrt(since * loop.dt * loop.dt * stride)
     return stored[index] * weight[:, None, None]

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxquad._core import ensemble_shape
 from jaxquad.control import find_transform, Transform, Tunable
 from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
 
@@ -115,7 +116,7 @@ def select_coordinates(controller: PyTree, free: Free = None) -> Coordinates:
 
 
 def _require_one(controller: PyTree) -> None:
-    ensemble = getattr(controller, "ensemble", ())
+    ensemble = ensemble_shape(controller)
     if ensemble:
         raise ValueError(
             f"the controller is an ensemble of {ensemble}: give one controller; "

@@ -106,7 +106,11 @@ class Pareto(eqx.Module):
         """Every point's numbers, for `jaxquad.report.write_json`."""
         own = vars(self) | {"effort": self.effort, "tracking": self.tracking, "front": self.front}
         names = ("over", "levels", "effort", "tracking", "front", "converged", "evaluations")
-        rows = [c.summaries[c.name].content() | {"holds": c.holds} for c in self.certificates]
+        summaries = [c.summaries[c.name] for c in self.certificates]
+        rows = [
+            {**x.content(), "holds": c.holds}
+            for x, c in zip(summaries, self.certificates, strict=True)
+        ]
         known = self.certificates[0].independent
         peers = {n: summarise_design(x, independent=known).content() for n, x in self.peers.items()}
         return {name: own[name] for name in names} | {"points": rows, "peers": peers}

@@ -191,7 +191,7 @@ class _Runner(eqx.Module):
                 result = result._replace(value=np.where(lost, np.inf, result.value))
             refused = [bool(go) and bool(self.refusal(x)) for x, go in zip(z, on, strict=True)]
             result = result._replace(value=np.where(refused, np.inf, result.value))
-            self.memory.slowest = result.numbers["abscissa"].max(axis=1)
+            self.memory.slowest = np.max(result.numbers["abscissa"], axis=1)
             self.progress.add(_evaluation(result, z, on, fly, self.progress.seconds))
             return np.asarray(result.value), np.asarray(result.gradient)
 
@@ -275,7 +275,7 @@ class _Optimised(NamedTuple):
 
 def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
     """Why the controller at `z` cannot be built or must not be flown; empty if it can."""
-    controller = build_design(coordinates, z)
+    controller = build_design(coordinates, jnp.asarray(z))
     for part in _iter_modules(controller):
         try:
             _check_again(part)
@@ -318,7 +318,8 @@ def _merge(old: Descent, new: Descent, on: np.ndarray) -> Descent:
     pick = lambda a, b: np.where(on.reshape((-1,) + (1,) * (a.ndim - 1)), b, a)
     reasons = tuple(b if o else a for a, b, o in zip(old.reasons, new.reasons, on, strict=True))
     fields = Descent._fields[:-1]
-    arrays = {name: pick(getattr(old, name), getattr(new, name)) for name in fields}
+    both = old._asdict(), new._asdict()
+    arrays = {name: pick(*(x[name] for x in both)) for name in fields}
     return Descent(**arrays, reasons=reasons)
 
 

@@ -128,7 +128,7 @@ class Problem(eqx.Module):
         """The wanted quantities of a flight of each member."""
         run = (self.loop_around(controller), self.flight)
         names = tuple(sorted({"activity" if n == "activity_rate" else n for n in wanted}))
-        summed = lambda run, _: self._summed(*run, names)
+        summed = lambda run, _: self._summed(run[0], run[1], names)
         numbers = loop_over_devices(summed, run, None, self.linear.devices)
         if "activity_rate" in wanted:
             duration = (self.window.last - self.window.first + 1) * self.loop.dt

@@ -413,9 +413,10 @@ def test_empty_laws_are_refused(make, message):
 @pytest.fixture
 def without_type_checks():
     """As in use: the tests check the types of all arguments, a user's Python does not."""
+    before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 def test_what_belongs_to_the_loop_is_refused_in_an_ensemble(without_type_checks):

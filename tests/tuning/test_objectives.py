@@ -110,12 +110,12 @@ def test_bad_choices_are_refused_with_what_there_is():
 
 def test_numbers_of_flights_are_those_of_the_metrics_between_events():
     """Of all members in the mean, as a listener hears them at the start."""
-    around, parts = loop(ladrc(10.0, 30.0)), [(0.0, 2.5), (2.5, 4.5), (4.5, 6.5)]
+    around, parts = loop(ladrc(4.0, 50.0, 1.5)), [(0.0, 2.5), (2.5, 4.5), (4.5, 6.5)]
     quick = ensemble(lag=Uniform(0.001, 0.012), inertia=LogUniform(0.5, 1.5))
     members, heard = quick.draw(around, 8, jax.random.key(0)), []
     large = scenario(
         duration=7.0, axes=1, disturbance=Pulse(0.2, width=0.5, at=2.5),
-        reference=Step(np.radians(20.0)) + Step(np.radians(-15.0), at=4.5),
+        reference=Step(np.radians(90.0)) + Step(np.radians(-75.0), at=4.5),
     )  # fmt: skip
     span = {"stop": 6.5, "load_start": 2.6}
     names = [name for name, quantity in QUANTITIES.items() if not quantity.linear]
@@ -124,6 +124,7 @@ def test_numbers_of_flights_are_those_of_the_metrics_between_events():
         objective=Objective(dict.fromkeys(names, 1.0), (), events=(0.0, 2.5, 4.5), **span),
         listener=heard.append,
     )  # fmt: skip
+    assert heard[-1].phase == "optimise"
     found = {name: float(heard[-1].means[name][0]) for name in names}
     happens, flown = members.flight(large), members.loop(around.controller)
     whole = evaluate(flown, happens, **span)
@@ -132,13 +133,12 @@ def test_numbers_of_flights_are_those_of_the_metrics_between_events():
     rate = mean(whole.activity) / 6.5
     assert found.pop("activity_rate") == pytest.approx(rate, rel=1e-9)
     overshoot = mean(np.nanmax([np.asarray(part.overshoot) for part in each], axis=0))
-    assert found.pop("overshoot") == pytest.approx(overshoot, rel=1e-9) and overshoot > 1.0
+    assert found.pop("overshoot") == pytest.approx(overshoot, rel=1e-9) and overshoot > 0.5
     for name in ("itae", "iae", "ise"):  # ITAE's clock starts again with each part
         total = sum(mean(vars(part)[name]) for part in each)
         assert found.pop(name) == pytest.approx(total, rel=2e-3), name
     # A command within 1 % of the limit counts in part, so that the share has a gradient.
     assert np.ptp(np.asarray(whole.saturation_share)) > 0.01
-    assert heard[-1].phase == "optimise"
     share = mean(whole.saturation_share)
     assert found.pop("saturation_share") == pytest.approx(share, abs=0.01)
     for name, value in found.items():

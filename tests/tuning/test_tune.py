@@ -18,10 +18,9 @@ from tuning_case import (
     STARTS,
 )
 
-from jaxquad.control import LADRC
+from jaxquad.control import LADRC, PD
 from jaxquad.ensembles import Uniform
-from jaxquad.models import DecoupledAxes
-from jaxquad.tuning import LBFGS, Limit, tune
+from jaxquad.tuning import LBFGS, Limit, Objective, tune
 
 
 MEMBERS, KEY = 16, jax.random.key(0)
@@ -51,7 +50,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+SLOW = pytest.param("a scheduled PID", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("case", [next(iter(CASES)), SLOW])
 def test_the_gradient_is_that_of_differences_for_every_parameter(case):
     controller, free, limits = CASES[case]
     cost, start = evaluator(controller, free, members=MEMBERS, limits=limits, multiplier=0.1)
@@ -125,13 +127,28 @@ def test_the_first_line_is_the_verdict():
     assert str(judged).splitlines()[0] == "CERTIFICATE FAILS: by this much"
 
 
+@pytest.mark.slow
 def test_names_choose_what_is_tuned():
     brief = {"method": LBFGS(evaluations=1)}
     some = run(equivalent(4.0, 50.0), free=["map.values[2]", "ladrc.wc"], **brief)
     assert set(some.values) == {"map.values[2]", "ladrc.wc"}
+
+
+@pytest.mark.slow
+def test_a_delay_of_150_samples_is_tuned():
+    """Whose queue is longer than what the compiler takes in one kernel."""
+    late = ensemble(delay=Uniform(0.25, 0.3), lag=Uniform(0.01, 0.02)).draw(loop(), 4, KEY)
+    found = tune(
+        loop(ladrc(0.8, 6.0)), late, flight(4.0), objective=Objective(), fresh=None,
+        progress=False, method=LBFGS(evaluations=3),
+    )  # fmt: skip
+    assert found.stabilised and np.isfinite(found.cost)
+
+
+def test_names_that_mean_nothing_are_refused():
     for controller, free, message in (
         (ladrc(4.0, 50.0), ["wx"], "no parameter 'wx'"),
-        (DecoupledAxes(1.0, 1.0), None, "name them, free="),
+        (PD([40.0], [8.0]), None, "name them, free="),
         (LADRC(np.full((1, 4), 5.0), 30.0, 1.0), None, "controller is an ensemble"),
     ):
         with pytest.raises(ValueError, match=message):

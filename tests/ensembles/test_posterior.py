@@ -162,7 +162,7 @@ def test_a_fit_without_a_minimum_is_refused():
         with pytest.raises(ValueError, match="no minimum"):
             lost.ensemble(5, KEY, hold_undetermined=hold)
     with pytest.raises(ValueError, match="no minimum"):
-        from_fit(lost, believed=1.0)
+        posterior_of(lost, believed=1.0)
 
 
 def test_a_fit_without_finite_errors_is_refused():
@@ -207,7 +207,7 @@ class Around(NamedTuple):
 OF_POSTERIOR = ("recorded_dt", "believed", "plant")
 
 
-def from_fit(fit, **options) -> Around:
+def posterior_of(fit, **options) -> Around:
     given: dict[str, Any] = {"recorded_dt": 0.01} | options
     distributions = {name: x for name, x in given.items() if name not in OF_POSTERIOR}
     posterior = Posterior(fit, **{name: x for name, x in given.items() if name in OF_POSTERIOR})
@@ -217,7 +217,7 @@ def from_fit(fit, **options) -> Around:
 
 def test_plants_are_drawn_from_an_attitude_axis_with_a_believed_inertia():
     fit = ratio_fit()
-    members = from_fit(fit, believed=0.0552).draw(4096, KEY)
+    members = posterior_of(fit, believed=0.0552).draw(4096, KEY)
     gain = fit.derived(lambda m: m.gain)
     assert np.mean(members.plant.gain) == pytest.approx(gain.value, rel=1e-3)
     assert spread(members.plant.gain) == pytest.approx(gain.standard_error, rel=0.03)
@@ -230,16 +230,16 @@ def test_a_plant_that_needs_what_is_not_determined_is_refused():
     with pytest.raises(
         jq.identify.UndeterminedError, match="inertia, torque_gain .*J_x, K_t.*believed="
     ):
-        from_fit(ratio_fit())
+        posterior_of(ratio_fit())
     with pytest.raises(jq.identify.UndeterminedError, match="delay, lag .*distribution instead"):
-        from_fit(sum_fit(), believed=1.0)
+        posterior_of(sum_fit(), believed=1.0)
     with pytest.raises(jq.identify.UndeterminedError, match="delay would"):
-        from_fit(sum_fit(), believed=1.0, lag=Uniform(0.01, 0.02))
+        posterior_of(sum_fit(), believed=1.0, lag=Uniform(0.01, 0.02))
 
 
 def test_laws_replace_what_is_not_determined():
     fit = sum_fit()
-    ensemble = from_fit(fit, believed=1.0, lag=Uniform(0.01, 0.02), delay=0.011)
+    ensemble = posterior_of(fit, believed=1.0, lag=Uniform(0.01, 0.02), delay=0.011)
     members = ensemble.draw(4096, KEY)
     assert spread(members.plant.gain) == pytest.approx(fit.standard_errors[0], rel=0.03)
     assert np.all(np.asarray(members.delay) == 0.011) and members.longest_delay == 0.011
@@ -248,7 +248,7 @@ def test_laws_replace_what_is_not_determined():
 
 
 def test_factors_multiply_what_is_drawn_and_the_inertia_told_is_the_believed_one():
-    ensemble = from_fit(
+    ensemble = posterior_of(
         ratio_fit(), believed=0.0552, inertia=LogUniform(0.5, 3.0), told=Normal(0.1)
     )
     members = ensemble.draw(1024, KEY)
@@ -265,7 +265,7 @@ def test_factors_multiply_what_is_drawn_and_the_inertia_told_is_the_believed_one
 
 def test_a_transfer_function_and_a_lagged_integrator_give_the_same_plants():
     fits = sharp_fit(), transfer_function_fit()
-    ours, theirs = (from_fit(fit, believed=0.05).draw(1024, KEY) for fit in fits)
+    ours, theirs = (posterior_of(fit, believed=0.05).draw(1024, KEY) for fit in fits)
     for name in ("torque_gain", "lag"):
         a, b = (np.asarray(getattr(m.plant, name)[0]) for m in (ours, theirs))
         assert np.mean(a) == pytest.approx(np.mean(b), rel=1e-4)
@@ -297,7 +297,7 @@ def test_models_of_the_same_response_make_the_same_plant(integrators, lag):
 def test_half_a_sample_of_the_records_hold_is_taken_off_the_delay_down_to_zero():
     fit = sharp_fit()
     whole, half, none = (
-        from_fit(fit, believed=1.0, recorded_dt=dt).draw(1024, KEY) for dt in (None, 0.01, 0.1)
+        posterior_of(fit, believed=1.0, recorded_dt=dt).draw(1024, KEY) for dt in (None, 0.01, 0.1)
     )
     np.testing.assert_allclose(half.delay, whole.delay - 0.005, atol=1e-15)
     assert np.all(np.asarray(none.delay) == 0) and none.longest_delay == 0
@@ -307,13 +307,13 @@ def test_half_a_sample_of_the_records_hold_is_taken_off_the_delay_down_to_zero()
 
 def test_lag_and_delay_keep_the_correlation_of_the_fit():
     fit = sharp_fit()
-    members = from_fit(fit, believed=1.0).draw(4096, KEY)
+    members = posterior_of(fit, believed=1.0).draw(4096, KEY)
     drawn = np.corrcoef(members.plant.lag[0], members.delay)[0, 1]
     assert drawn == pytest.approx(fit.correlation[1, 2], abs=0.03)
 
 
 def test_draws_of_a_fit_have_one_shape_and_fresh_ones_are_others():
-    ensemble = from_fit(sharp_fit(), believed=1.0)
+    ensemble = posterior_of(sharp_fit(), believed=1.0)
     one, other = ensemble.draw(8, KEY), ensemble.draw(8, jax.random.key(1))
     fresh = ensemble.fresh(8, KEY)
     kinds = [jax.tree.structure(members) for members in (one, other, fresh)]
@@ -335,7 +335,7 @@ def test_any_other_model_is_drawn_by_a_function_of_it():
         return jq.DecoupledAxes([0.05 * model.gain], [0.05], stiffness=[model.lag]), 0.002
 
     fit = sharp_fit()
-    members = from_fit(fit, plant=plant, recorded_dt=None).draw(1024, KEY)
+    members = posterior_of(fit, plant=plant, recorded_dt=None).draw(1024, KEY)
     assert spread(members.plant.gain) == pytest.approx(fit.standard_errors[0], rel=0.05)
     assert spread(members.plant.stiffness) == pytest.approx(fit.standard_errors[1], rel=0.05)
     assert members.plant.lag is None and np.all(np.asarray(members.delay) == 0.002)
@@ -343,17 +343,17 @@ def test_any_other_model_is_drawn_by_a_function_of_it():
 
 def test_functions_of_the_wrong_kind_and_models_without_a_form_are_refused():
     with pytest.raises(ValueError, match="pair"):
-        from_fit(sharp_fit(), plant=lambda m: m)
+        posterior_of(sharp_fit(), plant=lambda m: m)
     with pytest.raises(ValueError, match="plant= or believed=, not both"):
-        from_fit(sharp_fit(), plant=lambda m: m, believed=1.0)
+        posterior_of(sharp_fit(), plant=lambda m: m, believed=1.0)
     with pytest.raises(ValueError, match="give believed="):
-        from_fit(sharp_fit())
+        posterior_of(sharp_fit())
     with pytest.raises(ValueError, match="believed"):
-        from_fit(sharp_fit(), believed=-1.0)
+        posterior_of(sharp_fit(), believed=-1.0)
     with pytest.raises(ValueError, match="recorded_dt"):
-        from_fit(sharp_fit(), believed=1.0, recorded_dt=-0.01)
+        posterior_of(sharp_fit(), believed=1.0, recorded_dt=-0.01)
     with pytest.raises(ValueError, match="give the mean"):
-        from_fit(sharp_fit(), believed=1.0, lag=Normal(0.1)).draw(8, KEY)
+        posterior_of(sharp_fit(), believed=1.0, lag=Normal(0.1)).draw(8, KEY)
     for denominator in ([1.0, 3.0, 9.0], [1.0, 3.0, 9.0, 0.0], [1.0, 0.0, 0.0, 0.0]):
         with pytest.raises(ValueError, match="is not K"):
             make_plant(jq.TransferFunction([8.0], denominator), believed=1.0)
@@ -364,16 +364,16 @@ def test_functions_of_the_wrong_kind_and_models_without_a_form_are_refused():
 def test_a_plant_of_the_wrong_sign_is_refused():
     fit = integrator_fit(jq.LaggedIntegrator(-280.0, 0.016, 0.011), gain=-280.0)
     with pytest.raises(ValueError, match="torque_gain .*sign"):
-        from_fit(fit, believed=1.0)
+        posterior_of(fit, believed=1.0)
 
 
 def test_str_says_what_was_fitted():
-    text = str(from_fit(ratio_fit(), believed=0.0552, inertia=LogUniform(0.5, 3.0)).ensemble)
+    text = str(posterior_of(ratio_fit(), believed=0.0552, inertia=LogUniform(0.5, 3.0)).ensemble)
     assert "fit of J_x, K_t, lag" in text and "log-uniform 0.5 .. 3" in text
 
 
 def test_a_loop_around_another_plant_than_the_identified_one_is_refused():
-    ensemble = from_fit(sharp_fit(), believed=1.0)
+    ensemble = posterior_of(sharp_fit(), believed=1.0)
     other = ensemble.loop.with_plant(jq.DecoupledAxes([280.0], [2.0]))
     with pytest.raises(ValueError, match="posterior.plant"):
         ensemble.ensemble.draw(other, 8, KEY)
