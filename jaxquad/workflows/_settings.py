@@ -221,7 +221,7 @@ class IdentifySettings(Settings):
         kinds.TIME, None, "first time to use, in the file's time", group=_PART
     )
     stop: float | None = option_field(kinds.TIME, None, "last time to use", group=_PART)
-    segments: tuple[Pair, ...] = option_field(
+    segments: Sequence[Pair] = option_field(
         kinds.SEGMENTS,
         (),
         "instead of start and stop; repeat it to analyse several parts together",

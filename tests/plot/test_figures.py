@@ -1,5 +1,7 @@
 """Figures of records, responses and verifications can be read."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ def check():
     return jq.verify(jq.LaggedIntegrator(250.0, 0.016, 0.011), record)
 
 
-def lines(axis):
+def lines(axis) -> dict[str, Any]:
     return {line.get_label(): line for line in axis.get_lines()}
 
 
@@ -40,7 +42,7 @@ def test_a_bode_figure_names_its_axes_with_units(frf):
 def test_the_band_is_the_95_per_cent_band_of_the_random_error(frf):
     magnitude = bode(frf).axes[0]
     (band,) = magnitude.collections
-    corners = band.get_paths()[0].vertices
+    corners = np.asarray(band.get_paths()[0].vertices)
     at_first = corners[np.isclose(corners[:, 0], OMEGA[0]), 1]
     width = 2 * 1.96 * 0.05 * 20 / np.log(10)
     assert np.ptp(at_first) == pytest.approx(width, rel=1e-9)

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from jaxquad.plot import histories
 TIME = np.linspace(0, 1, 50)
 
 
-def lines(figure):
+def lines(figure) -> dict[str, Any]:
     return {line.get_label(): line for axis in figure.axes for line in axis.get_lines()}
 
 

@@ -1,5 +1,7 @@
 """Figures of certificates, fronts and tunes can be read without colour."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from certificates_by_hand import certificate, front, INERTIA, judged, missed
@@ -8,7 +10,7 @@ from jaxquad.plot import certificate_figure, convergence_figure, front_figure
 from jaxquad.tuning import Evaluation
 
 
-def lines(panel):
+def lines(panel) -> dict[str, Any]:
     return {line.get_label(): line for line in panel.get_lines()}
 
 
@@ -96,7 +98,7 @@ def test_convergence_is_drawn_from_where_flights_begin():
     np.testing.assert_allclose(first.get_ydata(), [0.9, 1e-5])
     np.testing.assert_allclose(second.get_ydata(), 0.4)  # what was best until then
     assert first.get_linestyle() != second.get_linestyle()
-    np.testing.assert_allclose(bottom.get_lines()[0].get_ydata(), [20, 100, 100])
+    np.testing.assert_allclose(np.asarray(bottom.get_lines()[0].get_ydata()), [20, 100, 100])
     assert bottom.get_xlabel() == "gradient evaluation"
     with pytest.raises(ValueError, match="the history is empty"):
         convergence_figure([])

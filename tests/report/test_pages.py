@@ -83,6 +83,6 @@ def test_a_folder_is_hashed_by_the_order_of_its_names(tmp_path):
         (tmp_path / name).write_text(name)
     [source] = provenance(tmp_path).files
     assert source.sha256 == hashlib.sha256(b"abc").hexdigest() and source.size == 3
-    assert provenance(tmp_path).content()["files"][0]["name"] == tmp_path.name
+    assert provenance(tmp_path).files[0].name == tmp_path.name
     with pytest.raises(OSError):
         provenance(tmp_path / "none")

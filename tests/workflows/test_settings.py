@@ -43,17 +43,15 @@ def test_settings_survive_the_command_line_and_json(settings):
 def test_toml_says_the_same_as_python(tmp_path):
     path = tmp_path / "identify.toml"
     path.write_text('input = "M"\noutput = "q"\nband = [1, 2]\nlag = false\n[units]\nq = "rad/s"\n')
-    same = IdentifySettings(
-        input={"M": {"M": 1.0}}, output="q", band=(1, 2), lag=False, units={"q": "rad/s"}
-    )
+    same = IdentifySettings(input="M", output="q", band=(1, 2), lag=False, units={"q": "rad/s"})
     assert IdentifySettings.from_toml(path) == same
     path.write_text("inertia = 0.05\nlimit = 10\n")
     assert TuneSettings.from_toml(path) == TuneSettings(inertia=0.05, limit=10)
 
 
 def test_a_mix_of_channels_may_be_a_mapping():
-    mix = {"roll": {"m1": -1.0, "m2": 0.5}}
-    assert IdentifySettings(input=mix, output="p").input == "roll=-1.0*m1+0.5*m2"
+    content = {"input": {"roll": {"m1": -1.0, "m2": 0.5}}, "output": "p"}
+    assert IdentifySettings.from_mapping(content).input == "roll=-1.0*m1+0.5*m2"
 
 
 def test_an_option_takes_the_place_of_what_says_the_same_in_a_file():
@@ -97,7 +95,7 @@ def test_settings_that_cannot_be_say_what_to_change(content, complaint):
 @pytest.mark.parametrize("text", ["5", "5:", "9:3", "a:b", "3:3", "nan:5", "0:inf", "1:2:3"])
 def test_a_segment_is_a_start_and_a_later_stop(text):
     with pytest.raises(SettingsError, match="is no START:STOP"):
-        IdentifySettings(segments=[text])
+        IdentifySettings.from_mapping({"segments": [text]})
 
 
 def test_required_settings_are_named():

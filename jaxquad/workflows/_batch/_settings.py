@@ -1,7 +1,7 @@
 """Settings of a batch: which logs, how each of them is identified, and by how many processes."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
@@ -51,7 +51,7 @@ class BatchSettings(Settings):
         ```
     """
 
-    logs: tuple[str, ...] = option_field(
+    logs: str | Sequence[str] = option_field(
         kinds.PATTERNS,
         _EVERY_LOG,
         "file patterns below the folder; by default every file but hidden ones",
@@ -70,8 +70,8 @@ class BatchSettings(Settings):
         None,
         "of a Dask cluster that sees the same files, such as tcp://10.0.0.1:8786",
     )
-    identify: Mapping[str, object] = dataclasses.field(default_factory=dict)
-    overrides: tuple[Override, ...] = ()
+    identify: IdentifySettings | Mapping[str, object] = dataclasses.field(default_factory=dict)
+    overrides: Sequence[Override] = ()
 
     @classmethod
     def options(cls) -> dict[str, Option]:
@@ -97,15 +97,17 @@ class BatchSettings(Settings):
 
     def __post_init__(self):
         super().__post_init__()
-        common = self.identify
-        if isinstance(common, IdentifySettings):
-            common = common.given()
-        object.__setattr__(self, "identify", _checked(common))
+        object.__setattr__(self, "identify", _checked(self._common))
         object.__setattr__(self, "overrides", tuple(Override(*each) for each in self.overrides))
         if self.timeout is not None and self.scheduler is not None:
             raise SettingsError(
                 "`timeout` is for processes of this machine: leave it out with `scheduler`"
             )
+
+    @property
+    def _common(self) -> Mapping[str, object]:
+        common = self.identify
+        return common.given() if isinstance(common, IdentifySettings) else common
 
     def changed(self: S, changes: Mapping[str, object]) -> S:
         return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
@@ -118,7 +120,7 @@ class BatchSettings(Settings):
 
         **Raises:** `SettingsError` for settings that exclude each other.
         """
-        found: Mapping[str, object] = self.identify
+        found = self._common
         for patterns, changes in self.overrides:
             if any(fnmatchcase(log, pattern) for pattern in patterns):
                 found = updated(found, changes)
