@@ -106,9 +106,9 @@ _NARROW = 128  # numbers that XLA never divides among threads
 _SUMS = {"reduce", "reduce_window", "dot_general", "dot"}
 _MOST_SUMMED = 4096
 _WIDEST = 2**15  # numbers of one operation: one thread is the slower way for more
-# Operations of one kernel: the time to compile them grows faster than their number. At 6800 wide
-# ones it is four times that of a plain loop, at 3200 twice; narrow ones compile faster than plain.
-_MOST_OPERATIONS, _MOST_WIDE = 12_000, 4_000
+# Operations of one kernel: the time to compile them grows faster than their number. With 6800, most
+# of them wide, it can be four times that of a plain loop; narrow ones compile faster than plain.
+_MOST_OPERATIONS, _MOST_WIDE = 12_000, 6_000
 _WIDE = 32  # numbers
 
 

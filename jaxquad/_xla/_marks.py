@@ -12,6 +12,7 @@ from ._switch import note, warn_once
 
 
 _TAGS = {"inlineable": "false", "xla_cpu_small_call": "true"}
+_SEEN = {"jaxquad_kernel": "false"}  # tells XLA nothing, and this module not to look again
 
 
 def _identity(name: str) -> Primitive:
@@ -63,13 +64,16 @@ def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:
     reason = why_not(call, whole.module)
     if reason is not None:
         note(f"a kernel does not hold {reason}")
+        call.attributes[ATTRIBUTE] = _attributes(_SEEN)
         return
     name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-    tags: dict[str, ir.Attribute] = {
-        name: ir.StringAttr.get(value) for name, value in _TAGS.items()
-    }
-    hold_in_kernel(call, whole.module, whole.symbol_table, ir.DictAttr.get(tags))
+    hold_in_kernel(call, whole.module, whole.symbol_table, _attributes(_TAGS))
+
+
+def _attributes(texts: dict[str, str]) -> ir.Attribute:
+    named: dict[str, ir.Attribute] = {name: ir.StringAttr.get(x) for name, x in texts.items()}
+    return ir.DictAttr.get(named)
 
 
 def _is_plain_call(op: Op | ir.Block) -> TypeGuard[ir.Operation]:

@@ -1,4 +1,4 @@
-"""How loops are compiled: the switch, the trial of an unknown jaxlib, and what a failure leads to."""
+"""How loops are compiled: the switch, the trial of an unknown jaxlib, and what is done on failure."""
 
 import json
 import subprocess

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._core._arrays import align
+from jaxquad._core import align, per_member
 from jaxquad.control import LADRC
 from jaxquad.loops import Loop
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
@@ -41,7 +41,7 @@ EXACT = [0.080522003175, 0.06981317008, 0.06981317008]  # of the baseline's READ
 class Quadrotor(eqx.Module):
     """What quad.c integrates: Euler angles, body rates, lagging torques."""
 
-    inertia: jax.Array
+    inertia: jax.Array = per_member(rank=1)
 
     def init(self, euler=None, *, ensemble=()):
         wide = jnp.broadcast_shapes(ensemble, self.inertia.shape[1:])
