@@ -119,8 +119,8 @@ def _beside(curve: _Curve, measured: _Curve) -> _Curve:
     """The curve on the same 360 deg branch as the measurement's coherent points."""
     good = measured.good if measured.good.any() else slice(None)
     omega = measured.omega[good]
-    apart = np.interp(omega, curve.omega, curve.phase) - measured.phase[good]
-    return curve._replace(phase=curve.phase - 360 * np.round(np.median(apart) / 360))
+    difference = np.interp(omega, curve.omega, curve.phase) - measured.phase[good]
+    return curve._replace(phase=curve.phase - 360 * np.round(np.median(difference) / 360))
 
 
 def _draw_measured(axes: Sequence[Axes], curve: _Curve, name: str) -> None:

@@ -68,8 +68,8 @@ def _styles(
     others = [name for name in names if name != target]
     if len(others) > len(_LINES):
         raise ValueError(
-            f"{len(others)} curves cannot be told apart, {len(_LINES)} can: split {others} over "
-            "several figures"
+            f"{len(others)} curves are too many to be distinguished, {len(_LINES)} is the most: "
+            f"split {others} over several figures"
         )
     return dict(zip(others, _LINES, strict=False)) | ({target: _TARGET} if target else {})
 

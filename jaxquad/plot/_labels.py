@@ -70,8 +70,8 @@ def marks(names: Iterable[str]) -> dict[str, Style]:
     names = list(names)
     if len(names) > len(_MARKS):
         raise ValueError(
-            f"{len(names)} designs cannot be told apart, {len(_MARKS)} can: leave some of {names} "
-            "out"
+            f"{len(names)} designs are too many to be distinguished, {len(_MARKS)} is the most: "
+            f"leave some of {names} out"
         )
     return {name: dict(mark) for name, mark in zip(names, _MARKS, strict=False)}
 

@@ -52,10 +52,10 @@ def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int)
     modelled = np.asarray(model_response(model, jnp.asarray(frf.omega)))[:, output, source]
     pair = (slice(None), output, source)
     with np.errstate(all="ignore"):
-        apart = np.log(np.asarray(frf.response)[pair] / modelled)
+        difference = np.log(np.asarray(frf.response)[pair] / modelled)
         error = np.maximum(np.asarray(frf.random_error)[pair], 1e-7)
-        size, angle = np.real(apart), np.imag(apart)
-        known = np.isfinite(apart) & np.isfinite(error)
+        size, angle = np.real(difference), np.imag(difference)
+        known = np.isfinite(difference) & np.isfinite(error)
         coherent = known & (np.asarray(frf.coherence)[pair] >= COHERENT)
         decibels, degrees = 20 / np.log(10) * size, np.degrees(angle)
         omega = np.asarray(frf.omega)

@@ -10,7 +10,7 @@ from ._fit import count_starts
 from ._page import Cell, Table
 
 
-_DRAWN = 7  # designs that can be told apart in a figure
+_DRAWN = 7  # designs that can be distinguished in a figure
 
 
 def tuned_section(tuned: Tuned | Certificate) -> dict[str, object]:

@@ -57,7 +57,7 @@ def test_a_design_that_does_not_exist_is_refused_and_so_are_too_many():
     designs = {f"design {k}": judged() for k in range(8)}
     with pytest.raises(ValueError, match="no designs \\['nothing'\\]"):
         certificate_figure(certificate(designs), designs=["nothing"])
-    with pytest.raises(ValueError, match="8 designs cannot be told apart"):
+    with pytest.raises(ValueError, match="8 designs are too many to be distinguished"):
         certificate_figure(certificate(designs))
 
 

@@ -48,7 +48,7 @@ def _answer(future) -> Content:
     if error is None:
         return future.result()
     return failure(
-        f"the cluster gave it up ({type(error).__name__}: {' '.join(str(error).split())})"
+        f"the cluster gave up on this log ({type(error).__name__}: {' '.join(str(error).split())})"
     )
 
 
