@@ -1,6 +1,6 @@
 """Identify the roll axis of the simulated Quanser 3 DOF Hover: the paper's section 5.2, done right.
 
-A frequency sweep is injected into the stabilised rig, which feels gusts and has an 8192-count
+A frequency sweep is injected into the stabilised test stand, with gusts and an 8192-count
 encoder. Prints a table for a report and writes JSON and figures under results/hover_roll.
 `--draws N` repeats the flight N times and counts how often the 95 % intervals hold the truth.
 """
@@ -20,7 +20,7 @@ from jaxquad.report import provenance, write_report, write_results
 jq.enable_x64()
 
 DT = 0.002  # s
-ADDED = 0.0276  # kg m^2, known weights on the arms in the second run: half the rig's inertia
+ADDED = 0.0276  # kg m^2, known weights on the arms in the second run: half the stand's inertia
 SHEET = jq.models.QUANSER_HOVER
 TRUTH = SHEET.arm * SHEET.thrust_coefficient / SHEET.inertia[0]
 OMEGA = np.geomspace(0.35, 12.0, 60)  # rad/s
@@ -41,7 +41,7 @@ def fly(signals: np.ndarray, added: np.ndarray, key: jax.Array) -> jq.simulation
     inertia = np.array(SHEET.inertia)[:, None] + np.outer([1.0, 0.0, 0.0], added)
     thrust, torque = SHEET.thrust_coefficient, SHEET.torque_coefficient
     allocation = jq.models.Allocation(SHEET.arm, thrust, torque)
-    rig = jq.models.Multirotor(jq.models.Attitude(inertia), allocation, jq.models.MotorLag(0.02))
+    stand = jq.models.Multirotor(jq.models.Attitude(inertia), allocation, jq.models.MotorLag(0.02))
     gains = [TRUTH, TRUTH, torque / SHEET.inertia[2]]
     pilot = jq.control.place_pd(gains, natural_frequency=3.0, damping=0.8, dt=DT)
     scenario = jq.simulation.excite(
@@ -51,7 +51,7 @@ def fly(signals: np.ndarray, added: np.ndarray, key: jax.Array) -> jq.simulation
         jq.simulation.MotorDrive(allocation),
         jq.simulation.Encoder(SHEET.encoder_counts),
     )
-    return jq.simulate(jq.Loop(rig, pilot, dt=DT, drive=drive, encoder=encoder), scenario)
+    return jq.simulate(jq.Loop(stand, pilot, dt=DT, drive=drive, encoder=encoder), scenario)
 
 
 def experiments(seed: int) -> list[jq.Record]:

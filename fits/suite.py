@@ -16,7 +16,7 @@ from experiments.data import Case, cases, load
 from experiments.flights import fly
 from experiments.loops import loop_rows, map_rows
 from experiments.matching import match, Matched
-from experiments.rows import markdown, matching_table, printed, require_judged, Row
+from experiments.rows import markdown, matching_table, printed, require_marked_quantities, Row
 from jaxquad.report import write_json
 
 
@@ -55,7 +55,7 @@ def rows_of(
         rows = map_rows(case, suite, loops)
     else:
         rows = fly(case, suite, loops, quick=quick, seed=seed)
-    require_judged(rows)
+    require_marked_quantities(rows)
     return rows
 
 

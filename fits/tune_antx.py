@@ -1,11 +1,12 @@
 """From a measured flight to certified gains: pitch of the ANT-X quadrotor, one command.
 
-The PRBS flight of `antx_pitch.py` identifies moment M to rate q: K, lag and delay, of which the
-last two trade off; members are drawn from what the fit leaves open. A scheduled LADRC on the pitch
-ANGLE (b0 = K at the flown inertia, straight to M, in place of the rig's two loops) is tuned on
-them and certified on fresh ones. Identified are K, lag and delay; the spread of inertia, and of K
-with the battery, is assumed, and nothing of this has been flown. Needs the logs: JAXQUAD_DATA names
-the folder that holds `antx_pitch/`. Writes JSON, figures and a C header under results/tune_antx.
+The flight with binary noise of `antx_pitch.py` identifies moment M to rate q: K, lag and delay, of
+which only the sum of the last two is well determined; members are drawn from the fit's
+distribution. A scheduled LADRC on the pitch ANGLE (b0 = K at the flown inertia, straight to M, in
+place of the test stand's two loops) is tuned on them and certified on fresh ones. Identified are K,
+lag and delay; the spread of inertia, and of K with the battery, is assumed, and nothing of this has
+been flown. Needs the logs: JAXQUAD_DATA names the folder that holds `antx_pitch/`. Writes JSON,
+figures and a C header under results/tune_antx.
 """
 
 import os
@@ -65,7 +66,7 @@ def flight() -> jq.simulation.Scenario:
 
 
 def own_activity(record: jq.Record) -> float:
-    """Squared changes of M per second that the rig's own controller made in the flight."""
+    """Squared changes of M per second that the test stand's own controller made in the flight."""
     moment = np.asarray(record.inputs)[:, 0]
     return float(np.sum(np.diff(moment) ** 2) / (moment.size * DT))
 
@@ -115,14 +116,14 @@ Identified from the PRBS flight: K = {gain:.1f} +- {error:.1f} rad/s^2, lag + de
 {1e3 * later.value:.2f} +- {1e3 * later.standard_error:.2f} ms
 (each alone only to {1e3 * fit.standard_errors[1]:.1f} and {1e3 * fit.standard_errors[2]:.1f} ms: \
 members are drawn along that trade-off); the other flight: fit {check.fit_percent:.0f} %.
-Assumed: inertia {SPAN[0]:g} to {SPAN[1]:g} times what was flown, told with an error of 10 %; K \
-another 5 % open; noise 0.01 deg;
+Assumed: inertia {SPAN[0]:g} to {SPAN[1]:g} times what was flown, \
+known to the controller within 10 %; K uncertain by another 5 %; noise 0.01 deg;
 M held for {1e3 * DT:g} ms, within +-1; activity below that of the flight, {activity:.2g}/s. \
 Torques are per kg m^2, in rad/s^2.
 The nominal loop crosses over at {crossover:.0f} rad/s and is most sensitive at {peak:.0f}, \
 {inside} the identified band of {low:.1f} to {high:.0f} rad/s.
 wo is held at the band's upper end: with noise this low, nothing but the model would bound it.
-Not flown: the gains are for the rig's attitude estimate and a model of 0.7 to 12 Hz.
+Not flown: the gains are for the test stand's attitude estimate and a model of 0.7 to 12 Hz.
 
 {found}
 

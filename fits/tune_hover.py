@@ -126,13 +126,14 @@ def described(
 {known.verdict}
 10 to 40 ms of lag: {assumed.verdict}
 
-Identified: L K_t / J_x = {gain.value:.4f} +- {gain.standard_error:.4f} rad/s^2 per V of V4 - V2, \
-lag {1e3 * lag:.2f} +- {1e3 * error:.2f} ms.
-Assumed: inertia {SPAN[0]:g} to {SPAN[1]:g} times {INERTIA} kg m^2, told with an error of 10 %; \
+Identified: L K_t / J_x = {gain.value:.4f} +- {gain.standard_error:.4f} (std. error) \
+rad/s^2 per V of V4 - V2, lag {1e3 * lag:.2f} +- {1e3 * error:.2f} ms.
+Assumed: inertia {SPAN[0]:g} to {SPAN[1]:g} times {INERTIA} kg m^2, \
+known to the controller within 10 %; \
 delay 4 ms, noise 0.02 deg,
 Coulomb friction 0.002 N m, +-{LIMIT:g} V.
 
-1. What the sweep leaves open
+1. What the sweep leaves uncertain
 {known}
 
 {front or "(no front in a quick run)"}

@@ -16,17 +16,17 @@ _VARIED = {"draws", "quick", "grid", "random", "rows", "keep", "names"}
 _SIGNALS = {"reference", "injection", "disturbance", "noise", "payload"}
 _OPTIONS = {
     "loop": set(),
-    "map": {"lags", "delays", "judged_to", "any_b0", "known_limits"},
+    "map": {"lags", "delays", "longest_lag", "any_b0", "known_limits"},
     "flight": _VARIED | _SIGNALS | {
-        "duration", "overrides", "knows", "judge", "linear", "theory", "invariant", "estimate",
-        "estimator", "second_gain", "told_limit", "held", "identify",
+        "duration", "overrides", "knows", "metrics", "linear", "theory", "invariant", "estimate",
+        "estimator", "second_gain", "knows_limit", "held", "identify",
     },
 }  # fmt: skip
 Numbers = dict[str, np.ndarray]  # of members, by quantity
 
 
 class Case(NamedTuple):
-    """One case of a scenario: a plant, what happens to it, and how it is judged."""
+    """One case of a scenario: a plant, what happens to it, and which numbers count."""
 
     scenario: str  # S0 to S11
     title: str
@@ -123,8 +123,8 @@ def _groups(data: dict[str, Any], values: dict[str, np.ndarray], count: int) -> 
     for key in dict.fromkeys(keys):
         named = dict(zip(names, key, strict=True))
         shown = all(named[name] == _text(data, name, value) for name, value in keep.items())
-        told = {name: text for name, text in named.items() if not (shown and name in keep)}
-        label = ", ".join(_labelled(data, name, text) for name, text in told.items())
+        labelled = {name: text for name, text in named.items() if not (shown and name in keep)}
+        label = ", ".join(_labelled(data, name, text) for name, text in labelled.items())
         groups.append(Group(label, np.flatnonzero([k == key for k in keys]), shown))
     return groups
 

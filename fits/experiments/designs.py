@@ -1,6 +1,6 @@
 """The suite's controllers, from gains that are the same for every plant.
 
-Gains are those of b u, in rad/s^2: a design fits any axis once it is told the axis' b = KT/J.
+Gains are those of b u, in rad/s^2: a design fits any axis once it knows the axis' b = KT/J.
 """
 
 from typing import Any, NamedTuple
@@ -52,8 +52,8 @@ class Belief(NamedTuple):
         return self.torque_gain / self.inertia
 
 
-class Untold(eqx.Module):
-    """A LADRC that does not hear what its drive gave: its observer goes by what it asked for."""
+class IgnoresDrive(eqx.Module):
+    """A LADRC that ignores what its drive applied: its observer uses the command it asked for."""
 
     law: LADRC | LADRCLaw
 
@@ -66,7 +66,7 @@ class Untold(eqx.Module):
         return self.law.ensemble
 
     def prepared(self) -> Any:
-        return self if isinstance(self.law, LADRCLaw) else Untold(self.law.prepared())
+        return self if isinstance(self.law, LADRCLaw) else IgnoresDrive(self.law.prepared())
 
     def init(self, like: Any) -> Any:
         return self.law.init(like)
@@ -83,15 +83,15 @@ def controller(
     belief: Belief,
     *,
     dt: float,
-    told_limit: bool = True,
+    knows_limit: bool = True,
     second_gain: np.ndarray | float = 1.0,
     estimator: dict[str, Any] | None = None,
 ) -> Any:
     """The design on axes of which it has this `belief`; `second_gain` scales wo or the filter."""
     wide = lambda x: np.array(np.broadcast_to(x, belief.gain.shape), float)
-    limit = belief.limit if told_limit else wide(np.inf)
+    limit = belief.limit if knows_limit else wide(np.inf)
     if design.law == "pid":
-        return _pid(design, belief, wide(second_gain), limit, told_limit, dt)
+        return _pid(design, belief, wide(second_gain), limit, knows_limit, dt)
     factor = lambda name: wide(design.data.get(name, 1.0))
     ladrc = LADRC(
         wide(design.gains["wc"]), wide(design.gains["wo"]) * wide(second_gain),
@@ -99,7 +99,7 @@ def controller(
         observer_factor=factor("observer_factor"), limit=limit, dt=dt,
     )  # fmt: skip
     if design.law == "ladrc":
-        return ladrc if told_limit else Untold(ladrc)
+        return ladrc if knows_limit else IgnoresDrive(ladrc)
     return _adaptive(ladrc, design, belief, estimator or {}, dt)
 
 
@@ -112,12 +112,21 @@ def b0_of(design: Design, belief: Belief) -> np.ndarray:
 
 
 def _pid(
-    design: Design, belief: Belief, second: np.ndarray, limit: np.ndarray, told: bool, dt: float
+    design: Design,
+    belief: Belief,
+    second: np.ndarray,
+    limit: np.ndarray,
+    knows_limit: bool,
+    dt: float,
 ) -> PID:
     per_unit, gains = 1 / belief.gain, design.gains
     kp, ki, kd = pid_gains(gains["pole"], gains.get("damping", 1.0), gains.get("ratio", 1.0))
     filter = gains["filter"] * second
-    common: dict[str, Any] = {"limit": limit, "anti_windup": Clamping() if told else None, "dt": dt}
+    common: dict[str, Any] = {
+        "limit": limit,
+        "anti_windup": Clamping() if knows_limit else None,
+        "dt": dt,
+    }
     if design.data.get("filtered") == "measurement":
         return PID(
             kp * per_unit, ki * per_unit, kd * per_unit, measurement_filter=filter,

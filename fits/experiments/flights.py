@@ -18,7 +18,7 @@ from .nominal import WIDTH
 from .rigs import Rig, rig
 from .rows import Row, with_loop, with_variation
 from .signals import scenario_of
-from .summary import judged, row_of
+from .summary import flight_numbers, row_of
 
 
 def fly(
@@ -50,7 +50,7 @@ def design_numbers(
         key = key_of(case, seed, first)
         belief, truth = believed(case, chunk, suite)
         done = flown(case, chunk, suite, design, belief, truth, key)
-        found = judged(case, done, suite["dt"])
+        found = flight_numbers(case, done, suite["dt"])
         if "identify" in case.data:
             found |= identified(case, chunk, count, truth, done, suite)
         if case.data.get("linear"):
@@ -89,7 +89,7 @@ def flown(
     """One design through the case."""
     second = case.data.get("second_gain", 1.0)
     law = controller(
-        design, belief, dt=suite["dt"], told_limit=case.data.get("told_limit", True),
+        design, belief, dt=suite["dt"], knows_limit=case.data.get("knows_limit", True),
         second_gain=chunk.of(second), estimator=case.data.get("estimator"),
     )  # fmt: skip
     axes = len(truth.torque_gain)

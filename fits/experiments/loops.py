@@ -41,8 +41,8 @@ def map_rows(case: Case, suite: dict[str, Any], loops: dict[str, Matched]) -> li
     for name in case.data.get("designs", list(loops)):
         growth = growth_map(loops[name].design, case, suite)
         ends = boundary(growth, lags)
-        judged = growth[lags <= case.data["judged_to"] + 1e-9]
-        numbers = {"stable_share": float(np.mean(judged < 0))}
+        counted = growth[lags <= case.data["longest_lag"] + 1e-9]
+        numbers = {"stable_share": float(np.mean(counted < 0))}
         numbers |= {f"lag_limit_at_{1e3 * d:g}_ms": end for d, end in zip(lates, ends, strict=True)}
         texts = [f"{1e3 * end:.0f} at {1e3 * d:g}" for d, end in zip(lates, ends, strict=True)]
         note = f"stable to a lag, in ms, of {', '.join(texts[::2])} ms delay"

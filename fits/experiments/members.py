@@ -25,7 +25,7 @@ def linear_numbers(
 ) -> Numbers:
     """Ms and stability of each member with its true inertia and torque gain.
 
-    An adaptive controller is judged with the b0 that it had come to at the end.
+    An adaptive controller is evaluated with the b0 that it had reached at the end.
     """
     level = suite["plants"][case.data["plant"]]
     changes = {name: chunk.of(x) for name, x in case.data.get("overrides", {}).items()}

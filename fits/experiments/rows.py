@@ -90,7 +90,7 @@ def with_variation(rows: list[Row], quantities: list[str]) -> list[Row]:
     return done
 
 
-def require_judged(rows: list[Row]) -> None:
+def require_marked_quantities(rows: list[Row]) -> None:
     """Raises ValueError for a mark whose quantity no row of its case has."""
     for row in rows:
         for mark in row.case.data.get("marks", []):
@@ -109,7 +109,7 @@ def _change(name: str, value: float, base: float) -> float:
 
 
 def _applies(mark: dict[str, Any], row: Row) -> bool:
-    """A row that lacks the quantity is not judged by it; see `require_judged`."""
+    """A row that lacks the quantity has no such mark; see `require_marked_quantities`."""
     if mark["quantity"] not in row.numbers:
         return False
     return row.design in mark.get("only", [row.design]) and row.design not in mark.get("except", [])

@@ -17,11 +17,11 @@ _AXES = ("roll", "pitch", "yaw")
 _ROOTS = ("rms", "disturbance_rmse")  # averaged as squares
 
 
-def judged(case: Case, done: Simulation, dt: float) -> Numbers:
+def flight_numbers(case: Case, done: Simulation, dt: float) -> Numbers:
     """Of the first axis, in the table's units; members that crashed have infinite numbers."""
-    judge = dict(case.data.get("judge", {}))
-    load = judge.pop("load", None)
-    given = metrics(done, **judge)
+    window = dict(case.data.get("metrics", {}))
+    load = window.pop("load", None)
+    given = metrics(done, **window)
     loaded = given if load is None else metrics(done, **load)
     numbers = _step_numbers(given) | _load_numbers(loaded)
     if "held" in case.data:
@@ -135,11 +135,11 @@ def _about_inertia(mine: Numbers, found: dict[str, float]) -> str:
 def _about_gain(mine: Numbers, found: dict[str, float]) -> str:
     if "gain_error" not in mine:
         return ""
-    told = identification_numbers(mine)
-    found |= told
+    numbers = identification_numbers(mine)
+    found |= numbers
     return (
-        f"b {100 * told['mean_error']:+.2g} % +- {100 * told['scatter']:.2g} %, "
-        f"95 % intervals hold it {told['covered']:.0%}"
+        f"b {100 * numbers['mean_error']:+.2g} % +- {100 * numbers['scatter']:.2g} %, "
+        f"95 % intervals hold it {numbers['covered']:.0%}"
     )
 
 

@@ -101,7 +101,7 @@ def test_members_are_every_combination_with_the_same_draws(fits, data):
 
 def test_misspelt_data_are_refused(fits, data, tmp_path):
     text = fits.data.SOURCE.read_text()
-    for good, bad, told in (
+    for good, bad, message in (
         ('held = "yaw"', 'hold = "yaw"', "hold"),
         ('plant = "C"', 'plant = "D"', "no plant"),
         ('only = ["adaptive LADRC"]', 'only = ["adaptive"]', "no design"),
@@ -109,7 +109,7 @@ def test_misspelt_data_are_refused(fits, data, tmp_path):
     ):  # fmt: skip
         path = tmp_path / "scenarios.toml"
         path.write_text(text.replace(good, bad))
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             fits.data.load(path)
     with pytest.raises(ValueError, match="no scenario"):
         fits.data.cases(data, ("S12",))
@@ -249,7 +249,7 @@ def test_a_mark_that_no_row_can_meet_is_an_error(fits, data, loops):
     case = altered(fits, data, "S0", "A", marks=[{"quantity": "stabel", "at_least": 1.0}])
     row = fits.rows.Row(case, "", "tuned PID", {"stable": 1.0})
     with pytest.raises(ValueError, match="stabel"):
-        fits.rows.require_judged([row])
+        fits.rows.require_marked_quantities([row])
 
 
 def test_verdicts_and_cells_say_what_failed_and_what_is_missing(fits, data):

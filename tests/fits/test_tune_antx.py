@@ -40,15 +40,15 @@ def result(run):
 
 
 @pytest.fixture(scope="module")
-def judged(run):
+def certificate(run):
     return json.loads((run[0] / "certificate.json").read_text())
 
 
-def test_the_first_line_says_that_the_certificate_holds(run, result, judged):
+def test_the_first_line_says_that_the_certificate_holds(run, result, certificate):
     assert run[1].startswith("CERTIFICATE HOLDS on 256 fresh members")
     assert run[1].splitlines()[0] == result["verdict"]
-    assert judged["holds"] and judged["designs"]["tuned"]["unstable"] == 0
-    assert judged["designs"]["tuned"]["statistics"]["sensitivity_peak"]["worst"] <= 2.5
+    assert certificate["holds"] and certificate["designs"]["tuned"]["unstable"] == 0
+    assert certificate["designs"]["tuned"]["statistics"]["sensitivity_peak"]["worst"] <= 2.5
 
 
 def test_gain_and_total_delay_are_those_of_the_flight(result):
@@ -60,9 +60,9 @@ def test_gain_and_total_delay_are_those_of_the_flight(result):
     assert abs(late["value"] - 0.0268) < 3 * late["standard_error"]
 
 
-def test_members_differ_in_lag_and_delay_more_than_in_their_sum(result, judged):
+def test_members_differ_in_lag_and_delay_more_than_in_their_sum(result, certificate):
     """They trade off in the fit, and so do they in what is drawn from it."""
-    lag, delay = (np.array(judged["members"][name])[0] for name in ("lag", "delay"))
+    lag, delay = (np.array(certificate["members"][name])[0] for name in ("lag", "delay"))
     assert np.corrcoef(lag, delay)[0, 1] < -0.7
     for name, drawn in (("lag", lag), ("delay", delay)):
         assert np.std(drawn) == pytest.approx(result["identified"][name][1], rel=0.25)

@@ -46,9 +46,9 @@ def test_the_first_line_says_that_the_certificate_holds(run, result):
     assert run[1].startswith("CERTIFICATE HOLDS on 256 fresh members")
     assert run[1].splitlines()[0] == result["verdict"]
     assert "CERTIFICATE HOLDS" in run[1].splitlines()[1]
-    judged = json.loads((run[0] / "certificate.json").read_text())
-    assert judged["holds"] and judged["designs"]["tuned"]["unstable"] == 0
-    assert set(judged["designs"]) == {"tuned", "paper b0 = 3", "paper b0 = 1.6", "CE 10/30"}
+    certificate = json.loads((run[0] / "certificate.json").read_text())
+    assert certificate["holds"] and certificate["designs"]["tuned"]["unstable"] == 0
+    assert set(certificate["designs"]) == {"tuned", "paper b0 = 3", "paper b0 = 1.6", "CE 10/30"}
 
 
 def test_the_sweep_finds_gain_and_lag_of_the_rig(script, result):
