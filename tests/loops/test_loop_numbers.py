@@ -75,6 +75,7 @@ def test_windows_at_2_ms_are_narrower_for_fast_observers():
     np.testing.assert_allclose(found[:, 5:7], found[:, [1, 1]], rtol=1e-9)  # whatever b and b0
 
 
+@pytest.mark.slow
 def test_no_b0_stabilises_beyond_a_lag_of_about_half_a_time_constant():
     edges = {30.0: 0.48, 50.0: 0.44, 100.0: 0.42}  # of lag wc, by wo
     inside = [{"wo": wo, "lag": (at - 0.006) / 10} for wo, at in edges.items()]
@@ -84,6 +85,7 @@ def test_no_b0_stabilises_beyond_a_lag_of_about_half_a_time_constant():
     np.testing.assert_allclose(found[:, 6], [0.28, 1.9], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_printed_pid_needs_a_gain_above_33_and_an_unstable_plant_one_that_holds_it():
     # Over a stiffness of -2, kp b has to exceed 2: there a pole passes z = 1.
     axis = DecoupledAxes(1.0, 1.0, stiffness=[[0.0, -2.0]])
@@ -113,6 +115,7 @@ def test_three_axes_are_analysed_as_each_alone():
     assert np.isnan(together.phase_margin[~together.stable]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law", [LADRC([10.0, 8.0, 6.0], 30.0, 0.8), PID([5.0, 2.0, 3.0], [3.0] * 3, [1.0] * 3)]
 )

@@ -21,6 +21,7 @@ def white_rms(frf):
     return rms_response(frf, 1.0)
 
 
+@pytest.mark.slow
 def test_a_measured_response_without_noise_gives_the_model_s_numbers():
     frf, model = response_of(MEASURED, error=1e-3, omega=BAND), MEASURED
     for name in ("phase_bandwidth", "gain_bandwidth", "omega_180", "phase_delay"):
@@ -41,6 +42,7 @@ SCATTERED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
 def test_standard_errors_are_the_scatter(correlation):
     noise = {"error": 0.01, "correlation": correlation, "omega": BAND}

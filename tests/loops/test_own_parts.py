@@ -168,6 +168,7 @@ def test_a_user_s_plant_and_controller_are_analysed_as_python_control_does():
     assert bool(found.stable) and np.isfinite(found.phase_margin)
 
 
+@pytest.mark.slow
 def test_a_user_s_controller_is_tuned():
     step = jq.scenario(reference={0: jq.Step(0.02)}, duration=1.0, dt=DT, axes=1)
     nominal = jq.DecoupledAxes([40.0], [1.0], lag=[0.03])

@@ -162,6 +162,7 @@ def qualities(model):
     }
 
 
+@pytest.mark.slow
 def test_gradients_under_jit_are_the_central_differences():
     model, step = ratio([2.0], [0.05, 1.0, 0.3], 0.1), 1e-5
 
@@ -176,6 +177,7 @@ def test_gradients_under_jit_are_the_central_differences():
         assert value == pytest.approx(difference, rel=1e-6), name
 
 
+@pytest.mark.slow
 def test_reverse_gradients_do_not_suffer_from_what_does_not_exist():
     def lag(delay):
         return attitude_bandwidth(

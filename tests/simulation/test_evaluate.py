@@ -27,7 +27,6 @@ from jaxquad.simulation import (
     Step,
     WhiteNoise,
 )
-from jaxquad.simulation._authority import warn_beyond_authority
 
 
 GAIN, INERTIA = 0.0468, 0.0552  # N m/V, kg m^2: the rig in roll, +u and -u on two motors
@@ -235,10 +234,11 @@ def test_a_disturbance_beyond_the_authority_is_reported(torque, share):
 
 
 def test_the_warning_counts_the_members_of_a_plant():
-    happens = scenario(duration=1.0, axes=1, disturbance={0: Step(0.2)})
-    found = authority(DecoupledAxes([[0.0468, 0.0936, 0.14]], [INERTIA]), Saturation(2.0))
+    happens = scenario(duration=10.0, axes=1, disturbance={0: Step(0.2)})
+    plant = DecoupledAxes([[0.0468, 0.0936, 0.14]], [INERTIA])
+    loop = Loop(plant, ladrc([GAIN / INERTIA] * 3), drive=Saturation(2.0))
     with pytest.warns(AuthorityWarning, match="66.7% of the samples exceed the 0.0936 .. 0.28 N m"):
-        warn_beyond_authority(found, happens)
+        evaluate(loop, happens)
 
 
 def test_parts_of_one_loop_may_be_narrower_than_its_ensemble(ensemble, running):

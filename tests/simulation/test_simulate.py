@@ -140,6 +140,7 @@ def cost(inertia):
     return jnp.sum(found.angle**2) + 1e-3 * jnp.sum(found.command**2)
 
 
+@pytest.mark.slow
 def test_forward_reverse_and_finite_derivatives_agree():
     inertia = jnp.asarray(SHEET.inertia)
     forward, reverse = jax.jacfwd(cost)(inertia), np.asarray(jax.grad(cost)(inertia))

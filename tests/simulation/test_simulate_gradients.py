@@ -75,6 +75,7 @@ def differences(law, noise):
     return np.asarray((ends[0] - ends[1]) / (2 * h))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
 def test_gradients_by_every_gain_and_parameter_are_those_of_differences(law):
     found = run(law, ones(law), residue())
@@ -84,6 +85,7 @@ def test_gradients_by_every_gain_and_parameter_are_those_of_differences(law):
     np.testing.assert_allclose(slope, differences(law, residue()), rtol=1e-6, atol=1e-8 * scale)
 
 
+@pytest.mark.slow
 def test_through_an_encoder_the_gradient_is_that_of_the_loop_with_its_rounding_as_noise():
     found = run(LADRC, ones(LADRC), residue(), ENCODER)
     rounding = found.measurement - found.angle
@@ -92,6 +94,7 @@ def test_through_an_encoder_the_gradient_is_that_of_the_loop_with_its_rounding_a
     np.testing.assert_allclose(straight, frozen, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_where_noise_dithers_the_encoder_its_gradient_is_the_slope_of_the_mean():
     count = 2 * np.pi / 8192
     noise = jnp.asarray(count * np.random.default_rng(1).standard_normal((SAMPLES, 1, 128)))

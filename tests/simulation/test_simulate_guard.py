@@ -146,7 +146,12 @@ RUNAWAYS = {
 }
 
 
-@pytest.mark.parametrize("name", RUNAWAYS)
+LONG = ("a singular attitude", "a plant without an answer")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x in LONG)) for x in RUNAWAYS]
+)
 def test_no_runaway_makes_values_or_gradients_infinite(name):
     plant, law, options = RUNAWAYS[name]
     found = simulate(Loop(plant, law, **options), step())

@@ -71,6 +71,7 @@ def exact():
     return adaptive(manoeuvre(), DELAY)
 
 
+@pytest.mark.slow
 def test_ten_seconds_of_the_rig_with_lag_delay_and_saturation_agree_to_1e_8(exact):
     found = simulate(Loop(PLANT, LAW, dt=DT, drive=DRIVE, delay=DELAY), manoeuvre())
     assert 0.05 < np.mean(found.saturated) < 0.5 and np.ptp(found.angle) > 0.35
@@ -78,6 +79,7 @@ def test_ten_seconds_of_the_rig_with_lag_delay_and_saturation_agree_to_1e_8(exac
     np.testing.assert_allclose(found.angle, exact, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_substeps_take_the_rest_of_the_error_away(exact):
     errors = []
     for substeps in (1, 2):

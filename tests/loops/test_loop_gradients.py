@@ -35,6 +35,7 @@ def slope_of():
     return jax.jit(jax.value_and_grad(total))
 
 
+@pytest.mark.slow
 def test_gradients_with_respect_to_every_gain_lag_and_delay_are_those_of_differences():
     step, base = 1e-5, FRICTION | POINT | {"gain": 0.6}
     moved = [
@@ -55,12 +56,14 @@ def test_gradients_with_respect_to_every_gain_lag_and_delay_are_those_of_differe
         np.testing.assert_allclose(exact * point, these @ differences, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_gradients_stay_finite_in_an_unstable_loop():
     weights = np.ones(7)
     slope = slope_of()(np.array([40.0, 90.0, 1.1, 0.03, 0.0033]), weights)[1]
     assert np.all(np.isfinite(slope)) and np.any(np.asarray(slope) != 0)
 
 
+@pytest.mark.slow
 def test_a_traced_delay_needs_its_bound_and_beyond_it_nothing_is_claimed():
     axis, controller = DecoupledAxes(1.0, 1.0), LADRC([10.0], [30.0], [1.0])
     with pytest.raises(ValueError, match="traced.*longest_delay"):
@@ -76,6 +79,7 @@ def slowest(A, mind):
     return np.max(np.log(np.abs(poles))) / DT
 
 
+@pytest.mark.slow
 def test_the_edges_of_the_gain_window_are_where_poles_cross_and_its_gradient_is_exact():
     point, step = {"wc": 10.0, "lag": 0.02}, 1e-5
     moved = [
