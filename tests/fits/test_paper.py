@@ -44,6 +44,7 @@ STEPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", STEPS, ids=" ".join)
 def test_steps_overshoot_and_settle_as_stated(linear, case):
     found = linear[case]
@@ -53,11 +54,13 @@ def test_steps_overshoot_and_settle_as_stated(linear, case):
     assert found.itae == pytest.approx(itae, abs=6e-4)
 
 
+@pytest.mark.slow
 def test_with_the_difference_of_two_voltages_for_command_b0_of_3_is_unstable(linear):
     found = linear["u = V4 - V2", "b0 = 3"]
     assert found.overshoot > 1000 and np.isnan(found.settling)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("b0", [3.0, 1.6, 4.0])
 def test_steps_are_those_of_an_independent_recursion(linear, loops, b0):
     gain = loops.TORQUE_GAINS[loops.VOLTAGE] / loops.INERTIA
@@ -80,6 +83,7 @@ TORQUES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", TORQUES, ids=" ".join)
 def test_disturbances_are_estimated_and_rejected_as_stated(loaded, case):
     torque, b0 = case
@@ -94,6 +98,7 @@ def test_disturbances_are_estimated_and_rejected_as_stated(loaded, case):
 SINES = [("b0 = 3", 1.000, -6.7), ("b0 = 1.6", 0.998, -7.0), ("b0 = b", 0.997, -7.2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("b0", "size", "lead"), SINES)
 def test_the_right_scaling_follows_the_sine_whatever_b0_is(loaded, b0, size, lead):
     found = loaded["u = +-V", b0, "sine"]
@@ -105,6 +110,7 @@ def test_the_right_scaling_follows_the_sine_whatever_b0_is(loaded, b0, size, lea
     assert np.degrees(np.angle(ratio)) == pytest.approx(lead, abs=0.06)
 
 
+@pytest.mark.slow
 def test_disturbances_are_those_of_an_independent_recursion(loaded, loops):
     found = loaded["u = +-V", "b0 = 3", "sine"]
     gain = loops.TORQUE_GAINS[loops.VOLTAGE] / loops.INERTIA
@@ -152,6 +158,7 @@ def test_a_verdict_counts_the_readings_under_which_a_claim_holds():
     assert str(reading(True)) == "x 1 m, y 2 -> unbounded"
 
 
+@pytest.mark.slow
 def test_verdicts_follow_from_the_loops(linear, loaded, tmp_path):
     """Steps fit one reading of u and the sine another: no rig shows both."""
     tracking, disturbance, paper, ledger = (
