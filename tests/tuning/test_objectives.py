@@ -114,7 +114,7 @@ def test_numbers_of_flights_are_those_of_the_metrics_between_events():
     quick = ensemble(lag=Uniform(0.001, 0.012), inertia=LogUniform(0.5, 1.5))
     members, heard = quick.draw(around, 8, jax.random.key(0)), []
     large = scenario(
-        duration=7.0, axes=1, disturbance=Pulse(0.2, width=0.5, at=2.5),
+        duration=7.0, axes=1, disturbance=Pulse(-0.2, width=0.5, at=5.9),
         reference=Step(np.radians(90.0)) + Step(np.radians(-75.0), at=4.5),
     )  # fmt: skip
     span = {"stop": 6.5, "load_start": 2.6}
