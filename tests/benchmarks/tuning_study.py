@@ -27,7 +27,7 @@ from tuning_case import (  # noqa: E402
     STARTS,
 )
 
-from jaxquad.tuning import certify, tune
+from jaxquad.tuning import certify, tune  # noqa: E402
 
 
 KEY = jax.random.key(0)
@@ -38,8 +38,8 @@ def printed() -> None:
     designs = {name: row[0] for name, row in PRINTED.items()}
     first, *others = designs
     judged = certify(
-        loop(designs[first]), ensemble(), flight(), peers={n: designs[n] for n in others}, name=first,
-        events=EVENTS, members=1024, key=KEY,
+        loop(designs[first]), ensemble(), flight(), peers={n: designs[n] for n in others},
+        name=first, events=EVENTS, members=1024, key=KEY,
     )  # fmt: skip
     print("ITAE deg s^2 mean/p95/worst, unstable %: found, printed")
     for name, row in judged.summaries.items():
@@ -55,8 +55,9 @@ def printed() -> None:
 def tuned(name: str, controller, **options) -> None:
     begun = time.perf_counter()
     found = tune(
-        loop(controller), ensemble(), flight(), objective=objective(), key=KEY, progress=False, **options
-    )
+        loop(controller), ensemble(), flight(), objective=objective(), key=KEY, progress=False,
+        **options,
+    )  # fmt: skip
     seconds = time.perf_counter() - begun
     flown = np.array([np.nanmin(e.cost) for e in found.history if e.phase == "optimise"])
     assert found.certificate is not None
