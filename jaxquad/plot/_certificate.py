@@ -106,7 +106,9 @@ def _members(
 
 def _label(shown: Quantity, top: float) -> str:
     unit = f", {raise_powers(shown.unit)}" if shown.unit else ""
-    return f"{shown.title}{unit}" + (f" (beyond {top:g} at {top:g})" if np.isfinite(top) else "")
+    return f"{shown.title}{unit}" + (
+        f" (above {top:g} drawn at {top:g})" if np.isfinite(top) else ""
+    )
 
 
 def _finish(figure: Figure, panels: Sequence[Axes]) -> None:

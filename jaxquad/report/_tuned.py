@@ -57,6 +57,7 @@ def _certificate(certificate: Certificate) -> dict[str, object]:
         "verdict": str(certificate).splitlines()[0],
         "limits": [str(distance) for distance in certificate.distances],
         "remarks": certificate.remarks,
+        "has_untuned": any(name.startswith("CE ") for name in certificate.designs),
         "designs": _designs(certificate),
         "image": image,
     }
