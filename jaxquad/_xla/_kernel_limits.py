@@ -93,19 +93,19 @@ _HELD = set(
     case if optimization_barrier reduce reduce_window return while dot dot_general
     """.split()
 )
-# These move numbers, or write zeros for a loop to fill: no arithmetic, so of any size.
+# These move the numbers of whole signals, or write zeros for a loop to fill: no arithmetic, so of
+# any size.
 _MOVES = set(
     """
-    broadcast broadcast_in_dim case constant dynamic_slice dynamic_update_slice if
-    optimization_barrier reshape return slice while
+    broadcast broadcast_in_dim case concatenate constant convert dynamic_slice dynamic_update_slice
+    if iota optimization_barrier pad reshape return reverse slice transpose while
     """.split()
 )
 _BRANCHES = {"case", "if"}
 _NARROW = 128  # numbers that XLA never divides among threads
-# XLA hands sums and products of more numbers to a library.
-_SUMS = {"reduce", "reduce_window", "dot_general", "dot"}
-_MOST_SUMMED = 4096
-_WIDEST = 2**15  # numbers of one operation: one thread is the slower way for more
+# The most numbers of any other operation: XLA hands longer sums to a library, which a kernel cannot
+# call, and all wider arithmetic takes three times as long to compile as in a plain loop.
+_WIDEST = 4096
 # Operations of one kernel: the time to compile them grows faster than their number. With 6800, most
 # of them wide, it can be four times that of a plain loop; narrow ones compile faster than plain.
 _MOST_OPERATIONS, _MOST_WIDE = 12_000, 6_000
@@ -179,8 +179,7 @@ def _fits(op: Op) -> bool:
         return False  # A branch's only result is divided among threads.
     if kind in _MOVES:
         return True
-    most = _MOST_SUMMED if kind in _SUMS else _WIDEST
-    return all(size_of(value.type) < most for value in (*op.operands, *op.results))
+    return all(size_of(value.type) < _WIDEST for value in (*op.operands, *op.results))
 
 
 def size_of(kind: ir.Type) -> int:
