@@ -20,7 +20,7 @@ class LinearLaws(eqx.Module):
     """The linear forms of an ensemble of controllers of one axis, stacked along the first axis."""
 
     stacked: LinearController
-    index: Int[Array, " members"] = per_member(0)  # in the stack
+    index: Int[Array, " members"] = per_member(rank=0)  # in the stack
 
     @property
     def dt(self) -> float:

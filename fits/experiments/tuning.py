@@ -83,6 +83,7 @@ def starts(
 
 def equivalent(loop: jq.Loop) -> dict[str, Any]:
     """Certainty equivalence with the gains of the paper, on the nominal plant."""
+    assert isinstance(loop.plant, jq.DecoupledAxes)
     all_of = peers(loop.plant, dt=loop.dt)
     return {name: design for name, design in all_of.items() if name.startswith("CE")}
 
@@ -93,14 +94,15 @@ def study(case: Case, size: Size, key: jax.Array) -> Study:
         jq.tune, ensemble=case.ensemble, scenario=case.flight, objective=case.objective,
         limits=case.limits, reserve=case.reserve, members=size.members, key=key,
     )  # fmt: skip
-    loop = case.loop
+    loop, scheduled = case.loop, case.loop.controller
+    assert isinstance(scheduled, jq.control.ScheduledLADRC)
     around_pid = loop.with_controller(case.pid)
     pid = tuned(around_pid, free=case.pid_free, fresh=None) if size.others else None
     full = tuned(loop, free=case.free, fresh=None) if size.others else None
     named = {PID_NAME: pid, FULL_NAME: full}
     others = {n: found.controller for n, found in named.items() if found} | dict(case.peers)
     free = [*case.free, *case.half]
-    start = loop.with_controller(halved(loop.controller, case.half))
+    start = loop.with_controller(halved(scheduled, case.half))
     ladrc = tuned(start, free=free, fresh=size.fresh, peers=others)
     return Study(ladrc, pid, full, others)
 
