@@ -14,7 +14,6 @@ from jaxquad.models import Multirotor
 from ._protocols import (
     Controller,
     Drive,
-    LinearisablePlant,
     Plant,
     sample_interval,
     Sensor,
@@ -62,7 +61,7 @@ class Loop(eqx.Module):
     a `jq.models.Multirotor` without a drive.
     """
 
-    plant: Plant | LinearisablePlant
+    plant: Plant
     controller: AnyController
     drive: Drive | None
     encoder: Sensor | None
@@ -75,7 +74,7 @@ class Loop(eqx.Module):
 
     def __init__(
         self,
-        plant: Plant | LinearisablePlant,
+        plant: Plant,
         controller: AnyController,
         *,
         drive: Drive | None = None,
@@ -123,7 +122,7 @@ class Loop(eqx.Module):
         loop.__check_init__()
         return loop
 
-    def with_plant(self, plant: Plant | LinearisablePlant) -> "Loop":
+    def with_plant(self, plant: Plant) -> "Loop":
         """The same loop around another plant."""
         loop = eqx.tree_at(lambda x: x.plant, self, plant)
         loop.__check_init__()

@@ -93,7 +93,7 @@ def delay_line(loop: Loop) -> DelayLine | None:
     length, splits, traced, fewest = loop.queue
     if length == 0:
         return None
-    delay, longest = loop.delay, loop.longest_delay
+    delay, longest = loop.delay, loop.longest_delay or 0.0
     if traced:
         wrong = (delay < 0) | (delay > longest * (1 + 1e-9)) | ~jnp.isfinite(delay)
         message = f"delay is outside 0 to longest_delay = {longest} s: raise longest_delay"

@@ -19,7 +19,7 @@ def require_memory(what: str, needed: float | int, remedy: str) -> None:
 
     Where a machine does not tell what that is, nothing is refused.
     """
-    chosen = jax.config.jax_default_device
+    chosen = getattr(jax.config, "jax_default_device", None)
     free = free_memory(chosen if isinstance(chosen, jax.Device) else jax.local_devices()[0])
     if free is not None and needed > free:
         raise ValueError(

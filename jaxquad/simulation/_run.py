@@ -11,21 +11,17 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._core import ensemble_shape, is_concrete, mark_members
 from jaxquad._xla import as_one_kernel
-from jaxquad.loops import CarriesPayload, Controller, Loop, Plant
+from jaxquad.loops import CarriesPayload, Loop, Plant
 
 from ._blocks import in_chunks, most_at_once, scan_in_blocks
 from ._guard import are_sound, guarded
 from ._scenario import Scenario
-from ._step import Carry, LoopStep, make_step, SampleResult
+from ._step import Carry, LoopStep, make_step, require_runnable, SampleResult
 
 
 def check_run(loop: Loop, scenario: Scenario) -> None:
     """Raises ValueError for a loop that cannot run, and for a scenario that does not fit it."""
-    if not isinstance(loop.controller, Controller):
-        raise ValueError(
-            f"a {type(loop.controller).__name__} cannot be run: a controller needs init(like) and "
-            "step(state, reference, measurement)"
-        )
+    require_runnable(loop.controller)
     if scenario.payload is not None:
         _check_payload(loop.plant, scenario.payload)
     for name, part in vars(scenario).items():

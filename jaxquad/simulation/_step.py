@@ -210,11 +210,21 @@ class LoopStep(eqx.Module):
         return past, hold(hold(carry.state, early, share * dt), late, (1 - share) * dt)
 
 
+def require_runnable(controller: object) -> Controller:
+    """The controller, or ValueError for one that can only be analysed."""
+    if isinstance(controller, Controller):
+        return controller
+    raise ValueError(
+        f"a {type(controller).__name__} cannot be run: a controller needs init(like) and "
+        "step(state, reference, measurement)"
+    )
+
+
 def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
     """What runs `loop`, for members of the shape `ensemble`."""
     return LoopStep(
         plant=loop.plant,
-        controller=prepared(loop.controller),
+        controller=prepared(require_runnable(loop.controller)),
         drive=loop.drive,
         encoder=loop.encoder,
         line=delay_line(loop),

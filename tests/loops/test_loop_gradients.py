@@ -104,6 +104,7 @@ def test_the_edges_of_the_gain_window_are_where_poles_cross_and_its_gradient_is_
     np.testing.assert_allclose(exact, differences, rtol=1e-4)  # the smoothing, differences
 
 
+@pytest.mark.slow
 def test_ensembles_of_any_shape_keep_their_members():
     c = columns(MEMBERS)
     pick = lambda shape: {name: value[:6].reshape(shape) for name, value in c.items()}

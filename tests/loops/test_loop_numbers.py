@@ -102,6 +102,7 @@ def three_axes(law):
     return Loop(plant, law)
 
 
+@pytest.mark.slow
 def test_three_axes_are_analysed_as_each_alone():
     """8 members of 3 axes and 24 of one: the same loops, in one compile."""
     wo, b0 = np.array([24.0, 40.0, 60.0]), np.array([1, 2, 3.0])

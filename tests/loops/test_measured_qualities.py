@@ -57,6 +57,7 @@ def test_standard_errors_are_the_scatter(correlation):
             assert stated == pytest.approx(np.std(values), rel=0.2), name
 
 
+@pytest.mark.slow
 def test_poor_coherence_at_a_crossing_is_remarked():
     frf = response_of(MEASURED)
     assert "coherence" not in str(attitude_bandwidth(frf))
@@ -130,6 +131,7 @@ def test_bad_input_is_refused_by_name():
         margins(ratio([1.0], [1.0, 0.0, 1.0]), omega=np.array([0.5, 1.0, 2.0]))
 
 
+@pytest.mark.slow
 def test_a_model_that_is_no_pytree_is_evaluated_anew():
     class Plain:
         gain = 1.0
