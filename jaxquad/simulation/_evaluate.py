@@ -4,7 +4,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._core import as_float
 from jaxquad._xla import Devices, gathered, Jit
@@ -112,7 +112,7 @@ def evaluate(
     return _metrics(numbers, place, loop.dt)
 
 
-def _metrics(numbers: dict[str, Array], place: tuple[int, int, int, int], dt: float) -> Metrics:
+def _metrics(numbers: dict[str, PyTree], place: tuple[int, int, int, int], dt: float) -> Metrics:
     first, last, loaded, _ = place
     return Metrics(**numbers, start=first * dt, stop=(last + 1) * dt, load_start=loaded * dt)
 
@@ -166,7 +166,7 @@ def _accumulator(
         window=judged,
         dt=dt,
         steps=find_steps(scenario.reference, [(judged.first, judged.until)]),
-        from_first=judged.first == 0,
+        from_first=jnp.asarray(judged.first == 0),
         torque_gain=torque_gain,
         limit=None if found is None else found.command,
     )

@@ -113,7 +113,7 @@ def _propagated(
 ) -> tuple[Numbers, Numbers, Basis, Numbers]:
 
     def perturbed(change):
-        model = curve.model
+        model = curve.measured
         moved = (model.log_magnitude + change[0], model.phase + change[1])
         model = eqx.tree_at(lambda m: (m.log_magnitude, m.phase), model, moved)
         values, *rest = numbers(eqx.tree_at(lambda c: c.model, curve, model), *args)
@@ -133,5 +133,5 @@ def _spread(
 ) -> Float[Array, " *numbers"]:
     # dT/T is circular: the real part of conj(w) dT/T has half the variance of the whole.
     w = jax.lax.complex(slope[..., 0, :], slope[..., 1, :])
-    power = jnp.einsum("...f,fg,...g->...", jnp.conj(w), curve.model.covariance, w)
+    power = jnp.einsum("...f,fg,...g->...", jnp.conj(w), curve.measured.covariance, w)
     return jnp.sqrt(jnp.maximum(jnp.real(power) / 2, 0.0))

@@ -58,6 +58,13 @@ class Curve(eqx.Module):
         """Response at `omega` in rad/s."""
         return self._given(omega) / imaginary(omega) ** self.integrations
 
+    @property
+    def measured(self) -> Interpolated:
+        """The interpolated response. Raises TypeError for a curve of a model."""
+        if not isinstance(self.model, Interpolated):
+            raise TypeError("a model has no measured response: it is exact")
+        return self.model
+
     def phase(self, start: Float[ArrayLike, ""] | None) -> Float[Array, " frequencies"]:
         """Phase on the grid in rad, unwrapped upwards from the lowest frequency.
 

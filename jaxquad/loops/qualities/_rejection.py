@@ -168,7 +168,7 @@ def _rivals(curve: Curve, level: Array, loop: Array, quantity: str) -> Float[Arr
     if curve.coherence is None:
         return jnp.zeros((), level.dtype)
     gain = jnp.abs(loop / (1 + loop)) if quantity == "loop" else jnp.ones_like(level)
-    doubt = 2 * gain * curve.model.random_error
+    doubt = 2 * gain * curve.measured.random_error
     close = level + doubt >= jnp.max(level)
     return jax.lax.stop_gradient(jnp.sum(close).astype(level.dtype) - 1)
 

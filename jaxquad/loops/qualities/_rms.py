@@ -193,7 +193,7 @@ def _of_data(
     curve: Curve, spectrum: Callable | Float[Array, " frequencies"]
 ) -> tuple[Float[Array, " intervals"], Float[Array, ""]]:
     density = spectrum(curve.omega) if callable(spectrum) else spectrum
-    power = jnp.abs(curve(curve.omega)) ** 2 / (1 + 2 * curve.model.random_error**2)
+    power = jnp.abs(curve(curve.omega)) ** 2 / (1 + 2 * curve.measured.random_error**2)
     y, x = power * density * curve.omega, jnp.log(curve.omega)
     return logarithmic_mean(y[:-1], y[1:]) * jnp.diff(x), jnp.zeros((), x.dtype)
 
