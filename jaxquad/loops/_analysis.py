@@ -185,7 +185,15 @@ def analyse(
         raise ValueError(
             f"smoothing is {smoothing} 1/s: give a rate above 0, as 1e-5 or, to tune, 0.1."
         )
-    parts, ensemble = linear_parts(loop, [axis_index(axis)], member)
+    place = None if member is None else tuple(int(k) for k in np.atleast_1d(member))
+    return _analyse_axis(loop, axis_index(axis), place, smoothing)
+
+
+@eqx.filter_jit
+def _analyse_axis(
+    loop: Loop, axis: int, member: tuple[int, ...] | None, smoothing: float
+) -> LoopAnalysis:
+    parts, ensemble = linear_parts(loop, [axis], member)
     found = analyse_parts(parts, smoothing)
     return jax.tree.map(lambda x: x.reshape(ensemble + x.shape[1:]), found)
 
