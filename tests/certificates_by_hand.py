@@ -30,8 +30,14 @@ def certificate(designs, distances=()):
     shape = (1, MEMBERS)
     facts = {"inertia": 0.05 * INERTIA[None], "torque_gain": np.full(shape, 0.05)}
     facts |= {"lag": np.full(shape, 0.02), "delay": np.zeros(shape), "told": np.ones(shape)}
-    known = {"members": MEMBERS, "fresh": True, "sampling": "random", "key": [0, 0], "versions": {}}
-    return Certificate(designs, tuple(distances), facts, np.array([0.05]), known, ())
+    return Certificate(
+        designs, tuple(distances), facts, np.array([0.05]),
+        {
+            "members": MEMBERS, "fresh": True, "sampling": "random", "key": [0, 0],
+            "precision": "float64", "ensemble": None, "device": "cpu", "versions": {},
+        },
+        (),
+    )  # fmt: skip
 
 
 def missed(quantity, bound, found):

@@ -78,8 +78,8 @@ def compare(delay, members, mode, double, traced):
         ]
     jq.engine(kernel="auto")
     (fast, took), (slow, plainly) = runs
-    tolerance = {"rtol": 1e-8, "atol": 1e-10} if double else {"rtol": 5e-3, "atol": 1e-3}
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **tolerance), fast, slow)
+    rtol, atol = (1e-8, 1e-10) if double else (5e-3, 1e-3)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=rtol, atol=atol), fast, slow)
     assert took <= SLOWEST[0] * plainly + SLOWEST[1], f"{took:.1f} s against {plainly:.1f} s"
     return took, plainly
 

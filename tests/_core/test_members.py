@@ -17,8 +17,8 @@ class Rotor(eqx.Module):
 
 
 class Gains(NamedTuple):
-    kp: jax.Array
-    kd: jax.Array | None = None
+    kp: jax.Array | np.ndarray
+    kd: jax.Array | np.ndarray | None = None
 
 
 class Plant(eqx.Module):

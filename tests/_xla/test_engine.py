@@ -154,6 +154,7 @@ def test_without_a_cache_every_process_asks_anew(untested, monkeypatch):
 
 def test_an_answer_that_cannot_be_read_is_asked_for_again(untested, monkeypatch):
     path = _canary._answer_path()
+    assert path is not None
     path.parent.mkdir(parents=True)
     path.write_text("{")
     monkeypatch.setattr(_canary, "_ask_child", lambda: "")

@@ -1,6 +1,6 @@
 """An estimator, an observer, a controller and a map of a user's own work by having the methods."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -207,7 +207,8 @@ def test_an_estimator_without_a_test_signal_or_a_sample_interval_adapts_b0():
 
 def test_what_has_not_the_methods_of_an_estimator_is_refused():
     with pytest.raises((ValueError, TypeError)):  # a TypeError where types are checked
-        jq.AdaptiveLADRC(LADRC(10.0, 30.0, 1.6), TextbookObserver(), lambda inertia: 1 / inertia)
+        wrong: Any = TextbookObserver()
+        jq.AdaptiveLADRC(LADRC(10.0, 30.0, 1.6), wrong, lambda inertia: 1 / inertia)
 
 
 def test_a_map_schedules_and_says_in_which_coordinates_it_is_tuned():
@@ -217,7 +218,9 @@ def test_a_map_schedules_and_says_in_which_coordinates_it_is_tuned():
         assert float(schedule(law, np.array([2 * J])).b0[0]) == pytest.approx(KT / (2 * J))
     assert list(law.tunable()) == ["ladrc.wc", "ladrc.wo", "map.exponent"]
     transform = jq.control.find_transform(law, "map.exponent")
-    assert transform.forward(transform.inverse(np.asarray(1.3))) == pytest.approx(1.3)
+    assert transform is not None
+    coordinates = jnp.asarray(transform.inverse(np.asarray(1.3)))
+    assert transform.forward(coordinates) == pytest.approx(1.3)
     assert jq.control.find_transform(law, "ladrc.wc") is None
 
 
@@ -245,4 +248,5 @@ def test_they_are_tuned_and_certified(controller, names):
         loop.with_controller(schedule_for_flight(tuned.controller, np.array([J]))), STEP
     )
     assert np.all(np.asarray(after.itae) < np.asarray(before.itae))
-    assert tuned.certificate.stable and not bool(np.any(np.asarray(after.diverged)))
+    assert tuned.certificate is not None and tuned.certificate.stable
+    assert not bool(np.any(np.asarray(after.diverged)))

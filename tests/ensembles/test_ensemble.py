@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from jaxtyping import ArrayLike
 from scipy import stats
 
 import jaxquad as jq
@@ -37,14 +38,14 @@ class Around(NamedTuple):
     loop: jq.Loop
     ensemble: Ensemble
 
-    def draw(self, n, key):
+    def draw(self, n, key) -> Any:  # the plants are of any kind that an ensemble varies
         return self.ensemble.draw(self.loop, n, key)
 
-    def fresh(self, n, key):
+    def fresh(self, n, key) -> Any:
         return self.ensemble.fresh(self.loop, n, key)
 
 
-def made(plant, drive=None, nominal_delay=0.0, **laws) -> Around:
+def made(plant, drive=None, nominal_delay: ArrayLike = 0.0, **laws) -> Around:
     multirotor = isinstance(plant, jq.models.Multirotor)
     drive = jq.simulation.MotorDrive(plant.allocation) if multirotor else drive
     controller = jq.LADRC(10.0, 30.0, 0.848)
@@ -426,7 +427,8 @@ def test_what_belongs_to_the_loop_is_refused_in_an_ensemble(without_type_checks)
     with pytest.raises(ValueError, match="loop is a DecoupledAxes"):
         Ensemble().draw(wrong, COUNT, KEY)
     with pytest.raises(ValueError, match="not of a LaggedIntegrator.*Posterior"):
-        made(wrong).ensemble.draw(jq.Loop(jq.LaggedIntegrator(1.0), jq.LADRC(1, 3, 1)), COUNT, KEY)
+        model: Any = jq.LaggedIntegrator(1.0)
+        made(wrong).ensemble.draw(jq.Loop(model, jq.LADRC(1, 3, 1)), COUNT, KEY)
 
 
 def test_plants_that_are_no_single_plant_are_refused():

@@ -197,10 +197,10 @@ class Around(NamedTuple):
     loop: jq.Loop
     ensemble: Ensemble
 
-    def draw(self, n, key):
+    def draw(self, n, key) -> Any:  # the plants are of any kind that an ensemble varies
         return self.ensemble.draw(self.loop, n, key)
 
-    def fresh(self, n, key):
+    def fresh(self, n, key) -> Any:
         return self.ensemble.fresh(self.loop, n, key)
 
 

@@ -117,17 +117,19 @@ def test_numbers_of_flights_are_those_of_the_metrics_between_events():
         duration=7.0, axes=1, disturbance=Pulse(-0.2, width=0.5, at=5.9),
         reference=Step(np.radians(90.0)) + Step(np.radians(-75.0), at=4.5),
     )  # fmt: skip
-    span = {"stop": 6.5, "load_start": 2.6}
+    stop, load_start = 6.5, 2.6
     names = [name for name, quantity in QUANTITIES.items() if not quantity.linear]
     tune(
         around, members, large, fresh=None, progress=False, method=LBFGS(evaluations=1),
-        objective=Objective(dict.fromkeys(names, 1.0), (), events=(0.0, 2.5, 4.5), **span),
+        objective=Objective(
+            dict.fromkeys(names, 1.0), (), events=(0.0, 2.5, 4.5), stop=stop, load_start=load_start
+        ),
         listener=heard.append,
     )  # fmt: skip
     assert heard[-1].phase == "optimise"
     found = {name: float(heard[-1].means[name][0]) for name in names}
     happens, flown = members.flight(large), members.loop(around.controller)
-    whole = evaluate(flown, happens, **span)
+    whole = evaluate(flown, happens, stop=stop, load_start=load_start)
     each = [evaluate(flown, happens, start=start, stop=stop) for start, stop in parts]
     mean = lambda x: float(np.mean(np.asarray(x)))
     rate = mean(whole.activity) / 6.5
