@@ -3,6 +3,7 @@
 import functools as ft
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +15,22 @@ _GB = 1e9
 _SIZED = (jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 
+@runtime_checkable
+class Device(Protocol):
+    """What a device says of itself; a `jax.Device` does."""
+
+    @property
+    def platform(self) -> str: ...
+    def memory_stats(self) -> dict[str, int] | None: ...
+
+
 def require_memory(what: str, needed: float | int, remedy: str) -> None:
     """Raises ValueError where `needed` bytes are more than the default device has left.
 
     Where a machine does not tell what that is, nothing is refused.
     """
     chosen = getattr(jax.config, "jax_default_device", None)
-    free = free_memory(chosen if isinstance(chosen, jax.Device) else jax.local_devices()[0])
+    free = free_memory(chosen if isinstance(chosen, Device) else jax.local_devices()[0])
     if free is not None and needed > free:
         raise ValueError(
             f"{what} needs about {needed / _GB:.3g} GB, but {free / _GB:.3g} GB are free: {remedy}"
@@ -32,7 +42,7 @@ def size_of(tree: PyTree) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree) if isinstance(x, _SIZED))
 
 
-def free_memory(device: jax.Device) -> float | None:
+def free_memory(device: Device) -> float | None:
     """In bytes; of the host for a CPU."""
     if device.platform != "cpu":
         known = device.memory_stats() or {}

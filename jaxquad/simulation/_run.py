@@ -60,7 +60,7 @@ class Accumulator(Protocol):
         """The total before the first sample; `like` is zeros."""
         ...
 
-    def update(self, total: PyTree, now: SampleResult) -> tuple[PyTree, PyTree]:
+    def update(self, total: PyTree, now: SampleResult, /) -> tuple[PyTree, PyTree]:
         """The total after one sample more, and what is stored of it."""
         ...
 

@@ -2,10 +2,10 @@
 
     python tests/benchmarks/coverage_study.py --draws 1000
 
-Three cases, from time-domain records to parameters by `jq.spectra.LocalPolynomial` and maximum likelihood:
-a five-parameter airframe in open loop and in closed loop, and a state space of two inputs, three
-outputs and twelve parameters whose outputs share a gust. Over 1000 draws a coverage of 95 % is
-known to 0.7 %.
+Three cases, from time-domain records to parameters by `jq.spectra.LocalPolynomial` and maximum
+likelihood: a five-parameter airframe in open loop and in closed loop, and a state space of two
+inputs, three outputs and twelve parameters whose outputs share a gust. Over 1000 draws a coverage
+of 95 % is known to 0.7 %.
 """
 
 import argparse

@@ -154,8 +154,9 @@ def test_members_of_a_declared_field_are_judged_as_each_alone(step):
 
 def test_a_user_s_plant_and_controller_are_analysed_as_python_control_does():
     found = jq.analyse(loop())
-    w, s = 60.0, control.tf("s")
-    plant = control.ss(40 * w**2 / ((s**2 + 40) * (s + w) ** 2))
+    w = 60.0
+    denominator = np.polymul([1, 0, 40], [1, 2 * w, w**2])
+    plant = control.ss(control.TransferFunction([40 * w**2], denominator))
     # The inputs that a delay of 1.5 samples holds: half of each interval the one before.
     half = control.c2d(plant, DT / 2)
     a, b = np.asarray(half.A), np.asarray(half.B)
