@@ -17,7 +17,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+LONG = ("traced, vmap",)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x in LONG)) for x in CASES]
+)
 def test_a_delayed_loop_is_the_same_as_a_kernel_and_plain(name):
     compare(*CASES[name])
 

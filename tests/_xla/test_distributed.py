@@ -14,6 +14,7 @@ import pytest
 from distributed_runs import GAINS, itae, MEMBERS, SLOPE
 
 
+pytestmark = pytest.mark.slow  # processes that start JAX
 PROGRAM = Path(__file__).parents[1] / "distributed_runs.py"
 SECONDS = 120  # JAX waits without an end for a process that does not come
 

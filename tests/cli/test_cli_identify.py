@@ -140,6 +140,7 @@ def test_the_version_is_printed(capsys):
     assert stop.value.code == 0 and capsys.readouterr().out.strip()
 
 
+@pytest.mark.slow
 def test_two_segments_are_analysed_together_and_what_lies_between_is_not(tmp_path, capsys):
     path = tmp_path / "twice.npz"
     end = write_two_sweeps(path)

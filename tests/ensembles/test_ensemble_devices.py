@@ -45,6 +45,7 @@ def found():
     return json.loads(run("-W", "error", str(PROGRAM), **told))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "what",
     ["evaluate", "simulate", "gradient", "gradient of a cost of one's own"],
@@ -55,24 +56,29 @@ def test_two_devices_have_the_numbers_of_one(found, what):
     assert 0 < found["diverged"] < 67
 
 
+@pytest.mark.slow
 def test_results_lie_where_those_of_one_device_do(found):
     assert found["results lie on"] == [[0], False]
 
 
+@pytest.mark.slow
 def test_data_that_were_put_on_a_device_by_hand_are_computed_there(found):
     assert found["data put by hand lie on"] == [1]
     assert found["data that are split lie on"] == [0, 1]
     assert found["the same data on two"] is None
 
 
+@pytest.mark.slow
 def test_what_is_split_already_is_not_split_again(found):
     assert found["alone within"]
 
 
+@pytest.mark.slow
 def test_each_device_has_a_kernel_of_its_own(found):
     assert found["kernels"]
 
 
+@pytest.mark.slow
 def test_few_members_stay_together(found):
     assert (found["devices for 63"], found["devices for 64"]) == (1, 2)
 

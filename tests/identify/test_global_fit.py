@@ -37,6 +37,7 @@ def many():
     return jq.fit(FAR, response_of(TRUTH, seed=0), cost=ML, starts=24)
 
 
+@pytest.mark.slow
 def test_one_start_a_turn_of_phase_away_stays_in_its_minimum():
     fit = jq.fit(FAR, response_of(TRUTH, seed=0), cost=ML)
     assert fit.chi_squared > 100

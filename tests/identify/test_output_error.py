@@ -49,6 +49,7 @@ def late_by_scipy(x, u):
     return dlsim((new[:2, :2] @ old[:2, :2], B, C, D, DT), held, x0=x[4:6])[1][:, 0] + x[6]
 
 
+@pytest.mark.slow
 def test_the_estimate_is_that_of_scipy_over_all_unknowns():
     y = late_by_scipy([*VALUES, 0.1, -0.5, 0.3], U) + 0.05 * noise(1)
     start = [8.5, 2.8, 21.0, 0.028, 0, 0, 0]

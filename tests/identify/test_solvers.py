@@ -50,6 +50,7 @@ def decay(z, data):
 DATA = 2 * np.exp(-0.7 * np.linspace(0.0, 2.0, 8)) + 0.05 * np.cos(9 * np.arange(8))
 
 
+@pytest.mark.slow
 def test_the_minimum_has_the_derivatives_of_finite_differences():
     def found(data):
         solver = DampedGaussNewton(1e-12)

@@ -184,6 +184,7 @@ def test_the_minimum_is_that_of_scipy_and_the_plant_is_recovered(seed):
     assert np.all(np.abs(off) < limit)
 
 
+@pytest.mark.slow
 def test_errors_of_the_roots_are_those_of_repeated_noise():
     exact = fit_transfer_function(response_of(PLANT, omega=OMEGA), 0, 3)
     found = factors(exact)
@@ -234,6 +235,7 @@ def test_repeated_roots_are_flagged_and_have_no_error():
     assert "~" in str(found) and "repeated within its error" in str(found)
 
 
+@pytest.mark.slow
 def test_a_delay_that_runs_to_zero_is_fixed_there_and_so_are_integrators():
     early = model_of([], [0.0, -9.0], 40.0)
     frf = response_of(early, omega=OMEGA)

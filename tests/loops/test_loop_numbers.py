@@ -40,6 +40,7 @@ def test_half_gains_move_the_slowest_pole_as_told(at_gains):
     np.testing.assert_allclose(at_gains.abscissa[8:11:2], [-4.95, -4.95], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_lag_costs_the_margins_of_the_table():
     lags = [{"lag": share / 10, "wo": wo} for wo in (30.0, 100.0) for share in (0.05, 0.1, 0.2)]
     peaks = np.asarray(analysed(*lags).sensitivity_peak)[:6]
@@ -56,6 +57,7 @@ def continuous_window(k, factor):
     return gains[stable][[0, -1]]
 
 
+@pytest.mark.slow
 def test_windows_of_fast_sampling_are_those_of_continuous_time():
     cases = [{"wc": 0.5, "wo": 0.5 * k} | half for half in ({}, HALF_L) for k in RATIOS]
     found = windows(*cases)  # only wc dt matters

@@ -171,6 +171,7 @@ def test_the_simulated_loop_is_the_analysed_one(loops):
     np.testing.assert_allclose(run.command[:, 0], command, rtol=0, atol=1e-7 * size)
 
 
+@pytest.mark.slow
 def test_the_gain_below_which_an_unstable_plant_falls_is_found_at_frequency_zero():
     axis = DecoupledAxes(0.5, 1.0, stiffness=-2.0)
     hold = LinearController(

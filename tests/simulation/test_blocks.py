@@ -139,6 +139,7 @@ def flown(inertia, gains):
     return evaluate(Loop(rig(inertia), controller, drive=Saturation(20.0)), HAPPENS)
 
 
+@pytest.mark.slow
 def test_members_of_a_large_ensemble_fly_as_in_a_small_one():
     gains = jnp.asarray([10.0, 30.0, 0.8478])
     many = lambda gains: flown(INERTIA, gains).itae[:, -20:]
@@ -147,6 +148,7 @@ def test_members_of_a_large_ensemble_fly_as_in_a_small_one():
     close(mean(many)(gains), mean(few)(gains), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_record_of_a_large_ensemble_has_every_member_in_its_place():
     controller, drive = LADRC([10.0], [30.0], [0.8478]), Saturation(20.0)
     record = simulate(Loop(rig(INERTIA), controller, drive=drive), HAPPENS)

@@ -189,6 +189,7 @@ def test_a_summary_is_that_of_numpy_and_counts_every_member():
     assert "3 of 64 members (4.7%) diverged" in str(found)
 
 
+@pytest.mark.slow
 def test_times_and_integrals_have_the_gradients_of_central_differences():
     happens = step_of(0.1)
 

@@ -63,6 +63,7 @@ def test_an_unstable_member_is_held_and_flagged_and_all_stays_finite():
     assert np.max(np.abs(found.angle[-1][:, STABLE] - 0.07)) < 1e-3
 
 
+@pytest.mark.slow
 def test_what_a_neighbour_does_changes_neither_a_member_nor_its_gradient():
     likes = axes(INERTIA[:, [1, 1, 1]])
     together, among_likes = (simulate(Loop(p, LAW, bound=5.0), step()) for p in (axes(), likes))
@@ -146,7 +147,7 @@ RUNAWAYS = {
 }
 
 
-LONG = ("a singular attitude", "a plant without an answer")
+LONG = ("a free multirotor", "a singular attitude", "a plant without an answer")
 
 
 @pytest.mark.parametrize(

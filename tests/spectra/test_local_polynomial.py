@@ -153,6 +153,7 @@ def closed_loop(r, k):
     return r - 0.5 * y, y
 
 
+@pytest.mark.slow
 def test_the_joint_estimate_holds_in_closed_loop_and_the_direct_one_is_biased():
     loops = [closed_loop(WHITE, k) for k in range(DRAWS)]
     joint = [estimate(u, y, WHITE, method="joint") for u, y in loops]

@@ -156,6 +156,7 @@ def test_a_bound_of_0_and_a_margin_that_is_any_are_printed_as_such():
     assert str(any_gain) == "gain margin up, worst, at least 3.522 dB: any, met"
 
 
+@pytest.mark.slow
 def test_a_payload_counts_in_the_linear_loop():
     """LADRC(10, 30, 0.848) is stable for b/b0 from 0.216: not with six times the inertia."""
     carrying = lambda added: Ensemble(payload=Payload(added, at=0.5))

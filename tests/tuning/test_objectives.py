@@ -108,6 +108,7 @@ def test_bad_choices_are_refused_with_what_there_is():
         Objective(events=(-1.0,))
 
 
+@pytest.mark.slow
 def test_numbers_of_flights_are_those_of_the_metrics_between_events():
     """Of all members in the mean, as a listener hears them at the start."""
     around, parts = loop(ladrc(4.0, 50.0, 1.5)), [(0.0, 2.5), (2.5, 4.5), (4.5, 6.5)]

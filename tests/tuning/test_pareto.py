@@ -37,6 +37,7 @@ def found():
     return swept(peers=paper_designs(RIG))
 
 
+@pytest.mark.slow
 def test_more_activity_buys_better_tracking_on_members_that_were_not_tuned_on(found):
     assert np.all(np.diff(found.effort) > 0) and np.all(np.diff(found.tracking) < 0)
     assert found.front.all() and all(c.stable for c in found.certificates)

@@ -51,10 +51,8 @@ CASES = {
 }
 
 
-SLOW = pytest.param("a scheduled PID", marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("case", [next(iter(CASES)), SLOW])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_the_gradient_is_that_of_differences_for_every_parameter(case):
     controller, free, limits = CASES[case]
     cost, start = evaluator(controller, free, members=MEMBERS, limits=limits, multiplier=0.1)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import tuning_case as case
 from certificates_by_hand import certificate, judged
 
@@ -52,6 +53,7 @@ class Servo(eqx.Module):
         return {"kp": None, "kd": None}
 
 
+@pytest.mark.slow
 def test_a_controller_of_ones_own_is_tuned_up_to_the_gains_that_it_refuses():
     found = brief(Servo(10.0, 5.0), Objective({"itae": 1.0}, ()), free=None)
     assert found.stabilised and set(found.values) == {"kp", "kd"}
@@ -67,6 +69,7 @@ def brief(controller, objective, free):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_tune_ends_at_the_bound_and_says_so():
     free = ["ladrc.observer_factor", "ladrc.wo"]
     found = brief(halved(4.0, 40.0, 0.3), Objective(), free)
