@@ -1,0 +1,44 @@
+"""Imports go from higher subjects to lower ones, and through their faces."""
+
+import ast
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+
+PACKAGE = ROOT / "jaxquad"
+ORDER = (
+    "_core", "_xla", "records", "excitation", "models", "spectra", "identify", "design", "control", "loops",
+    "simulation", "ensembles", "tuning", "export", "plot", "report", "workflows", "cli",
+)  # fmt: skip
+FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
+
+
+def imports(path: Path):
+    """The absolute names of the modules of this package that a file imports."""
+    own = path.relative_to(ROOT).with_suffix("").parts
+    package = own[:-1]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            yield (*base, *(node.module or "").split(".")) if node.module else base
+        elif isinstance(node, ast.Import):
+            yield from (tuple(name.name.split(".")) for name in node.names)
+
+
+def test_the_list_of_rooms_is_that_of_the_folders():
+    folders = {path.parent.relative_to(PACKAGE).parts[0] for path in FILES}
+    assert folders == set(ORDER)
+
+
+@pytest.mark.parametrize("room", ORDER)
+def test_a_room_imports_lower_ones_only_and_through_their_faces(room):
+    for path in (path for path in FILES if path.relative_to(PACKAGE).parts[0] == room):
+        for name in imports(path):
+            if name[0] != "jaxquad" or name[1:2] == (room,):
+                continue
+            assert len(name) > 1, f"{path} imports the package as a whole"
+            assert ORDER.index(name[1]) < ORDER.index(room), f"{path} imports {'.'.join(name)}"
+            private = [part for part in name[2:] if part.startswith("_")]
+            assert not private, f"{path} imports {'.'.join(name)}"
