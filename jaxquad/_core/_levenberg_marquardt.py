@@ -106,11 +106,11 @@ def advance(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float
         steps=state.steps + (active & ~first).astype(int),
         status=jnp.where(stalled, STALLED, state.status),
     )
-    return _aimed(moved, tolerance)
+    return _with_next_step(moved, tolerance)
 
 
-def _aimed(state: Descent, tolerance: float) -> Descent:
-    """The next step, damped; the last one is taken at once, for it needs no judgement."""
+def _with_next_step(state: Descent, tolerance: float) -> Descent:
+    """The next step, damped; the last one is taken at once, without a trial evaluation."""
     damping = state.damping * _size(state.normal.hessian)
     hessian, gradient = _damped(state.normal.hessian, damping), state.normal.gradient
     change, definite = solve_definite(hessian, -gradient)

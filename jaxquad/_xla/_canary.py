@@ -71,7 +71,7 @@ def _store(path: Path | None, answer: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"why_not": answer}))
     except OSError as error:
-        warn_once(f"the answer of the trial cannot be kept in {path} ({error})")
+        warn_once(f"the result of the trial cannot be stored in {path} ({error})")
 
 
 def _ask_child() -> str:

@@ -43,9 +43,9 @@ class Division:
         }
         self.light = [copies.is_in_a_part(op) for op in self.ops]
         self.fixed = [kind_of(op) == "constant" for op in self.ops]
-        self.kept = self._kept()
+        self.kept = self._select_kept()
 
-    def _kept(self) -> list[bool]:
+    def _select_kept(self) -> list[bool]:
         """Light operations whose result is dear and used twice, or used by what is in no part."""
         place = {op: k for k, op in enumerate(self.ops)}
         uses, kept = [0] * len(self.ops), [False] * len(self.ops)
@@ -59,10 +59,10 @@ class Division:
             if moves and outside:
                 self.light[k] = False
             kept[k] = not moves and outside
-        self._keep_the_dear(kept, uses)
+        self._keep_expensive(kept, uses)
         return kept
 
-    def _keep_the_dear(self, kept: list[bool], uses: list[int]) -> None:
+    def _keep_expensive(self, kept: list[bool], uses: list[int]) -> None:
         price = [0] * len(self.ops)  # of what a loop computes up to here
         for k, op in enumerate(self.ops):
             if not self.light[k] or self.fixed[k]:

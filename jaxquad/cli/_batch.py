@@ -25,7 +25,9 @@ def _add(declared: argparse.ArgumentParser) -> None:
     declared.add_argument("folder", type=Path, help="where the logs are")
     add_config(declared)
     add_out(declared, "results/NAME of the folder")
-    declared.add_argument("--again", action="store_true", help="try logs that failed before again")
+    declared.add_argument(
+        "--again", action="store_true", help="identify logs again that failed before"
+    )
     add_json(declared, "the rows of the table")
     add_settings(declared, BatchSettings)
 

@@ -10,7 +10,7 @@ from ._options import (
     add_config,
     add_json,
     add_log,
-    add_moved_log,
+    add_log_option,
     add_out,
     add_result,
     add_settings,
@@ -84,7 +84,7 @@ are the names of the options, but units, segments, lag = false and delay = false
 
 def _add_report(declared: argparse.ArgumentParser) -> None:
     add_result(declared)
-    add_moved_log(declared)
+    add_log_option(declared)
     add_out(declared, "the folder of the result")
     add_json(declared, "result.json")
 

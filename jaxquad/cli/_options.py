@@ -47,7 +47,7 @@ def add_result(declared: argparse.ArgumentParser) -> None:
     declared.add_argument("result", type=Path, help="the folder, or result.json, of identify")
 
 
-def add_moved_log(declared: argparse.ArgumentParser) -> None:
+def add_log_option(declared: argparse.ArgumentParser) -> None:
     text = "the log that was identified, if it was moved"
     declared.add_argument("--log", type=Path, metavar="FILE", help=text)
 

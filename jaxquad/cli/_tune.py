@@ -5,7 +5,7 @@ from jaxquad.workflows import TuneSettings
 from ._options import (
     add_config,
     add_json,
-    add_moved_log,
+    add_log_option,
     add_out,
     add_result,
     add_settings,
@@ -21,7 +21,7 @@ FAILS = 4
 
 def _add(declared: argparse.ArgumentParser) -> None:
     add_result(declared)
-    add_moved_log(declared)
+    add_log_option(declared)
     add_config(declared)
     add_out(declared, "tuned/ in the folder of the result")
     add_json(declared, "gains and certificate")

@@ -395,7 +395,7 @@ class LADRC(eqx.Module):
 _REMEDIES = {
     "wc": "give the closed loop's bandwidth in rad/s",
     "wo": "give the observer's bandwidth in rad/s, a few times wc",
-    "b0": "give the plant's gain; if it answers the other way, turn the sign of its command",
+    "b0": "give the plant's gain; if it is negative, reverse the sign of the command",
 }
 
 

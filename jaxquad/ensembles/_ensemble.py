@@ -93,7 +93,7 @@ def _check_ensemble(ensemble: "Ensemble") -> None:
     _check_names(ensemble, given)
     for name, one in given.items():
         if name in ensemble.independent and name in _ONE_FOR_ALL:
-            raise ValueError(f"{name} is one for all axes, and cannot be independent")
+            raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
         if name in FACTORS or not one.relative:
             _check_support(name, one)
     _check_payload(ensemble, given)
@@ -136,8 +136,8 @@ def _check_payload(ensemble: "Ensemble", given: dict[str, Distribution]) -> None
     least = [given[name].support[0] for name in ("inertia", "payload added")]
     if not sum(np.min(x) for x in least) > 0:
         raise ValueError(
-            f"a payload of {number(least[1])} times the nominal inertia leaves none of the "
-            f"{number(least[0])} that a member can have: remove less"
+            f"the payload adds {number(least[1])} and a member can start from {number(least[0])} "
+            "times the nominal inertia, whose sum is not above 0: remove less inertia"
         )
 
 
@@ -148,15 +148,15 @@ def _require_single_loop(ensemble: "Ensemble", loop: Loop) -> VariablePlant:
     plant = loop.plant
     if not isinstance(plant, DecoupledAxes | Multirotor):
         raise ValueError(
-            "members are drawn of a jq.DecoupledAxes or jq.models.Multirotor, not of a "
-            f"{type(plant).__name__}: for an identified model use "
+            f"the loop's plant is a {type(plant).__name__}, but an ensemble needs a "
+            "jq.DecoupledAxes or jq.models.Multirotor: for an identified model use "
             "jq.Ensemble(jq.ensembles.Posterior(fit, ...))"
         )
     shape = plant.shape[1:] if isinstance(plant, DecoupledAxes) else plant.ensemble
     if shape or loop.delay.ndim:
         raise ValueError(
             f"the loop already is an ensemble of {shape or loop.delay.shape}: give one plant and "
-            "one delay, and say as distributions what varies"
+            "one delay, and describe what varies by distributions"
         )
     if ensemble.plants is not None:
         ensemble.plants.require_nominal(plant)
@@ -167,7 +167,7 @@ def _check_axes(name: str, one: Distribution, plant: VariablePlant) -> None:
     sizes = {x.size for x in one.support} - {1}
     rotors = isinstance(plant, Multirotor) and name in _OF_ROTORS
     if sizes and (name in _ONE_FOR_ALL or rotors):
-        raise ValueError(f"{name} is one for all axes: give it single numbers")
+        raise ValueError(f"{name} is the same for all axes: give it numbers, not rows of them")
     if sizes and sizes != {count_axes(plant)}:
         raise ValueError(
             f"the distribution of {name} is for {max(sizes)} axes, but the plant has "
@@ -183,7 +183,7 @@ def _check_request(n: int, key: Key[Array, ""]) -> None:
         raise ValueError(f"key is {key!r}: give a jax.random.key(0)")
 
 
-_FRESH = 0x5EED  # folded into the key of members that judge what was tuned on others
+_FRESH = 0x5EED  # folded into the key of members that certify what was tuned on others
 
 Given = Distribution | ArrayLike | Sequence[float]
 
@@ -291,7 +291,7 @@ class Ensemble(eqx.Module):
         for name, one in self.distributions.items():
             _check_axes(name, one, plant)
             if name in self.independent and isinstance(plant, Multirotor) and name in _OF_ROTORS:
-                raise ValueError(f"{name} is one for all axes, and cannot be independent")
+                raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
             found[name] = (
                 one if name in FACTORS else one.about(self._nominal(loop, plant, name), name)
             )

@@ -18,7 +18,7 @@ from ._variation import VariablePlant
 
 
 class Payload(eqx.Module):
-    """Inertia that members pick up in flight; the controller is not told.
+    """Inertia that members pick up in flight; the controller does not know.
 
     Each argument is a number or a distribution, from which every member has its own draw. Times
     are rounded to samples.
@@ -118,7 +118,7 @@ class Members(eqx.Module):
         **Arguments:**
 
         - `controller`: one controller for all members. A scheduled one gets, for each member, the
-            gains at the inertia that it is told.
+            gains at the inertia that it is given.
 
         **Returns:**
 

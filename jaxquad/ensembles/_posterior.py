@@ -56,18 +56,20 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
         believed = as_float(believed)
         require_positive("believed", believed, "the inertia in kg m^2 that the gain belongs to")
         if believed.ndim:
-            raise ValueError(f"believed is {believed}: a fit of one axis has one inertia in kg m^2")
+            raise ValueError(
+                f"believed is {believed}: give one number, the axis's inertia in kg m^2"
+            )
     if isinstance(model, AttitudeAxis):
         return lambda m: _of_axis(m, believed, lagging=not is_zero(model.lag))
     if not isinstance(model, LaggedIntegrator | TransferFunction):
         raise ValueError(
-            f"it is not known how to make a plant of a {type(model).__name__}: give plant=, a "
+            f"a {type(model).__name__} cannot be converted into a plant: give plant=, a "
             "function of the model that returns (jq.DecoupledAxes(...), delay in s)"
         )
     if believed is None:
         raise ValueError(
             f"a {type(model).__name__} has the gain b = KT / J, but no inertia: give believed=, "
-            "the inertia in kg m^2 that torques and the inertia told to a controller refer to"
+            "the inertia in kg m^2 that torques and scheduled controllers refer to"
         )
     if isinstance(model, LaggedIntegrator):
         return _of_integrator(model, believed)
@@ -77,7 +79,7 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
 def _given(plant: Given, believed: ArrayLike | None) -> Build:
     if believed is not None:
         raise ValueError(
-            "give plant= or believed=, not both: the function plant= says the inertia itself"
+            "give plant= or believed=, not both: the function plant= sets the inertia itself"
         )
 
     def build(model: PyTree) -> tuple[DecoupledAxes, Array]:
@@ -182,7 +184,7 @@ class Posterior(eqx.Module):
             simulated loop holds its inputs itself. None for an input that was not held, and for a
             fit by `jq.refine(..., hold="zero")`, which holds it too.
         - `believed`: the inertia in kg m^2 that belongs to the gain, where the fit determines only
-            b = KT / J: torques in N m and the inertia told to a controller refer to it.
+            b = KT / J: torques in N m and the inertia given to a scheduled controller refer to it.
         - `plant`: a function of the model that returns the pair (`jq.DecoupledAxes`, delay in s).
 
         **Raises:**

@@ -73,7 +73,7 @@ def remarks_on_output_error(
         )
     remarks.append(
         "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
-        "model: judge this one by jq.verify on another record"
+        "model: check the model by jq.verify on another record"
     )
     return remarks
 

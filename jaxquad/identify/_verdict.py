@@ -112,7 +112,7 @@ class Verdict(eqx.Module):
         for direction in self.null_directions:
             parts = ", ".join(f"{share:+.3f} {name}" for name, share in direction.items())
             lines.append(
-                f"  null direction (relative changes that leave the responses alike): {parts}"
+                f"  null direction (relative changes that leave the responses unchanged): {parts}"
             )
         return lines
 

@@ -114,11 +114,11 @@ def _linearised(
                 at(linear.A, 2), at(linear.command, 1), at(linear.torque, 1), at(linear.gain, 0)
             )
             late = None if delay is None else at(delay.astype(linear.A.dtype), 0)
-            law = _law_of(controller, axis, place[:own] if own else None)
-            _require_interval(law, dt)
+            sampled = _linear_form(controller, axis, place[:own] if own else None)
+            _require_interval(sampled, dt)
             return (
                 physical,
-                _padded(_without_idle_states(law), states),
+                _padded(_without_idle_states(sampled), states),
                 late,
                 at(linear.gain, 0) / (at(b0.astype(linear.gain.dtype), 0)),
             )
@@ -130,7 +130,7 @@ def _linearised(
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *(of_axis(k) for k in axes))
 
 
-def _law_of(
+def _linear_form(
     controller: LinearController | LinearisableController, axis: int, place: Place | None
 ) -> LinearController:
     if isinstance(controller, LinearController):
@@ -138,11 +138,11 @@ def _law_of(
     return controller.linear(axis, place)
 
 
-def _require_interval(law: LinearController, dt: float) -> None:
-    if not math.isclose(law.dt, dt, rel_tol=1e-6):
+def _require_interval(controller: LinearController, dt: float) -> None:
+    if not math.isclose(controller.dt, dt, rel_tol=1e-6):
         raise ValueError(
-            f"the controller's linear form is for samples of {law.dt} s, the loop's are {dt} s: "
-            f"give the loop dt={law.dt}"
+            f"the controller's linear form is for samples of {controller.dt} s, the loop's are "
+            f"{dt} s: give the loop dt={controller.dt}"
         )
 
 
@@ -161,7 +161,9 @@ def _require_member(member: tuple[int, ...], ensemble: tuple[int, ...]) -> None:
     if len(member) != len(ensemble) or not all(
         0 <= m < n for m, n in zip(member, ensemble, strict=True)
     ):
-        raise ValueError(f"member is {member}, but the ensemble has the shape {ensemble}.")
+        raise ValueError(
+            f"member is {member}, but the ensemble has the shape {ensemble}: give one index each"
+        )
 
 
 def _without_idle_states(controller: LinearController) -> LinearController:
@@ -175,11 +177,11 @@ def _without_idle_states(controller: LinearController) -> LinearController:
 
 def _padded(controller: LinearController, states: int) -> LinearController:
     """With further states that nothing drives and nothing reads."""
-    room = max(0, states - len(controller.C))
-    longer = lambda x: jnp.pad(x, (0, room))
+    extra = max(0, states - len(controller.C))
+    longer = lambda x: jnp.pad(x, (0, extra))
     return dataclasses.replace(
         controller,
-        A=jnp.pad(controller.A, ((0, room), (0, room))),
+        A=jnp.pad(controller.A, ((0, extra), (0, extra))),
         reference_in=longer(controller.reference_in),
         measurement_in=longer(controller.measurement_in),
         C=longer(controller.C),

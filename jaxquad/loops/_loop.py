@@ -21,7 +21,7 @@ from ._protocols import (
 
 
 _DEFAULT_DT = 0.002  # s
-# A scheduled controller is tuned and certified: its members fly it at the inertia they are told.
+# A scheduled controller is tuned and certified: its members fly it at the inertia they are given.
 AnyController = Controller | LinearisableController | ScheduledController | LinearController
 
 
@@ -54,7 +54,7 @@ class Loop(eqx.Module):
         differentiable with respect to it where `longest_delay` is given and the delay is traced.
     - `dt`: sample interval in s; None is the controller's, or 0.002 if it has none.
     - `substeps`: Runge-Kutta steps of the plant in a sample interval.
-    - `bound`: rad, the largest angle that still counts as flown.
+    - `bound`: rad; a loop whose angle exceeds it has diverged.
     - `longest_delay`: s, the most that a `delay` traced by jit, vmap or grad can become.
 
     **Raises:** ValueError for a value out of range, for a controller made for another `dt`, and for
@@ -95,16 +95,17 @@ class Loop(eqx.Module):
     def __check_init__(self):
         if not (isinstance(self.substeps, int | np.integer) and self.substeps >= 1):
             raise ValueError(f"substeps is {self.substeps}: give a whole number, 1 or more")
-        message = f"bound is {self.bound} rad: give the largest angle that still counts as flown"
+        message = f"bound is {self.bound} rad: give an angle above 0"
         _require_positive_number(self.bound, message)
         made_for = sample_interval(self.controller)
         if made_for is not None and not math.isclose(made_for, self.dt, rel_tol=1e-6):
             raise ValueError(
-                f"the controller was made for samples of {made_for} s, not {self.dt} s"
+                f"the controller was made for samples of {made_for} s, not {self.dt} s: "
+                "leave dt out, or make the controller with this dt"
             )
         if isinstance(self.plant, Multirotor) and self.drive is None:
             raise ValueError(
-                "drive is None, but a Multirotor turns by four motor inputs: give "
+                "drive is None, but a Multirotor takes four motor inputs: give "
                 "drive=jq.simulation.MotorDrive(plant.allocation)"
             )
 
@@ -139,8 +140,8 @@ def _queue_of(delay: ArrayLike, dt: float, longest: float | None) -> DelayQueue:
     if isinstance(delay, Tracer):
         if longest is None or not 0 < longest < math.inf:
             raise ValueError(
-                "the delay is traced by jit, vmap or grad, so how many inputs to keep is not "
-                f"known: longest_delay is {longest}; give the longest delay in s that can occur"
+                f"the delay is traced by jit, vmap or grad, and longest_delay is {longest}: give "
+                "longest_delay=, the longest delay in s that can occur"
             )
         return DelayQueue(math.floor(longest / dt * (1 + 1e-9)) + 1, True, True)
     values = np.asarray(delay, dtype=float)
@@ -150,7 +151,7 @@ def _queue_of(delay: ArrayLike, dt: float, longest: float | None) -> DelayQueue:
     if longest is not None and not 0 <= longest < math.inf:
         raise ValueError(f"longest_delay is {longest} s, but it must be 0 or above and finite")
     if longest is not None and greatest > longest * (1 + 1e-9):
-        raise ValueError(f"delay is {delay} s, above longest_delay = {longest} s: raise that")
+        raise ValueError(f"delay is {delay} s, above longest_delay = {longest} s: raise the latter")
     return _queue_for(np.asarray(values / dt))
 
 

@@ -61,7 +61,7 @@ class Allocation(eqx.Module):
         _require_known("convention", self.convention, tuple(_FRAMES))
         _require_known("input", self.input, _INPUTS)
         require_positive("arm", self.arm, "give the distance from centre to rotor in m")
-        remedy = "the convention holds the signs"
+        remedy = "give its magnitude; the convention says which way each rotor turns"
         require_positive("thrust_coefficient", self.thrust_coefficient, remedy)
         require_positive("torque_coefficient", self.torque_coefficient, remedy)
 
@@ -131,4 +131,4 @@ def _product(matrix: np.ndarray, vectors: Float[Array, " n *ensemble"]) -> Array
 
 def _require_known(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
-        raise ValueError(f"{name} is {value!r}, which does not exist: choose one of {known}.")
+        raise ValueError(f"{name} is {value!r}, but it must be one of {known}.")

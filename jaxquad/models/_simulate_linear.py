@@ -167,7 +167,7 @@ def simulate_linear(
     """
     require_all_positive(dt=dt)
     if hold not in _HOLDS:
-        raise ValueError(f"hold is {hold!r}, which does not exist: choose one of {_HOLDS}.")
+        raise ValueError(f"hold is {hold!r}, but it must be one of {_HOLDS}.")
     inputs = _inputs(model, jnp.asarray(u))
     found = _simulate(_plant(model), _segments(inputs, hold), dt)
     return found[:, 0] if isinstance(model, TransferFunction) else found

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxquad.plot import certificate_figure, convergence_figure
-from jaxquad.tuning import Certificate, QUANTITIES, Tuned
+from jaxquad.tuning import Certificate, KNOWN_INERTIA, QUANTITIES, Tuned
 
 from ._figure import embed_figure
 from ._fit import count_starts
@@ -57,7 +57,7 @@ def _certificate(certificate: Certificate) -> dict[str, object]:
         "verdict": str(certificate).splitlines()[0],
         "limits": [str(distance) for distance in certificate.distances],
         "remarks": certificate.remarks,
-        "has_untuned": any(name.startswith("CE ") for name in certificate.designs),
+        "untuned": KNOWN_INERTIA if KNOWN_INERTIA in certificate.designs else "",
         "designs": _designs(certificate),
         "image": image,
     }

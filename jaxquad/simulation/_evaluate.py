@@ -105,9 +105,9 @@ def evaluate(
     """
     check_run(loop, scenario)
     place = window(len(scenario.reference), loop.dt, start=start, stop=stop, load_start=load_start)
-    judged = Window(*map(jnp.asarray, place))
+    span = Window(*map(jnp.asarray, place))
     run, places = placed(loop, scenario, devices)
-    found, numbers = gathered(_run(*run, judged, places))
+    found, numbers = gathered(_run(*run, span, places))
     warn_beyond_authority(found, scenario)
     return _metrics(numbers, place, loop.dt)
 
@@ -119,27 +119,27 @@ def _metrics(numbers: dict[str, PyTree], place: tuple[int, int, int, int], dt: f
 
 @Jit
 def _run(
-    loop: Loop, scenario: Scenario, judged: Window, devices: Devices | None = None
+    loop: Loop, scenario: Scenario, span: Window, devices: Devices | None = None
 ) -> tuple[Authority | None, dict[str, Array]]:
     found = find_authority(loop.plant, loop.drive, loop.controller)
-    return found, loop_over_devices(_judge, (loop, scenario), judged, devices)
+    return found, loop_over_devices(_measure, (loop, scenario), span, devices)
 
 
-def _judge(run: Run, judged: Window) -> dict[str, Array]:
+def _measure(run: Run, span: Window) -> dict[str, Array]:
     loop, scenario = run
     found = find_authority(loop.plant, loop.drive, loop.controller)
     gain = None if found is None else found.torque_gain
-    sums = _accumulator(scenario, judged, loop.dt, found, gain)
+    sums = _accumulator(scenario, span, loop.dt, found, gain)
     total, _, running = scan_loop(loop, scenario, sums)
     return _numbers(sums, total, ~running, scenario, found)
 
 
 @eqx.filter_jit
-def _replay(simulation: Simulation, judged: Window, gain: Array | None) -> dict[str, Array]:
+def _replay(simulation: Simulation, span: Window, gain: Array | None) -> dict[str, Array]:
     scenario, found = simulation.scenario, simulation.authority
     if gain is None and found is not None:
         gain = found.torque_gain
-    sums = _accumulator(scenario, judged, simulation.dt, found, gain)
+    sums = _accumulator(scenario, span, simulation.dt, found, gain)
     like = jnp.zeros_like(simulation.angle[0])
 
     def sample(total: Sums, now: tuple) -> tuple[Sums, None]:
@@ -156,17 +156,17 @@ def _replay(simulation: Simulation, judged: Window, gain: Array | None) -> dict[
 
 def _accumulator(
     scenario: Scenario,
-    judged: Window,
+    span: Window,
     dt: float,
     found: Authority | None,
     torque_gain: Array | None,
 ) -> FlightMetrics:
     return FlightMetrics(
         wanted=(*NUMBERS, "step", "stepped"),
-        window=judged,
+        window=span,
         dt=dt,
-        steps=find_steps(scenario.reference, [(judged.first, judged.until)]),
-        from_first=jnp.asarray(judged.first == 0),
+        steps=find_steps(scenario.reference, [(span.first, span.until)]),
+        from_first=jnp.asarray(span.first == 0),
         torque_gain=torque_gain,
         limit=None if found is None else found.command,
     )

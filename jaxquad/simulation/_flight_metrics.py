@@ -93,7 +93,7 @@ def _makes_step(
 
 
 def share_beyond(
-    limit: Float[Array, "axes ..."], signal: Float[Array, "samples axes ..."], judged: Window
+    limit: Float[Array, "axes ..."], signal: Float[Array, "samples axes ..."], span: Window
 ) -> Float[Array, "axes ..."]:
     """Share of the window's samples in which a signal exceeds a limit in size."""
     rows = limit.astype(signal.dtype)[None]
@@ -101,9 +101,9 @@ def share_beyond(
     rows, signal = (x.reshape(x.shape + (1,) * (rank - x.ndim)) for x in (rows, signal))
     shape = jnp.broadcast_shapes(rows.shape, signal.shape)
     rows, signal = jnp.broadcast_to(rows, shape), jnp.broadcast_to(signal, shape)
-    within = _inside(judged.first, judged.last, signal)
+    within = _inside(span.first, span.last, signal)
     beyond = (jnp.abs(signal) > rows * (1 + _ROUNDING)) & within
-    count = jnp.asarray(judged.last - judged.first + 1).astype(rows.dtype)
+    count = jnp.asarray(span.last - span.first + 1).astype(rows.dtype)
     return jnp.sum(beyond.astype(rows.dtype), axis=0) / count
 
 

@@ -93,7 +93,7 @@ class Metrics(eqx.Module):
 
     The error is the reference less the true angle. `str()` shows one loop as it is, and an ensemble
     by mean, 95 % quantile, worst and CVaR20. A member that has diverged, in the window or not, is
-    judged with its angle held where it left the bound: `diverged` says so, its integrals are
+    evaluated with its angle held where it left the bound: `diverged` says so, its integrals are
     finite, and it never settles.
     The step goes from where the reference stands before the window (with a window from 0 s, from
     the first angle) to where it is when the window ends or the load begins. Overshoot, rise and

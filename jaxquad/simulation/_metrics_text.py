@@ -103,7 +103,7 @@ def _divergence(metrics: "Metrics") -> list[str]:
     if not count:
         return []
     who = f"{count} of {members} members ({count / members:.1%})" if members > 1 else "the loop"
-    return [f"{who} diverged: the numbers are those of an angle held where it left the bound"]
+    return [f"{who} diverged: the numbers count its angle as held where it left the bound"]
 
 
 def _steps(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
@@ -113,7 +113,7 @@ def _steps(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
     found = []
     if without:
         found.append(
-            f"{', '.join(without)}: no step that the reference makes and holds, hence no "
+            f"{', '.join(without)}: the reference makes no step that it holds, hence no "
             "overshoot, rise or settling"
         )
     for field, what in (
@@ -136,7 +136,7 @@ def _estimate(metrics: "Metrics") -> list[str]:
     if not np.isnan(np.asarray(metrics.disturbance_rmse)).all():
         return []
     return [
-        "no error of the disturbance's estimate: the controller makes none, or the plant's torque "
+        "no error of the disturbance estimate: the controller makes none, or the plant's torque "
         "per unit of command is not known (give torque_gain)"
     ]
 
@@ -144,8 +144,8 @@ def _estimate(metrics: "Metrics") -> list[str]:
 def _torque(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
     found = []
     for field, what in (
-        ("beyond_authority", "ask for more torque than the drive has"),
-        ("reversing", "take motors that turn backwards"),
+        ("beyond_authority", "exceed the torque of the drive"),
+        ("reversing", "need motors that turn backwards"),
     ):
         shares = np.nan_to_num(_flat(vars(metrics)[field])).mean(axis=1)
         where = [f"{x:.1%} on {name}" for name, x in zip(names, shares, strict=True) if x]

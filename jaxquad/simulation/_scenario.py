@@ -141,7 +141,7 @@ def _require_room(given: tuple[Given, ...], clock: Clock, axes: int) -> None:
 def _names(axes: int | Sequence[str]) -> tuple[str, ...]:
     if isinstance(axes, int):
         if axes < 1:
-            raise ValueError(f"axes is {axes}: a plant has at least one")
+            raise ValueError(f"axes is {axes}: give 1 or more")
         return AXES[:axes] if axes <= len(AXES) else tuple(str(k) for k in range(axes))
     if isinstance(axes, str) or not axes or len(set(axes)) != len(axes):
         raise ValueError(f"axes is {axes!r}: give their number, or their names, each once")

@@ -63,7 +63,7 @@ class Simulation(eqx.Module):
                 f"an ensemble of shape {self.angle.shape[2:]} has many records: pick one, member=0"
             )
         if np.asarray(self.diverged)[() if member is None else member]:
-            raise ValueError("the loop diverged, and what is not flown is no record: stabilise it")
+            raise ValueError("the loop diverged, so its flight cannot be a record: stabilise it")
         place = (slice(None), k) if member is None else (slice(None), k, member)
         command, angle, sweep = (
             np.asarray(x[place]) for x in (self.command, self.measurement, self.injection)

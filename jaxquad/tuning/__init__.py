@@ -18,7 +18,11 @@ from ._objective import (
     Worst as Worst,
 )
 from ._pareto import Pareto as Pareto, pareto as pareto
-from ._peers import paper_designs as paper_designs, peers as peers
+from ._peers import (
+    KNOWN_INERTIA as KNOWN_INERTIA,
+    paper_designs as paper_designs,
+    peers as peers,
+)
 from ._progress import Evaluation as Evaluation
 from ._quantities import QUANTITIES as QUANTITIES, Quantity as Quantity
 from ._tune import tune as tune

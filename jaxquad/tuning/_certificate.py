@@ -47,7 +47,7 @@ def member_text(certificate: "Certificate", index: int) -> str:
     if np.any(certificate.facts["delay"] > 0):
         parts.append(f"delay {_joined(1e3 * known['delay'])} ms")
     if not np.allclose(known["told"], 1):
-        parts.append(f"told {_joined(known['told'])} J")
+        parts.append(f"scheduled at {_joined(known['told'])} J")
     return f"member {index}: {', '.join(parts)}"
 
 

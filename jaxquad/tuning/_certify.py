@@ -69,7 +69,7 @@ def certify(
     - `members`: how many are drawn.
     - `key`: give the tuner's key, whose training members are other draws; `jax.random.key(0)` by
         default.
-    - `events`: times in s at which ITAE's clock starts again and the overshoot of a step is judged.
+    - `events`: times in s at which ITAE's clock starts again and a new step begins.
     - `start`, `stop`, `load_start`, `devices`: see `jq.evaluate`; best as for the tuner.
     - `name`: of the design in the certificate.
 
@@ -183,7 +183,7 @@ def evaluate_design(
 
     The loop in time holds every limit, the encoder and dry friction. The linear one is exact, and
     is that of a controller with a method `linear`, a scheduled or adaptive one at the inertia that
-    it is told.
+    it is given.
     """
     axes = flight.reference.shape[1]
     loop = members.loop(controller)
@@ -206,16 +206,16 @@ def evaluate_design(
     return DesignResult(numbers, unstable, np.asarray(whole.diverged), why)
 
 
-_PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what an inertia told may change
+_PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what scheduling may change
 
 
-def _widen(law: PyTree, axes: int, members: int) -> PyTree:
+def _widen(controller: PyTree, axes: int, members: int) -> PyTree:
     """The gains of a LADRC or PID in one shape, so that all of a kind share a compile."""
-    if not isinstance(law, LADRC | PID):
-        return law
-    gains = {name: x for name, x in vars(law).items() if isinstance(x, Array)}
+    if not isinstance(controller, LADRC | PID):
+        return controller
+    gains = {name: x for name, x in vars(controller).items() if isinstance(x, Array)}
     full = {name: _full(x, name, axes, members) for name, x in gains.items()}
-    return dataclasses.replace(law, **full)
+    return dataclasses.replace(controller, **full)
 
 
 def _full(gain: Array, name: str, axes: int, members: int) -> Array:
@@ -245,11 +245,11 @@ def _greatest(values: Float[np.ndarray, "parts axes members"]) -> np.ndarray:
 
 
 def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:
-    law = schedule_for_analysis(controller, members.inertia_told)
-    if not isinstance(law, LinearisableController):
+    scheduled = schedule_for_analysis(controller, members.inertia_told)
+    if not isinstance(scheduled, LinearisableController):
         return None
     axes = flight.reference.shape[1]
-    loop = members.loop(controller).with_controller(_widen(law, axes, members.size))
+    loop = members.loop(controller).with_controller(_widen(scheduled, axes, members.size))
     plants = _with_payloads(members.plant, flight)
     return _worst([loop_numbers(loop.with_plant(x), range(axes)) for x in plants], members.size)
 

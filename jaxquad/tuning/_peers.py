@@ -11,16 +11,18 @@ from ._certify import decouple, Plant
 
 
 WC, WO = 10.0, 30.0  # rad/s, the paper's
+KNOWN_INERTIA = "b0 = KT/J"  # the name of the design that knows the inertia
 PAPER_B0 = (3.0, 1.6)  # before and after the paper's adaptation, rad/s^2 per V
 # +u and -u on two motors: the one convention in which the paper's gains are stable
-RIG_GAIN = 2 * QUANSER_HOVER.arm * QUANSER_HOVER.thrust_coefficient / QUANSER_HOVER.inertia[0]
+HOVER_GAIN = 2 * QUANSER_HOVER.arm * QUANSER_HOVER.thrust_coefficient / QUANSER_HOVER.inertia[0]
 
 
 def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
     """The paper's two LADRCs for a plant: 10 and 30 rad/s with b0 = 3, and with b0 = 1.6.
 
-    On the rig's roll axis (b = 0.848 rad/s^2 per V) b0 is exactly that. On another plant or axis it
-    has the same ratio to b: 3.54 and 1.89. Source: section 5 of the paper, docs/equations.md.
+    On the roll axis of the Quanser Hover (b = 0.848 rad/s^2 per V) b0 is exactly that. On another
+    plant or axis it has the same ratio to b: 3.54 and 1.89. Source: section 5 of the paper,
+    docs/equations.md.
 
     **Arguments:**
 
@@ -38,18 +40,18 @@ def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
     b = np.asarray(_nominal(plant).gain, float)
     designs = {}
     for b0 in PAPER_B0:
-        given = b0 * b / RIG_GAIN
-        on_rig = np.allclose(given, b0, rtol=2e-3)
-        name = f"paper b0 = {b0:g}" if on_rig else f"paper b0 = {b0 / RIG_GAIN:.3g} b"
-        designs[name] = LADRC(WC, WO, b0 * np.ones_like(b) if on_rig else given, dt=dt)
+        given = b0 * b / HOVER_GAIN
+        on_hover = np.allclose(given, b0, rtol=2e-3)
+        name = f"paper b0 = {b0:g}" if on_hover else f"paper b0 = {b0 / HOVER_GAIN:.3g} b"
+        designs[name] = LADRC(WC, WO, b0 * np.ones_like(b) if on_hover else given, dt=dt)
     return designs
 
 
 def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict[str, PyTree]:
     """Designs to stand beside a tuned one in its certificate, by name.
 
-    The paper's two, and the certainty-equivalence LADRC (10 and 30 rad/s, b0 = KT / J of the
-    inertia told).
+    The paper's two, and "b0 = KT/J": the LADRC with the paper's bandwidths, 10 and 30 rad/s, whose
+    b0 is exact for the inertia that the controller is given (certainty equivalence).
 
     **Arguments:**
 
@@ -69,7 +71,7 @@ def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict
     # As a map of ln J, b0 = KT / J is straight: two knots, far apart, hold it everywhere.
     map = certainty_equivalence(KT, J, span=(1e-3, 1e3), knots=2)
     designs: dict[str, PyTree] = dict(paper_designs(plant, dt=dt))
-    designs["CE 10/30"] = ScheduledLADRC(LADRC(WC, WO, axes.gain, dt=dt), map)
+    designs[KNOWN_INERTIA] = ScheduledLADRC(LADRC(WC, WO, axes.gain, dt=dt), map)
     return designs if pid is None else designs | {"tuned PID": pid}
 
 

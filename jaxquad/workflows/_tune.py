@@ -15,7 +15,15 @@ from jaxquad.plot import certificate_figure, convergence_figure
 from jaxquad.records import Record
 from jaxquad.report import plain_content, provenance, write_json, write_report
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
-from jaxquad.tuning import Limit, Objective, peers, Penalty, tune as tune_controller, Tuned
+from jaxquad.tuning import (
+    KNOWN_INERTIA,
+    Limit,
+    Objective,
+    peers,
+    Penalty,
+    tune as tune_controller,
+    Tuned,
+)
 
 from ._identify import Identification
 from ._settings import TuneSettings
@@ -154,7 +162,7 @@ def _tuned(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Tun
         limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
         members=settings.members,
         fresh=settings.fresh,
-        peers={name: one for name, one in peers(plant, dt=dt).items() if name.startswith("CE")},
+        peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
         key=jax.random.key(settings.seed),
     )
 

@@ -142,7 +142,7 @@ def test_a_measurement_of_another_shape_than_at_the_start_is_refused(name):
     [
         (dict(wc=0.0), "wc is 0.0, but it must be above 0"),
         (dict(wo=[30.0, -1.0, 30.0]), "wo is .*-1.* but it must be above 0"),
-        (dict(b0=0.0), "b0 is 0.0.* turn the sign of its command"),
+        (dict(b0=0.0), "b0 is 0.0.* reverse the sign of the command"),
         (dict(b0=[1.0, np.nan, 1.0]), "b0 is .*nan"),
         (dict(wo=2000.0), r"wo is 2000 rad/s, but at dt = 0.002 s it must be below 1571 rad/s"),
         (dict(wo=1100.0, observer=EulerObserver()), "below 1000 rad/s"),

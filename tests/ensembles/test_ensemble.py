@@ -376,10 +376,10 @@ WRONG = {
     "delay<0": (dict(delay=Uniform(-0.001, 0.004)), "cannot be negative"),
     "noise<0": (dict(noise=-1e-4), "standard deviation"),
     "axes": (dict(lag=Uniform([0.01, 0.02], [0.03, 0.04])), "2 axes, but the plant has 1"),
-    "delay axes": (dict(delay=[0.01, 0.02]), "one for all axes"),
+    "delay axes": (dict(delay=[0.01, 0.02]), "the same for all axes"),
     "sampling": (dict(sampling="halton"), "latin, random, sobol, grid"),
     "independent": (dict(independent=("delay",)), "name quantities that vary"),
-    "lost": (dict(payload=Payload(-0.5, at=1.0)), "remove less"),
+    "lost": (dict(payload=Payload(-0.5, at=1.0)), "remove less inertia"),
 }
 
 
@@ -426,7 +426,7 @@ def test_what_belongs_to_the_loop_is_refused_in_an_ensemble(without_type_checks)
         Ensemble(wrong)
     with pytest.raises(ValueError, match="loop is a DecoupledAxes"):
         Ensemble().draw(wrong, COUNT, KEY)
-    with pytest.raises(ValueError, match="not of a LaggedIntegrator.*Posterior"):
+    with pytest.raises(ValueError, match="the loop's plant is a LaggedIntegrator.*Posterior"):
         model: Any = jq.LaggedIntegrator(1.0)
         made(wrong).ensemble.draw(jq.Loop(model, jq.LADRC(1, 3, 1)), COUNT, KEY)
 
@@ -437,7 +437,7 @@ def test_plants_that_are_no_single_plant_are_refused():
     with pytest.raises(ValueError, match="already is an ensemble"):
         made(AXIS, nominal_delay=np.array([0.0, 0.002])).draw(COUNT, KEY)
     rotors = made(jq.quanser_hover(), torque_gain=Normal(0.05), independent=("torque_gain",))
-    with pytest.raises(ValueError, match="one for all axes"):
+    with pytest.raises(ValueError, match="the same for all axes"):
         rotors.draw(COUNT, KEY)
 
 

@@ -48,7 +48,7 @@ def test_the_first_line_says_that_the_certificate_holds(run, result):
     assert "CERTIFICATE HOLDS" in run[1].splitlines()[1]
     certificate = json.loads((run[0] / "certificate.json").read_text())
     assert certificate["holds"] and certificate["designs"]["tuned"]["unstable"] == 0
-    assert set(certificate["designs"]) == {"tuned", "paper b0 = 3", "paper b0 = 1.6", "CE 10/30"}
+    assert set(certificate["designs"]) == {"tuned", "paper b0 = 3", "paper b0 = 1.6", "b0 = KT/J"}
 
 
 def test_the_sweep_finds_gain_and_lag_of_the_rig(script, result):

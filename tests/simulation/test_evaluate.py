@@ -230,7 +230,7 @@ def test_a_disturbance_beyond_the_authority_is_reported(torque, share):
     assert len(told) == (share > 0)
     if share:
         assert f"roll reaches {torque} N m: 50.0% of the samples exceed the 0.0936 N m" in told[0]
-        assert "more torque than the drive has: samples 50.0% on roll" in str(found)
+        assert "exceed the torque of the drive: samples 50.0% on roll" in str(found)
 
 
 def test_the_warning_counts_the_members_of_a_plant():

@@ -111,7 +111,7 @@ def test_a_delay_that_cannot_be_is_refused(bad):
 
 def test_a_traced_delay_needs_to_know_how_long_it_can_become():
     run = lambda delay, **more: simulate(Loop(PLANT, Idle(), delay=delay, **more), pushed()).angle
-    with pytest.raises(ValueError, match="longest_delay is None; give the longest delay"):
+    with pytest.raises(ValueError, match="longest_delay is None: give longest_delay="):
         jax.jit(run)(0.004)
     with pytest.raises(ValueError, match="above longest_delay = 0.004 s"):
         run(0.005, longest_delay=0.004)

@@ -186,10 +186,10 @@ def test_a_peer_needs_a_name_of_its_own():
         judged(peers={"tuned": FIXED})
 
 
-def test_a_scheduled_design_is_flown_and_analysed_as_told(certificate):
-    told = peers(RIG)["CE 10/30"]
-    assert isinstance(told, ScheduledLADRC)
-    found, inertia = certificate.designs["CE 10/30"], certificate.facts["inertia"]
+def test_a_scheduled_design_is_flown_and_analysed_at_the_inertia_it_is_given(certificate):
+    known = peers(RIG)["b0 = KT/J"]
+    assert isinstance(known, ScheduledLADRC)
+    found, inertia = certificate.designs["b0 = KT/J"], certificate.facts["inertia"]
     alone = judged(jq.LADRC(10.0, 30.0, 0.0468 / inertia))
     np.testing.assert_allclose(found.of("itae"), alone.design.of("itae"), rtol=1e-9)
     np.testing.assert_allclose(

@@ -37,6 +37,6 @@ def test_the_papers_gains_are_3_and_1_6_on_the_rig_and_in_proportion_elsewhere()
         peers(jq.DecoupledAxes([[1.0, 2.0]], [1.0]))
 
 
-def test_certainty_equivalence_is_the_gain_over_the_inertia_told():
-    law = peers(RIG)["CE 10/30"].scheduled_at(jnp.array([[0.01, 0.0552, 0.5]]))
-    np.testing.assert_allclose(law.b0, 0.0468 / np.array([[0.01, 0.0552, 0.5]]), rtol=1e-12)
+def test_certainty_equivalence_is_the_gain_over_the_inertia_given():
+    scheduled = peers(RIG)["b0 = KT/J"].scheduled_at(jnp.array([[0.01, 0.0552, 0.5]]))
+    np.testing.assert_allclose(scheduled.b0, 0.0468 / np.array([[0.01, 0.0552, 0.5]]), rtol=1e-12)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
+from ._basis import Basis, basis_of, evaluate_curve, Numbers, only_finite, with_coherence
 from ._crossings import crossed, first
 from ._curve import ambiguous, Curve, curve_of, Response
 from ._text import degrees, lines, shown
@@ -52,8 +52,8 @@ def doubtful_bandwidth(result: "Bandwidth") -> list[str]:
     given = start + (np.pi / 2 if result.quantity == "rate" else 0.0)
     if result.branch != "as given" and (abs(given) > np.radians(150) or start > np.radians(90)):
         doubts.append(
-            f"the phase starts at {np.degrees(start):.4g} deg: if that is a turn off, say so with "
-            "phase_at_start; if the sign of the input is opposite, turn it round"
+            f"the phase starts at {np.degrees(start):.4g} deg: if that is wrong by 360 deg, give "
+            "the true one as phase_at_start=; if the input has the opposite sign, reverse it"
         )
     if float(result.phase_crossings) > 1:
         doubts.append(
@@ -81,7 +81,7 @@ def doubtful_bandwidth(result: "Bandwidth") -> list[str]:
 _POINTS = 64  # of a model, even in frequency from w180 to 2 w180
 
 
-def known_to(curve: Curve, clear: Bool[Array, " intervals"]) -> Float[Array, ""]:
+def top_of_clear(curve: Curve, clear: Bool[Array, " intervals"]) -> Float[Array, ""]:
     """Frequency in rad/s up to which the phase's branch is known: `clear` holds from the lowest."""
     return jnp.where(jnp.all(clear), curve.omega[-1], curve.omega[jnp.argmin(clear)])
 
@@ -214,10 +214,10 @@ def attitude_bandwidth(
     Source: ADS-33E-PRF fig. 2; Tischler & Remple, handling-qualities chapter.
     """
     if quantity not in ("attitude", "rate"):
-        raise ValueError(f'quantity is {quantity!r}: say "attitude" or "rate"')
+        raise ValueError(f'quantity is {quantity!r}: choose "attitude" or "rate"')
     curve = curve_of(response, omega, output, input, int(quantity == "rate"))
     start = None if phase_at_start is None else jnp.asarray(phase_at_start, curve.omega.dtype)
-    values, basis, errors = found(_numbers, curve, start)
+    values, basis, errors = evaluate_curve(_numbers, curve, start)
     places = {name: values[name] for name in _PLACES}
     return Bandwidth(
         **values,
@@ -235,7 +235,7 @@ def _numbers(curve: Curve, start: Float[Array, ""] | None) -> tuple[Numbers, Num
     by_phase = _falls_through(curve, phase, clear, _PHASE_MARGIN - jnp.pi)
     w180 = _falls_through(curve, phase, clear, -jnp.pi)
     by_gain, crossings = _gain_bandwidth(curve, values, w180)
-    top = known_to(curve, clear)
+    top = top_of_clear(curve, clear)
     targets = (-jnp.pi, _PHASE_MARGIN - jnp.pi)
     passes = [jnp.sum(crossed(phase - target, "both") & clear) for target in targets]
     numbers = {

@@ -59,7 +59,7 @@ def basis_of(
     return Basis(band, phase[0], unclear, finite, {}, curve.dropped)
 
 
-def found(
+def evaluate_curve(
     numbers: Callable[..., tuple[Numbers, Numbers, Basis]], curve: Curve, *args: Argument
 ) -> tuple[Numbers, Basis, Numbers]:
     """Numbers, basis and standard errors of a curve; the last are empty for a model.

@@ -196,7 +196,7 @@ def _require_grid(omega: Float[ArrayLike, " frequencies"]) -> None:
     grid = np.asarray(omega)
     if grid.ndim != 1 or grid.size < 3:
         raise ValueError(
-            f"omega has the shape {grid.shape}: it takes 3 usable frequencies at least, in one row"
+            f"omega has the shape {grid.shape}: give a row of 3 usable frequencies or more"
         )
     if not (np.all(np.isfinite(grid)) and grid[0] > 0 and np.all(np.diff(grid) > 0)):
         raise ValueError(

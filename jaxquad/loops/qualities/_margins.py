@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
+from ._basis import Basis, basis_of, evaluate_curve, Numbers, only_finite, with_coherence
 from ._crossings import crossed, crossings
 from ._curve import Curve, curve_of, Response
 from ._nyquist import remarks_on_roots, unstable_roots
@@ -102,7 +102,9 @@ def margins(
     Source: Tischler & Remple, broken-loop responses; delay margin = phase margin / crossover.
     """
     curve = curve_of(loop, omega, output, input)
-    values, basis, errors = found(_numbers, curve, jnp.asarray(unstable_poles, curve.omega.dtype))
+    values, basis, errors = evaluate_curve(
+        _numbers, curve, jnp.asarray(unstable_poles, curve.omega.dtype)
+    )
     places = {"crossover": values["crossover"], "phase_crossover": values["phase_crossover"]}
     places["reduction_crossover"] = values["reduction_crossover"]
     basis = with_coherence(basis, curve, places)

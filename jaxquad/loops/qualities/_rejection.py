@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ._basis import Basis, basis_of, found, Numbers, only_finite, with_coherence
+from ._basis import Basis, basis_of, evaluate_curve, Numbers, only_finite, with_coherence
 from ._crossings import between, crossed, first
 from ._curve import Curve, curve_of, Response
 from ._nyquist import remarks_on_roots, unstable_roots
@@ -94,10 +94,10 @@ def disturbance_rejection(
     Source: MIL-DTL-32742 / CONDUIT's DRB (-3 dB) and DRP.
     """
     if quantity not in ("loop", "sensitivity"):
-        raise ValueError(f'quantity is {quantity!r}: say "loop" or "sensitivity"')
+        raise ValueError(f'quantity is {quantity!r}: choose "loop" or "sensitivity"')
     curve = curve_of(response, omega, output, input)
     poles = jnp.asarray(unstable_poles, curve.omega.dtype)
-    values, basis, errors = found(_numbers, curve, quantity, poles)
+    values, basis, errors = evaluate_curve(_numbers, curve, quantity, poles)
     basis = with_coherence(basis, curve, {name: values[name] for name in _PLACES})
     return Rejection(
         **values,

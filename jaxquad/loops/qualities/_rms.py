@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import is_concrete
 
-from ._basis import Basis, basis_of, found, Numbers, only_finite
+from ._basis import Basis, basis_of, evaluate_curve, Numbers, only_finite
 from ._curve import Curve, curve_of, Response
 from ._text import lines, shown
 
@@ -132,11 +132,11 @@ def rms_response(
     Source: Wiener-Khinchin; Tischler & Remple, spectral analysis.
     """
     if sides not in _SIDES:
-        raise ValueError(f'sides is {sides!r}: say "one" or "two"')
+        raise ValueError(f'sides is {sides!r}: choose "one" or "two"')
     curve = curve_of(response, omega, output, input)
     if not callable(spectrum):
         spectrum = _on_grid(spectrum, curve)
-    values, basis, errors = found(_numbers, curve, spectrum, _SIDES[sides])
+    values, basis, errors = evaluate_curve(_numbers, curve, spectrum, _SIDES[sides])
     return RmsResponse(**values, standard_errors=errors, basis=basis)
 
 

@@ -11,13 +11,13 @@ from jaxtyping import Float, Int
 
 from .._errors import ReadError
 from .._log import Log, Table
-from ._betaflight_frames import ADJUSTMENT, Found, Payload, payload
+from ._betaflight_frames import ADJUSTMENT, Frames, Payload, payload
 from ._betaflight_header import Frame, Header, headers, MARKER, scaled, with_axis_sums
 from ._betaflight_predict import add_constants, believed, constants, elapsed, predicted, segments
 
 
 def slow_tables(
-    slow: dict[str, Found], main: Found, time: Float[np.ndarray, " samples"], header: Header
+    slow: dict[str, Frames], main: Frames, time: Float[np.ndarray, " samples"], header: Header
 ) -> dict[str, Table]:
     """The tables `slow` (flight modes) and `gps`, stamped with the last main frame before.
 
@@ -61,7 +61,7 @@ def table(
 
 
 def _home(
-    homes: Found | None, frame: Frame, offsets: np.ndarray, rows: np.ndarray
+    homes: Frames | None, frame: Frame, offsets: np.ndarray, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The home coordinates for the fields that refer to them, and the rows that have one."""
     fields = int((frame.predictors == 7).sum())
@@ -117,7 +117,7 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
     if not rows.size:
         raise ReadError("the log holds no readable frame", offset=header.payload)
     left_out = held.main.offsets.size - rows.size
-    main = Found(*(part[rows] for part in held.main)) if left_out else held.main
+    main = Frames(*(part[rows] for part in held.main)) if left_out else held.main
     time = _seconds(main.coded[:, 1])
     tables = {"": _main_table(main, time, header)} | slow_tables(held.slow, main, time, header)
     remarks = _remarks(held, rows)
@@ -136,7 +136,7 @@ def _seconds(counter: np.ndarray) -> np.ndarray:
     return np.concatenate([[start], start + passed]) / 1e6
 
 
-def _main_table(main: Found, time: np.ndarray, header: Header) -> Table:
+def _main_table(main: Frames, time: np.ndarray, header: Header) -> Table:
     fields = table(main.coded, header.frames["I"], time, header)
     return dataclasses.replace(fields, columns=with_axis_sums(fields.columns))
 

@@ -176,7 +176,7 @@ class Damage(NamedTuple):
     size: int
 
 
-class Found(NamedTuple):
+class Frames(NamedTuple):
     """Frames with the same fields, as coded: the predictions are not yet added."""
 
     offsets: Int[np.ndarray, " frames"]
@@ -187,8 +187,8 @@ class Found(NamedTuple):
 class Payload(NamedTuple):
     """What one log holds, each in the order of the file."""
 
-    main: Found  # I and P
-    slow: dict[str, Found]  # S, G, H
+    main: Frames  # I and P
+    slow: dict[str, Frames]  # S, G, H
     events: list[Event]
     damage: list[Damage]
 
@@ -199,20 +199,20 @@ class _Piece(NamedTuple):
     stop: int
     places: Int[np.ndarray, " places"]
     ends: Int[np.ndarray, " places"]  # -1 where no letter of a frame follows
-    coded: dict[str, Found]  # by letter, I and P together under M
+    coded: dict[str, Frames]  # by letter, I and P together under M
 
 
 def payload(data: bytes, header: Header) -> Payload:
     """Walk from frame to frame; after damage, on to the next place from which that works."""
     result = Payload(_nothing(header, "I"), {}, [], [])
-    found: dict[str, list[Found]] = {}
+    found: dict[str, list[Frames]] = {}
     at, stored = header.payload, 0
     while at < header.stop:
         piece = _piece(data, header, at)
         at, on_path = _walk(data, header, piece, at, result)
         for letter, every in piece.coded.items():
             taken = on_path[np.searchsorted(piece.places, every.offsets)]
-            found.setdefault(letter, []).append(Found(*(part[taken] for part in every)))
+            found.setdefault(letter, []).append(Frames(*(part[taken] for part in every)))
             stored += found[letter][-1].coded.nbytes
         check_size("the blackbox log", stored, len(data), offset=header.offset)
     _forgive_cut(result.damage, header)
@@ -227,13 +227,13 @@ def _forgive_cut(damage: list[Damage], header: Header) -> None:
         damage.pop()
 
 
-def _joined(parts: list[Found]) -> Found:
-    return Found(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+def _joined(parts: list[Frames]) -> Frames:
+    return Frames(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _nothing(header: Header, letter: str) -> Found:
+def _nothing(header: Header, letter: str) -> Frames:
     fields = len(header.frames[letter].names)
-    return Found(np.empty(0, int), np.empty((0, fields), np.int32), np.empty(0, bool))
+    return Frames(np.empty(0, int), np.empty((0, fields), np.int32), np.empty(0, bool))
 
 
 def _piece(data: bytes, header: Header, at: int) -> _Piece:
@@ -260,7 +260,7 @@ def _piece(data: bytes, header: Header, at: int) -> _Piece:
 
 def _decoded(
     raw: np.ndarray, header: Header, places: np.ndarray
-) -> tuple[dict[str, Found], np.ndarray]:
+) -> tuple[dict[str, Frames], np.ndarray]:
     prepared = block(raw)
     letters = raw[places]
     ends = np.full(places.size, -1)
@@ -268,10 +268,10 @@ def _decoded(
     for letter, frame in header.frames.items():
         rows = np.flatnonzero(letters == ord(letter))
         values, ends[rows] = fields(prepared, frame, places[rows])
-        coded[letter] = Found(places[rows], values, np.full(rows.size, letter == "I"))
+        coded[letter] = Frames(places[rows], values, np.full(rows.size, letter == "I"))
     key, between = coded.pop("I"), coded.pop("P")
     order = np.argsort(np.concatenate([key.offsets, between.offsets]))
-    coded["M"] = Found(*(part[order] for part in _joined([key, between])))
+    coded["M"] = Frames(*(part[order] for part in _joined([key, between])))
     return coded, ends
 
 

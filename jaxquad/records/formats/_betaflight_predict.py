@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int, Integer
 
 from .._errors import ReadError
-from ._betaflight_frames import Damage, Event, Found, RESUME
+from ._betaflight_frames import Damage, Event, Frames, RESUME
 from ._betaflight_header import Frame, Header
 
 
@@ -28,7 +28,7 @@ class Segments(NamedTuple):
     whole: Bool[np.ndarray, " segments"]  # no damage before the next one
 
 
-def segments(main: Found, header: Header, damage: list[Damage]) -> Segments:
+def segments(main: Frames, header: Header, damage: list[Damage]) -> Segments:
     begin = np.flatnonzero(main.key)
     size = np.diff(np.append(begin, main.key.size))
     hits = np.array([d.offset for d in damage] + [np.iinfo(np.int64).max])
@@ -49,7 +49,7 @@ def scheduled(header: Header) -> Int[np.ndarray, " logged"]:
     )
 
 
-def predicted(main: Found, header: Header, parts: Segments) -> None:
+def predicted(main: Frames, header: Header, parts: Segments) -> None:
     """Turn the coded numbers of all usable rows into values, in place.
 
     Frame after frame, but for all segments at once: the average of the last two values is
@@ -144,7 +144,7 @@ class Believed(NamedTuple):
     scheduled: bool  # whether frames come as the intervals of the header say
 
 
-def believed(main: Found, header: Header, parts: Segments, events: list[Event]) -> Believed:
+def believed(main: Frames, header: Header, parts: Segments, events: list[Event]) -> Believed:
     """The rows that are in order, from the first to the last.
 
     A segment that ends at another iteration than the next key frame says has lost frames
@@ -160,7 +160,7 @@ def believed(main: Found, header: Header, parts: Segments, events: list[Event]) 
     return Believed(spread(parts.begin, usable), bool(as_scheduled))
 
 
-def in_order(main: Found, parts: Segments) -> Bool[np.ndarray, " segments"]:
+def in_order(main: Frames, parts: Segments) -> Bool[np.ndarray, " segments"]:
     """Key frames whose iteration and time go on together from those before.
 
     Neighbours that agree on the time per iteration form a run. A key frame that agrees with
@@ -187,7 +187,7 @@ def in_order(main: Found, parts: Segments) -> Bool[np.ndarray, " segments"]:
 
 
 def short(
-    main: Found,
+    main: Frames,
     header: Header,
     parts: Segments,
     keep: Bool[np.ndarray, " segments"],
@@ -205,7 +205,7 @@ def short(
 
 
 def until_time_leaps(
-    main: Found, begin: Int[np.ndarray, " segments"], usable: Int[np.ndarray, " segments"]
+    main: Frames, begin: Int[np.ndarray, " segments"], usable: Int[np.ndarray, " segments"]
 ) -> Int[np.ndarray, " segments"]:
     """Cut segments where time does not increase, jumps, or passes that of the next key frame."""
     usable = usable.copy()
@@ -219,10 +219,10 @@ def until_time_leaps(
     bad[1:] = (segment[1:] == segment[:-1]) & ((step <= 0) | (step > _LEAP))
     kept = np.flatnonzero(usable)
     key = np.ascontiguousarray(main.coded[begin[kept], 1]).view(np.uint32)
-    room = np.full(begin.size, 2**32)
-    room[kept[:-1]] = key[1:] - key[:-1]
+    until_next = np.full(begin.size, 2**32)
+    until_next[kept[:-1]] = key[1:] - key[:-1]
     since = time - np.repeat(key, usable[kept])
-    bad |= since >= room[segment]
+    bad |= since >= until_next[segment]
     local = rows - begin[segment]
     np.minimum.at(usable, segment[bad], local[bad])
     return usable
@@ -240,5 +240,5 @@ def elapsed(counter: Integer[np.ndarray, " rows"]) -> Int[np.ndarray, " steps"]:
     return np.diff(counter.view(np.uint32)).view(np.int32)
 
 
-def _counters(main: Found, rows: Int[np.ndarray, " rows"]) -> tuple[np.ndarray, np.ndarray]:
+def _counters(main: Frames, rows: Int[np.ndarray, " rows"]) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(main.coded[rows, 0]), np.ascontiguousarray(main.coded[rows, 1])
