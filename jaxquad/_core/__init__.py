@@ -1,3 +1,5 @@
+"""Arrays and checks, the members axis, Levenberg-Marquardt, numbers of threads."""
+
 from ._arrays import (
     align as align,
     as_float as as_float,

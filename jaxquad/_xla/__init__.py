@@ -1,3 +1,5 @@
+"""What knows the compiler: loops as one kernel, compiler options, devices."""
+
 from ._devices import (
     asked_devices as asked_devices,
     Devices as Devices,

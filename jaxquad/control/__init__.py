@@ -1,3 +1,5 @@
+"""Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
+
 from ._adaptive_ladrc import AdaptiveLADRC as AdaptiveLADRC
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
 from ._observers import (

@@ -1,3 +1,5 @@
+"""Predicted accuracy of a test, and multisines optimised for it."""
+
 from ._criteria import (
     AOptimal as AOptimal,
     Criterion as Criterion,

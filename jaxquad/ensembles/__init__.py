@@ -1,3 +1,5 @@
+"""Uncertain plants: distributions, members drawn from them, the posterior of a fit."""
+
 from ._distributions import (
     Choice as Choice,
     Distribution as Distribution,

@@ -1,3 +1,5 @@
+"""Test signals, such as sweeps and multisines, and the guidelines for them."""
+
 from ._excitation import Excitation as Excitation
 from ._guidelines import (
     check_guidelines as check_guidelines,

@@ -1,3 +1,5 @@
+"""Parameters of models from responses or records, with their accuracy and verification."""
+
 from ._assess import MISFIT as MISFIT
 from ._cost import (
     coherence_weight as coherence_weight,

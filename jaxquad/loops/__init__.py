@@ -1,3 +1,5 @@
+"""Closed loops: `Loop`, its linear analysis, handling qualities."""
+
 from jaxquad._core import align as align, per_member as per_member
 
 from ._analysis import (

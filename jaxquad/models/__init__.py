@@ -1,3 +1,5 @@
+"""Models of vehicles and axes: attitude dynamics, transfer functions, state spaces."""
+
 from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._axis import AttitudeAxis as AttitudeAxis

@@ -1,3 +1,5 @@
+"""Figures with matplotlib."""
+
 from ._bode import bode as bode, COHERENT as COHERENT, Model as Model
 from ._certificate import certificate_figure as certificate_figure
 from ._convergence import convergence_figure as convergence_figure

@@ -1,3 +1,5 @@
+"""Records of a flight or a test: channels, formats of logs, resampling, proposals of channels."""
+
 from ._channel import Channel as Channel
 from ._edit import detrend as detrend, mix as mix, select as select, trim as trim
 from ._errors import (

@@ -1,3 +1,5 @@
+"""Result files and the HTML report."""
+
 from ._comparison import compare_fits as compare_fits
 from ._page import (
     Cell as Cell,

@@ -1,3 +1,5 @@
+"""Closed loops in time: scenarios, signals, sensors, drives, metrics."""
+
 from ._authority import (
     Authority as Authority,
     authority as authority,

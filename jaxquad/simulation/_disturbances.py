@@ -38,11 +38,21 @@ def gauss_markov(
 
 
 class Pulse(Signal):
-    """`amplitude` for `width` s from the time `at` (s), once or in every `period` (s).
+    """A pulse, or a train of pulses: `amplitude` for `width` s from the time `at` on.
 
-    A train may give the `share` of the period instead of the width; it is rounded to samples. With
-    inertia for amplitude it is a payload that is picked up and set down.
-    Raises ValueError for a pulse longer than its period.
+    As a payload it is picked up and set down.
+
+    **Arguments:**
+
+    - `amplitude`: in the unit of what it is given for (a disturbance: N m, a payload: kg m^2); one
+        value, or one per member.
+    - `width`: s.
+    - `period`: s; the pulse is repeated in every period, by default it is not.
+    - `share`: the part of the period that a pulse lasts, instead of `width`; rounded to samples.
+    - `at`: s from the start.
+
+    **Raises:** ValueError for a pulse longer than its period, and for both or none of `width` and
+    `share`.
     """
 
     amplitude: Float[Array, "..."] = eqx.field(converter=as_float)

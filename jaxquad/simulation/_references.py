@@ -10,7 +10,16 @@ from ._signal import as_signal, Clock, Motion, Signal, spread
 
 
 class Step(Signal):
-    """From `before` to `after` at the time `at` (s); a constant by default."""
+    """From `before` to `after` at the time `at`; a constant by default.
+
+    **Arguments:**
+
+    - `after`, `before`: in the unit of what it is given for (a reference: rad); one value, or one
+        per member.
+    - `at`: s from the start.
+
+    **Raises:** ValueError for a value that is not finite.
+    """
 
     after: Float[Array, "..."] = eqx.field(converter=as_float)
     before: Float[Array, "..."] = eqx.field(converter=as_float, default=0.0, kw_only=True)

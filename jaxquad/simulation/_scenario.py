@@ -24,11 +24,22 @@ class Scenario(eqx.Module):
     is None counts as zero. `payload` is inertia that the plant carries in addition to its own.
     `jq.scenario(...)` builds a scenario from signals of single axes.
 
+    **Arguments:**, all arrays [samples, axes, *ensemble]:
+
+    - `reference`: set-point of the angles, rad.
+    - `injection`: signal added to the command, in the command's unit.
+    - `disturbance`: torque on the plant, N m.
+    - `noise`: error of the measured angles, rad.
+    - `rate`, `acceleration`: of the reference, rad/s and rad/s^2.
+    - `payload`: added inertia, kg m^2.
+
     **Raises:** ValueError for arrays of different numbers of samples, axes or members.
     """
 
     reference: Float[Array, "samples axes ..."] = per_member(rank=2)  # attitude set-point, rad
-    injection: Float[Array, "samples axes ..."] = per_member(rank=2)  # added to the command, V
+    injection: Float[Array, "samples axes ..."] = per_member(
+        rank=2
+    )  # added to the command, in its unit
     disturbance: Float[Array, "samples axes ..."] = per_member(rank=2)  # torque, N m
     noise: Float[Array, "samples axes ..."] = per_member(rank=2)  # on the measured angle, rad
     rate: Float[Array, "samples axes ..."] | None = per_member(
@@ -106,6 +117,8 @@ def scenario(
     - `ensemble`: the number of members, each of which draws its own noise from `key`.
     - `key`: what an axis draws depends on nothing but the key, the part and the axis (and on the
         precision: float32 draws other numbers).
+
+    **Returns:** the `Scenario`.
 
     **Raises:** ValueError for unknown axes, for times outside, and for arrays that do not fit.
     """

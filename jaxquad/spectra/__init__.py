@@ -1,3 +1,5 @@
+"""Frequency responses of records, and their random error."""
+
 from ._closed_loop import (
     deembed as deembed,
     feedback_bias as feedback_bias,

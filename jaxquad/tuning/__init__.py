@@ -1,3 +1,5 @@
+"""Tuning over an ensemble: objectives, limits, the optimiser, certificates, Pareto fronts."""
+
 from ._certificate import Certificate as Certificate
 from ._certify import certify as certify
 from ._design_result import (

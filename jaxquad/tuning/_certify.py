@@ -73,6 +73,10 @@ def certify(
     - `start`, `stop`, `load_start`, `devices`: see `jq.evaluate`; best as for the tuner.
     - `name`: of the design in the certificate.
 
+    **Returns:**
+
+    A `jq.tuning.Certificate`; `print` shows the verdict first, then limits and a table.
+
     **Raises:**
 
     - `ValueError`: parts do not fit together, or a limit is on what is not computed.
