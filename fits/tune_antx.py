@@ -44,7 +44,7 @@ EVENTS = (0.0, 1.5, 3.0, 4.5)  # s
 # An inertia of 1 makes torques accelerations in rad/s^2: the flight tells K = KT / J alone.
 ASSUMED: dict[str, Any] = {
     "inertia": jq.ensembles.LogUniform(*SPAN),
-    "told": jq.ensembles.Normal(0.1),
+    "assumed_inertia": jq.ensembles.Normal(0.1),
     "torque_gain": jq.ensembles.Normal(0.05),
     "noise": np.radians(0.01),  # theta of the flight has 0.007 deg of white noise above 20 Hz
 }
@@ -152,7 +152,12 @@ def main(out: Path, seed: int, size: Size, data: Path) -> None:
             "late": late(fit)._asdict(),
             "fit_percent_on_the_other_flight": check.fit_percent,
         },
-        "assumed": {"inertia": SPAN, "told": 0.1, "torque_gain": 0.05, "activity": activity},
+        "assumed": {
+            "inertia": SPAN,
+            "assumed_inertia": 0.1,
+            "torque_gain": 0.05,
+            "activity": activity,
+        },
         "crossover_and_peak": crossovers(found, case.loop.plant, fit),
     }
     files = write(out, found, front, name="antx_pitch", extra=extra)

@@ -40,7 +40,7 @@ SHEET_ROLL = jq.DecoupledAxes([2 * SHEET.arm * SHEET.thrust_coefficient], [INERT
 EVENTS = (0.0, 2.5, 4.5, 6.5)  # s
 ASSUMED: dict[str, Any] = {
     "inertia": jq.ensembles.LogUniform(*SPAN),
-    "told": jq.ensembles.Normal(0.1),
+    "assumed_inertia": jq.ensembles.Normal(0.1),
     "delay": 0.004,  # s
     "damping": 0.0,
     "stiffness": 0.0,

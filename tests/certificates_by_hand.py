@@ -29,7 +29,11 @@ def judged(itae: Any = 1.0, peak=2.0, activity=10.0, unstable: Any = ()):
 def certificate(designs, distances=()):
     shape = (1, MEMBERS)
     facts = {"inertia": 0.05 * INERTIA[None], "torque_gain": np.full(shape, 0.05)}
-    facts |= {"lag": np.full(shape, 0.02), "delay": np.zeros(shape), "told": np.ones(shape)}
+    facts |= {
+        "lag": np.full(shape, 0.02),
+        "delay": np.zeros(shape),
+        "assumed_inertia": np.ones(shape),
+    }
     return Certificate(
         designs, tuple(distances), facts, np.array([0.05]),
         {

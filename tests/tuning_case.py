@@ -39,7 +39,7 @@ def ensemble(**others):
     laws = {
         "inertia": LogUniform(*SPAN),
         "torque_gain": Normal(0.05),
-        "told": Normal(0.1),
+        "assumed_inertia": Normal(0.1),
         "lag": Uniform(0.01, 0.04),
         "delay": 0.004,
         "coulomb": 0.002,

@@ -107,7 +107,7 @@ def draw_members(
     return Members(
         plant=vary_plant(plant, drawn),
         delay=as_float(wide(delay)[0]),
-        inertia_told=as_float(wide(multiply(believed, drawn["told"]))),
+        assumed_inertia=as_float(wide(multiply(believed, drawn["assumed_inertia"]))),
         keys=make_member_keys(key, n),
         noise=as_float(wide(drawn["noise"])) if "noise" in given else None,
         gust=as_float(wide(drawn["gust"])) if "gust" in given else None,

@@ -20,7 +20,7 @@ from ._variation import count_axes, FACTORS, nominal_value, QUANTITIES, Variable
 _UNITS = {
     "inertia": "times the nominal",
     "torque_gain": "times the nominal",
-    "told": "times the true inertia",
+    "assumed_inertia": "times the true inertia",
     "lag": "s",
     "delay": "s",
     "damping": "N m s/rad",
@@ -54,13 +54,13 @@ def _line(name: str, one: Distribution, ensemble: "Ensemble") -> str:
     relative = one.relative and name not in FACTORS
     unit = "times the nominal" if relative else _UNITS[name]
     alone = ", each axis by itself" if name in ensemble.independent else ""
-    return f"  {name:<14} {one.text:<32} {unit}{alone}"
+    return f"  {name:<15} {one.text:<32} {unit}{alone}"
 
 
 _POSITIVE = {
     "inertia": "factors of the plant's inertia",
     "torque_gain": "factors of the plant's torque gain",
-    "told": "factors of the true inertia",
+    "assumed_inertia": "factors of the true inertia",
     "lag": "s; for motors without lag leave it None",
     "payload width": "s; None lasts to the end",
 }
@@ -202,8 +202,8 @@ class Ensemble(eqx.Module):
                        drive=jq.simulation.Saturation(10.0), delay=0.004)
         ensemble = jq.Ensemble(
             inertia=jq.ensembles.LogUniform(0.5, 3.0), torque_gain=jq.ensembles.Normal(0.05),
-            told=jq.ensembles.Normal(0.1), lag=jq.ensembles.Uniform(0.01, 0.04), coulomb=0.002,
-            noise=np.radians(0.02),
+            assumed_inertia=jq.ensembles.Normal(0.1), lag=jq.ensembles.Uniform(0.01, 0.04),
+            coulomb=0.002, noise=np.radians(0.02),
         )
         members = ensemble.draw(loop, 64, jax.random.key(0))
         ```
@@ -213,7 +213,7 @@ class Ensemble(eqx.Module):
     - `plants`: plants and delays that an identification leaves uncertain; the other quantities act
         on top of these.
     - `inertia`, `torque_gain`: factors of the plant's.
-    - `told`: the inertia that a scheduled controller is given, over the true one.
+    - `assumed_inertia`: the inertia that a scheduled controller assumes, over the true one.
     - `lag`: of the motors, in s.
     - `delay`: of the command, in s.
     - `damping`, `stiffness`, `coulomb`: N m s/rad, N m/rad and N m.
@@ -236,7 +236,7 @@ class Ensemble(eqx.Module):
     plants: Posterior | None = None
     inertia: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
     torque_gain: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
-    told: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
+    assumed_inertia: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
     lag: Distribution | None = eqx.field(
         converter=distribution_or_none, default=None, kw_only=True
     )  # s

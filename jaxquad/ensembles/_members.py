@@ -74,7 +74,7 @@ class Members(eqx.Module):
 
     plant: VariablePlant
     delay: Float[Array, " members"] = per_member(rank=0)  # s, of the command
-    inertia_told: Float[Array, "axes members"] = per_member(
+    assumed_inertia: Float[Array, "axes members"] = per_member(
         rank=1
     )  # kg m^2, for scheduled controllers
     keys: Key[Array, " members"] = per_member(rank=0)  # of noise and gusts
@@ -92,12 +92,12 @@ class Members(eqx.Module):
     @property
     def size(self) -> int:
         """How many members there are."""
-        return self.inertia_told.shape[-1]
+        return self.assumed_inertia.shape[-1]
 
     @property
     def axes(self) -> int:
         """How many angles the plant turns by."""
-        return self.inertia_told.shape[0]
+        return self.assumed_inertia.shape[0]
 
     def take(self, indices: ArrayLike | Sequence[int]) -> "Members":
         """Some of the members, with the noise that is theirs.
@@ -131,7 +131,7 @@ class Members(eqx.Module):
         delayed = self.longest_delay > 0
         return Loop(
             self.plant,
-            schedule_for_flight(controller, self.inertia_told),
+            schedule_for_flight(controller, self.assumed_inertia),
             drive=self.drive,
             encoder=self.encoder,
             delay=self.delay if delayed else 0.0,

@@ -10,7 +10,8 @@ from jaxquad._core import as_float
 from jaxquad.models import Allocation, Attitude, DecoupledAxes, MotorLag, Multirotor
 
 
-FACTORS = ("inertia", "torque_gain", "told")  # of nominal values; the others replace these
+# Factors of nominal values; the other quantities replace these.
+FACTORS = ("inertia", "torque_gain", "assumed_inertia")
 QUANTITIES = (*FACTORS, "lag", "delay", "damping", "stiffness", "coulomb", "noise", "gust")
 VariablePlant = DecoupledAxes | Multirotor
 Numbers = Float[np.ndarray, "..."]

@@ -34,7 +34,7 @@ class Controller(Protocol):
     and the command to hold. Further members are used where a controller has them:
 
     - `dt`: the sample interval in s that it was made for;
-    - `applied(state, achieved)`: told what the drive really gave, before the next sample;
+    - `applied(state, achieved)`: gets what the drive really gave, before the next sample;
     - `signals(state)`: a dict of arrays `[axes, *ensemble]` to record;
     - `prepared()`: the controller to run, with what is the same for all samples computed;
     - `linear(axis, member)`: a `jq.control.LinearController` to analyse.

@@ -46,8 +46,8 @@ def member_text(certificate: "Certificate", index: int) -> str:
     parts.append(f"KT {_joined(known['torque_gain'])}")
     if np.any(certificate.facts["delay"] > 0):
         parts.append(f"delay {_joined(1e3 * known['delay'])} ms")
-    if not np.allclose(known["told"], 1):
-        parts.append(f"scheduled at {_joined(known['told'])} J")
+    if not np.allclose(known["assumed_inertia"], 1):
+        parts.append(f"scheduled at {_joined(known['assumed_inertia'])} J")
     return f"member {index}: {', '.join(parts)}"
 
 
@@ -236,7 +236,8 @@ class Certificate(eqx.Module):
 
     designs: dict[str, DesignResult]  # by name; what is certified comes first
     distances: tuple[Distance, ...]  # to each limit
-    facts: dict[str, Float[np.ndarray, "axes members"]]  # inertia, torque_gain, lag, delay, told
+    # inertia, torque_gain, lag and delay in SI units; assumed_inertia over the true one
+    facts: dict[str, Float[np.ndarray, "axes members"]]
     nominal: Float[np.ndarray, " axes"] | None  # inertia, kg m^2; None if it is not known
     provenance: Provenance
     remarks: tuple[str, ...]

@@ -125,7 +125,7 @@ def _facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
     wide = lambda x: np.broadcast_to(np.asarray(x) if x.ndim > 1 else x[:, None], shape)
     facts = {n: np.array(wide(x)) for n, x in given.items() if x is not None}
     facts["delay"] = np.array(np.broadcast_to(np.asarray(drawn.delay), shape))
-    return facts | {"told": np.asarray(drawn.inertia_told) / facts["inertia"]}
+    return facts | {"assumed_inertia": np.asarray(drawn.assumed_inertia) / facts["inertia"]}
 
 
 def _nominal_inertia(loop: Loop) -> Float[np.ndarray, " axes"]:
@@ -141,7 +141,7 @@ def _provenance(given: Ensemble | Members, drawn: Members, key: Key[Array, ""]) 
         "fresh": fresh,
         "sampling": "random" if fresh else "given",
         "key": np.asarray(jax.random.key_data(key)).tolist() if fresh else None,
-        "precision": str(drawn.inertia_told.dtype),
+        "precision": str(drawn.assumed_inertia.dtype),
         "ensemble": str(given).splitlines() if fresh else None,
         "device": jax.devices()[0].device_kind,
         "versions": {name: version(name) for name in names},
@@ -249,7 +249,7 @@ def _greatest(values: Float[np.ndarray, "parts axes members"]) -> np.ndarray:
 
 
 def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:
-    scheduled = schedule_for_analysis(controller, members.inertia_told)
+    scheduled = schedule_for_analysis(controller, members.assumed_inertia)
     if not isinstance(scheduled, LinearisableController):
         return None
     axes = flight.reference.shape[1]

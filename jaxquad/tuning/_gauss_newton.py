@@ -88,7 +88,7 @@ def minimise_squares(
     import lineax as lx
     import optimistix as optx
 
-    units = jnp.ones((problem.linear.inertia_told.shape[0], problem.members))
+    units = jnp.ones((problem.linear.assumed_inertia.shape[0], problem.members))
     given = _Given(coordinates, problem, objective.penalties, units, method.stride)
     own = jnp.sum(_errors(jnp.asarray(start), given) ** 2, axis=0)
     given = eqx.tree_at(lambda g: g.scale, given, jnp.sum(own, axis=0, keepdims=True) + 0 * own)

@@ -65,7 +65,7 @@ class LinearLoops(eqx.Module):
 
     axes: DecoupledAxes  # the plant near level flight
     delay: Float[Array, " members"]  # s
-    inertia_told: Float[Array, "axes members"]  # kg m^2
+    assumed_inertia: Float[Array, "axes members"]  # kg m^2
     longest_delay: float = eqx.field(static=True)  # s
     dt: float = eqx.field(static=True)  # s
     devices: Devices = eqx.field(static=True, default=())
@@ -73,7 +73,7 @@ class LinearLoops(eqx.Module):
     @property
     def members(self) -> int:
         """How many there are."""
-        return self.inertia_told.shape[-1]
+        return self.assumed_inertia.shape[-1]
 
     def numbers(
         self, controller: PyTree, wanted: Collection[str], smoothing: float
@@ -95,11 +95,11 @@ class LinearLoops(eqx.Module):
             return {name: each(x) for name, x in found.items()}
 
         if len(self.devices) < 2:
-            return run((self.axes, self.delay, self.inertia_told), controller)
+            return run((self.axes, self.delay, self.assumed_inertia), controller)
         full = lambda x: jnp.broadcast_to(
             x if x.ndim > 1 else x[:, None], (x.shape[0], self.members)
         )
-        own = (jax.tree.map(full, self.axes), self.delay, self.inertia_told)
+        own = (jax.tree.map(full, self.axes), self.delay, self.assumed_inertia)
         return over_devices(run, own, controller, devices=self.devices)
 
 
@@ -120,7 +120,9 @@ class Problem(eqx.Module):
 
     def loop_around(self, controller: PyTree) -> Loop:
         """The loops of all members around another controller."""
-        return self.loop.with_controller(schedule_for_flight(controller, self.linear.inertia_told))
+        return self.loop.with_controller(
+            schedule_for_flight(controller, self.linear.assumed_inertia)
+        )
 
     def in_time(
         self, controller: PyTree, wanted: Collection[str]
@@ -192,4 +194,4 @@ def _linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
     axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
     places = devices_for(members.size, asked_devices(devices))
     longest = float(members.longest_delay)
-    return LinearLoops(axes, members.delay, members.inertia_told, longest, members.dt, places)
+    return LinearLoops(axes, members.delay, members.assumed_inertia, longest, members.dt, places)

@@ -171,7 +171,7 @@ def _ensemble(posterior: Posterior, settings: TuneSettings) -> Ensemble:
     return Ensemble(
         posterior,
         inertia=LogUniform(*settings.spread),
-        told=Normal(settings.inertia_error) if settings.inertia_error else 1.0,
+        assumed_inertia=Normal(settings.inertia_error) if settings.inertia_error else 1.0,
         noise=np.radians(settings.noise),
     )
 

@@ -56,9 +56,9 @@ def made(plant, drive=None, nominal_delay: ArrayLike = 0.0, **laws) -> Around:
 def study(plant=AXIS, *, drive=None, **changes) -> Around:
     """The ensemble of docs/tuning.md."""
     laws = {
-        "inertia": LogUniform(0.5, 3.0), "torque_gain": Normal(0.05), "told": Normal(0.1),
-        "lag": Uniform(0.01, 0.04), "coulomb": 0.002, "noise": np.radians(0.02),
-        "gust_corner": 200.0,
+        "inertia": LogUniform(0.5, 3.0), "torque_gain": Normal(0.05),
+        "assumed_inertia": Normal(0.1), "lag": Uniform(0.01, 0.04), "coulomb": 0.002,
+        "noise": np.radians(0.02), "gust_corner": 200.0,
     }  # fmt: skip
     return made(plant, drive or jq.simulation.Saturation(10.0), 0.004, **(laws | changes))
 
@@ -74,7 +74,10 @@ def test_each_quantity_follows_its_law(many):
         "inertia": (many.plant.inertia / 0.0552, stats.loguniform(0.5, 3.0)),
         "gain": (many.plant.torque_gain / 0.0468, stats.truncnorm(-4, 4, 1, 0.05)),
         "lag": (many.plant.lag, stats.uniform(0.01, 0.03)),
-        "told": (many.inertia_told / many.plant.inertia, stats.truncnorm(-4, 4, 1, 0.1)),
+        "assumed_inertia": (
+            many.assumed_inertia / many.plant.inertia,
+            stats.truncnorm(-4, 4, 1, 0.1),
+        ),
     }
     for values, law in drawn.values():
         assert stats.kstest(np.asarray(values[0]), law.cdf).pvalue > 1e-3
@@ -127,7 +130,7 @@ def test_sobol_points_are_more_even_than_random_ones():
     law = {"inertia": Uniform(0.5, 1.5), "lag": Uniform(0.0 + 1e-9, 1.0), "torque_gain": 1.0}
 
     def discrepancy(sampling):
-        members = study(sampling=sampling, told=1.0, **law).draw(100, KEY)
+        members = study(sampling=sampling, assumed_inertia=1.0, **law).draw(100, KEY)
         points = [members.plant.inertia[0] / 0.0552 - 0.5, members.plant.lag[0]]
         return stats.qmc.discrepancy(np.clip(np.stack(points, axis=1), 0, 1))
 
@@ -160,7 +163,7 @@ def test_the_key_alone_decides_and_fresh_members_are_others():
     one, again, other = (ensemble.draw(COUNT, key) for key in (KEY, KEY, OTHER))
     fresh = ensemble.fresh(COUNT, KEY)
     assert all(map(np.array_equal, arrays(one), arrays(again)))
-    for drawn in (other, fresh, study(sampling="grid", told=1.0).fresh(COUNT, KEY)):
+    for drawn in (other, fresh, study(sampling="grid", assumed_inertia=1.0).fresh(COUNT, KEY)):
         assert not np.intersect1d(drawn.plant.inertia, one.plant.inertia).size
         assert not np.array_equal(drawn.flight(SCENARIO).noise, one.flight(SCENARIO).noise)
 
@@ -270,7 +273,7 @@ def test_a_member_flies_as_the_plant_that_it_stands_for():
         plant.torque_gain[:, k], plant.inertia[:, k], lag=plant.lag[:, k], coulomb=0.002
     )
     happening = eqx.tree_at(lambda s: s.noise, happens, happens.noise[..., k])
-    told = LADRC.scheduled_at(members.inertia_told[:, k])
+    told = LADRC.scheduled_at(members.assumed_inertia[:, k])
     alone = jq.simulate(
         jq.Loop(lone, told, delay=0.004, drive=jq.simulation.Saturation(10.0)), happening
     ).angle
@@ -308,7 +311,7 @@ def test_a_multirotor_varies_as_its_decoupled_axes_do(plant):
     for name in ("torque_gain", "inertia", "lag", "stiffness", "damping"):
         ours, theirs = (np.asarray(getattr(p, name)) for p in (apart, axes.plant))
         np.testing.assert_allclose(*np.broadcast_arrays(ours, theirs), rtol=1e-12)
-    np.testing.assert_allclose(members.inertia_told, members.plant.attitude.inertia, rtol=1e-12)
+    np.testing.assert_allclose(members.assumed_inertia, members.plant.attitude.inertia, rtol=1e-12)
     part = members.take([6]).plant
     np.testing.assert_array_equal(part.attitude.inertia, members.plant.attitude.inertia[:, 6:7])
     np.testing.assert_array_equal(part.motor.time_constant, members.plant.motor.time_constant[6:7])
@@ -362,7 +365,7 @@ def test_str_is_a_table_of_what_varies_and_how():
     lines = {line.split()[0]: line for line in text.splitlines()[1:]}
     assert "log-uniform 0.5 .. 3" in lines["inertia"] and "nominal" in lines["inertia"]
     assert "uniform 0.01 .. 0.04" in lines["lag"] and lines["lag"].endswith(" s")
-    assert "normal 1 +- 0.1" in lines["told"] and "latin" in text
+    assert "normal 1 +- 0.1" in lines["assumed_inertia"] and "latin" in text
     assert len(text.splitlines()) < 15
 
 
@@ -370,7 +373,7 @@ WRONG = {
     "inertia=Uniform(-0.1, 3)": (dict(inertia=Uniform(-0.1, 3.0)), "inertia .* -0.1.* above 0"),
     "inertia=Normal(0.3)": (dict(inertia=Normal(0.3)), "inertia .*LogNormal"),
     "inertia=0": (dict(inertia=0.0), "above 0"),
-    "told=Normal(0.25)": (dict(told=Normal(0.25)), "told"),
+    "assumed_inertia=Normal(0.25)": (dict(assumed_inertia=Normal(0.25)), "assumed_inertia"),
     "lag=0": (dict(lag=0.0), "leave it None"),
     "lag=Normal(0.1)": (dict(lag=Normal(0.1)), "give the mean"),
     "delay<0": (dict(delay=Uniform(-0.001, 0.004)), "cannot be negative"),

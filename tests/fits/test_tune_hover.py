@@ -81,7 +81,7 @@ def test_its_members_are_those_of_the_case_that_the_tuner_is_tested_on(script):
     loops = script.assumed().loop, tuning_case.loop()
     pairs = zip((ours, theirs), loops, strict=True)
     drawn, expected = (e.draw(loop, 8, jax.random.key(1)) for e, loop in pairs)
-    np.testing.assert_array_equal(drawn.inertia_told, expected.inertia_told)
+    np.testing.assert_array_equal(drawn.assumed_inertia, expected.assumed_inertia)
     np.testing.assert_array_equal(drawn.delay, expected.delay)
     ours, theirs = script.flight(), tuning_case.flight()
     np.testing.assert_allclose(ours.reference, theirs.reference)

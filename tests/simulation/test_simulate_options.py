@@ -136,7 +136,7 @@ def rotors():
     [
         ({"substeps": 0}, "substeps is 0"),
         ({"bound": -1.0}, "bound is -1.0 rad"),
-        ({"plant": rotors()}, "drive is None, but a Multirotor turns by four motor inputs"),
+        ({"plant": rotors()}, "drive is None, but a Multirotor takes four motor inputs"),
         ({"controller": PD([1.0] * 2, [1.0] * 2), "scenario": scenario(rate=0.1)}, "a PD feeds"),
         ({"scenario": scenario(noise=jnp.nan)}, "noise is not finite at sample 0"),
         ({"scenario": scenario(payload=-J)}, "must be above 0"),

@@ -84,7 +84,7 @@ def test_all_designs_meet_the_same_members_and_noise(certificate):
 
 def test_the_members_are_fresh_and_those_of_the_key(certificate):
     trained = OPEN.draw(LOOP, MEMBERS, jax.random.key(3))
-    seen = np.asarray(trained.inertia_told)[0]
+    seen = np.asarray(trained.assumed_inertia)[0]
     assert not np.isin(certificate.facts["inertia"][0], seen).any()
     again = judged()
     np.testing.assert_array_equal(again.facts["inertia"], certificate.facts["inertia"])

@@ -57,7 +57,7 @@ def test_all_points_and_peers_fly_the_same_fresh_members(found):
     inertias = [c.facts["inertia"] for c in found.certificates]
     for other in inertias[1:]:
         np.testing.assert_array_equal(inertias[0], other)
-    trained = np.asarray(OPEN.draw(LOOP, MEMBERS, jax.random.key(1)).inertia_told)
+    trained = np.asarray(OPEN.draw(LOOP, MEMBERS, jax.random.key(1)).assumed_inertia)
     assert not np.isin(inertias[0], trained).any()
     assert list(found.peers) == ["paper b0 = 3", "paper b0 = 1.6"]
     assert list(found.certificates[0].designs) == ["tuned"]
