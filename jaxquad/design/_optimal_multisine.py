@@ -136,7 +136,7 @@ def optimal_multisine(
     **Raises:**
 
     - `ValueError`: limits, lines or parameters that allow no design.
-    - `PrecisionError`: JAX runs in 32 bits.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
     """
     require_x64("a design")
     models = list(model) if isinstance(model, list | tuple) else [model]

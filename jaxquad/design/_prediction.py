@@ -139,7 +139,7 @@ def predict_accuracy(
     **Raises:**
 
     - `ValueError`: the excitation does not determine every parameter.
-    - `PrecisionError`: JAX runs in 32 bits.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
     """
     require_x64("a design")
     model = with_arrays(model)

@@ -93,7 +93,7 @@ def fit(
 
     - `ValueError`: for names that the model does not have, options that make no sense, and a
         solver that diverged.
-    - `PrecisionError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
 
     !!! example
 

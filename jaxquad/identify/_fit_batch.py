@@ -262,7 +262,7 @@ def fit_batch(
     **Raises:**
 
     - `ValueError`: responses on different frequencies or channels, or without a usable frequency.
-    - `PrecisionError`: JAX runs in 32 bits.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
     """
     require_x64("a fit")
     frfs = list(frfs)

@@ -67,7 +67,7 @@ def refine(
 
     - `ValueError`: what `jq.fit` and `jq.verify` refuse, and a model that cannot be simulated from
         its starting values.
-    - `PrecisionError`: JAX runs in 32 bits.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
 
     Source: Klein & Morelli, Aircraft System Identification, ch. 6 (modified Newton-Raphson with
     relaxation, errors corrected for coloured residuals).

@@ -179,7 +179,7 @@ def fit_transfer_function(
     **Raises:**
 
     - `ValueError`: orders that make no proper transfer function, and what `jq.fit` refuses.
-    - `PrecisionError`: JAX runs in 32 bits.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
 
     Source: Tischler & Remple, ch. 11, eq. 11.4.
     """

@@ -185,7 +185,7 @@ def guess_transfer_function(
 
     - `UndeterminedError`: fewer frequencies are usable than the orders need.
     - `ValueError`: orders that make no proper transfer function, or that no start fits.
-    - `PrecisionError`: JAX runs in 32 bits.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
     """
     require_x64("a transfer function")
     check_options(cost, band, min_coherence, 1)

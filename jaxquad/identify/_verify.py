@@ -159,7 +159,7 @@ def verify(
     **Raises:**
 
     - `ValueError`: a model of other channels, or one that is too unstable to be simulated.
-    - `PrecisionError`: JAX runs in 32 bits.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
 
     Source: Tischler & Remple, sec. 14.2, time-domain verification.
     """

@@ -12,6 +12,14 @@ class MotorDrive(eqx.Module):
 
     A command is the difference of voltages that Eq. (9) multiplies: V4 - V2 for roll, V1 - V3 for
     pitch, V1 - V2 + V3 - V4 for yaw, about a common `bias`.
+
+    **Arguments:**
+
+    - `allocation`: of the vehicle, `plant.allocation` of a `jq.models.Multirotor`.
+    - `bias`: V, at which all motors turn in hover; the Quanser Hover's by default.
+    - `limit`: V, of each motor to either side; the Quanser Hover's by default.
+
+    **Raises:** ValueError for a bias beyond the limit.
     """
 
     allocation: Allocation
@@ -20,7 +28,10 @@ class MotorDrive(eqx.Module):
 
     def __check_init__(self):
         if not abs(self.bias) < self.limit:
-            raise ValueError(f"bias {self.bias} V must lie within the limit of {self.limit} V")
+            raise ValueError(
+                f"bias is {self.bias} V, but it must lie within the limit of {self.limit} V: lower "
+                "it, or raise the limit"
+            )
 
     def inputs(self, command: Float[Array, " 3 *ensemble"]) -> Float[Array, " 4 *ensemble"]:
         """Motor voltages, clipped at the amplifier's limit."""

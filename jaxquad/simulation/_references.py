@@ -84,7 +84,15 @@ class SmoothStep(Signal):
 
 
 class Sine(Signal):
-    """`amplitude` sin(2 pi (t - at) / period + phase) from the time `at` (s), zero before."""
+    """`amplitude` sin(2 pi (t - at) / period + phase) from the time `at` on, zero before.
+
+    **Arguments:**
+
+    - `amplitude`: one value, or one per member.
+    - `period`: s, longer than two samples.
+    - `phase`: rad.
+    - `at`: s from the start.
+    """
 
     amplitude: Float[Array, "..."] = eqx.field(converter=as_float)
     period: float = eqx.field(static=True, kw_only=True)  # s

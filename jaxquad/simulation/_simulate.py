@@ -21,8 +21,8 @@ from ._step import SampleResult
 class Simulation(eqx.Module):
     """What a simulated loop did, sample by sample.
 
-    A member that left the angles that count as flown is held where it was, with command 0, and
-    `diverged` tells it apart: its numbers are finite, but they describe no flight.
+    Where an angle exceeds the loop's `bound`, the member has `diverged`: it is held at that angle
+    with command 0. Its numbers are finite, but they describe no flight.
     """
 
     time: Float[Array, " samples"]  # s

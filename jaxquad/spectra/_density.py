@@ -66,7 +66,7 @@ def spectral_density(
     **Raises:**
 
     - `ValueError`: for frequencies that the window does not resolve, and records that differ.
-    - `jq.PrecisionError`: in 32 bits; call `jq.enable_x64()` first.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
     """
     records = [record] if isinstance(record, Record) else list(record)
     check_compatible(records)

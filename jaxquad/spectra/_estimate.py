@@ -114,7 +114,7 @@ def frequency_response(
 
     - `ValueError`: for frequencies that the records do not resolve, a channel that is constant or
         given twice, and a joint estimate without one reference for each input.
-    - `jq.PrecisionError`: in 32 bits; call `jq.enable_x64()` first.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
 
     !!! Example
 
