@@ -193,6 +193,8 @@ class Posterior(eqx.Module):
         """
         if recorded_dt is not None:
             require_all_positive(recorded_dt=recorded_dt)
+        if not isinstance(fit, Fit):
+            raise ValueError(f"fit is a {type(fit).__name__}: give the result of jq.fit")
         check_drawable(fit, hold_undetermined=True)
         self.fit, self.build = fit, _choose_builder(fit.model, believed, plant)
         self.held_back = 0.0 if recorded_dt is None else recorded_dt / 2

@@ -164,6 +164,8 @@ def verify(
     Source: Tischler & Remple, sec. 14.2, time-domain verification.
     """
     require_x64("a verification")
+    if not isinstance(record, Record):
+        raise ValueError(f"verify needs a jq.Record, not a {type(record).__name__}: see jq.read")
     plant = linear_model(model)
     check_channels(plant, record)
     gain, shares = band_gain(band, record), _weights(weights, record)

@@ -97,6 +97,11 @@ class Loop(eqx.Module):
             raise ValueError(f"substeps is {self.substeps}: give a whole number, 1 or more")
         message = f"bound is {self.bound} rad: give an angle above 0"
         _require_positive_number(self.bound, message)
+        if isinstance(self.controller, Plant) and not isinstance(self.controller, Controller):
+            raise ValueError(
+                f"the controller is a {type(self.controller).__name__}, which is a plant: give "
+                "jq.Loop(plant, controller, ...)"
+            )
         made_for = sample_interval(self.controller)
         if made_for is not None and not math.isclose(made_for, self.dt, rel_tol=1e-6):
             raise ValueError(

@@ -21,6 +21,12 @@ from ._step import Carry, LoopStep, make_step, require_runnable, SampleResult
 
 def check_run(loop: Loop, scenario: Scenario) -> None:
     """Raises ValueError for a loop that cannot run, and for a scenario that does not fit it."""
+    if not isinstance(loop, Loop):
+        raise ValueError(f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...)")
+    if not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"scenario is a {type(scenario).__name__}: give jq.scenario(duration=..., ...)"
+        )
     require_runnable(loop.controller)
     if scenario.payload is not None:
         _check_payload(loop.plant, scenario.payload)

@@ -180,7 +180,9 @@ def _place(name: str, axis: str | int, names: tuple[str, ...]) -> int:
         return names.index(axis)
     if isinstance(axis, int) and 0 <= axis < len(names):
         return axis
-    raise ValueError(f"{name} of the axis {axis!r}: choose one of {', '.join(names)}")
+    raise ValueError(
+        f"{name} of the axis {axis!r}: choose one of {', '.join(names)}, or give other axes="
+    )
 
 
 def _fold(key: Key[Array, ""] | None, k: int) -> Key[Array, ""] | None:

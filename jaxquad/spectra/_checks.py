@@ -22,6 +22,11 @@ def check_compatible(records: Sequence[Record]) -> None:
     """Raise `ValueError` unless the records have the same channels and sample rate."""
     if not records:
         raise ValueError("no record is given: pass one jq.Record or a list of them")
+    odd = [type(one).__name__ for one in records if not isinstance(one, Record)]
+    if odd:
+        raise ValueError(
+            f"the records hold a {odd[0]}: pass one jq.Record or a list of them, see jq.read"
+        )
     first = records[0]
     for other in records[1:]:
         if not math.isclose(other.dt, first.dt, rel_tol=1e-6):

@@ -82,6 +82,11 @@ def certify(
     - `ValueError`: parts do not fit together, or a limit is on what is not computed.
     """
     key = jax.random.key(0) if key is None else key
+    if not isinstance(ensemble, Ensemble | Members):
+        raise ValueError(
+            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
+            "jq.ensembles.Members of it"
+        )
     given = isinstance(ensemble, Members)
     # Independent draws, as the bound of a share needs.
     drawn = ensemble if given else ensemble.fresh(loop, members, key)

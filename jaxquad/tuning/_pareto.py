@@ -162,7 +162,7 @@ def pareto(
         raise ValueError(f"no front over {over!r}: choose one of {', '.join(_NAMES)}")
     over, objective = _NAMES[over], Objective() if objective is None else objective
     method = LBFGS() if method is None else method
-    require_kinds(loop, ensemble, objective, limits, method)
+    require_kinds(loop, ensemble, scenario, objective, limits, method)
     held = _levels(over, objective, points, levels)
     if isinstance(ensemble, Members) and not isinstance(fresh, Members):
         raise ValueError("the members to tune on are given: give fresh=, other members, too")

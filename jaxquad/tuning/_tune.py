@@ -102,7 +102,7 @@ def tune(
     """
     objective = Objective() if objective is None else objective
     method = LBFGS() if method is None else method
-    require_kinds(loop, ensemble, objective, limits, method)
+    require_kinds(loop, ensemble, scenario, objective, limits, method)
     key = jax.random.key(0) if key is None else key
     span, watched = TimeSpan.of(objective), Progress(progress, listener)
     coordinates = select_coordinates(loop.controller, free)
@@ -241,7 +241,12 @@ def _remarks(
 
 
 def require_kinds(
-    loop: object, ensemble: object, objective: object, limits: object, method: object
+    loop: object,
+    ensemble: object,
+    scenario: object,
+    objective: object,
+    limits: object,
+    method: object,
 ) -> None:
     """Raise ValueError for an argument of another kind, and for limits on no sum of squares."""
     if not isinstance(loop, Loop):
@@ -253,6 +258,10 @@ def require_kinds(
         raise ValueError(
             f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
             "jq.ensembles.Members of it"
+        )
+    if not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"scenario is a {type(scenario).__name__}: give jq.scenario(duration=..., ...)"
         )
     if not isinstance(objective, Objective):
         name = type(objective).__name__
