@@ -1,0 +1,42 @@
+"""An argument of the wrong kind is refused with what to give instead."""
+
+from typing import Any
+
+import jaxtyping
+import numpy as np
+import pytest
+
+import jaxquad as jq
+
+
+@pytest.fixture(autouse=True)
+def without_type_checks():
+    """As in use: the tests check the types of all arguments, a user's Python does not."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)
+
+
+PLANT = jq.DecoupledAxes([0.05], [0.05])
+LOOP = jq.Loop(PLANT, jq.LADRC(10.0, 30.0, 1.0))
+WRONG: Any = "flight.csv"
+FLIGHT = jq.scenario(duration=1.0, axes=1)
+CALLS = {
+    "the records hold a str: .* see jq.read": lambda: jq.frequency_response(WRONG, np.ones(1)),
+    "verify needs a jq.Record, not a str": lambda: jq.verify(jq.LaggedIntegrator(1.0), WRONG),
+    "scenario is a str: give jq.scenario": lambda: jq.simulate(LOOP, WRONG),
+    "loop is a str: give jq.Loop": lambda: jq.evaluate(WRONG, FLIGHT),
+    "scenario is a str: give": lambda: jq.tune(LOOP, jq.Ensemble(), WRONG),
+    "ensemble is a str: give jq.Ensemble": lambda: jq.certify(LOOP, WRONG, FLIGHT),
+    "fit is a str: give the result of jq.fit": lambda: jq.ensembles.Posterior(
+        WRONG, recorded_dt=None
+    ),
+    "the controller is a DecoupledAxes, which is a plant": lambda: jq.Loop(WRONG, PLANT),
+}
+
+
+@pytest.mark.parametrize("message", CALLS)
+def test_an_argument_of_the_wrong_kind_is_refused(message):
+    with pytest.raises(ValueError, match=message):
+        CALLS[message]()
