@@ -21,6 +21,7 @@ def without_type_checks():
 PLANT = jq.DecoupledAxes([0.05], [0.05])
 LOOP = jq.Loop(PLANT, jq.LADRC(10.0, 30.0, 1.0))
 WRONG: Any = "flight.csv"
+AXES: Any = PLANT
 FLIGHT = jq.scenario(duration=1.0, axes=1)
 CALLS = {
     "the records hold a str: .* see jq.read": lambda: jq.frequency_response(WRONG, np.ones(1)),
@@ -32,7 +33,7 @@ CALLS = {
     "fit is a str: give the result of jq.fit": lambda: jq.ensembles.Posterior(
         WRONG, recorded_dt=None
     ),
-    "the controller is a DecoupledAxes, which is a plant": lambda: jq.Loop(WRONG, PLANT),
+    "the controller is a DecoupledAxes, which is a plant": lambda: jq.Loop(PLANT, AXES),
 }
 
 

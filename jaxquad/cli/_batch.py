@@ -22,7 +22,7 @@ SOME_FAILED = 4
 
 
 def _add(declared: argparse.ArgumentParser) -> None:
-    declared.add_argument("folder", type=Path, help="where the logs are")
+    declared.add_argument("folder", type=Path, help="the folder that contains the logs")
     add_config(declared)
     add_out(declared, "results/NAME of the folder")
     declared.add_argument(

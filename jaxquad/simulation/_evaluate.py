@@ -1,3 +1,4 @@
+import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._core import as_float
-from jaxquad._xla import Devices, gathered, Jit
+from jaxquad._xla import as_one_kernel, Devices, gathered, Jit
 from jaxquad.loops import Loop
 
 from ._authority import Authority, find_authority, warn_beyond_authority
@@ -140,18 +141,24 @@ def _replay(simulation: Simulation, span: Window, gain: Array | None) -> dict[st
     if gain is None and found is not None:
         gain = found.torque_gain
     sums = _accumulator(scenario, span, simulation.dt, found, gain)
-    like = jnp.zeros_like(simulation.angle[0])
+    index = jnp.arange(simulation.angle.shape[0])
+    stored = (simulation.angle, simulation.command, simulation.saturated, simulation.signals)
+    given = (index, scenario.reference, scenario.disturbance, *stored)
+    arrays, rest = eqx.partition((sums, given), eqx.is_array)
+    total = as_one_kernel(ft.partial(_add_up, rest), arrays)
+    return _numbers(sums, total, simulation.diverged, scenario, found)
+
+
+def _add_up(rest: PyTree, arrays: PyTree) -> Sums:
+    sums, given = eqx.combine(arrays, rest)
+    like = jnp.zeros_like(given[3][0])
 
     def sample(total: Sums, now: tuple) -> tuple[Sums, None]:
         index, reference, disturbance, angle, command, saturated, signals = now
         parts = (angle, widened(reference, like), widened(disturbance, like), command, saturated)
         return sums.update(total, _Sample(index, *parts, signals))
 
-    index = jnp.arange(simulation.angle.shape[0])
-    stored = (simulation.angle, simulation.command, simulation.saturated, simulation.signals)
-    given = (index, scenario.reference, scenario.disturbance, *stored)
-    total = jax.lax.scan(jax.checkpoint(sample), sums.begin(like), given)[0]
-    return _numbers(sums, total, simulation.diverged, scenario, found)
+    return jax.lax.scan(jax.checkpoint(sample), sums.begin(like), given)[0]
 
 
 def _accumulator(

@@ -249,7 +249,7 @@ class IdentifySettings(Settings):
         group=_MODEL,
     )
     zeros: int = option_field(
-        kinds.COUNT, 0, "and with this many zeros; 0 by default", group=_MODEL
+        kinds.COUNT, 0, "number of zeros, with --poles; 0 by default", group=_MODEL
     )
     band: Pair | None = option_field(
         kinds.BAND,
@@ -283,8 +283,12 @@ class IdentifySettings(Settings):
         "simulate the model on this record, which has the same channels",
         group=_CHECK,
     )
-    verify_start: float | None = option_field(kinds.TIME, None, "in that file's time", group=_CHECK)
-    verify_stop: float | None = option_field(kinds.TIME, None, "in that file's time", group=_CHECK)
+    verify_start: float | None = option_field(
+        kinds.TIME, None, "first time of that record to use", group=_CHECK
+    )
+    verify_stop: float | None = option_field(
+        kinds.TIME, None, "last time of that record to use", group=_CHECK
+    )
 
     def _check_together(self) -> None:
         one_of_two = (self.input is None) != (self.output is None)
