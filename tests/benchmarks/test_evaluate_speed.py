@@ -72,28 +72,29 @@ def rig(request):
 
 @pytest.mark.benchmark(group="evaluate")
 def test_evaluate(benchmark, rig):
-    found = benchmark(
-        lambda: jax.block_until_ready(evaluate(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS))
-    )
-    compiled = _run.lower(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS, WINDOW).compile()
+    loop = Loop(rig, CONTROLLER, drive=DRIVE)
+    found = benchmark(lambda: jax.block_until_ready(evaluate(loop, HAPPENS)))
+    compiled = _run.lower(loop, HAPPENS, WINDOW).compile()
     benchmark.extra_info["MB"] = reserved(compiled)
     assert np.isfinite(found.itae).all()
 
 
 @pytest.mark.benchmark(group="evaluate")
 def test_simulate_then_metrics(benchmark, rig):
-    run = lambda: metrics(simulate(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS))
+    loop = Loop(rig, CONTROLLER, drive=DRIVE)
+    run = lambda: metrics(simulate(loop, HAPPENS))
     found = benchmark(lambda: jax.block_until_ready(run()))
-    compiled = _run_stored.lower(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS).compile()
+    compiled = _run_stored.lower(loop, HAPPENS).compile()
     benchmark.extra_info["MB"] = reserved(compiled)
-    exact = evaluate(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS)
+    exact = evaluate(loop, HAPPENS)
     np.testing.assert_allclose(found.itae, exact.itae, rtol=1e-12)
 
 
 @pytest.mark.benchmark(group="evaluate")
 def test_alone(benchmark, rig):
     run = eqx.filter_jit(lambda loop, happens: scan_loop(loop, happens, LastAngle())[0])
-    benchmark(lambda: jax.block_until_ready(run(Loop(rig, CONTROLLER, drive=DRIVE), HAPPENS)))
+    loop = Loop(rig, CONTROLLER, drive=DRIVE)
+    benchmark(lambda: jax.block_until_ready(run(loop, HAPPENS)))
 
 
 @pytest.mark.benchmark(group="gradient of the mean ITAE, 3 gains")
