@@ -70,8 +70,8 @@ def scenario(samples=SAMPLES) -> Scenario:
 
 def as_c(inertia, samples=SAMPLES):
     law = LADRC(WC, WO, 1 / INERTIA, placement="continuous", dt=DT)
-    drive, case = Saturation(1.5), scenario(samples)
-    return lambda: simulate(Loop(Quadrotor(inertia), law, dt=DT, drive=drive), case)
+    loop, case = Loop(Quadrotor(inertia), law, dt=DT, drive=Saturation(1.5)), scenario(samples)
+    return lambda: simulate(loop, case)
 
 
 def rig(inertia):
@@ -81,8 +81,8 @@ def rig(inertia):
     gain = np.array([sheet.arm * sheet.thrust_coefficient] * 2 + [sheet.torque_coefficient])
     law = LADRC([4.0, 4.0, 2.0], [40.0, 40.0, 20.0], 1.8 * gain / INERTIA, dt=DT)
     case = eqx.tree_at(lambda s: s.disturbance, scenario(), 0.01 * scenario().disturbance)
-    drive = MotorDrive(allocation)
-    return lambda: simulate(Loop(plant, law, dt=DT, drive=drive), case)
+    loop = Loop(plant, law, dt=DT, drive=MotorDrive(allocation))
+    return lambda: simulate(loop, case)
 
 
 INERTIAS = INERTIA[:, None] * SPREAD
