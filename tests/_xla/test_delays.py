@@ -17,7 +17,7 @@ CASES = {
 }
 
 
-LONG = ("traced, vmap",)
+LONG = ("traced, vmap", "whole samples, single precision")
 
 
 @pytest.mark.parametrize(

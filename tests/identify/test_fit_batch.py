@@ -55,6 +55,7 @@ def one_by_one(response, weights):
     return np.asarray(found.value), np.sum(np.asarray(residuals(found.value, problem)) ** 2)
 
 
+@pytest.mark.slow
 def test_every_member_is_at_the_minimum_that_optimistix_finds():
     _, responses = measured()
     found = solved(responses)

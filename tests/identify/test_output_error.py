@@ -61,6 +61,7 @@ def test_the_estimate_is_that_of_scipy_over_all_unknowns():
     assert fit.cost == pytest.approx(SAMPLES, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_standard_errors_are_the_scatter_under_white_and_coloured_noise(pole):
     fits = [refined(CLEAN + 0.05 * noise(seed, pole), start=TRUTH) for seed in range(60)]

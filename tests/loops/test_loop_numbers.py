@@ -68,6 +68,7 @@ def test_windows_of_fast_sampling_are_those_of_continuous_time():
     assert 2.4 < np.min(found[1, 5:]) and np.max(found[1, 5:]) < 3.7
 
 
+@pytest.mark.slow
 def test_windows_at_2_ms_are_narrower_for_fast_observers():
     found = windows(
         *({"wo": 10 * k} for k in RATIOS), *({"gain": g, "b0": 3.0} for g in (1, 0.424))

@@ -152,6 +152,7 @@ def test_members_of_a_declared_field_are_judged_as_each_alone(step):
     assert together.itae.shape == (1, 3) and not together.diverged.any()
 
 
+@pytest.mark.slow
 def test_a_user_s_plant_and_controller_are_analysed_as_python_control_does():
     found = jq.analyse(loop())
     w = 60.0

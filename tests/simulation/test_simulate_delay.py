@@ -71,6 +71,7 @@ def final(delay):
     )
 
 
+@pytest.mark.slow
 def test_a_traced_delay_gives_the_same_and_its_gradient_is_that_of_differences():
     case = eqx.tree_at(lambda c: c.reference, pushed(), jnp.full((SAMPLES, 2), 0.1))
     concrete = simulate(Loop(PLANT, ladrc(), delay=0.0053), case)

@@ -55,6 +55,7 @@ def errors(estimator):
     )
 
 
+@pytest.mark.slow
 def test_the_composite_of_a_90_s_sweep_is_within_half_a_decibel_and_two_degrees():
     decibels, degrees = errors(Composite())
     assert decibels < 0.46 and degrees < 1.9

@@ -27,6 +27,7 @@ def fit(integrators):
     return error, jq.fit(start, frf, cost=jq.identify.MaximumLikelihood())
 
 
+@pytest.mark.slow
 def test_leakage_of_an_integrator_is_remarked_with_its_remedy():
     error, leaking = fit(integrators=0)
     (remark,) = [remark for remark in leaking.remarks if "leakage biases it" in remark]

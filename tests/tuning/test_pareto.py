@@ -45,6 +45,7 @@ def test_more_activity_buys_better_tracking_on_members_that_were_not_tuned_on(fo
     assert np.all(found.effort < 1.05 * np.array(LEVELS))
 
 
+@pytest.mark.slow
 def test_a_point_does_not_depend_on_those_that_descend_beside_it(found):
     others = swept((4.0, 10.0, 30.0))
     for a, b in zip(

@@ -72,6 +72,7 @@ def tuned(name):
     return run(STARTS[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STARTS)
 def test_every_start_is_stabilised_first_and_leads_to_the_same_cost(name):
     found = tuned(name)
@@ -106,6 +107,7 @@ def test_the_optimum_is_the_one_that_scipy_finds():
     assert tuned(name).evaluations <= 1.5 * scipys.nfev
 
 
+@pytest.mark.slow
 def test_a_limit_is_kept_and_is_said_to_hold_the_optimum_back():
     controller, free, limits = CASES["the map, wc, wo and the half-gain factors, with a limit"]
     found = run(controller, free=free, limits=limits)
