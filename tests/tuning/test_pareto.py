@@ -54,6 +54,7 @@ def test_a_point_does_not_depend_on_those_that_descend_beside_it(found):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_all_points_and_peers_fly_the_same_fresh_members(found):
     inertias = [c.facts["inertia"] for c in found.certificates]
     for other in inertias[1:]:
@@ -64,6 +65,7 @@ def test_all_points_and_peers_fly_the_same_fresh_members(found):
     assert list(found.certificates[0].designs) == ["tuned"]
 
 
+@pytest.mark.slow
 def test_a_front_is_printed_and_written(tmp_path, found):
     head, titles, *rows = str(found).splitlines()
     assert head.startswith("3 of 3 points are on the front of ITAE over activity, u^2/s, on 24")
