@@ -1,6 +1,7 @@
 """Imports go from higher subjects to lower ones, and through their faces."""
 
 import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ ORDER = (
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
 
 
-def imports(path: Path):
+def imports(path: Path) -> Iterator[tuple[str, ...]]:
     """The absolute names of the modules of this package that a file imports."""
     own = path.relative_to(ROOT).with_suffix("").parts
     package = own[:-1]

@@ -96,6 +96,7 @@ def test_errors_widened_by_misfit_widen_the_draws():
     assert spread(drawn.gain) == pytest.approx(fit.standard_errors[0], rel=0.05)
 
 
+@pytest.mark.slow
 def test_only_what_is_free_or_tied_gets_a_last_axis():
     """And a parameter that may cross zero is drawn as it is."""
     free = ("K_t", jq.identify.Real("K_af", scale=1e-2))

@@ -235,6 +235,7 @@ def test_what_a_blurred_parameter_is_determined_with_is_named_whatever_direction
     assert ("only lag + delay" in str(fit)) == alone and "lag + delay is determined" in str(fit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "seed", "count"), [(15.0, 1, 1), (15.0, 2, 0), (20.0, 0, 0), (20.0, 2, 0)]
 )

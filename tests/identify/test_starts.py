@@ -105,6 +105,7 @@ def test_a_stationary_point_that_is_no_minimum_says_so():
     assert abs(abs(best.values[0] - 1.0) - 1.0) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_stop_at_a_wall_says_so_and_is_not_converged():
     problem = problem_of(Walled(jnp.asarray(1.0)), constant_response(), (jq.identify.Real("b"),))
     best, points = solve_from_many(problem, np.array([[1.0], [0.5], [3.0]]), None, 256)

@@ -156,6 +156,7 @@ def random_plant(rng, order):
     return model_of(zeros, poles, 10 ** rng.uniform(-2, 2) * rng.choice([1.0, -1.0]), delay)
 
 
+@pytest.mark.slow
 def test_automatic_starts_reach_the_lowest_minimum_of_random_plants():
     rng, reached = np.random.default_rng(7), []
     for k in range(20):

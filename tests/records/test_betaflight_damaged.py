@@ -146,6 +146,7 @@ def test_bytes_put_in_the_place_of_others_raise_nothing_but_read_errors(new, at,
     only_read_errors(SMALL[:at] + new + SMALL[at + gone :])
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.binary(max_size=2000))
 def test_any_payload_raises_nothing_but_read_errors(payload):

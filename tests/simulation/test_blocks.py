@@ -71,6 +71,7 @@ def cost_of(run):
     return lambda start, gains: jnp.sum(run(start, gains)[1][0] ** 2)
 
 
+@pytest.mark.slow
 def test_derivatives_through_chunks_blocks_and_kernels_are_those_of_the_plain_scan():
     for transform in (jax.grad, lambda f, argnums: jax.jacfwd(lambda g: f(START, g))):
         args = (START, GAINS) if transform is jax.grad else (GAINS,)
