@@ -2,6 +2,7 @@
 
 from ._certificate import Certificate as Certificate
 from ._certify import certify as certify
+from ._cost import Evaluation as Evaluation
 from ._design_result import (
     DesignResult as DesignResult,
     Distance as Distance,
@@ -25,7 +26,6 @@ from ._peers import (
     paper_designs as paper_designs,
     peers as peers,
 )
-from ._progress import Evaluation as Evaluation
 from ._quantities import QUANTITIES as QUANTITIES, Quantity as Quantity
 from ._tune import tune as tune
 from ._tuned import LimitResult as LimitResult, Optimum as Optimum, Tuned as Tuned

@@ -14,14 +14,13 @@ from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate
 from ._certify import certify
-from ._cost import stack_copies
+from ._cost import Progress, stack_copies
 from ._design_result import DesignResult, DesignSummary, front_point, summarise_design
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty
 from ._parameters import build_design, select_coordinates
 from ._phases import solve
 from ._problem import DeviceChoice, make_problem, TimeSpan
-from ._progress import Progress
 from ._quantities import QUANTITIES
 from ._tune import draw_or_take, require_kinds, stabilising_rate, tighten
 

@@ -12,13 +12,20 @@ from jaxtyping import ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad.control import ObserverController
 
-from ._cost import CostResult, evaluate_cost, Multipliers, Subproblem, take_problem
+from ._cost import (
+    CostResult,
+    evaluate_cost,
+    Evaluation,
+    Multipliers,
+    Progress,
+    Subproblem,
+    take_problem,
+)
 from ._gauss_newton import GaussNewton, minimise_squares
 from ._lbfgs import Descent, Evaluate, LBFGS, minimise
 from ._objective import Limit, Objective
 from ._parameters import build_design, Coordinates
 from ._problem import Problem
-from ._progress import Evaluation, Progress
 from ._quantities import QUANTITIES
 
 

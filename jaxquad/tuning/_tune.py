@@ -12,14 +12,13 @@ from jaxquad.simulation import find_steps, Scenario
 
 from ._certificate import Certificate, lag_remark
 from ._certify import certify, require_same_rate
-from ._cost import stack_copies
+from ._cost import Listener, Progress, stack_copies
 from ._gauss_newton import GaussNewton, require_squares
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective
 from ._parameters import build_design, select_coordinates
 from ._phases import Solution, solve
 from ._problem import DeviceChoice, make_problem, Problem, TimeSpan
-from ._progress import Listener, Progress
 from ._quantities import QUANTITIES
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
 

@@ -5,10 +5,10 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from ._certificate import Certificate
+from ._cost import Evaluation
 from ._objective import Limit
 from ._parameters import Coordinates
 from ._phases import Solution
-from ._progress import Evaluation
 
 
 _COST, _PLACE = 2e-3, 0.1  # within which two ends are one: of the cost, and in nepers
