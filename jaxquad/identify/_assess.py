@@ -54,6 +54,7 @@ def assess(
     misfit = misfit_ratio(data_cost, bread, noise)
     # A misfit beyond the noise is in no covariance of the noise: widen the errors to match it.
     inflation = misfit if misfit > MISFIT**2 else 1.0
+    by_noise = calibrated_covariance(bread, noise)
     covariance = calibrated_covariance(bread, noise, inflation)
     decrement = _decrement(bread, gradient, ran_to_zero(problem, solution))
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
@@ -66,7 +67,7 @@ def assess(
     return make_fit(
         problem,
         solution,
-        Estimate(bread, covariance, units[:count], verdict, decrement),
+        Estimate(bread, covariance, by_noise, units[:count], verdict, decrement),
         Costs(cost, average, information, misfit),
         points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in blocks),
         remarks=(
@@ -84,7 +85,8 @@ class Estimate(NamedTuple):
     """What the derivatives at the solution say about the parameters."""
 
     bread: Matrix  # J'J
-    covariance: Matrix  # calibrated, of relative changes
+    covariance: Matrix  # of relative changes, with what the model leaves unexplained
+    noise: Matrix  # of relative changes, by the measured noise alone
     units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
     verdict: Verdict
     decrement: float
@@ -108,10 +110,12 @@ def make_fit(
     points: int,
     remarks: tuple[str, ...],
     minima: tuple[Minimum, ...] = (),
+    degrees_of_freedom: float = np.inf,
 ) -> Fit:
-    """A result in physical units."""
-    bread, covariance, units, verdict, decrement = estimate
+    """A result in physical units; `degrees_of_freedom` are those of the noise estimate."""
+    bread, covariance, _, units, verdict, decrement = estimate
     names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
+    verdict = _with_freedom(verdict, degrees_of_freedom)
     if runaways(problem, solution):
         verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
     physical, unbounded = _physical_covariance(covariance, units, names, verdict)
@@ -122,6 +126,7 @@ def make_fit(
         values=values,
         standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
         covariance=physical,
+        noise_covariance=_in_units(estimate.noise, units, unbounded),
         cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
         insensitivity=insensitivity(bread) * percent,
         cost=costs.cost,
@@ -138,7 +143,15 @@ def make_fit(
         units=units,
         relative_covariance=covariance,
         minima=minima,
+        degrees_of_freedom=degrees_of_freedom,
     )
+
+
+def _with_freedom(verdict: Verdict, degrees_of_freedom: float) -> Verdict:
+    """The verdict whose combinations have intervals of these degrees of freedom."""
+    known = verdict.combinations
+    combinations = tuple(each._replace(degrees_of_freedom=degrees_of_freedom) for each in known)
+    return dataclasses.replace(verdict, combinations=combinations)
 
 
 def no_minimum(names: tuple[str, ...], decrement: float, cost: float, *remedies: str) -> Verdict:
@@ -163,9 +176,16 @@ def _physical_covariance(
     unbounded = lost & np.any(
         np.abs(np.reshape([*hidden, *verdict.exact], (-1, len(names)))) > 1e-6, axis=0
     )
+    return _in_units(relative, slopes, unbounded), unbounded
+
+
+def _in_units(
+    relative: Matrix, slopes: Float[np.ndarray, " parameters"], unbounded: np.ndarray
+) -> Matrix:
+    """A covariance of relative changes in physical units, nan where it is unbounded."""
     physical = relative * np.outer(slopes, slopes)
     physical[unbounded, :] = physical[:, unbounded] = np.nan
-    return physical, unbounded
+    return physical
 
 
 def unfitted(
@@ -181,6 +201,7 @@ def unfitted(
         values=values,
         standard_errors=infinite,
         covariance=np.full((count, count), np.nan),
+        noise_covariance=np.full((count, count), np.nan),
         cramer_rao=infinite,
         insensitivity=infinite,
         cost=np.nan,

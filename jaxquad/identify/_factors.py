@@ -132,9 +132,9 @@ def factors(fit: Fit) -> Factors:
         - above[0] / below[0] ** 2 * (_slopes(fit, "denominator", 1)[0])
     )
     late = _slopes(fit, "delay", 1)[0]
-    integrators = _integrators(fit, below)
+    integrators, freedom = _integrators(fit, below), fit.degrees_of_freedom
     return Factors(
-        gain=Combination("gain", *spread.given(float(above[0] / below[0]), gain_slope)),
+        gain=Combination("gain", *spread.given(float(above[0] / below[0]), gain_slope), freedom),
         zeros=_factored(above, _slopes(fit, "numerator", above.size), spread),
         poles=_factored(
             below[: below.size - integrators],
@@ -142,7 +142,7 @@ def factors(fit: Fit) -> Factors:
             spread,
         ),
         integrators=integrators,
-        delay=Combination("delay", *spread.given(float(model.delay), late)),
+        delay=Combination("delay", *spread.given(float(model.delay), late), freedom),
     )
 
 

@@ -207,7 +207,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     return make_fit(
         base,
         solution,
-        Estimate(bread, covariance, units[:count], verdict, decrement),
+        Estimate(bread, covariance, covariance, units[:count], verdict, decrement),
         Costs(cost, average, information, data_cost / max(rows - fitted, 1)),
         points=rows,
         remarks=(

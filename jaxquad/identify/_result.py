@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from ._accuracy import Matrix
 from ._parameters import Parameters
 from ._starts import Minimum
-from ._verdict import Combination, UndeterminedError, Verdict
+from ._verdict import Combination, reach_of_interval, UndeterminedError, Verdict
 
 
 _SHOWN = 6  # optima of several starts
@@ -87,6 +87,7 @@ class Fit(eqx.Module):
     values: Float[np.ndarray, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
+    noise_covariance: Float[np.ndarray, "parameters parameters"]
     cramer_rao: Float[np.ndarray, " parameters"]  # %
     insensitivity: Float[np.ndarray, " parameters"]  # %
     cost: float  # summed over the responses
@@ -103,6 +104,7 @@ class Fit(eqx.Module):
     units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
     relative_covariance: Float[np.ndarray, "parameters parameters"]
     minima: tuple[Minimum, ...] = ()  # distinct stops of several starts, by the first weights
+    degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard errors
 
     @property
     def identifiable(self) -> bool:
@@ -124,10 +126,24 @@ class Fit(eqx.Module):
         """Correlation matrix of the parameters."""
         return self.covariance / np.outer(self.standard_errors, self.standard_errors)
 
-    def interval(self, name: str) -> tuple[float, float]:
-        """The 95 % interval of one parameter."""
+    @property
+    def noise_standard_errors(self) -> Float[np.ndarray, " parameters"]:
+        """Standard errors by the measured noise alone, as if the model's structure were exact."""
+        unbounded = np.isinf(self.standard_errors)
+        return np.where(unbounded, np.inf, np.sqrt(np.diagonal(self.noise_covariance)))
+
+    def interval(self, name: str, *, model_error: bool = True) -> tuple[float, float]:
+        """The 95 % interval of one parameter.
+
+        **Arguments:**
+
+        - `name`: of the parameter.
+        - `model_error`: count what the model's structure leaves unexplained, as
+            `standard_errors` do; False for the measured noise alone.
+        """
         k = self.names.index(name)
-        reach = 1.96 * self.standard_errors[k]
+        errors = self.standard_errors if model_error else self.noise_standard_errors
+        reach = reach_of_interval(self.degrees_of_freedom) * errors[k]
         return float(self.values[k] - reach), float(self.values[k] + reach)
 
     def derived(
@@ -160,7 +176,7 @@ class Fit(eqx.Module):
                 "jq.identify.Prior or a second record, or ask for a determined combination"
             )
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
-        return Combination(name, float(quantity(self.model)), error)
+        return Combination(name, float(quantity(self.model)), error, self.degrees_of_freedom)
 
     def ensemble(self, n: int, key: Key[Array, ""], *, hold_undetermined: bool = False) -> PyTree:
         """Draw `n` models from the fit; leaves with free or tied numbers get a last axis `[n]`.

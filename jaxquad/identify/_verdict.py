@@ -14,17 +14,34 @@ class UndeterminedError(ValueError):
     """A number was asked for that the record does not determine; a ValueError."""
 
 
+def reach_of_interval(degrees_of_freedom: float) -> float:
+    """How many standard errors reach from the middle of a 95 % interval to its end.
+
+    **Arguments:**
+
+    - `degrees_of_freedom`: of the noise estimate behind the standard errors; infinite where the
+        noise is known.
+
+    **Returns:** the 97.5 % point of Student's t.
+    """
+    # Imported here: scipy.special takes a tenth of the time of `import jaxquad`.
+    from scipy.special import stdtrit
+
+    return 1.96 if np.isinf(degrees_of_freedom) else float(stdtrit(degrees_of_freedom, 0.975))
+
+
 class Combination(NamedTuple):
     """A product of powers, or a weighted sum, of parameters, with its standard error."""
 
     name: str
     value: float
     standard_error: float
+    degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard error
 
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval."""
-        reach = 1.96 * self.standard_error
+        reach = reach_of_interval(self.degrees_of_freedom) * self.standard_error
         return self.value - reach, self.value + reach
 
     def __str__(self) -> str:
