@@ -1,6 +1,5 @@
 """Records of a flight or a test: channels, formats of logs, resampling, proposals of channels."""
 
-from ._channel import Channel as Channel
 from ._edit import detrend as detrend, mix as mix, select as select, trim as trim
 from ._errors import (
     ReadError as ReadError,
@@ -9,7 +8,7 @@ from ._errors import (
 )
 from ._read import channels as channels, ChannelSummary as ChannelSummary, read as read
 from ._record import Record as Record
-from ._resample import resample as resample
+from ._resample import Channel as Channel, resample as resample
 from ._segments import (
     Mix as Mix,
     parse_mix as parse_mix,

@@ -1,5 +1,5 @@
 import functools as ft
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -7,8 +7,7 @@ from jaxtyping import Float
 
 from ._clock import window
 from ._errors import RecordError
-from ._names import as_tuple
-from ._record import Record
+from ._record import as_tuple, Record
 
 
 Channels = Float[np.ndarray, "samples channels"]
@@ -76,14 +75,16 @@ def select(
     - `record`: a `Record`.
     - `inputs`, `outputs`, `references`: names of channels of the record, whatever their role was.
 
-    **Returns:** a `Record` of the named channels, with their units.
+    **Returns:** a `Record` of the named channels, with their units. Its `hold` is known where every
+    input was one before.
 
     **Raises:**
 
     - `RecordError`: for a name that the record lacks or that is given twice.
     """
     roles = [as_tuple(names) for names in (inputs, outputs, references)]
-    return _assembled(record, roles, record.channel, record.unit)
+    hold = _hold_of(record, roles[0])
+    return _assembled(record, roles, record.channel, record.unit, hold)
 
 
 def mix(
@@ -123,11 +124,13 @@ def mix(
     unit = shared.pop() if len(shared) == 1 else ""
     roles = [record.input_names, record.output_names, record.reference_names]
     roles[_ROLES.index(role)] += (name,)
+    hold = _hold_of(record, weights) if role == "input" else record.hold
     return _assembled(
         record,
         roles,
         lambda each: column if each == name else record.channel(each),
         lambda each: unit if each == name else record.unit(each),
+        hold,
     )
 
 
@@ -147,11 +150,17 @@ def combine(
     return ft.reduce(np.add, (weight * values(source) for source, weight in weights.items()))
 
 
+def _hold_of(record: Record, sources: Iterable[str]) -> float | None:
+    """The hold of channels as inputs: known of the record's own inputs alone."""
+    return record.hold if set(sources) <= set(record.input_names) else None
+
+
 def _assembled(
     record: Record,
     roles: Sequence[tuple[str, ...]],
     values: Callable[[str], Float[np.ndarray, " samples"]],
     unit: Callable[[str], str],
+    hold: float | None,
 ) -> Record:
     blocks = [
         np.stack([values(name) for name in names], axis=1)
@@ -170,6 +179,7 @@ def _assembled(
         output_units=units[1],
         reference_units=units[2],
         source=record.source,
+        hold=hold,
     )
 
 
@@ -190,4 +200,5 @@ def _rebuilt(
         output_units=record.output_units,
         reference_units=record.reference_units,
         source=record.source,
+        hold=record.hold,
     )

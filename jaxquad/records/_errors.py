@@ -1,4 +1,9 @@
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
+
+
+_MOST_LISTED = 40  # names
 
 
 class RecordError(ValueError):
@@ -30,3 +35,24 @@ class RecordWarning(UserWarning):
 def located(error: ReadError, path: Path | str) -> ReadError:
     """The same error, with the file named."""
     return ReadError(f"{path}: {error.args[0]}", offset=error.offset)
+
+
+def unknown_name(name: str, known: Iterable[str]) -> str:
+    """What an error says of a `name` that is not among the `known` ones, with the nearest."""
+    known = list(known)
+    plain = {each.lower(): each for each in known}
+    near = difflib.get_close_matches(name.lower(), plain, n=1)
+    guess = f" Did you mean {plain[near[0]]!r}?" if near else ""
+    return f"there is no channel {name!r}.{guess} The channels are: {listed(known)}."
+
+
+def listed(names: Iterable[str]) -> str:
+    """The names, separated by commas; of many, the first 40."""
+    names = list(names)
+    more = f", and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
+    return f"{', '.join(names[:_MOST_LISTED]) or 'none'}{more}"
+
+
+def printable(text: str) -> str:
+    """Text from a file without terminal control characters, cut to 500 characters."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text[:500])

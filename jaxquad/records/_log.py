@@ -6,8 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from ._errors import ReadError
-from ._names import printable
+from ._errors import printable, ReadError
 
 
 @dataclasses.dataclass(frozen=True)

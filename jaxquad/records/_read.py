@@ -5,13 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._channel import Channel
 from ._clock import JITTER, nonuniformity, window
 from ._edit import combine
-from ._errors import located, ReadError, RecordError
-from ._names import as_tuple, check_distinct, unknown_name
-from ._record import Record
-from ._resample import resample
+from ._errors import located, ReadError, RecordError, unknown_name
+from ._record import as_tuple, check_distinct, Record
+from ._resample import Channel, resample
 from ._timebase import signal_names, Timebases, TimeUnit
 from .formats import load_signals
 
@@ -84,6 +82,7 @@ def read(
     time_unit: TimeUnit | None = None,
     max_gap: float | int | None = None,
     units: Mapping[str, str] | None = None,
+    hold: float | None = None,
 ) -> Record:
     """Read a record from a log: ArduPilot, PX4, Betaflight, Crazyflie, or a table of arrays.
 
@@ -107,6 +106,9 @@ def read(
     - `max_gap`: the longest gap that is interpolated, in s; see `resample`.
     - `units`: channel name of the record -> unit, for figures and tables; by default those of the
         log.
+    - `hold`: how long the plant's input keeps each value, in s, as in `Record`: 0 for what was
+        measured, the loop's period for a command. A record at a higher sample rate than that of the
+        hold shows straight lines where the input had steps: its hold is unknown.
 
     **Returns:** a `Record`. Overflows of the time counter are undone, and up to 1 % of time
     stamps that repeat or go back are dropped with their rows, both with a `RecordWarning`.
@@ -145,7 +147,13 @@ def read(
         output_units=[units[name] for name in roles[1]],
         reference_units=[units[name] for name in roles[2]],
         source=str(path),
+        hold=hold if span is not None else _after_resampling(hold, stamps),
     )
+
+
+def _after_resampling(hold: float | None, stamps: Float[np.ndarray, " samples"]) -> float | None:
+    """Input and output pass through one filter, so that a hold within a sample stays what it is."""
+    return None if hold and hold > 1.01 * (stamps[1] - stamps[0]) else hold
 
 
 def _all_units(

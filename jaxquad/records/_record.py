@@ -1,4 +1,5 @@
 import warnings
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -6,8 +7,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ._clock import check_increasing, check_uniform, FEWEST
-from ._errors import RecordError, RecordWarning
-from ._names import as_names, as_units, check_distinct, Names, unknown_name
+from ._errors import RecordError, RecordWarning, unknown_name
+
+
+Names = str | Sequence[str] | None
 
 
 class Record(eqx.Module):
@@ -23,11 +26,14 @@ class Record(eqx.Module):
         1 where there are several.
     - `input_units`, `output_units`, `reference_units`: empty where unknown.
     - `source`: where the data come from, such as a path.
+    - `hold`: how long the plant's input keeps each value, in s. 0 for a continuous quantity that
+        was measured, such as a rotor speed or a surface's deflection; the loop's period for a
+        command. `None` where nobody said. With it a fit tells the hold from the plant's own delay.
 
     **Raises:**
 
-    - `RecordError`: for arrays of unequal length, NaN, time stamps that are not uniform, and names
-        that occur twice. A channel that never changes gives a `RecordWarning`.
+    - `RecordError`: for arrays of unequal length, NaN, time stamps that are not uniform, names that
+        occur twice, and a `hold` below 0. A channel that never changes gives a `RecordWarning`.
     """
 
     time: Float[np.ndarray, " samples"]  # s
@@ -41,6 +47,7 @@ class Record(eqx.Module):
     output_units: tuple[str, ...] = eqx.field(static=True)
     reference_units: tuple[str, ...] = eqx.field(static=True)
     source: str = eqx.field(static=True)
+    hold: float | None = eqx.field(static=True)  # s; of the inputs
 
     def __init__(
         self,
@@ -56,6 +63,7 @@ class Record(eqx.Module):
         output_units: Names = None,
         reference_units: Names = None,
         source: str = "",
+        hold: float | None = None,
     ):
         self.time = _stamps(time)
         rows = self.time.size
@@ -63,13 +71,14 @@ class Record(eqx.Module):
         self.outputs = _columns("outputs", outputs, rows)
         none = np.empty((rows, 0))
         self.references = none if references is None else _columns("references", references, rows)
-        self.input_names = as_names(input_names, "u", self.inputs.shape[1])
-        self.output_names = as_names(output_names, "y", self.outputs.shape[1])
-        self.reference_names = as_names(reference_names, "r", self.references.shape[1])
-        self.input_units = as_units(input_units, self.input_names)
-        self.output_units = as_units(output_units, self.output_names)
-        self.reference_units = as_units(reference_units, self.reference_names)
+        self.input_names = _as_names(input_names, "u", self.inputs.shape[1])
+        self.output_names = _as_names(output_names, "y", self.outputs.shape[1])
+        self.reference_names = _as_names(reference_names, "r", self.references.shape[1])
+        self.input_units = _as_units(input_units, self.input_names)
+        self.output_units = _as_units(output_units, self.output_names)
+        self.reference_units = _as_units(reference_units, self.reference_names)
         self.source = source
+        self.hold = _held(hold)
         _check_channels(self)
 
     @property
@@ -116,7 +125,13 @@ class Record(eqx.Module):
         for role, members in zip(roles, names, strict=True):
             texts = [f"{name} [{self.unit(name)}]" if self.unit(name) else name for name in members]
             lines.append(f"  {role}: {', '.join(texts) or 'none'}")
+        if self.hold is not None:
+            lines.append(f"  inputs {_held_text(self.hold)}")
         return "\n".join(lines)
+
+
+def _held_text(hold: float) -> str:
+    return f"held for {hold:.6g} s" if hold else "measured, not held"
 
 
 def _each_channel(record: Record) -> list[Float[np.ndarray, " samples"]]:
@@ -138,6 +153,17 @@ def _stamps(time: ArrayLike) -> Float[np.ndarray, " samples"]:
     check_increasing("time", stamps)
     check_uniform(stamps)
     return stamps
+
+
+def _held(hold: float | None) -> float | None:
+    if hold is None:
+        return None
+    if not (np.isscalar(hold) and np.isreal(hold) and 0 <= float(hold) < np.inf):
+        raise RecordError(
+            f"hold is {hold!r}: give the time in s for which the input keeps each value, 0 for a "
+            f"continuous quantity that was measured, or None where it is unknown."
+        )
+    return float(hold)
 
 
 def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samples channels"]:
@@ -182,3 +208,42 @@ def _check_channels(record: Record) -> None:
                 RecordWarning,
                 stacklevel=4,
             )
+
+
+def _as_names(names: Names, letter: str, count: int) -> tuple[str, ...]:
+    """Names of `count` channels; by default `letter`, or `letter` with a number from 1."""
+    if names is None:
+        return (letter,) if count == 1 else tuple(f"{letter}{i + 1}" for i in range(count))
+    names = as_tuple(names)
+    if len(names) != count:
+        raise RecordError(
+            f"{len(names)} names {names} for {count} channels: give one name for each channel."
+        )
+    return names
+
+
+def _as_units(units: Names, names: Sequence[str]) -> tuple[str, ...]:
+    """One unit for each of the `names`; by default none is known (an empty string)."""
+    if units is None:
+        return ("",) * len(names)
+    units = as_tuple(units)
+    if len(units) != len(names):
+        raise RecordError(
+            f"{len(units)} units {units} for the channels {tuple(names)}: give one unit for each."
+        )
+    return units
+
+
+def as_tuple(names: str | Iterable[str]) -> tuple[str, ...]:
+    """A single string is one name, not a sequence of letters."""
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+def check_distinct(names: Sequence[str]) -> None:
+    """Raise RecordError for a name that stands for two channels."""
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise RecordError(
+            f"the channel name {twice[0]!r} occurs {names.count(twice[0])} times among "
+            f"{', '.join(names)}: give each channel of the record a different name."
+        )

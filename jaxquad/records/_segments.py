@@ -71,6 +71,7 @@ class _Options(NamedTuple):
     time: str | None
     time_unit: TimeUnit | None
     units: Mapping[str, str]
+    hold: float | None
 
 
 def read_segments(
@@ -84,6 +85,7 @@ def read_segments(
     time: str | None = None,
     time_unit: TimeUnit | None = None,
     units: Mapping[str, str] | None = None,
+    hold: float | None = None,
 ) -> list[Record]:
     """Read several segments of a file as records with one sample rate.
 
@@ -94,7 +96,7 @@ def read_segments(
     - `inputs`, `outputs`, `references`: name -> channel or its power (`m1^2`) -> weight, as
         `parse_mix` returns it.
     - `sample_rate`: in Hz; by default that of the slowest segment.
-    - `time`, `time_unit`, `units`: as in `read`.
+    - `time`, `time_unit`, `units`, `hold`: as in `read`.
 
     **Returns:** a `Record` for each segment. Each warning about the file is given once.
 
@@ -105,7 +107,7 @@ def read_segments(
     """
     _check(segments)
     roles = (inputs, outputs, references or {})
-    options = _Options(time, time_unit, units or {})
+    options = _Options(time, time_unit, units or {}, hold)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         records = [_mixed(path, roles, each, sample_rate, options) for each in segments]
@@ -151,6 +153,7 @@ def _mixed(
         stop=segment[1],
         time=options.time,
         time_unit=options.time_unit,
+        hold=options.hold,
     )
     terms = [{name: _terms(name, mix) for name, mix in role.items()} for role in roles]
     each = [term for role in terms for terms_of in role.values() for term in terms_of]
@@ -196,6 +199,7 @@ def _assembled(
         output_units=[units[name] for name in outputs],
         reference_units=[units[name] for name in references],
         source=raw.source,
+        hold=raw.hold,
     )
 
 

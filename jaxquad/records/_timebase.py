@@ -5,11 +5,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from ._channel import Channel
 from ._clock import repair, RepairedTime, unwrap
-from ._errors import ReadError, RecordWarning
+from ._errors import listed, ReadError, RecordWarning, unknown_name
 from ._log import Signal, Signals
-from ._names import listed, unknown_name
+from ._resample import Channel
 
 
 TimeUnit = Literal["s", "ms", "us", "ns"]

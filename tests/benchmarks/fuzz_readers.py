@@ -33,17 +33,13 @@ from hostile_files import damaged, sound_files
 from jaxquad.records import channels, propose, ReadError, RecordError
 from jaxquad.records._log import allowance
 from jaxquad.records.formats import _isolated
-from jaxquad.records.formats._child import answer, load_module
+from jaxquad.records.formats._by_library import answer
 
 
 CASES = 500  # of one kind and one seed
 OUTCOMES = ("read", "refused", "net", "killed", "BAD")
 ISOLATED = ("hdf5", "parquet", "mcap", "db3")
 SLOW = 5  # s
-FOLDER = Path(_isolated.__file__).parent
-MODULES = {
-    name: load_module(str(FOLDER / name)) for name in ("_hdf5.py", "_parquet.py", "_rosbag.py")
-}
 MEMORY = 3 * 2**30  # bytes above what the worker has
 
 
@@ -124,9 +120,9 @@ def _work(
             print(f"BAD {kind} seed {seed} case {number}: {text}", flush=True)
 
 
-def _in_this_process(script: Path, path: Path, kind: str, stored: int, patience: float) -> bytes:
+def _in_this_process(name: str, path: Path, kind: str, stored: int, patience: float) -> bytes:
     stream = io.BytesIO()
-    answer(MODULES[script.name], str(path), allowance(stored), stream)
+    answer(name, str(path), allowance(stored), stream)
     return stream.getvalue()
 
 

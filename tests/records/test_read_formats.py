@@ -16,7 +16,7 @@ from jaxquad.records import channels, formats, read, ReadError, RecordWarning
 
 
 ISOLATED = "jaxquad.records.formats._isolated"
-CHILD = Path(formats.__file__).with_name("_child.py")
+CHILD = Path(formats.__file__).with_name("_by_library.py")
 TIME = 5.0 + np.arange(400) / 100.0
 U = np.sin(3 * TIME)
 Y = np.stack([np.cos(3 * TIME), np.sin(5 * TIME)], axis=1)

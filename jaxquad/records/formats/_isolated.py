@@ -2,8 +2,8 @@
 
 Compiled libraries can loop for ever or crash on a damaged file, and a compressed file can unfold to
 fill the memory before anyone has seen its size. The other process has limits of time, memory and
-file size. It loads the format's file by its path, without the package, so such a format imports
-nothing of the package, and its libraries (`LIBRARIES`) within its functions only.
+file size. It runs `_by_library.py` by its path, without the package, so that file imports nothing
+of the package, and its libraries within its functions only.
 """
 
 import functools as ft
@@ -12,33 +12,30 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
-from .._errors import ReadError
+from .._errors import printable, ReadError
 from .._log import allowance, Log, oversize, Table
-from .._names import printable
 
 
-_CHILD = Path(__file__).with_name("_child.py")
+_CHILD = Path(__file__).with_name("_by_library.py")
 PATIENCE = 20.0  # s, beside what the size of the file allows
 _Listed = tuple[str, str, str, Sequence[int], str]  # table, column, dtype, shape, unit
 
 
-def in_child(module: ModuleType, kind: str, *, per_megabyte: float = 0.1) -> Callable[[Path], Log]:
-    """A `load` function that runs `module.tables(path, check)` in a child process.
+def in_child(name: str, kind: str, *, per_megabyte: float = 0.1) -> Callable[[Path], Log]:
+    """A `load` function that reads the format `name` of `_by_library` in a child process.
 
     A column `time` of a table with a name is its clock, in s. The process may take `per_megabyte`
     s for each megabyte of the file beside `PATIENCE`.
     """
-    assert module.__file__ is not None
-    return ft.partial(_load, Path(module.__file__), kind, per_megabyte)
+    return ft.partial(_load, name, kind, per_megabyte)
 
 
-def _load(script: Path, kind: str, per_megabyte: float, path: Path) -> Log:
+def _load(name: str, kind: str, per_megabyte: float, path: Path) -> Log:
     stored = sum(each.stat().st_size for each in _files(path))
-    header, _, content = _answer(script, path, kind, stored, per_megabyte).partition(b"\n")
+    header, _, content = _answer(name, path, kind, stored, per_megabyte).partition(b"\n")
     found = json.loads(header)
     if "missing" in found:
         raise ReadError(
@@ -61,8 +58,8 @@ def _files(path: Path) -> list[Path]:
     return [each for each in path.iterdir() if each.is_file()] if path.is_dir() else [path]
 
 
-def _answer(script: Path, path: Path, kind: str, stored: int, per_megabyte: float) -> bytes:
-    words = [str(_CHILD), str(script), str(path.absolute()), str(allowance(stored))]
+def _answer(name: str, path: Path, kind: str, stored: int, per_megabyte: float) -> bytes:
+    words = [str(_CHILD), name, str(path.absolute()), str(allowance(stored))]
     patience = PATIENCE + per_megabyte * stored / 1e6
     try:
         child = subprocess.run(

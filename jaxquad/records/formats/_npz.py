@@ -7,9 +7,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from .._errors import ReadError
+from .._errors import printable, ReadError
 from .._log import check_size, Log, Table
-from .._names import printable
 
 
 _MAGIC = b"\x93NUMPY"

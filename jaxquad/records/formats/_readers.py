@@ -2,7 +2,7 @@
 
 A format is one file of this folder with two functions: `sniff(head, path) -> bool` and
 `load(path) -> Log`. To add one, write that file and enter it in `READERS`. A format that another
-library decodes has `tables(path, check)` in the place of `load`, which a child process runs.
+library decodes is a function `tables(path, check)` of `_by_library.py`, which a child process runs.
 """
 
 import warnings
@@ -10,21 +10,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from .._errors import located, ReadError, RecordWarning
+from .._errors import located, printable, ReadError, RecordWarning
 from .._log import flattened, Log, Signals
-from .._names import printable
 from . import (
     _betaflight,
-    _betaflight_csv,
+    _by_library,
     _crazyflie,
     _csv,
     _dataflash,
-    _dataflash_text,
-    _hdf5,
     _mat,
     _npz,
-    _parquet,
-    _rosbag,
     _ulog,
 )
 from ._isolated import in_child
@@ -55,28 +50,28 @@ READERS: Mapping[str, Reader] = {
         "an ArduPilot DataFlash log", _dataflash.sniff, _dataflash.load, (".bin",)
     ),
     "dataflash_text": Reader(
-        "an ArduPilot text log", _dataflash_text.sniff, _dataflash_text.load, (".log",)
+        "an ArduPilot text log", _dataflash.sniff_text, _dataflash.load_text, (".log",)
     ),
     "ulog": Reader("a PX4 ULog", _ulog.sniff, _ulog.load, (".ulg", ".ulog")),
     "betaflight": Reader(
         "a Betaflight blackbox log", _betaflight.sniff, _betaflight.load, (".bbl", ".bfl")
     ),
     "betaflight_csv": Reader(
-        "a table of blackbox_decode", _betaflight_csv.sniff, _betaflight_csv.load
+        "a table of blackbox_decode", _betaflight.sniff_table, _betaflight.load_table
     ),
     "crazyflie": Reader("a Crazyflie log", _crazyflie.sniff, _crazyflie.load),
     "hdf5": Reader(
         "an HDF5 or MATLAB v7.3 file",
-        _hdf5.sniff,
-        in_child(_hdf5, "an HDF5 or MATLAB v7.3 file"),
+        _by_library.sniff_hdf5,
+        in_child("hdf5", "an HDF5 or MATLAB v7.3 file"),
         (".h5", ".hdf5", ".hdf"),
     ),
     "parquet": Reader(
-        "a Parquet table", _parquet.sniff, in_child(_parquet, "a Parquet table"),
+        "a Parquet table", _by_library.sniff_parquet, in_child("parquet", "a Parquet table"),
         (".parquet", ".pq"),
     ),
     "rosbag": Reader(
-        "a ROS 2 bag", _rosbag.sniff, in_child(_rosbag, "a ROS 2 bag", per_megabyte=2.0),
+        "a ROS 2 bag", _by_library.sniff_bag, in_child("rosbag", "a ROS 2 bag", per_megabyte=2.0),
         (".mcap", ".db3"),
     ),
     "csv": Reader("a text table", _csv.sniff, _csv.load, (".csv", ".tsv", ".txt")),

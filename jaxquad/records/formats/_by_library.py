@@ -1,0 +1,335 @@
+"""Formats that other libraries decode: HDF5, Parquet and ROS 2 bags, in a process of their own.
+
+`_isolated` runs this file as a script, without the package: `_by_library.py FORMAT PATH LIMIT`. It
+reads PATH and writes to stdout a line of JSON (names, dtypes, shapes, units, remarks; or what was
+wrong), then the bytes of the arrays.
+"""
+
+import dataclasses
+import importlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, TYPE_CHECKING
+
+import numpy as np
+
+
+if TYPE_CHECKING:
+    import h5py
+    import pyarrow
+
+_SPARE = 512 * 2**20  # bytes of address space beside three times the numbers
+Check = Callable[[str, int], None]  # of how many bytes something declares
+Found = tuple[dict[str, dict[str, tuple[np.ndarray, str]]], list[str]]  # values and unit; remarks
+
+
+class Oversize(Exception):
+    """What declares how many bytes too many."""
+
+
+class Library(NamedTuple):
+    """How to read a format: the modules that it needs, and the function that returns its tables."""
+
+    modules: tuple[str, ...]
+    tables: Callable[[str, Check], Found]
+
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_MOST_OBJECTS = 20_000
+_MATLAB_NUMBERS = ("double", "single", "logical")
+
+
+def sniff_hdf5(head: bytes, path: Path) -> bool:
+    return head.startswith((_MAGIC, b"MATLAB 7.3")) or head[512:520] == _MAGIC
+
+
+def _hdf5_tables(path: str, check: Check) -> Found:
+    """The numeric datasets as `group.name` with their units, and what was left out.
+
+    MATLAB v7.3 files, which are HDF5 with the axes reversed, keep the rows and columns that they
+    have in MATLAB. Datasets whose values lie in other files are left out.
+    """
+    import h5py
+
+    columns: dict[str, tuple[np.ndarray, str]] = {}
+    remarks = []
+    with h5py.File(path, "r") as file:
+        datasets = _datasets(file)
+        check("the file", sum(int(dataset.nbytes) for dataset in datasets.values()))
+        for name, dataset in datasets.items():
+            if dataset.external or dataset.is_virtual:
+                remarks.append(f"{name!r} lies in another file and was left out")
+                continue
+            chunk = np.prod(dataset.chunks or (0,), dtype=object) * dataset.dtype.itemsize
+            check(f"a chunk of {name!r}", int(chunk))
+            unit = _dataset_unit(dataset)
+            columns |= {
+                full: (values, unit) for full, values in _dataset_columns(name, dataset).items()
+            }
+    return {"": columns}, remarks
+
+
+def _datasets(file: "h5py.File") -> dict[str, "h5py.Dataset"]:
+    """Those of numbers or records; soft and external links are not followed."""
+    import h5py
+
+    found: dict[str, h5py.Dataset] = {}
+    visited = 0
+
+    def visit(name: str, item: object) -> None:
+        nonlocal visited
+        visited += 1
+        if visited > _MOST_OBJECTS:
+            raise ValueError(f"more than {_MOST_OBJECTS} objects")
+        if isinstance(item, h5py.Dataset) and not name.startswith("#") and _is_numeric(item):
+            found[name.replace("/", ".")] = item
+
+    file.visititems(visit)
+    return found
+
+
+def _is_numeric(dataset: "h5py.Dataset") -> bool:
+    if dataset.shape is None or not 1 <= len(dataset.shape) <= 2 or not dataset.size:
+        return False
+    kind = _text(dataset.attrs.get("MATLAB_class", b""))
+    numeric = dataset.dtype.kind in "fiub" or (dataset.dtype.names and len(dataset.shape) == 1)
+    matlab = kind.startswith(("int", "uint")) or kind in _MATLAB_NUMBERS
+    return bool(numeric) and (matlab or not kind) and "MATLAB_empty" not in dataset.attrs
+
+
+def _dataset_columns(name: str, dataset: "h5py.Dataset") -> dict[str, np.ndarray]:
+    values = np.asarray(dataset[()])
+    if values.dtype.names:
+        return {f"{name}.{field}": values[field] for field in values.dtype.names}
+    if "MATLAB_class" in dataset.attrs:
+        values = values.T
+    return {name: values.reshape(-1) if 1 in values.shape else values}
+
+
+def _dataset_unit(dataset: "h5py.Dataset") -> str:
+    named = (dataset.attrs.get(key) for key in ("units", "unit"))
+    return next((_text(each) for each in named if each is not None), "")
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return value if isinstance(value, str) else ""
+
+
+_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+
+
+def sniff_parquet(head: bytes, path: Path) -> bool:
+    return head.startswith(b"PAR1")
+
+
+def _parquet_tables(path: str, check: Check) -> Found:
+    """The numeric columns with their units; time stamps and durations in s."""
+    import pyarrow.parquet
+
+    with pyarrow.parquet.ParquetFile(path) as file:
+        wanted = [field for field in file.schema_arrow if _is_number(field.type)]
+        check("the table", 8 * len(wanted) * file.metadata.num_rows)
+        table = file.read(columns=[field.name for field in wanted], use_threads=False)
+    columns = {field.name: (_field_values(table, field), _field_unit(field)) for field in wanted}
+    return {"": columns}, []
+
+
+def _is_number(kind: "pyarrow.DataType") -> bool:
+    import pyarrow
+
+    types = pyarrow.types
+    number = types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
+    return number or types.is_timestamp(kind) or types.is_duration(kind)
+
+
+def _field_values(table: "pyarrow.Table", field: "pyarrow.Field") -> np.ndarray:
+    """Where values are missing, integers become floats with NaN."""
+    import pyarrow
+
+    column = table.column(field.name)
+    if pyarrow.types.is_timestamp(field.type) or pyarrow.types.is_duration(field.type):
+        return column.cast(pyarrow.int64()).to_numpy() / _PER_SECOND[field.type.unit]
+    return column.to_numpy()
+
+
+def _field_unit(field: "pyarrow.Field") -> str:
+    metadata = field.metadata or {}
+    named = (metadata.get(key) for key in (b"units", b"unit"))
+    return next((each.decode("utf-8", "replace") for each in named if each is not None), "")
+
+
+_MCAP, _SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
+_LONGEST = 64  # elements of an array that is taken as channels
+_DEEPEST = 6  # messages within messages
+_UNITS = {"angular_velocity": "rad/s", "linear_acceleration": "m/s^2", "position": "m"}
+
+
+def sniff_bag(head: bytes, path: Path) -> bool:
+    """A folder with metadata.yaml, or a single .mcap or .db3 file."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return head.startswith((_MCAP, _SQLITE))
+
+
+def _bag_tables(path: str, check: Check) -> Found:
+    """The numbers of each topic with their units and a column `time` (s), and what was left out.
+
+    The table `/imu/data` has the columns `angular_velocity.x`, ... Its time is that of the
+    message's header, else that of recording, in s from the beginning of the bag. Covariances are
+    left out.
+    """
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import get_typestore, Stores
+
+    topics: dict[str, _Topic] = {}
+    size = 0
+    # Some bags do not say how their messages are laid out.
+    with AnyReader([Path(path)], default_typestore=get_typestore(Stores.LATEST)) as reader:
+        known = [each for each in reader.connections if each.msgtype in reader.typestore.types]
+        unknown = {each.msgtype for each in reader.connections} - {each.msgtype for each in known}
+        for connection, recorded, raw in reader.messages(known) if known else ():
+            message = reader.deserialize(raw, connection.msgtype)
+            topic = topics.setdefault(connection.topic, _Topic(message, reader.start_time))
+            size += topic.add(recorded, message)
+            check("the bag", size)
+    found = {name: topic.columns() for name, topic in topics.items() if topic.stamps}
+    return found, [*_bag_remarks(unknown, topics)]
+
+
+def _bag_remarks(unknown: set[str], topics: dict[str, "_Topic"]) -> Iterator[str]:
+    for kind in sorted(unknown):
+        yield f"messages of the unknown type {kind!r} were left out"
+    for name, topic in topics.items():
+        if topic.odd:
+            yield f"{topic.odd} messages of {name!r} whose arrays have another size were left out"
+        if topic.stamps and not topic.stamped:
+            yield f"{name!r} has no header: the time of recording is used"
+
+
+class _Topic:
+    """The numbers of one topic's messages, shaped like the first of them."""
+
+    def __init__(self, first: Any, begin: int):
+        self.begin = begin  # ns
+        paths = list(_leaves(first, "", 0))
+        self.numbers = [path for path, value in paths if not isinstance(value, np.ndarray)]
+        self.arrays = {path: value.shape for path, value in paths if isinstance(value, np.ndarray)}
+        self.stamped = {"header.stamp.sec", "header.stamp.nanosec"} <= set(self.numbers)
+        self.rows: list[tuple[Any, ...]] = []
+        self.stamps: list[float] = []
+        self.odd = 0
+        self._get = attrgetter(*self.numbers, *self.arrays) if paths else None
+
+    def add(self, recorded: int, message: Any) -> int:
+        """Take one message; returns how many bytes its numbers are."""
+        if self._get is None:
+            return 0
+        row: Any = self._get(message)
+        row = row if len(self.numbers) + len(self.arrays) > 1 else (row,)
+        ours = row[len(self.numbers) :]
+        if any(a.shape != shape for a, shape in zip(ours, self.arrays.values(), strict=True)):
+            self.odd += 1
+            return 0
+        self.rows.append(row)
+        stamp = message.header.stamp if self.stamped else None
+        nanoseconds = stamp.sec * 10**9 + stamp.nanosec if stamp is not None else recorded
+        self.stamps.append((nanoseconds - self.begin) * 1e-9)
+        return 8 * len(self.numbers) + sum(array.nbytes for array in ours)
+
+    def columns(self) -> dict[str, tuple[np.ndarray, str]]:
+        named = {}
+        for i, name in enumerate(self.numbers):
+            if not name.startswith("header.stamp"):
+                named[name] = np.array([row[i] for row in self.rows])
+        for i, name in enumerate(self.arrays, start=len(self.numbers)):
+            named[name] = np.stack([row[i] for row in self.rows])
+        units = {name: _UNITS.get(name.split(".")[-2], "") for name in named if "." in name}
+        columns = {name: (values, units.get(name, "")) for name, values in named.items()}
+        # Last, for a field of the message may be called time as well.
+        return columns | {"time": (np.array(self.stamps), "s")}
+
+
+def _leaves(message: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
+    """The numbers of a message, and its short vectors, by the way to them."""
+    for field in dataclasses.fields(message):
+        value, path = getattr(message, field.name), prefix + field.name
+        if field.name.endswith("covariance"):
+            continue
+        if dataclasses.is_dataclass(value) and depth < _DEEPEST:
+            yield from _leaves(value, f"{path}.", depth + 1)
+        elif isinstance(value, bool | int | float):
+            if not field.name.isupper():  # Constants of the message type.
+                yield path, value
+        elif isinstance(value, np.ndarray) and value.ndim == 1 and 0 < value.size <= _LONGEST:
+            yield path, value
+
+
+LIBRARIES: Mapping[str, Library] = {
+    "hdf5": Library(("h5py",), _hdf5_tables),
+    "parquet": Library(("pyarrow", "pyarrow.parquet"), _parquet_tables),
+    "rosbag": Library(("rosbags.highlevel", "rosbags.typesys"), _bag_tables),
+}
+
+
+def answer(kind: str, path: str, limit: int, stream: BinaryIO) -> None:
+    """Write the tables of a file, which may declare up to `limit` bytes."""
+
+    def check(what: str, declared: int) -> None:
+        if declared > limit:
+            raise Oversize(what, declared)
+
+    try:
+        tables, remarks = LIBRARIES[kind].tables(path, check)
+    except Oversize as error:
+        stream.write(json.dumps({"oversize": error.args}).encode() + b"\n")
+        return
+    # On damaged files the libraries raise almost anything.
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        stream.write(json.dumps({"error": reason[:500]}).encode() + b"\n")
+        return
+    arrays = [
+        (table, name, np.asarray(values), unit)
+        for table, columns in tables.items()
+        for name, (values, unit) in columns.items()
+        if values.dtype.kind in "fiub" and values.ndim in (1, 2)
+    ]
+    listed = [(table, name, a.dtype.str, a.shape, unit) for table, name, a, unit in arrays]
+    stream.write(json.dumps({"arrays": listed, "remarks": remarks}).encode() + b"\n")
+    for _, _, array, _ in arrays:
+        stream.write(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
+
+
+def _limit_memory(limit: int) -> None:
+    try:
+        import resource
+    except ImportError:  # There is no such thing on Windows.
+        return
+    with open("/proc/self/statm") as file:
+        held = int(file.read().split()[0]) * resource.getpagesize()
+    most = held + 3 * limit + _SPARE
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+
+def main() -> None:
+    kind, path, limit = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    try:
+        # Before memory is limited: some libraries reserve gigabytes of addresses.
+        for module in LIBRARIES[kind].modules:
+            importlib.import_module(module)
+    except ImportError as error:
+        sys.stdout.buffer.write(json.dumps({"missing": str(error)}).encode() + b"\n")
+        return
+    if sys.platform == "linux":
+        _limit_memory(limit)
+    answer(kind, path, limit, sys.stdout.buffer)
+
+
+if __name__ == "__main__":
+    main()
