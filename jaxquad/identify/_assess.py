@@ -71,7 +71,7 @@ def assess(
         Costs(cost, average, information, misfit),
         points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in blocks),
         remarks=(
-            *dict.fromkeys(remark for frf in frfs for remark in frf.remarks),
+            *_remarks_on_used(problem, frfs),
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_leakage(problem, frfs, solution),
@@ -79,6 +79,13 @@ def assess(
         ),
         minima=minima,
     )
+
+
+def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> list[str]:
+    """Those of the responses' remarks that concern the points in use, each once."""
+    used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
+    parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True)]
+    return list(dict.fromkeys(remark for part in parts for remark in part))
 
 
 class Estimate(NamedTuple):

@@ -19,3 +19,4 @@ from ._estimators import (
     Welch as Welch,
 )
 from ._frequency_response import Distortion as Distortion, FrequencyResponse as FrequencyResponse
+from ._remarks import Remark as Remark

@@ -19,7 +19,7 @@ def in_hertz(omega: Float[np.ndarray, " frequencies"]) -> str:
 
 
 def check_compatible(records: Sequence[Record]) -> None:
-    """Raise `ValueError` unless the records have the same channels and sample rate."""
+    """Raise `ValueError` unless the records have the same channels, sample rate and hold."""
     if not records:
         raise ValueError("no record is given: pass one jq.Record or a list of them")
     odd = [type(one).__name__ for one in records if not isinstance(one, Record)]
@@ -37,6 +37,11 @@ def check_compatible(records: Sequence[Record]) -> None:
         names = (other.input_names, other.output_names, other.reference_names)
         if names != (first.input_names, first.output_names, first.reference_names):
             raise ValueError(f"the records have different channels: {first} and {other}")
+        if other.hold != first.hold:
+            raise ValueError(
+                f"the inputs of the records are held for {first.hold} and {other.hold} s: give all "
+                "records of one response the same hold (hold=, --hold)"
+            )
 
 
 def check_distinct(records: Sequence[Record]) -> None:

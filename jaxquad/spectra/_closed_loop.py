@@ -14,6 +14,7 @@ from ._checks import check_compatible, check_references, in_hertz
 from ._density import spectral_density
 from ._estimators import Welch
 from ._frequency_response import FrequencyResponse
+from ._remarks import Remark
 
 
 _AMPLIFIED = 10.0  # factor on the relative error from which a remark is made
@@ -74,14 +75,16 @@ def deembed(
     )
 
 
-def _remark_on_errors(omega: np.ndarray, amplified: np.ndarray) -> tuple[str, ...]:
+def _remark_on_errors(omega: np.ndarray, amplified: np.ndarray) -> tuple[Remark, ...]:
     lost = omega[amplified > _AMPLIFIED]
     if not lost.size:
         return ()
-    return (
-        f"the closed loop hardly depends on the plant at {lost.size} of {omega.size} frequencies, "
-        f"{in_hertz(lost)}: its errors are amplified more than {_AMPLIFIED:g} times there",
+    text = (
+        f"the closed loop hardly depends on the plant {{where}}: its errors are amplified more "
+        f"than {_AMPLIFIED:g} times there. Leave these frequencies out, or inject the signal at "
+        "the plant input"
     )
+    return (Remark(text, lost),)
 
 
 _SIGNIFICANT = 0.02  # share of noise in the input from which the joint estimate is recommended

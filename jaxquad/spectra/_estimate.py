@@ -3,7 +3,7 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
@@ -62,8 +62,9 @@ def _result(
     spread = np.sqrt(np.asarray(found.errors.variance()) / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(known, spread / np.abs(np.asarray(found.response)), np.inf)
-    columns = np.angle(found.response), error, found.coherence, found.direct_coherence
-    remarks = remarks_on_feedback(method, omega, *(_pairs(each) for each in columns))
+    columns = (found.response, error, found.coherence, found.direct_coherence)
+    names = records[0].output_names, records[0].input_names
+    remarks = remarks_on_feedback(method, omega, *map(np.asarray, columns), names)
     return FrequencyResponse(
         omega=jnp.asarray(omega),
         response=found.response,
@@ -78,11 +79,9 @@ def _result(
         remarks=remarks + found.remarks,
         integrators=integrators,
         distortion=found.distortion if isinstance(found, PeriodicEstimate) else None,
+        dt=records[0].dt,
+        hold=records[0].hold,
     )
-
-
-def _pairs(columns: np.ndarray | Array) -> Float[np.ndarray, "frequencies pairs"]:
-    return np.nan_to_num(np.asarray(columns).reshape(len(columns), -1))
 
 
 Estimator = Welch | Composite | LocalPolynomial | Periodic | JointInputOutput
@@ -106,7 +105,7 @@ def frequency_response(
     - `estimator`: one of `jq.spectra.LocalPolynomial`, `Composite`, `Welch`, `Periodic` and
         `JointInputOutput`. By default local polynomials, by the joint input-output method where the
         record has references, else directly from input to output (H1, equation (13) in
-        docs/equations.md). The direct estimate is biased by feedback, and a remark says so.
+        docs/equations.md). Feedback biases the direct estimate towards -1/C.
 
     **Returns:** a `FrequencyResponse`. Several inputs are conditioned on each other.
 

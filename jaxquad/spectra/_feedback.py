@@ -1,19 +1,20 @@
 """Signs that a controller, and not the plant, made the coherence between input and output."""
 
-import numpy as np
-from jaxtyping import Bool, Float
+from collections.abc import Sequence
+from typing import Literal
 
-from ._checks import in_hertz
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from ._remarks import Remark
+
+
+Grid = Float[np.ndarray, " frequencies"]
+Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
-
-DIRECT = (
-    "direct estimate (H1): if a controller C feeds the output back to this input, the estimate is "
-    "biased towards -1/C. Name an external reference (references=, --reference) for the joint "
-    "estimate, which is unbiased"
-)
 
 
 def dominated_by_feedback(
@@ -50,39 +51,48 @@ def phase_rises(
 
 
 def remarks_on_feedback(
-    method: str,
-    omega: Float[np.ndarray, " frequencies"],
-    phase: Float[np.ndarray, "frequencies outputs"],
-    error: Float[np.ndarray, "frequencies outputs"],
-    coherence: Float[np.ndarray, "frequencies outputs"],
-    direct: Float[np.ndarray, "frequencies outputs"],
-) -> tuple[str, ...]:
-    """Remarks on feedback that a user of the response has to know."""
-    remarks = [DIRECT] if method == "direct" else []
-    for o in range(direct.shape[1]):
+    method: Literal["direct", "joint"],
+    omega: Grid,
+    response: Complex[np.ndarray, "frequencies outputs inputs"],
+    error: Pairs,
+    coherence: Pairs,
+    direct: Pairs,
+    names: tuple[Sequence[str], Sequence[str]],
+) -> tuple[Remark, ...]:
+    """Remarks on feedback that a user of the response has to know; `names` of outputs and inputs.
+
+    `direct` is the coherence from input to output, `coherence` that of the estimate.
+    """
+    remarks = []
+    for o, i in np.ndindex(response.shape[1:]):
+        pair, known = (names[0][o], names[1][i]), np.isfinite(response[:, o, i])
         if method == "joint":
-            remarks += _explained_by_reference(omega, coherence[:, o], direct[:, o])
-        elif phase_rises(omega, phase[:, o], error[:, o], coherence[:, o]):
-            remarks.append(
-                "feedback-dominated: the phase increases with frequency at the top of the coherent "
-                "band, like that of -1/C and unlike that of any actuator; the coherence there "
-                "comes from the controller. Add excitation, and name it as the reference"
-            )
+            remarks += _explained_by_reference(omega, coherence[:, o, i], direct[:, o, i], pair)
+            continue
+        phase = np.angle(np.where(known, response[:, o, i], 1.0))
+        error_here = np.where(known, error[:, o, i], np.inf)
+        if phase_rises(omega, phase, error_here, np.where(known, coherence[:, o, i], 0.0)):
+            remarks.append(Remark(_RISES, omega[coherence[:, o, i] >= COHERENT], pair))
     return tuple(dict.fromkeys(remarks))
 
 
+_RISES = (
+    "feedback-dominated: the phase increases with frequency at the top of the coherent "
+    "band, like that of -1/C and unlike that of any actuator; the coherence there "
+    "comes from the controller. Add excitation, and name it as the reference"
+)
+
+
 def _explained_by_reference(
-    omega: Float[np.ndarray, " frequencies"],
-    coherence: Float[np.ndarray, " frequencies"],
-    direct: Float[np.ndarray, " frequencies"],
-) -> list[str]:
+    omega: Grid, coherence: Grid, direct: Grid, pair: tuple[str, str]
+) -> list[Remark]:
     dominated = dominated_by_feedback(direct, coherence)
     if 2 * np.sum(dominated) <= np.sum(direct >= COHERENT):
         return []
-    span = omega[dominated]
-    return [
+    text = (
         f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
-        f"frequencies, but at {np.sum(dominated)} of them, {in_hertz(span)}, the reference "
+        "frequencies, but {where}, the reference "
         "explains neither. There the controller feeds back noise, and the record holds no "
         "information on the plant. Excite these frequencies by the reference"
-    ]
+    )
+    return [Remark(text, omega[dominated], pair)]

@@ -8,6 +8,7 @@ from jaxquad._core import require_float64
 
 from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
+from ._remarks import Remark, remarks_on_used
 
 
 class Distortion(eqx.Module):
@@ -50,13 +51,21 @@ class Distortion(eqx.Module):
         return "\n".join(lines)
 
 
+_METHODS = {
+    "direct": "direct estimate (H1, unbiased in open loop; with feedback, name a reference)",
+    "joint": "joint estimate",
+}
+
+
 class FrequencyResponse(eqx.Module):
     """Measured frequency responses of every output to every input, with their random errors.
 
     With several inputs, responses are conditioned on the other inputs and `coherence` is partial.
     Where the inputs cannot be separated, the response is nan and its random error infinite.
     `errors` is the covariance of all random errors: neighbouring frequencies share part of their
-    noise. `remarks` are what a user of the response should know, as sentences.
+    noise. `remarks` are what a user of the response should know: sentences that know the
+    frequencies they are about. `dt` and `hold` are the sample interval and the inputs' hold of the
+    records it was made from, see `Record`.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s
@@ -69,10 +78,12 @@ class FrequencyResponse(eqx.Module):
     method: Literal["direct", "joint"] = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
-    remarks: tuple[str, ...] = eqx.field(static=True, default=())
+    remarks: tuple[Remark, ...] = eqx.field(static=True, default=())
     integrators: int = eqx.field(static=True, default=0)  # removed before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
+    dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
+    hold: float | None = eqx.field(static=True, default=None)  # s
 
     def __check_init__(self):
         if not isinstance(self.omega, Array | np.ndarray):
@@ -89,6 +100,13 @@ class FrequencyResponse(eqx.Module):
         """Phase in degrees, unwrapped along frequency."""
         return np.degrees(np.unwrap(np.angle(np.asarray(self.response)), axis=0))
 
+    def remarks_about(
+        self, used: Bool[np.ndarray, "frequencies outputs inputs"]
+    ) -> tuple[Remark, ...]:
+        """Those of the remarks that concern the points in use, restricted to these, each once."""
+        omega = np.asarray(self.omega)
+        return remarks_on_used(self.remarks, omega, used, self.output_names, self.input_names)
+
     def relative_covariance(
         self, output: int = 0, input: int = 0
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
@@ -102,7 +120,7 @@ class FrequencyResponse(eqx.Module):
 
     def __str__(self) -> str:
         omega, coherence = np.asarray(self.omega), np.asarray(self.coherence)
-        lines = [f"frequency response, {self.method} estimate, {omega.size} frequencies"]
+        lines = [f"frequency response, {_METHODS[self.method]}, {omega.size} frequencies"]
         for o, output in enumerate(self.output_names):
             for i, source in enumerate(self.input_names):
                 good = omega[coherence[:, o, i] >= 0.6]

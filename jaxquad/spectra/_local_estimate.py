@@ -7,7 +7,6 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
 from ._estimators import LocalPolynomial
 from ._local_fit import (
@@ -28,6 +27,7 @@ from ._local_noise import (
     smooth_noise,
 )
 from ._local_width import choose_widths, reach, Respond, Shape
+from ._remarks import Remark
 
 
 _DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest
@@ -109,7 +109,7 @@ class LocalEstimate(NamedTuple):
     errors: ErrorCovariance
     half_width: Grid  # rad/s
     rational: Bool[np.ndarray, " frequencies"]  # where a rational function is used, at a resonance
-    remarks: tuple[str, ...]
+    remarks: tuple[Remark, ...]
 
 
 def estimate_local_polynomial(
@@ -263,27 +263,26 @@ def _direct_coherence(
 
 def _remark_on_lost(
     omega: Grid, known: Bool[np.ndarray, " frequencies"], least: Grid, options: LocalPolynomial
-) -> tuple[str, ...]:
+) -> tuple[Remark, ...]:
     lost = omega[~known]
     if lost.size == 0:
         return ()
     remark = (
-        f"undetermined at {lost.size} of {omega.size} frequencies, {in_hertz(lost)}: the inputs "
+        "undetermined {where}: the inputs "
         "are not excited there, or cannot be separated from each other or from transients. Excite "
         "them there, or leave these frequencies out"
     )
     if options.width is not None:
         enough = np.max(least[~known])
         remark += f"; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins"
-    return (remark,)
+    return (Remark(remark, lost),)
 
 
-def _remark_on_resolution(omega: Grid) -> tuple[str, ...]:
+def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:
     if omega.size == 0:
         return ()
-    count = f"at {omega.size} frequencies from {in_hertz(omega)}"
-    where = f"near {in_hertz(omega)}" if omega.size == 1 else count
-    return (
-        f"the estimate {where} is under-resolved (narrow-band noise or a ringing mode); its error "
-        "bars may be too small. Record longer, or add rest at the end",
+    text = (
+        "the estimate {where} is under-resolved (narrow-band noise or a ringing mode); its error "
+        "bars may be too small. Record longer, or add rest at the end"
     )
+    return (Remark(text, omega),)

@@ -10,11 +10,11 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
 from ._estimators import Periodic
 from ._frequency_response import Distortion
 from ._local_noise import smooth_noise
+from ._remarks import Remark
 
 
 _CHANCE = 1e-4  # of taking noise for an excited line, for distortion, or for a line in the noise
@@ -222,7 +222,7 @@ class PeriodicEstimate(NamedTuple):
     multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
     errors: ErrorCovariance
     distortion: Distortion
-    remarks: tuple[str, ...]
+    remarks: tuple[Remark, ...]
 
 
 def estimate_periodic(
@@ -372,27 +372,25 @@ def _remarks(
     fit: Averages,
     scatter: Scatter,
     periods: Sequence[Periods],
-) -> tuple[str, ...]:
+) -> tuple[Remark, ...]:
     remarks, lost = [], omega[~fit.known]
     if lost.size:
-        remarks.append(
-            f"undetermined at {lost.size} of {omega.size} lines, {in_hertz(lost)}: the inputs "
-            "cannot be separated there. Use different phases in each record"
+        text = (
+            "undetermined {where}: the inputs cannot be separated there. Use different phases in "
+            "each record"
         )
+        remarks.append(Remark(text, lost))
     unsettled = [each.settled for each in periods if each.settled > _UNSETTLED]
     if unsettled:
-        remarks.append(
+        text = (
             f"the first period differs from the later ones by {max(unsettled):.3g} times the noise "
             "power, because a transient remains: discard more periods"
         )
-    if scatter.total is None:
-        remarks.append(
-            "no more records than inputs: the error bars cover noise only. To include nonlinear "
-            "distortion, record the same lines with other phases"
-        )
-    elif np.any(scatter.significant):
-        remarks.append(
+        remarks.append(Remark(text))
+    if np.any(scatter.significant):
+        text = (
             "nonlinear distortion exceeds the noise: the error bars are those of the best linear "
-            "approximation"
+            "approximation. Use a smaller amplitude, or take the fit as that at this amplitude"
         )
+        remarks.append(Remark(text))
     return tuple(remarks)

@@ -17,6 +17,7 @@ from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
+from ._remarks import Remark
 from ._transform import transform_windows
 from ._window import coefficients, segment_starts, window
 
@@ -159,7 +160,7 @@ def remarks_on_inputs(
     omega: Float[np.ndarray, " frequencies"],
     coherence: Float[np.ndarray, "frequencies inputs"],
     names: Sequence[str],
-) -> tuple[str, ...]:
+) -> tuple[Remark, ...]:
     """`coherence` is the multiple coherence of each input with all others."""
     if len(names) < 2:
         return ()
@@ -167,18 +168,19 @@ def remarks_on_inputs(
     for i, name in enumerate(names):
         lost = coherence[:, i] > _LOST
         if np.any(lost):
-            span = omega[lost]
-            remarks.append(
-                f"input {name} cannot be separated from the other inputs at {lost.sum()} of "
-                f"{omega.size} frequencies, {in_hertz(span)}; they are left out. Excite the "
-                "inputs independently, one after the other or with interleaved multisines"
+            text = (
+                f"input {name} cannot be separated from the other inputs {{where}}; they are left "
+                "out. Excite the inputs independently, one after the other or with interleaved "
+                "multisines"
             )
+            remarks.append(Remark(text, omega[lost]))
         elif np.mean(coherence[:, i]) > _TOGETHER:
-            remarks.append(
+            text = (
                 f"input {name} is correlated with the other inputs: their average coherence is "
                 f"{coherence[:, i].mean():.2f} (limit {_TOGETHER}), so the errors of conditioned "
                 f"responses are larger. Excite the inputs independently"
             )
+            remarks.append(Remark(text))
     return tuple(remarks)
 
 
@@ -261,14 +263,12 @@ def _result(
 ) -> FrequencyResponse:
     first, dt = records[0], records[0].dt
     independent = _independent(records, segments)
-    remarks = remarks_on_feedback(
-        method, omega, *(_pairs(each) for each in (
-            np.angle(found.response), found.random_error, found.coherence, found.direct_coherence
-        ))
-    )  # fmt: skip
+    columns = (found.response, found.random_error, found.coherence, found.direct_coherence)
+    names = first.output_names, first.input_names
+    remarks = remarks_on_feedback(method, omega, *map(np.asarray, columns), names)
     remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
     if max(independent) < 3:
-        remarks += (_FEW.format(count=max(independent)),)
+        remarks += (Remark(_FEW.format(count=max(independent))),)
     counts = tuple(len(starts) for _, starts in segments.groups)
     windows = place_windows(segments.groups, members[0].shape, dt, omega[-1] - omega[0])
     grid = jnp.asarray(omega)
@@ -286,8 +286,6 @@ def _result(
         remarks=remarks,
         integrators=members[0].integrators,
         resolution=2 * np.pi / (segments.groups[0][0] * dt),
+        dt=dt,
+        hold=first.hold,
     )
-
-
-def _pairs(columns) -> Float[np.ndarray, "frequencies pairs"]:
-    return np.asarray(columns).reshape(len(columns), -1)

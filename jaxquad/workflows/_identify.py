@@ -134,10 +134,9 @@ class Identification:
     def __str__(self) -> str:
         first, *others = map(str, self.records)
         record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
-        remarks = tuple(each for each in self.fit.remarks if each not in self.frf.remarks)
-        fit = dataclasses.replace(self.fit, remarks=remarks)  # those of the response stand above
-        parts = [f"{record}\n\n{self.frf}"]
-        parts += [f"\n{self.formula}, {self.method} estimate:\n{fit}"]
+        frf = dataclasses.replace(self.frf, remarks=())  # the fit repeats what concerns it
+        parts = [f"{record}\n\n{frf}"]
+        parts += [f"\n{self.formula}, {self.method} estimate:\n{self.fit}"]
         sums, known = _sums(self.settings), [each.name for each in self.fit.combinations]
         if self.settings.poles is not None and self.fit.verdict.fitted:
             parts += [_text_or_reason(lambda: factors(self.fit))]

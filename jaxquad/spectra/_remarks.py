@@ -1,0 +1,73 @@
+"""What a user of a response should know, with the frequencies and the pair that it is about."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ._checks import in_hertz
+
+
+Pair = tuple[str, str]  # output, input
+
+
+class Remark(str):
+    """A sentence about a response that knows which frequencies it is about.
+
+    It is the text itself, so it prints, joins and compares like any other string.
+
+    **Arguments:**
+
+    - `text`: what happened, the number, and what to do. `{where}` stands for the frequencies.
+    - `omega`: the frequencies that it is about, in rad/s; none for the response as a whole.
+    - `pair`: names of the output and the input that it is about; `None` for all pairs.
+    """
+
+    text: str
+    omega: tuple[float, ...]
+    pair: Pair | None
+
+    def __new__(
+        cls,
+        text: str,
+        omega: Sequence[float] | Float[np.ndarray, " points"] = (),
+        pair: Pair | None = None,
+    ) -> "Remark":
+        points = tuple(float(x) for x in omega)
+        self = super().__new__(cls, text.replace("{where}", _place(points)))
+        self.text, self.omega, self.pair = text, points, pair
+        return self
+
+    def __getnewargs__(self) -> tuple[str, tuple[float, ...], Pair | None]:
+        return self.text, self.omega, self.pair
+
+    def within(self, omega: Float[np.ndarray, " used"]) -> "Remark | None":
+        """The same about those of its frequencies that are in `omega`; `None` for none of them."""
+        if not self.omega:
+            return self
+        kept = [x for x in self.omega if np.any(np.abs(omega - x) <= 1e-9 * x)]
+        return Remark(self.text, kept, self.pair) if kept else None
+
+
+def _place(omega: tuple[float, ...]) -> str:
+    if len(omega) <= 1:
+        return f"near {in_hertz(np.array(omega))}" if omega else "everywhere"
+    return f"at {len(omega)} frequencies, {in_hertz(np.array(omega))}"
+
+
+def remarks_on_used(
+    remarks: Sequence[Remark],
+    omega: Float[np.ndarray, " frequencies"],
+    used: Bool[np.ndarray, "frequencies outputs inputs"],
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+) -> tuple[Remark, ...]:
+    """Those of the remarks that concern the points in use, each once."""
+    kept = []
+    for remark in remarks:
+        mine = np.any(used, axis=(1, 2))
+        if remark.pair is not None:
+            mine = used[:, outputs.index(remark.pair[0]), inputs.index(remark.pair[1])]
+        part = remark.within(omega[mine]) if np.any(mine) else None
+        kept += [] if part is None else [part]
+    return tuple(dict.fromkeys(kept))
