@@ -24,6 +24,7 @@ from ._local_noise import (
     multiple_coherence,
     Noise,
     partial_coherence,
+    power_alone,
     smooth_noise,
 )
 from ._local_width import choose_widths, reach, Respond, Shape
@@ -67,11 +68,17 @@ def coherence_of_references(
     fit: LocalFit,
     inputs: int,
 ) -> Float[np.ndarray, "frequencies outputs inputs"]:
-    """The smaller of the shares of each input's and each output's power that references explain."""
+    """Partial coherence of the joint estimate: the smaller of the shares of input and output.
+
+    Of the input, what the references move of it and of no other input; of the output, what
+    responds to that, beside the noise. Source: Bendat and Piersol, Random Data, ch. 7.
+    """
     noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
-    explained = _diagonal(fit.response @ fit.power @ _adjoint(fit.response))
-    coherence = explained / (explained + noise.power)
-    return np.minimum(coherence[:, inputs:, None], coherence[:, None, :inputs])
+    moved = noise.power[:, None, :inputs]
+    plant = joint_fit(fit, inputs)
+    alone = power_alone(plant)[:, None, :]
+    through = partial_coherence(plant, noise.power[:, inputs:])
+    return np.minimum(through, alone / (alone + moved))
 
 
 def _diagonal(x: Complex[np.ndarray, "frequencies a a"]) -> Float[np.ndarray, "frequencies a"]:

@@ -138,10 +138,16 @@ def partial_coherence(
 ) -> Float[np.ndarray, "frequencies outputs inputs"]:
     """Share of each output's power that an input explains beyond the other inputs, 0 to 1."""
     known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
-    power = np.where(known, fit.power, np.eye(fit.power.shape[1]))
-    alone = 1 / np.real(np.diagonal(np.linalg.inv(power), axis1=1, axis2=2))
-    explained = np.abs(np.where(known, fit.response, 0)) ** 2 * alone[:, None, :]
+    response = np.where(known, fit.response, 0)
+    explained = np.abs(response) ** 2 * power_alone(fit)[:, None, :]
     return explained / (explained + noise[:, :, None])
+
+
+def power_alone(fit: LocalFit) -> Float[np.ndarray, "frequencies inputs"]:
+    """Power of each input that no other input explains; 1 where nothing is determined."""
+    known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
+    power = np.where(known, fit.power, np.eye(fit.power.shape[1]))
+    return 1 / np.real(np.diagonal(np.linalg.inv(power), axis1=1, axis2=2))
 
 
 def multiple_coherence(

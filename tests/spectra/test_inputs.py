@@ -5,7 +5,14 @@ import pytest
 from scipy import signal
 
 from jaxquad.records import Record
-from jaxquad.spectra import frequency_response, JointInputOutput, Welch
+from jaxquad.spectra import (
+    Composite,
+    frequency_response,
+    JointInputOutput,
+    LocalPolynomial,
+    Periodic,
+    Welch,
+)
 
 
 RATE, LENGTH, SAMPLES = 50.0, 200, 4000
@@ -171,3 +178,37 @@ def test_ten_inputs_and_twenty_outputs_are_estimated_at_once():
         found.response, np.broadcast_to(gain.T, (OMEGA.size, 20, 10)), atol=2e-3
     )
     assert found.errors.noise.shape == (OMEGA.size, 20, 20)
+
+
+def decoupled(seed):
+    """Two outputs, each of which responds to its own input; the references move both inputs."""
+    r = noise(0, 2) @ np.array([[1.0, 0.5], [0.0, 1.0]])
+    u = r + noise(seed, 2, 0.2)
+    y = np.stack([signal.lfilter(*part, u[:, k]) for k, part in enumerate(PLANT)], axis=1)
+    return Record(np.arange(SAMPLES) / RATE, u, y + noise(seed + 1, 2, 0.05), r)
+
+
+@pytest.mark.parametrize("spectra", [LocalPolynomial(), WELCH, Composite((4.0, 8.0))])
+@pytest.mark.parametrize("joint", [False, True])
+def test_a_pair_without_any_response_has_no_coherence(spectra, joint):
+    estimator = JointInputOutput(spectra) if joint else spectra
+    found = frequency_response(decoupled(2), OMEGA, estimator=estimator)
+    typical = np.median(np.asarray(found.coherence), axis=0)
+    assert np.all(np.diag(typical) > 0.9)
+    assert np.all(typical[[0, 1], [1, 0]] < 0.3)
+
+
+def test_a_pair_without_any_response_has_no_coherence_over_periods_either():
+    rng, samples = np.random.default_rng(3), 200
+    spectrum = np.exp(2j * np.pi * rng.uniform(size=(101, 2)))
+    spectrum[[0, *range(41, 101)]] = 0
+    wave = np.fft.irfft(spectrum, samples, axis=0)
+    records = []
+    for sign in (1, -1):
+        u = np.tile(wave * np.array([1, sign]), (8, 1)) / np.std(wave)
+        y = np.stack([signal.lfilter(*part, u[:, k]) for k, part in enumerate(PLANT)], axis=1)
+        time = np.arange(len(u)) / RATE
+        records.append(Record(time, u, y + 0.05 * rng.standard_normal(y.shape)))
+    found = frequency_response(records, estimator=Periodic(samples / RATE))
+    typical = np.median(np.asarray(found.coherence), axis=0)
+    assert np.all(np.diag(typical) > 0.9) and np.all(typical[[0, 1], [1, 0]] < 0.3)
