@@ -6,8 +6,6 @@ from ._arrays import (
     as_float_or_none as as_float_or_none,
     is_concrete as is_concrete,
     is_zero as is_zero,
-)
-from ._checks import (
     Number as Number,
     require_all_nonnegative as require_all_nonnegative,
     require_all_positive as require_all_positive,
@@ -51,10 +49,10 @@ from ._members import (
     mark_members as mark_members,
     per_member as per_member,
 )
-from ._precision import (
+from ._process import (
     enable_x64 as enable_x64,
+    one_blas_thread as one_blas_thread,
     PrecisionError as PrecisionError,
     require_float64 as require_float64,
     require_x64 as require_x64,
 )
-from ._threads import one_blas_thread as one_blas_thread

@@ -1,7 +1,11 @@
-"""Double precision: asked for once, and required where single precision gives wrong numbers."""
+"""What a process is set to: double precision where single gives wrong numbers, and one thread."""
+
+import contextlib
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
+import threadpoolctl
 from jaxtyping import Array
 
 
@@ -34,3 +38,13 @@ def require_float64(what: str, array: Array) -> None:
             f"{what} is {jnp.asarray(array).dtype}: create it after "
             "jaxquad.enable_x64(), or convert it with jnp.asarray(x, float)"
         )
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Within it, NumPy's and SciPy's BLAS has one thread, in the whole process.
+
+    The environment's OPENBLAS_NUM_THREADS and its kin count only before NumPy is imported.
+    """
+    with threadpoolctl.threadpool_limits(limits=1, user_api="blas"):
+        yield
