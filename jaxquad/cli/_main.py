@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from ._batch import BATCH
-from ._channels import CHANNELS
 from ._design import DESIGN
-from ._identify import DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
+from ._identify import CHANNELS, DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
 from ._options import in_flags
 from ._tune import TUNE
 
