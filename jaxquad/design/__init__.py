@@ -6,10 +6,11 @@ from ._criteria import (
     DOptimal as DOptimal,
     LargestError as LargestError,
 )
-from ._noise import MeasuredNoise as MeasuredNoise, noise_covariance as noise_covariance
 from ._optimal_multisine import Design as Design, optimal_multisine as optimal_multisine
 from ._prediction import (
     information_per_energy as information_per_energy,
+    MeasuredNoise as MeasuredNoise,
+    noise_covariance as noise_covariance,
     predict_accuracy as predict_accuracy,
     Prediction as Prediction,
 )

@@ -9,8 +9,7 @@ from jaxquad.excitation import check_lines, Excitation, harmonics
 from jaxquad.identify import Free, select_parameters
 
 from ._criteria import Criterion, DOptimal
-from ._noise import Noise
-from ._prediction import check_distinct, Prediction, unit_information
+from ._prediction import check_distinct, Noise, Prediction, unit_information
 from ._search import gather_limits, multisine_signals, Plan, search, Trial
 
 
