@@ -1,8 +1,8 @@
 """Test signals, such as sweeps and multisines, and the guidelines for them."""
 
-from ._excitation import Excitation as Excitation
-from ._guidelines import (
+from ._excitation import (
     check_guidelines as check_guidelines,
+    Excitation as Excitation,
     Guideline as Guideline,
     Guidelines as Guidelines,
 )
