@@ -12,8 +12,7 @@ from jaxquad._core import as_float, is_concrete
 from jaxquad.loops import Loop
 
 from ._distributions import Distribution, normal_scores, Shares
-from ._members import MemberPayload, Members
-from ._variation import count_axes, Drawn, multiply, plant_inertia, vary_plant
+from ._members import count_axes, Drawn, MemberPayload, Members, multiply, plant_inertia, vary_plant
 
 
 if TYPE_CHECKING:

@@ -12,9 +12,16 @@ from jaxquad.models import DecoupledAxes, Multirotor
 
 from ._distributions import as_distribution, Distribution, distribution_or_none, number
 from ._draw import draw_members, SAMPLINGS
-from ._members import Members, Payload
+from ._members import (
+    count_axes,
+    FACTORS,
+    Members,
+    nominal_value,
+    Payload,
+    QUANTITIES,
+    VariablePlant,
+)
 from ._posterior import Posterior
-from ._variation import count_axes, FACTORS, nominal_value, QUANTITIES, VariablePlant
 
 
 _UNITS = {
