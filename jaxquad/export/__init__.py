@@ -1,3 +1,8 @@
 """Controllers as C headers."""
 
-from ._header import c_header as c_header, write_c_header as write_c_header
+from ._header import (
+    c_header as c_header,
+    ExportableController as ExportableController,
+    write_c_header as write_c_header,
+)
+from ._source import Gain as Gain, Source as Source

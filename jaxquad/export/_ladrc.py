@@ -11,8 +11,20 @@ from jaxquad.control import (
     ScheduledLADRC,
 )
 
-from ._map import map_gains, map_source, require_map
-from ._source import axes_text, Gain, per_axis, Precision, require_precision, Source, starting
+from ._source import (
+    axes_text,
+    COMMAND,
+    Gain,
+    map_gains,
+    map_source,
+    per_axis,
+    Precision,
+    require_map,
+    require_precision,
+    Source,
+    starting,
+    update,
+)
 
 
 def ladrc_step(ladrc: LADRC, b0: str) -> str:
@@ -25,11 +37,10 @@ def ladrc_step(ladrc: LADRC, b0: str) -> str:
         lines += [*correct, *_feedback(ladrc)]
     else:
         lines += [*_feedback(ladrc), *correct]
-    lines += [f"state->{name}[k] = {name};" for name in names]
-    lines.append("command[k] = state->command[k] = ${name}_limited(drive / b0, g->limit);")
-    unused = "" if ladrc.order == 2 else "    (void)reference_acceleration;\n"
-    body = "\n".join(f"        {line}" for line in lines)
-    return _STEP.replace("$unused", unused).replace("$lines", body)
+    lines.append("const $real wanted = drive / b0;")
+    new = {name: name for name in names} | {"command": "${name}_limited(wanted, g->limit)"}
+    lines += update(new, (*names, "wanted"))
+    return _STEP.replace("$lines", "\n".join(f"        {line}" for line in lines))
 
 
 def _predict(ladrc: LADRC) -> list[str]:
@@ -64,12 +75,12 @@ def _feedback(ladrc: LADRC) -> list[str]:
 
 _STEP = """\
 /* One sample: the command to hold until the next one. The set-point's rate and acceleration may be
- * null pointers, for none. */
+ * null pointers, for none. A sample that is not finite changes nothing of its axis. */
 static inline void ${name}_step(${name}_state *state, const $real reference[${NAME}_AXES],
     const $real *reference_rate, const $real *reference_acceleration,
     const $real measurement[${NAME}_AXES], $real command[${NAME}_AXES])
 {
-$unused    for (int k = 0; k < ${NAME}_AXES; ++k) {
+    for (int k = 0; k < ${NAME}_AXES; ++k) {
         const ${name}_gains *g = &${name}_table[k];
 $lines
     }
@@ -77,11 +88,12 @@ $lines
 
 SCHEDULE = """\
 /* Another inertia, kg m^2: b0 changes, an unsaturated command does not, because the estimate of f
- * changes instead. Values that are not above 0 are ignored. Starts at the nominal inertia. */
+ * changes instead. Values that are not above 0, or not finite, are ignored. Starts at the nominal
+ * inertia. */
 static inline void ${name}_schedule(${name}_state *state, const $real inertia[${NAME}_AXES])
 {
     for (int k = 0; k < ${NAME}_AXES; ++k) {
-        if (!(inertia[k] > 0)) continue;
+        if (!(${name}_finite(&inertia[k]) && inertia[k] > 0)) continue;
         const $real b0 = ${name}_b0(k, inertia[k]);
         state->disturbance[k] += (state->b0[k] - b0) * state->command[k];
         state->b0[k] = b0;
@@ -89,11 +101,12 @@ static inline void ${name}_schedule(${name}_state *state, const $real inertia[${
 }"""
 
 APPLIED = """\
-/* What the drive really gave since the last step: saturated further, or with a test signal. */
+/* What the drive really gave since the last step: saturated further, or with a test signal. A value
+ * that is not finite is ignored. */
 static inline void ${name}_applied(${name}_state *state, const $real achieved[${NAME}_AXES])
 {
     for (int k = 0; k < ${NAME}_AXES; ++k)
-        state->command[k] = achieved[k];
+        if (${name}_finite(&achieved[k])) state->command[k] = achieved[k];
 }"""
 
 
@@ -108,7 +121,6 @@ _STATES = {
         "disturbance": "f of angle'' = b0 u + f, rad/s^2, estimate",
     },
 }
-_COMMAND = {"command": "as applied since the last sample"}
 
 
 def ladrc_source(ladrc: LADRC, axes: int | None, precision: Precision) -> Source:
@@ -119,7 +131,7 @@ def ladrc_source(ladrc: LADRC, axes: int | None, precision: Precision) -> Source
         dt=ladrc.dt,
         settings=_settings(ladrc, True),
         gains=_noted(ladrc, gains),
-        state=_STATES[ladrc.order] | _COMMAND,
+        state=_STATES[ladrc.order] | COMMAND,
         functions=(*_starting(ladrc, ""), ladrc_step(ladrc, "g->b0"), APPLIED),
     )
 
@@ -138,7 +150,7 @@ def scheduled_ladrc_source(law: ScheduledLADRC, axes: int | None, precision: Pre
         settings=_settings(ladrc, False)
         | {"b0": "piecewise linear from ln inertia to ln b0, constant beyond the knots"},
         gains=noted,
-        state=_STATES[ladrc.order] | _COMMAND | {"b0": f"in force, {_UNITS[ladrc.order]}"},
+        state=_STATES[ladrc.order] | COMMAND | {"b0": f"in force, {_UNITS[ladrc.order]}"},
         functions=(*start, source.function, SCHEDULE, ladrc_step(ladrc, "state->b0[k]"), APPLIED),
         tables=source.tables,
         needs_libm=True,

@@ -6,16 +6,20 @@ from jaxtyping import Array
 
 from jaxquad.control import BackCalculation, Clamping, PID, ScheduledPID
 
-from ._map import map_gains, map_source, require_map
 from ._source import (
     axes_text,
+    COMMAND,
     Gain,
+    map_gains,
+    map_source,
     per_axis,
     Precision,
+    require_map,
     require_precision,
     Source,
     starting,
     type_of,
+    update,
 )
 
 
@@ -30,48 +34,51 @@ def pid_step(pid: PID, per_gain: str) -> str:
         "const $real half = 0.5$f * ${NAME}_DT * ki * (reference[k] - seen);",
         "const $real acceleration = reference_acceleration ? reference_acceleration[k] : 0;",
         *(_SUMMED if smooth else _STRAIGHT),
-        "$real rate = state->started ? state->rate[k] + g->sharp * change : 0;",
-        "if (reference_rate && state->started)",
+        "$real rate = state->started[k] ? state->rate[k] + g->sharp * change : 0;",
+        "if (reference_rate && state->started[k])",
         "    rate += (1 - g->keep) * (reference_rate[k] - 0.5$f * ${NAME}_DT * acceleration);",
-        "state->rate[k] = g->keep * rate - g->sharp * change;",
-        *(["rate -= state->slope[k];"] if smooth else []),
+        "const $real filtered = g->keep * rate - g->sharp * change;",
+        *(["rate -= turn;"] if smooth else []),
         f"$real wanted = {gain('kp')} * (g->proportional_weight * reference[k] - seen);",
         f"wanted = wanted + integral + {gain('kd')} * rate;",
         f"if (reference_rate) wanted += {gain('feedforward')} * acceleration;",
-        "command[k] = ${name}_limited(wanted, g->limit);",
+        "const $real given = ${name}_limited(wanted, g->limit);",
         f"$real growth = integral{'' if smooth else ' + half'} - state->integral[k];",
         *_anti_windup(pid),
-        "state->integral[k] += growth;",
+        "const $real sum = state->integral[k] + growth;",
     ]
+    new = {"integral": "sum", "rate": "filtered", "command": "given", "started": "1"}
+    new |= {"angle": "seen", "slope": "turn"} if smooth else {}
+    lines += update(new, ("wanted", "sum", "filtered", *(("seen", "turn") if smooth else ())))
     return _STEP.replace("$lines", "\n".join(f"        {line}" for line in lines))
 
 
 def _anti_windup(pid: PID) -> list[str]:
     if isinstance(pid.anti_windup, Clamping):
-        return ["if ((wanted - command[k]) * growth > 0) growth = 0;"]
+        return ["if ((wanted - given) * growth > 0) growth = 0;"]
     if isinstance(pid.anti_windup, BackCalculation):
-        return ["growth += g->follow * (command[k] - wanted);"]
+        return ["growth += g->follow * (given - wanted);"]
     return []
 
 
 _FILTERED = [
     "const $real away = state->angle[k] - measurement[k], slope = state->slope[k];",
     "const $real seen = measurement[k] + g->angle_angle * away + g->angle_rate * slope;",
-    "state->angle[k] = seen;",
-    "state->slope[k] = g->rate_angle * away + g->rate_rate * slope;",
+    "const $real turn = g->rate_angle * away + g->rate_rate * slope;",
 ]
 _SUMMED = [
     "const $real integral = state->integral[k] + 2 * half;",
     "const $real change = reference_rate ? 0 : g->derivative_weight * reference[k];",
 ]
 _STRAIGHT = [
-    "const $real integral = state->integral[k] + (state->started ? half : 0);",
+    "const $real integral = state->integral[k] + (state->started[k] ? half : 0);",
     "const $real change = (reference_rate ? 0 : g->derivative_weight * reference[k]) - seen;",
 ]
 
 _STEP = """\
 /* One sample: the command to hold until the next one. The set-point's rate and acceleration may be
- * null pointers: derivative_weight then acts on its differences, and there is no feed-forward. */
+ * null pointers: derivative_weight then acts on its differences, and there is no feed-forward. A
+ * sample that is not finite changes nothing of its axis. */
 static inline void ${name}_step(${name}_state *state, const $real reference[${NAME}_AXES],
     const $real *reference_rate, const $real *reference_acceleration,
     const $real measurement[${NAME}_AXES], $real command[${NAME}_AXES])
@@ -80,16 +87,16 @@ static inline void ${name}_step(${name}_state *state, const $real reference[${NA
         const ${name}_gains *g = &${name}_table[k];
 $lines
     }
-    state->started = 1;
 }"""
 
 SCHEDULE = """\
 /* Another inertia, kg m^2: the gains change at once, the integral of the command does not. Values
- * that are not above 0 are ignored. Starts at the nominal inertia. */
+ * that are not above 0, or not finite, are ignored. Starts at the nominal inertia. */
 static inline void ${name}_schedule(${name}_state *state, const $real inertia[${NAME}_AXES])
 {
     for (int k = 0; k < ${NAME}_AXES; ++k)
-        if (inertia[k] > 0) state->b0[k] = ${name}_b0(k, inertia[k]);
+        if (${name}_finite(&inertia[k]) && inertia[k] > 0)
+            state->b0[k] = ${name}_b0(k, inertia[k]);
 }"""
 
 
@@ -182,7 +189,7 @@ def _states(pid: PID) -> dict[str, str]:
     found = {
         "integral": "units of the command",
         "rate": "of the derivative's filter, rad/s",
-    }
+    } | COMMAND
     if pid.measurement_filter is None:
         return found
     return found | {
@@ -193,7 +200,7 @@ def _states(pid: PID) -> dict[str, str]:
 
 def _starting(pid: PID, more: str) -> tuple[str, ...]:
     measured = None if pid.measurement_filter is None else "angle"
-    return starting(_states(pid), measured=measured, more=more, flags=("started",))
+    return starting((*_states(pid), "started"), measured=measured, more=more)
 
 
 def _settings(pid: PID) -> dict[str, str]:
