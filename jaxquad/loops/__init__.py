@@ -4,13 +4,13 @@ from jaxquad._core import align as align, per_member as per_member
 
 from ._analysis import (
     analyse as analyse,
+    linear_numbers as linear_numbers,
     loop_numbers as loop_numbers,
     LoopAnalysis as LoopAnalysis,
     LoopNumbers as LoopNumbers,
     LoopResponse as LoopResponse,
 )
 from ._gain_window import gain_window as gain_window, GainWindow as GainWindow
-from ._linear_numbers import linear_numbers as linear_numbers
 from ._loop import Loop as Loop
 from ._protocols import (
     after_drive as after_drive,

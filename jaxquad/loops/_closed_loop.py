@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float
 from jaxquad.control import LinearController
 from jaxquad.models import imaginary
 
-from ._sampled_axis import SampledAxis
+from ._linear_parts import SampledAxis
 from ._spectrum import balance
 
 

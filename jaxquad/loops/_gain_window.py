@@ -11,9 +11,8 @@ from jaxtyping import Array, Bool, Float
 from jaxquad.control import LinearController
 
 from ._closed_loop import close
-from ._linear_parts import axis_index, linear_parts, LinearParts
+from ._linear_parts import axis_index, linear_parts, LinearParts, SampledAxis
 from ._loop import Loop
-from ._sampled_axis import SampledAxis
 from ._spectrum import abscissa, growth, powers, sharpest
 from .qualities._crossings import first
 

@@ -4,10 +4,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ._basis import Basis, basis_of, evaluate_curve, Numbers, only_finite, with_coherence
+from ._basis import (
+    Basis,
+    basis_of,
+    degrees,
+    evaluate_curve,
+    lines,
+    Numbers,
+    only_finite,
+    shown,
+    with_coherence,
+)
 from ._crossings import crossed, first
 from ._curve import ambiguous, Curve, curve_of, Response
-from ._text import degrees, lines, shown
 
 
 def missing_bandwidth(result: "Bandwidth") -> list[str]:

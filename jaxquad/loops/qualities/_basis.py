@@ -1,4 +1,4 @@
-"""What a number rests on: the band, the phase's branch, coherence and random error."""
+"""What the numbers of a response were found from, and how they are printed."""
 
 from collections.abc import Callable, Mapping
 
@@ -135,3 +135,38 @@ def _spread(
     w = jax.lax.complex(slope[..., 0, :], slope[..., 1, :])
     power = jnp.einsum("...f,fg,...g->...", jnp.conj(w), curve.measured.covariance, w)
     return jnp.sqrt(jnp.maximum(jnp.real(power) / 2, 0.0))
+
+
+def shown(
+    value: Float[Array, ""] | float,
+    error: Float[Array, ""] | float | None,
+    unit: str,
+    scale: float = 1.0,
+) -> str:
+    """`value` times `scale` with its standard error."""
+    if not np.isfinite(value):
+        return "-"
+    doubt = "" if error is None else f" +- {float(error) * scale:.2g}"
+    return f"{float(value) * scale:.4g}{doubt} {unit}"
+
+
+def degrees(value: Float[Array, ""] | float, error: Float[Array, ""] | float | None) -> str:
+    """An angle in rad as degrees."""
+    return shown(value, error, "deg", float(np.degrees(1.0)))
+
+
+def decibels(value: Float[Array, ""] | float, error: Float[Array, ""] | float | None) -> str:
+    """A ratio in dB."""
+    if not np.isfinite(value):
+        return "-"
+    scale = 20 / np.log(10)
+    relative = None if error is None else np.asarray(error) / np.asarray(value)
+    doubt = "" if relative is None else f" +- {scale * float(relative):.2g}"
+    return f"{scale * np.log(float(value)):.4g}{doubt} dB"
+
+
+def lines(rows: list[tuple[str, str]], remarks: list[str]) -> str:
+    """Names and numbers in two columns, then the remarks."""
+    width = max(len(name) for name, _ in rows)
+    table = [f"  {name:<{width}}  {text}" for name, text in rows]
+    return "\n".join(table + [f"  ! {remark}" for remark in remarks])

@@ -6,11 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ._basis import Basis, basis_of, evaluate_curve, Numbers, only_finite, with_coherence
+from ._basis import (
+    Basis,
+    basis_of,
+    decibels,
+    evaluate_curve,
+    lines,
+    Numbers,
+    only_finite,
+    shown,
+    with_coherence,
+)
 from ._crossings import between, crossed, first
 from ._curve import Curve, curve_of, Response
-from ._nyquist import remarks_on_roots, unstable_roots
-from ._text import decibels, lines, shown
+from ._margins import remarks_on_roots, unstable_roots
 
 
 _LEVEL = np.log(10.0) * -3 / 20  # -3 dB in nepers

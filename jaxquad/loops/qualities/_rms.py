@@ -8,9 +8,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import is_concrete
 
-from ._basis import Basis, basis_of, evaluate_curve, Numbers, only_finite
+from ._basis import Basis, basis_of, evaluate_curve, lines, Numbers, only_finite, shown
 from ._curve import Curve, curve_of, Response
-from ._text import lines, shown
 
 
 def nodes_between(
