@@ -2,15 +2,18 @@
 
 from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
-from ._axis import AttitudeAxis as AttitudeAxis
 from ._connect import realise as realise, series as series, state_space as state_space
 from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
 from ._entry_slopes import Entry as Entry, logarithmic_slopes as logarithmic_slopes
 from ._modes import Mode as Mode, modes as modes
 from ._multirotor import (
+    CRAZYFLIE as CRAZYFLIE,
+    crazyflie as crazyflie,
     MotorLag as MotorLag,
     Multirotor as Multirotor,
     MultirotorState as MultirotorState,
+    QUANSER_HOVER as QUANSER_HOVER,
+    quanser_hover as quanser_hover,
 )
 from ._protocols import (
     evaluate_response as evaluate_response,
@@ -34,13 +37,8 @@ from ._simulate_linear import (
 )
 from ._state_space import explicit as explicit, matrices_of as matrices_of, StateSpace as StateSpace
 from ._transfer_function import (
+    AttitudeAxis as AttitudeAxis,
     imaginary as imaginary,
     LaggedIntegrator as LaggedIntegrator,
     TransferFunction as TransferFunction,
-)
-from ._vehicles import (
-    CRAZYFLIE as CRAZYFLIE,
-    crazyflie as crazyflie,
-    QUANSER_HOVER as QUANSER_HOVER,
-    quanser_hover as quanser_hover,
 )
