@@ -1,6 +1,6 @@
 """Result files and the HTML report."""
 
-from ._comparison import compare_fits as compare_fits
+from ._fit import compare_fits as compare_fits
 from ._page import (
     Cell as Cell,
     render_page as render_page,

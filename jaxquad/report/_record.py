@@ -14,8 +14,7 @@ from jaxquad.plot import (
 )
 from jaxquad.records import Record
 
-from ._figure import embed_figure, Image, short_unit
-from ._page import Cell, Table
+from ._page import Cell, embed_figure, Image, short_unit, Table
 
 
 GOOD_TIC = 0.25  # Theil inequality coefficient, below which agreement is good

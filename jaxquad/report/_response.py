@@ -18,7 +18,7 @@ from jaxquad.plot import (
 )
 from jaxquad.spectra import FrequencyResponse
 
-from ._figure import embed_figure, Image
+from ._page import embed_figure, Image
 
 
 _PAIRS = 6  # responses that are drawn, of all estimates together
