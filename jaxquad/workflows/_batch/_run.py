@@ -6,7 +6,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 from .._settings import IdentifySettings
-from ._cluster import perform_on_cluster
 from ._jobs import (
     Content,
     failure,
@@ -17,9 +16,9 @@ from ._jobs import (
     stored_result,
     Work,
 )
-from ._pool import perform_locally
 from ._settings import BatchSettings
 from ._tables import Row, write_summary, write_tables
+from ._workers import perform_locally, perform_on_cluster
 
 
 TIMEOUT = 1800.0  # s, for one log on this machine
