@@ -14,7 +14,6 @@ from ._disturbances import (
     Pulse as Pulse,
     WhiteNoise as WhiteNoise,
 )
-from ._drives import MotorDrive as MotorDrive, Saturation as Saturation
 from ._evaluate import evaluate as evaluate, metrics as metrics
 from ._flight_metrics import (
     find_steps as find_steps,
@@ -22,6 +21,7 @@ from ._flight_metrics import (
     Window as Window,
     window as window,
 )
+from ._hardware import Encoder as Encoder, MotorDrive as MotorDrive, Saturation as Saturation
 from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
 from ._over_devices import loop_over_devices as loop_over_devices, over_devices as over_devices
@@ -34,7 +34,6 @@ from ._references import (
 )
 from ._run import check_run as check_run, scan_loop as scan_loop
 from ._scenario import excite as excite, Scenario as Scenario, scenario as scenario
-from ._sensors import Encoder as Encoder
 from ._signal import Clock as Clock, Motion as Motion, Signal as Signal
 from ._simulate import simulate as simulate, Simulation as Simulation
 from ._step import runge_kutta as runge_kutta, SampleResult as SampleResult

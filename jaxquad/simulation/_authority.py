@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxquad._core import align, as_float, ensemble_shape, is_concrete, per_member
 from jaxquad.loops import Drive, Plant
 
-from ._metrics_text import axis_names
+from ._metrics import axis_names
 from ._scenario import Scenario
 
 
