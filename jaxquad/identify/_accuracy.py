@@ -92,10 +92,9 @@ def _through_fit(record: ResponseTerm, count: int) -> Matrix:
     weighted = record.weights[..., None] ** 2 * record.slopes[..., :count]
     model = np.asarray(record.frf.response) / record.ratio
     used = record.weights[..., :1] > 0
-    # Circular noise: real and imaginary parts share its covariance with opposite signs.
+    # Magnitude and phase of the misfit are the parts of dT over T.
     columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / model.conj()[..., None]
-    effect = record.frf.errors.project(jnp.asarray(np.where(used, columns, 0.0)))
-    return 0.5 * np.real(np.asarray(effect))
+    return np.asarray(record.frf.errors.project(jnp.asarray(np.where(used, columns, 0.0))))
 
 
 def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -> Matrix:

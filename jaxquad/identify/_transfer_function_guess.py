@@ -110,19 +110,12 @@ def select_pair(frf: FrequencyResponse, output: int | str, input: int | str) -> 
     def pick(values: Array) -> Array:
         return values[:, o : o + 1, i : i + 1]
 
-    share = None if frf.errors.share is None else pick(frf.errors.share)
-    errors = dataclasses.replace(
-        frf.errors,
-        effect=frf.errors.effect[:, i : i + 1],
-        noise=frf.errors.noise[:, o : o + 1],
-        share=share,
-    )
     return dataclasses.replace(
         frf,
         response=pick(frf.response),
         coherence=pick(frf.coherence),
         random_error=pick(frf.random_error),
-        errors=errors,
+        errors=frf.errors.pair(o, i),
         direct_coherence=pick(frf.direct_coherence),
         multiple_coherence=frf.multiple_coherence[:, o : o + 1],
         input_names=frf.input_names[i : i + 1],

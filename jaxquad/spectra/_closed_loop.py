@@ -63,9 +63,7 @@ def deembed(
     else:
         raise ValueError(f"entry is {entry!r}: use 'set-point' or 'plant input'")
     amplified = np.abs(slope * measured / plant)
-    errors = dataclasses.replace(
-        closed.errors, effect=closed.errors.effect * jnp.asarray(slope[:, 0])[:, :, None]
-    )
+    errors = closed.errors.scaled(jnp.asarray(slope[:, 0, 0]))
     return dataclasses.replace(
         closed,
         response=jnp.asarray(plant),

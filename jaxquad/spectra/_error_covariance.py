@@ -1,3 +1,4 @@
+import dataclasses
 import functools as ft
 
 import equinox as eqx
@@ -78,6 +79,11 @@ class ErrorCovariance(eqx.Module):
     the root of the outputs' noise covariance: cov(V[o], V[p]) = sum_c noise[f, o, c]
     conj(noise[f, p, c]). The full covariance matrix of 20 outputs and 10 inputs would fill
     gigabytes, but a fit needs only its product with a few columns.
+
+    Real parameters p that the same noise W[a, c] has disturbed, as those of a model that all
+    frequencies share, add `sensitivity[f, o, i, p] Re(sum_ac drive[p, a, c] W[a, c])`, where
+    V[a, o] = sum_c noise[f, o, c] W[a, c]: an effect that is linear in the real and the imaginary
+    part of the noise apart. They need atoms without windows and `share`.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s
@@ -86,47 +92,98 @@ class ErrorCovariance(eqx.Module):
     share: Float[Array, "frequencies outputs inputs groups"] | None = None  # 1 without
     windows: Placement | None = None
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)  # one group without
+    sensitivity: Complex[Array, "frequencies outputs inputs parameters"] | None = None
+    drive: Complex[Array, "parameters atoms roots"] | None = None
 
     @eqx.filter_jit
     def project(
         self, columns: Complex[Array, "frequencies outputs inputs columns"]
-    ) -> Complex[Array, "columns columns"]:
-        """Covariance of the sums of `conj(columns) dT` over frequencies, outputs and inputs."""
+    ) -> Float[Array, "columns columns"]:
+        """Covariance of Re(sum of `conj(columns) dT`) over frequencies, outputs and inputs."""
         share = self._share()
         drawn = jnp.einsum(
             "foip,foc,foig->fgicp", jnp.conj(columns), self.noise, share.astype(columns.dtype)
         )
-        count = columns.shape[3]
-        start = jnp.zeros((count, count), columns.dtype)
+        count, moved = columns.shape[3], self._moved(columns)
+        start = jnp.zeros((count, count), self.omega.dtype)
 
         def add(total, times):
-            part = jnp.einsum("fgit,fgicp->tcp", self._at(times), drawn).reshape(-1, count)
-            return total + part.T @ jnp.conj(part), None
+            part = jnp.einsum("fgit,fgicp->tcp", self._at(times), drawn)
+            if self.drive is not None:
+                part += jnp.einsum("nac,np->acp", _taken(self.drive, times), moved)
+            part = part.reshape(-1, count)
+            return total + 0.5 * jnp.real(part.T @ jnp.conj(part)), None
 
         return jax.lax.scan(add, start, self._times())[0]
 
-    def variance(self) -> Float[Array, "frequencies outputs inputs"]:
+    def _moved(
+        self, columns: Complex[Array, "frequencies outputs inputs columns"]
+    ) -> Complex[Array, "parameters columns"] | None:
+        """What each real parameter adds to Re(sum of `conj(columns) dT`)."""
+        if self.sensitivity is None:
+            return None
+        total = jnp.einsum("foip,foin->np", jnp.conj(columns), self.sensitivity)
+        return jnp.real(total).astype(columns.dtype)
+
+    def variance(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
         if self.windows is not None or self.share is not None:
             raise ValueError(
                 "the errors of overlapping windows are correlated: use the diagonal of "
                 "errors.between(pair, pair)"
             )
-        gain = jnp.sum(jnp.abs(self.effect) ** 2, axis=2)
-        power = jnp.sum(jnp.abs(self.noise) ** 2, axis=2)
-        return power[:, :, None] * gain[:, None, :]
+        effect, noise = np.asarray(self.effect), np.asarray(self.noise)
+        gain, power = np.sum(np.abs(effect) ** 2, axis=2), np.sum(np.abs(noise) ** 2, axis=2)
+        total = power[:, :, None] * gain[:, None, :]
+        if self.sensitivity is None or self.drive is None:
+            return total
+        slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
+        both = np.tensordot(effect, np.conj(drive), axes=(2, 1))
+        both = np.einsum("finc,foc,foin->foi", both, noise, np.conj(slope), optimize=True)
+        flat = drive.reshape(len(drive), -1)
+        moved = slope @ (0.5 * np.real(flat @ np.conj(flat).T))
+        own = np.sum(moved * np.conj(slope), axis=3)
+        return np.maximum(total + np.real(both + own), 0.0)
 
     def between(
         self, first: tuple[int, int], second: tuple[int, int]
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
-        """Covariance of two pairs (output, input) between all pairs of frequencies."""
+        """Covariance E[dT dT^H] of two pairs (output, input) between all pairs of frequencies."""
         times = self._times().reshape(-1)
         atoms, share, noise = (np.asarray(x) for x in (self._at(times), self._share(), self.noise))
         one, other = (
             np.einsum("fgt,fg->ft", atoms[:, :, i], share[:, o, i]) for o, i in (first, second)
         )
         shared = noise[:, first[0]] @ noise[:, second[0]].conj().T
-        return (one @ other.conj().T) * shared
+        total = (one @ other.conj().T) * shared
+        if self.sensitivity is None or self.drive is None:
+            return total
+        drive = np.asarray(_taken(self.drive, times))
+        mine, its = (np.asarray(self.sensitivity[:, o, i]) for o, i in (first, second))
+        local = [
+            np.einsum("ft,ntc,fc->fn", effect, np.conj(drive), noise[:, pair[0]], optimize=True)
+            for effect, pair in ((one, first), (other, second))
+        ]
+        flat = drive.reshape(len(drive), -1)
+        moved = mine @ (0.5 * np.real(flat @ np.conj(flat).T)) @ its.conj().T
+        return total + moved + 0.5 * (local[0] @ its.conj().T + mine @ local[1].conj().T)
+
+    def pair(self, output: int, input: int) -> "ErrorCovariance":
+        """That of a single response."""
+        o, i = slice(output, output + 1), slice(input, input + 1)
+        return dataclasses.replace(
+            self,
+            effect=self.effect[:, i],
+            noise=self.noise[:, o],
+            share=None if self.share is None else self.share[:, o, i],
+            sensitivity=None if self.sensitivity is None else self.sensitivity[:, o, i],
+        )
+
+    def scaled(self, factor: Complex[Array, " frequencies"]) -> "ErrorCovariance":
+        """That of the errors times `factor`."""
+        columns, slope = jnp.asarray(factor)[:, None, None], self.sensitivity
+        turned = None if slope is None else slope * columns[..., None]
+        return dataclasses.replace(self, effect=self.effect * columns, sensitivity=turned)
 
     def _share(self) -> Float[Array, "frequencies outputs inputs groups"]:
         shape = (*self.noise.shape[:2], self.effect.shape[1], 1)
@@ -144,9 +201,7 @@ class ErrorCovariance(eqx.Module):
     ) -> Complex[Array, "frequencies groups inputs times"]:
         """Contribution of unit noise at these times to the errors, by group of atoms."""
         if self.windows is None:
-            place = jnp.maximum(times, 0.0).astype(int)
-            inside = (times >= 0).astype(self.effect.dtype)
-            return (jnp.take(self.effect, place, axis=2) * inside[None, None, :])[:, None]
+            return jnp.moveaxis(_taken(jnp.moveaxis(self.effect, 2, 1), times), 1, 2)[:, None]
         seen = self.windows.at(times)
         turned = turn(self.omega[:, None] * times[None, :])
         ends = np.cumsum(self.counts or (self.effect.shape[2],))
@@ -157,6 +212,14 @@ class ErrorCovariance(eqx.Module):
             )
         ]
         return jnp.stack(parts, axis=1) * turned[:, None, None, :]
+
+
+def _taken(
+    values: Complex[Array, "rows atoms columns"], places: Float[Array, " places"]
+) -> Complex[Array, "rows places columns"]:
+    """Values at these atoms; 0 where the place is padding."""
+    inside = (places >= 0).astype(values.dtype)
+    return jnp.take(values, jnp.maximum(places, 0.0).astype(int), axis=1) * inside[None, :, None]
 
 
 def independent_errors(
