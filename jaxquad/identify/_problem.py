@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
 from jaxquad._xla import no_fuse
-from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
+from ._held import Aliases, evaluate_sampled, plan_aliases
 from ._parameters import Parameters
 
 
@@ -60,6 +60,7 @@ class Problem(eqx.Module):
     measured: tuple[Complex[Array, "frequencies outputs inputs"], ...]
     weights: tuple[Float[Array, "frequencies outputs inputs 2"], ...]
     known: Float[Array, "priors 2"]  # value, standard error
+    aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
 
     def weighted(self, weights: Sequence[Float[Array, "..."]]) -> "Problem":
         """The same problem under other weights."""
@@ -102,6 +103,10 @@ def make_problem(
         measured=tuple(jnp.where(jnp.isfinite(f.response), f.response, 1.0) for f in frfs),
         weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
         known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
+        aliases=tuple(
+            plan_aliases((condition or unchanged)(model), frf)
+            for condition, frf in zip(conditions, frfs, strict=True)
+        ),
     )
 
 
@@ -111,10 +116,10 @@ def unchanged(model: PyTree) -> PyTree:
 
 
 def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, "..."]]:
-    """The model's responses in every record's condition."""
+    """The model's responses in every record's condition, as its samples show them."""
     model = problem.parameters.insert(problem.model, z)
-    pairs = zip(problem.conditions, problem.omega, strict=True)
-    return [evaluate_response(condition(model), omega) for condition, omega in pairs]
+    terms = zip(problem.conditions, problem.omega, problem.aliases, strict=True)
+    return [evaluate_sampled(condition(model), *where) for condition, *where in terms]
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> list[Float[Array, "..."]]:

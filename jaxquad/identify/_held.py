@@ -1,0 +1,204 @@
+"""What a sampled record shows of a model whose input is held: its response with all aliases."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, PyTree
+
+from jaxquad.models import evaluate_response
+from jaxquad.spectra import FrequencyResponse
+
+
+_COUNTS = (16, 64)  # aliases to either side
+_NODES = (6, 12)  # frequencies between which the sum over the aliases is interpolated
+_TRIED = 32  # frequencies at which the two are chosen
+_TOLERANCE = 1e-8  # of the response, to which they are chosen
+
+
+class Aliases(eqx.Module):
+    """How the response of a held input follows from a model's own at other frequencies.
+
+    Held for h seconds each, the samples u[k] give a plant G the sampled response
+    T(w) = sum_k G(j(w + k ws)) H(j(w + k ws)) / h, H(s) = (1 - e^(-s h)) / s, ws = 2 pi / h.
+    The numerator of H is common to all terms; what is left of those with k other than 0 is smooth
+    over the band, so that a few nodes carry it.
+    Source: Franklin, Powell and Workman, "Digital Control of Dynamic Systems", 3rd ed., ch. 5.
+    """
+
+    direct: Complex[Array, " frequencies"]  # times G(jw)
+    spread: Complex[Array, "frequencies nodes"]  # times the sum at each node
+    upper: Float[Array, "nodes aliases"]  # rad/s
+    lower: Float[Array, "nodes aliases"]  # rad/s, of the negative frequencies
+    weights: Float[Array, " aliases"]  # of the sum
+
+    @property
+    def omega(self) -> Float[Array, " others"]:
+        """All frequencies at which the model is needed beside those of the response, in rad/s."""
+        return jnp.concatenate([self.upper.reshape(-1), self.lower.reshape(-1)])
+
+    def total(
+        self,
+        own: Complex[Array, "frequencies *pairs"],
+        others: Complex[Array, "others *pairs"],
+    ) -> Complex[Array, "frequencies *pairs"]:
+        """The response, from the model's at the frequencies themselves and at `omega`."""
+        columns = (1,) * (own.ndim - 1)
+        upper, lower = jnp.split(others / (1j * self.omega).reshape(-1, *columns), 2)
+        terms = (upper + jnp.conj(lower)).reshape(*self.upper.shape, *own.shape[1:])
+        at_nodes = jnp.einsum("na...,a->n...", terms, self.weights)
+        aliased = jnp.einsum("fn,n...->f...", self.spread, at_nodes)
+        return self.direct.reshape(-1, *columns) * own + aliased
+
+
+def evaluate_sampled(
+    model: PyTree, omega: Float[Array, " frequencies"], aliases: Aliases | None
+) -> Complex[Array, "frequencies outputs inputs"]:
+    """A model's response as a sampled record shows it; without aliases its own."""
+    if aliases is None:
+        return evaluate_response(model, omega)
+    both = evaluate_response(model, jnp.concatenate([omega, aliases.omega]))
+    return aliases.total(both[: omega.size], both[omega.size :])
+
+
+class SampledModel(eqx.Module):
+    """A model as samples of it show it while its input is held; for figures and comparisons."""
+
+    model: PyTree
+    hold: float = eqx.field(static=True)  # s
+
+    def frequency_response(
+        self, omega: Float[Array, " frequencies"]
+    ) -> Complex[Array, "frequencies outputs inputs"]:
+        """At frequencies below half the sample rate."""
+        omega = jnp.asarray(omega)
+        return evaluate_sampled(self.model, omega, _aliases_at(omega, self.hold, _COUNTS[-1]))
+
+
+def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
+    """The model whose frequency response is to be compared with a measured one.
+
+    **Arguments:**
+
+    - `model`: with `frequency_response(omega)`.
+    - `frf`: a measured response, which knows how its input was held.
+
+    **Returns:** the model itself, or one whose response has the hold and its aliases.
+    """
+    hold = hold_of(frf)
+    return SampledModel(model, hold) if hold else model
+
+
+def hold_of(frf: FrequencyResponse) -> float:
+    """The hold in s that a model has to allow for; 0: none.
+
+    What is held for several samples is held for each of them: the record shows the steps.
+    """
+    return min(frf.hold or 0.0, frf.dt)
+
+
+def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
+    """As many aliases and as few nodes as a model's response needs; None without a hold.
+
+    **Arguments:**
+
+    - `model`: near the ones that are to be evaluated.
+    - `frf`: the measured response that they are compared with.
+    """
+    hold, omega = hold_of(frf), np.asarray(frf.omega)
+    if not hold:
+        return None
+    tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
+    every = _aliases_at(tried, hold, _COUNTS[-1])
+    found = np.asarray(_evaluate(model, jnp.asarray(tried), every.omega))
+    terms = _Terms(tried, hold, every, found[: tried.size], found[tried.size :])
+    best = terms.total(_COUNTS[-1], None)
+    close = lambda *plan: bool(np.all(np.abs(terms.total(*plan) - best) <= _TOLERANCE * abs(best)))
+    count = next(count for count in _COUNTS if close(count, None))
+    for nodes in _NODES if omega.size > _NODES[-1] else ():
+        if close(count, places := _places(tried, nodes)):
+            return _aliases_at(omega, hold, count, tried[places])
+    return _aliases_at(omega, hold, count)
+
+
+@eqx.filter_jit
+def _evaluate(model, omega, others):
+    return evaluate_response(model, jnp.concatenate([omega, others]))
+
+
+class _Terms(eqx.Module):
+    """A model's response at some frequencies and at all of their aliases."""
+
+    omega: Float[np.ndarray, " frequencies"]
+    hold: float
+    aliases: Aliases
+    own: Complex[np.ndarray, "frequencies outputs inputs"]
+    others: Complex[np.ndarray, "others outputs inputs"]
+
+    def total(
+        self, count: int, nodes: np.ndarray | None
+    ) -> Complex[np.ndarray, "frequencies outputs inputs"]:
+        """The response from fewer aliases, and interpolated between some of the frequencies."""
+        shape = (2, *self.aliases.upper.shape, *self.own.shape[1:])
+        kept = slice(None) if nodes is None else nodes
+        others = self.others.reshape(shape)[:, kept, :count].reshape(-1, *self.own.shape[1:])
+        at = None if nodes is None else self.omega[nodes]
+        return np.asarray(_aliases_at(self.omega, self.hold, count, at).total(self.own, others))
+
+
+def _places(omega: Float[np.ndarray, " frequencies"], count: int) -> np.ndarray:
+    """Which of the frequencies lie nearest to Chebyshev's points between the first and the last."""
+    turns = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    wanted = omega[0] + (omega[-1] - omega[0]) * (1 - turns) / 2
+    left = list(range(omega.size))
+    for target in wanted:
+        left.remove(min(left, key=lambda k: abs(omega[k] - target)))
+    return np.setdiff1d(np.arange(omega.size), left)
+
+
+def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None) -> Aliases:
+    """The aliases of all frequencies, or of the nodes between which they are interpolated."""
+    at = omega if nodes is None else nodes
+    rate = 2 * np.pi / hold
+    turn = (1 - jnp.exp(-1j * omega * hold)) / hold
+    across = jnp.eye(len(omega)) if nodes is None else jnp.asarray(_interpolation(omega, nodes))
+    steps = rate * np.arange(1, count + 1)
+    return Aliases(
+        direct=turn / (1j * omega),
+        spread=turn[:, None] * across,
+        upper=jnp.asarray(at)[:, None] + steps,
+        lower=steps - jnp.asarray(at)[:, None],
+        weights=jnp.asarray(_window(count)),
+    )
+
+
+def _interpolation(
+    omega: Float[np.ndarray, " frequencies"], nodes: Float[np.ndarray, " nodes"]
+) -> Float[np.ndarray, "frequencies nodes"]:
+    """The matrix from values at the nodes to the polynomial through them at all frequencies."""
+    middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
+    basis = lambda at: np.polynomial.chebyshev.chebvander((at - middle) / half, nodes.size - 1)
+    return np.linalg.solve(basis(nodes).T, basis(omega).T).T
+
+
+_FLAT = 0.3  # of the sum, over which its window stays at 1
+_SECOND = 0.7  # length of a second window beside the first
+
+
+def _window(count: int) -> Float[np.ndarray, " aliases"]:
+    """Weights of the first aliases in a sum that goes on for ever.
+
+    A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
+    one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
+    (Richardson's extrapolation).
+    """
+    place = np.arange(1, count + 1) / (count + 1)
+    first, second = _step(place), _step(place / _SECOND)
+    return (first - _SECOND * second) / (1 - _SECOND)
+
+
+def _step(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]:
+    """From 1 to 0 at 1, with all derivatives."""
+    x = np.clip((place - _FLAT) / (1 - _FLAT), 0, 1)
+    with np.errstate(divide="ignore", over="ignore"):
+        rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
+    return fall / (rise + fall)
