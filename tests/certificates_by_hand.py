@@ -18,12 +18,16 @@ def judged(itae: Any = 1.0, peak=2.0, activity=10.0, unstable: Any = ()):
     by_axis = {
         "itae": np.radians(wide(itae)),
         "overshoot": wide(1.0),
+        "saturation_share": wide(0.0),
         "activity_rate": wide(activity),
         "abscissa": np.where(which, 0.5, wide(-1.0)),
         "sensitivity_peak": np.where(which, np.nan, wide(peak)),
         "gain_margin": np.where(which, np.nan, wide(2.0)),
     }
-    return DesignResult(by_axis, which, np.zeros(MEMBERS, bool))
+    return DesignResult(by_axis, which, np.zeros(MEMBERS, bool), np.zeros(MEMBERS, bool))
+
+
+IDLE_ITAE = 100.0  # deg s^2
 
 
 def certificate(designs, distances=()):
@@ -41,6 +45,7 @@ def certificate(designs, distances=()):
             "precision": "float64", "ensemble": None, "device": "cpu", "versions": {},
         },
         (),
+        idle=judged(itae=IDLE_ITAE),
     )  # fmt: skip
 
 

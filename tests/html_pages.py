@@ -8,7 +8,7 @@ import numpy as np
 from certificates_by_hand import certificate, judged, missed
 
 import jaxquad as jq
-from jaxquad.tuning import Evaluation, Tuned
+from jaxquad.tuning import Evaluation, Tuned, Verdict
 
 
 ERROR = 0.005
@@ -104,6 +104,7 @@ def tuned_by_hand():
         controller=TRUTH,
         certificate=certificate(designs, [missed("sensitivity_peak", 1.5, 2.0)]),
         stabilised=True, converged=True, cost=1.0, values={"ladrc.wc": 5.25, "ladrc.wo": 40.0},
-        limits=(), minima=(), evaluations=2, stabilising=0, history=history, seconds=1.0,
+        limits=(), minima=(), bounds=(), convergence=Verdict("CONVERGENCE", True, "2 gradients"),
+        evaluations=2, stabilising=0, history=history, seconds=1.0,
         remarks=("a remark of the tuner",),
     )  # fmt: skip

@@ -165,6 +165,8 @@ class Posterior(eqx.Module):
     build: Build = eqx.field(static=True)
     held_back: float = eqx.field(static=True)  # s, of the delay, which the loop adds by itself
     longest: float = eqx.field(static=True)  # s, of many draws
+    band: tuple[float, float] | None = eqx.field(static=True)  # rad/s, that was identified
+    largest_command: float | None = eqx.field(static=True)  # of the record, in its unit
 
     def __init__(
         self,
@@ -173,6 +175,8 @@ class Posterior(eqx.Module):
         recorded_dt: float | None,
         believed: ArrayLike | None = None,
         plant: Given | None = None,
+        band: tuple[float, float] | None = None,
+        largest_command: float | None = None,
     ):
         """**Arguments:**
 
@@ -186,6 +190,10 @@ class Posterior(eqx.Module):
         - `believed`: the inertia in kg m^2 that belongs to the gain, where the fit determines only
             b = KT / J: torques in N m and the inertia given to a scheduled controller refer to it.
         - `plant`: a function of the model that returns the pair (`jq.DecoupledAxes`, delay in s).
+        - `band`: the frequencies in rad/s that were fitted: a certificate says where a bandwidth
+            lies beyond them.
+        - `largest_command`: how far the record's command went to either side, in its unit: a
+            certificate says where a drive's limit exceeds it.
 
         **Raises:**
 
@@ -196,6 +204,11 @@ class Posterior(eqx.Module):
         if not isinstance(fit, Fit):
             raise ValueError(f"fit is a {type(fit).__name__}: give the result of jq.fit")
         check_drawable(fit, hold_undetermined=True)
+        if band is not None and not 0 < band[0] < band[1]:
+            raise ValueError(f"band is {band} rad/s: give (low, high), 0 < low < high")
+        if largest_command is not None:
+            require_all_positive(largest_command=largest_command)
+        self.band, self.largest_command = band, largest_command
         self.fit, self.build = fit, _choose_builder(fit.model, believed, plant)
         self.held_back = 0.0 if recorded_dt is None else recorded_dt / 2
         self.plant, delay = self.build(fit.model)

@@ -30,7 +30,7 @@ def certificate_figure(
     - `certificate`: see `jq.certify`.
     - `quantities`: names of `jaxquad.tuning`, a panel for each.
     - `designs`: the names of those that are drawn; all by default.
-    - `title`: by default the verdict.
+    - `title`: by default the verdict, and what fails.
 
     **Raises:** ValueError for unknown designs, and for more than there are marks.
     """
@@ -47,8 +47,9 @@ def certificate_figure(
         _members(panel, certificate, quantity, names, place)
     panels[-1].set_xlabel(label)
     _finish(figure, panels)
-    verdict = str(certificate).splitlines()[0]
-    figure.suptitle("\n".join(wrap(title or verdict, 95)), fontsize=9)
+    failed = [str(each) for each in certificate.verdicts if each.holds is False]
+    lines = [title] if title else [str(certificate).splitlines()[0], *failed]
+    figure.suptitle("\n".join(part for line in lines for part in wrap(line, 95)), fontsize=9)
     return figure
 
 

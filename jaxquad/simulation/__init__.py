@@ -4,6 +4,7 @@ from ._authority import (
     Authority as Authority,
     authority as authority,
     AuthorityWarning as AuthorityWarning,
+    beyond_authority as beyond_authority,
     find_authority as find_authority,
 )
 from ._blocks import run_ensemble as run_ensemble

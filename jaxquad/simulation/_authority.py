@@ -108,27 +108,33 @@ def find_authority(
 
 def warn_beyond_authority(found: Authority | None, scenario: Scenario) -> None:
     """Warn of disturbances that no controller can hold. Silent for traced values."""
+    for message in beyond_authority(found, scenario):
+        warnings.warn(message, AuthorityWarning, stacklevel=3)
+
+
+def beyond_authority(found: Authority | None, scenario: Scenario) -> list[str]:
+    """What to say of disturbances that no controller can hold; nothing for traced values."""
     if found is None or not (is_concrete(scenario.disturbance) and is_concrete(found.torque)):
-        return
+        return []
     torque = np.abs(np.asarray(scenario.disturbance))
     limits = (
         (found.torque, "that the drive has: no controller holds the angle there"),
         (found.forward, "that the motors give without turning backwards"),
     )
+    messages = []
     for k, name in enumerate(axis_names(torque.shape[1])):
         for limit, what in limits:
             least, asked = np.asarray(limit[min(k, len(limit) - 1)]), torque[:, k]
             asked = asked.reshape(asked.shape + (1,) * (least.ndim + 1 - asked.ndim))
             share = np.mean(asked > (1 + 1e-6) * least)
             if share:
-                warnings.warn(
+                messages.append(
                     f"the disturbance of {name} reaches {torque[:, k].max():.4g} N m: "
                     f"{share:.1%} of the samples exceed the {_span(least)} N m {what}. Lower it, "
-                    "or raise the limit or the bias",
-                    AuthorityWarning,
-                    stacklevel=3,
+                    "or raise the limit or the bias"
                 )
                 break
+    return messages
 
 
 def _limit_of(part: object | None) -> Float[Array, "axes ..."]:

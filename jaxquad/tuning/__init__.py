@@ -29,3 +29,4 @@ from ._peers import (
 from ._quantities import QUANTITIES as QUANTITIES, Quantity as Quantity
 from ._tune import tune as tune
 from ._tuned import LimitResult as LimitResult, Optimum as Optimum, Tuned as Tuned
+from ._verdict import Bound as Bound, Verdict as Verdict

@@ -12,6 +12,7 @@ from jaxquad.control import LADRC
 
 from ._design_result import DesignResult, DesignSummary, Distance, summarise_design
 from ._quantities import QUANTITIES
+from ._verdict import judge_performance, judge_stability, NOT_TUNED, overall, Verdict
 
 
 class Provenance(TypedDict):
@@ -92,57 +93,20 @@ _FIRST = 34
 
 
 def describe(certificate: "Certificate") -> str:
-    """The verdict, the limits, the designs side by side, the worst members, and the remarks."""
-    lines = [verdict(certificate)]
+    """The verdicts, the limits, the designs side by side, the worst members, and the remarks."""
+    lines = [verdict(certificate), *(f"  {each}" for each in certificate.verdicts)]
+    lines += [f"  ! {remark}" for remark in certificate.remarks]
     lines += [f"  {distance}" for distance in certificate.distances]
     lines += _table(certificate.summaries)
     lines += [f"  worst members of {certificate.name}:"]
     lines += [f"    {line}" for line in worst_lines(certificate)]
-    lines += [f"  ! {remark}" for remark in certificate.remarks]
     return "\n".join([*lines, f"  {_provenance(certificate.provenance)}"])
 
 
 def verdict(certificate: "Certificate") -> str:
-    """One line: whether the certificate holds, or what fails first and by how much."""
-    on = f"{certificate.members} {'fresh ' * certificate.provenance['fresh']}members"
-    if certificate.holds:
-        count = len(certificate.distances)
-        met = ("", ", the limit is met")[count] if count < 2 else f", all {count} limits are met"
-        return f"CERTIFICATE HOLDS on {on}: none is unstable{_proven(certificate)}{met}"
-    first, *others = _failures(certificate)
-    more = f"; and {len(others)} more" if others else ""
-    return f"CERTIFICATE FAILS on {on}: {first}{more}"
-
-
-def _proven(certificate: "Certificate") -> str:
-    bound = certificate.summaries[certificate.name].unstable_at_most
-    return (
-        "" if bound is None else f" (proven: at most {100 * bound:.2g} % of all, 95 % confidence)"
-    )
-
-
-def _failures(certificate: "Certificate") -> list[str]:
-    design, found = certificate.design, []
-    if design.unstable is None:
-        found.append("the controller has no method linear(), so its stability is not known")
-    elif design.unstable.any():
-        found.append(_count(design.unstable, "linearly unstable", certificate))
-    if design.diverged.any():
-        found.append(_count(design.diverged, "diverged in flight", certificate))
-    if design.observer_instability:
-        found.append(design.observer_instability)
-    missed = [distance for distance in certificate.distances if not distance.met]
-    for distance in sorted(missed, key=lambda d: -np.inf if np.isnan(d.percent) else d.percent):
-        where = "" if distance.member is None else member_text(certificate, distance.member)
-        found.append(f"{distance}{f' ({where})' if where else ''}")
-    return found
-
-
-def _count(which: np.ndarray, what: str, certificate: "Certificate") -> str:
-    count, first = int(which.sum()), int(np.argmax(which))
-    worst = certificate.design.worst_member("abscissa")  # None without a linear form
-    where = member_text(certificate, first if worst is None or not which[worst] else worst)
-    return f"{count} of {which.size} ({count / which.size:.1%}) {what} ({where})"
+    """One line: whether the design may be flown, or which of the three verdicts fails."""
+    fresh = "fresh " * certificate.provenance["fresh"]
+    return overall(certificate.verdicts, f"{certificate.members} {fresh}members")
 
 
 def _table(rows: dict[str, DesignSummary]) -> list[str]:
@@ -165,6 +129,7 @@ def _counts(rows: dict[str, DesignSummary], widths: dict[str, int]) -> list[str]
         ],
         ("", "at most"): [row.unstable_at_most for row in rows.values()],
         ("diverged, %", ""): [row.diverged / row.members for row in rows.values()],
+        ("lost, %", ""): [row.lost / row.members for row in rows.values()],
     }
     return [
         f"  {title:<22}{which:<12}"
@@ -194,7 +159,7 @@ def lag_remark(
     controller: PyTree, delay: ArrayLike, lag: Float[ArrayLike, "..."] | None
 ) -> str | None:
     """Compare lag times wc of a LADRC with the most that any b0 stabilises; None for others."""
-    ladrc = _find_ladrc(controller)
+    ladrc = find_ladrc(controller)
     if lag is None or ladrc is None:
         return None
     wc, wo = float(np.max(np.asarray(ladrc.wc))), float(np.max(np.asarray(ladrc.wo)))
@@ -214,7 +179,8 @@ def lag_remark(
     )
 
 
-def _find_ladrc(controller: PyTree) -> LADRC | None:
+def find_ladrc(controller: PyTree) -> LADRC | None:
+    """The LADRC that a controller is made of, scheduled or not; None for others."""
     is_ladrc = lambda x: isinstance(x, LADRC)
     return next(filter(is_ladrc, jax.tree.leaves(controller, is_leaf=is_ladrc)), None)
 
@@ -222,11 +188,18 @@ def _find_ladrc(controller: PyTree) -> LADRC | None:
 class Certificate(eqx.Module):
     """What a design was shown to do on members of an ensemble that its tuner never saw.
 
-    It `holds` if no member is linearly unstable (by the exact poles), none diverged in flight, no
-    observer is unstable by itself (it would run away in saturation), and every limit is met. The
-    first line of `str()` says so, or what failed, by how much and in which member. None unstable of
-    n members drawn at random proves a share: at most 1.2 % with 95 % confidence for n = 256
-    (Clopper-Pearson), and no more than that.
+    Three verdicts, each with the numbers and with what to do:
+
+    - `stability`: no member is linearly unstable (by the exact poles), none diverged in flight, no
+        observer is unstable by itself (it would run away in saturation), and every limit is met.
+    - `performance`: every member stays in the range of the model, makes less than half the error
+        of doing nothing (the command 0), and has its command at the limit for less than a quarter
+        of the time.
+    - `convergence`: the tuning ended at a stationary point; not asked of gains that were given.
+
+    It `holds` if none of them fails, and `str()` begins with them. None of n members drawn at
+    random proves a share: at most 1.2 % of all with 95 % confidence for n = 256 (Clopper-Pearson),
+    and no more than that. Each verdict and each limit says what its share covers.
 
     The first of the `designs` is the one that is certified; the others are its peers on the same
     members and noise. Numbers of the linear loop leave out members that are unstable, which
@@ -241,6 +214,10 @@ class Certificate(eqx.Module):
     nominal: Float[np.ndarray, " axes"] | None  # inertia, kg m^2; None if it is not known
     provenance: Provenance
     remarks: tuple[str, ...]
+    idle: DesignResult  # the same flights with the command 0
+    start: DesignResult | None = None  # with the gains that the tuning started from
+    error: str = eqx.field(static=True, default="itae")  # by which performance is measured
+    convergence: Verdict = NOT_TUNED
 
     @property
     def name(self) -> str:
@@ -264,9 +241,27 @@ class Certificate(eqx.Module):
         return design.unstable_count == 0 and not design.diverged.any() and not observer
 
     @property
+    def stability(self) -> Verdict:
+        """Whether all members are stable and within the limits."""
+        place = lambda index: member_text(self, index)
+        known = self.independent
+        return judge_stability(self.design, self.distances, independent=known, place=place)
+
+    @property
+    def performance(self) -> Verdict:
+        """Whether the design is of use, against doing nothing and beside its start."""
+        compared = (self.design, self.idle, self.start, self.error)
+        return judge_performance(*compared, independent=self.independent)
+
+    @property
+    def verdicts(self) -> tuple[Verdict, Verdict, Verdict]:
+        """Stability, performance and convergence."""
+        return self.stability, self.performance, self.convergence
+
+    @property
     def holds(self) -> bool:
-        """Whether the design is stable on all members and meets every limit."""
-        return self.stable and all(distance.met for distance in self.distances)
+        """Whether none of the three verdicts fails: only then the design may be flown."""
+        return all(each.holds is not False for each in self.verdicts)
 
     @property
     def independent(self) -> bool:
@@ -279,6 +274,14 @@ class Certificate(eqx.Module):
         known = self.independent
         return {name: summarise_design(x, independent=known) for name, x in self.designs.items()}
 
+    @property
+    def _baselines(self) -> dict[str, DesignSummary]:
+        given = {"doing nothing": self.idle, "start": self.start}
+        known = self.independent
+        return {
+            n: summarise_design(x, independent=known) for n, x in given.items() if x is not None
+        }
+
     def member(self, index: int) -> dict[str, Float[np.ndarray, " axes"]]:
         """The parameters of one member, per axis, in SI units."""
         return {name: values[:, index] for name, values in self.facts.items()}
@@ -288,9 +291,12 @@ class Certificate(eqx.Module):
         return {
             "certificate": verdict(self),
             "holds": self.holds,
+            "verdicts": [each._asdict() for each in self.verdicts],
             "provenance": self.provenance,
             "limits": [distance._asdict() | {"met": distance.met} for distance in self.distances],
             "designs": {name: row.content() for name, row in self.summaries.items()},
+            "baselines": {name: row.content() for name, row in self._baselines.items()},
+            "error": self.error,
             "remarks": self.remarks,
             "members": self.facts | {"nominal_inertia": self.nominal},
             "per_member": {name: _arrays(design) for name, design in self.designs.items()},
@@ -301,5 +307,5 @@ class Certificate(eqx.Module):
 
 
 def _arrays(design: DesignResult) -> Mapping[str, object]:
-    flags = {"unstable": design.unstable, "diverged": design.diverged}
+    flags = {"unstable": design.unstable, "diverged": design.diverged, "lost": design.lost}
     return flags | {name: design.of(name) for name in design.by_axis}

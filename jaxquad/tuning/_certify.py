@@ -1,4 +1,6 @@
 import dataclasses
+import functools as ft
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
@@ -6,21 +8,30 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from jaxquad.control import (
     LADRC,
     LinearisableController,
     ObserverController,
     PID,
+    Reference,
     schedule_for_analysis,
 )
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop, loop_numbers, LoopNumbers
 from jaxquad.models import DecoupledAxes, Multirotor
-from jaxquad.simulation import evaluate, Metrics, Scenario
+from jaxquad.simulation import (
+    Authority,
+    AuthorityWarning,
+    beyond_authority,
+    evaluate,
+    find_authority,
+    Metrics,
+    Scenario,
+)
 
-from ._certificate import Certificate, lag_remark, Provenance
+from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
 from ._design_result import DesignResult, measure_distances
 from ._objective import Limit
 from ._problem import DeviceChoice, TimeSpan
@@ -37,6 +48,7 @@ def certify(
     *,
     limits: Sequence[Limit] = (),
     peers: Mapping[str, PyTree] | None = None,
+    begun: PyTree | None = None,
     members: int = 256,
     key: Key[Array, ""] | None = None,
     events: Sequence[float] = (),
@@ -66,6 +78,7 @@ def certify(
     - `scenario`: all designs fly it with the same noise.
     - `limits`: what the design has to meet.
     - `peers`: other controllers to stand beside the design, by name.
+    - `begun`: the controller that a tuning started from, whose error stands beside the design's.
     - `members`: how many are drawn.
     - `key`: give the tuner's key, whose training members are other draws; `jax.random.key(0)` by
         default.
@@ -75,7 +88,7 @@ def certify(
 
     **Returns:**
 
-    A `jq.tuning.Certificate`; `print` shows the verdict first, then limits and a table.
+    A `jq.tuning.Certificate`; `print` shows the verdicts first, then limits and a table.
 
     **Raises:**
 
@@ -94,18 +107,82 @@ def certify(
     flight = drawn.flight(scenario)
     designs = {name: loop.controller} | _named(peers or {}, name)
     span = TimeSpan(tuple(events), start, stop, load_start)
-    results = {n: evaluate_design(x, drawn, flight, span, devices) for n, x in designs.items()}
+    run = ft.partial(evaluate_design, members=drawn, flight=flight, span=span, devices=devices)
+    results = {n: run(x) for n, x in designs.items()}
     known = _provenance(ensemble, drawn, key)
     known["controller"] = _describe_controller(loop.controller)
     found = Certificate(
         designs=results,
-        distances=measure_distances(results[name], limits),
+        distances=measure_distances(results[name], limits, independent=not given),
         facts=_facts(drawn),
         nominal=_nominal_inertia(loop) if isinstance(ensemble, Ensemble) else None,
         provenance=known,
         remarks=(),
+        idle=run(_Idle()),
+        start=None if begun is None else run(begun),
+        error="itae" if _moves(flight) else "rms",
     )
-    return dataclasses.replace(found, remarks=tuple(_remarks(found, loop.controller, drawn)))
+    remarks = [*_remarks(found, loop.controller, drawn), *_beyond_knowledge(loop, ensemble)]
+    remarks += beyond_authority(_authority(loop, drawn), flight)
+    return dataclasses.replace(found, remarks=tuple(remarks))
+
+
+class _Idle(eqx.Module):
+    """The controller that does nothing."""
+
+    def init(self, like: Float[Array, " axes *ensemble"]) -> None:
+        """It remembers nothing."""
+        return None
+
+    def step(
+        self, state: None, reference: Reference, measurement: Float[Array, " axes *ensemble"]
+    ) -> tuple[None, Float[Array, " axes *ensemble"]]:
+        """The command 0."""
+        return None, jnp.zeros_like(measurement)
+
+
+def _moves(flight: Scenario) -> bool:
+    """Whether the reference leaves 0: then the time of the error counts, else its size alone."""
+    return bool(np.any(np.asarray(flight.reference) != 0))
+
+
+def _authority(loop: Loop, drawn: Members) -> Authority | None:
+    members = drawn.loop(loop.controller)
+    return find_authority(members.plant, members.drive, members.controller)
+
+
+def _beyond_knowledge(loop: Loop, ensemble: Ensemble | Members) -> list[str]:
+    """Where the design uses more of the plant than was identified, if that is known."""
+    plants = ensemble.plants if isinstance(ensemble, Ensemble) else None
+    if plants is None:
+        return []
+    found = _beyond_band(loop.controller, plants.band)
+    limit = find_authority(loop.plant, loop.drive, loop.controller)
+    most, known = plants.largest_command, None if limit is None else float(np.max(limit.command))
+    if most is not None and known is not None and known > _ROUNDED * most:
+        found.append(
+            f"the limit of the command, {known:.4g}, is {known / most:.2g} times the largest "
+            f"command of the record, {most:.3g}: the model is not known there. Lower the limit to "
+            f"{most:.2g}, or record larger commands"
+        )
+    return found
+
+
+_ROUNDED = 1.01  # by which a limit is given beyond the record's largest command without a word
+
+
+def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[str]:
+    ladrc = find_ladrc(controller)
+    if band is None or ladrc is None:
+        return []
+    rates = {name: float(np.max(np.asarray(vars(ladrc)[name]))) for name in ("wc", "wo")}
+    return [
+        f"{name} = {value:.4g} rad/s lies beyond the identified band of {band[0]:.3g} to "
+        f"{band[1]:.3g} rad/s: the design relies on a model that no data support there. Hold "
+        f"{name} at {band[1]:.2g} rad/s or below (free=), or record to higher frequencies"
+        for name, value in rates.items()
+        if value > _ROUNDED * band[1]
+    ]
 
 
 def require_same_rate(loop: Loop, members: Members) -> None:
@@ -203,8 +280,11 @@ def evaluate_design(
             loop, flight, start=start, stop=stop, load_start=load_start, devices=devices
         )
 
-    whole = run(span.start, span.stop, span.load_start)
-    parts = [run(*part) for part in span.parts] if len(span.parts) > 1 else [whole]
+    with warnings.catch_warnings():  # the certificate says it
+        warnings.simplefilter("ignore", AuthorityWarning)
+        whole = run(span.start, span.stop, span.load_start)
+        single = len(span.parts) == 1 and span.load_start is None
+        parts = [whole] if single else [run(*part) for part in span.parts]
     numbers = _join(whole, parts)
     linear = _linear(controller, members, flight)
     if linear is not None:
@@ -212,7 +292,19 @@ def evaluate_design(
     unstable = None if linear is None else ~np.all(linear.stable, axis=0)
     observed = isinstance(controller, ObserverController)
     why = controller.observer_instability() if observed else ""
-    return DesignResult(numbers, unstable, np.asarray(whole.diverged), why)
+    diverged = np.asarray(whole.diverged)
+    return DesignResult(numbers, unstable, diverged, diverged | _carried_off(parts, flight), why)
+
+
+_TILTED = np.pi / 2  # rad: a vehicle that is turned further pushes downwards
+
+
+def _carried_off(parts: Sequence[Metrics], flight: Scenario) -> Bool[np.ndarray, " members"]:
+    """Members whose error exceeds all that the reference moves by more than a quarter turn."""
+    reference = np.asarray(flight.reference)
+    moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
+    greatest = np.max([np.asarray(part.peak) for part in parts], axis=(0, 1))
+    return ~(greatest <= _TILTED + moved)
 
 
 _PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what scheduling may change

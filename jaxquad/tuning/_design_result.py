@@ -27,6 +27,7 @@ class DesignResult(eqx.Module):
     by_axis: dict[str, Float[np.ndarray, "axes members"]]
     unstable: Bool[np.ndarray, " members"] | None  # by the exact poles; None without a linear form
     diverged: Bool[np.ndarray, " members"]
+    lost: Bool[np.ndarray, " members"]  # diverged, or carried off beyond the model's range
     observer_instability: str = ""  # why an observer of the controller is unstable by itself
 
     @property
@@ -126,6 +127,7 @@ class DesignSummary(NamedTuple):
     unstable: int | None  # by the exact poles of the linear loop; None without a linear form
     unstable_at_most: float | None  # share, with 95 % confidence
     diverged: int
+    lost: int  # diverged, or carried off beyond the model's range
     statistics: dict[str, Statistics]
 
     def content(self) -> Mapping[str, object]:
@@ -143,6 +145,7 @@ def summarise_design(design: DesignResult, *, independent: bool) -> DesignSummar
         unstable=count,
         unstable_at_most=bound if independent else None,
         diverged=int(np.sum(design.diverged)),
+        lost=int(np.sum(design.lost)),
         statistics={name: _statistics(design, name) for name in design.by_axis},
     )
 
@@ -183,6 +186,7 @@ class Distance(NamedTuple):
     of_others: float  # what is found without those
     members: int
     member: int | None  # the worst one
+    beyond_at_most: float | None = None  # share of all members, with 95 % confidence
 
     @property
     def met(self) -> bool:
@@ -194,8 +198,7 @@ class Distance(NamedTuple):
         demand = f"{shown.title}, {self.over}, {self.sense} {shown.text(self.bound)}"
         if np.isnan(self.found):
             return f"{demand}: not known, because the scenario or the controller does not have it"
-        several = self.beyond > 0 and self.over == "worst"
-        beyond = f", {self.beyond} of {self.members} members beyond" if several else ""
+        beyond = self._beyond
         if self.without:
             known = np.isfinite(self.of_others)
             others = f"; of the others {shown.text(self.of_others)}" if known else ""
@@ -207,30 +210,60 @@ class Distance(NamedTuple):
         share = f" ({abs(self.percent):.2g} %)" if np.isfinite(self.percent) else ""
         return f"{demand}: {shown.text(self.found)}, {by}{share}{beyond}"
 
+    @property
+    def _beyond(self) -> str:
+        """How many members are beyond the limit, and what that proves of all."""
+        if not covers(self):
+            return ""
+        found = f", {self.beyond} of {self.members} members beyond"
+        if self.beyond_at_most is None:
+            return found
+        most = 100 * self.beyond_at_most
+        return f"{found} (proven: at most {most:.2g} % of all, 95 % confidence)"
 
-def measure_distances(design: DesignResult, limits: Sequence[Limit]) -> tuple[Distance, ...]:
-    """Of one design to each of the limits. Raise ValueError for quantities not computed."""
-    return tuple(_distance(design, limit) for limit in limits)
+
+def covers(distance: Distance) -> bool:
+    """Whether every single member has to keep the limit, and not a mean or a quantile."""
+    return distance.over == "worst"
 
 
-def _distance(design: DesignResult, limit: Limit) -> Distance:
+def beyond_limit(design: DesignResult, distance: Distance) -> Bool[np.ndarray, " members"]:
+    """Which members are beyond the bound themselves; a number that is not known counts as so."""
+    sign = 1.0 if distance.sense == "at most" else -1.0
+    return ~(sign * _with_unstable(design, distance.quantity) <= sign * distance.bound)
+
+
+def measure_distances(
+    design: DesignResult, limits: Sequence[Limit], *, independent: bool
+) -> tuple[Distance, ...]:
+    """Of one design to each of the limits; bounds of shares only for `independent` members.
+
+    Raise ValueError for quantities that were not computed.
+    """
+    return tuple(_distance(design, limit, independent) for limit in limits)
+
+
+def _distance(design: DesignResult, limit: Limit, independent: bool) -> Distance:
     bound, sign = float(limit.bound), limit.sign
     values = sign * _with_unstable(design, limit.quantity)  # larger is worse
     found = sign * _risk(limit.over, values)
     slack = sign * (bound - found)
+    over, beyond = risk_text(limit.over), int(np.sum(~(values <= sign * bound)))
+    proven = independent and over == "worst"
     return Distance(
         quantity=limit.quantity,
-        over=risk_text(limit.over),
+        over=over,
         sense="at least" if limit.at_most is None else "at most",
         bound=bound,
         found=found,
         slack=slack,
         percent=100 * slack / abs(bound) if bound else np.copysign(np.inf, slack),
-        beyond=int(np.sum(~(values <= sign * bound))),
+        beyond=beyond,
         without=int(np.sum(np.isposinf(values))),
         of_others=sign * _risk(limit.over, values[~np.isposinf(values)]),
         members=values.size,
         member=None if np.isnan(values).any() else int(np.argmax(values)),
+        beyond_at_most=upper_bound(beyond, values.size) if proven else None,
     )
 
 

@@ -27,6 +27,7 @@ from ._objective import Limit, Objective
 from ._parameters import build_design, Coordinates
 from ._problem import Problem
 from ._quantities import QUANTITIES
+from ._verdict import Bound
 
 
 MET = 2e-3  # beyond a limit, as a level: 0.2 %
@@ -291,6 +292,22 @@ def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
     if not isinstance(controller, ObserverController):
         return ""
     return controller.observer_instability() or controller.observer_slowness()
+
+
+_NEAR, _FLAT = 0.02, 1e-3  # nepers to a bound, and the slope per neper that pushes against it
+
+
+def find_bounds(
+    coordinates: Coordinates, z: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]
+) -> tuple[Bound, ...]:
+    """The numbers that could lower the cost if the controller allowed them a small step more."""
+    found, values = [], coordinates.values(z)
+    for k, name in enumerate(values):
+        step = np.zeros_like(z)
+        step[k] = -_NEAR * np.sign(gradient[k])
+        if abs(gradient[k]) > _FLAT and (why := find_refusal(coordinates, z + step)):
+            found.append(Bound(name, values[name], why))
+    return tuple(found)
 
 
 def _check_again(module: eqx.Module) -> None:

@@ -1,3 +1,4 @@
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
 import jax
@@ -17,10 +18,11 @@ from ._gauss_newton import GaussNewton, require_squares
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective
 from ._parameters import build_design, select_coordinates
-from ._phases import Solution, solve
+from ._phases import find_bounds, Solution, solve
 from ._problem import DeviceChoice, make_problem, Problem, TimeSpan
 from ._quantities import QUANTITIES
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
+from ._verdict import Bound, judge_convergence, Verdict
 
 
 Method = LBFGS | GaussNewton
@@ -124,12 +126,18 @@ def tune(
         others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
         certificate = certify(
             loop.with_controller(tuned), others, scenario, limits=limits, peers=peers,
-            members=count, key=key, devices=devices, **span._asdict(),
+            begun=loop.controller, members=count, key=key, devices=devices, **span._asdict(),
         )  # fmt: skip
     found = _limit_results(limits, solution, best)
+    bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
+    convergence = _judge_descent(solution, best, bounds, found)
+    if certificate is not None:
+        certificate = dataclasses.replace(certificate, convergence=convergence)
     return Tuned(
         controller=tuned,
         certificate=certificate,
+        bounds=bounds,
+        convergence=convergence,
         stabilised=bool(solution.stabilised[best]),
         converged=bool(solution.converged[best]),
         cost=float(solution.cost[best]),
@@ -209,6 +217,25 @@ def _limit_results(
     return tuple(results)
 
 
+def _judge_descent(
+    solution: Solution, index: int, bounds: tuple[Bound, ...], limits: Sequence[LimitResult]
+) -> Verdict:
+    """The verdict on convergence, where all members could be stabilised."""
+    if not solution.stable[index]:
+        text = "nothing was optimised, because not every member could be stabilised"
+        remedy = "Start with slower gains, or narrow the ensemble"
+        return Verdict("CONVERGENCE", False, text, remedy)
+    return judge_convergence(
+        converged=bool(solution.converged[index]),
+        reason=solution.reasons[index],
+        refusal=solution.refusal,
+        gradient=float(np.max(np.abs(solution.gradient[index]))),
+        evaluations=int(solution.evaluations[index]),
+        bounds=bounds,
+        missed=[f"{x.limit} cannot be met: {x.found:.4g} at best" for x in limits if not x.met],
+    )
+
+
 def _remarks(
     controller: PyTree,
     problem: Problem,
@@ -226,17 +253,10 @@ def _remarks(
         )
     elif not solution.stabilised[index]:
         yield f"the slowest pole of a member decays at only {-slowest.max():.3g} 1/s"
-    missed = [one for one in limits if not one.met]
-    for one in missed:
-        yield f"the limit on {one.limit} cannot be met: {one.found:.4g} at best"
-    if missed or not solution.stable[index]:
+    if not all(one.met for one in limits) or not solution.stable[index]:
         remark = lag_remark(controller, problem.linear.delay, problem.linear.axes.lag)
         if remark is not None:
             yield remark
-    if solution.refusal and not solution.converged[index]:
-        yield f"the descent reached a bound of the controller: {solution.refusal}"
-    if not solution.converged[index] and solution.stable[index]:
-        yield f"the descent has not converged: {solution.reasons[index]}"
 
 
 def require_kinds(

@@ -9,6 +9,7 @@ from ._cost import Evaluation
 from ._objective import Limit
 from ._parameters import Coordinates
 from ._phases import Solution
+from ._verdict import Bound, Verdict
 
 
 _COST, _PLACE = 2e-3, 0.1  # within which two ends are one: of the cost, and in nepers
@@ -71,9 +72,10 @@ class LimitResult(NamedTuple):
 
 
 class Tuned(eqx.Module):
-    """A tuned controller, and what is known of it. The first line of `str()` is the verdict.
+    """A tuned controller, and what is known of it.
 
-    `certificate` evaluates it on fresh members; it is None if that was not asked for. `limits` and
+    `str()` begins with three verdicts: `stability` and `performance` on fresh members, and the
+    `convergence` of the tuning. Only where all of them hold the design may be flown. `certificate` evaluates it on fresh members; it is None if that was not asked for. `limits` and
     `minima` are on the members that were tuned on. `evaluations` counts gradients through the
     flights of all members, `stabilising` those of the linear loops alone that came before.
     """
@@ -86,6 +88,8 @@ class Tuned(eqx.Module):
     values: dict[str, float]  # of the tuned numbers
     limits: tuple[LimitResult, ...]
     minima: tuple[Optimum, ...]  # at which the starts ended, the best first
+    bounds: tuple[Bound, ...]  # the tuned numbers that stand at the end of what is allowed
+    convergence: Verdict
     evaluations: int
     stabilising: int
     history: tuple[Evaluation, ...]
@@ -98,23 +102,42 @@ class Tuned(eqx.Module):
         return tuple(one.limit for one in self.limits if one.active)
 
     @property
+    def stability(self) -> Verdict:
+        """Whether all fresh members are stable and within the limits."""
+        return _UNSEEN[0] if self.certificate is None else self.certificate.stability
+
+    @property
+    def performance(self) -> Verdict:
+        """Whether the design is of use on the fresh members, against doing nothing."""
+        return _UNSEEN[1] if self.certificate is None else self.certificate.performance
+
+    @property
+    def verdicts(self) -> tuple[Verdict, Verdict, Verdict]:
+        """Stability, performance and convergence."""
+        return self.stability, self.performance, self.convergence
+
+    @property
     def holds(self) -> bool:
-        """Whether there is a certificate, and it holds."""
-        return self.certificate is not None and self.certificate.holds
+        """Whether all three verdicts hold: only then the design may be flown."""
+        return all(each.holds is True for each in self.verdicts)
 
     def __str__(self) -> str:
-        first, *rest = ["NOT CERTIFIED: no fresh members were asked for"]
-        missed = [_describe_limit(one) for one in self.limits if not one.met]
-        if missed:
-            first = f"{first}; {'; '.join(missed)}"
+        first, *rest = ["NOT CERTIFIED: no fresh members were asked for", *self.verdicts]
         if self.certificate is not None:
             first, *rest = str(self.certificate).splitlines()
+        verdicts, rest = rest[:3], rest[3:]
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
-        lines = [first, f"tuned: {numbers}", f"  {_describe_effort(self)}"]
+        lines = [first, *map(str, verdicts), f"tuned: {numbers}", f"  {_describe_effort(self)}"]
         lines += [f"  {_describe_limit(one)}" for one in self.limits]
         lines += _describe_optima(self.minima) if len(self.minima) > 1 else []
         lines += [f"  ! {remark}" for remark in self.remarks]
-        return "\n".join(lines + rest)
+        return "\n".join([*lines, *map(str, rest)])
+
+
+_UNSEEN = tuple(
+    Verdict(name, None, "not known without fresh members", "Give fresh=, how many to certify on")
+    for name in ("STABILITY", "PERFORMANCE")
+)
 
 
 def _describe_effort(tuned: Tuned) -> str:

@@ -96,6 +96,12 @@ class Identification:
         return float(self.frf.omega[0]), float(self.frf.omega[-1])
 
     @property
+    def largest_command(self) -> float:
+        """How far the input went from its mean to either side, in its unit."""
+        inputs = [np.asarray(record.inputs)[:, 0] for record in self.records]
+        return max(float(np.max(np.abs(x - np.mean(x)))) for x in inputs)
+
+    @property
     def formula(self) -> str:
         """The structure of the model in words."""
         return model_formula(self.settings)

@@ -36,6 +36,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
             "stop_s": max(stop for _, stop in spans),
             "segments_s": spans,
             "sample_rate_hz": found.records[0].sample_rate,
+            "largest_command": found.largest_command,
         },
         "settings": found.settings.content(),
         "band_rad_per_s": found.band,

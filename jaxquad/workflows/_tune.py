@@ -9,7 +9,7 @@ import numpy as np
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
-from jaxquad.identify import Fit, UndeterminedError
+from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
 from jaxquad.plot import certificate_figure, convergence_figure
 from jaxquad.records import Record
@@ -56,9 +56,11 @@ class Tuning:
         certificate = tuned.certificate
         content = {
             "holds": tuned.holds,
+            "verdicts": [each._asdict() for each in tuned.verdicts],
             "values": tuned.values,
             "cost": tuned.cost,
             "converged": tuned.converged,
+            "bounds": [each._asdict() for each in tuned.bounds],
             "stabilised": tuned.stabilised,
             "evaluations": tuned.evaluations,
             "seconds": tuned.seconds,
@@ -126,7 +128,7 @@ def tune(
     record = found.records[0]
     _check_unit(record)
     dt = record.dt if settings.dt is None else settings.dt
-    return Tuning(found, settings, _tuned(found.fit, record, dt, settings))
+    return Tuning(found, settings, _tuned(found, dt, settings))
 
 
 def _check_unit(record: Record) -> None:
@@ -139,8 +141,11 @@ def _check_unit(record: Record) -> None:
         )
 
 
-def _tuned(found: Fit, record: Record, dt: float, settings: TuneSettings) -> Tuned:
-    posterior = Posterior(found, recorded_dt=record.dt, believed=settings.inertia)
+def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
+    posterior = Posterior(
+        found.fit, recorded_dt=found.records[0].dt, believed=settings.inertia, band=found.band,
+        largest_command=found.largest_command,
+    )  # fmt: skip
     plant, ensemble = posterior.plant, _ensemble(posterior, settings)
     gain = float(plant.torque_gain[0])
     if gain <= 0:

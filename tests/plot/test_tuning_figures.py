@@ -28,7 +28,10 @@ def shown():
 
 def test_the_verdict_stands_above_and_the_axes_have_units(shown):
     title = shown.get_suptitle().replace("\n", " ")
-    assert title.startswith("CERTIFICATE FAILS on 12 fresh members: Ms, worst, at most 1.5: 2")
+    assert title.startswith(
+        "CERTIFICATE FAILS on 12 fresh members, not to be flown: STABILITY FAIL STABILITY: Ms, "
+        "worst, at most 1.5: 2"
+    )
     stability, itae, peak = shown.axes
     assert itae.get_ylabel() == "ITAE, deg s$^{2}$" and peak.get_ylabel().startswith("Ms")
     assert peak.get_xlabel() == "inertia of the member, J / J0" and peak.get_xscale() == "log"

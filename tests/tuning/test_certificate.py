@@ -98,10 +98,14 @@ def test_a_design_within_its_limits_holds_and_says_what_that_proves():
     slow = jq.LADRC(4.0, 20.0, 1.0)
     found = judged(slow, limits=limits)
     assert found.holds and found.summaries["tuned"].unstable_at_most == upper_bound(0, MEMBERS)
-    assert str(found).splitlines()[0] == (
-        "CERTIFICATE HOLDS on 24 fresh members: none is unstable (proven: at most 12 % of all, "
-        "95 % confidence), all 2 limits are met"
+    first, stability, performance, convergence = str(found).splitlines()[:4]
+    assert first == "CERTIFICATE HOLDS on 24 fresh members: STABILITY and PERFORMANCE"
+    assert stability == (
+        "  OK   STABILITY: 24 of 24 members are stable and within the limits on Ms and phase margin "
+        "(proven: at most 12 % of all are not, 95 % confidence)"
     )
+    assert performance.startswith("  OK   PERFORMANCE: 24 of 24 members make less than half")
+    assert convergence == "  --   CONVERGENCE: the gains were given, not tuned here"
 
 
 def test_a_missed_limit_is_named_first_with_how_much_and_in_which_member():
@@ -119,12 +123,13 @@ def test_a_missed_limit_is_named_first_with_how_much_and_in_which_member():
     assert missed.percent == pytest.approx(100 * missed.slack / 1.2, rel=1e-12)
     assert missed.member == np.argmax(peak) and missed.beyond == np.sum(peak > 1.2)
     assert met.found == pytest.approx(np.mean(found.design.of("itae")), rel=1e-12)
-    first = str(found).splitlines()[0]
-    assert first.startswith(
-        f"CERTIFICATE FAILS on 24 fresh members: Ms, worst, at most 1.2: {np.max(peak):.4g}, "
+    first, stability = str(found).splitlines()[:2]
+    assert first == "CERTIFICATE FAILS on 24 fresh members, not to be flown: STABILITY"
+    assert stability.startswith(
+        f"  FAIL STABILITY: Ms, worst, at most 1.2: {np.max(peak):.4g}, "
         f"missed by {-missed.slack:.3g} ({-missed.percent:.2g} %)"
     )
-    assert f"member {missed.member}: J {found.facts['inertia'][0, missed.member]:.3g}" in first
+    assert f"member {missed.member}: J {found.facts['inertia'][0, missed.member]:.3g}" in stability
 
 
 def test_an_unstable_member_fails_the_certificate_whatever_the_limits(certificate):
@@ -133,9 +138,9 @@ def test_an_unstable_member_fails_the_certificate_whatever_the_limits(certificat
     )
     count = certificate.designs["paper b0 = 3"].unstable_count
     assert not unstable.holds and unstable.distances[0].without == count
-    first, margin = str(unstable).splitlines()[:2]
-    assert f"FAILS on 24 fresh members: {count} of 24 ({count / 24:.1%}) linearly unstable" in first
-    assert f"missed, {count} members are unstable" in margin
+    stability = str(unstable.stability)
+    assert f"FAIL STABILITY: {count} of 24 ({count / 24:.1%}) linearly unstable" in stability
+    assert f"missed, {count} members are unstable" in stability
     row = unstable.summaries["tuned"].statistics["sensitivity_peak"]
     assert row.members == MEMBERS - count  # none of the unstable ones is in its mean
 
@@ -143,7 +148,8 @@ def test_an_unstable_member_fails_the_certificate_whatever_the_limits(certificat
 def test_a_limit_on_what_does_not_exist_is_not_met():
     still = jq.scenario(duration=2.0, axes=1)
     found = judged(flight=still, limits=(Limit("overshoot", at_most=5.0),))
-    assert not found.holds and "not known" in str(found).splitlines()[0]
+    assert not found.holds and "not known" in str(found.stability)
+    assert found.performance.holds is False and "moves nothing" in str(found.performance)
 
 
 def test_a_bound_of_0_and_a_margin_that_is_any_are_printed_as_such():
@@ -153,7 +159,7 @@ def test_a_bound_of_0_and_a_margin_that_is_any_are_printed_as_such():
     )
     assert "saturated, worst, at most 0 %: 0 %, met by 0 %" in str(found)
     any_gain = found.distances[1]._replace(found=np.inf, slack=np.inf, percent=np.inf)
-    assert str(any_gain) == "gain margin up, worst, at least 3.522 dB: any, met"
+    assert str(any_gain).startswith("gain margin up, worst, at least 3.522 dB: any, met, 0 of 24")
 
 
 @pytest.mark.slow
