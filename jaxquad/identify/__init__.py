@@ -7,8 +7,10 @@ from ._cost import (
     Cost as Cost,
     MaximumLikelihood as MaximumLikelihood,
     paper_cost as paper_cost,
+    Points as Points,
     usable as usable,
 )
+from ._discrepancy import Discrepancy as Discrepancy
 from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch

@@ -107,6 +107,31 @@ def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -
     return inverse @ (inflation * noise.data + noise.priors) @ inverse
 
 
+def degrees_of_freedom(
+    records: Sequence[ResponseTerm], bread: Matrix, noise: Noise, count: int
+) -> Float[np.ndarray, " parameters"]:
+    """Of the noise estimate behind each parameter's variance; infinite where the noise is known.
+
+    The variance is a sum over frequencies of noise powers, each estimated: with shares p of it and
+    L the covariance of the powers' logarithms, 2 / (p'L p). Source: Satterthwaite (1946), "An
+    approximate distribution of estimates of variance components".
+    """
+    inverse = scaled_inverse(bread)
+    variance, doubt = np.diagonal(inverse @ noise.priors @ inverse).copy(), np.zeros(count)
+    for record in records:
+        used = record.weights[..., 0] > 0
+        error = np.where(used, np.asarray(record.frf.random_error) * np.abs(record.ratio), 0.0)
+        moved = (record.weights[..., None] ** 2 * record.slopes[..., :count]) @ inverse
+        share = np.sum((error[..., None, None] * moved) ** 2, axis=(2, 3))
+        variance += np.sum(share, axis=(0, 1))
+        covariance = record.frf.log_noise_covariance
+        if covariance is not None:
+            doubt += np.einsum("fop,fg,gop->p", share, covariance, share, optimize=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = 2 * variance**2 / doubt
+    return np.where(doubt > 0, np.maximum(found, 1.0), np.inf)
+
+
 def misfit_ratio(cost: float, bread: Matrix, noise: Noise) -> float:
     """The data's cost over what noise alone would leave of it: about 1 for the right model."""
     return cost / max(noise.cost - fitted_noise(bread, noise), 1e-300)

@@ -5,6 +5,7 @@ import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PyTree
 
@@ -16,6 +17,7 @@ from ._accuracy import (
     calibrated_covariance,
     condition_number,
     cramer_rao,
+    degrees_of_freedom,
     fitted_noise,
     gauss_newton,
     information_root,
@@ -27,58 +29,103 @@ from ._accuracy import (
     ResponseTerm,
     scaled_inverse,
 )
+from ._cost import Points, Weights
+from ._discrepancy import (
+    describe_discrepancy,
+    Discrepancy,
+    discrepancy_effect,
+    find_discrepancy,
+    Mixture,
+)
 from ._identifiability import assess_identifiability, Information, LIMIT
 from ._parameters import Parameters, Place
 from ._problem import Problem
 from ._result import Fit
 from ._solve import same_responses, Solution
 from ._starts import Minimum, remarks_on_minima
-from ._verdict import Verdict, without_numbers
+from ._verdict import pooled_freedom, Verdict, without_numbers
+
+
+class Counted(NamedTuple):
+    """How the points of a fit count: as the noise says, and with what the model does not explain.
+
+    `weights` are those by the noise alone; those of the problem may have a floor on the error.
+    """
+
+    points: Sequence[Points]
+    weights: Sequence[Weights]
+    found: tuple[Mixture, Mixture]
 
 
 def assess(
     problem: Problem,
-    frfs: Sequence[FrequencyResponse],
+    counted: Counted,
     solution: Solution,
     minima: tuple[Minimum, ...] = (),
 ) -> Fit:
     """Costs, bounds, calibrated covariance and identifiability at the solution."""
     parameters, count = problem.parameters, problem.parameters.count
+    frfs = [each.frf for each in counted.points]
     units = _units(problem, solution)
     records = _records(problem, frfs, solution, units)
     blocks, prior = blocks_of(records), _prior_rows(solution, units)
     bread, gradient = gauss_newton(blocks, prior, count)
     noise = noise_effect(records, blocks, prior, count)
-    data_cost = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
-    cost = data_cost + float(np.sum(prior.misfit**2))
-    misfit = misfit_ratio(data_cost, bread, noise)
-    # A misfit beyond the noise is in no covariance of the noise: widen the errors to match it.
-    inflation = misfit if misfit > MISFIT**2 else 1.0
     by_noise = calibrated_covariance(bread, noise)
-    covariance = calibrated_covariance(bread, noise, inflation)
+    effect = discrepancy_effect(records, count)
+    discrepancy, added = describe_discrepancy(counted.found, bread, by_noise, effect)
+    covariance = by_noise + added
+    problem = problem.weighted([jnp.asarray(each) for each in counted.weights])
+    costs = _costs(_records(problem, frfs, solution, units), prior, count)
+    cost, misfit = costs.cost, costs.chi_squared
     decrement = _decrement(bread, gradient, ran_to_zero(problem, solution))
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
         remedies = ("start from other values", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(parameters.names, decrement, cost, *remedies)
     else:
-        facts = _information(problem, solution, blocks, covariance, units, inflation)
+        facts = _information(problem, solution, blocks, covariance, units)
         verdict, by_data = _identifiability(facts, prior)
-    average, information = cost / len(blocks), cost + 2 * inflation * fitted_noise(bread, noise)
     return make_fit(
         problem,
         solution,
         Estimate(bread, covariance, by_noise, units[:count], verdict, decrement),
-        Costs(cost, average, information, misfit),
+        costs,
         points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in blocks),
+        freedom=degrees_of_freedom(records, bread, noise, count),
         remarks=(
             *_remarks_on_used(problem, frfs),
             *remarks_on_fit(problem, solution, cost, decrement, misfit),
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_leakage(problem, frfs, solution),
             *remarks_on_priors(prior.misfit, verdict, by_data),
+            *_remarks_on_discrepancy(discrepancy),
         ),
         minima=minima,
+        discrepancy=discrepancy,
     )
+
+
+def _costs(records: list[ResponseTerm], prior: PriorRows, count: int) -> "Costs":
+    """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
+    blocks = blocks_of(records)
+    bread, _ = gauss_newton(blocks, prior, count)
+    noise = noise_effect(records, blocks, prior, count)
+    data = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
+    cost, misfit = data + float(np.sum(prior.misfit**2)), misfit_ratio(data, bread, noise)
+    # A misfit beyond the noise is in no covariance of the noise.
+    inflation = misfit if misfit > MISFIT**2 else 1.0
+    information = cost + 2 * inflation * fitted_noise(bread, noise)
+    return Costs(cost, cost / len(blocks), information, misfit)
+
+
+def discrepancy_at(
+    problem: Problem, points: Sequence[Points], solution: Solution
+) -> tuple[Mixture, Mixture]:
+    """What the model leaves unexplained at a solution."""
+    units = np.asarray(solution.slopes)
+    records = _records(problem, [each.frf for each in points], solution, units)
+    count = problem.parameters.count
+    return find_discrepancy(records, points, _prior_rows(solution, units), count)
 
 
 def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> list[str]:
@@ -117,12 +164,14 @@ def make_fit(
     points: int,
     remarks: tuple[str, ...],
     minima: tuple[Minimum, ...] = (),
-    degrees_of_freedom: float = np.inf,
+    freedom: Float[np.ndarray, " parameters"] | None = None,
+    discrepancy: Discrepancy | None = None,
 ) -> Fit:
-    """A result in physical units; `degrees_of_freedom` are those of the noise estimate."""
+    """A result in physical units; `freedom` is that of the noise estimate, infinite without."""
     bread, covariance, _, units, verdict, decrement = estimate
     names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
-    verdict = _with_freedom(verdict, degrees_of_freedom)
+    freedom = np.full(units.size, np.inf) if freedom is None else freedom
+    verdict = _with_freedom(verdict, pooled_freedom(freedom, np.ones(units.size)))
     if runaways(problem, solution):
         verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
     physical, unbounded = _physical_covariance(covariance, units, names, verdict)
@@ -150,14 +199,15 @@ def make_fit(
         units=units,
         relative_covariance=covariance,
         minima=minima,
-        degrees_of_freedom=degrees_of_freedom,
+        degrees_of_freedom=freedom,
+        discrepancy=discrepancy,
     )
 
 
-def _with_freedom(verdict: Verdict, degrees_of_freedom: float) -> Verdict:
+def _with_freedom(verdict: Verdict, freedom: float) -> Verdict:
     """The verdict whose combinations have intervals of these degrees of freedom."""
     known = verdict.combinations
-    combinations = tuple(each._replace(degrees_of_freedom=degrees_of_freedom) for each in known)
+    combinations = tuple(each._replace(degrees_of_freedom=freedom) for each in known)
     return dataclasses.replace(verdict, combinations=combinations)
 
 
@@ -211,6 +261,7 @@ def unfitted(
         noise_covariance=np.full((count, count), np.nan),
         cramer_rao=infinite,
         insensitivity=infinite,
+        degrees_of_freedom=infinite,
         cost=np.nan,
         average_cost=np.nan,
         information=np.nan,
@@ -283,12 +334,11 @@ def _information(
     blocks: list[Block],
     covariance: Float[np.ndarray, "parameters parameters"],
     units: Float[np.ndarray, " all"],
-    inflation: float,
 ) -> Information:
     """What the data say, with errors as wide as they are printed."""
     places = problem.parameters.places
     return Information(
-        root=information_root(blocks) / np.sqrt(inflation),
+        root=information_root(blocks),
         covariance=covariance,
         names=tuple(place.name for place in places),
         values=np.asarray(solution.values),
@@ -318,6 +368,7 @@ def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
+_LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
 _POOR = 10.0  # ratio above which a local minimum is likely
 _LOCAL = ", or this is a local minimum: try other starting values"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
@@ -339,10 +390,20 @@ def remarks_on_fit(
         ratio = np.sqrt(chi_squared)
         remarks.append(
             f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
-            f"explain the whole response{_LOCAL if ratio > _POOR else ''}; standard errors are "
-            f"widened by {ratio:.1f}"
+            f"explain the whole response{_LOCAL if ratio > _POOR else ''}"
         )
     return remarks
+
+
+def _remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
+    """Remark on a model that explains too little of the response for its intervals to be exact."""
+    if not discrepancy.amplitude > _LARGE:
+        return []
+    return [
+        f"the model leaves {100 * discrepancy.amplitude:.0f} % of the response unexplained: the "
+        "intervals are rough; fit the part of the band where it holds (band=), or a model that "
+        "explains more (Fit.explain() names terms)"
+    ]
 
 
 def _opposite(problem: Problem, solution: Solution) -> str:

@@ -1,6 +1,6 @@
 """Costs: weights on the logarithm of the ratio of model to measurement."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Complex, Float
 from jaxquad.spectra import FrequencyResponse
 
 
+_LARGEST = 0.3  # random error of a point that counts
 _DB = 20 / np.log(10)  # dB to a unit of natural logarithm
 _W_g, _W_p = 1.0, 0.01745  # so that 1 dB weighs as much as 7.57 deg
 
@@ -43,17 +44,29 @@ def paper_cost(
     return float(20 / T.size * np.sum(coherence_weight(gamma_squared) * squares))
 
 
+class Points(eqx.Module):
+    """The points of one measured response as a fit counts them.
+
+    Neighbouring frequencies share part of their noise: `shared` is the sum of |rho|^2 of a point's
+    error with those of all points used, so that `1 / shared` of it is the point's own.
+    """
+
+    frf: FrequencyResponse
+    used: Mask  # the weights of the others have to be 0
+    shared: Ratio
+    floor: Ratio  # what the model leaves unexplained, in neper and rad; 0 before that is known
+
+
 @runtime_checkable
 class Cost(Protocol):
     """How much each point of a response counts in a fit; any object with this method is one."""
 
-    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
+    def weights(self, points: Points, ratio: Ratio) -> Weights:
         """Weights of `ln|T/T^|` and of `angle(T/T^)` in rad, on a last axis of two.
 
         **Arguments:**
 
-        - `frf`: the measured response T^.
-        - `used`: which points count; the weights of the others have to be 0.
+        - `points`: the measured response T^, and which of its points count.
         - `ratio`: |model / measurement|, 1 before there is a model.
         """
         ...
@@ -62,15 +75,16 @@ class Cost(Protocol):
 class CoherenceWeighted(eqx.Module):
     """The cost of Eq. (14), `paper_cost`, summed over the responses (CIFER's).
 
-    An average cost below 100 is acceptable, below 50 very good. It has no noise model, so
-    `jq.identify.Prior`s need `MaximumLikelihood` instead.
+    An average cost below 100 is acceptable, below 50 very good. It has no noise model: its
+    estimates scatter 2 to 4 times as much as those of `MaximumLikelihood`, and
+    `jq.identify.Prior`s need the latter.
     Source: Tischler & Remple, eq. 11.4; docs/equations.md says what the paper prints.
     """
 
-    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
-        points = np.maximum(used.sum(axis=0, keepdims=True), 1)
-        W_gamma = coherence_weight(np.asarray(frf.coherence))
-        root = np.where(used, np.sqrt(20 / points) * np.sqrt(W_gamma), 0.0)
+    def weights(self, points: Points, ratio: Ratio) -> Weights:
+        count = np.maximum(points.used.sum(axis=0, keepdims=True), 1)
+        W_gamma = coherence_weight(np.asarray(points.frf.coherence))
+        root = np.where(points.used, np.sqrt(20 / count) * np.sqrt(W_gamma), 0.0)
         units = np.sqrt(_W_g) * _DB, np.sqrt(_W_p) * np.degrees(1.0)
         return np.stack([root * unit for unit in units], axis=-1)
 
@@ -79,14 +93,26 @@ class MaximumLikelihood(eqx.Module):
     """The likelihood of Gaussian noise: squared logarithm of the ratio over its random error.
 
     The random error is taken relative to the model: relative to the measurement, points that came
-    out low by chance would weigh more. The logarithm is unbiased for circular noise.
+    out low by chance would weigh more. The logarithm is unbiased for circular noise. Points that
+    share their noise with neighbours count by what is their own, and what the model leaves
+    unexplained is a floor on the random error.
     """
 
-    def weights(self, frf: FrequencyResponse, used: Mask, ratio: Ratio) -> Weights:
+    def weights(self, points: Points, ratio: Ratio) -> Weights:
         # 1e-7 keeps noise-free records from weights that overflow.
-        error = np.maximum(np.asarray(frf.random_error), 1e-7)
-        root = np.where(used, ratio / error, 0.0)
+        error = np.maximum(np.asarray(points.frf.random_error), 1e-7) / ratio
+        with np.errstate(invalid="ignore"):  # an unknown response has an infinite error
+            deviation = np.hypot(error * np.sqrt(points.shared), points.floor)
+        root = np.where(points.used, 1 / deviation, 0.0)
         return np.stack([root, root], axis=-1)
+
+
+def default_coherence(cost: Cost) -> float:
+    """The least coherence of a point that counts under `cost`, where nothing else is said.
+
+    A cost that knows the noise weighs poor points as they deserve; others have to do without them.
+    """
+    return 0.05 if isinstance(cost, MaximumLikelihood) else 0.6
 
 
 Range = tuple[float, float]
@@ -104,11 +130,45 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
 
     **Returns:**
 
-    True for known points within the band of their pair that are coherent enough.
+    True for known points within the band of their pair that are coherent enough, and whose random
+    error, averaged likewise, is below 30 %.
     """
-    known = np.isfinite(np.asarray(frf.response)) & np.isfinite(np.asarray(frf.random_error))
-    coherent = _local_mean(np.asarray(frf.omega), np.asarray(frf.coherence)) >= least
-    return known & coherent & _in_band(frf, band)
+    omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)
+    known = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
+    coherent = _local_mean(omega, np.asarray(frf.coherence)) >= least
+    information = _local_mean(omega, np.maximum(error, 1e-7) ** -2)
+    return known & coherent & (information >= _LARGEST**-2) & _in_band(frf, band)
+
+
+def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float) -> str:
+    """How many frequencies are usable, in words."""
+    total = sum(frf.response.size for frf in frfs)
+    best = max(float(np.max(np.asarray(frf.coherence))) for frf in frfs)
+    lowest = min(float(np.min(np.asarray(frf.random_error))) for frf in frfs)
+    return (
+        f"coherence reaches {least:g}, with a random error below {100 * _LARGEST:.0f} %, at "
+        f"{points} of {total} frequencies; the largest coherence is {best:.2f}, the smallest error "
+        f"{100 * lowest:.2g} %"
+    )
+
+
+def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
+    """The points of several responses, with a floor of 0."""
+    return [
+        Points(frf, mask, _shared_noise(frf, mask), np.zeros(mask.shape))
+        for frf, mask in zip(frfs, used, strict=True)
+    ]
+
+
+def _shared_noise(frf: FrequencyResponse, used: Mask) -> Ratio:
+    shared = np.ones(used.shape)
+    for o, i in np.ndindex(used.shape[1:]):
+        mine = np.flatnonzero(used[:, o, i])
+        covariance = frf.errors.between((o, i), (o, i))[np.ix_(mine, mine)]
+        power = np.maximum(np.real(np.diagonal(covariance)), 1e-300)
+        correlation = np.real(covariance * covariance.conj()) / np.outer(power, power)
+        shared[mine, o, i] = np.maximum(np.sum(correlation, axis=1), 1.0)
+    return shared
 
 
 def _in_band(frf: FrequencyResponse, band: Band) -> Bool[np.ndarray, "frequencies outputs inputs"]:

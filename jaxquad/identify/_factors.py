@@ -132,9 +132,10 @@ def factors(fit: Fit) -> Factors:
         - above[0] / below[0] ** 2 * (_slopes(fit, "denominator", 1)[0])
     )
     late = _slopes(fit, "delay", 1)[0]
-    integrators, freedom = _integrators(fit, below), fit.degrees_of_freedom
+    integrators = _integrators(fit, below)
+    gain = *spread.given(float(above[0] / below[0]), gain_slope), fit.freedom_of(gain_slope)
     return Factors(
-        gain=Combination("gain", *spread.given(float(above[0] / below[0]), gain_slope), freedom),
+        gain=Combination("gain", *gain),
         zeros=_factored(above, _slopes(fit, "numerator", above.size), spread),
         poles=_factored(
             below[: below.size - integrators],
@@ -142,7 +143,7 @@ def factors(fit: Fit) -> Factors:
             spread,
         ),
         integrators=integrators,
-        delay=Combination("delay", *spread.given(float(model.delay), late), freedom),
+        delay=Combination("delay", *spread.given(float(model.delay), late), fit.freedom_of(late)),
     )
 
 

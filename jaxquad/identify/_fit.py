@@ -1,3 +1,4 @@
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -9,8 +10,20 @@ from jaxquad._core import require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ._assess import assess, unfitted
-from ._cost import Band, CoherenceWeighted, Cost, Mask, MaximumLikelihood, Ratio, usable, Weights
+from ._assess import assess, Counted, discrepancy_at, unfitted
+from ._cost import (
+    Band,
+    Cost,
+    default_coherence,
+    describe_usable,
+    Mask,
+    MaximumLikelihood,
+    Points,
+    points_of,
+    Ratio,
+    usable,
+    Weights,
+)
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem
 from ._result import Fit
@@ -53,11 +66,11 @@ def fit(
     *,
     free: Free = None,
     tied: Mapping[str, Tie] | None = None,
-    cost: Cost = CoherenceWeighted(),
+    cost: Cost = MaximumLikelihood(),
     conditions: Sequence[Condition | None] | None = None,
     priors: Sequence[Prior] = (),
     band: Band = None,
-    min_coherence: float = 0.6,
+    min_coherence: float | None = None,
     starts: int = 1,
     solver: eqx.Module | None = None,
     max_steps: int = 256,
@@ -72,13 +85,16 @@ def fit(
         `jq.identify.Real("zero")`) or selected (`lambda m: (m.gain, m.delay)`); `None` for all.
         A bare name keeps the sign of its start.
     - `tied`: parameters that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
-    - `cost`: `jq.identify.CoherenceWeighted()`, Eq. (14), or `jq.identify.MaximumLikelihood()`.
+    - `cost`: `jq.identify.MaximumLikelihood()`, or `jq.identify.CoherenceWeighted()`: Eq. (14),
+        the paper's and CIFER's.
     - `conditions`: how the model differs in each response, for instance
         `(None, lambda m: m.with_added_inertia(0.03))`.
     - `priors`: known values with their standard errors, `jq.identify.Prior`.
     - `band`: (low, high) in rad/s. A mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs
         of output and input a band of their own, or leaves them out with `None`.
-    - `min_coherence`: frequencies with a lower coherence do not count.
+    - `min_coherence`: frequencies with a lower coherence do not count; by default 0.05, which
+        maximum likelihood can weigh, and 0.6 for other costs. Those with a random error above 30 %
+        never count. Both are averaged over a third of an octave.
     - `starts`: how many starting points, spread around the model's values in a Latin hypercube.
         `Fit.minima` lists where they ended.
     - `solver`: any optimistix least-squares solver; Levenberg-Marquardt by default.
@@ -102,26 +118,28 @@ def fit(
         print(fit)
         ```
 
-    Source: Eq. (14) of the paper, as corrected in docs/equations.md.
+    Source: docs/identification.md; Eq. (14) of the paper, as corrected in docs/equations.md.
     """
     require_x64("a fit")
     frfs = require_responses(frf)
     check_options(cost, band, min_coherence, max_steps)
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
-    used = [usable(one, band, min_coherence) for one in frfs]
+    least = default_coherence(cost) if min_coherence is None else min_coherence
+    used = [usable(one, band, least) for one in frfs]
     _check_priors_against(model, priors, cost)
-    too_few = _too_few_points(frfs, used, parameters, min_coherence, band)
+    too_few = _too_few_points(frfs, used, parameters, least, band)
     if too_few is not None:
         remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
         return unfitted(model, parameters, too_few, tuple(remarks))
     problem = make_problem(model, parameters, frfs, conditions, priors)
-    problem, solution, minima = _solve_reweighted(
-        problem, frfs, used, cost, (starts, solver, max_steps)
-    )
+    points = points_of(frfs, used)
+    how = (starts, solver, max_steps)
+    problem, solution, minima = _solve_reweighted(problem, points, cost, how)
     _check_finite(solution)
     check_priors(problem, solution)
-    return assess(problem, frfs, solution, minima)
+    problem, solution, counted = _solve_with_floor(problem, points, cost, solution, how)
+    return assess(problem, counted, solution, minima)
 
 
 def _too_few_points(
@@ -135,11 +153,8 @@ def _too_few_points(
     needed = parameters.count + 2
     if points >= needed:
         return None
-    best = max(float(np.max(np.asarray(frf.coherence))) for frf in frfs)
-    total = sum(mask.size for mask in used)
     reason = (
-        f"coherence reaches {least:g} at {points} of {total} frequencies"
-        f"{f' (band {band} rad/s)' if band else ''}, its maximum is {best:.2f}, and "
+        f"{describe_usable(frfs, points, least)}{f' (band {band} rad/s)' if band else ''}, and "
         f"{parameters.count} parameters need at least {needed}"
     )
     remedy = "excite the axis (jq.sweep), record longer, or use a longer window"
@@ -148,31 +163,64 @@ def _too_few_points(
 
 def _solve_reweighted(
     problem: Problem,
-    frfs: Sequence[FrequencyResponse],
-    used: Sequence[Mask],
+    points: Sequence[Points],
     cost: Cost,
     how: tuple[int, eqx.Module | None, int],
 ) -> tuple[Problem, Solution, tuple[Minimum, ...]]:
     """Solve; where the weights depend on the model, solve again under those of the solution."""
     starts, solver, max_steps = how
-    weights = _weights(cost, frfs, used, [np.ones(mask.shape) for mask in used])
+    weights = _weights(cost, points, [np.ones(each.used.shape) for each in points])
     problem = problem.weighted([jnp.asarray(each) for each in weights])
     z, minima = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count]), ()
     if starts == 1:
         solution = solve(problem, z, solver, max_steps)
     else:
-        fastest = max(float(frf.omega[-1]) for frf in frfs)
+        fastest = max(float(each.frf.omega[-1]) for each in points)
         spread = spread_starts(problem.parameters, starts, fastest=fastest)
         solution, minima = solve_from_many(problem, spread, solver, max_steps)
-    again = _weights(cost, frfs, used, _ratios(solution))
-    if all(np.allclose(old, new, rtol=1e-4) for old, new in zip(weights, again, strict=True)):
+    again = _weights(cost, points, _ratios(solution))
+    if _are_close(weights, again, 1e-4):
         return problem, solution, minima
     problem = problem.weighted([jnp.asarray(each) for each in again])
     return problem, solve(problem, solution.z, solver, max_steps), minima
 
 
-def _weights(cost: Cost, frfs, used, ratios) -> list[Weights]:
-    return [cost.weights(*each) for each in zip(frfs, used, ratios, strict=True)]
+_ROUNDS = 3  # solutions under a floor at most
+_SETTLED = 0.1  # relative change of weights that moves no estimate by more than a fraction of it
+
+
+def _solve_with_floor(
+    problem: Problem,
+    points: Sequence[Points],
+    cost: Cost,
+    solution: Solution,
+    how: tuple[int, eqx.Module | None, int],
+) -> tuple[Problem, Solution, Counted]:
+    """Solve again with what the model leaves unexplained as a floor on the random error."""
+    found = discrepancy_at(problem, points, solution)
+    for _ in range(_ROUNDS):
+        lifted = [_with_floor(each, found[0].amplitude) for each in points]
+        weights = _weights(cost, lifted, _ratios(solution))
+        if _are_close([np.asarray(each) for each in problem.weights], weights, _SETTLED):
+            break
+        problem = problem.weighted([jnp.asarray(each) for each in weights])
+        solution = solve(problem, solution.z, how[1], how[2])
+        _check_finite(solution)
+        found = discrepancy_at(problem, points, solution)
+    return problem, solution, Counted(points, _weights(cost, points, _ratios(solution)), found)
+
+
+def _with_floor(points: Points, floor: float) -> Points:
+    return dataclasses.replace(points, floor=np.full(points.used.shape, floor))
+
+
+def _are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
+    pairs = zip(old, new, strict=True)
+    return all(np.allclose(one, other, rtol=share) for one, other in pairs)
+
+
+def _weights(cost: Cost, points: Sequence[Points], ratios: Sequence[Ratio]) -> list[Weights]:
+    return [cost.weights(*each) for each in zip(points, ratios, strict=True)]
 
 
 def _ratios(solution: Solution) -> list[Ratio]:
@@ -197,19 +245,20 @@ def require_responses(frf: object) -> list[FrequencyResponse]:
     return frfs
 
 
-def check_options(cost: PyTree, band: PyTree, min_coherence: float, max_steps: int) -> None:
+def check_options(cost: PyTree, band: PyTree, min_coherence: float | None, max_steps: int) -> None:
     """Check `cost`, `band`, `min_coherence` and `max_steps`; raise ValueError."""
     if isinstance(cost, type) or not isinstance(cost, Cost):
         raise ValueError(
-            f"cost={cost!r}: pass an object, jq.identify.CoherenceWeighted() or "
-            "jq.identify.MaximumLikelihood()"
+            f"cost={cost!r}: pass an object, jq.identify.MaximumLikelihood() or "
+            "jq.identify.CoherenceWeighted()"
         )
     for limits in band.values() if isinstance(band, Mapping) else [band]:
         if limits is not None and np.shape(limits) != (2,):
             raise ValueError(f"band={limits!r}: give two frequencies in rad/s, (low, high)")
-    if not 0 < min_coherence < 1:
+    if min_coherence is not None and not 0 < min_coherence < 1:
         raise ValueError(
-            f"min_coherence is {min_coherence}: give a number between 0 and 1, usually 0.6"
+            f"min_coherence is {min_coherence}: give a number between 0 and 1, or None for what "
+            "goes with the cost"
         )
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}: give at least 1")
@@ -219,8 +268,8 @@ def _check_priors_against(model: PyTree, priors: Sequence[Prior], cost: Cost) ->
     """Raise ValueError for priors under a cost without noise, and for unknown parameters."""
     if priors and not isinstance(cost, MaximumLikelihood):
         raise ValueError(
-            "a prior needs a cost that knows the noise, and that of Eq. (14) does not: "
-            "pass cost=jq.identify.MaximumLikelihood()"
+            "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave cost= "
+            "at its default, jq.identify.MaximumLikelihood()"
         )
     known = [place.name for place in name_places(model)] if priors else []
     for prior in priors:

@@ -12,8 +12,16 @@ from jaxquad._xla import evaluate_once
 from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ._assess import assess
-from ._cost import CoherenceWeighted, Cost, Mask, Range, usable
+from ._assess import assess, Counted, discrepancy_at
+from ._cost import (
+    Cost,
+    default_coherence,
+    MaximumLikelihood,
+    Points,
+    points_of,
+    Range,
+    usable,
+)
 from ._fit import check_options
 from ._parameters import Free, Parameters, Place, select_parameters, Tie
 from ._problem import make_problem
@@ -199,18 +207,25 @@ class BatchFit(eqx.Module):
     converged: Bool[np.ndarray, " batch"]
     model: PyTree
     parameters: Parameters
-    frfs: tuple[FrequencyResponse, ...]
+    points: tuple[Points, ...]
     weights: Float[np.ndarray, "batch frequencies outputs inputs 2"]
     z: Float[np.ndarray, "batch parameters"]
 
     def fit(self, k: int) -> Fit:
-        """The fit of response k, with standard errors, verdict and remarks."""
-        frf, z = self.frfs[k], jnp.asarray(self.z[k])
-        problem = make_problem(self.model, self.parameters, [frf])
+        """The fit of response k, with standard errors, verdict and remarks.
+
+        Its standard errors count what the model leaves unexplained. Its values are those of the
+        batch, where that is no floor on the random error as it is in `jq.fit`: it would take each
+        response through a solution of its own.
+        """
+        points, z = self.points[k], jnp.asarray(self.z[k])
+        problem = make_problem(self.model, self.parameters, [points.frf])
         problem = problem.weighted([jnp.asarray(self.weights[k])])
         reason = jnp.asarray(1 if self.converged[k] else 2)
         stop = Stop(z, jnp.asarray(self.converged[k]), reason, jnp.asarray(self.steps[k]))
-        return assess(problem, [frf], solution_at(stop, *_describe(z, problem)))
+        solution = solution_at(stop, *_describe(z, problem))
+        found = discrepancy_at(problem, [points], solution)
+        return assess(problem, Counted([points], [self.weights[k]], found), solution)
 
     def __str__(self) -> str:
         lost = int(np.sum(~self.converged))
@@ -231,7 +246,7 @@ class _Data(NamedTuple):
 
     omega: Float[np.ndarray, " frequencies"]
     measured: np.ndarray
-    used: list[Mask]
+    points: list[Points]
 
 
 def fit_batch(
@@ -240,9 +255,9 @@ def fit_batch(
     *,
     free: Free = None,
     tied: dict[str, Tie] | None = None,
-    cost: Cost = CoherenceWeighted(),
+    cost: Cost = MaximumLikelihood(),
     band: Range | None = None,
-    min_coherence: float = 0.6,
+    min_coherence: float | None = None,
     max_steps: int = 64,
 ) -> BatchFit:
     """Fit one model to each of many responses on the same frequencies, in one compiled call.
@@ -273,17 +288,18 @@ def fit_batch(
     check_options(cost, band, min_coherence, max_steps)
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
-    data = _stack_responses(frfs, band, min_coherence)
-    ones = [np.ones(mask.shape) for mask in data.used]
-    weights = _weights(cost, frfs, data, ones)
+    least = default_coherence(cost) if min_coherence is None else min_coherence
+    data = _stack_responses(frfs, band, least)
+    ones = [np.ones(each.used.shape) for each in data.points]
+    weights = _weights(cost, data, ones)
     found = _solve(model, parameters, data, weights, max_steps)
-    again = _weights(cost, frfs, data, _ratios(model, parameters, data, found))
+    again = _weights(cost, data, _ratios(model, parameters, data, found))
     if not np.allclose(weights, again, rtol=1e-4):
         weights, found = again, _solve(model, parameters, data, again, max_steps)
     facts = (found.values, found.cost, found.decrement, found.steps, found.converged)
     return BatchFit(
         parameters.names, *(np.asarray(part) for part in facts),
-        model=model, parameters=parameters, frfs=tuple(frfs), weights=weights,
+        model=model, parameters=parameters, points=tuple(data.points), weights=weights,
         z=np.asarray(found.z),
     )  # fmt: skip
 
@@ -305,11 +321,11 @@ def _stack_responses(frfs: Sequence[FrequencyResponse], band: Range | None, leas
         )
     measured = [np.asarray(frf.response) for frf in frfs]
     kept = [np.where(mask, each, 1.0) for mask, each in zip(used, measured, strict=True)]
-    return _Data(omega, np.stack(kept), used)
+    return _Data(omega, np.stack(kept), points_of(frfs, used))
 
 
-def _weights(cost: Cost, frfs, data: _Data, ratios) -> np.ndarray:
-    rows = zip(frfs, data.used, ratios, strict=True)
+def _weights(cost: Cost, data: _Data, ratios) -> np.ndarray:
+    rows = zip(data.points, ratios, strict=True)
     return np.stack([cost.weights(*row) for row in rows])
 
 

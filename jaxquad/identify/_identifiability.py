@@ -42,45 +42,31 @@ def combine(
     weights: Float[np.ndarray, " parameters"],
     named: Named,
     kinds: tuple[str, ...] = KINDS,
-) -> Combination:
-    """The simplest product or sum that is as sharp as `weights` times the relative changes.
+) -> Combination | None:
+    """The product or sum, as a person would write it, that is as sharp as `weights`.
 
-    Whole exponents or coefficients are taken if they cost no more than a quarter in standard error;
-    where nothing simple is as sharp, the weights are printed as they are.
+    Exponents are whole numbers up to 2, coefficients 1 or -1, and cost no more than a quarter in
+    standard error. None where nothing of the kind is as sharp, or where its error is beyond 30 %.
     """
     logarithmic = bool(np.all(named.units == named.values))
-    products = logarithmic and "product" in kinds
-    powers = _simple(weights) if products else None
-    sums = _simple(weights / named.units) if "sum" in kinds else None
+    powers = _simple(weights, 2) if logarithmic and "product" in kinds else None
+    sums = _simple(weights / named.units, 1) if "sum" in kinds else None
     if powers is not None and not _as_sharp(powers, weights, named):
         powers = None
     if sums is not None and not _as_sharp(sums * named.units, weights, named):
         sums = None
     if sums is not None and (powers is None or _simpler(sums, powers)):
-        return _sum(sums, named)
-    if powers is not None:
-        return _product(powers, named)
-    if products:
-        return _product(np.round(weights, 3), named)
-    scaled = weights / named.units
-    return _sum(np.round(scaled / np.max(np.abs(scaled)), 3), named)
+        found = _sum(sums, named)
+    elif powers is not None:
+        found = _product(powers, named)
+    else:
+        return None
+    return found if found.standard_error <= VAGUE * abs(found.value) else None
 
 
 def _simpler(sums: np.ndarray, powers: np.ndarray) -> bool:
     """Whether to take the sum of the two; times that only lower the response add up."""
     return bool(np.abs(sums).max() < np.abs(powers).max() or np.all(powers <= 0))
-
-
-def is_vague(weights: Float[np.ndarray, " parameters"], named: Named, limit: float) -> bool:
-    """Whether the error of a combination is beyond `limit` times what it is made of.
-
-    Where all parts have one sign that is their sum, else the largest: of 0.02 + 0.02 an error of
-    0.01 is a quarter. One that ran to zero adds nothing, whatever its unit.
-    """
-    parts = weights * named.values / named.units
-    alike = np.all(parts >= 0) or np.all(parts <= 0)
-    size = np.sum(np.abs(parts)) if alike else np.max(np.abs(parts))
-    return _spread(weights, named) > limit * float(size)
 
 
 def _as_sharp(simple: np.ndarray, weights: np.ndarray, named: Named) -> bool:
@@ -97,14 +83,16 @@ def _length(weights: np.ndarray, like: np.ndarray) -> float:
     return abs(float(weights @ like)) / float(like @ like)
 
 
-def _simple(weights: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"] | None:
-    """The nearest vector of small whole numbers, or None if there is none near."""
+def _simple(
+    weights: Float[np.ndarray, " parameters"], largest: int
+) -> Float[np.ndarray, " parameters"] | None:
+    """The nearest vector of whole numbers up to `largest`, or None if there is none near."""
     unit = weights / np.max(np.abs(weights))
-    parts = [Fraction(float(w)).limit_denominator(4) for w in unit]
+    parts = [Fraction(float(w)).limit_denominator(largest) for w in unit]
     exact = np.array([float(part) for part in parts])
     whole = exact * np.lcm.reduce([part.denominator for part in parts])
     near = np.max(np.abs(exact - unit)) < 0.25
-    return whole * np.sign(weights @ whole) if near and np.max(np.abs(whole)) <= 4 else None
+    return whole * np.sign(weights @ whole) if near and np.max(np.abs(whole)) <= largest else None
 
 
 def _product(powers: Float[np.ndarray, " parameters"], named: Named) -> Combination:
@@ -132,7 +120,8 @@ def _sum(weights: Float[np.ndarray, " parameters"], named: Named) -> Combination
     return Combination(name, value, _spread(weights * named.units, named))
 
 
-LIMIT = 0.5  # standard error, relative, above which a combination counts as undetermined
+LIMIT = 0.5  # standard error, relative, above which a parameter counts as undetermined
+VAGUE = 0.3  # likewise of a combination
 _MEMBER = 0.05  # share of a null direction from which a parameter takes part in it
 _MOVE = 0.4  # finite relative change along a null direction, to test products against sums
 _FLOOR = 1e-8  # of the largest singular value: below it lies rounding
@@ -287,7 +276,7 @@ def _describe(
     information: Information,
     kinds: tuple[str, ...],
 ) -> Combination | None:
-    """None if the record does not determine it any better than its parts."""
+    """None if the record does not determine it, or if nobody would write it."""
     weights = np.zeros(len(information.values))
     weights[block] = row
     weights = _with_fixed(weights, effect, information) if "product" in kinds else weights
@@ -299,8 +288,7 @@ def _describe(
     named = Named(
         names, information.values[used], information.units[used], relative[np.ix_(used, used)]
     )
-    vague = is_vague(weights[used], named, LIMIT)
-    return None if vague else combine(weights[used], named, kinds)
+    return combine(weights[used], named, kinds)
 
 
 def _with_fixed(

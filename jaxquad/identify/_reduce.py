@@ -8,7 +8,7 @@ from jaxtyping import PyTree
 
 from jaxquad.spectra import FrequencyResponse
 
-from ._cost import Band, CoherenceWeighted, Cost
+from ._cost import Band, Cost, MaximumLikelihood
 from ._fit import fit
 from ._parameters import Free, Parameters, Positive, Real, select_parameters, Tie
 from ._result import counted, Fit
@@ -58,7 +58,7 @@ class _Options(NamedTuple):
     tied: Mapping[str, Tie] | None
     cost: Cost
     band: Band
-    min_coherence: float
+    min_coherence: float | None
     null: Mapping[str, float]
 
 
@@ -68,9 +68,9 @@ def reduce_structure(
     *,
     free: Free = None,
     tied: Mapping[str, Tie] | None = None,
-    cost: Cost = CoherenceWeighted(),
+    cost: Cost = MaximumLikelihood(),
     band: Band = None,
-    min_coherence: float = 0.6,
+    min_coherence: float | None = None,
     null: Mapping[str, float] | None = None,
     insensitivity: float = 10.0,
     cramer_rao: float = 20.0,

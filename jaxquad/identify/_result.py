@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ._accuracy import Matrix
+from ._discrepancy import Discrepancy
 from ._parameters import Parameters
 from ._starts import Minimum
-from ._verdict import Combination, reach_of_interval, UndeterminedError, Verdict
+from ._verdict import Combination, pooled_freedom, reach_of_interval, UndeterminedError, Verdict
 
 
 _SHOWN = 6  # optima of several starts
@@ -40,7 +41,7 @@ def _parameters(fit: "Fit") -> list[str]:
         cells += [f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:15.2f}"]
         lines.append(" ".join([f"{name:<{width}}", *cells]))
     if not fit.identifiable:
-        lines.append("* where the solver stopped; this record does not determine it by itself")
+        lines.append("* where the solver stopped; this record does not determine it individually")
     return lines
 
 
@@ -103,17 +104,18 @@ class Fit(eqx.Module):
     parameters: Parameters
     units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
     relative_covariance: Float[np.ndarray, "parameters parameters"]
+    degrees_of_freedom: Float[np.ndarray, " parameters"]  # of the noise estimate behind the errors
     minima: tuple[Minimum, ...] = ()  # distinct stops of several starts, by the first weights
-    degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard errors
+    discrepancy: Discrepancy | None = None  # what the model leaves unexplained, if it was looked at
 
     @property
     def identifiable(self) -> bool:
-        """Whether the record determines every free parameter by itself."""
+        """Whether the record determines every free parameter individually."""
         return self.verdict.identifiable
 
     @property
     def determined(self) -> Bool[np.ndarray, " parameters"]:
-        """Which parameters the record determines by themselves."""
+        """Which parameters the record determines individually."""
         return np.array([name not in self.verdict.undetermined for name in self.names])
 
     @property
@@ -143,7 +145,7 @@ class Fit(eqx.Module):
         """
         k = self.names.index(name)
         errors = self.standard_errors if model_error else self.noise_standard_errors
-        reach = reach_of_interval(self.degrees_of_freedom) * errors[k]
+        reach = reach_of_interval(float(self.degrees_of_freedom[k])) * errors[k]
         return float(self.values[k] - reach), float(self.values[k] + reach)
 
     def derived(
@@ -176,7 +178,12 @@ class Fit(eqx.Module):
                 "jq.identify.Prior or a second record, or ask for a determined combination"
             )
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
-        return Combination(name, float(quantity(self.model)), error, self.degrees_of_freedom)
+        return Combination(name, float(quantity(self.model)), error, self.freedom_of(slope))
+
+    def freedom_of(self, slope: Float[np.ndarray, " parameters"]) -> float:
+        """Degrees of freedom of a quantity with this `slope` by relative changes."""
+        shares = slope**2 * np.diagonal(self.relative_covariance)
+        return pooled_freedom(self.degrees_of_freedom, shares)
 
     def ensemble(self, n: int, key: Key[Array, ""], *, hold_undetermined: bool = False) -> PyTree:
         """Draw `n` models from the fit; leaves with free or tied numbers get a last axis `[n]`.

@@ -14,7 +14,7 @@ from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
 from ._assess import unfitted
-from ._cost import Band, CoherenceWeighted, Cost, MaximumLikelihood
+from ._cost import Band, Cost, default_coherence, MaximumLikelihood, Points
 from ._fit import check_options, fit
 from ._parameters import name_places, Parameters, Real
 from ._rational import descend, Rational, Samples
@@ -29,6 +29,7 @@ from ._transfer_function_guess import (
     Structure,
     too_few_points,
     transfer_function,
+    usable_points,
     usable_samples,
 )
 from ._verdict import without_numbers
@@ -41,25 +42,18 @@ _BEYOND = 20.0  # times the highest frequency, from which a pole is a constant
 
 
 def _cancelling_pair(
-    pair: FrequencyResponse,
-    samples: Samples,
-    structure: Structure,
-    best: Rational,
-    band: Band,
-    min_coherence: float,
+    points: Points, structure: Structure, best: Rational
 ) -> tuple[str, str] | None:
     """Reason and remedy where one zero and one pole fewer explain the response within its noise."""
     if structure.zeros == 0 or structure.poles == structure.integrators:
         return None
     smaller = structure._replace(zeros=structure.zeros - 1, poles=structure.poles - 1)
-    likelihood = MaximumLikelihood()
-    samples = usable_samples(pair, structure, likelihood, band, min_coherence)
+    samples = usable_samples(points, structure, MaximumLikelihood())
     full = descend(samples, best, steps=200, free_delay=structure.delay is None)
     less = search(samples, smaller, (_without_nearest(full),))
-    freedom = max(2 * samples.s.size - structure.unknowns, 1)
-    # A misfit beyond the noise counts as noise here, as it does in the standard errors.
-    noise = max(full.cost / freedom, 1.0) * _correlated_points(pair)
-    gained = (less.cost - full.cost) / noise
+    freedom = max(2 * float(np.sum(1 / points.shared[points.used])) - structure.unknowns, 1.0)
+    # A misfit beyond the noise counts as noise here.
+    gained = (less.cost - full.cost) / max(full.cost / freedom, 1.0)
     if gained > _CHANCE:
         return None
     orders = f"zeros={smaller.zeros}, poles={smaller.poles}"
@@ -131,14 +125,6 @@ def _without_nearest(model: Rational) -> Rational:
     return Rational(above, np.real(polyfromroots(np.delete(poles, p))), model.delay)
 
 
-def _correlated_points(pair: FrequencyResponse) -> float:
-    """How many neighbouring frequencies share their noise."""
-    covariance = pair.relative_covariance()
-    size = np.sqrt(np.maximum(np.real(np.diagonal(covariance)), 1e-300))
-    correlation = np.abs(covariance / np.outer(size, size)) ** 2
-    return float(np.nanmean(np.nansum(correlation, axis=1)))
-
-
 def fit_transfer_function(
     frf: FrequencyResponse,
     zeros: int,
@@ -148,9 +134,9 @@ def fit_transfer_function(
     integrators: int = 0,
     output: int | str = 0,
     input: int | str = 0,
-    cost: Cost = CoherenceWeighted(),
+    cost: Cost = MaximumLikelihood(),
     band: Band = None,
-    min_coherence: float = 0.6,
+    min_coherence: float | None = None,
     max_steps: int = 256,
 ) -> Fit:
     """Identify a transfer function of given orders from one response (CIFER's NAVFIT).
@@ -187,16 +173,18 @@ def fit_transfer_function(
     check_options(cost, band, min_coherence, max_steps)
     structure = require_structure(zeros, poles, integrators, delay)
     pair = select_pair(require_single_response(frf), output, input)
-    too_few = too_few_points(pair, structure, band, min_coherence)
+    least = default_coherence(cost) if min_coherence is None else min_coherence
+    points = usable_points(pair, band, least)
+    too_few = too_few_points(points, structure, least)
     if too_few is not None:
         return _unfitted(structure, too_few, pair.remarks)
-    samples = usable_samples(pair, structure, cost, band, min_coherence)
+    samples = usable_samples(points, structure, cost)
     best = search(samples, structure)
     result = _refined(
         pair, transfer_function(best, samples, structure), structure, samples, cost, band,
         min_coherence, max_steps,
     )  # fmt: skip
-    idle = _cancelling_pair(pair, samples, structure, best, band, min_coherence)
+    idle = _cancelling_pair(points, structure, best)
     if idle is not None:
         return _refused(result, *idle)
     far = _pole_beyond_band(result, float(samples.omega[-1]) * samples.unit)
@@ -210,7 +198,7 @@ def _refined(
     samples: Samples,
     cost: Cost,
     band: Band,
-    min_coherence: float,
+    min_coherence: float | None,
     max_steps: int,
 ) -> Fit:
     """The fit from a start that is already its minimum, with all that `jq.fit` says of it."""

@@ -11,7 +11,16 @@ from jaxquad._core import require_x64
 from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ._cost import Band, CoherenceWeighted, Cost, Mask, usable
+from ._cost import (
+    Band,
+    Cost,
+    default_coherence,
+    describe_usable,
+    MaximumLikelihood,
+    Points,
+    points_of,
+    usable,
+)
 from ._fit import check_options, require_responses
 from ._rational import Coefficients, descend, Rational, Samples, sanathanan_koerner
 from ._verdict import UndeterminedError
@@ -156,9 +165,9 @@ def guess_transfer_function(
     integrators: int = 0,
     output: int | str = 0,
     input: int | str = 0,
-    cost: Cost = CoherenceWeighted(),
+    cost: Cost = MaximumLikelihood(),
     band: Band = None,
-    min_coherence: float = 0.6,
+    min_coherence: float | None = None,
 ) -> TransferFunction:
     """A transfer function of given orders near a measured response, without starting values.
 
@@ -183,11 +192,12 @@ def guess_transfer_function(
     require_x64("a transfer function")
     check_options(cost, band, min_coherence, 1)
     structure = require_structure(zeros, poles, integrators, delay)
-    pair = select_pair(require_single_response(frf), output, input)
-    reason = too_few_points(pair, structure, band, min_coherence)
+    least = default_coherence(cost) if min_coherence is None else min_coherence
+    points = usable_points(select_pair(require_single_response(frf), output, input), band, least)
+    reason = too_few_points(points, structure, least)
     if reason is not None:
         raise UndeterminedError(f"no transfer function from this record: {reason}; {MORE_POINTS}")
-    samples = usable_samples(pair, structure, cost, band, min_coherence)
+    samples = usable_samples(points, structure, cost)
     return transfer_function(search(samples, structure), samples, structure)
 
 
@@ -220,17 +230,16 @@ def require_structure(zeros: int, poles: int, integrators: int, delay: Delay) ->
     return Structure(zeros, poles, integrators, float(delay))
 
 
-def usable_samples(
-    pair: FrequencyResponse,
-    structure: Structure,
-    cost: Cost,
-    band: Band,
-    min_coherence: float,
-) -> Samples:
-    """The coherent points, in frequencies over the geometric mean of the lowest and highest."""
-    used = _usable(pair, band, min_coherence)
-    mask = used[:, 0, 0]
-    weights = cost.weights(pair, used, np.ones(used.shape))[mask, 0, 0]
+def usable_points(pair: FrequencyResponse, band: Band, least: float) -> Points:
+    """The points of a single response that count, as in `jq.fit`."""
+    used = usable(pair, band, least) & (np.abs(np.asarray(pair.response)) > 0)
+    return points_of([pair], [used])[0]
+
+
+def usable_samples(points: Points, structure: Structure, cost: Cost) -> Samples:
+    """The points that count, in frequencies over the geometric mean of the lowest and highest."""
+    pair, mask = points.frf, points.used[:, 0, 0]
+    weights = cost.weights(points, np.ones(points.used.shape))[mask, 0, 0]
     omega = np.asarray(pair.omega)[mask]
     unit = float(np.sqrt(omega[0] * omega[-1]))
     s = 1j * omega / unit
@@ -238,24 +247,16 @@ def usable_samples(
     return Samples(s, response, weights, unit)
 
 
-def too_few_points(
-    pair: FrequencyResponse, structure: Structure, band: Band, min_coherence: float
-) -> str | None:
+def too_few_points(points: Points, structure: Structure, least: float) -> str | None:
     """Why a structure cannot be fitted, where fewer frequencies are usable than it needs."""
-    used = _usable(pair, band, min_coherence)
-    points, needed = int(used.sum()), structure.unknowns + 2
+    count, needed = int(points.used.sum()), structure.unknowns + 2
     # Magnitude and phase are two numbers, but half as many points leave nothing to judge by.
-    if points >= needed:
+    if count >= needed:
         return None
-    best = float(np.max(np.asarray(pair.coherence)))
     return (
-        f"coherence reaches {min_coherence:g} at {points} of {used.size} frequencies, its maximum "
-        f"is {best:.2f}, and {structure.unknowns} coefficients need at least {needed}"
+        f"{describe_usable([points.frf], count, least)}, and {structure.unknowns} coefficients need "
+        f"at least {needed}"
     )
-
-
-def _usable(pair: FrequencyResponse, band: Band, min_coherence: float) -> Mask:
-    return usable(pair, band, min_coherence) & (np.abs(np.asarray(pair.response)) > 0)
 
 
 def search(samples: Samples, structure: Structure, extra: tuple[Rational, ...] = ()) -> Rational:

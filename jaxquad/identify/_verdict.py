@@ -30,6 +30,14 @@ def reach_of_interval(degrees_of_freedom: float) -> float:
     return 1.96 if np.isinf(degrees_of_freedom) else float(stdtrit(degrees_of_freedom, 0.975))
 
 
+def pooled_freedom(
+    each: Float[np.ndarray, " parameters"], shares: Float[np.ndarray, " parameters"]
+) -> float:
+    """Degrees of freedom of a quantity whose variance has these `shares` of the parameters'."""
+    doubt = float(np.sum(shares / each))
+    return float(np.sum(shares)) / doubt if doubt > 0 else np.inf
+
+
 class Combination(NamedTuple):
     """A product of powers, or a weighted sum, of parameters, with its standard error."""
 
@@ -53,7 +61,7 @@ class Combination(NamedTuple):
 
 
 class Verdict(eqx.Module):
-    """Which free parameters a record determines; true if it determines each of them by itself.
+    """Which free parameters a record determines; true if it determines each of them individually.
 
     `kind` is "identifiable", "not identifiable" (the numbers are those of the best fit, but some
     could be changed together without changing the responses), "no minimum" (the solver stopped
@@ -72,7 +80,7 @@ class Verdict(eqx.Module):
 
     @property
     def identifiable(self) -> bool:
-        """Whether the record determines every free parameter by itself."""
+        """Whether the record determines every free parameter individually."""
         return self.kind == "identifiable"
 
     @property
@@ -84,7 +92,7 @@ class Verdict(eqx.Module):
     def summary(self) -> str:
         """The verdict in one line."""
         if self.identifiable:
-            return "identifiable: the record determines every free parameter by itself"
+            return "identifiable: the record determines every free parameter individually"
         if not self.fitted:
             return f"not identifiable from this record: {'; '.join(self.reasons)}"
         if self.kind == "no minimum":
@@ -93,7 +101,7 @@ class Verdict(eqx.Module):
         it = "it" if len(self.undetermined) == 1 else "them"
         rest = f"only {known}" if known else f"nothing about {it} is determined"
         lost = " and ".join(self.undetermined)
-        return f"not identifiable from this record, each by itself: {lost}; {rest}"
+        return f"not identifiable from this record, individually: {lost}; {rest}"
 
     def __bool__(self) -> bool:
         return self.identifiable
@@ -106,7 +114,7 @@ class Verdict(eqx.Module):
             lines = [self.summary.replace(head, head.upper(), 1)]
         else:
             lines = [
-                "NOT IDENTIFIABLE from this record, each by itself: "
+                "NOT IDENTIFIABLE from this record, individually: "
                 + ", ".join(self.undetermined),
                 *self._determined(),
                 *(f"  {reason}" for reason in self.reasons),
@@ -120,7 +128,7 @@ class Verdict(eqx.Module):
             known = " and ".join(combination.name for combination in self.combinations)
             rows = self.null_directions
             every = all(name in self.undetermined for row in rows for name in row)
-            only = "only " if every else ""  # else a parameter in it is determined by itself, too
+            only = "only " if every else ""  # else a parameter in it is determined individually, too
             lines = [f"  {only}{known} is determined by this record"]
         elif self.curved and not self.reasons:
             curved = ", ".join(self.curved)

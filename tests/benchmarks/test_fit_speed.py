@@ -16,7 +16,7 @@ from airframe import Airframe
 from scipy.optimize import least_squares
 
 import jaxquad as jq
-from jaxquad.identify._cost import usable
+from jaxquad.identify._cost import points_of, usable
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._problem import make_problem
 from jaxquad.identify._solve import descend
@@ -78,8 +78,8 @@ def _model():
 class _OneSolve(eqx.Module):
     """Maximum likelihood without the second solve under the model's own weights."""
 
-    def weights(self, frf, used, ratio):
-        return jq.identify.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
+    def weights(self, points, ratio):
+        return jq.identify.MaximumLikelihood().weights(points, np.ones_like(ratio))
 
 
 @pytest.mark.benchmark(group="fit")
@@ -92,8 +92,8 @@ def test_descend(benchmark, frf):
     parameters = select_parameters(_model(), None)
     cost = _OneSolve()
     problem = make_problem(_model(), parameters, [frf])
-    used = usable(frf, None, 0.6)
-    problem = problem.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
+    points = points_of([frf], [usable(frf, None, 0.6)])[0]
+    problem = problem.weighted([jnp.asarray(cost.weights(points, np.ones(points.used.shape)))])
     found = benchmark(
         lambda: descend(problem, parameters.start[:5], None, 256).z.block_until_ready()
     )

@@ -16,7 +16,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import jaxquad as jq
-from jaxquad.identify._cost import usable
+from jaxquad.identify._cost import points_of, usable
 from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._problem import make_problem
 from jaxquad.identify._solve import descend
@@ -89,8 +89,8 @@ def model(values):
 
 
 class _OneSolve(eqx.Module):
-    def weights(self, frf, used, ratio):
-        return jq.identify.MaximumLikelihood().weights(frf, used, np.ones_like(ratio))
+    def weights(self, points, ratio):
+        return jq.identify.MaximumLikelihood().weights(points, np.ones_like(ratio))
 
 
 def problem():
@@ -109,9 +109,9 @@ def problem():
         output_names=("u", "v", "p", "q", "w", "r"),
     )
     parameters = select_parameters(model(START), NAMES)
-    cost, used = _OneSolve(), usable(frf, None, 0.6)
+    cost, points = _OneSolve(), points_of([frf], [usable(frf, None, 0.6)])[0]
     made = make_problem(model(START), parameters, [frf])
-    return made.weighted([jnp.asarray(cost.weights(frf, used, np.ones(used.shape)))])
+    return made.weighted([jnp.asarray(cost.weights(points, np.ones(points.used.shape)))])
 
 
 @pytest.mark.benchmark(group="state-space fit")

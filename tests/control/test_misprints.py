@@ -122,8 +122,9 @@ def test_eq_10_has_no_row_for_the_thrust():
 def test_the_weight_of_eq_14_is_squared_and_a_decibel_weighs_as_7_57_degrees():
     frf = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011))
     frf = eqx.tree_at(lambda f: f.coherence, frf, jnp.full(frf.coherence.shape, 0.6))
-    everywhere = np.ones(frf.coherence.shape, bool)
-    weights = jq.identify.CoherenceWeighted().weights(frf, everywhere, np.ones(frf.coherence.shape))
+    ones = np.ones(frf.coherence.shape)
+    points = jq.identify.Points(frf, ones > 0, shared=ones, floor=0 * ones)
+    weights = jq.identify.CoherenceWeighted().weights(points, ones)
     one_db, one_degree = np.log(10) / 20, np.radians(1.0)
     cost = lambda k, misfit: np.sum((weights[..., k] * misfit) ** 2) / 20
     # Half of a coherent point's weight, as the textbook says; the printed 0.713 is its root.

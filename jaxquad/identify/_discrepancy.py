@@ -1,0 +1,199 @@
+"""What a model leaves unexplained of a response: its size, and what that does to the parameters.
+
+The logarithm of measurement over model is noise plus a discrepancy: a Gaussian process over the
+logarithm of frequency, with one amplitude for magnitude (neper) and phase (rad) and all response
+pairs. Amplitude and length follow from the restricted likelihood, which leaves out what the
+parameters can take up themselves.
+Source: Kennedy & O'Hagan (2001), Bayesian calibration of computer models; Rasmussen & Williams
+(2006), Gaussian Processes for Machine Learning, eq. 2.45.
+"""
+
+import functools as ft
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ._accuracy import Matrix, PriorRows, ResponseTerm, scaled_inverse
+from ._cost import Points
+
+
+LENGTHS = (0.35, 0.6, 1.0, 1.7)  # in ln(omega); 0.69 is an octave
+MEAN = 0.03  # of the prior of the amplitude, neper
+_NONE = 0.5  # the prior's mass at a discrepancy of zero
+_AMPLITUDES = 16
+_RANK = 24  # of a kernel over a band: what is left of its variance is below 1 %
+_OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
+_FOLLOWS = 1.25  # factor by which such a width grows
+
+Widths = Float[np.ndarray, " parameters"]
+
+
+class Discrepancy(eqx.Module):
+    """How far a model is off beyond the noise, as a share of the response (neper, or rad).
+
+    **Attributes:**
+
+    - `amplitude`: root mean square of the posterior; 0.1 is about 10 % or 6 deg.
+    - `length`: over which it changes, in ln(omega).
+    - `none`: the probability that the model is right.
+    - `widths`: for each parameter what makes its interval as wide as it is: "noise", "data" (the
+      response itself shows a discrepancy of this size), or "prior" (it shows none that the
+      parameter would not take up: the width follows what models usually leave unexplained).
+    """
+
+    amplitude: float
+    length: float
+    none: float
+    widths: tuple[str, ...] = eqx.field(static=True)
+
+
+class Mixture(NamedTuple):
+    """A posterior mean of squared amplitudes by length, and the probability of none."""
+
+    powers: Float[np.ndarray, " lengths"]
+    none: float
+
+    @property
+    def amplitude(self) -> float:
+        return float(np.sqrt(np.sum(self.powers)))
+
+
+class _Seen(NamedTuple):
+    """The data under noise alone, and what of them lies along the kernels' components."""
+
+    whole: Float[np.ndarray, "columns columns"]  # slopes and misfit
+    gains: Float[np.ndarray, "lengths components"]  # of unit amplitude over the noise
+    along: Float[np.ndarray, "lengths components squares"]  # products of two columns
+    smallest: float  # random error
+
+
+def find_discrepancy(
+    records: Sequence[ResponseTerm], points: Sequence[Points], prior: PriorRows, count: int
+) -> tuple[Mixture, Mixture]:
+    """The discrepancy of a fit, under the prior and under one of a larger mean."""
+    seen = _look(records, points, prior, count)
+    lowest = np.log(0.1 * seen.smallest)
+    amplitudes = np.exp(np.linspace(lowest, max(0.0, lowest + 1.4), _AMPLITUDES))
+    likelihoods = _restricted_likelihoods(seen, np.concatenate([[0.0], amplitudes]))
+    one, other = (_mix(likelihoods, amplitudes, mean) for mean in (MEAN, _OTHER * MEAN))
+    return one, other
+
+
+def _look(
+    records: Sequence[ResponseTerm], points: Sequence[Points], prior: PriorRows, count: int
+) -> _Seen:
+    rows = np.concatenate([prior.slopes[:, :count], prior.misfit[:, None]], axis=1)
+    whole, gains, along, errors = rows.T @ rows, [], [], []
+    for record, counted in zip(records, points, strict=True):
+        used = record.weights[..., 0] > 0
+        error = np.maximum(np.asarray(record.frf.random_error) * np.abs(record.ratio), 1e-7)
+        inverse = np.where(used, error**-2 / counted.shared, 0.0)
+        columns = np.concatenate([record.slopes[..., :count], record.misfit[..., None]], axis=-1)
+        columns = np.where(used[..., None, None], columns, 0.0)
+        whole += np.einsum("foimx,foi,foimy->xy", columns, inverse, columns, optimize=True)
+        parts = _components(np.asarray(record.frf.omega), used, inverse, columns)
+        gains.append(parts[0])
+        along.append(parts[1])
+        errors.append(error[used])
+    smallest = float(np.median(np.concatenate(errors)))
+    return _Seen(whole, np.concatenate(gains, axis=1), np.concatenate(along, axis=1), smallest)
+
+
+def _components(omega, used, inverse, columns) -> tuple[np.ndarray, np.ndarray]:
+    """Components of the kernels in which noise and discrepancy are both diagonal."""
+    pairs = np.any(used, axis=0)
+    inverse, columns = inverse[:, pairs], columns[:, pairs]
+    basis = kernel_basis(omega.tobytes())
+    weighted = basis[:, :, :, None] * inverse[None, :, None, :]  # length frequency rank pair
+    gram = np.einsum("lfrp,lfs->lprs", weighted, basis, optimize=True)
+    seen = np.einsum("lfrp,fpmx->lprmx", weighted, columns, optimize=True)
+    gains, turned = np.linalg.eigh(gram)
+    seen = np.einsum("lprk,lprmx->lpkmx", turned, seen, optimize=True)
+    products = np.einsum("lpkmx,lpkmy->lpkxy", seen, seen, optimize=True)
+    lengths, width = len(basis), columns.shape[-1]
+    return np.maximum(gains, 0.0).reshape(lengths, -1), products.reshape(lengths, -1, width**2)
+
+
+@ft.lru_cache(maxsize=16)
+def kernel_basis(omega: bytes) -> Float[np.ndarray, "lengths frequencies rank"]:
+    """Roots of the kernels of all lengths at frequencies (the bytes of their array, rad/s)."""
+    place = np.log(np.frombuffer(omega))
+    apart = np.abs(place[:, None] - place[None, :])
+    roots = []
+    for length in LENGTHS:
+        values, vectors = np.linalg.eigh(_matern(np.sqrt(3) * apart / length))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        roots.append(root[:, ::-1][:, :_RANK])
+    return np.stack(roots)
+
+
+def _matern(distance: np.ndarray) -> np.ndarray:
+    """Matern's kernel of order 3/2: a discrepancy whose slope is continuous."""
+    return (1 + distance) * np.exp(-distance)
+
+
+def _restricted_likelihoods(
+    seen: _Seen, amplitudes: Float[np.ndarray, " amplitudes"]
+) -> Float[np.ndarray, "lengths amplitudes"]:
+    """Logarithms, up to a constant; the parameters' own changes are projected out."""
+    power = amplitudes**2
+    damped = power[None, :, None] / (1 + power[None, :, None] * seen.gains[:, None, :])
+    width = len(seen.whole)
+    left = seen.whole - np.reshape(damped @ seen.along, (*damped.shape[:2], width, width))
+    scale = np.sqrt(np.maximum(np.diagonal(seen.whole), 1e-300))
+    left = left / np.outer(scale, scale) + 1e-11 * np.eye(width)
+    slopes, misfit = left[..., :-1, :-1], left[..., :-1, -1]
+    step = np.linalg.solve(slopes, misfit[..., None])[..., 0]
+    rest = (left[..., -1, -1] - np.sum(misfit * step, axis=-1)) * scale[-1] ** 2
+    volume = np.linalg.slogdet(slopes)[1]
+    # Magnitude and phase have the same components: two halves of a logarithm.
+    grown = np.sum(np.log1p(power[None, :, None] * seen.gains[:, None, :]), axis=-1)
+    return -grown - 0.5 * volume - 0.5 * rest
+
+
+def _mix(likelihoods: np.ndarray, amplitudes: np.ndarray, mean: float) -> Mixture:
+    """The posterior under half the mass at zero, and an exponential distribution above it."""
+    cell = amplitudes * np.log(amplitudes[1] / amplitudes[0])
+    density = cell / mean * np.exp(-amplitudes / mean)
+    density *= (1 - _NONE) / max(float(np.sum(density)), 1e-300) / len(likelihoods)
+    relative = np.exp(likelihoods - np.max(likelihoods))
+    none, some = _NONE * relative[0, 0], relative[:, 1:] * density
+    total = none + np.sum(some)
+    return Mixture(np.sum(some * amplitudes**2, axis=1) / total, float(none / total))
+
+
+def discrepancy_effect(
+    records: Sequence[ResponseTerm], count: int
+) -> Float[np.ndarray, "lengths parameters parameters"]:
+    """J'W D W J of a discrepancy D of unit amplitude, for each length."""
+    total = np.zeros((len(LENGTHS), count, count))
+    for record in records:
+        pulls = record.weights[..., None] ** 2 * record.slopes[..., :count]
+        pulls = np.where(record.weights[..., None] > 0, pulls, 0.0)
+        basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
+        along = np.einsum("lfr,foimx->lroimx", basis, pulls, optimize=True)
+        along = along.reshape(len(LENGTHS), -1, count)
+        total += np.swapaxes(along, 1, 2) @ along
+    return total
+
+
+def describe_discrepancy(
+    found: tuple[Mixture, Mixture], bread: Matrix, noise: Matrix, effect: np.ndarray
+) -> tuple[Discrepancy, Matrix]:
+    """The discrepancy in words and numbers, and the covariance that it adds to the parameters."""
+    inverse = scaled_inverse(bread)
+    one, other = (
+        inverse @ np.tensordot(mixture.powers, effect, axes=1) @ inverse for mixture in found
+    )
+    by_noise, with_one, with_other = (
+        np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in (noise, noise + one, noise + other)
+    )
+    widths = np.where(with_other > _FOLLOWS * with_one, "prior", "data")
+    widths = np.where(with_one < _FOLLOWS * by_noise, "noise", widths)
+    mixture = found[0]
+    weight = mixture.powers / max(float(np.sum(mixture.powers)), 1e-300)
+    length = float(np.exp(weight @ np.log(LENGTHS)))
+    return Discrepancy(mixture.amplitude, length, mixture.none, tuple(widths.tolist())), one
