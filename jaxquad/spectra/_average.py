@@ -88,7 +88,7 @@ def _diagonal(
     return jnp.real(jnp.diagonal(matrix, axis1=1, axis2=2))
 
 
-_BANDWIDTH = 0.2  # of the noise's smoothing, in ln(omega)
+BANDWIDTH = 0.2  # of the noise's smoothing, in ln(omega)
 _FLOOR = 1e-26  # of the output's power: below it lies rounding
 
 Residuals = Complex[Array, "frequencies windows outputs"]
@@ -131,7 +131,7 @@ def _local_line(
 ) -> Float[Array, " frequencies"]:
     """Weighted local straight lines: a power law passes unchanged."""
     offset = place[None, :] - place[:, None]
-    kernel = weight[None, :] * jnp.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
+    kernel = weight[None, :] * jnp.exp(-0.5 * (offset / BANDWIDTH) ** 2)
     m0, m1, m2 = (jnp.sum(kernel * offset**k, axis=1) for k in (0, 1, 2))
     l0, l1 = (jnp.sum(kernel * offset**k * level[None, :], axis=1) for k in (0, 1))
     # A single frequency has no slope: the small term keeps the line flat there.
@@ -144,7 +144,7 @@ def _coherency(
 ) -> Complex[Array, "frequencies outputs outputs"]:
     """Correlation between the outputs' noise, of unit diagonal and positive semidefinite."""
     total = jnp.swapaxes(unit, 1, 2) @ jnp.conj(unit)
-    kernel = jnp.exp(-0.5 * ((place[None, :] - place[:, None]) / _BANDWIDTH) ** 2)
+    kernel = jnp.exp(-0.5 * ((place[None, :] - place[:, None]) / BANDWIDTH) ** 2)
     flat = total.reshape(place.size, -1)
     smooth = jax.lax.complex(kernel @ flat.real, kernel @ flat.imag).reshape(total.shape)
     deviation = jnp.sqrt(jnp.real(jnp.diagonal(smooth, axis1=1, axis2=2))).astype(smooth.dtype)

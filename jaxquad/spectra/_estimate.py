@@ -78,6 +78,7 @@ def _result(
         output_names=records[0].output_names,
         remarks=remarks + found.remarks,
         integrators=integrators,
+        log_noise_covariance=found.log_noise_covariance,
         distortion=found.distortion if isinstance(found, PeriodicEstimate) else None,
         dt=records[0].dt,
         hold=records[0].hold,

@@ -63,7 +63,9 @@ class FrequencyResponse(eqx.Module):
     With several inputs, responses are conditioned on the other inputs and `coherence` is partial.
     Where the inputs cannot be separated, the response is nan and its random error infinite.
     `errors` is the covariance of all random errors: neighbouring frequencies share part of their
-    noise. `remarks` are what a user of the response should know: sentences that know the
+    noise. `log_noise_covariance` says how well the noise behind them is known: the covariance of the
+    logarithm of its estimated power between frequencies; without it, the noise counts as known.
+    `remarks` are what a user of the response should know: sentences that know the
     frequencies they are about. `dt` and `hold` are the sample interval and the inputs' hold of the
     records it was made from, see `Record`.
     """
@@ -82,6 +84,7 @@ class FrequencyResponse(eqx.Module):
     integrators: int = eqx.field(static=True, default=0)  # removed before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
+    log_noise_covariance: Float[np.ndarray, "frequencies frequencies"] | None = None
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
 

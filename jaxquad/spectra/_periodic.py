@@ -13,7 +13,8 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance
 from ._estimators import Periodic
 from ._frequency_response import Distortion
-from ._local_noise import smooth_noise
+from ._local_noise import BANDWIDTH, smooth_noise
+from ._noise_freedom import smoothed
 from ._remarks import Remark
 
 
@@ -123,6 +124,7 @@ class Scatter(NamedTuple):
     significant: Bool[np.ndarray, " outputs"]
     root: Covariances  # of the larger of the two
     periods: float  # in an average
+    freedom: float  # complex degrees of freedom of the root's power at each line
 
     def nonlinear(self) -> Levels:
         """Power that the noise does not explain."""
@@ -168,7 +170,7 @@ def estimate_scatter(
     power, root = _smooth(omega, noise, freedom, fit.known)
     spare = float(fit.u.shape[2] - inputs)
     if spare <= 0:
-        return Scatter(power, None, np.zeros(outputs, bool), root, count)
+        return Scatter(power, None, np.zeros(outputs, bool), root, count, freedom)
     residual = fit.y - fit.response @ fit.u
     between = residual @ np.conj(np.swapaxes(residual, 1, 2)) / spare
     total, total_root = _smooth(omega, between, spare, fit.known)
@@ -181,8 +183,8 @@ def estimate_scatter(
     significant &= np.mean(_diagonal(between), axis=0) > _ROUNDING * output
     if np.any(significant):
         larger = np.sqrt(np.maximum(power, total) / total)
-        return Scatter(power, total, significant, total_root * larger[:, :, None], count)
-    return Scatter(power, total, significant, root, count)
+        return Scatter(power, total, significant, total_root * larger[:, :, None], count, spare)
+    return Scatter(power, total, significant, root, count, freedom)
 
 
 def _smooth(
@@ -222,6 +224,7 @@ class PeriodicEstimate(NamedTuple):
     multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
     errors: ErrorCovariance
     distortion: Distortion
+    log_noise_covariance: Float[np.ndarray, "frequencies frequencies"]
     remarks: tuple[Remark, ...]
 
 
@@ -258,6 +261,7 @@ def estimate_periodic(
         jnp.asarray(_multiple(fit, scatter)),
         _errors(grid[lines], fit, scatter),
         _distortion(grid[lines], fit, scatter, records[0], len(records)),
+        _log_noise_covariance(grid[lines], fit, scatter),
         _remarks(grid[lines], fit, scatter, periods),
     )
 
@@ -343,6 +347,13 @@ def _errors(
     effect = effect.reshape(count, inputs, -1)
     noise = np.where(fit.known[:, None, None], scatter.root, np.eye(scatter.root.shape[1]))
     return ErrorCovariance(jnp.asarray(omega), jnp.asarray(effect), jnp.asarray(noise))
+
+
+def _log_noise_covariance(
+    omega: Float[np.ndarray, " frequencies"], fit: Averages, scatter: Scatter
+) -> Float[np.ndarray, "frequencies frequencies"]:
+    weight = np.where(fit.known, scatter.freedom, 1e-9)
+    return smoothed(omega, np.eye(omega.size) / scatter.freedom, weight, BANDWIDTH)
 
 
 def _distortion(

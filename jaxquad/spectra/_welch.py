@@ -10,16 +10,17 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 from jaxquad._core import require_x64
 from jaxquad.records import Record
 
-from ._average import average, Averaged, Channels
+from ._average import average, Averaged, BANDWIDTH, Channels
 from ._blocks import lattice_windows
 from ._checks import check_band, check_excitation, in_hertz
 from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
+from ._noise_freedom import smoothed
 from ._remarks import Remark
 from ._transform import transform_windows
-from ._window import coefficients, segment_starts, window
+from ._window import coefficients, leaked_power, segment_starts, window
 
 
 Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
@@ -285,7 +286,27 @@ def _result(
         output_names=first.output_names,
         remarks=remarks,
         integrators=members[0].integrators,
+        log_noise_covariance=_log_noise_covariance(records, omega, members, segments, found),
         resolution=2 * np.pi / (segments.groups[0][0] * dt),
         dt=dt,
         hold=first.hold,
     )
+
+
+def _log_noise_covariance(
+    records: Sequence[Record],
+    omega: Float[np.ndarray, " frequencies"],
+    members: Sequence[Welch],
+    segments: Segments,
+    found: Averaged,
+) -> Float[np.ndarray, "frequencies frequencies"]:
+    """All window lengths see the same noise, each with its own resolution."""
+    inputs = len(records[0].input_names)
+    freedom = _freedom(_independent(records, segments), segments, members[0], inputs)[:, 1]
+    weights = np.mean(np.asarray(found.share), axis=(1, 2))
+    apart = (omega[:, None] - omega) * records[0].dt
+    single = np.zeros_like(apart)
+    for share, left, (length, _) in zip(weights.T, freedom, segments.groups, strict=True):
+        level = share / np.sqrt(left)
+        single += np.outer(level, level) * leaked_power(members[0].shape, length, apart)
+    return smoothed(omega, single, weights @ freedom, BANDWIDTH)

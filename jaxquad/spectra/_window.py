@@ -27,3 +27,16 @@ def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]
     step = max(int(round(length * (1 - overlap))), 1)
     count = -(-(samples - length) // step) + 1
     return tuple(int(start) for start in np.round(np.linspace(0, samples - length, count)))
+
+
+def leaked_power(
+    shape: str, samples: int, angle: Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
+    """Squared correlation of white noise behind a window at frequencies `angle` apart (rad)."""
+    level, cosine = coefficients(shape)
+    cycles = angle * samples / (2 * np.pi)
+    terms = level**2 + cosine**2 / 2, level * cosine, cosine**2 / 4  # of the squared window
+    found = terms[0] * np.sinc(cycles)
+    for k in (1, 2):
+        found = found + terms[k] * (np.sinc(cycles - k) + np.sinc(cycles + k))
+    return (found / terms[0]) ** 2
