@@ -38,9 +38,9 @@ class Aliases(eqx.Module):
 
     def total(
         self,
-        own: Complex[Array, "frequencies *pairs"],
-        others: Complex[Array, "others *pairs"],
-    ) -> Complex[Array, "frequencies *pairs"]:
+        own: Complex[Array, "frequencies outputs inputs"],
+        others: Complex[Array, "others outputs inputs"],
+    ) -> Complex[Array, "frequencies outputs inputs"]:
         """The response, from the model's at the frequencies themselves and at `omega`."""
         columns = (1,) * (own.ndim - 1)
         upper, lower = jnp.split(others / (1j * self.omega).reshape(-1, *columns), 2)

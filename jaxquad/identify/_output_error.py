@@ -23,6 +23,7 @@ from ._simulated import (
     check_growth,
     count_states,
     DifferentialModel,
+    inputs_between_samples,
     Linear,
     linear_model,
     unknown_motions,
@@ -35,7 +36,7 @@ def refine(
     *,
     free: Free = None,
     tied: Mapping[str, Tie] | None = None,
-    hold: str = "first",
+    hold: str | None = None,
     band: tuple[float, float] | None = None,
     priors: Sequence[Prior] = (),
     max_steps: int = 64,
@@ -56,7 +57,8 @@ def refine(
         estimated as a change of `init()`.
     - `record`: a `jq.Record` or a list of them.
     - `free`, `tied`, `priors`: as in `jq.fit`.
-    - `hold`, `band`: as in `jq.verify`; model and data are filtered alike.
+    - `hold`, `band`: as in `jq.verify`, the hold by default as each record says; model and data are
+        filtered alike.
     - `max_steps`: of the solver.
 
     **Returns:**
@@ -73,7 +75,7 @@ def refine(
     relaxation, errors corrected for coloured residuals).
     """
     require_x64("an output-error fit")
-    records = _checked(record, max_steps, hold)
+    records = _checked(record, max_steps)
     parameters = select_parameters(model, free, tied)
     base = _base(model, parameters, priors)
     terms = tuple(_term(model, one, hold, band) for one in records)
@@ -83,17 +85,13 @@ def refine(
     return assess_output_error(descent, records)
 
 
-def _checked(record: Record | Sequence[Record], max_steps: int, hold: str) -> list[Record]:
+def _checked(record: Record | Sequence[Record], max_steps: int) -> list[Record]:
     records = [record] if isinstance(record, Record) else list(record)
     if not records or not all(isinstance(one, Record) for one in records):
         kinds = ", ".join(sorted({type(one).__name__ for one in records})) or "nothing"
         raise ValueError(f"refine needs a jq.Record or a list of them, not {kinds}: see jq.read")
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}: give at least 1")
-    if hold not in ("first", "zero"):
-        raise ValueError(
-            f'hold is {hold!r}: give "first" (straight between samples) or "zero" (held)'
-        )
     for one in records:
         still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
         if still:
@@ -121,7 +119,10 @@ def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Pro
     )
 
 
-def _term(model: PyTree, record: Record, hold: str, band: tuple[float, float] | None) -> RecordTerm:
+def _term(
+    model: PyTree, record: Record, hold: str | None, band: tuple[float, float] | None
+) -> RecordTerm:
+    u, between = inputs_between_samples(record, hold)
     gain = band_gain(band, record)
     gain = None if gain is None else jnp.asarray(gain)
     if isinstance(model, DifferentialModel) and not isinstance(model, Linear):
@@ -135,7 +136,7 @@ def _term(model: PyTree, record: Record, hold: str, band: tuple[float, float] | 
         motions, start = (found.slow, found.fast), jnp.zeros(0)
     y = band_filter(jnp.asarray(record.outputs), gain)
     weights = 1 / jnp.std(y, axis=0)
-    return RecordTerm(jnp.asarray(record.inputs), y, weights, gain, motions, start, record.dt, hold)
+    return RecordTerm(u, y, weights, gain, motions, start, record.dt, between)
 
 
 def _check_measured(model: DifferentialModel, record: Record) -> None:

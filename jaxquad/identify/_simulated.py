@@ -57,6 +57,28 @@ def band_filter(
     return jnp.fft.irfft(weighted, len(periodic), axis=0)[: len(x)]
 
 
+def inputs_between_samples(
+    record: Record, hold: str | None
+) -> tuple[Float[Array, "samples inputs"], str]:
+    """The inputs, and how they run between their samples: "zero" (held) or "first" (straight).
+
+    Where `hold` does not say, the record does: held where they keep each value for a sample,
+    straight where nobody knows. What is held for less is straight, and half its hold late.
+    """
+    u = jnp.asarray(record.inputs)
+    if hold not in ("first", "zero", None):
+        raise ValueError(
+            f'hold is {hold!r}: give "first" (straight between samples), "zero" (held), or None '
+            "for what the record says (Record.hold)"
+        )
+    share = (record.hold or 0.0) / record.dt
+    if hold or not share:
+        return u, hold or "first"
+    if share > 1 - 1e-6:
+        return u, "zero"
+    return u - 0.5 * share * jnp.diff(u, axis=0, prepend=u[:1]), "first"
+
+
 _RELATIVE, _ABSOLUTE = 1e-8, 1e-10  # tolerances of the states within one sample
 _STEPS = 64  # within one sample at most
 

@@ -16,6 +16,7 @@ from ._simulated import (
     check_growth,
     forced_response,
     free_response,
+    inputs_between_samples,
     linear_model,
     Motions,
     unknown_motions,
@@ -131,7 +132,7 @@ def verify(
     record: Record,
     *,
     band: tuple[float, float] | None = None,
-    hold: str = "first",
+    hold: str | None = None,
     weights: Sequence[float] | None = None,
 ) -> Verification:
     """Simulate the measured inputs open loop and compare the outputs (CIFER's VERIFY).
@@ -147,8 +148,9 @@ def verify(
     - `record`: with the model's inputs and outputs.
     - `band`: (low, high) in rad/s, to compare within: an integrating plant drifts on disturbances
         that no model predicts.
-    - `hold`: "first" if inputs run straight between their samples, which suits an identified model
-        (its delay contains the half sample for which an input is held); "zero" if they are held.
+    - `hold`: how inputs run between their samples, "zero" (held) or "first" (straight); by default
+        as the record says (`Record.hold`), straight where it does not. A model that was identified
+        from a record of unknown hold has half of it in its delay: straight inputs suit it.
     - `weights`: of the squares of the outputs in the measures of all together; give them where
         units differ. 1 by default.
 
@@ -169,11 +171,12 @@ def verify(
     plant = linear_model(model)
     check_channels(plant, record)
     gain, shares = band_gain(band, record), _weights(weights, record)
+    u, between = inputs_between_samples(record, hold)
     check_growth(plant, record)
     motions = unknown_motions(plant, record.duration)
     parts = [
         jnp.asarray(record.outputs),
-        forced_response(plant, jnp.asarray(record.inputs), record.dt, hold),
+        forced_response(plant, u, record.dt, between),
         free_response(plant, motions, record.samples, record.dt),
     ]
     gain = None if gain is None else jnp.asarray(gain)
