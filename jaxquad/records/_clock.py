@@ -1,6 +1,6 @@
 """Time stamps: their order, rate and uniformity, and the repair of glitches and overflows."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,6 +12,46 @@ Times = Float[np.ndarray, " samples"]  # s
 FEWEST = 16  # samples in a record
 JITTER = 0.02  # of a sample: largest departure from the uniform grid that still counts as uniform
 GAP = 1.5  # nominal samples: a longer step is a gap
+TimeUnit = Literal["s", "ms", "us", "ns"]
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_SLOW = 0.25  # s: as large a step may be one of milliseconds
+_DATE_UNITS = {
+    "W": 604800.0, "D": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0,
+    "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15, "as": 1e-18,
+}  # fmt: skip
+
+
+def check_unit(unit: TimeUnit | None) -> None:
+    """Raise RecordError for another unit of time."""
+    if unit is not None and unit not in PER_SECOND:
+        raise RecordError(f"time_unit is {unit!r}: use one of {', '.join(PER_SECOND)}.")
+
+
+def doubt_of_seconds(stamps: Times) -> str:
+    """What speaks against steps in s of which nobody said the unit; empty if nothing does."""
+    step = float(np.median(np.abs(np.diff(stamps)))) if stamps.size > 1 else 0.0
+    if not step >= _SLOW:
+        return ""
+    doubt = (
+        "which is probably not in seconds"
+        if step >= 1
+        else f"{1 / step:.3g} Hz if that is in s, {1e3 / step:.4g} Hz in ms"
+    )
+    return (
+        f"steps by {step:.6g}, {doubt}. Give its unit (time_unit=, --time-unit): ms, us or ns, or "
+        f"s if the log really is that slow"
+    )
+
+
+def dates_in_seconds(stamps: np.ndarray) -> np.ndarray | None:
+    """Dates (s since 1970) or durations (s) of NumPy; None where they have no fixed unit."""
+    if stamps.dtype.kind == "M" and np.datetime_data(stamps.dtype)[0] in ("Y", "M"):
+        stamps = stamps.astype("M8[D]")
+    unit, count = np.datetime_data(stamps.dtype)
+    if unit not in _DATE_UNITS:
+        return None
+    seconds = stamps.astype(np.int64) * (count * _DATE_UNITS[unit])
+    return np.where(np.isnat(stamps), np.nan, seconds)
 
 
 def check_increasing(label: str, time: Times) -> None:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from ._clock import window
 from ._errors import RecordError
 from ._record import as_tuple, Record
+from ._repair import within
 
 
 Channels = Float[np.ndarray, "samples channels"]
@@ -180,6 +181,8 @@ def _assembled(
         reference_units=units[2],
         source=record.source,
         hold=hold,
+        time_unit="s",
+        repaired=record.repaired,
     )
 
 
@@ -201,4 +204,6 @@ def _rebuilt(
         reference_units=record.reference_units,
         source=record.source,
         hold=record.hold,
+        time_unit="s",
+        repaired=within(record.repaired, time[0], time[-1]),
     )

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from ._clock import dates_in_seconds
 from ._errors import printable, ReadError
 
 
@@ -68,6 +69,9 @@ def flattened(log: Log) -> Signals:
         for name, values in table.columns.items():
             full = printable(f"{table_name}.{name}" if table_name else name)
             unit, scale = printable(table.units.get(name, "")), table.scales.get(name, 1.0)
+            if values.dtype.kind in "mM":
+                seconds = dates_in_seconds(values)
+                values, unit = (values, unit) if seconds is None else (seconds, "s")
             if is_data(values) and (table.time is None or len(values) == table.time.size):
                 arrays[full] = Signal(values, clock, unit, scale)
     return Signals(arrays, clocks)

@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._clock import JITTER, nonuniformity, window
+from ._clock import JITTER, nonuniformity, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, unknown_name
 from ._record import as_tuple, check_distinct, Record
+from ._repair import check_ranges, repair_values, Valid, within
 from ._resample import Channel, resample
-from ._timebase import signal_names, Timebases, TimeUnit
+from ._timebase import signal_names, Timebases
 from .formats import load_signals
 
 
@@ -83,6 +84,7 @@ def read(
     max_gap: float | int | None = None,
     units: Mapping[str, str] | None = None,
     hold: float | None = None,
+    valid: Valid | None = None,
 ) -> Record:
     """Read a record from a log: ArduPilot, PX4, Betaflight, Crazyflie, or a table of arrays.
 
@@ -102,13 +104,17 @@ def read(
     - `start`, `stop`: first and last time in s of the file's own time, which the record keeps.
     - `time`: the array with the time stamps, where the format does not define them. The time
         stamps of `x` are `t_x`, else those that `time` names, else t, time, time_s or timestamp.
-    - `time_unit`: of the time stamps. `None` means s, and refuses steps of 1 s and more.
-    - `max_gap`: the longest gap that is interpolated, in s; see `resample`.
+    - `time_unit`: of the time stamps. `None` means what the file says, else s, and then refuses
+        steps of 0.25 and more, which may be milliseconds.
+    - `max_gap`: the longest gap that is interpolated, in s: of time stamps (see `resample`), and of
+        values that are not finite, which by default are refused.
     - `units`: channel name of the record -> unit, for figures and tables; by default those of the
         log.
     - `hold`: how long the plant's input keeps each value, in s, as in `Record`: 0 for what was
         measured, the loop's period for a command. A record at a higher sample rate than that of the
         hold shows straight lines where the input had steps: its hold is unknown.
+    - `valid`: channel name of the file -> lowest and highest value that can be true. Others count
+        as missing, and are interpolated up to `max_gap`, as in `Record`.
 
     **Returns:** a `Record`. Overflows of the time counter are undone, and up to 1 % of time
     stamps that repeat or go back are dropped with their rows, both with a `RecordWarning`.
@@ -127,6 +133,8 @@ def read(
     roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
     channels = _channels(path, names, time, time_unit)
+    check_ranges(valid or {}, names)
+    channels, repaired = _repaired(channels, valid or {}, max_gap)
     span = _shared_grid(channels, start, stop) if sample_rate is None else None
     if span is not None:
         stamps = channels[0].time[span]
@@ -148,7 +156,21 @@ def read(
         reference_units=[units[name] for name in roles[2]],
         source=str(path),
         hold=hold if span is not None else _after_resampling(hold, stamps),
+        time_unit="s",
+        repaired=within(repaired, stamps[0], stamps[-1]),
     )
+
+
+def _repaired(
+    channels: Sequence[Channel], valid: Valid, max_gap: float | int | None
+) -> tuple[list[Channel], dict[str, Float[np.ndarray, " repaired"]]]:
+    """The channels with values filled in where that is asked for, and when (s), by channel."""
+    whole, times = [], {}
+    for each in channels:
+        found = repair_values(each.name, each.time, each.values, valid.get(each.name), max_gap)
+        whole.append(Channel(each.name, each.time, found.values, each.unit))
+        times[each.name] = found.times
+    return whole, times
 
 
 def _after_resampling(hold: float | None, stamps: Float[np.ndarray, " samples"]) -> float | None:

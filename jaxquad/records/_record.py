@@ -1,16 +1,27 @@
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ._clock import check_increasing, check_uniform, FEWEST
+from ._clock import (
+    check_increasing,
+    check_uniform,
+    check_unit,
+    dates_in_seconds,
+    doubt_of_seconds,
+    FEWEST,
+    PER_SECOND,
+    TimeUnit,
+)
 from ._errors import RecordError, RecordWarning, unknown_name
+from ._repair import as_float64, check_ranges, repair_values, Valid
 
 
 Names = str | Sequence[str] | None
+_MOST_REPAIRED = 0.01  # of a channel, without a warning
 
 
 class Record(eqx.Module):
@@ -18,8 +29,10 @@ class Record(eqx.Module):
 
     **Arguments:**
 
-    - `time`: time stamps in s, uniform within 2 % of a sample; at least 16.
-    - `inputs`, `outputs`: shape `(samples, channels)`, or `(samples,)` for a single channel.
+    - `time`: time stamps in s, uniform within 2 % of a sample; at least 16. Dates (datetime64)
+        become s since the first, durations (timedelta64) s.
+    - `inputs`, `outputs`: shape `(samples, channels)`, or `(samples,)` for a single channel. What
+        is masked counts as NaN.
     - `references`: likewise; external signals that no feedback changes, such as an injected sweep.
         A record may have none.
     - `input_names`, `output_names`, `reference_names`: by default `u`, `y`, `r`, with numbers from
@@ -29,11 +42,20 @@ class Record(eqx.Module):
     - `hold`: how long the plant's input keeps each value, in s. 0 for a continuous quantity that
         was measured, such as a rotor speed or a surface's deflection; the loop's period for a
         command. `None` where nobody said. With it a fit tells the hold from the plant's own delay.
+    - `time_unit`: of the time stamps: `"s"`, `"ms"`, `"us"` or `"ns"`. `None` means s, and refuses
+        steps of 0.25 and more, which may be milliseconds.
+    - `valid`: channel name -> lowest and highest value that can be true. Others count as missing.
+    - `max_gap`: the longest gap in s, between good neighbours, that is interpolated where values
+        are missing. By default nothing is, except in channels with a `valid` range: there 10
+        samples, or 0.05 s if that is longer.
+    - `repaired`: channel name -> times in s at which values were interpolated before.
 
     **Raises:**
 
-    - `RecordError`: for arrays of unequal length, NaN, time stamps that are not uniform, names that
-        occur twice, and a `hold` below 0. A channel that never changes gives a `RecordWarning`.
+    - `RecordError`: for arrays of unequal length, NaN that are not repaired, structured arrays,
+        time stamps that are not uniform or may not be in s, names that occur twice, and a `hold`
+        below 0. A channel that never changes, or of which more than 1 % is repaired, gives a
+        `RecordWarning`.
     """
 
     time: Float[np.ndarray, " samples"]  # s
@@ -48,6 +70,7 @@ class Record(eqx.Module):
     reference_units: tuple[str, ...] = eqx.field(static=True)
     source: str = eqx.field(static=True)
     hold: float | None = eqx.field(static=True)  # s; of the inputs
+    repaired: dict[str, Float[np.ndarray, " repaired"]]  # s; when values were interpolated
 
     def __init__(
         self,
@@ -64,8 +87,12 @@ class Record(eqx.Module):
         reference_units: Names = None,
         source: str = "",
         hold: float | None = None,
+        time_unit: TimeUnit | None = None,
+        valid: Valid | None = None,
+        max_gap: float | int | None = None,
+        repaired: Mapping[str, ArrayLike] | None = None,
     ):
-        self.time = _stamps(time)
+        self.time = _stamps(time, time_unit)
         rows = self.time.size
         self.inputs = _columns("inputs", inputs, rows)
         self.outputs = _columns("outputs", outputs, rows)
@@ -79,6 +106,9 @@ class Record(eqx.Module):
         self.reference_units = _as_units(reference_units, self.reference_names)
         self.source = source
         self.hold = _held(hold)
+        check_distinct(self.names)
+        before = {name: np.asarray(each, np.float64) for name, each in (repaired or {}).items()}
+        self.repaired = before | _repair_in_place(self, valid or {}, max_gap)
         _check_channels(self)
 
     @property
@@ -127,6 +157,9 @@ class Record(eqx.Module):
             lines.append(f"  {role}: {', '.join(texts) or 'none'}")
         if self.hold is not None:
             lines.append(f"  inputs {_held_text(self.hold)}")
+        counts = [f"{name} {times.size} samples" for name, times in self.repaired.items()]
+        if counts:
+            lines.append(f"  repaired by interpolation: {', '.join(counts)}")
         return "\n".join(lines)
 
 
@@ -144,8 +177,16 @@ def _position(record: Record, name: str) -> int:
     return record.names.index(name)
 
 
-def _stamps(time: ArrayLike) -> Float[np.ndarray, " samples"]:
-    stamps = _float64("time", time)
+def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Float[np.ndarray, " samples"]:
+    check_unit(unit)
+    dates = np.asarray(time)
+    if dates.dtype.kind in "mM":
+        stamps = _dated(dates, unit)
+    else:
+        stamps = as_float64("time", time) / PER_SECOND[unit or "s"]
+        doubt = doubt_of_seconds(stamps) if unit is None and stamps.ndim == 1 else ""
+        if doubt:
+            raise RecordError(f"time {doubt}.")
     if stamps.ndim != 1:
         raise RecordError(f"time has shape {stamps.shape}: give one value for each sample.")
     if stamps.size < FEWEST:
@@ -166,8 +207,20 @@ def _held(hold: float | None) -> float | None:
     return float(hold)
 
 
+def _dated(dates: np.ndarray, unit: TimeUnit | None) -> np.ndarray:
+    first = dates.flat[0] if dates.size and dates.dtype.kind == "M" else None
+    # Before they become s, of which a float holds a day of nanoseconds but not 50 years of them.
+    seconds = dates_in_seconds(dates if first is None else dates - first)
+    if seconds is None or unit is not None:
+        raise RecordError(
+            f"time has the type {dates.dtype}: give time_unit= to plain numbers only, and dates or "
+            f"durations in a unit between weeks and attoseconds."
+        )
+    return seconds
+
+
 def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samples channels"]:
-    array = _float64(role, values)
+    array = as_float64(role, values)
     array = array[:, None] if array.ndim == 1 else array
     if array.ndim != 2:
         raise RecordError(f"{role} has shape {array.shape}: it must be (samples, channels).")
@@ -182,24 +235,36 @@ def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samp
     return array
 
 
-def _float64(label: str, values: ArrayLike) -> np.ndarray:
-    if np.iscomplexobj(values):
-        raise RecordError(f"{label} is complex: a record holds real numbers.")
-    try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise RecordError(f"{label} is not an array of numbers: {error}.") from error
+def _repair_in_place(
+    record: Record, valid: Valid, max_gap: float | int | None
+) -> dict[str, Float[np.ndarray, " repaired"]]:
+    """Repairs the columns of a record that is being made; returns when, by channel."""
+    check_ranges(valid, record.names)
+    times = {}
+    for name, values in zip(record.names, _each_channel(record), strict=True):
+        values[:], found = repair_values(name, record.time, values, valid.get(name), max_gap)
+        if found.size:
+            times[name] = found
+    return times
 
 
 def _check_channels(record: Record) -> None:
-    check_distinct(record.names)
+    for name, times in record.repaired.items():
+        if times.size > _MOST_REPAIRED * record.samples:
+            warnings.warn(
+                f"channel {name!r}: {times.size} of {record.samples} samples are interpolated, the "
+                f"first at t = {times.min():.6g} s. Check valid= and the sensor.",
+                RecordWarning,
+                stacklevel=4,
+            )
     for name, values in zip(record.names, _each_channel(record), strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
                 f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s. "
-                f"Choose a range without them (start=, stop=; --start, --stop), or repair them."
+                f"Choose a range without them (start=, stop=; --start, --stop), or in Python let "
+                f"gaps up to some length be interpolated (max_gap= in s)."
             )
         if np.ptp(values) == 0:
             warnings.warn(

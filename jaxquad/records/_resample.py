@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ._clock import check_increasing, FEWEST, GAP, native_rate
 from ._errors import RecordError, RecordWarning
+from ._repair import longest_gap
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -66,13 +67,13 @@ def contiguous_part(
     """
     time = channel.time
     bad = ~np.isfinite(channel.values)
-    broken = (np.diff(time) > _longest_gap(channel, max_gap)) | bad[:-1] | bad[1:]
+    broken = (np.diff(time) > longest_gap(channel.time, max_gap)) | bad[:-1] | bad[1:]
     inside = (time[1:] > begin) & (time[:-1] < end)
     if (broken & inside).any():
         _raise_for_break(channel, int(np.flatnonzero(broken & inside)[0]), max_gap)
     before = np.flatnonzero(broken & (time[1:] <= begin))
     after = np.flatnonzero(broken & (time[:-1] >= end))
-    reach = margin + _longest_gap(channel, max_gap)
+    reach = margin + longest_gap(channel.time, max_gap)
     first = max(np.searchsorted(time, begin - reach), *(before[-1:] + 1), 0)
     last = min(np.searchsorted(time, end + reach, "right"), *(after[:1] + 1), time.size)
     return Channel(channel.name, time[first:last], channel.values[first:last], channel.unit)
@@ -85,11 +86,6 @@ def gaps(channel: Channel, begin: float, end: float) -> np.ndarray:
     return np.flatnonzero((step > GAP * np.median(step)) & inside)
 
 
-def _longest_gap(channel: Channel, max_gap: float | int | None) -> float:
-    nominal = float(np.median(np.diff(channel.time)))
-    return max(10 * nominal, 0.05) if max_gap is None else float(max_gap)
-
-
 def _raise_for_break(channel: Channel, index: int, max_gap: float | int | None) -> None:
     left, right = channel.time[index : index + 2]
     pair = channel.values[index : index + 2]
@@ -98,11 +94,12 @@ def _raise_for_break(channel: Channel, index: int, max_gap: float | int | None) 
         raise RecordError(
             f"channel {channel.name!r} is {channel.values[i]} at sample {i}, "
             f"t = {channel.time[i]:.6g} s. Choose a range without it (start=, stop=; --start, "
-            f"--stop), or repair the value in the file."
+            f"--stop), or in Python let gaps up to some length be interpolated (max_gap= in s)."
         )
+    longest = longest_gap(channel.time, max_gap)
     raise RecordError(
         f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
-        f"t = {left:.6g} s to {right:.6g} s (limit {1e3 * _longest_gap(channel, max_gap):.4g} ms). "
+        f"t = {left:.6g} s to {right:.6g} s (limit {1e3 * longest:.4g} ms). "
         f"Choose a range without it (start=, stop=; --start, --stop), or in Python allow it with "
         f"max_gap= (s)."
     )

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ._clock import TimeUnit
 from ._errors import RecordError
 from ._read import read
 from ._record import Record
-from ._timebase import TimeUnit
 
 
 Mix = dict[str, dict[str, float]]  # name -> channel, or its power `m1^2`, -> weight
@@ -200,6 +200,8 @@ def _assembled(
         reference_units=[units[name] for name in references],
         source=raw.source,
         hold=raw.hold,
+        time_unit="s",
+        repaired=raw.repaired,
     )
 
 

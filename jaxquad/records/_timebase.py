@@ -1,18 +1,23 @@
 import warnings
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from ._clock import repair, RepairedTime, unwrap
+from ._clock import (
+    check_unit,
+    doubt_of_seconds,
+    PER_SECOND,
+    repair,
+    RepairedTime,
+    TimeUnit,
+    unwrap,
+)
 from ._errors import listed, ReadError, RecordWarning, unknown_name
 from ._log import Signal, Signals
 from ._resample import Channel
 
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
-_PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _SHARED = ("t", "time", "time_s", "timestamp", "Time", "Timestamp", "TIME")
 
 
@@ -36,8 +41,7 @@ class Timebases:
     """The time bases of a log, each repaired once."""
 
     def __init__(self, signals: Signals, time: str | None, time_unit: TimeUnit | None):
-        if time_unit is not None and time_unit not in _PER_SECOND:
-            raise ReadError(f"time_unit is {time_unit!r}: use one of {', '.join(_PER_SECOND)}.")
+        check_unit(time_unit)
         self._signals, self._time = signals, time
         self._unit: TimeUnit | None = time_unit
         self._names = signal_names(signals, time)
@@ -97,8 +101,10 @@ class Timebases:
 
     def _counted(self, base: str) -> tuple[Float[np.ndarray, " samples"], int]:
         array, column = _all_names(self._signals)[base]
-        counter, wraps = unwrap(column_values(self._signals.arrays[array], column, raw=True))
-        return _seconds(base, counter, self._unit), wraps
+        signal = self._signals.arrays[array]
+        counter, wraps = unwrap(column_values(signal, column, raw=True))
+        stated: TimeUnit | None = signal.unit if signal.unit in PER_SECOND else None  # pyright: ignore[reportAssignmentType]
+        return _seconds(base, counter, self._unit or stated), wraps
 
 
 def column_values(signal: Signal, column: int | None, *, raw: bool = False) -> np.ndarray:
@@ -146,11 +152,8 @@ def _is_time(arrays: Mapping[str, Signal], name: str, time: str | None) -> bool:
 
 
 def _seconds(name: str, stamps: np.ndarray, unit: TimeUnit | None) -> Float[np.ndarray, " samples"]:
-    seconds = stamps.astype(np.float64) / _PER_SECOND[unit or "s"]
-    if unit is None and stamps.size > 1 and np.median(np.abs(np.diff(seconds))) >= 1:
-        raise ReadError(
-            f"the time base {name!r} steps by {np.median(np.diff(seconds)):.6g}, which is probably "
-            f"not in seconds. Give its unit (time_unit=, --time-unit): ms, us or ns, or s if the "
-            f"log really is that slow."
-        )
+    seconds = stamps.astype(np.float64) / PER_SECOND[unit or "s"]
+    doubt = doubt_of_seconds(seconds) if unit is None else ""
+    if doubt:
+        raise ReadError(f"the time base {name!r} {doubt}.")
     return seconds

@@ -74,7 +74,7 @@ class Simulation(eqx.Module):
             input_names=f"{axis}_command", output_names=f"{axis}_angle",
             reference_names="sweep" if excited else None,
             input_units="V", output_units="rad", reference_units="V" if excited else None,
-            source="simulation", hold=self.dt,
+            source="simulation", hold=self.dt, time_unit="s",
         )  # fmt: skip
 
     def _index(self, axis: str) -> int:
