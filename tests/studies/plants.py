@@ -44,6 +44,20 @@ class Mode(eqx.Module):
         return (self.gain * late / (s**2 + 2 * self.damping * s + 1))[:, None, None]
 
 
+class Rate(eqx.Module):
+    """gain e^(-delay s) / ((s + damping) (lag s + 1)): a damped axis behind an actuator."""
+
+    gain: jax.Array
+    damping: jax.Array  # rad/s
+    lag: jax.Array  # s
+    delay: jax.Array  # s
+
+    def frequency_response(self, omega):
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
+        slow = (s + self.damping) * (self.lag * s + 1)
+        return (self.gain * jnp.exp(-self.delay * s) / slow)[:, None, None]
+
+
 class Kind(NamedTuple):
     """A family of plants: its matrices of the parameters, and the library's model of them."""
 
@@ -55,8 +69,8 @@ class Kind(NamedTuple):
 
 
 def _rate(theta: np.ndarray) -> Continuous:
-    gain, lag, delay = theta
-    A = np.array([[-1 / lag, 0.0], [1.0, 0.0]])
+    gain, damping, lag, delay = theta
+    A = np.array([[-1 / lag, 0.0], [1.0, -damping]])
     B = np.array([[gain / lag], [0.0]])
     return Continuous(A, B, np.array([[0.0, 1.0]]), delay)
 
@@ -107,9 +121,12 @@ def _state_space(F: list, G: list, free_F: list, free_G: list) -> tuple[Kind, np
     return Kind(names, matrices, model, names, tied), truth
 
 
-_AXIS = ("gain", "lag", "delay")
-RATE = Kind(_AXIS, _rate, lambda theta: jq.LaggedIntegrator(*theta, integrators=1))
-ANGLE = Kind(_AXIS, _angle, lambda theta: jq.LaggedIntegrator(*theta, integrators=2))
+RATE = Kind(
+    ("gain", "damping", "lag", "delay"), _rate, lambda theta: Rate(*map(jnp.asarray, theta))
+)
+ANGLE = Kind(
+    ("gain", "lag", "delay"), _angle, lambda theta: jq.LaggedIntegrator(*theta, integrators=2)
+)
 MODE = Kind(
     ("gain", "damping", "frequency", "delay"), _mode, lambda theta: Mode(*map(jnp.asarray, theta))
 )
@@ -156,8 +173,9 @@ class Plant(NamedTuple):
     bound: Callable[[], Bound]
 
 
-def _rng(seed: int) -> np.random.Generator:
-    return np.random.default_rng([2026, int(seed)])
+def _rng(title: str, seed: int) -> np.random.Generator:
+    """Of one run; plants do not share their noise."""
+    return np.random.default_rng([*title.encode(), int(seed)])
 
 
 def _columns(wave: np.ndarray) -> np.ndarray:
@@ -202,7 +220,7 @@ def open_loop(
     def fly(seeds):
         flown = []
         for seed in seeds:
-            rng = _rng(seed)
+            rng = _rng(title, seed)
             e = scale * (noise(rng, clean.shape, dt) @ mixing.T)
             run = Flown(u, _rounded(clean + e, lsb))
             flown.append(run if spoil is None else spoil(rng, run, time))
@@ -271,7 +289,7 @@ def closed_loop(title, kind, truth, pid, *, wave, seconds, gust, noise, at_input
         w = np.zeros((len(seeds), before + len(time), 3))
         w[:, before:, :1] = r
         for row, seed in zip(w, seeds, strict=True):
-            row[:, 1:] = _rng(seed).standard_normal((len(row), 2))
+            row[:, 1:] = _rng(title, seed).standard_normal((len(row), 2))
         z = flying.run(w)[:, before:]
         return [Flown(run[:, :1], run[:, 1:], r) for run in z]
 
@@ -311,7 +329,7 @@ def _drifting(offset: float, slope: float):
 
 
 _LONG = Chirp(0.6, 20.0, 60.0)
-_THETA = (10.0, 0.08, 0.03)
+_THETA = (10.0, 1.5, 0.08, 0.03)
 _FLIES = (12.0, 0.05, 0.03)
 _BUMP = (2.0, 0.4, 6.0, 0.03)
 _PID = Loop(0.7, 0.3, 0.28)
