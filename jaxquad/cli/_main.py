@@ -18,7 +18,7 @@ _CODES = """exit codes:
   0  done
   2  the input or the options cannot be used
   3  the record does not determine the parameters
-  4  some logs of a batch failed, a certificate fails, or an excitation misses a guideline
+  4  some logs of a batch failed, a design is not to be flown, or an excitation misses a guideline
   130  interrupted
 """
 _UNUSABLE, _INTERRUPTED = 2, 130

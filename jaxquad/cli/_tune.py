@@ -16,7 +16,7 @@ from ._options import (
 )
 
 
-FAILS = 4
+NOT_TO_BE_FLOWN = 4
 
 
 def _add(declared: argparse.ArgumentParser) -> None:
@@ -40,7 +40,7 @@ def _run(options: argparse.Namespace) -> int:
         print(f"\n{folder}: {', '.join(path.name for path in found.write(folder))}")
     if options.json:
         print_json(found.content())
-    return 0 if found.tuned.holds else FAILS
+    return 0 if found.tuned.holds else NOT_TO_BE_FLOWN
 
 
 TUNE = Command(
@@ -53,8 +53,8 @@ TUNE = Command(
 A LADRC for the angle of the axis, scheduled with the inertia, is tuned on plants that are drawn
 from everything the record leaves uncertain. Each flies a step, a torque pulse and a step back. The
 folder gets the report, the certificate and a C header.
-exit codes: 0 done, 2 unusable input, 3 the record does not determine the plant, 4 the certificate
-fails (the gains are written all the same)
+exit codes: 0 done, 2 unusable input, 3 the record does not determine the plant, 4 the design is not
+to be flown, since STABILITY, PERFORMANCE or CONVERGENCE fails (it is written all the same)
 """,
     _add,
     _run,

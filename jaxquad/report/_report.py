@@ -69,7 +69,7 @@ def write_report(
     remarks = remarks_of(fit, frfs, found)
     headlines = [fit_headline(fit, len(remarks))]
     headlines += [check_headline(name, check) for name, check in found.items()]
-    headlines += [certificate_headline(tuned)] if tuned is not None else []
+    headlines += verdict_headlines(tuned) if tuned is not None else []
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
     sections = {
@@ -147,13 +147,18 @@ def check_headline(name: str, check: Verification) -> Headline:
     return Headline("bad", "VERIFICATION FAILS", f"{numbers} (good: below {GOOD_TIC})")
 
 
-def certificate_headline(tuned: Tuned | Certificate) -> Headline:
-    """Of tuned gains."""
-    certificate = tuned.certificate if isinstance(tuned, Tuned) else tuned
-    if certificate is None:
-        return Headline("warn", "NOT CERTIFIED", "no fresh members were drawn to certify on")
-    word, _, reason = str(certificate).splitlines()[0].partition(" on ")
-    return Headline("good" if certificate.holds else "bad", word, f"on {reason}")
+def verdict_headlines(tuned: Tuned | Certificate) -> list[Headline]:
+    """The three verdicts of a design; of gains that were given, those that were asked for."""
+    headlines = []
+    for verdict in tuned.verdicts:
+        if verdict.holds is not None:
+            level, fails = ("good", "") if verdict.holds else ("bad", " FAILS")
+            text = ". ".join(filter(None, (verdict.text, verdict.remedy)))
+            headlines.append(Headline(level, f"{verdict.name}{fails}", text))
+    if isinstance(tuned, Tuned) and tuned.certificate is None:
+        text = "no fresh members were drawn to certify on"
+        headlines.insert(0, Headline("warn", "NOT CERTIFIED", text))
+    return headlines
 
 
 def remarks_of(

@@ -13,9 +13,10 @@ _DRAWN = 7  # designs that can be distinguished in a figure
 
 
 def tuned_section(tuned: Tuned | Certificate) -> dict[str, object]:
-    """The gains, how the tune went, and the certificate."""
+    """The verdicts, the gains, how the tune went, and the certificate."""
     certificate = tuned.certificate if isinstance(tuned, Tuned) else tuned
     return {
+        "verdicts": [str(verdict) for verdict in tuned.verdicts],
         "gains": _gains(tuned) if isinstance(tuned, Tuned) else None,
         "certificate": None if certificate is None else _certificate(certificate),
         "text": str(tuned),

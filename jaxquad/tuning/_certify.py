@@ -179,7 +179,7 @@ def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[s
     return [
         f"{name} = {value:.4g} rad/s lies beyond the identified band of {band[0]:.3g} to "
         f"{band[1]:.3g} rad/s: the design relies on a model that no data support there. Hold "
-        f"{name} at {band[1]:.2g} rad/s or below (free=), or record to higher frequencies"
+        f"{name} at {band[1]:.2g} rad/s or below, or record to higher frequencies"
         for name, value in rates.items()
         if value > _ROUNDED * band[1]
     ]

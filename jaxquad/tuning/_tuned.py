@@ -75,9 +75,10 @@ class Tuned(eqx.Module):
     """A tuned controller, and what is known of it.
 
     `str()` begins with three verdicts: `stability` and `performance` on fresh members, and the
-    `convergence` of the tuning. Only where all of them hold the design may be flown. `certificate` evaluates it on fresh members; it is None if that was not asked for. `limits` and
-    `minima` are on the members that were tuned on. `evaluations` counts gradients through the
-    flights of all members, `stabilising` those of the linear loops alone that came before.
+    `convergence` of the tuning. Only where all of them hold the design may be flown. `certificate`
+    is None if no fresh members were asked for. `limits` and `minima` are on the members that were
+    tuned on. `evaluations` counts gradients through the flights of all members, `stabilising` those
+    of the linear loops alone that came before.
     """
 
     controller: PyTree

@@ -87,9 +87,7 @@ def _missed(distances: Sequence[Distance], place: Place) -> list[str]:
 
 
 def _titles(distances: Sequence[Distance]) -> list[str]:
-    return [
-        f"{'' if covers(x) else f'{x.over} '}{QUANTITIES[x.quantity].title}" for x in distances
-    ]
+    return [f"{'' if covers(x) else f'{x.over} '}{QUANTITIES[x.quantity].title}" for x in distances]
 
 
 def _join(words: Sequence[str]) -> str:
@@ -144,12 +142,12 @@ def judge_performance(
         )
         if which.any()
     ]
-    weak = design.lost.any() or busy.any()
-    remedy = (
-        "Ask for less (smaller disturbance or step), or raise the limit of the command"
-        if weak
-        else "Ask for a faster design: relax limits and penalties, or start with a higher bandwidth"
-    )
+    faster = "relax limits and penalties, or start with a higher bandwidth"
+    remedy = f"Let the design be faster: {faster}"
+    if busy.any():
+        remedy = "Ask for less (smaller disturbance or step), or raise the limit of the command"
+    elif design.lost.any():
+        remedy = f"Ask for less (smaller disturbance or step), or let it be faster: {faster}"
     return Verdict("PERFORMANCE", False, f"{'; '.join(reasons)}: {numbers}", remedy)
 
 
@@ -161,7 +159,8 @@ def _numbers(
     beside = [f"doing nothing {_mean(idle, error)}"]
     beside += [f"the start {_mean(start, error)}"] if start is not None else []
     worst = shown.text(float(np.max(design.of(error))))
-    parts = [f"{shown.title} {_mean(design, error)} in the mean and {worst} at worst"]
+    mean = shown.text(float(np.mean(design.of(error))))
+    parts = [f"{shown.title} {mean} in the mean and {worst} at worst"]
     parts[0] += f" ({', '.join(beside)})"
     for quantity in ("overshoot", "saturation_share"):
         values: Numbers = design.of(quantity)
@@ -203,14 +202,20 @@ def judge_convergence(
     faults = [] if converged else [f"the descent ended where the cost still falls: {reason}"]
     if refusal and not (converged or bounds):
         faults.append(f"the controller refused steps: {refusal}")
-    faults += [f"{b.name} = {b.value:.4g} stands at its bound: {b.reason}" for b in bounds]
+    faults += [
+        f"{b.name} = {b.value:.4g} stands at its bound, a further step is refused "
+        f"({b.reason.rstrip('.')})"
+        for b in bounds
+    ]
     faults += [f"the limit on {text}" for text in missed]
     ended = f"{evaluations} gradients"
     if not faults:
         text = f"the descent ended at a stationary point after {ended}: {reason}, {size}"
         return Verdict("CONVERGENCE", True, text)
     names = ", ".join(b.name for b in bounds)
-    remedies = [f"Hold {names} (free=), or penalise what drives it there (activity)"] * bool(bounds)
+    remedies = [f"Hold {names} below it, or penalise what drives it there (activity)"] * bool(
+        bounds
+    )
     remedies += ["Relax the limits, or narrow the ensemble"] * bool(missed)
     remedies += ["Tune on from here, with more evaluations"] * (not remedies)
     return Verdict(

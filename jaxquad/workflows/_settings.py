@@ -370,6 +370,13 @@ class TuneSettings(Settings):
     sensitivity: float = option_field(
         kinds.POSITIVE, 3.6, "upper limit of the peak of |S|; 3.6 by default", group="controller"
     )
+    wo: float | None = option_field(
+        kinds.POSITIVE,
+        None,
+        "hold the observer's bandwidth at this value in rad/s, for instance where the "
+        "identified band ends; by default it is tuned",
+        group="controller",
+    )
     name: str = option_field(
         kinds.TEXT,
         "attitude",

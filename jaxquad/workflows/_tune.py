@@ -33,6 +33,7 @@ from ._stored import identify_again, StoredResult
 _PULSE, _BACK = 0.375, 0.625  # of the flight: when the torque comes, and the step back
 _ACTIVITY = 0.2  # limit^2 per second: where a busier command begins to cost
 _WIDTH = 0.08  # of the flight, the pulse's
+_START = 10.0, 30.0  # rad/s, wc and wo
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,8 +143,10 @@ def _check_unit(record: Record) -> None:
 
 
 def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
+    record = found.records[0]
+    recorded_dt = record.dt if record.hold is None else None  # a fit that knows it models it
     posterior = Posterior(
-        found.fit, recorded_dt=found.records[0].dt, believed=settings.inertia, band=found.band,
+        found.fit, recorded_dt=recorded_dt, believed=settings.inertia, band=found.band,
         largest_command=found.largest_command,
     )  # fmt: skip
     plant, ensemble = posterior.plant, _ensemble(posterior, settings)
@@ -153,7 +156,10 @@ def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
             f"the gain is negative (KT = {gain:.4g}): identify with the sign of the input reversed "
             "(--input NAME=-CHANNEL)"
         )
-    start = LADRC(10.0, 30.0, gain / settings.inertia, limit=settings.limit, dt=dt)
+    held = settings.wo is not None
+    wo = _START[1] if settings.wo is None else settings.wo
+    wc = min(_START[0], wo / 3)
+    start = LADRC(wc, wo, gain / settings.inertia, limit=settings.limit, dt=dt)
     schedule = certainty_equivalence(gain, settings.inertia, span=settings.spread)
     loop = Loop(
         plant, ScheduledLADRC(start, schedule), drive=Saturation(settings.limit), dt=dt,
@@ -165,6 +171,7 @@ def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
         _flight(gain, dt, settings),
         objective=_objective(settings),
         limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
+        free=["ladrc.wc", "map.values"] if held else None,
         members=settings.members,
         fresh=settings.fresh,
         peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},

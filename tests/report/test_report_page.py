@@ -76,7 +76,8 @@ def test_the_verdict_is_the_first_that_is_read(whole, fit):
     assert page.text("title").startswith("IDENTIFIED: y0 / u0")
     first = page.text("header")
     assert f"gain = {fit.values[0]:.4g}" in first and "VERIFIED other.csv" in first
-    assert "CERTIFICATE FAILS on 12 fresh members: Ms, worst, at most 1.5" in first
+    assert "STABILITY FAILS Ms, worst, at most 1.5: 2, missed" in first
+    assert "PERFORMANCE 12 of 12 members" in first and "CONVERGENCE 2 gradients" in first
 
 
 def test_nothing_is_fetched_and_no_script_runs(whole):
@@ -163,7 +164,7 @@ def test_not_identifiable_comes_first_and_marks_its_numbers(tmp_path, frf):
     fit = jq.fit(axis, response, free=("J_x", "K_t", "lag"), cost=jq.identify.MaximumLikelihood())
     page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=response))
     assert page.text().split()[:3] == ["\u2717", "NOT", "IDENTIFIABLE"]
-    assert "each by itself: J_x and K_t; only L K_t / J_x = " in page.text("header")
+    assert "individually: J_x and K_t; only L K_t / J_x = " in page.text("header")
     tables, text = page.text("table"), page.text("section")
     assert tables.count("not determined") == 2 and "nan" not in text
     assert "Null directions" in text and "direction 1" in text and "jq.identify.Prior" in text

@@ -101,8 +101,8 @@ def test_a_design_within_its_limits_holds_and_says_what_that_proves():
     first, stability, performance, convergence = str(found).splitlines()[:4]
     assert first == "CERTIFICATE HOLDS on 24 fresh members: STABILITY and PERFORMANCE"
     assert stability == (
-        "  OK   STABILITY: 24 of 24 members are stable and within the limits on Ms and phase margin "
-        "(proven: at most 12 % of all are not, 95 % confidence)"
+        "  OK   STABILITY: 24 of 24 members are stable and within the limits on Ms and phase "
+        "margin (proven: at most 12 % of all are not, 95 % confidence)"
     )
     assert performance.startswith("  OK   PERFORMANCE: 24 of 24 members make less than half")
     assert convergence == "  --   CONVERGENCE: the gains were given, not tuned here"

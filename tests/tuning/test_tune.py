@@ -2,7 +2,6 @@
 
 import functools as ft
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
