@@ -1,8 +1,8 @@
 """What a model leaves unexplained of a response: its size, and what that does to the parameters.
 
 The logarithm of measurement over model is noise plus a discrepancy: a Gaussian process over the
-logarithm of frequency, with one amplitude for magnitude (neper) and phase (rad) and all response
-pairs. Amplitude and length follow from the restricted likelihood, which leaves out what the
+logarithm of frequency, with one amplitude for all response pairs: in rad of phase, and 0.6 of it
+in neper of magnitude. Amplitude and length follow from the restricted likelihood, which leaves out what the
 parameters can take up themselves.
 Source: Kennedy & O'Hagan (2001), Bayesian calibration of computer models; Rasmussen & Williams
 (2006), Gaussian Processes for Machine Learning, eq. 2.45.
@@ -20,11 +20,12 @@ from ._accuracy import Matrix, PriorRows, ResponseTerm, scaled_inverse
 from ._cost import Points
 
 
-LENGTHS = (0.35, 0.6, 1.0, 1.7)  # in ln(omega); 0.69 is an octave
+LENGTHS = (0.5, 1.0, 2.0)  # in ln(omega); 0.69 is an octave
 MEAN = 0.03  # of the prior of the amplitude, neper
+SHARES = np.array([0.6, 1.0])  # of the amplitude, in magnitude and in phase
 _NONE = 0.5  # the prior's mass at a discrepancy of zero
 _AMPLITUDES = 16
-_RANK = 24  # of a kernel over a band: what is left of its variance is below 1 %
+_RANK = 16  # of a kernel over a band of two decades: what is left of its variance is below 1 %
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
 _FOLLOWS = 1.25  # factor by which such a width grows
 
@@ -32,11 +33,11 @@ Widths = Float[np.ndarray, " parameters"]
 
 
 class Discrepancy(eqx.Module):
-    """How far a model is off beyond the noise, as a share of the response (neper, or rad).
+    """How far a model is off beyond the noise, in rad of phase; 0.6 of it in neper of magnitude.
 
     **Attributes:**
 
-    - `amplitude`: root mean square of the posterior; 0.1 is about 10 % or 6 deg.
+    - `amplitude`: root mean square of the posterior; 0.1 is 6 deg, and 6 % of magnitude.
     - `length`: over which it changes, in ln(omega).
     - `none`: the probability that the model is right.
     - `widths`: for each parameter what makes its interval as wide as it is: "noise", "data" (the
@@ -111,10 +112,11 @@ def _components(omega, used, inverse, columns) -> tuple[np.ndarray, np.ndarray]:
     gram = np.einsum("lfrp,lfs->lprs", weighted, basis, optimize=True)
     seen = np.einsum("lfrp,fpmx->lprmx", weighted, columns, optimize=True)
     gains, turned = np.linalg.eigh(gram)
-    seen = np.einsum("lprk,lprmx->lpkmx", turned, seen, optimize=True)
-    products = np.einsum("lpkmx,lpkmy->lpkxy", seen, seen, optimize=True)
+    seen = np.einsum("lprk,lprmx->lpkmx", turned, seen, optimize=True) * SHARES[:, None]
+    products = np.einsum("lpkmx,lpkmy->lpkmxy", seen, seen, optimize=True)
+    gains = np.maximum(gains, 0.0)[..., None] * SHARES**2
     lengths, width = len(basis), columns.shape[-1]
-    return np.maximum(gains, 0.0).reshape(lengths, -1), products.reshape(lengths, -1, width**2)
+    return gains.reshape(lengths, -1), products.reshape(lengths, -1, width**2)
 
 
 @ft.lru_cache(maxsize=16)
@@ -124,15 +126,15 @@ def kernel_basis(omega: bytes) -> Float[np.ndarray, "lengths frequencies rank"]:
     apart = np.abs(place[:, None] - place[None, :])
     roots = []
     for length in LENGTHS:
-        values, vectors = np.linalg.eigh(_matern(np.sqrt(3) * apart / length))
+        values, vectors = np.linalg.eigh(_matern(np.sqrt(5) * apart / length))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         roots.append(root[:, ::-1][:, :_RANK])
     return np.stack(roots)
 
 
 def _matern(distance: np.ndarray) -> np.ndarray:
-    """Matern's kernel of order 3/2: a discrepancy whose slope is continuous."""
-    return (1 + distance) * np.exp(-distance)
+    """Matern's kernel of order 5/2: a discrepancy whose curvature is continuous."""
+    return (1 + distance + distance**2 / 3) * np.exp(-distance)
 
 
 def _restricted_likelihoods(
@@ -149,9 +151,8 @@ def _restricted_likelihoods(
     step = np.linalg.solve(slopes, misfit[..., None])[..., 0]
     rest = (left[..., -1, -1] - np.sum(misfit * step, axis=-1)) * scale[-1] ** 2
     volume = np.linalg.slogdet(slopes)[1]
-    # Magnitude and phase have the same components: two halves of a logarithm.
     grown = np.sum(np.log1p(power[None, :, None] * seen.gains[:, None, :]), axis=-1)
-    return -grown - 0.5 * volume - 0.5 * rest
+    return -0.5 * (grown + volume + rest)
 
 
 def _mix(likelihoods: np.ndarray, amplitudes: np.ndarray, mean: float) -> Mixture:
@@ -174,6 +175,7 @@ def discrepancy_effect(
         pulls = record.weights[..., None] ** 2 * record.slopes[..., :count]
         pulls = np.where(record.weights[..., None] > 0, pulls, 0.0)
         basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
+        pulls = pulls * SHARES[:, None]
         along = np.einsum("lfr,foimx->lroimx", basis, pulls, optimize=True)
         along = along.reshape(len(LENGTHS), -1, count)
         total += np.swapaxes(along, 1, 2) @ along

@@ -1,5 +1,6 @@
 """Which parameters a record determines, decided from the Fisher information."""
 
+import dataclasses
 from collections.abc import Callable
 from fractions import Fraction
 from typing import NamedTuple
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._accuracy import Matrix
-from ._verdict import Combination, remedies_for, Verdict
+from ._verdict import Bound, Combination, remedies_for, Verdict
 
 
 KINDS = ("product", "sum")
@@ -155,8 +156,41 @@ class _Group(NamedTuple):
     curved: bool
 
 
-def assess_identifiability(information: Information) -> Verdict:
-    """Null directions of the Fisher information, and the combinations outside them."""
+def assess_identifiability(information: Information, bounds: tuple[Bound, ...] = ()) -> Verdict:
+    """Null directions of the Fisher information, and the combinations outside them.
+
+    Parameters with a bound are determined by it, and take part in no direction.
+    """
+    count = len(information.covariance)
+    at_zero = [information.names.index(bound.name) for bound in bounds]
+    kept = np.setdiff1d(np.arange(len(information.names)), at_zero)
+    free = kept[kept < count]
+
+    def widened(reduced: np.ndarray) -> np.ndarray:
+        whole = np.zeros((*reduced.shape[:-1], count))
+        whole[..., free] = reduced
+        return whole
+
+    verdict = _assess(
+        Information(
+            root=information.root[:, kept],
+            covariance=information.covariance[np.ix_(free, free)],
+            names=tuple(information.names[k] for k in kept),
+            values=information.values[kept],
+            units=information.units[kept],
+            order=tuple(information.order[k] for k in kept),
+            same=lambda values: information.same(widened(values)),
+        )
+    )
+    return dataclasses.replace(
+        verdict,
+        exact=widened(verdict.exact),
+        alternatives=tuple(widened(values) for values in verdict.alternatives),
+        bounds=bounds,
+    )
+
+
+def _assess(information: Information) -> Verdict:
     count = len(information.covariance)
     _, singular, right = np.linalg.svd(information.root[:, :count], full_matrices=True)
     singular = np.pad(singular, (0, count - len(singular)))

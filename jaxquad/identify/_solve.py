@@ -98,6 +98,7 @@ class Solution(NamedTuple):
     converged: bool
     steps: int
     sensitivity: Sensitivity
+    at_zero: tuple[int, ...] = ()  # parameters at their bound, where z stands for next to nothing
 
 
 class Stop(NamedTuple):
@@ -126,7 +127,7 @@ def solve(
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
     stop = descend(problem, z0, solver, max_steps)
-    return solution_at(stop, *_describe(stop.z, problem))
+    return solution_at(stop, *describe_once(stop.z, problem))
 
 
 def solution_at(stop: Stop, facts: tuple, derivatives: Sensitivity) -> Solution:
@@ -156,7 +157,7 @@ def describe(z: Float[Array, " parameters"], problem: Problem) -> tuple[tuple, S
     return facts, sensitivity(z_all, problem)
 
 
-_describe = eqx.filter_jit(describe)
+describe_once = eqx.filter_jit(describe)
 
 
 def least_squares(
@@ -229,9 +230,9 @@ def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> 
     parameters, count = problem.parameters, problem.parameters.count
     ratio = values / np.asarray(parameters.scale)[:count]
     logarithmic = np.array(parameters.logarithmic[:count])
-    if np.any(logarithmic & (ratio <= 0)):
+    if np.any(logarithmic & (ratio < 0)):
         return False
-    z = np.where(logarithmic, np.log(np.where(logarithmic, ratio, 1.0)), ratio)
+    z = np.where(logarithmic, np.log(np.where(logarithmic, np.maximum(ratio, 1e-300), 1.0)), ratio)
     moved = _misfits(jnp.asarray(z), problem)
     return all(
         np.allclose(new, old, atol=1e-6, rtol=0, equal_nan=True)

@@ -60,6 +60,18 @@ class Combination(NamedTuple):
         )
 
 
+class Bound(NamedTuple):
+    """A parameter that keeps its sign, at zero, and how far from it the record allows it to be."""
+
+    name: str
+    limit: float  # of the one-sided 95 % interval, with what the model leaves unexplained
+    noise_limit: float  # likewise, by the measured noise alone
+
+    def __str__(self) -> str:
+        side = "below" if self.limit >= 0 else "above"
+        return f"{self.name}: 0, {side} {self.limit:.3g} (95 %)"
+
+
 class Verdict(eqx.Module):
     """Which free parameters a record determines; true if it determines each of them individually.
 
@@ -77,6 +89,7 @@ class Verdict(eqx.Module):
     exact: Float[np.ndarray, "null parameters"]  # null directions that no noise explains
     alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
     curved: tuple[str, ...] = eqx.field(static=True)  # determined as neither a product nor a sum
+    bounds: tuple[Bound, ...] = ()  # parameters at zero: determined, by a limit
 
     @property
     def identifiable(self) -> bool:
@@ -92,7 +105,8 @@ class Verdict(eqx.Module):
     def summary(self) -> str:
         """The verdict in one line."""
         if self.identifiable:
-            return "identifiable: the record determines every free parameter individually"
+            known = "identifiable: the record determines every free parameter individually"
+            return "; ".join([known, *map(str, self.bounds)])
         if not self.fitted:
             return f"not identifiable from this record: {'; '.join(self.reasons)}"
         if self.kind == "no minimum":
@@ -118,6 +132,7 @@ class Verdict(eqx.Module):
                 + ", ".join(self.undetermined),
                 *self._determined(),
                 *(f"  {reason}" for reason in self.reasons),
+                *(f"  {bound}" for bound in self.bounds),
             ]
         return "\n".join([*lines, *self._remedied()])
 

@@ -35,7 +35,7 @@ def test_a_noise_free_response_gives_the_parameters_back(cost, solver):
 
 def test_the_cost_is_equation_14_and_its_minimum_that_of_scipy():
     frf = response_of(TRUTH, seed=0)
-    fit = jq.fit(START, frf)
+    fit = jq.fit(START, frf, cost=jq.identify.CoherenceWeighted())
     assert fit.cost == pytest.approx(cost_14(fit.values, frf), rel=1e-10)
     T, T_hat = (
         np.asarray(r)[:, 0, 0] for r in (fit.model.frequency_response(frf.omega), frf.response)
@@ -93,11 +93,11 @@ def test_standard_errors_are_the_scatter_even_of_correlated_noise(cost):
     frfs = [response_of(TRUTH, error=0.01, correlation=0.7, seed=k) for k in range(200)]
     fits = [jq.fit(START, frf, cost=cost) for frf in frfs]
     values = np.array([fit.values for fit in fits])
-    predicted = np.mean([fit.standard_errors for fit in fits], axis=0)
+    predicted = np.mean([fit.noise_standard_errors for fit in fits], axis=0)
     # The standard deviation of 200 draws is itself uncertain by 5 %.
     np.testing.assert_allclose(predicted / values.std(axis=0), 1.0, atol=0.15)
     inside = np.abs(values - [280.0, 0.016, 0.011]) < 1.96 * np.array(
-        [fit.standard_errors for fit in fits]
+        [fit.noise_standard_errors for fit in fits]
     )
     assert np.all(inside.mean(axis=0) > 0.89)
 
