@@ -19,6 +19,7 @@ from ._estimators import Composite, JointInputOutput, LocalPolynomial, Periodic,
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
 from ._local_estimate import estimate_local_polynomial, LocalEstimate
+from ._nonlinearity import remarks_on_nonlinearity
 from ._periodic import estimate_periodic, PeriodicEstimate
 from ._welch import average_windows
 
@@ -65,6 +66,9 @@ def _result(
     columns = (found.response, error, found.coherence, found.direct_coherence)
     names = records[0].output_names, records[0].input_names
     remarks = remarks_on_feedback(method, omega, *map(np.asarray, columns), names)
+    if isinstance(found, LocalEstimate):  # periods show their own distortion
+        response, coherence = np.asarray(found.response), np.asarray(found.coherence)
+        remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     return FrequencyResponse(
         omega=jnp.asarray(omega),
         response=found.response,

@@ -63,11 +63,9 @@ class FrequencyResponse(eqx.Module):
     With several inputs, responses are conditioned on the other inputs and `coherence` is partial.
     Where the inputs cannot be separated, the response is nan and its random error infinite.
     `errors` is the covariance of all random errors: neighbouring frequencies share part of their
-    noise. `log_noise_covariance` says how well the noise behind them is known: the covariance of the
-    logarithm of its estimated power between frequencies; without it, the noise counts as known.
-    `remarks` are what a user of the response should know: sentences that know the
-    frequencies they are about. `dt` and `hold` are the sample interval and the inputs' hold of the
-    records it was made from, see `Record`.
+    noise. `log_noise_covariance` says how well that noise is known: the covariance of the logarithm
+    of its estimated power between frequencies; without it, the noise counts as known. `remarks` are
+    what a user of the response should know: sentences that know the frequencies they are about.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s

@@ -18,6 +18,7 @@ from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
 from ._noise_freedom import smoothed
+from ._nonlinearity import remarks_on_nonlinearity
 from ._remarks import Remark
 from ._transform import transform_windows
 from ._window import coefficients, leaked_power, segment_starts, window
@@ -267,6 +268,8 @@ def _result(
     columns = (found.response, found.random_error, found.coherence, found.direct_coherence)
     names = first.output_names, first.input_names
     remarks = remarks_on_feedback(method, omega, *map(np.asarray, columns), names)
+    response, coherence = np.asarray(found.response), np.asarray(found.coherence)
+    remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
     if max(independent) < 3:
         remarks += (Remark(_FEW.format(count=max(independent))),)
