@@ -77,6 +77,16 @@ def flattened(log: Log) -> Signals:
     return Signals(arrays, clocks)
 
 
+def add_columns(
+    columns: dict[str, np.ndarray], more: Mapping[str, np.ndarray], remarks: list[str]
+) -> None:
+    """Put arrays to those of a file; of two with the same name the later stays, with a remark."""
+    for name, values in more.items():
+        if name in columns:
+            remarks.append(f"two arrays are called {printable(name)!r}: the later one is used")
+        columns[name] = values
+
+
 def is_data(array: np.ndarray) -> bool:
     """Real numbers in one or two dimensions."""
     return array.dtype.kind in "fiub" and array.ndim in (1, 2)

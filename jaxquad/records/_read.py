@@ -50,7 +50,10 @@ def channels(
     - `ReadError`: where the file is missing, damaged or of an unknown format.
     """
     signals = load_signals(path)
-    timebases = Timebases(signals, time, time_unit)
+    try:
+        timebases = Timebases(signals, time, time_unit)
+    except ReadError as error:
+        raise located(error, path) from error
     return [_summary(timebases, name) for name in signal_names(signals, time)]
 
 
@@ -59,8 +62,7 @@ def _summary(timebases: Timebases, name: str) -> ChannelSummary:
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
     try:
-        channel = timebases.channel(name)
-        clock = channel.rate, float(channel.time[0]), float(channel.time[-1])
+        clock = timebases.extent(name)
     except RecordError:  # A list of channels is also for finding out what is wrong with a file.
         clock = np.nan, np.nan, np.nan
     return ChannelSummary(name, len(values), *clock, low, high, timebases.unit(name))

@@ -45,7 +45,11 @@ class Timebases:
         self._signals, self._time = signals, time
         self._unit: TimeUnit | None = time_unit
         self._names = signal_names(signals, time)
+        self._every = _all_names(signals)
+        if time is not None and time not in self._every and time not in signals.arrays:
+            raise ReadError(f"time base {time!r}: {unknown_name(time, signals.arrays)}")
         self._repaired: dict[str, RepairedTime] = {}
+        self._rates: dict[str, float] = {}
 
     def channel(self, name: str) -> Channel:
         """The named channel with its time stamps, in s.
@@ -53,6 +57,19 @@ class Timebases:
         Raises ReadError for an unknown channel and for one without a time base of its length,
         and warns with RecordWarning of time stamps that had to be repaired.
         """
+        values, stamps = self.values(name), self._checked(name)[1]
+        kept = values if stamps.kept is None else values[stamps.kept]
+        return Channel(name, stamps.time, kept, self.unit(name))
+
+    def extent(self, name: str) -> tuple[float, float, float]:
+        """Rate in Hz, first and last time in s of a channel; raises as `channel` does."""
+        base, stamps = self._checked(name)
+        if base not in self._rates:
+            self._rates[base] = self.channel(name).rate
+        return self._rates[base], float(stamps.time[0]), float(stamps.time[-1])
+
+    def _checked(self, name: str) -> tuple[str, RepairedTime]:
+        """The time base of a channel, of the channel's length."""
         values, array = self.values(name), self._names[name][0]
         base = self._base(array)
         stamps = self._stamps(base)
@@ -63,8 +80,7 @@ class Timebases:
                 f"{whole}. Name another time base (time=, --time), or save the channel's own as "
                 f"{'t_' + array!r}."
             )
-        kept = values if stamps.kept is None else values[stamps.kept]
-        return Channel(name, stamps.time, kept, self._signals.arrays[array].unit)
+        return base, stamps
 
     def values(self, name: str) -> np.ndarray:
         """The values of a channel in its unit, without its time stamps."""
@@ -85,7 +101,27 @@ class Timebases:
                     f"leave the unit out, or name another time base (time=, --time)."
                 )
             return known
-        return time_array(self._signals, array, self._time)
+        base = time_array(self._signals, array, self._time)
+        if base not in self._repaired and self._time is None:
+            self._warn_of_others(base)
+        return base
+
+    def _warn_of_others(self, base: str) -> None:
+        """Of arrays beside the time base that are called like one, and hold something else."""
+        arrays = self._signals.arrays
+        struct, dot, field = base.rpartition(".")
+        names = [f"{struct}{dot}{name}" for name in _SHARED if field in _SHARED and name != field]
+        alike = [
+            n for n in names if n in arrays and len(arrays[n].values) == len(arrays[base].values)
+        ]
+        other = [n for n in alike if not np.array_equal(arrays[n].values, arrays[base].values)]
+        if other:
+            warnings.warn(
+                f"the time stamps are taken from {base!r}; {', '.join(map(repr, other))}, of the "
+                f"same length, is not used. Name the right one (time=, --time).",
+                RecordWarning,
+                stacklevel=2,
+            )
 
     def _stamps(self, base: str) -> RepairedTime:
         if base not in self._repaired:
@@ -100,7 +136,7 @@ class Timebases:
         return self._repaired[base]
 
     def _counted(self, base: str) -> tuple[Float[np.ndarray, " samples"], int]:
-        array, column = _all_names(self._signals)[base]
+        array, column = self._every[base]
         signal = self._signals.arrays[array]
         counter, wraps = unwrap(column_values(signal, column, raw=True))
         stated: TimeUnit | None = signal.unit if signal.unit in PER_SECOND else None  # pyright: ignore[reportAssignmentType]
@@ -120,8 +156,6 @@ def time_array(signals: Signals, array: str, time: str | None) -> str:
     timestamp, ... in the same struct; and the same in the whole file.
     """
     struct, dot, field = array.rpartition(".")
-    if time is not None and time not in signals.arrays and time not in _all_names(signals):
-        raise ReadError(f"time base {time!r}: {unknown_name(time, signals.arrays)}")
     own = f"{struct}{dot}t_{field}"
     asked = [] if time is None else [time]
     shared = asked or [f"{struct}{dot}{name}" for name in _SHARED] + list(_SHARED)

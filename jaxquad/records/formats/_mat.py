@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._errors import ReadError
-from .._log import check_size, Log, Table
+from .._log import add_columns, check_size, Log, Table
 
 
 _HEADER = 128
@@ -43,6 +43,18 @@ class _Element(NamedTuple):
     offset: int
 
 
+class _Budget:
+    """How many bytes the variables of a file unfold to, in the type that they are stored in or in
+    the wider one of their class; raises ReadError where they are too many."""
+
+    def __init__(self, stored: int):
+        self.stored, self.taken = stored, 0
+
+    def take(self, size: int, offset: int) -> None:
+        self.taken += size
+        check_size("the file", self.taken, self.stored, offset=offset)
+
+
 def sniff(head: bytes, path: Path) -> bool:
     return head[126:128] in (b"IM", b"MI") and head[124:126] in (b"\0\1", b"\1\0")
 
@@ -57,11 +69,13 @@ def load(path: Path) -> Log:
         )
     order = "<" if content[126:128] == b"IM" else ">"
     arrays: dict[str, np.ndarray] = {}
+    remarks: list[str] = []
+    budget = _Budget(len(content))
     for element in _elements(memoryview(content), order, _HEADER, 0):
-        variable = _inflated(element, order, len(content))
+        variable = _inflated(element, order, budget)
         if variable.kind == _MATRIX:
-            arrays |= _variable(variable, order, "", 0)
-    return Log({"": Table(arrays)})
+            add_columns(arrays, _variable(variable, order, "", 0, budget), remarks)
+    return Log({"": Table(arrays)}, tuple(remarks))
 
 
 def _elements(content: memoryview, order: str, place: int, base: int) -> Iterator[_Element]:
@@ -89,7 +103,7 @@ def _elements(content: memoryview, order: str, place: int, base: int) -> Iterato
         )
 
 
-def _inflated(element: _Element, order: str, stored: int) -> _Element:
+def _inflated(element: _Element, order: str, budget: _Budget) -> _Element:
     if element.kind != _COMPRESSED:
         return element
     inflater = zlib.decompressobj()
@@ -99,6 +113,7 @@ def _inflated(element: _Element, order: str, stored: int) -> _Element:
             raise ReadError("a compressed variable is cut off", offset=element.offset)
         kind, size = (int(n) for n in np.frombuffer(tag, f"{order}u4"))
         check_size("a compressed variable", size, len(element.body), offset=element.offset)
+        budget.take(size, element.offset)
         body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
         if inflater.decompress(inflater.unconsumed_tail, 1):
             raise ReadError(
@@ -113,7 +128,9 @@ def _inflated(element: _Element, order: str, stored: int) -> _Element:
     return _Element(kind, memoryview(body), element.offset)
 
 
-def _variable(matrix: _Element, order: str, prefix: str, depth: int) -> dict[str, np.ndarray]:
+def _variable(
+    matrix: _Element, order: str, prefix: str, depth: int, budget: _Budget
+) -> dict[str, np.ndarray]:
     """One variable as arrays by name: none if it holds no real numbers."""
     parts = list(_elements(matrix.body, order, 0, matrix.offset))
     if len(parts) < 3 or len(parts[0].body) < 8:
@@ -123,15 +140,18 @@ def _variable(matrix: _Element, order: str, prefix: str, depth: int) -> dict[str
     name = prefix + bytes(parts[2].body).decode("latin-1")
     kind, is_complex = flags & 0xFF, flags & 0x0800
     if kind == _STRUCT and depth < _DEEPEST and len(parts) >= 5 and (shape == 1).all():
-        return _struct(parts, order, name, depth)
+        return _struct(parts, order, name, depth, budget)
     if kind not in _CLASSES or is_complex or len(parts) < 4:
         return {}
     # Numbers are stored in the smallest type that fits, regardless of their class.
-    numbers = _numbers(parts[3], order, name).astype(_CLASSES[kind])
-    return {name: _squeezed(numbers, shape, name, matrix.offset)}
+    numbers = _numbers(parts[3], order, name)
+    budget.take(numbers.size * np.dtype(_CLASSES[kind]).itemsize, matrix.offset)
+    return {name: _squeezed(numbers.astype(_CLASSES[kind]), shape, name, matrix.offset)}
 
 
-def _struct(parts: list[_Element], order: str, name: str, depth: int) -> dict[str, np.ndarray]:
+def _struct(
+    parts: list[_Element], order: str, name: str, depth: int, budget: _Budget
+) -> dict[str, np.ndarray]:
     width = int(np.frombuffer(parts[3].body[:4], f"{order}i4")[0]) if len(parts[3].body) >= 4 else 0
     if width <= 0:
         return {}
@@ -143,7 +163,7 @@ def _struct(parts: list[_Element], order: str, name: str, depth: int) -> dict[st
     for field, part in zip(names, parts[5:], strict=False):
         if part.kind == _MATRIX:
             # A field's matrix has no name of its own.
-            arrays |= _variable(part, order, f"{name}.{field}", depth + 1)
+            arrays |= _variable(part, order, f"{name}.{field}", depth + 1, budget)
     return arrays
 
 

@@ -1,6 +1,4 @@
-import functools as ft
 import io
-import operator
 import zipfile
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -8,7 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from .._errors import printable, ReadError
-from .._log import check_size, Log, Table
+from .._log import add_columns, check_size, Log, Table
 
 
 _MAGIC = b"\x93NUMPY"
@@ -38,8 +36,11 @@ def load(path: Path) -> Log:
         with _opened(stream, size) as archive:
             members = [member for member in archive.infolist() if not member.filename.endswith("/")]
             check_size("the archive", sum(member.file_size for member in members), size)
-            arrays = [_member(archive, member) for member in members]
-        return Log({"": Table(ft.reduce(operator.or_, arrays, {}))})
+            arrays: dict[str, np.ndarray] = {}
+            remarks: list[str] = []
+            for member in members:
+                add_columns(arrays, _member(archive, member), remarks)
+        return Log({"": Table(arrays)}, tuple(remarks))
 
 
 def _opened(stream: io.BufferedIOBase, size: int) -> zipfile.ZipFile:

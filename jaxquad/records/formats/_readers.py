@@ -93,7 +93,17 @@ def load_signals(path: str | Path) -> Signals:
 def load_log(path: str | Path) -> Log:
     """The tables of a file, as its reader finds them. Raises ReadError, warns RecordWarning."""
     path = Path(path)
-    log = _load_guarded(_choose_reader(path), path)
+    try:
+        reader = _choose_reader(path)
+    # A name with a zero byte, one too long, a link to itself, a folder that may not be read.
+    except (OSError, RuntimeError, ValueError) as error:
+        if isinstance(error, ReadError):
+            raise
+        raise ReadError(
+            f"{printable(str(path))}: the file cannot be opened "
+            f"({type(error).__name__}: {printable(str(error))})."
+        ) from error
+    log = _load_guarded(reader, path)
     remarks = list(log.remarks[:_LISTED])
     if len(log.remarks) > _LISTED:
         remarks.append(f"{len(log.remarks) - _LISTED} more remarks of this kind")
@@ -125,11 +135,8 @@ def _head(path: Path) -> bytes:
     if not path.is_file():
         missing = f"there is no such file in {path.resolve().parent}"
         raise ReadError(f"{path}: {'it is not a regular file' if path.exists() else missing}.")
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD)
-    except OSError as error:
-        raise ReadError(f"{path}: the file cannot be opened ({error}).") from error
+    with path.open("rb") as file:
+        head = file.read(HEAD)
     if not head:
         raise ReadError(f"{path}: the file is empty.", offset=0)
     return head
