@@ -109,9 +109,11 @@ class Loop(eqx.Module):
                 "leave dt out, or make the controller with this dt"
             )
         if isinstance(self.plant, Multirotor) and self.drive is None:
+            volts = self.plant.allocation.input == "voltage"
+            drive = "MotorDrive(plant.allocation)" if volts else "RotorDrive(plant.allocation, ...)"
             raise ValueError(
                 "drive is None, but a Multirotor takes four motor inputs: give "
-                "drive=jq.simulation.MotorDrive(plant.allocation)"
+                f"drive=jq.simulation.{drive}"
             )
 
     @property

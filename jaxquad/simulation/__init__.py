@@ -22,7 +22,12 @@ from ._flight_metrics import (
     Window as Window,
     window as window,
 )
-from ._hardware import Encoder as Encoder, MotorDrive as MotorDrive, Saturation as Saturation
+from ._hardware import (
+    Encoder as Encoder,
+    MotorDrive as MotorDrive,
+    RotorDrive as RotorDrive,
+    Saturation as Saturation,
+)
 from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
 from ._over_devices import loop_over_devices as loop_over_devices, over_devices as over_devices

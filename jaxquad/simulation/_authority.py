@@ -13,7 +13,7 @@ from ._metrics import axis_names
 from ._scenario import Scenario
 
 
-_ALL = 1e6  # units of command, more than any drive gives
+_ALL = 1e12  # units of command, more than any drive gives
 
 
 class AuthorityWarning(UserWarning):

@@ -10,6 +10,13 @@ from jaxquad._core import align, as_float, is_concrete, per_member
 from jaxquad.models import Allocation, QUANSER_HOVER
 
 
+_MOTOR_DRIVE = "jq.simulation.MotorDrive(plant.allocation)"
+_ROTOR_DRIVE = (
+    "jq.simulation.RotorDrive(plant.allocation, jq.models.CRAZYFLIE.hover_input, "
+    "jq.models.CRAZYFLIE.top_speed)"
+)
+
+
 class MotorDrive(eqx.Module):
     """From roll, pitch and yaw commands in V to four motor voltages within their limits.
 
@@ -22,7 +29,9 @@ class MotorDrive(eqx.Module):
     - `bias`: V, at which all motors turn in hover; the Quanser Hover's by default.
     - `limit`: V, of each motor to either side; the Quanser Hover's by default.
 
-    **Raises:** ValueError for a bias beyond the limit.
+    **Raises:**
+
+    - `ValueError`: the bias is beyond the limit, or the vehicle is driven by squared rotor speeds.
     """
 
     allocation: Allocation
@@ -30,6 +39,11 @@ class MotorDrive(eqx.Module):
     limit: float = eqx.field(static=True, default=QUANSER_HOVER.voltage_limit)  # V, either sign
 
     def __check_init__(self):
+        if self.allocation.input != "voltage":
+            raise ValueError(
+                "the vehicle takes squared rotor speeds, and a MotorDrive clips voltages: give "
+                f"drive={_ROTOR_DRIVE}, with the numbers of your vehicle"
+            )
         if not abs(self.bias) < self.limit:
             raise ValueError(
                 f"bias is {self.bias} V, but it must lie within the limit of {self.limit} V: lower "
@@ -49,6 +63,49 @@ class MotorDrive(eqx.Module):
 
     def achieved(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
         """The command that these voltages amount to: less than was asked for where they clip."""
+        return self.allocation.differences(inputs)
+
+
+class RotorDrive(eqx.Module):
+    """From roll, pitch and yaw commands in rad^2/s^2 to four squared rotor speeds from 0 to a top.
+
+    A command is the difference of squared speeds that Eq. (9) multiplies, as in `MotorDrive`, about
+    the squared speed at which the vehicle hovers.
+
+    **Arguments:**
+
+    - `allocation`: of the vehicle, `plant.allocation` of a `jq.models.Multirotor`.
+    - `hover`: squared speed in rad^2/s^2, as `jq.models.CRAZYFLIE.hover_input`.
+    - `top_speed`: of a rotor in rad/s, as `jq.models.CRAZYFLIE.top_speed`.
+
+    **Raises:**
+
+    - `ValueError`: the hover is not between 0 and the top, or the vehicle is driven by voltages.
+    """
+
+    allocation: Allocation
+    hover: float = eqx.field(static=True)  # rad^2/s^2
+    top_speed: float = eqx.field(static=True)  # rad/s
+
+    def __check_init__(self):
+        if self.allocation.input != "omega2":
+            raise ValueError(
+                "the vehicle takes voltages, and a RotorDrive gives squared rotor speeds: give "
+                f"drive={_MOTOR_DRIVE}"
+            )
+        if not 0 < self.hover < self.top_speed**2:
+            raise ValueError(
+                f"hover is {self.hover} rad^2/s^2, but it must lie between 0 and top_speed^2, "
+                f"{self.top_speed**2}: give the squared speed that carries the vehicle"
+            )
+
+    def inputs(self, command: Float[Array, " 3 *ensemble"]) -> Float[Array, " 4 *ensemble"]:
+        """Squared rotor speeds, clipped: a rotor does not turn backwards."""
+        squares = self.allocation.from_differences(command, self.hover)
+        return jnp.clip(squares, 0.0, self.top_speed**2)
+
+    def achieved(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
+        """The command that these speeds amount to: less than was asked for where they clip."""
         return self.allocation.differences(inputs)
 
 

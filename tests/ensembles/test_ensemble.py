@@ -45,9 +45,15 @@ class Around(NamedTuple):
         return self.ensemble.fresh(self.loop, n, key)
 
 
+def drive_of(vehicle):
+    if vehicle.allocation.input == "voltage":
+        return jq.simulation.MotorDrive(vehicle.allocation)
+    sheet = jq.models.CRAZYFLIE
+    return jq.simulation.RotorDrive(vehicle.allocation, sheet.hover_input, sheet.top_speed)
+
+
 def made(plant, drive=None, nominal_delay: ArrayLike = 0.0, **laws) -> Around:
-    multirotor = isinstance(plant, jq.models.Multirotor)
-    drive = jq.simulation.MotorDrive(plant.allocation) if multirotor else drive
+    drive = drive_of(plant) if isinstance(plant, jq.models.Multirotor) else drive
     controller = jq.LADRC(10.0, 30.0, 0.848)
     loop = jq.Loop(plant, controller, drive=drive, dt=DT, delay=nominal_delay)
     return Around(loop, Ensemble(**laws))

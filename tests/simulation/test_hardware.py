@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad.models import Allocation, QUANSER_HOVER
-from jaxquad.simulation import Encoder, excite, gauss_markov, MotorDrive
+from jaxquad.control import LADRC
+from jaxquad.loops import Loop
+from jaxquad.models import Allocation, CRAZYFLIE, crazyflie, QUANSER_HOVER, quanser_hover
+from jaxquad.simulation import authority, Encoder, excite, gauss_markov, MotorDrive, RotorDrive
 
 
 SHEET = QUANSER_HOVER
@@ -57,6 +59,40 @@ def test_a_drive_clips_at_its_limit_and_owns_up_to_it():
 def test_a_bias_beyond_the_limit_is_refused():
     with pytest.raises(ValueError, match="bias is 12.0 V.*within the limit of 10.0 V"):
         MotorDrive(ALLOCATION, bias=12.0, limit=10.0)
+
+
+ROTORS = RotorDrive(crazyflie().allocation, CRAZYFLIE.hover_input, CRAZYFLIE.top_speed)
+TOP = CRAZYFLIE.top_speed**2
+
+
+def test_rotors_achieve_a_command_between_standstill_and_top_speed():
+    wanted = 0.1 * TOP * COMMANDS / 8
+    squares = np.asarray(ROTORS.inputs(jnp.asarray(wanted)))
+    np.testing.assert_allclose(ROTORS.achieved(jnp.asarray(squares)), wanted, atol=1e-9 * TOP)
+    np.testing.assert_allclose(squares.mean(axis=0), CRAZYFLIE.hover_input, rtol=1e-12)
+    assert squares.min() > 0 and squares.max() < TOP
+    squares = np.asarray(ROTORS.inputs(jnp.array([10 * TOP, 0.0, 0.0])))
+    np.testing.assert_allclose(squares, [0, 0, TOP, TOP])
+
+
+def test_the_authority_of_rotors_is_that_of_two_at_the_top_and_two_at_rest():
+    found, plant = authority(crazyflie(), ROTORS), crazyflie()
+    np.testing.assert_allclose(found.torque[0], plant.torque_gain[0] * 2 * TOP, rtol=1e-12)
+
+
+def test_a_drive_refuses_a_vehicle_of_the_other_kind_and_names_the_right_one():
+    with pytest.raises(ValueError, match="squared rotor speeds.*give drive=.*RotorDrive"):
+        MotorDrive(crazyflie().allocation)
+    with pytest.raises(ValueError, match="takes voltages.*give drive=.*MotorDrive"):
+        RotorDrive(ALLOCATION, CRAZYFLIE.hover_input, CRAZYFLIE.top_speed)
+    for vehicle, drive in ((crazyflie(), "RotorDrive"), (quanser_hover(), "MotorDrive")):
+        with pytest.raises(ValueError, match=f"drive is None.*{drive}"):
+            Loop(vehicle, LADRC(10.0, 30.0, 1.0))
+
+
+def test_a_hover_beyond_the_top_speed_is_refused():
+    with pytest.raises(ValueError, match="hover is 9900000.* between 0 and top_speed"):
+        RotorDrive(crazyflie().allocation, 9.9e6, CRAZYFLIE.top_speed)
 
 
 CORNER, DT = 4.0, 0.01
