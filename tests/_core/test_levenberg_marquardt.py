@@ -40,13 +40,14 @@ def test_every_member_of_a_batch_reaches_the_minimum_of_scipy():
 
 
 def test_too_few_steps_are_told_and_a_wall_of_nan_stalls():
-    assert np.all(minimise(evaluate, jnp.asarray(STARTS.T), 1).status == RUNNING)
+    once = jax.jit(lambda z: minimise(evaluate, z, 1))(STARTS.T)
+    assert np.all(once.status == RUNNING)
 
     def walled(z):
         inside = jnp.where(z[0] < 1, 3 - z[0], jnp.nan)  # falls towards a wall at 1
         return Normal(inside**2 / 2, -inside[None], jnp.ones((1, 1, *inside.shape)))
 
-    stopped = minimise(walled, jnp.asarray([[0.0, 2.0]]), 200)
+    stopped = jax.jit(lambda z: minimise(walled, z, 200))(np.array([[0.0, 2.0]]))
     np.testing.assert_array_equal(stopped.status, STALLED)
     # As near as the damping lets it, or not at all from a start behind the wall.
     np.testing.assert_allclose(stopped.z[0], [1.0, 2.0], atol=1e-6)

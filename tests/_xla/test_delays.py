@@ -17,7 +17,7 @@ CASES = {
 }
 
 
-LONG = ("traced, vmap", "whole samples, single precision")
+LONG = ("traced, vmap", "whole samples, single precision", "no delay, forward derivative")
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ def fleet(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_fleet_gives_a_table_a_summary_and_reports(fleet, tmp_path, capfd, monkeypatch):
     out = tmp_path / "out"
     words = ["batch", str(fleet), "--config", str(fleet / "fleet.toml"), "--out", str(out)]

@@ -171,6 +171,7 @@ def test_inputs_that_move_together_are_remarked():
     assert not any("is correlated with" in remark for remark in independent.remarks)
 
 
+@pytest.mark.slow
 def test_ten_inputs_and_twenty_outputs_are_estimated_at_once():
     u, gain = noise(0, 10), np.random.default_rng(1).standard_normal((10, 20))
     found = respond(u, u @ gain + 1e-3 * noise(2, 20), estimator=Welch(2.0))

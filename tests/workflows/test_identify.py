@@ -76,6 +76,7 @@ def test_a_stored_model_is_that_of_the_fit(found, folder):
     assert stored.model == found.fit.model
 
 
+@pytest.mark.slow
 def test_a_second_record_is_read_with_the_settings_of_the_first(found, folder, log):
     check = verify_result(folder, log, {"start": 5, "stop": 30})
     record = jq.read(log, inputs={"M": {"right": 1, "left": -1}}, outputs="q", start=5, stop=30)
