@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxquad._xla._devices import devices_for, where_put
+from jaxquad._xla import devices_for, where_put
 from jaxquad.control import LADRC, PD
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import (
     evaluate,
+    over_devices,
     Pulse,
     Saturation,
     scenario,
@@ -26,7 +27,6 @@ from jaxquad.simulation import (
     Window,
 )
 from jaxquad.simulation._evaluate import _run
-from jaxquad.simulation._over_devices import over_devices
 
 
 MEMBERS, SAMPLES = 67, 120  # no multiple of two

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxquad.models._transfer_function import imaginary
+from jaxquad.models import imaginary
 
 
 class Ratio(eqx.Module):

@@ -15,8 +15,8 @@ import pytest
 from airframe import Airframe
 from scipy.optimize import least_squares
 
+from jaxquad.identify import select_parameters
 from jaxquad.identify._fit_batch import solve_batch
-from jaxquad.identify._parameters import select_parameters
 
 
 jax.config.update("jax_enable_x64", True)

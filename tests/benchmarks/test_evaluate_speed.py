@@ -22,13 +22,13 @@ from jaxquad.simulation import (
     metrics,
     Pulse,
     Saturation,
+    scan_loop,
     scenario,
     simulate,
     Step,
     Window,
 )
 from jaxquad.simulation._evaluate import _run
-from jaxquad.simulation._run import scan_loop
 from jaxquad.simulation._simulate import _run as _run_stored
 
 

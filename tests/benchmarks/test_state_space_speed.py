@@ -16,8 +16,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import jaxquad as jq
+from jaxquad.identify import select_parameters
 from jaxquad.identify._cost import points_of, usable
-from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._problem import make_problem
 from jaxquad.identify._solve import descend
 from jaxquad.models import simulate_linear, StateSpace

@@ -17,9 +17,17 @@ from jaxquad._core import ensemble_shape, mark_members
 from jaxquad.control import AdaptiveLADRC, InertiaMap, LADRC, PD, RecursiveInertia
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
-from jaxquad.simulation import evaluate, in_slices, MotorDrive, scenario, simulate, Step, WhiteNoise
+from jaxquad.simulation import (
+    evaluate,
+    in_slices,
+    MotorDrive,
+    over_devices,
+    scenario,
+    simulate,
+    Step,
+    WhiteNoise,
+)
 from jaxquad.simulation._memory import free_memory, require_memory
-from jaxquad.simulation._over_devices import over_devices
 
 
 ROUNDING = 1e-12  # the same sums, in vectors of another length

@@ -7,8 +7,8 @@ import pytest
 
 import jaxquad as jq
 from jaxquad._xla import evaluate_once
+from jaxquad.identify import select_parameters
 from jaxquad.identify._fit_batch import solve_batch
-from jaxquad.identify._parameters import select_parameters
 from jaxquad.identify._problem import Problem, residuals, unchanged
 
 

@@ -16,12 +16,12 @@ from jaxquad.simulation import (
     Pulse,
     run_ensemble,
     Saturation,
+    scan_loop,
     scenario,
     simulate,
     Step,
 )
 from jaxquad.simulation._blocks import in_chunks, scan_in_blocks
-from jaxquad.simulation._run import scan_loop
 
 
 MEMBERS, SAMPLES, TAG = 150, 131, "xla_cpu_small_call"

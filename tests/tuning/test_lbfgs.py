@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from jaxquad.tuning._lbfgs import LBFGS, minimise
+from jaxquad.tuning import LBFGS
+from jaxquad.tuning._lbfgs import minimise
 from jaxquad.tuning._phases import Rounds
 
 
