@@ -22,6 +22,7 @@ PLANT = jq.DecoupledAxes([0.05], [0.05])
 LOOP = jq.Loop(PLANT, jq.LADRC(10.0, 30.0, 1.0))
 WRONG: Any = "flight.csv"
 AXES: Any = PLANT
+NUMBER: Any = 3.0
 FLIGHT = jq.scenario(duration=1.0, axes=1)
 CALLS = {
     "the records hold a str: .* see jq.read": lambda: jq.frequency_response(WRONG, np.ones(1)),
@@ -33,6 +34,8 @@ CALLS = {
     "fit is a str: give the result of jq.fit": lambda: jq.ensembles.Posterior(
         WRONG, recorded_dt=None
     ),
+    "a float is no frequency response: give": lambda: jq.loops.margins(NUMBER),
+    "estimator is 3.0: give an object with the methods": lambda: jq.AdaptiveLADRC(LOOP.controller, NUMBER, lambda inertia: 1 / inertia),
     "the controller is a DecoupledAxes, which is a plant": lambda: jq.Loop(PLANT, AXES),
 }
 

@@ -1,6 +1,8 @@
 """`jaxquad`: from a flight record to an identified model, on the command line."""
 
 import argparse
+import difflib
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -33,7 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     **Returns:** the exit code, see `jaxquad --help`.
     """
-    options = make_parser().parse_args(argv)
+    options, unknown = make_parser().parse_known_args(argv)
+    if unknown:
+        return _fail(_describe_unknown(options, unknown), _UNUSABLE)
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -57,6 +61,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _INTERRUPTED
 
 
+def _describe_unknown(options: argparse.Namespace, words: Sequence[str]) -> str:
+    """What is wrong with words that no command declares, and the option that was meant."""
+    command = f"jaxquad {options.command}"
+    first = next((word for word in words if word.startswith("-")), words[0])
+    if not first.startswith("-"):
+        return f"{command} takes no further argument {first!r}. See {command} --help."
+    name = first.partition("=")[0]
+    near = difflib.get_close_matches(name, re.findall(r"--[a-z][a-z0-9-]*", options.usage), n=1)
+    guess = f" Did you mean {near[0]}?" if near else ""
+    return f"{command} has no option {name}.{guess} See {command} --help."
+
+
 def _fail(message: str, code: int) -> int:
     print("jaxquad: error:", *message.split(), file=sys.stderr)
     return code
@@ -75,9 +91,11 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('jaxquad')}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
     for each in _COMMANDS:
         each.declare(commands)
+    for each in commands.choices.values():
+        each.set_defaults(usage=each.format_usage())
     return parser
 
 

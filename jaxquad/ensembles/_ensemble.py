@@ -156,8 +156,10 @@ def _require_single_loop(ensemble: "Ensemble", loop: Loop) -> VariablePlant:
     if not isinstance(plant, DecoupledAxes | Multirotor):
         raise ValueError(
             f"the loop's plant is a {type(plant).__name__}, but an ensemble needs a "
-            "jq.DecoupledAxes or jq.models.Multirotor: for an identified model use "
-            "jq.Ensemble(jq.ensembles.Posterior(fit, ...))"
+            "jq.DecoupledAxes or jq.models.Multirotor. For an identified model use "
+            "jq.Ensemble(jq.ensembles.Posterior(fit, ...)). For a plant of your own draw its "
+            "arrays yourself, with the members on the last axis and fields made by "
+            "jq.loops.per_member, and fly them with jq.evaluate(jq.Loop(plant, ...), scenario)"
         )
     shape = plant.shape[1:] if isinstance(plant, DecoupledAxes) else plant.ensemble
     if shape or loop.delay.ndim:

@@ -128,24 +128,33 @@ class Members(eqx.Module):
     """Drawn members of an ensemble, on the last axis of all arrays that differ between them.
 
     `jq.evaluate(members.loop(controller), members.flight(scenario))` flies all of them.
+
+    **Arguments:**
+
+    - `plant`: the nominal one with what was drawn.
+    - `delay`: s, of the command; `longest_delay`: s, that any draw can have.
+    - `assumed_inertia`: kg m^2, for scheduled controllers.
+    - `keys`: of the noise and gusts.
+    - `noise`: rad, standard deviation; `gust`: N m, standard deviation; None for none.
+    - `payload`: inertia that is picked up in flight, or None.
+    - `drive`, `encoder`, `dt` (s), `substeps`, `bound` (rad): of the loop, as in `jq.Loop`.
+    - `gust_corner`: rad/s.
     """
 
     plant: VariablePlant
-    delay: Float[Array, " members"] = per_member(rank=0)  # s, of the command
-    assumed_inertia: Float[Array, "axes members"] = per_member(
-        rank=1
-    )  # kg m^2, for scheduled controllers
-    keys: Key[Array, " members"] = per_member(rank=0)  # of noise and gusts
-    noise: Float[Array, "axes members"] | None = per_member(rank=1, default=None)  # rad, deviation
-    gust: Float[Array, "axes members"] | None = per_member(rank=1, default=None)  # N m, deviation
+    delay: Float[Array, " members"] = per_member(rank=0)
+    assumed_inertia: Float[Array, "axes members"] = per_member(rank=1)
+    keys: Key[Array, " members"] = per_member(rank=0)
+    noise: Float[Array, "axes members"] | None = per_member(rank=1, default=None)
+    gust: Float[Array, "axes members"] | None = per_member(rank=1, default=None)
     payload: MemberPayload | None = None
     drive: Drive | None = None
     encoder: Sensor | None = None
-    longest_delay: float = eqx.field(static=True, default=0.0)  # s, that any draw can have
-    gust_corner: float = eqx.field(static=True, default=2.0)  # rad/s
-    dt: float = eqx.field(static=True, default=0.002)  # s
+    longest_delay: float = eqx.field(static=True, default=0.0)
+    gust_corner: float = eqx.field(static=True, default=2.0)
+    dt: float = eqx.field(static=True, default=0.002)
     substeps: int = eqx.field(static=True, default=1)
-    bound: float = eqx.field(static=True, default=100.0)  # rad
+    bound: float = eqx.field(static=True, default=100.0)
 
     @property
     def size(self) -> int:

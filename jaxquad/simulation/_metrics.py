@@ -103,30 +103,48 @@ class Metrics(eqx.Module):
     settling are nan on an axis whose reference does not go from one value to another and stay
     there; the rise time also if 90 % is never reached, a settling time if the angle is outside
     the band at the end. Times are interpolated between samples, so that they have gradients.
+
+    **Arguments:**
+
+    - `itae`: integral of (t - start) |error|, rad s^2; `iae`: of |error|, rad s; `ise`: of error^2,
+        rad^2 s.
+    - `overshoot`: % of the step, 0 if there is none.
+    - `rise_time`: s, from 10 to 90 % of the step.
+    - `settling_time`, `settling_time_5`: s, to within 2 % and 5 % of the step for good.
+    - `peak`, `rms`: greatest |error| and its root mean square under load, rad.
+    - `disturbance_rmse`: root mean square error of its estimate under load, N m; nan without one.
+    - `activity`: sum of squared changes of the command; `energy`: integral of its square, unit^2 s.
+    - `saturation_share`: of the samples.
+    - `step`: rad, from first to last, 0 without one; `stepped`: whether the reference makes one.
+    - `diverged`: whether the member left the bound.
+    - `beyond_authority`: share of samples with a disturbance that the drive cannot hold; nan if
+        that is not known. `reversing`: share of samples at which motors turn backwards.
+    - `start`, `stop`, `load_start`: s, of the window and of the load in it.
+    - `per_step`: whether the integrals are divided by the step.
     """
 
-    itae: Float[Array, " axes *ensemble"]  # integral of (t - start) |error|, rad s^2
-    iae: Float[Array, " axes *ensemble"]  # integral of |error|, rad s
-    ise: Float[Array, " axes *ensemble"]  # integral of error^2, rad^2 s
-    overshoot: Float[Array, " axes *ensemble"]  # % of the step, 0 if there is none
-    rise_time: Float[Array, " axes *ensemble"]  # s, from 10 to 90 % of the step
-    settling_time: Float[Array, " axes *ensemble"]  # s, to within 2 % of the step for good
-    settling_time_5: Float[Array, " axes *ensemble"]  # s, to within 5 %
-    peak: Float[Array, " axes *ensemble"]  # greatest |error| under load, rad
-    rms: Float[Array, " axes *ensemble"]  # of the error under load, rad
-    disturbance_rmse: Float[Array, " axes *ensemble"]  # of its estimate under load, N m; or nan
-    activity: Float[Array, " axes *ensemble"]  # sum of squared changes of the command
-    energy: Float[Array, " axes *ensemble"]  # integral of the squared command, unit^2 s
-    saturation_share: Float[Array, " axes *ensemble"]  # of the samples
-    step: Float[Array, " axes *ensemble"]  # rad, from first to last; 0 without one
-    stepped: Bool[Array, " axes *ensemble"]  # whether the reference makes a step
+    itae: Float[Array, " axes *ensemble"]
+    iae: Float[Array, " axes *ensemble"]
+    ise: Float[Array, " axes *ensemble"]
+    overshoot: Float[Array, " axes *ensemble"]
+    rise_time: Float[Array, " axes *ensemble"]
+    settling_time: Float[Array, " axes *ensemble"]
+    settling_time_5: Float[Array, " axes *ensemble"]
+    peak: Float[Array, " axes *ensemble"]
+    rms: Float[Array, " axes *ensemble"]
+    disturbance_rmse: Float[Array, " axes *ensemble"]
+    activity: Float[Array, " axes *ensemble"]
+    energy: Float[Array, " axes *ensemble"]
+    saturation_share: Float[Array, " axes *ensemble"]
+    step: Float[Array, " axes *ensemble"]
+    stepped: Bool[Array, " axes *ensemble"]
     diverged: Bool[Array, "*ensemble"]
-    beyond_authority: Float[Array, " axes *ensemble"]  # share of samples; nan if not known
-    reversing: Float[Array, " axes *ensemble"]  # share of samples that turn motors backwards
-    start: float = eqx.field(static=True)  # s
-    stop: float = eqx.field(static=True)  # s
-    load_start: float = eqx.field(static=True)  # s
-    per_step: bool = eqx.field(static=True, default=False)  # integrals divided by the step
+    beyond_authority: Float[Array, " axes *ensemble"]
+    reversing: Float[Array, " axes *ensemble"]
+    start: float = eqx.field(static=True)
+    stop: float = eqx.field(static=True)
+    load_start: float = eqx.field(static=True)
+    per_step: bool = eqx.field(static=True, default=False)
 
     def normalised(self) -> "Metrics":
         """The same with ITAE, IAE and ISE of a unit step; nan on axes without a step."""

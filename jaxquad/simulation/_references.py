@@ -35,7 +35,19 @@ class Step(Signal):
 
 
 class Ramp(Signal):
-    """From `before` to `after` at a constant rate, `within` s from the time `at` (s)."""
+    """From `before` to `after` at a constant rate.
+
+    **Arguments:**
+
+    - `after`, `before`: in the unit of what it is given for (a reference: rad); one value, or one
+        per member.
+    - `within`: s that the change lasts.
+    - `at`: s from the start.
+
+    **Raises:**
+
+    - `ValueError`: a value is not finite, or `within` is not above 0.
+    """
 
     after: Float[Array, "..."] = eqx.field(converter=as_float)
     within: float = eqx.field(static=True, kw_only=True)  # s
@@ -55,10 +67,21 @@ class Ramp(Signal):
 
 
 class SmoothStep(Signal):
-    """From `before` to `after` with the least jerk, `within` s from the time `at` (s).
+    """From `before` to `after` with the least jerk.
 
     The polynomial s^3 (10 - 15 s + 6 s^2) starts and ends at rest, with no acceleration (Flash and
     Hogan, 1985). Its rate and acceleration are exact, for feed-forward.
+
+    **Arguments:**
+
+    - `after`, `before`: in the unit of what it is given for (a reference: rad); one value, or one
+        per member.
+    - `within`: s that the change lasts.
+    - `at`: s from the start.
+
+    **Raises:**
+
+    - `ValueError`: a value is not finite, or `within` is not above 0.
     """
 
     after: Float[Array, "..."] = eqx.field(converter=as_float)
@@ -120,6 +143,16 @@ class ReferenceModel(Signal):
 
     What a pilot's command model does: the set-point becomes one that the vehicle can follow, with
     the rate and acceleration for feed-forward. Exact for a signal held between samples.
+
+    **Arguments:**
+
+    - `signal`: the set-point as it is asked for, a `Signal` or a number.
+    - `natural_frequency`: wn in rad/s.
+    - `damping`: zeta, without unit; 1 does not overshoot.
+
+    **Raises:**
+
+    - `ValueError`: wn or zeta is not above 0.
     """
 
     signal: Signal = eqx.field(converter=as_signal)

@@ -169,6 +169,24 @@ def test_every_command_has_help_with_an_example(name, capsys):
     assert stop.value.code == 0 and f"  jaxquad {name}" in printed and "--json" in printed
 
 
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (
+            ["identify", "x", "--lagg"],
+            "jaxquad identify has no option --lagg. Did you mean --no-lag?",
+        ),
+        (["identify", "x", "--referense=r"], "no option --referense. Did you mean --reference?"),
+        (["channels", "x", "--zzz", "1"], "has no option --zzz. See jaxquad channels --help."),
+        (["channels", "x", "y"], "jaxquad channels takes no further argument 'y'."),
+    ],
+)
+def test_an_option_that_does_not_exist_is_answered_with_the_nearest(words, said, capsys):
+    assert main(words) == 2
+    printed = capsys.readouterr()
+    assert said in printed.err and not printed.out and printed.err.count("\n") == 1
+
+
 def test_channels_are_listed_as_json(demo, capsys):
     assert main(["channels", str(demo / "demo.csv"), "--json"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}

@@ -1,6 +1,6 @@
 """An estimator, an observer, a controller and a map of a user's own work by having the methods."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -203,12 +203,6 @@ def test_an_estimator_without_a_test_signal_or_a_sample_interval_adapts_b0():
     assert float(flight.signals["b0"][-1, 0]) == pytest.approx(KT / (1.7 * J), rel=1e-6)
     with pytest.raises(ValueError, match="RatioEstimator has no test signal"):
         law.excite(law.init(jnp.zeros(1)))
-
-
-def test_what_has_not_the_methods_of_an_estimator_is_refused():
-    with pytest.raises((ValueError, TypeError)):  # a TypeError where types are checked
-        wrong: Any = TextbookObserver()
-        jq.AdaptiveLADRC(LADRC(10.0, 30.0, 1.6), wrong, lambda inertia: 1 / inertia)
 
 
 def test_a_map_schedules_and_says_in_which_coordinates_it_is_tuned():
