@@ -207,6 +207,7 @@ def test_errors_of_the_roots_are_those_of_repeated_noise():
     assert "[0.55 +- 0.0042, 7 +- 0.031] (22.22 +- 0.37)" in str(found)
 
 
+@pytest.mark.slow
 def test_a_pole_and_a_zero_that_cancel_are_not_identifiable():
     frf = response_of(PLANT, seed=1, omega=OMEGA)
     fit = fit_transfer_function(frf, zeros=1, poles=4)

@@ -35,6 +35,7 @@ def test_leakage_of_an_integrator_is_remarked_with_its_remedy():
     assert error > 0.05
 
 
+@pytest.mark.slow
 def test_without_leakage_the_error_bars_are_ten_times_smaller_and_hold():
     leaking, clean = fit(integrators=0)[1], fit(integrators=1)[1]
     assert not any("leakage" in remark for remark in clean.remarks)

@@ -65,10 +65,8 @@ CASES = {
 }
 
 
-SLOW = ("white input", "sweep", "sweep under drifting noise")  # The loop holds all of them.
 PARAMETERS = [
-    pytest.param(name, id=name.replace(" ", "-"), marks=[pytest.mark.slow] * (name in SLOW))
-    for name in CASES
+    pytest.param(name, id=name.replace(" ", "-"), marks=pytest.mark.slow) for name in CASES
 ]
 
 
