@@ -122,7 +122,7 @@ def identifiability_section(fit: Fit) -> dict[str, object]:
 
 
 def _least_sharp(fit: Fit) -> str:
-    text = "The record determines every free parameter by itself."
+    text = "The record determines every free parameter individually."
     known = [k for k, value in enumerate(fit.values) if value != 0]
     if not known:
         return text
@@ -195,9 +195,10 @@ def _cells(fit: Fit | None, derived: Mapping[str, Quantity]) -> list[str]:
 
 def _derived(fit: Fit, quantity: Quantity, name: str) -> str:
     try:
-        return _plus_minus(*fit.derived(quantity, name)[1:])
+        found = fit.derived(quantity, name)
     except UndeterminedError:
         return "not determined"
+    return _plus_minus(found.value, found.standard_error)
 
 
 def _plus_minus(value: float, error: float) -> str:
