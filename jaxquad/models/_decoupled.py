@@ -162,8 +162,9 @@ class DecoupledAxes(eqx.Module):
         **Raises:** ValueError for an axis that the plant does not have.
         """
         axes, *ensemble = self.shape
-        if not 0 <= axis < axes and axes > 1:
-            raise ValueError(f"axis is {axis}, but the plant has axes 0 to {axes - 1}")
+        if not 0 <= axis < axes:
+            has = f"axes 0 to {axes - 1}" if axes > 1 else "one axis only, number 0 (roll)"
+            raise ValueError(f"axis is {axis}, but the plant has {has}")
         of_axis = lambda x: _on_axis(x, axis, tuple(ensemble))
         inertia, lag = of_axis(self.inertia), None if self.lag is None else of_axis(self.lag)
         one, zero = jnp.ones_like(inertia), jnp.zeros_like(inertia)

@@ -1,6 +1,7 @@
 """A loop in a scenario, from the first sample to the last."""
 
 import functools as ft
+import math
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
@@ -28,10 +29,15 @@ def check_run(loop: Loop, scenario: Scenario) -> None:
             f"scenario is a {type(scenario).__name__}: give jq.scenario(duration=..., ...)"
         )
     require_runnable(loop.controller)
+    if scenario.dt is not None and not math.isclose(scenario.dt, loop.dt, rel_tol=1e-6):
+        raise ValueError(
+            f"the scenario is sampled every {scenario.dt} s, but the loop runs every {loop.dt} s: "
+            f"give jq.scenario(..., dt={loop.dt}), or a loop with dt={scenario.dt}"
+        )
     if scenario.payload is not None:
         _check_payload(loop.plant, scenario.payload)
-    for name, part in vars(scenario).items():
-        if part is not None and is_concrete(part):
+    for name, part in scenario.parts.items():
+        if is_concrete(part):
             _check_numbers(name, part)
 
 
@@ -105,19 +111,16 @@ def _run(
 def _at_rest(
     plant: Plant, scenario: Scenario, ensemble: tuple[int, ...]
 ) -> tuple[PyTree, Float[Array, " axes *ensemble"]]:
-    """The plant at rest with as many axes as the scenario, and zeros shaped as its angles."""
+    """The plant at rest, and zeros shaped as its angles; raise ValueError for other axes."""
     axes = scenario.reference.shape[1]
     state = plant.init(ensemble=ensemble)
     angle = jax.eval_shape(plant.measure, state)
-    if angle.shape[0] == 1 < axes:  # one set of parameters for all axes
-        state = plant.init(jnp.zeros(axes, angle.dtype), ensemble=ensemble)
-        angle = jax.eval_shape(plant.measure, state)
     if angle.shape == (axes, *ensemble):
         return state, jnp.zeros(angle.shape, angle.dtype)
     if angle.shape[0] != axes:
         raise ValueError(
-            f"the scenario is for {axes} axes, but the plant has {angle.shape[0]} angles: give a "
-            f"scenario with axes={angle.shape[0]}"
+            f"the scenario is for {axes} axes, but the plant has {angle.shape[0]}: give "
+            f"jq.scenario(..., axes={angle.shape[0]}), or a plant with a value for each axis"
         )
     raise ValueError(
         f"the plant's angles have the shape {angle.shape}, but {(axes, *ensemble)} is expected: "

@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Key
+from jaxtyping import Array, ArrayLike, Float, Key, PyTree
 
 from jaxquad._core import as_float, ensemble_shape, per_member, require_all_positive, whole_samples
 from jaxquad.excitation import Excitation
@@ -32,6 +32,7 @@ class Scenario(eqx.Module):
     - `noise`: error of the measured angles, rad.
     - `rate`, `acceleration`: of the reference, rad/s and rad/s^2.
     - `payload`: added inertia, kg m^2.
+    - `dt`: the sample interval of the arrays in s, which a loop has to have, too; None for any.
 
     **Raises:** ValueError for arrays of different numbers of samples, axes or members.
     """
@@ -51,9 +52,10 @@ class Scenario(eqx.Module):
     payload: Float[Array, "samples axes ..."] | None = per_member(
         rank=2, default=None
     )  # added inertia, kg m^2
+    dt: float | None = eqx.field(static=True, default=None)  # s
 
     def __check_init__(self):
-        parts = {name: part for name, part in vars(self).items() if part is not None}
+        parts = self.parts
         if not all(isinstance(part, jax.Array | np.ndarray) for part in parts.values()):
             return
         try:
@@ -67,6 +69,12 @@ class Scenario(eqx.Module):
                 f"a scenario's arrays have different shapes: {shapes}; give all of them the same "
                 "samples and axes, and one ensemble or none"
             )
+
+    @property
+    def parts(self) -> dict[str, PyTree]:
+        """The arrays that are given, by name."""
+        given = {name: part for name, part in vars(self).items() if name != "dt"}
+        return {name: part for name, part in given.items() if part is not None}
 
     @property
     def ensemble(self) -> tuple[int, ...]:
@@ -138,7 +146,7 @@ def scenario(
     if feed_forward:
         for name in ("rate", "acceleration"):
             arrays[name] = _stack("reference", name, parts["reference"], clock)
-    return Scenario(**arrays)
+    return Scenario(**arrays, dt=float(dt))
 
 
 def _require_room(given: tuple[Given, ...], clock: Clock, axes: int) -> None:
@@ -239,7 +247,7 @@ def excite(
         raise ValueError(f"axis {axis!r}: choose one of {', '.join(AXES)}")
     _check_excitation(signal, dt, torque_noise, torque_corner, sensor_noise)
     levels = jnp.asarray([torque_noise, torque_corner, sensor_noise], dtype=float)
-    return _excited(jnp.asarray(signal, dtype=float), key, levels, dt, AXES.index(axis))
+    return _excited(jnp.asarray(signal, dtype=float), key, levels, float(dt), AXES.index(axis))
 
 
 def _check_excitation(
@@ -273,4 +281,4 @@ def _excited(signal, key, levels, dt, axis) -> Scenario:
     jitter = levels[2] * jax.random.normal(sensor_key, signal.shape, signal.dtype)
     still = jnp.zeros((signal.shape[0], len(AXES), *signal.shape[1:]), signal.dtype)
     injection, disturbance, noise = (still.at[:, axis].set(x) for x in (signal, torque, jitter))
-    return Scenario(still, injection, disturbance, noise)
+    return Scenario(still, injection, disturbance, noise, dt=dt)

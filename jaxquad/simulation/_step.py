@@ -257,8 +257,7 @@ def _setpoint(happens: Scenario) -> Reference:
 
 def _wide(happens: Scenario, like: Float[Array, " axes *ensemble"]) -> Scenario:
     """One scenario for all members of an ensemble."""
-    parts = {name: x for name, x in vars(happens).items() if x is not None}
-    wide = {name: widen(x, like) for name, x in parts.items()}
+    wide = {name: widen(x, like) for name, x in happens.parts.items()}
     return eqx.tree_at(lambda h: [vars(h)[name] for name in wide], happens, list(wide.values()))
 
 

@@ -135,6 +135,8 @@ def test_parts_that_do_not_fit_are_refused_with_a_remedy():
         analyse(Loop(axis, controller, dt=0.01))
     with pytest.raises(ValueError, match="axis is 3.*0 to 2"):
         analyse(Loop(quanser_hover(), LADRC(10.0, 30.0, 1.0), drive=drive), axis=3)
+    with pytest.raises(ValueError, match="axis is 1, but the plant has one axis only"):
+        analyse(Loop(DecoupledAxes([1.0], [1.0]), LADRC(10.0, 30.0, 1.0)), axis="pitch")
     with pytest.raises(ValueError, match=r"member is \(99,\).*\(20,\)"):
         analyse(Loop(axis, controller), member=99)
     with pytest.raises(ValueError, match="for ensembles of different shapes.*Loop.delay .4,"):

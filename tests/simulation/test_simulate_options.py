@@ -1,5 +1,6 @@
 """What a loop is given beyond plant, law and scenario: payloads, set-points, drives, ensembles."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -144,7 +145,12 @@ def rotors():
             {"plant": axes(np.full((2, 3), J)), "delay": np.full(4, 0.001)},
             r"Loop.plant.inertia \(3,\), Loop.delay \(4,\)",
         ),
-        ({"plant": DecoupledAxes([KT] * 4, J)}, "the scenario is for 2 axes"),
+        ({"plant": DecoupledAxes([KT] * 4, J)}, "for 2 axes, but the plant has 4: .*axes=4"),
+        ({"plant": DecoupledAxes([KT], [J])}, "for 2 axes, but the plant has 1: .*axes=1"),
+        (
+            {"scenario": dataclasses.replace(scenario(), dt=0.01)},
+            r"sampled every 0.01 s, but the loop runs every 0.002 s: give .*dt=0.002",
+        ),
     ],
     ids=lambda x: next(iter(x)) if isinstance(x, dict) else "",
 )
