@@ -24,11 +24,13 @@ from ._accuracy import (
     insensitivity,
     Matrix,
     misfit_ratio,
+    Noise,
     noise_effect,
     PriorRows,
     ResponseTerm,
     scaled_inverse,
 )
+from ._bounds import one_sided, one_sided_limit
 from ._cost import Points, Weights
 from ._discrepancy import (
     describe_discrepancy,
@@ -43,7 +45,7 @@ from ._problem import Problem
 from ._result import Fit
 from ._solve import same_responses, Solution
 from ._starts import Minimum, remarks_on_minima
-from ._verdict import pooled_freedom, Verdict, without_numbers
+from ._verdict import Bound, pooled_freedom, Verdict, without_numbers
 
 
 class Counted(NamedTuple):
@@ -66,25 +68,26 @@ def assess(
     """Costs, bounds, calibrated covariance and identifiability at the solution."""
     parameters, count = problem.parameters, problem.parameters.count
     frfs = [each.frf for each in counted.points]
-    units = _units(problem, solution)
-    records = _records(problem, frfs, solution, units)
-    blocks, prior = blocks_of(records), _prior_rows(solution, units)
-    bread, gradient = gauss_newton(blocks, prior, count)
-    noise = noise_effect(records, blocks, prior, count)
-    by_noise = calibrated_covariance(bread, noise)
-    effect = discrepancy_effect(records, count)
-    discrepancy, added = describe_discrepancy(counted.found, bread, by_noise, effect)
-    covariance = by_noise + added
-    problem = problem.weighted([jnp.asarray(each) for each in counted.weights])
-    costs = _costs(_records(problem, frfs, solution, units), prior, count)
+    units = _units(solution)
+    seen = _see(problem, counted, solution, units)
+    bounds, tangled = _bounds(problem, solution, seen, units)
+    if tangled:
+        units = _with_tangled(units, seen, tangled)
+        seen = _see(problem, counted, solution, units)
+    records, blocks, prior = seen.records, seen.blocks, seen.prior
+    bread, gradient, noise, discrepancy = seen.bread, seen.gradient, seen.noise, seen.discrepancy
+    halved = ft.partial(_one_sided, seen=seen, names=parameters.names, bounds=bounds)
+    by_noise, covariance = halved(seen.by_noise), halved(seen.covariance)
+    by_noise_alone = problem.weighted([jnp.asarray(each) for each in counted.weights])
+    costs = _costs(_records(by_noise_alone, frfs, solution, units), prior, count)
     cost, misfit = costs.cost, costs.chi_squared
-    decrement = _decrement(bread, gradient, ran_to_zero(problem, solution))
+    decrement = _decrement(bread, gradient, solution.at_zero)
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
         remedies = ("start from other values", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(parameters.names, decrement, cost, *remedies)
     else:
         facts = _information(problem, solution, blocks, covariance, units)
-        verdict, by_data = _identifiability(facts, prior)
+        verdict, by_data = _identifiability(facts, prior, bounds)
     return make_fit(
         problem,
         solution,
@@ -94,7 +97,7 @@ def assess(
         freedom=degrees_of_freedom(records, bread, noise, count),
         remarks=(
             *_remarks_on_used(problem, frfs),
-            *remarks_on_fit(problem, solution, cost, decrement, misfit),
+            *remarks_on_fit(problem, solution, cost, decrement, misfit, verdict),
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_leakage(problem, frfs, solution),
             *remarks_on_priors(prior.misfit, verdict, by_data),
@@ -103,6 +106,95 @@ def assess(
         minima=minima,
         discrepancy=discrepancy,
     )
+
+
+class _Seen(NamedTuple):
+    """Derivatives and errors at a solution, by changes relative to some units."""
+
+    records: list[ResponseTerm]
+    blocks: list[Block]
+    prior: PriorRows
+    bread: Matrix
+    gradient: Float[np.ndarray, " parameters"]
+    noise: Noise
+    by_noise: Matrix
+    covariance: Matrix
+    discrepancy: Discrepancy
+
+
+def _see(
+    problem: Problem, counted: Counted, solution: Solution, units: Float[np.ndarray, " all"]
+) -> _Seen:
+    count = problem.parameters.count
+    records = _records(problem, [each.frf for each in counted.points], solution, units)
+    blocks, prior = blocks_of(records), _prior_rows(solution, units)
+    bread, gradient = gauss_newton(blocks, prior, count)
+    noise = noise_effect(records, blocks, prior, count)
+    by_noise = calibrated_covariance(bread, noise)
+    effect = discrepancy_effect(records, count)
+    discrepancy, added = describe_discrepancy(counted.found, bread, by_noise, effect)
+    covariance = by_noise + added
+    return _Seen(records, blocks, prior, bread, gradient, noise, by_noise, covariance, discrepancy)
+
+
+def _bounds(
+    problem: Problem, solution: Solution, seen: _Seen, units: Float[np.ndarray, " all"]
+) -> tuple[tuple[Bound, ...], list[int]]:
+    """The limits of parameters that may be zero, and those at zero that are mixed up with others.
+
+    That is where another one would change by too much if this one had a value up to its limit.
+    """
+    bounds, tangled = [], []
+    curvature, names = scaled_inverse(seen.bread), problem.parameters.names
+    for k in _possible_zeros(problem, solution, seen):
+        widths = seen.covariance[k, k], seen.by_noise[k, k]
+        both = [one_sided_limit(problem, solution, k, each / curvature[k, k]) for each in widths]
+        moved = _along(seen, k) * abs(both[0] / units[k])
+        moved[[k, *solution.at_zero]] = 0.0
+        if np.all(moved <= LIMIT):
+            bounds.append(Bound(names[k], float(np.asarray(solution.values)[k]), *both))
+        elif k in solution.at_zero:
+            tangled.append(k)
+    return tuple(bounds), tangled
+
+
+_ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
+
+
+def _possible_zeros(problem: Problem, solution: Solution, seen: _Seen) -> list[int]:
+    """Parameters that keep their sign, at zero or so near it that the data allow it."""
+    count = problem.parameters.count
+    near = np.sqrt(np.diagonal(seen.covariance)) * _ONE_SIDED > 1
+    near &= np.array(problem.parameters.logarithmic[:count])
+    near[list(solution.at_zero)] = True
+    return np.flatnonzero(near & (np.diagonal(seen.bread) > 0)).tolist()
+
+
+def _along(seen: _Seen, k: int) -> Float[np.ndarray, " parameters"]:
+    """How far the others go with a change of parameter k, all relative to their units."""
+    return np.abs(seen.covariance[:, k] / seen.covariance[k, k])
+
+
+def _with_tangled(
+    units: Float[np.ndarray, " all"], seen: _Seen, tangled: Sequence[int]
+) -> Float[np.ndarray, " all"]:
+    """Units of parameters at zero that count as much as the parameter they are mixed up with."""
+    units = units.copy()
+    for k in tangled:
+        units[k] /= np.max(np.delete(_along(seen, k), tangled), initial=1e-300)
+    return units
+
+
+def _one_sided(
+    covariance: Matrix, seen: _Seen, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> Matrix:
+    step = -scaled_inverse(seen.bread) @ seen.gradient
+    for bound in bounds:
+        k = names.index(bound.name)
+        if bound.value:
+            continue
+        covariance = one_sided(covariance, k, float(step[k]))
+    return covariance
 
 
 def _costs(records: list[ResponseTerm], prior: PriorRows, count: int) -> "Costs":
@@ -122,7 +214,7 @@ def discrepancy_at(
     problem: Problem, points: Sequence[Points], solution: Solution
 ) -> tuple[Mixture, Mixture]:
     """What the model leaves unexplained at a solution."""
-    units = np.asarray(solution.slopes)
+    units = _units(solution)
     records = _records(problem, [each.frf for each in points], solution, units)
     count = problem.parameters.count
     return find_discrepancy(records, points, _prior_rows(solution, units), count)
@@ -172,10 +264,11 @@ def make_fit(
     names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
     freedom = np.full(units.size, np.inf) if freedom is None else freedom
     verdict = _with_freedom(verdict, pooled_freedom(freedom, np.ones(units.size)))
-    if runaways(problem, solution):
+    if runaways(problem, solution, verdict):
         verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
     physical, unbounded = _physical_covariance(covariance, units, names, verdict)
-    percent = 100 * np.abs(units) / np.maximum(np.abs(values), 1e-3 * np.abs(units))
+    with np.errstate(divide="ignore"):
+        percent = np.where(values == 0, np.nan, 100 * np.abs(units / values))
     return Fit(
         model=solution.model,
         names=names,
@@ -290,16 +383,14 @@ def _decrement(
     return 0.5 * float(gradient[free] @ inverse @ gradient[free])
 
 
-def _units(problem: Problem, solution: Solution) -> Float[np.ndarray, " all"]:
-    """What relative changes are relative to: the value, or the start of one that ran to zero.
+def _units(solution: Solution) -> Float[np.ndarray, " all"]:
+    """What relative changes are relative to: the value, or the change that shows of one at zero.
 
-    Relative to itself, a lag that ran to zero would look as if it had no effect, while in truth it
-    trades off with the delay.
+    Relative to itself, a lag at zero would look as if it had no effect, while in truth it trades
+    off with the delay.
     """
     units = np.asarray(solution.slopes).copy()
-    scale, start = (np.asarray(x) for x in (problem.parameters.scale, problem.parameters.start))
-    for k in ran_to_zero(problem, solution):
-        units[k] = scale[k] * np.exp(start[k]) if units[k] != 0 else units[k]
+    units[list(solution.at_zero)] = solution.units_at_zero
     return units
 
 
@@ -348,16 +439,18 @@ def _information(
     )
 
 
-def _identifiability(facts: Information, prior: PriorRows) -> tuple[Verdict, Verdict]:
+def _identifiability(
+    facts: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
+) -> tuple[Verdict, Verdict]:
     """What data and priors determine together, and what the data determine alone."""
     if not len(prior.misfit):
-        verdict = assess_identifiability(facts)
+        verdict = assess_identifiability(facts, bounds)
         return verdict, verdict
     # Rows come in pairs of magnitude and phase; a prior's row counts once.
     priors = np.repeat(prior.slopes, 2, axis=0) / np.sqrt(2)
     return assess_identifiability(
-        facts._replace(root=np.concatenate([facts.root, priors]))
-    ), assess_identifiability(facts)
+        facts._replace(root=np.concatenate([facts.root, priors])), bounds
+    ), assess_identifiability(facts, bounds)
 
 
 def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
@@ -375,10 +468,16 @@ _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or 
 
 
 def remarks_on_fit(
-    problem: Problem, solution: Solution, cost: float, decrement: float, chi_squared: float
+    problem: Problem,
+    solution: Solution,
+    cost: float,
+    decrement: float,
+    chi_squared: float,
+    verdict: Verdict,
 ) -> list[str]:
     """Runaway parameters, missing convergence, misfit beyond the noise."""
-    remarks, no_minimum = runaways(problem, solution), decrement > 1e-3 * max(cost, 1e-9)
+    remarks = runaways(problem, solution, verdict)
+    no_minimum = decrement > 1e-3 * max(cost, 1e-9)
     if not solution.converged and (no_minimum or not remarks):
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
@@ -464,25 +563,20 @@ def _leakage(integrators: int, resolution: float) -> float:
     return max(integrators, 0) * (integrators + 1) / 6 * resolution**2
 
 
-def ran_to_zero(problem: Problem, solution: Solution) -> list[int]:
-    """Which of the parameters that keep their sign ran towards zero."""
-    logarithmic = np.array(problem.parameters.logarithmic[: problem.parameters.count])
-    return np.flatnonzero(logarithmic & (_change_of_z(problem, solution) < -_FAR)).tolist()
-
-
 def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
     return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
 
 
-def runaways(problem: Problem, solution: Solution) -> list[str]:
-    """Remarks on parameters that ran to zero or to infinity."""
-    names, low = problem.parameters.names, ran_to_zero(problem, solution)
+def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[str]:
+    """Remarks on parameters that ran to zero or to infinity, as far as nothing bounds them."""
+    names, lost = problem.parameters.names, verdict.undetermined
     remarks = [
         f"{names[k]} ran to zero: leave it out, or let its sign change with "
         f"jq.identify.Real({names[k]!r})"
-        for k in low
+        for k in solution.at_zero
+        if names[k] in lost
     ]
     for k in np.flatnonzero(_change_of_z(problem, solution) > 2 * _FAR):
-        if problem.parameters.logarithmic[k]:
+        if problem.parameters.logarithmic[k] and names[k] in lost:
             remarks.append(f"{names[k]} ran to infinity: start from other values, or leave it out")
     return remarks

@@ -11,6 +11,7 @@ from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
 from ._assess import assess, Counted, discrepancy_at, unfitted
+from ._bounds import settle_at_bounds, solve_within_bounds
 from ._cost import (
     Band,
     Cost,
@@ -27,7 +28,7 @@ from ._cost import (
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem
 from ._result import Fit
-from ._solve import Solution, solve
+from ._solve import Solution
 from ._starts import Minimum, solve_from_many, spread_starts
 from ._verdict import Verdict, without_numbers
 
@@ -173,16 +174,17 @@ def _solve_reweighted(
     problem = problem.weighted([jnp.asarray(each) for each in weights])
     z, minima = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count]), ()
     if starts == 1:
-        solution = solve(problem, z, solver, max_steps)
+        solution = solve_within_bounds(problem, z, solver, max_steps)
     else:
         fastest = max(float(each.frf.omega[-1]) for each in points)
         spread = spread_starts(problem.parameters, starts, fastest=fastest)
         solution, minima = solve_from_many(problem, spread, solver, max_steps)
+        solution = settle_at_bounds(problem, solution, solver, max_steps)
     again = _weights(cost, points, _ratios(solution))
     if _are_close(weights, again, 1e-4):
         return problem, solution, minima
     problem = problem.weighted([jnp.asarray(each) for each in again])
-    return problem, solve(problem, solution.z, solver, max_steps), minima
+    return problem, solve_within_bounds(problem, solution.z, solver, max_steps), minima
 
 
 _ROUNDS = 3  # solutions under a floor at most
@@ -204,7 +206,7 @@ def _solve_with_floor(
         if _are_close([np.asarray(each) for each in problem.weights], weights, _SETTLED):
             break
         problem = problem.weighted([jnp.asarray(each) for each in weights])
-        solution = solve(problem, solution.z, how[1], how[2])
+        solution = solve_within_bounds(problem, solution.z, *how[1:])
         _check_finite(solution)
         found = discrepancy_at(problem, points, solution)
     return problem, solution, Counted(points, _weights(cost, points, _ratios(solution)), found)

@@ -207,8 +207,24 @@ def descend_by_turns(problem: OutputError, max_steps: int) -> Descent:
             break
     at = jnp.asarray(z)
     (model, values, slopes), derivatives = _describe(at[:count], base)
-    solution = Solution(at[:count], model, values, slopes, message, not message, steps, derivatives)
+    solution = Solution(
+        at[:count], model, values, slopes, message, not message, steps, derivatives,
+        *_at_zero(base, at[:count]),
+    )  # fmt: skip
     return Descent(problem, at, solution, found.reweighted(sizes))
+
+
+_FAR = 7.0  # in ln: a parameter that shrank by a factor of 1000 ran to zero
+
+
+def _at_zero(
+    base: Problem, z: Float[Array, " parameters"]
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Parameters that ran to zero, and their sizes at the start."""
+    start, scale = (np.asarray(x)[: z.size] for x in (base.parameters.start, base.parameters.scale))
+    logarithmic = np.array(base.parameters.logarithmic[: z.size])
+    low = np.flatnonzero(logarithmic & (np.asarray(z) - start < -_FAR))
+    return tuple(low.tolist()), tuple((scale[low] * np.exp(start[low])).tolist())
 
 
 _describe = eqx.filter_jit(describe)

@@ -41,9 +41,7 @@ from ._output_error_problem import (
     RecordTerm,
     with_fixed_slopes,
 )
-from ._problem import Problem
 from ._result import Fit
-from ._solve import Solution
 from ._verdict import Verdict
 
 
@@ -51,10 +49,11 @@ _LEFT = 1e-2  # share of what the noise moves that a step may still save
 
 
 def remarks_on_output_error(
-    base: Problem, solution: Solution, records: Sequence[Record], decrement: float, taken: float
+    descent: Descent, records: Sequence[Record], decrement: float, taken: float, verdict: Verdict
 ) -> list[str]:
     """Runaway parameters, missing convergence, and feedback."""
-    remarks, no_minimum = runaways(base, solution), decrement > _LEFT * max(taken, 1.0)
+    solution, no_minimum = descent.solution, decrement > _LEFT * max(taken, 1.0)
+    remarks = runaways(descent.problem.base, solution, verdict)
     if not solution.converged and (no_minimum or not remarks):
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
@@ -180,7 +179,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     """Costs, bounds, covariance and identifiability at the solution."""
     problem, solution = descent.problem, descent.solution
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
-    units, rescale = _units(base, solution), _rescale(solution, _units(base, solution))
+    units, rescale = _units(solution), _rescale(solution, _units(solution))
     projected = project_records(problem, descent.found, rescale[:count])
     prior = _prior_rows(solution, units)
     reduced = reduced_rows(projected, problem.terms, count)
@@ -211,7 +210,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         Costs(cost, average, information, data_cost / max(rows - fitted, 1)),
         points=rows,
         remarks=(
-            *remarks_on_output_error(base, solution, records, decrement, taken),
+            *remarks_on_output_error(descent, records, decrement, taken, verdict),
             *remarks_on_colour([one.misfit for one in projected], bread, covariance),
             *remarks_on_priors(prior.misfit, verdict, by_data),
         ),

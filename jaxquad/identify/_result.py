@@ -33,15 +33,23 @@ def _parameters(fit: "Fit") -> list[str]:
     width = max(9, *map(len, names))
     heads = (f"{'parameter':<{width}}", f"{'value':>11}", f"{'std. error':>10}")
     heads = (*heads, f"{'95 % interval':>25}", f"{'CR %':>7}", f"{'insensitivity %':>15}")
+    heads += () if fit.identifiable else (f"{'stopped at':>11}",)
     lines = [" ".join(heads)]
     for k, name in enumerate(names):
         low, high = fit.interval(fit.names[k])
-        interval = f"{low:.5g} .. {high:.5g}" if fit.determined[k] else "not determined"
-        cells = [f"{fit.values[k]:11.5g}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>25}"]
-        cells += [f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:15.2f}"]
-        lines.append(" ".join([f"{name:<{width}}", *cells]))
+        value, interval = f"{fit.values[k]:.5g}", f"{low:.5g} .. {high:.5g}"
+        stopped = "" if fit.determined[k] else value
+        if stopped:
+            value, interval = "-", "not determined"
+        cells = [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>25}"]
+        percent = f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:15.2f}"
+        cells += percent if np.isfinite(fit.insensitivity[k]) else (f"{'-':>7}", f"{'-':>15}")
+        lines.append(" ".join([f"{name:<{width}}", *cells, f"{stopped:>11}"]).rstrip())
     if not fit.identifiable:
-        lines.append("* where the solver stopped; this record does not determine it individually")
+        lines.append(
+            "* this record does not determine it individually: where the solver stopped is for "
+            "comparison alone"
+        )
     return lines
 
 
@@ -144,6 +152,10 @@ class Fit(eqx.Module):
             `standard_errors` do; False for the measured noise alone.
         """
         k = self.names.index(name)
+        for bound in self.verdict.bounds:
+            if bound.name == name:
+                limit = bound.limit if model_error else bound.noise_limit
+                return min(0.0, limit), max(0.0, limit)
         errors = self.standard_errors if model_error else self.noise_standard_errors
         reach = reach_of_interval(float(self.degrees_of_freedom[k])) * errors[k]
         return float(self.values[k] - reach), float(self.values[k] + reach)
@@ -189,7 +201,8 @@ class Fit(eqx.Module):
         """Draw `n` models from the fit; leaves with free or tied numbers get a last axis `[n]`.
 
         Draws are normal in the coordinates of the fit (logarithms of parameters that keep their
-        sign, so that a lag never comes out negative), with the calibrated covariance.
+        sign, so that a lag never comes out negative), with the calibrated covariance. A parameter
+        of `verdict.bounds` is the absolute value of a normal one: it keeps its sign, too.
 
         **Arguments:**
 
@@ -206,8 +219,7 @@ class Fit(eqx.Module):
         **Raises:**
 
         - `UndeterminedError`: the record leaves parameters undetermined, and these are not held.
-        - `ValueError`: the fit found no minimum, has no finite standard errors, or a parameter
-            ran to zero.
+        - `ValueError`: the fit found no minimum, or has no finite standard errors.
         """
         if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"n is {n}: give a whole number of models, 1 or more")
@@ -271,9 +283,17 @@ def _drawn_values(
 ) -> Float[Array, "parameters members"]:
     """Physical values of the free parameters."""
     check_drawable(fit, hold_undetermined)
-    changes = jnp.asarray(_root(known_covariance(fit))) @ scores
+    covariance = known_covariance(fit)
+    changes = jnp.asarray(_root(covariance)) @ scores
+    at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
+    for k in at_zero:
+        # Folded to one side of zero, with what goes along with it: they keep their sign.
+        drawn = fit.values[k] / fit.units[k] + changes[k]
+        folded = jnp.abs(drawn) - drawn
+        changes += jnp.asarray(covariance[:, k] / covariance[k, k])[:, None] * folded[None]
     here, units = jnp.asarray(fit.values)[:, None], jnp.asarray(fit.units)[:, None]
     logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])[:, None]
+    logarithmic[at_zero] = False
     return jnp.where(logarithmic, here * jnp.exp(changes), here + units * changes)
 
 
@@ -281,12 +301,6 @@ def check_drawable(fit: Fit, hold_undetermined: bool) -> None:
     """Raise ValueError for a fit that cannot be drawn from, as `Fit.ensemble` says."""
     if not fit.verdict.fitted:
         raise UndeterminedError(f"there is nothing to draw from: {fit.verdict.summary}")
-    zeros = _ran_to_zero(fit)
-    if zeros:
-        raise ValueError(
-            f"{', '.join(zeros)} ran to zero, and a logarithm has no spread there to draw from: "
-            "set it to 0, leave it out of free=, and fit again"
-        )
     stopped = [remark for remark in fit.remarks if remark.startswith("no minimum")]
     if stopped:
         raise ValueError(
@@ -329,14 +343,6 @@ def _held_directions(fit: Fit) -> Float[np.ndarray, "held parameters"]:
 def _root(covariance: Matrix) -> Matrix:
     variances, directions = np.linalg.eigh(covariance)
     return directions * np.sqrt(np.maximum(variances, 0.0))
-
-
-def _ran_to_zero(fit: Fit) -> list[str]:
-    """Parameters that keep their sign, whose errors are no longer relative to themselves."""
-    logarithmic = fit.parameters.logarithmic[: len(fit.names)]
-    at_zero = ~np.isclose(np.abs(fit.units), np.abs(fit.values), rtol=1e-6) & fit.determined
-    rows = zip(fit.names, logarithmic, at_zero, strict=True)
-    return [name for name, log, zero in rows if log and zero]
 
 
 def _refusal(fit: Fit, lost: tuple[str, ...]) -> str:

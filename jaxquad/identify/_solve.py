@@ -99,6 +99,7 @@ class Solution(NamedTuple):
     steps: int
     sensitivity: Sensitivity
     at_zero: tuple[int, ...] = ()  # parameters at their bound, where z stands for next to nothing
+    units_at_zero: tuple[float, ...] = ()  # changes of them that show
 
 
 class Stop(NamedTuple):

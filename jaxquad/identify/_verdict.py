@@ -61,15 +61,16 @@ class Combination(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """A parameter that keeps its sign, at zero, and how far from it the record allows it to be."""
+    """A parameter that keeps its sign and may be zero, and how far from it the record allows."""
 
     name: str
+    value: float
     limit: float  # of the one-sided 95 % interval, with what the model leaves unexplained
     noise_limit: float  # likewise, by the measured noise alone
 
     def __str__(self) -> str:
         side = "below" if self.limit >= 0 else "above"
-        return f"{self.name}: 0, {side} {self.limit:.3g} (95 %)"
+        return f"{self.name}: {self.value:.3g}, {side} {self.limit:.3g} (95 %)"
 
 
 class Verdict(eqx.Module):
@@ -89,7 +90,7 @@ class Verdict(eqx.Module):
     exact: Float[np.ndarray, "null parameters"]  # null directions that no noise explains
     alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
     curved: tuple[str, ...] = eqx.field(static=True)  # determined as neither a product nor a sum
-    bounds: tuple[Bound, ...] = ()  # parameters at zero: determined, by a limit
+    bounds: tuple[Bound, ...] = ()  # parameters that may be zero: determined, by a limit
 
     @property
     def identifiable(self) -> bool:
@@ -128,8 +129,7 @@ class Verdict(eqx.Module):
             lines = [self.summary.replace(head, head.upper(), 1)]
         else:
             lines = [
-                "NOT IDENTIFIABLE from this record, individually: "
-                + ", ".join(self.undetermined),
+                "NOT IDENTIFIABLE from this record, individually: " + ", ".join(self.undetermined),
                 *self._determined(),
                 *(f"  {reason}" for reason in self.reasons),
                 *(f"  {bound}" for bound in self.bounds),
@@ -143,7 +143,7 @@ class Verdict(eqx.Module):
             known = " and ".join(combination.name for combination in self.combinations)
             rows = self.null_directions
             every = all(name in self.undetermined for row in rows for name in row)
-            only = "only " if every else ""  # else a parameter in it is determined individually, too
+            only = "only " if every else ""  # else one in it is determined, too
             lines = [f"  {only}{known} is determined by this record"]
         elif self.curved and not self.reasons:
             curved = ", ".join(self.curved)

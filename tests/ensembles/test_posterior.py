@@ -172,13 +172,15 @@ def test_a_fit_without_finite_errors_is_refused():
         broken.ensemble(5, KEY)
 
 
-def test_a_parameter_that_ran_to_zero_is_refused():
+def test_a_parameter_at_zero_is_drawn_on_its_side_of_it():
     frf = response_of(jq.LaggedIntegrator(8.0, 0.1, 0.0), error=0.005, seed=6, omega=WIDE)
     fit = jq.fit(jq.LaggedIntegrator(8.0, 0.1, 0.03), frf, cost=ML)
-    assert any("delay ran to zero" in remark for remark in fit.remarks)
-    assert fit.identifiable
-    with pytest.raises(ValueError, match="delay ran to zero.*leave it out"):
-        fit.ensemble(5, KEY)
+    (bound,) = fit.verdict.bounds
+    assert fit.identifiable and bound.name == "delay" and not fit.remarks
+    drawn = np.asarray(fit.ensemble(2000, KEY).delay)
+    assert drawn.min() >= 0
+    assert 0.8 < np.mean(drawn < bound.limit) < 0.99
+    assert np.sqrt(np.mean(drawn**2)) == pytest.approx(fit.standard_errors[2], rel=0.05)
 
 
 def test_the_truth_lies_in_the_range_of_the_draws_as_often_as_it_should():

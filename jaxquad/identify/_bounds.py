@@ -1,0 +1,226 @@
+"""Parameters that keep their sign, at zero: decided at the optimum, with the limit they stay below.
+
+At a bound the optimum is a one-sided problem: the cost rises from it with a slope, and the limit is
+where the profile likelihood has risen by 2.71 / 2.
+Source: Self and Liang (1987), Asymptotic properties of maximum likelihood estimators and likelihood
+ratio tests under nonstandard conditions.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ._accuracy import Matrix, scaled_inverse
+from ._held import evaluate_sampled
+from ._problem import Problem
+from ._solve import describe_once, Solution, solution_at, solve, Stop
+
+
+_RISE = 2.71  # of the cost, at the end of a one-sided 95 % interval
+_NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
+_AT_ZERO = 1e-6  # likewise, where its slopes are evaluated
+_ROUNDS = 4  # of releasing parameters that do not belong at zero
+_EVALUATIONS = 12  # of the profile
+_CLOSE = 0.02  # of the rise
+_SMALLEST = 60.0  # in ln, below the start: 1e-26 of it
+
+Point = Float[np.ndarray, " parameters"]
+
+
+class _Local(NamedTuple):
+    """Weighted residuals at a solution and their slopes by `z`."""
+
+    residual: Float[np.ndarray, " residuals"]
+    jacobian: Float[np.ndarray, "residuals parameters"]
+
+    @property
+    def cost(self) -> float:
+        return float(self.residual @ self.residual)
+
+    @property
+    def shown(self) -> Point:
+        """The change of each `z` that stands out from the scatter of the residuals."""
+        freedom = max(self.residual.size - self.jacobian.shape[1], 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(self.cost / freedom) / np.linalg.norm(self.jacobian, axis=0)
+
+
+def solve_within_bounds(
+    problem: Problem, z: Float[Array, " parameters"], solver: eqx.Module | None, max_steps: int
+) -> Solution:
+    """Solve from `z`; parameters that belong at zero are there, wherever the path to it ended."""
+    solution = solve(problem, jnp.asarray(z), solver, max_steps)
+    return settle_at_bounds(problem, solution, solver, max_steps)
+
+
+def settle_at_bounds(
+    problem: Problem, solution: Solution, solver: eqx.Module | None, max_steps: int
+) -> Solution:
+    """The solution with its parameters at zero marked; a better one if they do not belong there.
+
+    By its logarithm the cost has no slope near zero, and a solver may stop anywhere. What counts is
+    the slope of the cost by the parameter itself.
+    """
+    for _ in range(_ROUNDS):
+        solution = _above_underflow(problem, solution)
+        local = _look(problem, solution)
+        low = _near_zero(problem, local)
+        if not low:
+            return solution
+        shown, z = local.shown, np.asarray(solution.z)
+        step = _one_sided_step(local, low)
+        released = [k for k in low if step[k] > _NEAR]
+        if not released:
+            at = z.copy()
+            at[low] += np.log(_AT_ZERO * shown[low])
+            return _as_zero(problem, _polished(problem, at, low, solution), low)
+        change = step.copy()
+        change[low] = np.log(np.maximum(step[low], _AT_ZERO) * shown[low])
+        solution = solve(problem, jnp.asarray(z + change), solver, max_steps)
+    return solution
+
+
+def _above_underflow(problem: Problem, solution: Solution) -> Solution:
+    """The same where a value is a number that its slopes can be seen at."""
+    z, count = np.array(solution.z), problem.parameters.count
+    logarithmic = np.array(problem.parameters.logarithmic[:count])
+    least = np.asarray(problem.parameters.start)[:count] - _SMALLEST
+    lost = logarithmic & (z < least)
+    return _at(problem, np.where(lost, least, z), solution) if np.any(lost) else solution
+
+
+def _look(problem: Problem, solution: Solution) -> _Local:
+    residual, jacobian = [], []
+    parts, count = solution.sensitivity, problem.parameters.count
+    for weights, misfit, slopes in zip(problem.weights, parts.misfits, parts.slopes, strict=True):
+        weights = np.asarray(weights)
+        used = weights > 0
+        residual.append((weights * np.asarray(misfit))[used])
+        jacobian.append((weights[..., None] * np.asarray(slopes)[..., :count])[used])
+    r = np.concatenate([*residual, np.asarray(parts.prior_misfits)])
+    return _Local(r, np.concatenate([*jacobian, np.asarray(parts.prior_slopes)[:, :count]]))
+
+
+def _near_zero(problem: Problem, local: _Local) -> list[int]:
+    """Parameters that keep their sign, and could grow a hundred times without being seen."""
+    logarithmic = np.array(problem.parameters.logarithmic[: problem.parameters.count])
+    shown = local.shown
+    return np.flatnonzero(logarithmic & np.isfinite(shown) & (shown > 1 / _NEAR)).tolist()
+
+
+def _one_sided_step(local: _Local, low: Sequence[int]) -> Point:
+    """The Gauss-Newton step under which no parameter near zero becomes negative.
+
+    Of `z`, but of the parameters near zero: the value to go to, in units of what shows.
+    """
+    from scipy.optimize import lsq_linear
+
+    units, least = np.ones(local.jacobian.shape[1]), np.full(local.jacobian.shape[1], -np.inf)
+    units[low], least[low] = local.shown[low], 0.0
+    return lsq_linear(local.jacobian * units, -local.residual, (least, np.inf), method="bvls").x
+
+
+def _polished(
+    problem: Problem, z: Point, held: Sequence[int], like: Solution, rounds: int = 3
+) -> Solution:
+    """The optimum over the other parameters, from near it, by undamped Gauss-Newton steps."""
+    free = np.setdiff1d(np.arange(z.size), held)
+    solution, local = _at(problem, z, like), None
+    for _ in range(rounds):
+        local = _look(problem, solution)
+        step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
+        z = z.copy()
+        z[free] += step
+        moved = _at(problem, z, like)
+        if not _look(problem, moved).cost <= local.cost:
+            break
+        solution = moved
+        if np.max(np.abs(step), initial=0.0) < 1e-9:
+            break
+    return solution
+
+
+def _at(problem: Problem, z: Point, like: Solution) -> Solution:
+    stop = Stop(jnp.asarray(z), jnp.asarray(True), jnp.asarray(1), jnp.asarray(like.steps))
+    return solution_at(stop, *describe_once(stop.z, problem))
+
+
+def _as_zero(problem: Problem, solution: Solution, low: Sequence[int]) -> Solution:
+    """The same with values of exactly 0, where the model has a response there."""
+    values = np.array(solution.values)
+    values[low] = 0.0
+    count = problem.parameters.count
+    model = problem.parameters.replace(problem.model, jnp.asarray(values[:count]))
+    units = np.asarray(solution.slopes)[list(low)] / _AT_ZERO
+    marked = solution._replace(at_zero=tuple(low), units_at_zero=tuple(units.tolist()))
+    found = _responses(model, problem)
+    if not all(bool(np.all(np.isfinite(np.asarray(each)))) for each in found):
+        return marked
+    return marked._replace(values=jnp.asarray(values), model=model)
+
+
+@eqx.filter_jit
+def _responses(model: PyTree, problem: Problem) -> list[Array]:
+    aliases = zip(problem.conditions, problem.omega, problem.aliases, strict=True)
+    return [evaluate_sampled(condition(model), *where) for condition, *where in aliases]
+
+
+def one_sided_limit(problem: Problem, solution: Solution, k: int, inflation: float) -> float:
+    """Where a parameter that may be zero leaves its one-sided 95 % interval, in its own unit.
+
+    **Arguments:**
+
+    - `problem`, `solution`: with the parameter at zero, or at so small a value that it might be.
+    - `k`: which parameter.
+    - `inflation`: its variance over what the curvature of the cost says.
+
+    **Returns:** the limit, with the parameter's sign; infinite where the cost does not rise so far.
+    """
+    local, z = _look(problem, solution), np.asarray(solution.z)
+    wanted = _RISE * inflation
+
+    def rise(times: float) -> float:
+        at = z.copy()
+        at[k] += np.log(times)
+        return _look(problem, _polished(problem, at, [k], solution)).cost - local.cost
+
+    low, high, times = 1.0, np.inf, 1 + _first_guess(local, k, wanted)
+    for _ in range(_EVALUATIONS):
+        found = rise(times)
+        if abs(found - wanted) <= _CLOSE * wanted:
+            break
+        low, high = (times, high) if found < wanted else (low, times)
+        times *= np.clip(np.sqrt(wanted / max(found, 1e-300)), 0.2, 5.0)
+        if not low < times < high:
+            times = np.sqrt(low * min(high, 100 * low))
+    else:
+        times = times if np.isfinite(high) else np.inf
+    return float(np.asarray(solution.slopes)[k] * times)
+
+
+def _first_guess(local: _Local, k: int, wanted: float) -> float:
+    """By the slope and the curvature at zero, over the value at which these are known."""
+    jacobian = local.jacobian
+    slope = float(jacobian[:, k] @ local.residual)
+    curvature = 1 / max(float(scaled_inverse(jacobian.T @ jacobian)[k, k]), 1e-300)
+    return (np.sqrt(max(slope, 0.0) ** 2 + curvature * wanted) - max(slope, 0.0)) / curvature
+
+
+def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
+    """The covariance where parameter `k` is at zero, from that of an unconstrained fit.
+
+    What is left of its normal distribution above zero has this second moment about zero, and what
+    the other parameters make of it. `optimum` is where it would be without the bound.
+    """
+    from scipy.special import log_ndtr
+
+    variance = covariance[k, k]
+    below = max(-optimum / np.sqrt(variance), 0.0)
+    hazard = np.exp(-0.5 * below**2 - log_ndtr(-below)) / np.sqrt(2 * np.pi)
+    moment = variance * max(1 - below * (hazard - below), 0.0)
+    along = covariance[:, k] / variance
+    return covariance + np.outer(along, along) * (moment - variance)
