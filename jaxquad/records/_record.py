@@ -199,7 +199,7 @@ def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Float[np.ndarray, " sampl
 def _held(hold: float | None) -> float | None:
     if hold is None:
         return None
-    if not (np.isscalar(hold) and np.isreal(hold) and 0 <= float(hold) < np.inf):
+    if not (isinstance(hold, float | int | np.number) and 0 <= float(hold) < np.inf):
         raise RecordError(
             f"hold is {hold!r}: give the time in s for which the input keeps each value, 0 for a "
             f"continuous quantity that was measured, or None where it is unknown."

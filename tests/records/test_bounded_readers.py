@@ -5,6 +5,7 @@ import time
 import tracemalloc
 import zipfile
 import zlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +59,8 @@ def test_npz_takes_a_time_in_proportion_to_its_members(tmp_path):
     taken = []
     for count in (250, 2000):
         path = tmp_path / f"{count}.npz"
-        np.savez(path, t=TIME, **{f"c{k}": TIME for k in range(count)})
+        arrays: Any = {f"c{k}": TIME for k in range(count)}
+        np.savez(path, t=TIME, **arrays)
         taken.append(min(seconds_of(lambda path=path: channels(path)) for _ in range(2)))
     assert taken[1] < 16 * taken[0] + 0.1  # 8 times as many
 

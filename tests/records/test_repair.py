@@ -146,7 +146,8 @@ def test_a_file_with_dates_needs_no_unit(tmp_path):
 
 def test_a_file_is_repaired_where_it_is_read_and_nowhere_else(tmp_path):
     np.savez(tmp_path / "log.npz", t=TIME, u=U, y=spoilt(SPIKE, value=1e6), z=spoilt(300, 301))
-    path, options = tmp_path / "log.npz", dict(inputs="u", outputs=["y", "z"])
+    path = tmp_path / "log.npz"
+    options: dict[str, Any] = dict(inputs="u", outputs=["y", "z"])
     kept = read(path, **options, valid={"y": (-2, 2)}, max_gap=0.05)
     assert {name: times.size for name, times in kept.repaired.items()} == {"y": 1, "z": 2}
     np.testing.assert_allclose(kept.outputs, np.stack([Y, Y], axis=1), atol=2e-3)

@@ -83,6 +83,7 @@ def _datasets(file: "h5py.h5f.FileID") -> Iterator[tuple[str, "h5py.h5d.DatasetI
     By the lower layer of h5py: its upper one takes five times as long for many small datasets.
     """
     import h5py
+    from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]  # h5py has no stubs of it
 
     names: list[bytes] = []
 
@@ -91,9 +92,9 @@ def _datasets(file: "h5py.h5f.FileID") -> Iterator[tuple[str, "h5py.h5d.DatasetI
             raise ValueError(f"more than {_MOST_OBJECTS} objects")
         names.append(name)
 
-    h5py.h5o.visit(file, visit)
+    h5o.visit(file, visit)
     for name in names:
-        item = h5py.h5o.open(file, name)
+        item = h5o.open(file, name)
         if not isinstance(item, h5py.h5d.DatasetID) or name.startswith(b"#"):
             continue
         dtype = item.dtype
