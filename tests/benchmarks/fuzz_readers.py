@@ -32,7 +32,7 @@ from hostile_files import damaged, sound_files
 
 from jaxquad.records import channels, propose, ReadError, RecordError
 from jaxquad.records._log import allowance
-from jaxquad.records.formats import _isolated
+from jaxquad.records.formats import _readers
 from jaxquad.records.formats._by_library import answer
 
 
@@ -107,7 +107,7 @@ def _work(
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     name, content = files[kind]
-    setattr(_isolated, "_answer", _in_this_process)  # noqa: B010
+    setattr(_readers, "_answer", _in_this_process)  # noqa: B010
     counts = Counter()
     for number in range(first, CASES):
         struct.pack_into("I", shared, 0, number)

@@ -15,7 +15,7 @@ from scipy.io import savemat
 from jaxquad.records import channels, formats, read, ReadError, RecordWarning
 
 
-ISOLATED = "jaxquad.records.formats._isolated"
+READERS = "jaxquad.records.formats._readers"
 CHILD = Path(formats.__file__).with_name("_by_library.py")
 TIME = 5.0 + np.arange(400) / 100.0
 U = np.sin(3 * TIME)
@@ -97,7 +97,7 @@ def test_hdf5_that_declares_more_than_it_can_hold_is_refused(tmp_path):
 
 def test_hdf5_that_never_comes_to_an_end_is_given_up(tmp_path, monkeypatch):
     pytest.importorskip("h5py")
-    monkeypatch.setattr(f"{ISOLATED}.PATIENCE", 0.01)
+    monkeypatch.setattr(f"{READERS}.PATIENCE", 0.01)
     (tmp_path / "log.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     with pytest.raises(ReadError, match="an HDF5 .* file: reading did not end within"):
         channels(tmp_path / "log.h5")
@@ -127,7 +127,7 @@ def test_a_missing_package_is_named_with_the_remedy(tmp_path, monkeypatch, kind)
         "for name in ('h5py', 'pyarrow', 'rosbags'): sys.modules[name] = None\n"
         f"runpy.run_path({str(CHILD)!r}, run_name='__main__')\n"
     )
-    monkeypatch.setattr(f"{ISOLATED}._CHILD", script)
+    monkeypatch.setattr(f"{READERS}._CHILD", script)
     with pytest.raises(
         ReadError, match=r'needs a further library .*: pip install "jaxquad\[logs\]"'
     ):

@@ -3,15 +3,25 @@
 A format is one file of this folder with two functions: `sniff(head, path) -> bool` and
 `load(path) -> Log`. To add one, write that file and enter it in `READERS`. A format that another
 library decodes is a function `tables(path, check)` of `_by_library.py`, which a child process runs.
+
+Compiled libraries can loop for ever or crash on a damaged file, and a compressed file can unfold to
+fill the memory before anyone has seen its size. So that process has limits of time, memory and file
+size. It runs `_by_library.py` by its path, without the package.
 """
 
+import functools as ft
+import json
+import subprocess
+import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from .._errors import located, printable, ReadError, RecordWarning
-from .._log import flattened, Log, Signals
+from .._log import allowance, flattened, Log, oversize, Signals, Table
 from . import (
     _betaflight,
     _by_library,
@@ -22,11 +32,85 @@ from . import (
     _npz,
     _ulog,
 )
-from ._isolated import in_child
 
 
 HEAD = 4096  # bytes that `sniff` gets
 _LISTED = 8  # remarks shown one by one
+_CHILD = Path(__file__).with_name("_by_library.py")
+PATIENCE = 20.0  # s, beside what the size of the file allows
+_Listed = tuple[str, str, str, Sequence[int], str]  # table, column, dtype, shape, unit
+
+
+def _in_child(name: str, kind: str, *, per_megabyte: float = 0.1) -> Callable[[Path], Log]:
+    """A `load` function that reads the format `name` of `_by_library` in a child process.
+
+    A column `time` of a table with a name is its clock, in s. The process may take `per_megabyte`
+    s for each megabyte of the file beside `PATIENCE`.
+    """
+    return ft.partial(_load_in_child, name, kind, per_megabyte)
+
+
+def _load_in_child(name: str, kind: str, per_megabyte: float, path: Path) -> Log:
+    stored = sum(each.stat().st_size for each in _files(path))
+    header, _, content = _answer(name, path, kind, stored, per_megabyte).partition(b"\n")
+    found = json.loads(header)
+    if "missing" in found:
+        raise ReadError(
+            f"reading {kind} needs a further library ({found['missing']}): "
+            f'pip install "jaxquad[logs]"'
+        )
+    if "oversize" in found:
+        what, declared = found["oversize"]
+        raise ReadError(oversize(what, declared, stored))
+    if "error" in found:
+        raise ReadError(
+            f"cannot be read as {kind}: the file is cut off or damaged "
+            f"({printable(found['error'])})"
+        )
+    arrays = [tuple(each) for each in found["arrays"]]
+    return Log(_tables(arrays, content), tuple(found["remarks"]))
+
+
+def _files(path: Path) -> list[Path]:
+    return [each for each in path.iterdir() if each.is_file()] if path.is_dir() else [path]
+
+
+def _answer(name: str, path: Path, kind: str, stored: int, per_megabyte: float) -> bytes:
+    words = [str(_CHILD), name, str(path.absolute()), str(allowance(stored))]
+    patience = PATIENCE + per_megabyte * stored / 1e6
+    try:
+        child = subprocess.run(
+            [sys.executable, "-P", *words], capture_output=True, timeout=patience, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise ReadError(
+            f"cannot be read as {kind}: reading did not end within {patience:.0f} s. The file is "
+            f"probably damaged"
+        ) from error
+    if child.returncode:
+        last = child.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2]
+        said = f", {printable(last)}" if last else ""
+        raise ReadError(
+            f"cannot be read as {kind}: the library that decodes it crashed (exit status "
+            f"{child.returncode}{said}). The file is probably damaged"
+        )
+    return child.stdout
+
+
+def _tables(arrays: Sequence[_Listed], content: bytes) -> dict[str, Table]:
+    columns: dict[str, dict[str, np.ndarray]] = {}
+    units: dict[str, dict[str, str]] = {}
+    place = 0
+    for table, name, dtype, shape, unit in arrays:
+        count = int(np.prod(shape, dtype=object))
+        values = np.frombuffer(content, dtype, count, place).reshape(shape)
+        columns.setdefault(table, {})[name] = values
+        units.setdefault(table, {})[name] = unit
+        place += values.nbytes
+    return {
+        table: Table(named, named.pop("time") if table else None, units[table])
+        for table, named in columns.items()
+    }
 
 
 class Reader(NamedTuple):
@@ -63,15 +147,15 @@ READERS: Mapping[str, Reader] = {
     "hdf5": Reader(
         "an HDF5 or MATLAB v7.3 file",
         _by_library.sniff_hdf5,
-        in_child("hdf5", "an HDF5 or MATLAB v7.3 file"),
+        _in_child("hdf5", "an HDF5 or MATLAB v7.3 file"),
         (".h5", ".hdf5", ".hdf"),
     ),
     "parquet": Reader(
-        "a Parquet table", _by_library.sniff_parquet, in_child("parquet", "a Parquet table"),
+        "a Parquet table", _by_library.sniff_parquet, _in_child("parquet", "a Parquet table"),
         (".parquet", ".pq"),
     ),
     "rosbag": Reader(
-        "a ROS 2 bag", _by_library.sniff_bag, in_child("rosbag", "a ROS 2 bag", per_megabyte=2.0),
+        "a ROS 2 bag", _by_library.sniff_bag, _in_child("rosbag", "a ROS 2 bag", per_megabyte=2.0),
         (".mcap", ".db3"),
     ),
     "csv": Reader("a text table", _csv.sniff, _csv.load, (".csv", ".tsv", ".txt")),
