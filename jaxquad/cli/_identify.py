@@ -156,6 +156,8 @@ _OF_A_RECORD = {
     "time": "",
     "time_unit": "",
     "rate": "resample to this rate; by default that of the result",
+    "valid": "",
+    "max_gap": "",
     "start": "",
     "stop": "",
     "band": "compare between these frequencies, in Hz; by default those that were fitted",

@@ -263,8 +263,8 @@ def _check_channels(record: Record) -> None:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
                 f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s. "
-                f"Choose a range without them (start=, stop=; --start, --stop), or in Python let "
-                f"gaps up to some length be interpolated (max_gap= in s)."
+                f"Choose a range without them (start=, stop=; --start, --stop), or let gaps up to "
+                f"some length in s be interpolated (max_gap=, --max-gap)."
             )
         if np.ptp(values) == 0:
             warnings.warn(

@@ -14,6 +14,7 @@ from ._clock import TimeUnit
 from ._errors import RecordError
 from ._read import read
 from ._record import Record
+from ._repair import Valid
 
 
 Mix = dict[str, dict[str, float]]  # name -> channel, or its power `m1^2`, -> weight
@@ -72,6 +73,8 @@ class _Options(NamedTuple):
     time_unit: TimeUnit | None
     units: Mapping[str, str]
     hold: float | None
+    max_gap: float | int | None
+    valid: Valid
 
 
 def read_segments(
@@ -86,6 +89,8 @@ def read_segments(
     time_unit: TimeUnit | None = None,
     units: Mapping[str, str] | None = None,
     hold: float | None = None,
+    max_gap: Number | None = None,
+    valid: Valid | None = None,
 ) -> list[Record]:
     """Read several segments of a file as records with one sample rate.
 
@@ -96,7 +101,7 @@ def read_segments(
     - `inputs`, `outputs`, `references`: name -> channel or its power (`m1^2`) -> weight, as
         `parse_mix` returns it.
     - `sample_rate`: in Hz; by default that of the slowest segment.
-    - `time`, `time_unit`, `units`, `hold`: as in `read`.
+    - `time`, `time_unit`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
 
     **Returns:** a `Record` for each segment. Each warning about the file is given once.
 
@@ -107,7 +112,7 @@ def read_segments(
     """
     _check(segments)
     roles = (inputs, outputs, references or {})
-    options = _Options(time, time_unit, units or {}, hold)
+    options = _Options(time, time_unit, units or {}, hold, max_gap, valid or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         records = [_mixed(path, roles, each, sample_rate, options) for each in segments]
@@ -154,6 +159,8 @@ def _mixed(
         time=options.time,
         time_unit=options.time_unit,
         hold=options.hold,
+        max_gap=options.max_gap,
+        valid=options.valid,
     )
     terms = [{name: _terms(name, mix) for name, mix in role.items()} for role in roles]
     each = [term for role in terms for terms_of in role.values() for term in terms_of]

@@ -262,6 +262,8 @@ def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
         time=settings.time,
         time_unit=settings.time_unit,
         units={name: unit for name, unit in settings.units.items() if name in asked},
+        max_gap=settings.max_gap,
+        valid=settings.valid,
     )
     return tuple(records)
 

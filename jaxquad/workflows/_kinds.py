@@ -162,6 +162,31 @@ def _units(value: object) -> dict[str, str]:
     return dict(_unit(each) for each in pairs)
 
 
+def _range(value: object) -> tuple[str, Pair]:
+    """`("q", (-20, 20))`, or `q=-20:20`."""
+    name, limits = value.partition("=")[::2] if isinstance(value, str) else _pair(value)
+    try:
+        pair = _rising([float(x) for x in limits.split(":")] if isinstance(limits, str) else limits)
+    except ValueError:
+        pair = None
+    if not (isinstance(name, str) and name.strip()) or pair is None:
+        raise ValueError(f"{value!r} is no NAME=LOW:HIGH: write q=-20:20, the lower one first")
+    return name.strip(), pair
+
+
+def _pair(value: object) -> tuple[object, object]:
+    if isinstance(value, Sequence) and len(value) == 2:
+        return value[0], value[1]
+    return None, None
+
+
+def _ranges(value: object) -> dict[str, Pair]:
+    pairs = list(value.items()) if isinstance(value, Mapping) else value
+    if not isinstance(pairs, Sequence) or isinstance(pairs, str):
+        raise ValueError("give the valid range of each channel, such as { q = [-20, 20] }")
+    return dict(_range(each) for each in pairs)
+
+
 def _patterns(value: object) -> tuple[str, ...]:
     found = (value,) if isinstance(value, str) else value
     if (
@@ -196,6 +221,10 @@ SWITCH = Kind(_switch, words=0)
 BAND = Kind(_band, float, _plain, words=2, metavar=("LOW", "HIGH"))
 SEGMENTS = Kind(_segments, write=_joined, repeated=True, metavar="START:STOP")
 UNITS = Kind(_units, write="=".join, repeated=True, metavar="NAME=UNIT")
+RANGES = Kind(
+    _ranges, write=lambda one: f"{one[0]}={_joined(one[1])}", repeated=True,
+    metavar="NAME=LOW:HIGH",
+)  # fmt: skip
 PATTERNS = Kind(_patterns, metavar="PATTERN")
 INERTIA = Kind(_positive, float, _plain, metavar="J")
 DEVIATION = Kind(_not_negative, float, _plain, metavar="DEG")

@@ -217,6 +217,19 @@ class IdentifySettings(Settings):
         "resample to this rate; by default the slowest channel's own",
         group=_PART,
     )
+    valid: Mapping[str, Pair] = option_field(
+        kinds.RANGES,
+        {},
+        "lowest and highest value of a channel that can be true, such as gyro.x=-20:20: others "
+        "count as missing, and are interpolated; may be repeated",
+        group=_PART,
+    )
+    max_gap: float | None = option_field(
+        kinds.DURATION,
+        None,
+        "the longest gap, and the longest run of missing values, that is interpolated",
+        group=_PART,
+    )
     start: float | None = option_field(
         kinds.TIME, None, "first time to use, in the file's time", group=_PART
     )

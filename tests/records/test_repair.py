@@ -6,7 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxquad.records import mix, read, Record, RecordError, RecordWarning, select, trim
+from jaxquad.records import (
+    mix,
+    read,
+    read_segments,
+    Record,
+    RecordError,
+    RecordWarning,
+    select,
+    trim,
+)
 
 
 TIME = np.arange(500) / 100.0
@@ -37,7 +46,9 @@ def test_what_is_missing_or_out_of_range_is_interpolated_and_counted(value):
 
 
 def test_no_value_is_repaired_unless_asked():
-    with pytest.raises(RecordError, match="'y' holds 1 NaN and 0 inf.*max_gap= in s"):
+    with pytest.raises(
+        RecordError, match="'y' holds 1 NaN and 0 inf.*length in s .*max_gap=, --max-gap"
+    ):
         record(outputs=spoilt(SPIKE))
     assert "repaired" not in str(record()) and record().repaired == {}
     assert record(outputs=spoilt(SPIKE, value=1e6)).outputs[SPIKE, 0] == 1e6
@@ -166,3 +177,17 @@ def test_a_repaired_channel_is_resampled_like_a_sound_one(tmp_path):
         )
     np.testing.assert_allclose(kept.outputs[:, 0], kept.outputs[:, 1], atol=1e-3)
     assert kept.repaired["y"].size == 2
+
+
+def test_segments_and_powers_are_of_repaired_channels(tmp_path):
+    np.savez(tmp_path / "log.npz", t=TIME, u=U, y=spoilt(SPIKE, value=1e6))
+    first, second = read_segments(
+        tmp_path / "log.npz",
+        [(0, 2), (2, 4)],
+        inputs={"u2": {"y^2": 1.0}},
+        outputs={"u": {"u": 1.0}},
+        valid={"y": (-2, 2)},
+        max_gap=0.05,
+    )
+    np.testing.assert_allclose(first.inputs[:, 0], Y[:201] ** 2, atol=1e-3)
+    assert first.repaired["y"].size == 1 and not second.repaired

@@ -20,6 +20,7 @@ EVERY = [
         input="roll=-m1-m2+0.5*m3^2", output="p", reference="x 0", units={"p": "rad/s", "m1": "V"},
         time="stamp", time_unit="ms", rate=250, segments=[(-3, 5.5), (22, 30)], band=(0.7, 12),
         integrators=0, lag=False, delay=False, poles=3, zeros=1, estimator="welch", window=0.1,
+        valid={"m1": (-20, 20.5), "p q": (0, 1e6)}, max_gap=0.05,
         cost="coherence", verify="b.npz", verify_start=-1e-3, verify_stop=1e6,
     ),
     IdentifySettings(axis="pitch", start=-2.5, stop=1 / 3, band_rad=(1, 2)),
@@ -85,6 +86,10 @@ def test_an_option_takes_the_place_of_what_says_the_same_in_a_file():
         ({"input": "M", "output": "q", "axis": "roll"}, "axis is for a proposal"),
         ({"units": "rad"}, "units is 'rad': give the unit of each channel"),
         ({"units": ["q"]}, "'q' is no NAME=UNIT"),
+        ({"valid": ["q=3:1"]}, "'q=3:1' is no NAME=LOW:HIGH: write q=-20:20"),
+        ({"valid": {"q": 3}}, "is no NAME=LOW:HIGH"),
+        ({"valid": 3}, "valid is 3: give the valid range of each channel"),
+        ({"max_gap": 0}, "max_gap is 0: give a number above 0"),
     ],
 )
 def test_settings_that_cannot_be_say_what_to_change(content, complaint):
