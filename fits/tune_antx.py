@@ -72,7 +72,7 @@ def own_activity(record: jq.Record) -> float:
 
 
 def case_of(fit: jq.identify.Fit, activity: float) -> Case:
-    posterior = jq.ensembles.Posterior(fit, recorded_dt=DT, believed=1.0)
+    posterior = jq.ensembles.Posterior(fit, recorded_dt=DT, believed=1.0, band=BAND)
     ensemble = jq.Ensemble(posterior, **ASSUMED)
     penalties = (
         jq.tuning.Penalty("activity_rate", knee=activity, weight=2.0),

@@ -186,7 +186,7 @@ class Posterior(eqx.Module):
         - `recorded_dt`: the sample interval in s of a record whose input was held from sample to
             sample. Half of it is in the identified delay and is subtracted, down to 0, since a
             simulated loop holds its inputs itself. None for an input that was not held, and for a
-            fit by `jq.refine(..., hold="zero")`, which holds it too.
+            fit that models the hold, as that of a record that knows its `hold`.
         - `believed`: the inertia in kg m^2 that belongs to the gain, where the fit determines only
             b = KT / J: torques in N m and the inertia given to a scheduled controller refer to it.
         - `plant`: a function of the model that returns the pair (`jq.DecoupledAxes`, delay in s).

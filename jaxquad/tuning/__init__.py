@@ -7,6 +7,7 @@ from ._design_result import (
     DesignResult as DesignResult,
     Distance as Distance,
     front_point as front_point,
+    share_interval as share_interval,
     upper_bound as upper_bound,
 )
 from ._gauss_newton import GaussNewton as GaussNewton

@@ -1,12 +1,17 @@
 """What certificates are made of: bounds, peers, and linear loops of all members."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import binom
+import tuning_case
+from conftest import ROOT
+from scipy.stats import beta, binom
 
 import jaxquad as jq
-from jaxquad.tuning import paper_designs, peers, upper_bound
+from jaxquad.control import schedule_for_analysis
+from jaxquad.loops import loop_numbers
+from jaxquad.tuning import paper_designs, peers, share_interval, upper_bound
 
 
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
@@ -15,6 +20,27 @@ RIG = jq.DecoupledAxes([0.0468], [0.0552])
 @pytest.mark.parametrize("count, draws", [(0, 256), (3, 256), (255, 256), (0, 1), (7, 24)])
 def test_the_bound_is_the_share_at_which_so_few_are_seen_once_in_twenty(count, draws):
     assert binom.cdf(count, draws, upper_bound(count, draws)) == pytest.approx(0.05, rel=1e-9)
+
+
+@pytest.mark.parametrize("count, draws", [(0, 256), (171, 256), (1408, 2000), (24, 24)])
+def test_an_interval_ends_where_so_many_or_so_few_are_seen_once_in_forty(count, draws):
+    low, high = share_interval(count, draws)
+    assert low == pytest.approx(0.0 if count == 0 else beta.ppf(0.025, count, draws - count + 1))
+    assert high == pytest.approx(
+        1.0 if count == draws else beta.isf(0.025, count + 1, draws - count)
+    )
+
+
+@pytest.mark.slow
+def test_the_shares_that_the_readme_prints_are_those_of_2000_fresh_members():
+    """Counted by the exact poles of the linear loops, without a flight."""
+    members = tuning_case.ensemble().fresh(tuning_case.loop(), 2000, jax.random.key(0))
+    read_me = " ".join((ROOT / "README.md").read_text().split())
+    for design in peers(RIG).values():
+        scheduled = schedule_for_analysis(design, members.assumed_inertia)
+        count = int(np.sum(~loop_numbers(members.loop(scheduled), [0]).stable))
+        low, high = share_interval(count, 2000)
+        assert f"{count / 20:.1f} % ({100 * low:.1f} to {100 * high:.1f} %)" in read_me
 
 
 def test_none_of_256_proves_1_2_per_cent_and_no_more():
