@@ -14,6 +14,7 @@ from ._discrepancy import Discrepancy as Discrepancy
 from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
+from ._held import as_sampled as as_sampled
 from ._output_error import refine as refine
 from ._parameters import (
     Free as Free,
@@ -48,6 +49,7 @@ from ._starts import (
 from ._transfer_function_fit import fit_transfer_function as fit_transfer_function
 from ._transfer_function_guess import guess_transfer_function as guess_transfer_function
 from ._verdict import (
+    Bound as Bound,
     Combination as Combination,
     UndeterminedError as UndeterminedError,
     Verdict as Verdict,

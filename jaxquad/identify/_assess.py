@@ -39,6 +39,7 @@ from ._discrepancy import (
     find_discrepancy,
     Mixture,
 )
+from ._held import remarks_on_hold
 from ._identifiability import assess_identifiability, Information, LIMIT
 from ._parameters import Parameters, Place
 from ._problem import Problem
@@ -97,6 +98,7 @@ def assess(
         freedom=degrees_of_freedom(records, bread, noise, count),
         remarks=(
             *_remarks_on_used(problem, frfs),
+            *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
             *remarks_on_fit(problem, solution, cost, decrement, misfit, verdict),
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_leakage(problem, frfs, solution),
@@ -150,7 +152,7 @@ def _bounds(
         widths = seen.covariance[k, k], seen.by_noise[k, k]
         both = [one_sided_limit(problem, solution, k, each / curvature[k, k]) for each in widths]
         moved = _along(seen, k) * abs(both[0] / units[k])
-        moved[[k, *solution.at_zero]] = 0.0
+        moved[[k, *(solution.at_zero if k in solution.at_zero else ())]] = 0.0
         if np.all(moved <= LIMIT):
             bounds.append(Bound(names[k], float(np.asarray(solution.values)[k]), *both))
         elif k in solution.at_zero:

@@ -1,9 +1,11 @@
 """What a sampled record shows of a model whose input is held: its response with all aliases."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, PyTree
+from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
@@ -61,7 +63,7 @@ def evaluate_sampled(
 
 
 class SampledModel(eqx.Module):
-    """A model as samples of it show it while its input is held; for figures and comparisons."""
+    """A model as samples of it show it while its input is held, at any frequencies."""
 
     model: PyTree
     hold: float = eqx.field(static=True)  # s
@@ -71,7 +73,7 @@ class SampledModel(eqx.Module):
     ) -> Complex[Array, "frequencies outputs inputs"]:
         """At frequencies below half the sample rate."""
         omega = jnp.asarray(omega)
-        return evaluate_sampled(self.model, omega, _aliases_at(omega, self.hold, _COUNTS[-1]))
+        return evaluate_sampled(self.model, omega, _aliases_at(omega, self.hold, _COUNTS[0]))
 
 
 def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
@@ -84,7 +86,11 @@ def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
 
     **Returns:** the model itself, or one whose response has the hold and its aliases.
     """
-    hold = hold_of(frf)
+    return held(model, hold_of(frf))
+
+
+def held(model: PyTree, hold: float) -> PyTree:
+    """The model behind an input that is held for `hold` s; itself for 0."""
     return SampledModel(model, hold) if hold else model
 
 
@@ -94,6 +100,32 @@ def hold_of(frf: FrequencyResponse) -> float:
     What is held for several samples is held for each of them: the record shows the steps.
     """
     return min(frf.hold or 0.0, frf.dt)
+
+
+def remarks_on_hold(
+    frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
+) -> list[str]:
+    """Remark on inputs of which nobody said how they are held, where it would show.
+
+    What is held for a sample loses (w dt)^2 / 24 of its magnitude, beside a delay of half a sample.
+    """
+    for frf, mine in zip(frfs, used, strict=True):
+        if frf.hold is not None or not frf.dt or not np.any(mine):
+            continue
+        lost = np.broadcast_to(
+            (np.asarray(frf.omega) * frf.dt)[:, None, None] ** 2 / 24, mine.shape
+        )
+        over = np.where(mine, lost / np.maximum(np.asarray(frf.random_error), 1e-7), 0.0)
+        k = np.unravel_index(np.argmax(over), over.shape)
+        if over[k] > 1:
+            return [
+                f"nobody said how long the input keeps each value: held for a sample "
+                f"({1e3 * frf.dt:.3g} ms) it loses {100 * lost[k]:.2g} % at "
+                f"{np.asarray(frf.omega)[k[0]]:.3g} rad/s, {over[k]:.2g} times the error there, and "
+                "half a sample of the delay is its own; say hold= in s, the loop's period for a "
+                "command, 0 for a quantity that was measured (jq.Record, jq.read; --hold)"
+            ]
+    return []
 
 
 def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:

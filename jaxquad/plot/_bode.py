@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from jaxquad.identify import as_sampled
 from jaxquad.models import evaluate_response, Model
 from jaxquad.spectra import FrequencyResponse
 
@@ -50,7 +51,8 @@ def bode(
     **Arguments:**
 
     - `frf`: the measured response.
-    - `models`: a model with `frequency_response(omega)`, or several by the text of the legend.
+    - `models`: a model with `frequency_response(omega)`, or several by the text of the legend. They
+        are drawn as the record's samples show them, with the hold of its input.
     - `others`: further estimates of the same response, by the text of the legend.
     - `pair`: names of output and input; by default the first of each.
     - `title`: above the figure.
@@ -67,7 +69,8 @@ def bode(
     if not isinstance(models, Mapping):
         models = {"model": models} if models is not None else {}
     for k, (name, each) in enumerate(models.items()):
-        _draw_model(axes, _beside(_model_curve(each, measured, o, i), measured), name, k)
+        drawn = _model_curve(as_sampled(each, frf), measured, o, i)
+        _draw_model(axes, _beside(drawn, measured), name, k)
     _scale(axes, measured)
     _label(figure, axes, f"{frf.output_names[o]} / {frf.input_names[i]}", title)
     return figure
@@ -227,7 +230,8 @@ def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int)
     - `frf`, `model`: the measured response, and a model with `frequency_response(omega)`.
     - `output`, `source`: places of output and input.
     """
-    modelled = np.asarray(model_response(model, jnp.asarray(frf.omega)))[:, output, source]
+    omega = jnp.asarray(frf.omega)
+    modelled = np.asarray(model_response(as_sampled(model, frf), omega))[:, output, source]
     pair = (slice(None), output, source)
     with np.errstate(all="ignore"):
         difference = np.log(np.asarray(frf.response)[pair] / modelled)

@@ -251,7 +251,7 @@ NARROW = np.geomspace(1.0, 6.0, 30)
 
 
 def test_what_ran_to_zero_and_is_mixed_up_with_another_is_refused_with_it():
-    frf = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), error=0.03, seed=0, omega=NARROW)
+    frf = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), error=0.04, seed=0, omega=NARROW)
     fit = jq.fit(jq.LaggedIntegrator(280.0, 0.02, 0.02), frf, free=("lag", "delay"), cost=ML)
     ran = [remark for remark in fit.remarks if "ran to zero" in remark]
     assert ran and not any("no minimum" in remark for remark in fit.remarks)
