@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ._clock import JITTER, nonuniformity, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, unknown_name
-from ._record import as_tuple, check_distinct, Record
+from ._record import as_tuple, check_distinct, Hold, Record
 from ._repair import check_ranges, repair_values, Valid, within
 from ._resample import Channel, resample
 from ._timebase import signal_names, Timebases
@@ -85,7 +85,7 @@ def read(
     time_unit: TimeUnit | None = None,
     max_gap: float | int | None = None,
     units: Mapping[str, str] | None = None,
-    hold: float | None = None,
+    hold: Hold = None,
     valid: Valid | None = None,
 ) -> Record:
     """Read a record from a log: ArduPilot, PX4, Betaflight, Crazyflie, or a table of arrays.
@@ -175,9 +175,10 @@ def _repaired(
     return whole, times
 
 
-def _after_resampling(hold: float | None, stamps: Float[np.ndarray, " samples"]) -> float | None:
+def _after_resampling(hold: Hold, stamps: Float[np.ndarray, " samples"]) -> Hold:
     """Input and output pass through one filter, so that a hold within a sample stays what it is."""
-    return None if hold and hold > 1.01 * (stamps[1] - stamps[0]) else hold
+    longest = 1.01 * (stamps[1] - stamps[0])
+    return None if isinstance(hold, int | float) and hold > longest else hold
 
 
 def _all_units(

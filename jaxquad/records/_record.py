@@ -1,5 +1,6 @@
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
@@ -21,6 +22,7 @@ from ._repair import as_float64, check_ranges, repair_values, Valid
 
 
 Names = str | Sequence[str] | None
+Hold = float | int | Literal["dt"] | None
 _MOST_REPAIRED = 0.01  # of a channel, without a warning
 
 
@@ -41,7 +43,8 @@ class Record(eqx.Module):
     - `source`: where the data come from, such as a path.
     - `hold`: how long the plant's input keeps each value, in s. 0 for a continuous quantity that
         was measured, such as a rotor speed or a surface's deflection; the loop's period for a
-        command. `None` where nobody said. With it a fit tells the hold from the plant's own delay.
+        command, which is often the sample interval, `"dt"`. `None` where nobody said. With it a fit
+        tells the hold from the plant's own delay.
     - `time_unit`: of the time stamps: `"s"`, `"ms"`, `"us"` or `"ns"`. `None` means s, and refuses
         steps of 0.25 and more, which may be milliseconds.
     - `valid`: channel name -> lowest and highest value that can be true. Others count as missing.
@@ -86,7 +89,7 @@ class Record(eqx.Module):
         output_units: Names = None,
         reference_units: Names = None,
         source: str = "",
-        hold: float | None = None,
+        hold: Hold = None,
         time_unit: TimeUnit | None = None,
         valid: Valid | None = None,
         max_gap: float | int | None = None,
@@ -105,7 +108,7 @@ class Record(eqx.Module):
         self.output_units = _as_units(output_units, self.output_names)
         self.reference_units = _as_units(reference_units, self.reference_names)
         self.source = source
-        self.hold = _held(hold)
+        self.hold = self.dt if isinstance(hold, str) and hold == "dt" else _held(hold)
         check_distinct(self.names)
         before = {name: np.asarray(each, np.float64) for name, each in (repaired or {}).items()}
         self.repaired = before | _repair_in_place(self, valid or {}, max_gap)
@@ -196,13 +199,14 @@ def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Float[np.ndarray, " sampl
     return stamps
 
 
-def _held(hold: float | None) -> float | None:
+def _held(hold: Hold) -> float | None:
     if hold is None:
         return None
-    if not (isinstance(hold, float | int | np.number) and 0 <= float(hold) < np.inf):
+    if isinstance(hold, str) or not 0 <= float(hold) < np.inf:
         raise RecordError(
-            f"hold is {hold!r}: give the time in s for which the input keeps each value, 0 for a "
-            f"continuous quantity that was measured, or None where it is unknown."
+            f"hold is {hold!r}: give the time in s for which the input keeps each value, 'dt' for "
+            f"the sample interval, 0 for a continuous quantity that was measured, or None where it "
+            f"is unknown."
         )
     return float(hold)
 

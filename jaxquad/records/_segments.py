@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ._clock import TimeUnit
 from ._errors import RecordError
 from ._read import read
-from ._record import Record
+from ._record import Hold, Record
 from ._repair import Valid
 
 
@@ -72,7 +72,7 @@ class _Options(NamedTuple):
     time: str | None
     time_unit: TimeUnit | None
     units: Mapping[str, str]
-    hold: float | None
+    hold: Hold
     max_gap: float | int | None
     valid: Valid
 
@@ -88,7 +88,7 @@ def read_segments(
     time: str | None = None,
     time_unit: TimeUnit | None = None,
     units: Mapping[str, str] | None = None,
-    hold: float | None = None,
+    hold: Hold = None,
     max_gap: Number | None = None,
     valid: Valid | None = None,
 ) -> list[Record]:

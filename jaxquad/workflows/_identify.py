@@ -229,6 +229,8 @@ def propose_settings(
         found["reference"] = offered["references"]
     if settings.rate is None:
         found["rate"] = offered["sample_rate"]
+    if settings.hold is None:
+        found["hold"] = offered["hold"]
     if proposal.setup.band and settings.band is settings.band_rad is None:
         found["band"] = proposal.setup.band
     return dataclasses.replace(settings, **found | _proposed_span(settings, proposal)), proposal
@@ -264,6 +266,7 @@ def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
         units={name: unit for name, unit in settings.units.items() if name in asked},
         max_gap=settings.max_gap,
         valid=settings.valid,
+        hold=settings.hold,
     )
     return tuple(records)
 

@@ -82,6 +82,16 @@ def _not_negative(value: object) -> float:
     raise ValueError("give a number of at least 0")
 
 
+def _hold(value: object) -> float | str:
+    if value == "dt" or (_is_number(value) and value >= 0):
+        return value if isinstance(value, str) else float(value)
+    raise ValueError('give the seconds for which the input keeps each value, 0 or more, or "dt"')
+
+
+def _read_hold(text: str) -> float | str:
+    return text if text == "dt" else float(text)
+
+
 def _whole(least: int) -> Callable[[object], int]:
     def convert(value: object) -> int:
         if isinstance(value, int) and not isinstance(value, bool) and value >= least:
@@ -213,6 +223,7 @@ MIX = Kind(_mix, metavar="CHANNEL")
 POSITIVE = Kind(_positive, float, _plain, metavar="NUMBER")
 NOT_NEGATIVE = Kind(_not_negative, float, _plain, metavar="NUMBER")
 TIME = Kind(_number, float, _plain, metavar="S")
+HOLD = Kind(_hold, _read_hold, str, metavar="S")
 DURATION = Kind(_positive, float, _plain, metavar="S")
 HERTZ = Kind(_positive, float, _plain, metavar="HZ")
 DEGREES = Kind(_positive, float, _plain, metavar="DEG")

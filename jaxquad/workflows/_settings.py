@@ -217,6 +217,13 @@ class IdentifySettings(Settings):
         "resample to this rate; by default the slowest channel's own",
         group=_PART,
     )
+    hold: float | Literal["dt"] | None = option_field(
+        kinds.HOLD,
+        None,
+        "for how long the plant's input keeps each value: the loop's period for a command (dt: a "
+        "sample), 0 for a quantity that was measured; by default what an autopilot's log says",
+        group=_RUN,
+    )
     valid: Mapping[str, Pair] = option_field(
         kinds.RANGES,
         {},

@@ -40,6 +40,7 @@ class Setup(NamedTuple):
     excitation: str = "no injected excitation found"
     remarks: tuple[str, ...] = ()
     segments: tuple[tuple[float, float], ...] = ()  # s
+    hold: float | None = None  # s; of the command, where the log says it
 
 
 class Proposal(NamedTuple):
@@ -67,6 +68,7 @@ class Proposal(NamedTuple):
             "sample_rate": self.sample_rate,
             "start": setup.start,
             "stop": setup.stop,
+            "hold": setup.hold,
         }
 
     @property
@@ -84,6 +86,7 @@ class Proposal(NamedTuple):
         words = ["jaxquad", "identify", self.path, "--input", self._mix, "--output", setup.rate]
         words += ["--reference", setup.reference] if setup.reference else []
         words += ["--rate", f"{self.sample_rate:.6g}"]
+        words += ["--hold", f"{setup.hold:.6g}"] if setup.hold else []
         if len(self.segments) > 1:
             spans = [f"{start:.12g}:{stop:.12g}" for start, stop in self.segments]
             words += [word for span in spans for word in ("--segment", span)]
@@ -117,6 +120,7 @@ class Proposal(NamedTuple):
             f"  command: {self._mix}",
             f"  rate: {setup.rate} [{self.units.get(setup.rate) or 'unit unknown'}]",
             f"  external reference: {setup.reference or none}",
+            *([f"  the command is held for {1e3 * setup.hold:.4g} ms"] if setup.hold else []),
             *(f"  ! {remark}" for remark in setup.remarks),
             f"  {self.command_line}",
         ]
@@ -158,7 +162,31 @@ def complete(path: str, log: Log, setup: Setup) -> Proposal:
         )
     units = {name: array_of(signals, name)[1] for name in names}
     rate = float(f"{min(rates.values()):.3g}")
-    return Proposal(path, log.vehicle, setup._replace(remarks=remarks), rate, units)
+    setup = setup._replace(remarks=remarks, hold=_loop_period(log))
+    return Proposal(path, log.vehicle, setup, rate, units)
+
+
+_RATES = ("SCHED_LOOP_RATE", "IMU_GYRO_RATEMAX")  # Hz, of ArduPilot's and of PX4's rate loop
+_LONGEST = 0.1  # s
+
+
+def _loop_period(log: Log) -> float | None:
+    """For how long the rate loop holds its command, in s, where the log has the loop's settings."""
+    given = {name: float(text) for name, text in log.settings.items() if _is_number(text)}
+    rates = [given[name] for name in _RATES if given.get(name, 0.0) > 0]
+    period = 1 / rates[0] if rates else 0.0
+    if (
+        not rates and "looptime" in given
+    ):  # Betaflight: us, and loops of the gyro for one of the PID
+        period = 1e-6 * given["looptime"] * given.get("pid_process_denom", 1.0)
+    return period if 0 < period < _LONGEST else None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
 
 
 def channel_rate(signals: Signals, name: str) -> float:
