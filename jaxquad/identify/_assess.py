@@ -101,7 +101,6 @@ def assess(
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
             *remarks_on_fit(problem, solution, cost, decrement, misfit, verdict),
             *remarks_on_minima(problem, solution, bread, minima),
-            *remarks_on_leakage(problem, frfs, solution),
             *remarks_on_priors(prior.misfit, verdict, by_data),
             *_remarks_on_discrepancy(discrepancy),
         ),
@@ -536,33 +535,6 @@ def remarks_on_priors(
         )
     return remarks
 
-
-def remarks_on_leakage(
-    problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution
-) -> list[str]:
-    """Remark on responses of integrating plants that were estimated without integrators."""
-    misfits = solution.sensitivity.misfits
-    for frf, weights, misfit in zip(frfs, problem.weights, misfits, strict=True):
-        level = np.log(np.abs(np.asarray(frf.response))) + np.asarray(misfit)[..., 0]
-        for o, i in np.ndindex(level.shape[1:]):
-            used = np.flatnonzero(np.asarray(weights)[:, o, i, 0] > 0)[:3]
-            if len(used) < 3:
-                continue
-            omega, error = np.asarray(frf.omega)[used], np.asarray(frf.random_error)[used[0], o, i]
-            steepness = round(-np.polyfit(np.log(omega), level[used, o, i], 1)[0])
-            leak = _leakage(steepness - frf.integrators, frf.resolution / omega[0])
-            if leak > error:
-                return [
-                    f"the response falls as 1/s^{steepness} at its lowest frequencies, where the "
-                    f"window's leakage biases it by up to {100 * leak:.2g} % (at {omega[0]:.3g} "
-                    f"rad/s): estimate it with jq.spectra.Welch(integrators={min(steepness, 3)})"
-                ]
-    return []
-
-
-def _leakage(integrators: int, resolution: float) -> float:
-    """Relative error of 1/s^n behind a Hann window of 1 / resolution cycles, to second order."""
-    return max(integrators, 0) * (integrators + 1) / 6 * resolution**2
 
 
 def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
+from ._leakage import Rest, Slopes, without_leakage
+
 
 _TINY = 1e-300
 
@@ -100,7 +102,7 @@ def noise_root(
     outputs: Residuals,
     member: Float[Array, "windows groups"],
     trace: Float[Array, "frequencies outputs groups"],
-    freedom: Float[Array, " groups"],
+    freedom: Float[Array, "frequencies outputs groups"],
     weights: Float[Array, "frequencies outputs groups"],
 ) -> Complex[Array, "frequencies outputs outputs"]:
     """Hermitian root of the covariance of the noise, from the residuals, smooth along frequency.
@@ -113,8 +115,9 @@ def noise_root(
     energy, floor = (jnp.swapaxes(jnp.abs(x) ** 2, 1, 2) @ member for x in (residuals, outputs))
     # The logarithm of a chi-squared variable is biased by digamma(f) - ln(f).
     low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
-    levels = jnp.log(jnp.maximum(energy, _FLOOR * floor + 1e-280) / trace) - low[None, None, :]
-    weight, level = weights @ freedom, jnp.sum(weights * levels, axis=2)
+    levels = jnp.log(jnp.maximum(energy, _FLOOR * floor + 1e-280) / trace) - low
+    weight = jnp.sum(weights * freedom, axis=2)
+    level = jnp.sum(weights * levels, axis=2)
     lines = jax.vmap(_local_line, in_axes=(None, 1, 1), out_axes=1)
     root = jnp.exp(lines(place, level, weight) / 2)
     if root.shape[1] == 1:
@@ -265,24 +268,29 @@ class Averaged(NamedTuple):
     share: Float[Array, "frequencies outputs inputs groups"]
     noise: Complex[Array, "frequencies outputs roots"]
     excitation: Float[Array, "channels frequencies"]  # power of inputs and of instruments
+    freedom: Float[
+        Array, "frequencies outputs groups"
+    ]  # complex, of the noise of each window length
+    leakage: Float[Array, "2 frequencies outputs inputs"]  # relative bias, and its error
 
 
 @eqx.filter_jit
 def average(
     transforms: tuple[Complex[Array, "_ frequencies channels"], ...],
+    slopes: tuple[Slopes, ...],
     channels: Channels,
     omega: Float[ArrayLike, " frequencies"],
     overlap: Float[ArrayLike, "windows windows"],
     scales: Float[ArrayLike, " groups"],
     resolved: Bool[ArrayLike, "groups frequencies"],
-    freedom: Float[ArrayLike, "groups 2"],
+    averages: Float[ArrayLike, " groups"],
 ) -> Averaged:
     """One response from all window lengths, with the effect of noise in each window.
 
-    `freedom` holds, for each length, the independent windows less the inputs, and the degrees of
-    freedom of the residuals.
+    `averages` are the independent windows of each length less the inputs, and `slopes` the
+    transforms behind the derivatives of the windows.
     """
-    averages, left = jnp.asarray(freedom).T
+    averages = jnp.asarray(averages)
     many = tuple(len(part) for part in transforms)
     flat = jnp.swapaxes(jnp.concatenate(transforms), 0, 1)
     rows = jnp.split(flat, np.cumsum(many)[:-1], axis=1)
@@ -296,12 +304,16 @@ def average(
     z, inputs, outputs = channels.split(flat)
     split = jnp.split(jnp.conj(jnp.swapaxes(z, 1, 2)), np.cumsum(many)[:-1], axis=2)
     effect = jnp.concatenate([s @ c for s, c in zip(parts.solver, split, strict=True)], axis=2)
-    gain, trace = _unit_noise(effect, combined.share, inputs, jnp.asarray(overlap), many)
+    gain = _unit_noise(effect, combined.share, jnp.asarray(overlap), many)
     weights = jnp.mean(combined.share, axis=2)
     trust = jnp.where(jnp.any(lost, axis=1), 1e-9, 1.0)[:, None, None]
     residuals = outputs - inputs @ jnp.swapaxes(combined.response, 1, 2)
+    rest = without_leakage(residuals, inputs, slopes, jnp.asarray(overlap), many)
     member = jnp.asarray(np.repeat(np.eye(len(many)), many, axis=0))
-    noise = noise_root(jnp.asarray(omega), residuals, outputs, member, trace, left, weights * trust)
+    noise = noise_root(
+        jnp.asarray(omega), rest.residuals, outputs, member, rest.trace, rest.freedom,
+        weights * trust,
+    )  # fmt: skip
     power = jnp.sum(jnp.abs(noise) ** 2, axis=2)
     error = jnp.sqrt(power[:, :, None] * gain / 2) / jnp.abs(combined.response)
     gone = lost[:, None, :]
@@ -316,7 +328,19 @@ def average(
         combined.share,
         noise,
         _excitation(products[0] / counts[0].astype(products.dtype), channels),
+        rest.freedom,
+        _leakage(rest, combined, power),
     )
+
+
+def _leakage(
+    rest: Rest, combined: Combined, power: Float[Array, "frequencies outputs"]
+) -> Float[Array, "2 frequencies outputs inputs"]:
+    """What leakage adds to the response, relative, and the standard error of that."""
+    bias = jnp.abs(jnp.sum(rest.bias * combined.share.astype(rest.bias.dtype), axis=3))
+    spread = jnp.sum(combined.share * jnp.sqrt(rest.doubt), axis=3)
+    error = jnp.sqrt(power / 2)[:, :, None] * spread
+    return jnp.stack([bias, error]) / jnp.abs(combined.response)[None]
 
 
 def _conditioned(products, channels: Channels, counts: Float[Array, " groups"]) -> Conditioned:
@@ -340,29 +364,19 @@ def _with_placeholders(
 def _unit_noise(
     effect: Complex[Array, "frequencies inputs windows"],
     share: Float[Array, "frequencies outputs inputs groups"],
-    x: Complex[Array, "frequencies windows inputs"],
     overlap: Float[Array, "windows windows"],
     counts: tuple[int, ...],
-) -> tuple[Float[Array, "frequencies outputs inputs"], Float[Array, "frequencies outputs groups"]]:
-    """Variance of the responses under noise of unit power, and the residual energy it leaves.
+) -> Float[Array, "frequencies outputs inputs"]:
+    """Variance of the responses under noise of unit power.
 
     Sums over windows are taken group by group, since the shares differ between outputs.
     """
-    ends, count = np.cumsum(counts)[:-1], effect.shape[1]
+    ends = np.cumsum(counts)[:-1]
     rows = zip(jnp.split(effect, ends, axis=2), jnp.split(overlap, ends), strict=True)
-    spread = jnp.concatenate([_times_real(e, o) for e, o in rows], axis=1)
-    columns = jnp.concatenate([jnp.conj(jnp.swapaxes(effect, 1, 2)), x], axis=2)
-    kept = zip(jnp.split(spread, ends, axis=2), jnp.split(columns, ends, axis=1), strict=True)
-    sums = jnp.stack([s @ c for s, c in kept], axis=-1)
-    sums = sums.reshape(len(effect), len(counts), count, 2 * count, len(counts))
-    part, pairs, crossed = share.astype(effect.dtype), sums[:, :, :, :count], sums[:, :, :, count:]
-    covariance = jnp.einsum("foig,fgijh,fojh->foij", part, pairs, part)
-    once = jnp.einsum("foig,fgiih->foh", part, crossed)
-    moments = [jnp.swapaxes(c, 1, 2) @ jnp.conj(c) for c in jnp.split(x, ends, axis=1)]
-    twice = jnp.einsum("hfij,foij->foh", jnp.stack(moments), covariance)
-    whole = jnp.stack([jnp.sum(part) for part in jnp.split(jnp.diagonal(overlap), ends)])
-    variance = jnp.real(jnp.diagonal(covariance, axis1=2, axis2=3))
-    return variance, whole[None, None, :] - jnp.real(2 * once - twice)
+    spread = jnp.stack([_times_real(e, o) for e, o in rows], axis=-1)
+    own = jnp.split(spread * jnp.conj(effect)[..., None], ends, axis=2)
+    pairs = jnp.real(jnp.stack([jnp.sum(part, axis=2) for part in own], axis=-1))
+    return jnp.einsum("foig,figh,foih->foi", share, pairs, share)
 
 
 def _times_real(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ._window import coefficients
+from ._window import waves
 
 
 _TOLERANCE = 6e-14  # of a block's exponentials; leaves 2e-13 of the largest Fourier sum
@@ -90,19 +90,20 @@ def _tapered(
     angle: Float[np.ndarray, " frequencies"],
     basis: Float[np.ndarray, "block rank"],
 ) -> Complex[np.ndarray, "frequencies blocks rank"]:
-    level, cosine = coefficients(shape)
+    level, cosine, sine = waves(shape)
     block = basis.shape[0]
     inner = np.arange(block)
-    waves = np.exp(-1j * angle[:, None] * inner)
+    spins = np.exp(-1j * angle[:, None] * inner)
     turn = 2 * np.pi * inner / length
     weights = np.stack([np.ones(block), np.cos(turn), np.sin(turn)])
     weighted = np.concatenate([basis * each[:, None] for each in weights], axis=1)
-    products = np.real(waves) @ weighted + 1j * (np.imag(waves) @ weighted)
+    products = np.real(spins) @ weighted + 1j * (np.imag(spins) @ weighted)
     plain, even, odd = np.split(products[:, None, :], 3, axis=2)
     first = np.arange(0, length, block)
     theta = (2 * np.pi * first / length)[None, :, None]
     # cos(theta + turn), so that three products with the basis serve all blocks.
     raised = level * plain - cosine * (np.cos(theta) * even - np.sin(theta) * odd)
+    raised = raised - sine * (np.sin(theta) * even + np.cos(theta) * odd) if sine else raised
     return np.exp(-1j * angle[:, None] * first)[:, :, None] * raised
 
 

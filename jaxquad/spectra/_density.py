@@ -72,7 +72,8 @@ def spectral_density(
     check_compatible(records)
     welch = Welch() if welch is None else welch
     omega = frequencies_for(omega, records, welch)
-    [transforms], [(length, _)] = transform_records(records, omega, [welch])
+    segments = transform_records(records, omega, [welch])
+    [transforms], [(length, _)] = segments.transforms, segments.groups
     energy = np.sum(window(welch.shape, length) ** 2)
     density = _averaged(transforms, np.asarray(2 * records[0].dt / energy))
     return SpectralDensity(jnp.asarray(omega), density, records[0].names)

@@ -40,7 +40,7 @@ class Plan(eqx.Module):
     detrend: str = eqx.field(static=True)
 
 
-@ft.lru_cache(maxsize=4)
+@ft.lru_cache(maxsize=12)
 def plan_transform(
     samples: int,
     angle: tuple[float, ...],  # rad per sample

@@ -17,6 +17,7 @@ from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
+from ._leakage import Slopes
 from ._noise_freedom import smoothed
 from ._nonlinearity import remarks_on_nonlinearity
 from ._remarks import Remark
@@ -32,10 +33,11 @@ class Segments(NamedTuple):
 
     Channels are in the order of `Record.names`: inputs, outputs, references. `groups` are the
     lengths and starts in samples, of the records one after the other, with gaps wider than any
-    window.
+    window. `slopes` are those behind the derivatives of the windows.
     """
 
     transforms: tuple[Complex[Array, "windows frequencies channels"], ...]
+    slopes: tuple[Slopes, ...]
     groups: Layout
 
 
@@ -45,16 +47,27 @@ def transform_records(
     """Transform all channels of all records; no window spans two records."""
     require_x64("a frequency response")
     layouts = _layouts(records, omega, members)
-    parts, starts, origin = [], [[] for _ in members], 0
+    parts, slopes, starts, origin = [], [], [[] for _ in members], 0
     for record, layout in zip(records, layouts, strict=True):
         parts.append(_transform_record(record, omega, members[0], layout, origin))
+        slopes.append(_transform_slopes(record, omega, members[0], layout, origin))
         for mine, (_, local) in zip(starts, layout, strict=True):
             mine += [origin + start for start in local]
         origin += record.samples + max(length for length, _ in layout)
-    kinds = zip(*parts, strict=True)
-    joined = tuple(mine[0] if len(mine) == 1 else jnp.concatenate(mine) for mine in kinds)
+    joined, leaked = (
+        tuple(
+            mine[0] if len(mine) == 1 else jnp.concatenate(mine) for mine in zip(*kind, strict=True)
+        )
+        for kind in (parts, slopes)
+    )
     lengths = [length for length, _ in layouts[0]]
-    return Segments(joined, tuple(zip(lengths, map(tuple, starts), strict=True)))
+    return Segments(joined, leaked, tuple(zip(lengths, map(tuple, starts), strict=True)))
+
+
+def _joined(
+    parts: Sequence[Complex[Array, "_ frequencies channels"]],
+) -> Complex[Array, "windows frequencies channels"]:
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
 
 
 def _layouts(
@@ -82,23 +95,60 @@ def _transform_record(
     layout: Layout,
     origin: int,
 ) -> list[Complex[Array, "_ frequencies channels"]]:
+    columns = _columns(record, welch)
+    found = _transform(columns, omega * record.dt, welch, layout, origin, order=0)
+    n, late = welch.integrators, welch.delay_samples(record)
+    if not (n or late):
+        return found
+    angle = omega * record.dt
+    factor = np.ones((omega.size, columns.shape[1]), complex)
+    first = len(record.input_names)
+    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
+    factor[:, first : first + record.outputs.shape[1]] = recolour[:, None]
+    return [part * factor[None] for part in found]
+
+
+def _columns(record: Record, welch: Welch) -> Float[np.ndarray, "samples channels"]:
+    """All channels, the outputs differenced and earlier by the delay."""
     n, late = welch.integrators, welch.delay_samples(record)
     outputs = np.diff(record.outputs, n, axis=0)
     outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
     # A difference delays by n/2 samples, and the window would act on it like on any delay.
     centre = slice(n - n // 2, record.samples - n // 2)
-    columns = np.hstack([record.inputs[centre], outputs, record.references[centre]])
-    angle = omega * record.dt
-    found = transform_windows(
-        columns, angle, layout, shape=welch.shape, detrend=welch.detrend, origin=float(origin)
+    return np.hstack([record.inputs[centre], outputs, record.references[centre]])
+
+
+def _transform(
+    columns: Float[np.ndarray, "samples channels"],
+    angle: Float[np.ndarray, " frequencies"],
+    welch: Welch,
+    layout: Layout,
+    origin: int,
+    *,
+    order: int,
+) -> list[Complex[Array, "_ frequencies channels"]]:
+    """Behind the windows, or their derivative of that `order`."""
+    shape = welch.shape + order * "'"
+    return transform_windows(
+        columns, angle, layout, shape=shape, detrend=welch.detrend, origin=float(origin)
     )
-    if not (n or late):
-        return found
-    factor = np.ones((omega.size, columns.shape[1]), complex)
-    first = len(record.input_names)
-    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
-    factor[:, first : first + outputs.shape[1]] = recolour[:, None]
-    return [part * factor[None] for part in found]
+
+
+def _transform_slopes(
+    record: Record,
+    omega: Float[np.ndarray, " frequencies"],
+    welch: Welch,
+    layout: Layout,
+    origin: int,
+) -> list[Slopes]:
+    inputs, angle = record.inputs.shape[1], omega * record.dt
+    columns = _columns(record, welch)[:, : inputs + record.outputs.shape[1]]
+    first = _transform(columns, angle, welch, layout, origin, order=1)
+    second = _transform(columns[:, :inputs], angle, welch, layout, origin, order=2)
+    return [
+        Slopes(jnp.concatenate([one[:, :, :inputs], other], axis=2), one[:, :, inputs:])
+        for one, other in zip(first, second, strict=True)
+    ]
 
 
 _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
@@ -186,6 +236,35 @@ def remarks_on_inputs(
     return tuple(remarks)
 
 
+_LEAKED = 3.0  # bias over random error, averaged over a third of an octave, that is remarked
+_AVERAGED = 0.2  # in ln(omega)
+
+
+def remarks_on_leakage(
+    omega: Float[np.ndarray, " frequencies"],
+    leakage: Float[np.ndarray, "2 frequencies outputs inputs"],
+    error: Float[np.ndarray, "frequencies outputs inputs"],
+    names: tuple[Sequence[str], Sequence[str]],
+) -> tuple[Remark, ...]:
+    """Remarks on pairs whose response leakage biases, clearly and beyond the random error."""
+    kernel = np.exp(-0.5 * (np.log(omega[:, None] / omega) / _AVERAGED) ** 2)
+    bias, remarks = leakage[0], []
+    least = np.maximum(leakage[1], error)
+    with np.errstate(invalid="ignore"):
+        ratio = np.where(np.isfinite(least) & np.isfinite(bias), bias / least, 0.0)
+    for o, i in np.ndindex(bias.shape[1:]):
+        leaked = kernel @ ratio[:, o, i] ** 2 > _LEAKED**2 * np.sum(kernel, axis=1)
+        if np.any(leaked):
+            text = (
+                f"leakage through the window biases the response by about "
+                f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
+                "include it. Use jq.spectra.LocalPolynomial(), which estimates leakage, a longer "
+                "window, or integrators= where the plant integrates"
+            )
+            remarks.append(Remark(text, omega[leaked], (names[0][o], names[1][i])))
+    return tuple(remarks)
+
+
 Method = Literal["direct", "joint"]
 _CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
@@ -207,10 +286,11 @@ def average_windows(
     channels = _channels(records[0], method)
     independent = _independent(records, segments)
     check_windows(independent, segments, channels)
+    overlap = window_products(segments.groups, members[0].shape)
     found = average(
-        segments.transforms, channels, omega, window_products(segments.groups, members[0].shape),
+        segments.transforms, segments.slopes, channels, omega, overlap,
         _scales(segments, members[0], records[0].dt), _resolved(segments, omega * records[0].dt),
-        _freedom(independent, segments, members[0], channels.inputs),
+        np.maximum(np.array(independent) - channels.inputs + 1, 0.5),
     )  # fmt: skip
     check_spectrum(omega, np.asarray(found.excitation), records, members[0], method)
     return _result(records, omega, members, segments, found, method)
@@ -242,19 +322,6 @@ def _resolved(
     return angle[None, :] * lengths[:, None] >= 2 * np.pi * _CYCLES
 
 
-def _freedom(
-    independent: list[float], segments: Segments, welch: Welch, inputs: int
-) -> Float[np.ndarray, "groups 2"]:
-    """Independent windows and the residuals' degrees of freedom, less those of the inputs."""
-    shared, at, rows = window_products(segments.groups, welch.shape), 0, []
-    for count, (_, starts) in zip(independent, segments.groups, strict=True):
-        mine = shared[at : at + len(starts), at : at + len(starts)]
-        left = np.trace(mine) ** 2 / np.sum(mine**2) - inputs
-        rows.append((max(count - inputs + 1, 0.5), max(float(left), 0.5)))
-        at += len(starts)
-    return np.array(rows)
-
-
 def _result(
     records: Sequence[Record],
     omega: Float[np.ndarray, " frequencies"],
@@ -271,6 +338,9 @@ def _result(
     response, coherence = np.asarray(found.response), np.asarray(found.coherence)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
+    remarks += remarks_on_leakage(
+        omega, np.asarray(found.leakage), np.asarray(found.random_error), names
+    )
     if max(independent) < 3:
         remarks += (Remark(_FEW.format(count=max(independent))),)
     counts = tuple(len(starts) for _, starts in segments.groups)
@@ -304,12 +374,11 @@ def _log_noise_covariance(
     found: Averaged,
 ) -> Float[np.ndarray, "frequencies frequencies"]:
     """All window lengths see the same noise, each with its own resolution."""
-    inputs = len(records[0].input_names)
-    freedom = _freedom(_independent(records, segments), segments, members[0], inputs)[:, 1]
     weights = np.mean(np.asarray(found.share), axis=(1, 2))
+    freedom = np.mean(np.asarray(found.freedom), axis=1)
     apart = (omega[:, None] - omega) * records[0].dt
     single = np.zeros_like(apart)
-    for share, left, (length, _) in zip(weights.T, freedom, segments.groups, strict=True):
+    for share, left, (length, _) in zip(weights.T, freedom.T, segments.groups, strict=True):
         level = share / np.sqrt(left)
         single += np.outer(level, level) * leaked_power(members[0].shape, length, apart)
-    return smoothed(omega, single, weights @ freedom, BANDWIDTH)
+    return smoothed(omega, single, np.sum(weights * freedom, axis=1), BANDWIDTH)

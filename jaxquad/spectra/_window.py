@@ -7,8 +7,22 @@ _SHAPES = {"hann": (0.5, 0.5), "hamming": (0.54, 0.46), "rectangular": (1.0, 0.0
 
 def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
     """A periodic raised-cosine window of `samples` points: "hann", "hamming" or "rectangular"."""
-    level, cosine = coefficients(name)
-    return level - cosine * np.cos(2 * np.pi * np.arange(samples) / samples)
+    level, cosine, sine = waves(name)
+    angle = 2 * np.pi * np.arange(samples) / samples
+    return level - cosine * np.cos(angle) - sine * np.sin(angle)
+
+
+def waves(name: str) -> tuple[float, float, float]:
+    """Coefficients of a window with angle a = 2 pi n / samples: level - cosine cos a - sine sin a.
+
+    A prime stands for a derivative by a: "hann'" and "hann''".
+    """
+    plain = name.rstrip("'")
+    level, cosine = coefficients(plain)
+    sine = 0.0
+    for _ in range(len(name) - len(plain)):
+        level, cosine, sine = 0.0, sine, -cosine
+    return level, cosine, sine
 
 
 def coefficients(name: str) -> tuple[float, float]:

@@ -135,7 +135,7 @@ def test_the_covariance_is_positive_semidefinite():
 
 
 def test_every_output_has_the_error_it_would_have_alone():
-    y, z = plant(WHITE) + white(0), 3 * WHITE + white(1)
+    y, z = plant(WHITE) + white(2), 3 * WHITE + white(1)
     both = respond(WHITE, np.stack([y, z], axis=1))
     for o, alone in enumerate([respond(WHITE, y), respond(WHITE, z)]):
         np.testing.assert_allclose(
