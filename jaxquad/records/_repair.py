@@ -87,8 +87,8 @@ def _range(name: str, valid: Range | None) -> Range:
     return valid
 
 
-def as_float64(label: str, values: ArrayLike) -> np.ndarray:
-    """A copy in float64, NaN where masked. Raises RecordError for anything but numbers."""
+def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarray:
+    """In float64, NaN where masked, a `copy` or a view. Raises RecordError for other than numbers."""
     array = np.ma.asanyarray(values)
     if array.dtype.names:
         raise RecordError(
@@ -100,6 +100,8 @@ def as_float64(label: str, values: ArrayLike) -> np.ndarray:
     if array.dtype.kind == "c":
         raise RecordError(f"{label} is complex: a record holds real numbers.")
     try:
-        return np.array(np.ma.filled(array.astype(np.float64), np.nan))
+        return np.array(
+            np.ma.filled(array.astype(np.float64, copy=False), np.nan), copy=copy or None
+        )
     except (TypeError, ValueError) as error:
         raise RecordError(f"{label} is not an array of numbers: {error}.") from error

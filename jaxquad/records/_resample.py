@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ._clock import check_increasing, FEWEST, GAP, native_rate
+from ._clock import check_increasing, dates_in_seconds, FEWEST, GAP, native_rate
 from ._errors import RecordError, RecordWarning
-from ._repair import longest_gap
+from ._repair import as_float64, longest_gap
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -20,8 +20,8 @@ class Channel(eqx.Module):
     **Arguments:**
 
     - `name`: of the signal.
-    - `time`: time stamps in s, strictly increasing.
-    - `values`: one for each time stamp, in `unit`.
+    - `time`: time stamps in s, strictly increasing; dates become s since 1970.
+    - `values`: one for each time stamp, in `unit`; NaN where masked.
     - `unit`: such as `"rad/s"`; empty where unknown.
 
     **Raises:**
@@ -37,8 +37,8 @@ class Channel(eqx.Module):
 
     def __init__(self, name: str, time: ArrayLike, values: ArrayLike, unit: str = ""):
         self.name = name
-        self.time = np.asarray(time, dtype=np.float64)
-        self.values = np.asarray(values, dtype=np.float64)
+        self.time = _absolute(name, time)
+        self.values = as_float64(f"channel {name!r}", values, copy=False)
         self.unit = unit
         if self.time.ndim != 1 or self.time.shape != self.values.shape:
             raise RecordError(
@@ -55,6 +55,14 @@ class Channel(eqx.Module):
     def rate(self) -> float:
         """Native sample rate in Hz, without the gaps."""
         return native_rate(self.time)
+
+
+def _absolute(name: str, time: ArrayLike) -> Samples:
+    """Time stamps in s, of dates since 1970."""
+    stamps = np.asarray(time)
+    dated = dates_in_seconds(stamps) if stamps.dtype.kind in "mM" else None
+    label = f"the time of channel {name!r}"
+    return as_float64(label, time, copy=False) if dated is None else dated
 
 
 def contiguous_part(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxquad.records import (
+    Channel,
     mix,
     read,
     read_segments,
@@ -102,6 +103,16 @@ def test_what_is_masked_is_a_gap():
     assert abs(kept.outputs[SPIKE, 0] - Y[SPIKE]) < 1e-4
     whole = np.ma.masked_array(np.arange(500), mask=np.arange(500) == SPIKE)
     assert record(outputs=whole, max_gap=0.1).outputs[SPIKE, 0] == SPIKE
+
+
+def test_a_channel_takes_masks_and_dates_as_a_record_does():
+    masked = np.ma.masked_array(Y, mask=np.arange(500) == SPIKE)
+    stamps = np.datetime64("2026-05-04T10:00") + (1e9 * TIME).astype("m8[ns]")
+    channel = Channel("y", stamps, masked)
+    assert np.isnan(channel.values[SPIKE]) and channel.rate == pytest.approx(100, rel=1e-4)
+    assert channel.time[0] == 1777888800.0
+    with pytest.raises(RecordError, match="'y' is a structured array"):
+        Channel("y", TIME, np.zeros(500, dtype=[("p", "f8")]))
 
 
 def test_a_structured_array_is_refused_with_its_fields():
