@@ -88,7 +88,7 @@ def _range(name: str, valid: Range | None) -> Range:
 
 
 def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarray:
-    """In float64, NaN where masked, a `copy` or a view. Raises RecordError for other than numbers."""
+    """In float64, NaN where masked; a `copy`, or a view. Raises RecordError for no numbers."""
     array = np.ma.asanyarray(values)
     if array.dtype.names:
         raise RecordError(
@@ -100,8 +100,6 @@ def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarra
     if array.dtype.kind == "c":
         raise RecordError(f"{label} is complex: a record holds real numbers.")
     try:
-        return np.array(
-            np.ma.filled(array.astype(np.float64, copy=False), np.nan), copy=copy or None
-        )
+        return np.asarray(np.ma.filled(array.astype(np.float64, copy=copy), np.nan))
     except (TypeError, ValueError) as error:
         raise RecordError(f"{label} is not an array of numbers: {error}.") from error
