@@ -11,10 +11,18 @@ from ._cost import (
     usable as usable,
 )
 from ._discrepancy import Discrepancy as Discrepancy
+from ._explain import Candidate as Candidate, Explanation as Explanation
 from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
+from ._half_bands import Bands as Bands
 from ._held import as_sampled as as_sampled
+from ._noise_model import (
+    ARMA as ARMA,
+    AutoRegressive as AutoRegressive,
+    Noise as Noise,
+    NoiseModel as NoiseModel,
+)
 from ._output_error import refine as refine
 from ._parameters import (
     Free as Free,

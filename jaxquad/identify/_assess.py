@@ -87,7 +87,7 @@ def assess(
         remedies = ("start from other values", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(parameters.names, decrement, cost, *remedies)
     else:
-        facts = _information(problem, solution, blocks, covariance, units)
+        facts = _information(problem, solution, blocks, (covariance, by_noise), units)
         verdict, by_data = _identifiability(facts, prior, bounds)
     return make_fit(
         problem,
@@ -424,14 +424,15 @@ def _information(
     problem: Problem,
     solution: Solution,
     blocks: list[Block],
-    covariance: Float[np.ndarray, "parameters parameters"],
+    covariances: tuple[Matrix, Matrix],
     units: Float[np.ndarray, " all"],
 ) -> Information:
-    """What the data say, with errors as wide as they are printed."""
+    """What the data say; the covariances are those with model error and by the noise alone."""
     places = problem.parameters.places
     return Information(
         root=information_root(blocks),
-        covariance=covariance,
+        covariance=covariances[0],
+        by_noise=covariances[1],
         names=tuple(place.name for place in places),
         values=np.asarray(solution.values),
         units=units,

@@ -100,19 +100,24 @@ class MaximumLikelihood(eqx.Module):
 
     def weights(self, points: Points, ratio: Ratio) -> Weights:
         # 1e-7 keeps noise-free records from weights that overflow.
-        error = np.maximum(np.asarray(points.frf.random_error), 1e-7) / ratio
+        # Where the model is off by far, as at the start, the measurement is the better guide.
+        error = np.maximum(np.asarray(points.frf.random_error), 1e-7) / np.clip(ratio, 1 / 3, 3)
         with np.errstate(invalid="ignore"):  # an unknown response has an infinite error
             deviation = np.hypot(error * np.sqrt(points.shared), points.floor)
         root = np.where(points.used, 1 / deviation, 0.0)
         return np.stack([root, root], axis=-1)
 
 
-def default_coherence(cost: Cost) -> float:
-    """The least coherence of a point that counts under `cost`, where nothing else is said.
+def least_coherence(given: float | None, cost: Cost, frf: FrequencyResponse) -> float:
+    """The least coherence of a point that counts: as `given`, or what is best for the cost.
 
     A cost that knows the noise weighs poor points as they deserve; others have to do without them.
+    So has the joint estimate, a ratio, whose error is no longer small where coherence is.
     """
-    return 0.05 if isinstance(cost, MaximumLikelihood) else 0.6
+    if given is not None:
+        return given
+    weighs = isinstance(cost, MaximumLikelihood) and frf.method == "direct"
+    return 0.05 if weighs else 0.6
 
 
 Range = tuple[float, float]
@@ -136,8 +141,8 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)
     known = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
     coherent = _local_mean(omega, np.asarray(frf.coherence)) >= least
-    information = _local_mean(omega, np.maximum(error, 1e-7) ** -2)
-    return known & coherent & (information >= _LARGEST**-2) & _in_band(frf, band)
+    sharp = _local_mean(omega, np.fmin(error, 1.0)) <= _LARGEST
+    return known & coherent & sharp & _in_band(frf, band)
 
 
 def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float) -> str:

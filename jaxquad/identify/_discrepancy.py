@@ -2,8 +2,8 @@
 
 The logarithm of measurement over model is noise plus a discrepancy: a Gaussian process over the
 logarithm of frequency, with one amplitude for all response pairs: in rad of phase, and 0.6 of it
-in neper of magnitude. Amplitude and length follow from the restricted likelihood, which leaves out what the
-parameters can take up themselves.
+in neper of magnitude. Amplitude and length follow from the restricted likelihood, which leaves out
+what the parameters can take up themselves.
 Source: Kennedy & O'Hagan (2001), Bayesian calibration of computer models; Rasmussen & Williams
 (2006), Gaussian Processes for Machine Learning, eq. 2.45.
 """

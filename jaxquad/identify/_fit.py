@@ -15,8 +15,8 @@ from ._bounds import settle_at_bounds, solve_within_bounds
 from ._cost import (
     Band,
     Cost,
-    default_coherence,
     describe_usable,
+    least_coherence,
     Mask,
     MaximumLikelihood,
     Points,
@@ -25,6 +25,7 @@ from ._cost import (
     usable,
     Weights,
 )
+from ._origin import Options, Origin
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem
 from ._result import Fit
@@ -94,8 +95,8 @@ def fit(
     - `band`: (low, high) in rad/s. A mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs
         of output and input a band of their own, or leaves them out with `None`.
     - `min_coherence`: frequencies with a lower coherence do not count; by default 0.05, which
-        maximum likelihood can weigh, and 0.6 for other costs. Those with a random error above 30 %
-        never count. Both are averaged over a third of an octave.
+        maximum likelihood can weigh, and 0.6 for other costs and for joint estimates. Those with
+        a random error above 30 % never count. Both are averaged over a third of an octave.
     - `starts`: how many starting points, spread around the model's values in a Latin hypercube.
         `Fit.minima` lists where they ended.
     - `solver`: any optimistix least-squares solver; Levenberg-Marquardt by default.
@@ -124,23 +125,40 @@ def fit(
     require_x64("a fit")
     frfs = require_responses(frf)
     check_options(cost, band, min_coherence, max_steps)
+    options = Options(
+        free, tied, cost, conditions, priors, band, min_coherence, starts, solver, max_steps
+    )
+    return fit_with(model, frfs, options)
+
+
+def fit_with(
+    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
+) -> Fit:
+    """Fit as `jq.fit` does.
+
+    **Arguments:**
+
+    - `model`, `frfs`, `options`: as in `jq.fit`.
+    - `rounds`: how often to solve again with what the model leaves unexplained as a floor on the
+        random error; 0 for estimates under the noise alone, whose costs compare structures.
+    """
     model = with_arrays(model)
-    parameters = select_parameters(model, free, tied)
-    least = default_coherence(cost) if min_coherence is None else min_coherence
-    used = [usable(one, band, least) for one in frfs]
-    _check_priors_against(model, priors, cost)
-    too_few = _too_few_points(frfs, used, parameters, least, band)
+    parameters = select_parameters(model, options.free, options.tied)
+    least = [least_coherence(options.min_coherence, options.cost, one) for one in frfs]
+    used = [usable(one, options.band, limit) for one, limit in zip(frfs, least, strict=True)]
+    _check_priors_against(model, options.priors, options.cost)
+    too_few = _too_few_points(frfs, used, parameters, max(least), options.band)
     if too_few is not None:
         remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
         return unfitted(model, parameters, too_few, tuple(remarks))
-    problem = make_problem(model, parameters, frfs, conditions, priors)
+    problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
     points = points_of(frfs, used)
-    how = (starts, solver, max_steps)
-    problem, solution, minima = _solve_reweighted(problem, points, cost, how)
+    problem, solution, minima = _solve_reweighted(problem, points, options)
     _check_finite(solution)
     check_priors(problem, solution)
-    problem, solution, counted = _solve_with_floor(problem, points, cost, solution, how)
-    return assess(problem, counted, solution, minima)
+    problem, solution, counted = _solve_with_floor(problem, points, solution, options, rounds)
+    found = assess(problem, counted, solution, minima)
+    return dataclasses.replace(found, origin=Origin(fit_with, tuple(points), options))
 
 
 def _too_few_points(
@@ -165,11 +183,11 @@ def _too_few_points(
 def _solve_reweighted(
     problem: Problem,
     points: Sequence[Points],
-    cost: Cost,
-    how: tuple[int, eqx.Module | None, int],
+    options: Options,
 ) -> tuple[Problem, Solution, tuple[Minimum, ...]]:
     """Solve; where the weights depend on the model, solve again under those of the solution."""
-    starts, solver, max_steps = how
+    starts, solver, max_steps = options.starts, options.solver, options.max_steps
+    cost = options.cost
     weights = _weights(cost, points, [np.ones(each.used.shape) for each in points])
     problem = problem.weighted([jnp.asarray(each) for each in weights])
     z, minima = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count]), ()
@@ -187,26 +205,25 @@ def _solve_reweighted(
     return problem, solve_within_bounds(problem, solution.z, solver, max_steps), minima
 
 
-_ROUNDS = 3  # solutions under a floor at most
 _SETTLED = 0.1  # relative change of weights that moves no estimate by more than a fraction of it
 
 
 def _solve_with_floor(
     problem: Problem,
     points: Sequence[Points],
-    cost: Cost,
     solution: Solution,
-    how: tuple[int, eqx.Module | None, int],
+    options: Options,
+    rounds: int,
 ) -> tuple[Problem, Solution, Counted]:
     """Solve again with what the model leaves unexplained as a floor on the random error."""
-    found = discrepancy_at(problem, points, solution)
-    for _ in range(_ROUNDS):
+    found, cost = discrepancy_at(problem, points, solution), options.cost
+    for _ in range(rounds):
         lifted = [_with_floor(each, found[0].amplitude) for each in points]
         weights = _weights(cost, lifted, _ratios(solution))
         if _are_close([np.asarray(each) for each in problem.weights], weights, _SETTLED):
             break
         problem = problem.weighted([jnp.asarray(each) for each in weights])
-        solution = solve_within_bounds(problem, solution.z, *how[1:])
+        solution = solve_within_bounds(problem, solution.z, options.solver, options.max_steps)
         _check_finite(solution)
         found = discrepancy_at(problem, points, solution)
     return problem, solution, Counted(points, _weights(cost, points, _ratios(solution)), found)

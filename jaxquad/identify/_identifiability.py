@@ -133,7 +133,8 @@ class Information(NamedTuple):
 
     The fixed ones take part in names only: the arm L in L K_t / J_x. `root` holds derivatives of
     ln-magnitudes and phases (alternate rows), in units of their random error, with respect to
-    relative changes; `covariance` is that of the free parameters' relative changes; `order` is
+    relative changes; `covariance` is that of the free parameters' relative changes, and `by_noise`
+    what of it the noise alone accounts for, if the model's error has a share in it; `order` is
     the model's own order of its parameters; `same` says whether other values of the free ones
     give the same responses.
     """
@@ -145,6 +146,7 @@ class Information(NamedTuple):
     units: Float[np.ndarray, " all"]
     order: tuple[int, ...]
     same: Callable[[Float[np.ndarray, " parameters"]], bool]
+    by_noise: Float[np.ndarray, "parameters parameters"] | None = None
 
 
 class _Group(NamedTuple):
@@ -165,6 +167,7 @@ def assess_identifiability(information: Information, bounds: tuple[Bound, ...] =
     at_zero = [information.names.index(bound.name) for bound in bounds]
     kept = np.setdiff1d(np.arange(len(information.names)), at_zero)
     free = kept[kept < count]
+    some = np.ix_(free, free)
 
     def widened(reduced: np.ndarray) -> np.ndarray:
         whole = np.zeros((*reduced.shape[:-1], count))
@@ -174,12 +177,13 @@ def assess_identifiability(information: Information, bounds: tuple[Bound, ...] =
     verdict = _assess(
         Information(
             root=information.root[:, kept],
-            covariance=information.covariance[np.ix_(free, free)],
+            covariance=information.covariance[some],
             names=tuple(information.names[k] for k in kept),
             values=information.values[kept],
             units=information.units[kept],
             order=tuple(information.order[k] for k in kept),
             same=lambda values: information.same(widened(values)),
+            by_noise=None if information.by_noise is None else information.by_noise[some],
         )
     )
     return dataclasses.replace(
@@ -197,8 +201,9 @@ def _assess(information: Information) -> Verdict:
     exact = singular <= _FLOOR * singular[0]
     null = right[exact | (singular * LIMIT < 1)]
     null = _sparse(null) if len(null) else null
-    lost = np.any(null, axis=0) | _imprecise(information.covariance)
-    null = _with_causes(null, information.covariance)
+    imprecise = _imprecise(information)
+    lost = np.any(null, axis=0) | imprecise
+    null = _with_causes(null, information.covariance, imprecise)
     sure = _sparse(right[exact]) if np.any(exact) else null[:0]
     information = information._replace(
         covariance=_with_null_variance(information.covariance, right[exact])
@@ -221,16 +226,23 @@ def _assess(information: Information) -> Verdict:
     )
 
 
-def _imprecise(covariance: np.ndarray) -> np.ndarray:
-    """Parameters with a standard error beyond the limit."""
-    return np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) > LIMIT
+def _imprecise(information: Information) -> np.ndarray:
+    """Parameters with a standard error beyond the limit, or beyond twice that with model error.
+
+    What a record determines is a matter of its noise; what is unknown by all of its size even so
+    is of no use to anyone.
+    """
+    covariance, by_noise = information.covariance, information.by_noise
+    parts = (covariance, covariance) if by_noise is None else (covariance, by_noise)
+    errors = [np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in parts]
+    return (errors[0] > 2 * LIMIT) | (errors[1] > LIMIT)
 
 
 def _with_causes(
-    null: Float[np.ndarray, "null parameters"], covariance: np.ndarray
+    null: Float[np.ndarray, "null parameters"], covariance: np.ndarray, imprecise: np.ndarray
 ) -> Float[np.ndarray, "more parameters"]:
     """`null`, and the direction of most variance of each imprecise parameter in none of them."""
-    left = _imprecise(covariance) & ~np.any(null, axis=0)
+    left = imprecise & ~np.any(null, axis=0)
     if not left.any():
         return null
     spread, directions = np.linalg.eigh(covariance)

@@ -9,7 +9,9 @@ from jaxtyping import PyTree
 from jaxquad.spectra import FrequencyResponse
 
 from ._cost import Band, Cost, MaximumLikelihood
-from ._fit import fit
+from ._fit import check_options, fit_with, require_responses
+from ._half_bands import model_to_start_from
+from ._origin import free_again, Options
 from ._parameters import Free, Parameters, Positive, Real, select_parameters, Tie
 from ._result import counted, Fit
 
@@ -100,47 +102,44 @@ def reduce_structure(
 
     Source: Tischler & Remple, ch. 13, model structure determination.
     """
+    check_options(cost, band, min_coherence, 1)
     options = _Options(tied, cost, band, min_coherence, null or {})
     parameters = select_parameters(model, free, tied)
-    kinds = _kinds(parameters)
+    kinds = {each.name: each for each in free_again(parameters)}
+    frfs = require_responses(frf)
     unknown = set(options.null) - set(parameters.names)
     if unknown:
         raise ValueError(
             f"null names {', '.join(sorted(unknown))}, which is not free; free are: "
             f"{', '.join(parameters.names)}"
         )
-    first = best = _fit_free(model, frf, kinds, options)
+    first = best = _fit_free(model, frfs, kinds, options)
     steps, needed = [], set()
     while len(best.names) > 1 and best.verdict.fitted:
         worst = _least_needed(best, needed, insensitivity, cramer_rao)
         if worst is None:
             break
         name, reason = worst
-        trial = _fit_without(best, frf, kinds, name, options)
+        trial = _fit_without(best, frfs, kinds, name, options)
         step = _decide(best, trial, name, reason, rise)
         steps.append(step)
         needed.add(name)
         best = trial if step.dropped and trial is not None else best
+    if best.verdict.fitted:
+        rest = {each: kinds[each] for each in best.names}
+        best = _fit_free(model_to_start_from(best), frfs, rest, options, rounds=3)
     return Reduction(best, first, tuple(steps))
 
 
-def _kinds(parameters: Parameters) -> dict[str, Positive | Real]:
-    """How each free parameter is fitted, with the size it had at the start."""
-    scales = np.abs(np.asarray(parameters.scale))
-    rows = zip(parameters.names, parameters.logarithmic, scales, strict=False)
-    return {name: Positive(name) if log else Real(name, float(size)) for name, log, size in rows}
-
-
-def _fit_free(model: PyTree, frf, kinds: Mapping[str, Positive | Real], options: _Options) -> Fit:
-    return fit(
-        model,
-        frf,
-        free=list(kinds.values()),
-        tied=options.tied,
-        cost=options.cost,
-        band=options.band,
-        min_coherence=options.min_coherence,
-    )
+def _fit_free(
+    model: PyTree, frfs, kinds: Mapping[str, Positive | Real], options: _Options, rounds: int = 0
+) -> Fit:
+    """Under the noise alone by default: a floor of each structure's own would hide its misfit."""
+    chosen = Options(
+        list(kinds.values()), options.tied, options.cost, None, (), options.band,
+        options.min_coherence, 1, None, 256,
+    )  # fmt: skip
+    return fit_with(model, frfs, chosen, rounds=rounds)
 
 
 def _least_needed(
@@ -159,7 +158,7 @@ def _least_needed(
 
 
 def _fit_without(
-    best: Fit, frf, kinds: Mapping[str, Positive | Real], name: str, options: _Options
+    best: Fit, frfs, kinds: Mapping[str, Positive | Real], name: str, options: _Options
 ) -> Fit | None:
     """The fit without one parameter, or None where the model has no response then."""
     place = best.parameters.places[best.names.index(name)]
@@ -167,7 +166,7 @@ def _fit_without(
     model = alone.replace(best.model, jnp.asarray([options.null.get(name, 0.0)]))
     rest = {each: kinds[each] for each in best.names if each != name}
     try:
-        return _fit_free(model, frf, rest, options)
+        return _fit_free(model, frfs, rest, options)
     except ValueError:
         return None
 

@@ -8,6 +8,10 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ._accuracy import Matrix
 from ._discrepancy import Discrepancy
+from ._explain import explain_misfit, Explanation
+from ._half_bands import Bands, fit_bands
+from ._origin import Origin
+from ._noise_model import NoiseModel
 from ._parameters import Parameters
 from ._starts import Minimum
 from ._verdict import Combination, pooled_freedom, reach_of_interval, UndeterminedError, Verdict
@@ -115,6 +119,8 @@ class Fit(eqx.Module):
     degrees_of_freedom: Float[np.ndarray, " parameters"]  # of the noise estimate behind the errors
     minima: tuple[Minimum, ...] = ()  # distinct stops of several starts, by the first weights
     discrepancy: Discrepancy | None = None  # what the model leaves unexplained, if it was looked at
+    noise_models: tuple[tuple[NoiseModel, ...], ...] = ()  # of each record's outputs, by jq.refine
+    origin: Origin | None = None  # the responses and options of `jq.fit`
 
     @property
     def identifiable(self) -> bool:
@@ -191,6 +197,34 @@ class Fit(eqx.Module):
             )
         error = float(np.sqrt(slope @ self.relative_covariance @ slope))
         return Combination(name, float(quantity(self.model)), error, self.freedom_of(slope))
+
+    def bands(self) -> Bands:
+        """The same parameters from the lower and from the upper half of the band.
+
+        Where the two disagree, the model does not hold over the whole band. The band is halved on
+        a logarithmic scale; each half is fitted from where this fit stopped.
+
+        **Returns:** a `jq.identify.Bands`, a table in print.
+
+        **Raises:**
+
+        - `ValueError`: the fit is not one of `jq.fit`.
+        """
+        return fit_bands(self)
+
+    def explain(self) -> Explanation:
+        """Which further term the responses want, where the model does not explain them.
+
+        The model is fitted again with one more pole or zero, a pair of them, rate damping, or the
+        slow pair of a hovering vehicle; the lowest information criterion (BIC) decides.
+
+        **Returns:** a `jq.identify.Explanation`, a table in print.
+
+        **Raises:**
+
+        - `ValueError`: the fit is not one of `jq.fit`.
+        """
+        return explain_misfit(self)
 
     def freedom_of(self, slope: Float[np.ndarray, " parameters"]) -> float:
         """Degrees of freedom of a quantity with this `slope` by relative changes."""

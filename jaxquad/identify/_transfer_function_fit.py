@@ -14,7 +14,7 @@ from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
 from ._assess import unfitted
-from ._cost import Band, Cost, default_coherence, MaximumLikelihood, Points
+from ._cost import Band, Cost, least_coherence, MaximumLikelihood, Points
 from ._fit import check_options, fit
 from ._parameters import name_places, Parameters, Real
 from ._rational import descend, Rational, Samples
@@ -173,7 +173,7 @@ def fit_transfer_function(
     check_options(cost, band, min_coherence, max_steps)
     structure = require_structure(zeros, poles, integrators, delay)
     pair = select_pair(require_single_response(frf), output, input)
-    least = default_coherence(cost) if min_coherence is None else min_coherence
+    least = least_coherence(min_coherence, cost, pair)
     points = usable_points(pair, band, least)
     too_few = too_few_points(points, structure, least)
     if too_few is not None:

@@ -14,8 +14,8 @@ from jaxquad.spectra import FrequencyResponse
 from ._cost import (
     Band,
     Cost,
-    default_coherence,
     describe_usable,
+    least_coherence,
     MaximumLikelihood,
     Points,
     points_of,
@@ -192,8 +192,9 @@ def guess_transfer_function(
     require_x64("a transfer function")
     check_options(cost, band, min_coherence, 1)
     structure = require_structure(zeros, poles, integrators, delay)
-    least = default_coherence(cost) if min_coherence is None else min_coherence
-    points = usable_points(select_pair(require_single_response(frf), output, input), band, least)
+    pair = select_pair(require_single_response(frf), output, input)
+    least = least_coherence(min_coherence, cost, pair)
+    points = usable_points(pair, band, least)
     reason = too_few_points(points, structure, least)
     if reason is not None:
         raise UndeterminedError(f"no transfer function from this record: {reason}; {MORE_POINTS}")
@@ -254,8 +255,8 @@ def too_few_points(points: Points, structure: Structure, least: float) -> str | 
     if count >= needed:
         return None
     return (
-        f"{describe_usable([points.frf], count, least)}, and {structure.unknowns} coefficients need "
-        f"at least {needed}"
+        f"{describe_usable([points.frf], count, least)}, and {structure.unknowns} coefficients "
+        f"need at least {needed}"
     )
 
 
