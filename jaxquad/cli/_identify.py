@@ -158,6 +158,7 @@ _OF_A_RECORD = {
     "rate": "resample to this rate; by default that of the result",
     "valid": "",
     "max_gap": "",
+    "hold": "for how long its input keeps each value; by default as in the result",
     "start": "",
     "stop": "",
     "band": "compare between these frequencies, in Hz; by default those that were fitted",
@@ -180,16 +181,17 @@ def _verify(options: argparse.Namespace) -> int:
     stored = read_result(options.result)
     check = verify_result(stored, options.file, given_settings(options, IdentifySettings))
     with stdout_for_json(options):
-        print(check)
         for doubt in stored.doubts:
             print(f"! {doubt}")
+        print(check)
         if options.out:
             options.out.parent.mkdir(parents=True, exist_ok=True)
             overlay(check, title=options.file.name).savefig(options.out, dpi=130)
             print(options.out)
     if options.json:
-        print_json(verification_content(check))
-    return 0
+        known = {"identifiable": stored.identifiable, "verdict": stored.summary}
+        print_json(known | verification_content(check))
+    return 0 if stored.identifiable else NOT_IDENTIFIABLE
 
 
 VERIFY = Command(
@@ -199,7 +201,8 @@ VERIFY = Command(
   jaxquad verify results/flight second_flight.npz --start 20 --stop 45 --out verification.png
 
 Channels, rate and band are those of the result, unless other ones are given.
-exit codes: 0 done, 2 unusable input, 3 the result holds no model
+exit codes: 0 done, 2 unusable input, 3 the record that was identified does not determine the
+parameters of the model, or the result holds none
 """,
     _add_verify,
     _verify,

@@ -20,8 +20,9 @@ _DASH = "\u2013"
 def parameter_section(fit: Fit, derived: Sequence[Combination]) -> dict[str, object]:
     """Every number with its standard error, and how good the fit is."""
     heads = ("parameter", "value", "std. error", "95 % interval", "CR, %", "insensitivity, %")
+    heads += () if fit.identifiable else ("stopped at",)
     rows = [_parameter(fit, k) for k in range(len(fit.names))]
-    rows += [[*_estimate(each), _DASH, _DASH] for each in derived]
+    rows += [[*_estimate(each), *[_DASH] * (len(heads) - 4)] for each in derived]
     return {
         "table": Table("Identified parameters", heads, rows),
         "bounds": [f"{bound:g}" for bound in _BOUNDS],
@@ -36,11 +37,15 @@ def parameter_section(fit: Fit, derived: Sequence[Combination]) -> dict[str, obj
 def _parameter(fit: Fit, k: int) -> list[str | Cell]:
     name = fit.names[k]
     value, error = float(fit.values[k]), float(fit.standard_errors[k])
-    cells = _estimate(Combination(name, value, error))
+    low, high = fit.interval(name)
+    cells = [*_estimate(Combination(name, value, error))[:-1], f"{low:.5g} .. {high:.5g}"]
+    stopped = [] if fit.identifiable else [""]
     if not fit.determined[k]:
-        cells = [Cell(f"{name} *"), *cells[1:-1], "not determined"]
+        stopped = [cells[1]]
+        cells = [Cell(f"{name} *"), "", cells[2], "not determined"]
     percents = zip((fit.cramer_rao[k], fit.insensitivity[k]), _BOUNDS, strict=True)
-    return [*cells, *(_marked(f"{x:.2f}", bool(x > most)) for x, most in percents)]
+    shares = [_marked(f"{x:.2f}" if np.isfinite(x) else "", bool(x > most)) for x, most in percents]
+    return [*cells, *shares, *stopped]
 
 
 def _estimate(one: Combination) -> list[str | Cell]:
@@ -106,15 +111,16 @@ def identifiability_section(fit: Fit) -> dict[str, object]:
         "lost": [], "texts": [], "combinations": None, "directions": None, "remedies": []
     }  # fmt: skip
     verdict = fit.verdict
+    bounds = [f"{bound}." for bound in verdict.bounds]
     if fit.identifiable:
-        return none | {"texts": [_least_sharp(fit)]}
+        return none | {"texts": [_least_sharp(fit), *bounds]}
     remedies = [f"{text[:1].upper()}{text[1:]}." for text in verdict.remedies]
     if verdict.kind != "not identifiable":
         return none | {"texts": [f"{verdict.summary}."], "remedies": remedies}
     texts = [] if fit.combinations else ["No combination of them is determined either."]
     return {
         "lost": verdict.undetermined,
-        "texts": [*texts, *(f"{reason}." for reason in verdict.reasons)],
+        "texts": [*texts, *(f"{reason}." for reason in verdict.reasons), *bounds],
         "combinations": _combinations(fit),
         "directions": _directions(fit),
         "remedies": remedies,

@@ -68,7 +68,7 @@ def write_report(
     models = _models(fit, frfs, models or {})
     remarks = remarks_of(fit, frfs, found)
     headlines = [fit_headline(fit, len(remarks))]
-    headlines += [check_headline(name, check) for name, check in found.items()]
+    headlines += [check_headline(name, check, fit) for name, check in found.items()]
     headlines += verdict_headlines(tuned) if tuned is not None else []
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
@@ -139,9 +139,13 @@ def _numbers(fit: Fit) -> str:
     return f"{', '.join(shown[:6])}{more} (95 % intervals)"
 
 
-def check_headline(name: str, check: Verification) -> Headline:
+def check_headline(name: str, check: Verification, fit: Fit) -> Headline:
     """Of the model simulated on a record."""
     numbers = f"{name}: fit {check.fit_percent:.1f} %, TIC {check.tic:.3f}"
+    if check.tic < GOOD_TIC and not fit.identifiable:
+        lost = ", ".join(fit.verdict.undetermined)
+        reason = f"{numbers}: right in what it does, but its record does not determine {lost}"
+        return Headline("warn", "VERIFIED AS A WHOLE", reason)
     if check.tic < GOOD_TIC:
         return Headline("good", "VERIFIED", f"{numbers} (good: below {GOOD_TIC})")
     return Headline("bad", "VERIFICATION FAILS", f"{numbers} (good: below {GOOD_TIC})")

@@ -61,6 +61,7 @@ def _fit(fit: Fit) -> dict[str, object]:
         "undetermined": fit.verdict.undetermined,
         "reasons": fit.verdict.reasons,
         "remedies": fit.verdict.remedies,
+        "bounds": [bound._asdict() for bound in fit.verdict.bounds],
     }
     known: dict[str, object] = {
         "identifiable": fit.identifiable,

@@ -103,11 +103,15 @@ class StoredResult(NamedTuple):
         return str(_part(_part(self.content, "fit"), "verdict").get("summary", ""))
 
     @property
+    def identifiable(self) -> bool:
+        """Whether the record determines every parameter."""
+        return _part(self.content, "fit").get("identifiable") is True
+
+    @property
     def doubts(self) -> tuple[str, ...]:
         """The verdict and the remarks of a result that is not identifiable."""
-        fit = _part(self.content, "fit")
-        remarks = fit.get("remarks")
-        if fit.get("identifiable") is True or not isinstance(remarks, list):
+        remarks = _part(self.content, "fit").get("remarks")
+        if self.identifiable or not isinstance(remarks, list):
             return ()
         return self.summary, *map(str, remarks)
 
