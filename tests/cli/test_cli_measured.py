@@ -82,3 +82,27 @@ def test_the_cessna_has_cifers_poles_at_a_lower_cost(identified):
     [(zeta, omega)] = re.findall(r"\[(\S+) \+- \S+, (\S+) \+-", printed)
     assert float(zeta) == pytest.approx(0.63, abs=0.02)
     assert float(omega) == pytest.approx(6.11, rel=0.01)
+
+
+def test_a_limit_far_beyond_the_record_gives_no_design_to_be_flown(identified, tmp_path, capsys):
+    """M stays within 0.79, and the data end at 75 rad/s, but wo runs to the sampling limit."""
+    _, _, result = identified("antx_log3_prbs.npz")
+    result["settings"]["units"] = {"q": "rad/s"}
+    (tmp_path / "result.json").write_text(json.dumps(result))
+    vehicle = ["--inertia", "0.0552", "--limit", "10", "--members", "16", "--fresh", "64"]
+    code = main(["tune", str(tmp_path), *vehicle])
+    printed = capsys.readouterr().out
+    assert code == 4 and printed.startswith(
+        "CERTIFICATE FAILS on 64 fresh members, not to be flown"
+    )
+    assert "members are lost" in printed and "FAIL CONVERGENCE" in printed
+    assert "ladrc.wo" in printed and "stands at its bound" in printed
+    stored = json.loads((tmp_path / "tuned" / "tuned.json").read_text())
+    page = (tmp_path / "tuned" / "report.html").read_text()
+    assert not stored["holds"] and {v["name"]: v["holds"] for v in stored["verdicts"]} == {
+        "STABILITY": True, "PERFORMANCE": False, "CONVERGENCE": False,
+    }  # fmt: skip
+    for text in (printed, str(stored["certificate"]["remarks"]), page):
+        assert "13 times the largest command of the record" in text
+        assert "rad/s lies beyond the identified band of 4.4 to 75.4 rad/s" in text
+    assert "CONVERGENCE FAILS" in page
