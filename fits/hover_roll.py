@@ -30,8 +30,8 @@ COSTS = {
     "maximum likelihood": jq.identify.MaximumLikelihood(),
     "Eq. (14)": jq.identify.CoherenceWeighted(),
 }
-# A wrong first guess; the held input is half a sample late.
-START = jq.models.AttitudeAxis(L=SHEET.arm, K_t=0.2, J_x=0.1, lag=0.03, delay=DT / 2)
+# A wrong first guess.
+START = jq.models.AttitudeAxis(L=SHEET.arm, K_t=0.2, J_x=0.1, lag=0.03)
 SWEEP = jq.sweep(0.3, 12.0, duration=90.0, sample_rate=1 / DT, amplitude=3.0)
 PULSES = jq.excitation.three_two_one_one(width=0.5, sample_rate=1 / DT, amplitude=3.0)
 

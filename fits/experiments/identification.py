@@ -24,8 +24,7 @@ def identified(
     asked, level = case.data["identify"], suite["plants"][case.data["plant"]]
     periodic = chunk.of(asked["periodic"]) > 0
     b = (truth.torque_gain / truth.inertia)[0]
-    # A command held for a sample comes half a sample late.
-    start = LaggedIntegrator(0.7 * b[0], 0.03, level["delay"] + suite["dt"] / 2, integrators=2)
+    start = LaggedIntegrator(0.7 * b[0], 0.03, level["delay"], integrators=2)
     rows = np.tile(np.array(_LOST), (len(b), 1))
     for k in range(count):
         if not np.asarray(done.diverged)[k]:

@@ -16,9 +16,8 @@ from .steps import AFTER, BEFORE, MATCHED, Steps
 
 def responses(roll: Roll) -> Any:
     """Figure 5."""
-    paper = jq.models.AttitudeAxis(
-        SHEET.arm, PAPER_THRUST, PAPER_INERTIA, lag=roll.joint.model.lag, delay=DT / 2
-    )
+    lag = roll.joint.model.lag
+    paper = jq.models.AttitudeAxis(SHEET.arm, PAPER_THRUST, PAPER_INERTIA, lag=lag)
     gain = roll.joint_gain.value
     models = {f"identified here, b = {gain:.3f}": roll.joint.model, "the paper's, b = 0.468": paper}
     apart = 20 * np.log10(PAPER_GAIN / gain)

@@ -14,10 +14,9 @@ from ._settings import IdentifySettings
 _RATE, _GAIN, _LAG, _DELAY = 250.0, 280.0, 0.02, 0.008  # Hz, rad/s^2 per unit of M, s, s
 _FEEDBACK = 0.02  # of M per rad/s
 _GUST, _CORNER, _NOISE = 2.0, 3.0, 0.01  # rad/s^2, rad/s, rad/s
-# An input that is held is half a sample late.
-DEMO_TRUTH: Mapping[str, float] = {"gain": _GAIN, "lag": _LAG, "delay": _DELAY + 0.5 / _RATE}
+DEMO_TRUTH: Mapping[str, float] = {"gain": _GAIN, "lag": _LAG, "delay": _DELAY}
 DEMO = IdentifySettings(
-    input="M", output="q", reference="x0", units={"q": "rad/s"}, band=(0.5, 12.0)
+    input="M", output="q", reference="x0", units={"q": "rad/s"}, band=(0.5, 12.0), hold="dt"
 )
 
 
