@@ -17,10 +17,10 @@ def _factors_text(factors: "Factors") -> str:
     """`-7.03 +- 0.2 (2.89 +- 0.1) / ((89.1 +- 9) [0.626 +- 0.01, 6.11 +- 0.05])`."""
     above = [_factor_text(each) for each in factors.zeros]
     below = ["(0)"] * factors.integrators + [_factor_text(each) for each in factors.poles]
-    lines = [" ".join([_number(*factors.gain[1:]), *above])]
+    lines = [" ".join([_number(*factors.gain[1:3]), *above])]
     lines[0] += f" / ({' '.join(below)})" if below else ""
     if factors.delay.value != 0:
-        lines[0] += f" exp(-({_number(*factors.delay[1:])}) s)"
+        lines[0] += f" exp(-({_number(*factors.delay[1:3])}) s)"
     lines.append(
         "(a) is s + a, [zeta, omega] is s^2 + 2 zeta omega s + omega^2, rad/s; +- one std. error"
     )

@@ -10,8 +10,8 @@ from ._accuracy import Matrix
 from ._discrepancy import Discrepancy
 from ._explain import explain_misfit, Explanation
 from ._half_bands import Bands, fit_bands
-from ._origin import Origin
 from ._noise_model import NoiseModel
+from ._origin import Origin
 from ._parameters import Parameters
 from ._starts import Minimum
 from ._verdict import Combination, pooled_freedom, reach_of_interval, UndeterminedError, Verdict
@@ -36,7 +36,9 @@ def _parameters(fit: "Fit") -> list[str]:
     names = [f"{name}{mark}" for name, mark in zip(fit.names, marks, strict=True)]
     width = max(9, *map(len, names))
     heads = (f"{'parameter':<{width}}", f"{'value':>11}", f"{'std. error':>10}")
-    heads = (*heads, f"{'95 % interval':>25}", f"{'CR %':>7}", f"{'insensitivity %':>15}")
+    apart = fit.discrepancy is not None
+    heads = (*heads, f"{'95 % interval':>25}", *([_BESIDE] if apart else []))
+    heads = (*heads, f"{'CR %':>7}", f"{'insensitivity %':>15}")
     heads += () if fit.identifiable else (f"{'stopped at':>11}",)
     lines = [" ".join(heads)]
     for k, name in enumerate(names):
@@ -46,15 +48,41 @@ def _parameters(fit: "Fit") -> list[str]:
         if stopped:
             value, interval = "-", "not determined"
         cells = [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>25}"]
+        cells += [_by_noise(fit, k)] if apart else []
         percent = f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:15.2f}"
         cells += percent if np.isfinite(fit.insensitivity[k]) else (f"{'-':>7}", f"{'-':>15}")
         lines.append(" ".join([f"{name:<{width}}", *cells, f"{stopped:>11}"]).rstrip())
+    if apart:
+        lines.append(_how_wide(fit))
     if not fit.identifiable:
         lines.append(
             "* this record does not determine it individually: where the solver stopped is for "
             "comparison alone"
         )
     return lines
+
+
+_BESIDE = f"{'by noise alone':>23} {'width':>6}"
+
+
+def _by_noise(fit: "Fit", k: int) -> str:
+    """The interval by the noise alone, and what makes the other one as wide as it is."""
+    if fit.discrepancy is None or not fit.determined[k]:
+        return " " * len(_BESIDE)
+    low, high = fit.interval(fit.names[k], model_error=False)
+    return f"{f'{low:.5g} .. {high:.5g}':>23} {fit.discrepancy.widths[k]:>6}"
+
+
+def _how_wide(fit: "Fit") -> str:
+    """What the model leaves unexplained, and what the words under "width" mean."""
+    found = fit.discrepancy
+    if found is None or found.none > 0.5:
+        return "95 % intervals with model error; the response shows none"
+    size, degrees = 100 * 0.6 * found.amplitude, np.degrees(found.amplitude)
+    text = f"95 % intervals with model error: {size:.2g} % and {degrees:.2g} deg are unexplained"
+    if "prior" in found.widths:
+        text += "; width prior: as models usually err, the response cannot tell"
+    return text
 
 
 def counted(number: int, one: str, many: str = "") -> str:

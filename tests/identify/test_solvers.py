@@ -32,7 +32,7 @@ def equation_14(log_values, response):
 )
 def test_the_minimum_of_equation_14_is_that_of_scipy(solver):
     frf = response_of(TRUTH, seed=0)
-    fit = jq.fit(START, frf, solver=solver)
+    fit = jq.fit(START, frf, solver=solver, cost=jq.identify.CoherenceWeighted())
     response = np.asarray(frf.response)[:, 0, 0]
     start = np.log([150.0, 0.03, 0.02])
     peer = least_squares(equation_14, start, args=(response,), method="lm", xtol=1e-12, ftol=1e-12)

@@ -17,6 +17,7 @@ from jaxquad.identify import factors, fit_transfer_function, guess_transfer_func
 OMEGA = np.geomspace(0.3, 60.0, 60)
 K, LAG, ZETA, WN, DELAY = 18.0, 0.045, 0.55, 7.0, 0.018
 DENOMINATOR = np.convolve([1.0, 2 * ZETA * WN, WN**2], [1.0, 1 / LAG])
+EQ_14 = jq.identify.CoherenceWeighted()
 PLANT = jq.TransferFunction([K * WN**2 / LAG], DENOMINATOR, DELAY)
 COEFFICIENTS = np.concatenate([[K * WN**2 / LAG], DENOMINATOR[1:], [DELAY]])
 
@@ -162,7 +163,7 @@ def test_automatic_starts_reach_the_lowest_minimum_of_random_plants():
     for k in range(20):
         truth = random_plant(rng, 1 + k % 6)
         frf = response_of(truth, error=0.05, seed=k, omega=OMEGA)
-        guess = guess_transfer_function(frf, len(truth.zeros), len(truth.poles))
+        guess = guess_transfer_function(frf, len(truth.zeros), len(truth.poles), cost=EQ_14)
         late = float(truth.delay) > 0
         reference = scipy_minimum(truth, frf, delay=late)[1]
         # A guess whose delay stopped at 0 may be above a peer's that went below it.
@@ -173,7 +174,7 @@ def test_automatic_starts_reach_the_lowest_minimum_of_random_plants():
 @pytest.mark.parametrize("seed", [None, 0])
 def test_the_minimum_is_that_of_scipy_and_the_plant_is_recovered(seed):
     frf = response_of(PLANT, seed=seed, omega=OMEGA)
-    fit = fit_transfer_function(frf, zeros=0, poles=3)
+    fit = fit_transfer_function(frf, zeros=0, poles=3, cost=EQ_14)
     start = jq.TransferFunction(1.1 * COEFFICIENTS[:1], PLANT.denominator, 1.1 * DELAY)
     values, cost = scipy_minimum(start, frf, delay=True)
     np.testing.assert_allclose(fit.values, values, rtol=1e-6)
