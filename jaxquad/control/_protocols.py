@@ -10,11 +10,18 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 
 class Setpoint(NamedTuple):
-    """A reference with its derivatives, for feed-forward."""
+    """A reference with its derivatives, for feed-forward.
 
-    angle: Float[Array, " axes *ensemble"]  # rad
-    rate: Float[Array, " axes *ensemble"]  # rad/s
-    acceleration: Float[Array, " axes *ensemble"]  # rad/s^2
+    **Arguments:**
+
+    - `angle`: rad.
+    - `rate`: rad/s.
+    - `acceleration`: rad/s^2.
+    """
+
+    angle: Float[Array, " axes *ensemble"]
+    rate: Float[Array, " axes *ensemble"]
+    acceleration: Float[Array, " axes *ensemble"]
 
 
 Reference = Setpoint | Float[Array, " axes *ensemble"]  # angles in rad have no feed-forward
@@ -188,11 +195,18 @@ class AntiWindup(Protocol):
 
 
 class InertiaEstimate(NamedTuple):
-    """An estimate of the inertia with its uncertainty."""
+    """An estimate of the inertia with its uncertainty.
 
-    inertia: Float[Array, " axes *ensemble"]  # kg m^2; the nominal one before any excitation
-    deviation: Float[Array, " axes *ensemble"]  # kg m^2, one standard deviation
-    trusted: Float[Array, " axes *ensemble"]  # 1 where excited and precise enough, else 0
+    **Arguments:**
+
+    - `inertia`: kg m^2; the nominal one before any excitation.
+    - `deviation`: kg m^2, one standard deviation.
+    - `trusted`: 1 where excited and precise enough, else 0.
+    """
+
+    inertia: Float[Array, " axes *ensemble"]
+    deviation: Float[Array, " axes *ensemble"]
+    trusted: Float[Array, " axes *ensemble"]
 
 
 @runtime_checkable

@@ -23,6 +23,11 @@ class ScheduledLADRC(eqx.Module):
     The `ladrc`'s own b0 has no effect. A loop flies and analyses `scheduled_at(inertia)`; exported
     to C, the controller is given its inertia in flight. Source: Eq. (25) of docs/equations.md, with
     the map of docs/control.md.
+
+    **Arguments:**
+
+    - `ladrc`: the `LADRC` at any b0.
+    - `map`: from the inertia in kg m^2 to b0, such as a `jq.control.InertiaMap`.
     """
 
     ladrc: LADRC
@@ -73,6 +78,11 @@ class ScheduledPID(eqx.Module):
     kp, ki and kd of `pid` are those of b u, in rad/s^2 per rad, per rad s and per rad/s; its
     feedforward is the share of the reference's acceleration, 1 for all of it. Filters, weights,
     limit and anti-windup do not change. A loop flies and analyses `scheduled_at(inertia)`.
+
+    **Arguments:**
+
+    - `pid`: the `PID` of the acceleration.
+    - `map`: from the inertia in kg m^2 to b0, such as a `jq.control.InertiaMap`.
     """
 
     pid: PID

@@ -161,22 +161,39 @@ class LoopAnalysis(eqx.Module):
     Its gradient grows as 1 / smoothing there: tune with 0.1 or 1.
     Margins are those of the loop broken at the command. In an unstable loop they are `nan`, and
     sensitivity peak and noise gain are infinite, whose gradients are 0.
+
+    **Arguments:**
+
+    - `abscissa`: 1/s.
+    - `stable`: whether every pole decays.
+    - `sensitivity_peak`: Ms, the greatest |S|.
+    - `sensitivity_frequency`: rad/s, of that peak.
+    - `rejection_bandwidth`: rad/s, where |S| first rises through -3 dB.
+    - `gain_margin`: factor by which the gain may rise; inf if any.
+    - `gain_reduction`: factor to which it may fall; 0 if any.
+    - `phase_margin`: rad.
+    - `crossover`: rad/s, of the phase margin.
+    - `delay_margin`: s, from the phase margin at its crossover.
+    - `noise_gain`: rms of the command per rms of white measurement noise.
+    - `closed`: the closed loop as a matrix.
+    - `loop`: the loop broken at the command.
+    - `dt`: s.
     """
 
-    abscissa: Float[Array, "*ensemble"]  # 1/s
+    abscissa: Float[Array, "*ensemble"]
     stable: Bool[Array, "*ensemble"]
-    sensitivity_peak: Float[Array, "*ensemble"]  # Ms
-    sensitivity_frequency: Float[Array, "*ensemble"]  # rad/s, of that peak
-    rejection_bandwidth: Float[Array, "*ensemble"]  # rad/s, where |S| first rises through -3 dB
-    gain_margin: Float[Array, "*ensemble"]  # factor by which the gain may rise; inf if any
-    gain_reduction: Float[Array, "*ensemble"]  # factor to which it may fall; 0 if any
-    phase_margin: Float[Array, "*ensemble"]  # rad
-    crossover: Float[Array, "*ensemble"]  # rad/s, of the phase margin
-    delay_margin: Float[Array, "*ensemble"]  # s, from the phase margin at its crossover
-    noise_gain: Float[Array, "*ensemble"]  # rms of the command per rms of white measurement noise
+    sensitivity_peak: Float[Array, "*ensemble"]
+    sensitivity_frequency: Float[Array, "*ensemble"]
+    rejection_bandwidth: Float[Array, "*ensemble"]
+    gain_margin: Float[Array, "*ensemble"]
+    gain_reduction: Float[Array, "*ensemble"]
+    phase_margin: Float[Array, "*ensemble"]
+    crossover: Float[Array, "*ensemble"]
+    delay_margin: Float[Array, "*ensemble"]
+    noise_gain: Float[Array, "*ensemble"]
     closed: ClosedLoopMatrix
     loop: OpenLoop
-    dt: float = eqx.field(static=True)  # s
+    dt: float = eqx.field(static=True)
 
     @property
     def poles(self) -> np.ndarray:

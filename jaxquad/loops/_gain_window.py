@@ -27,6 +27,10 @@ class GainWindow(NamedTuple):
 
     An end that the search does not reach, a ten-thousandth or ten thousand times the plant's own
     gain, is 0 or infinite.
+
+    **Arguments:**
+
+    - `low`, `high`: b/b0, in the shape of the loop's ensemble.
     """
 
     low: Float[Array, "*ensemble"]

@@ -16,13 +16,25 @@ from .formats import load_signals
 
 
 class ChannelSummary(NamedTuple):
-    """One channel of a file: NaN for its rate and times where it has no usable time base."""
+    """One channel of a file: NaN for its rate and times where it has no usable time base.
+
+    **Arguments:**
+
+    - `name`: of the channel.
+    - `samples`: their number.
+    - `rate`: Hz, without gaps.
+    - `start`: s.
+    - `stop`: s.
+    - `minimum`: of the finite values.
+    - `maximum`: likewise.
+    - `unit`: empty where unknown.
+    """
 
     name: str
     samples: int
-    rate: float  # Hz, without gaps
-    start: float  # s
-    stop: float  # s
+    rate: float
+    start: float
+    stop: float
     minimum: float
     maximum: float
     unit: str

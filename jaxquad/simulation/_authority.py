@@ -21,18 +21,20 @@ class AuthorityWarning(UserWarning):
 
 
 class Authority(eqx.Module):
-    """The torque that a drive can hold against a disturbance, one axis at a time."""
+    """The torque that a drive can hold against a disturbance, one axis at a time.
 
-    torque_gain: Float[Array, " axes *ensemble"] = per_member(rank=1)  # N m per unit of command
-    command: Float[Array, "axes ..."] = per_member(
-        rank=1
-    )  # greatest command, of the drive and the controller; or inf
-    torque: Float[Array, "axes ..."] = per_member(
-        rank=1
-    )  # N m, at the limit of the command; inf without one
-    forward: Float[Array, "axes ..."] = per_member(
-        rank=1
-    )  # N m, until a motor turns backwards; inf if none can
+    **Arguments:**
+
+    - `torque_gain`: N m per unit of command.
+    - `command`: greatest command, of the drive and the controller; or inf.
+    - `torque`: N m, at the limit of the command; inf without one.
+    - `forward`: N m, until a motor turns backwards; inf if none can.
+    """
+
+    torque_gain: Float[Array, " axes *ensemble"] = per_member(rank=1)
+    command: Float[Array, "axes ..."] = per_member(rank=1)
+    torque: Float[Array, "axes ..."] = per_member(rank=1)
+    forward: Float[Array, "axes ..."] = per_member(rank=1)
 
     def __str__(self) -> str:
         rows = []

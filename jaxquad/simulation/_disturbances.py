@@ -90,9 +90,17 @@ class Pulse(Signal):
 class Gust(Signal):
     """First-order Gauss-Markov noise: stationary from the first sample, exact at the samples.
 
-    `deviation` is its standard deviation in the unit of the signal (N m for a torque), `corner` its
-    bandwidth in rad/s: the spectrum is that of white noise through K / (s + corner), with
-    K = deviation sqrt(2 corner). Each axis and member draws its own.
+    The spectrum is that of white noise through K / (s + corner), with K = deviation sqrt(2 corner).
+    Each axis and member draws its own.
+
+    **Arguments:**
+
+    - `deviation`: standard deviation in the unit of the signal, N m for a torque.
+    - `corner`: bandwidth in rad/s.
+
+    **Raises:**
+
+    - `ValueError`: the deviation is below 0, or the corner is not above 0.
     """
 
     deviation: Float[Array, "..."] = eqx.field(converter=as_float)
@@ -113,7 +121,16 @@ class Gust(Signal):
 
 
 class WhiteNoise(Signal):
-    """Independent normal values of standard `deviation`, each axis and member with its own."""
+    """Independent normal values, each axis and member with its own.
+
+    **Arguments:**
+
+    - `deviation`: standard deviation in the unit of the signal, rad for a measurement.
+
+    **Raises:**
+
+    - `ValueError`: the deviation is below 0.
+    """
 
     deviation: Float[Array, "..."] = eqx.field(converter=as_float)
 

@@ -112,7 +112,13 @@ class RotorDrive(eqx.Module):
 class Saturation(eqx.Module):
     """A drive that takes commands as they are, within a limit: for `jq.DecoupledAxes`.
 
-    Raises ValueError for a limit that is not above 0.
+    **Arguments:**
+
+    - `limit`: of |command|, in its unit; one value, or one per axis.
+
+    **Raises:**
+
+    - `ValueError`: the limit is not above 0.
     """
 
     limit: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # of |u|; [], [axes, ...]
@@ -135,7 +141,16 @@ class Saturation(eqx.Module):
 
 
 class Encoder(eqx.Module):
-    """An optical encoder: angles in steps of one count, with the gradient of the angle itself."""
+    """An optical encoder: angles in steps of one count, with the gradient of the angle itself.
+
+    **Arguments:**
+
+    - `counts`: in a revolution.
+
+    **Raises:**
+
+    - `ValueError`: there is less than one count.
+    """
 
     counts: int = eqx.field(static=True, default=8192)  # per revolution
 

@@ -19,12 +19,20 @@ _TIMES = ("rise_time", "settling_time", "settling_time_5")
 
 
 class Spread(NamedTuple):
-    """One number over an ensemble; inf where it rests on members that never get there."""
+    """One number over an ensemble; inf where it rests on members that never get there.
+
+    **Arguments:**
+
+    - `mean`: over the members.
+    - `p95`: their 95 % quantile.
+    - `worst`: of them.
+    - `cvar20`: mean of the worst fifth.
+    """
 
     mean: Float[Array, " axes"]
     p95: Float[Array, " axes"]
     worst: Float[Array, " axes"]
-    cvar20: Float[Array, " axes"]  # mean of the worst fifth
+    cvar20: Float[Array, " axes"]
 
 
 class Summary(eqx.Module):

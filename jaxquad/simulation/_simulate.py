@@ -23,18 +23,31 @@ class Simulation(eqx.Module):
 
     Where an angle exceeds the loop's `bound`, the member has `diverged`: it is held at that angle
     with command 0. Its numbers are finite, but they describe no flight.
+
+    **Arguments:**
+
+    - `time`: s.
+    - `angle`: true, rad.
+    - `measurement`: rad.
+    - `command`: achieved, V.
+    - `saturated`: whether the drive gave less than was asked.
+    - `signals`: of the controller, [samples, axes, *ensemble].
+    - `diverged`: whether the member left the bound.
+    - `scenario`: as it was given.
+    - `dt`: s.
+    - `authority`: the torque that the drive can hold; None for a plant that does not tell it.
     """
 
-    time: Float[Array, " samples"]  # s
-    angle: Float[Array, " samples axes *ensemble"]  # true, rad
-    measurement: Float[Array, " samples axes *ensemble"]  # rad
-    command: Float[Array, " samples axes *ensemble"]  # achieved, V
-    saturated: Bool[Array, " samples axes *ensemble"]  # the drive gave less than was asked
-    signals: dict[str, Array]  # of the controller, [samples, axes, *ensemble]
+    time: Float[Array, " samples"]
+    angle: Float[Array, " samples axes *ensemble"]
+    measurement: Float[Array, " samples axes *ensemble"]
+    command: Float[Array, " samples axes *ensemble"]
+    saturated: Bool[Array, " samples axes *ensemble"]
+    signals: dict[str, Array]
     diverged: Bool[Array, "*ensemble"]
-    scenario: Scenario  # as it was given
-    dt: float = eqx.field(static=True, default=0.002)  # s
-    authority: Authority | None = None  # None: of a plant that does not tell it
+    scenario: Scenario
+    dt: float = eqx.field(static=True, default=0.002)
+    authority: Authority | None = None
 
     @property
     def reference(self) -> Float[Array, " samples axes *ensemble"]:

@@ -155,20 +155,35 @@ class Bandwidth(eqx.Module):
 
     `bandwidth` is the lesser of the phase and the gain bandwidth, as for rate command; for
     attitude command with attitude hold, ADS-33 takes the phase bandwidth alone.
+
+    **Arguments:**
+
+    - `bandwidth`: rad/s.
+    - `phase_bandwidth`: rad/s, where the phase falls through -135 deg.
+    - `gain_bandwidth`: rad/s, where the magnitude is 6 dB above that at w180.
+    - `omega_180`: rad/s, where the phase falls through -180 deg.
+    - `phase_delay`: s, from the phase at w180 and at 2 w180.
+    - `phase_delay_fit`: s, from a straight line through the phase between them.
+    - `gain_crossings`: how often the magnitude falls through that level below w180.
+    - `phase_crossings`: how often the phase passes -135 or -180 deg.
+    - `standard_errors`: of a measured response, by the names above; else empty.
+    - `basis`: what the numbers were found from.
+    - `quantity`: what the response is of.
+    - `branch`: who chose the branch of the phase at the lowest frequency.
     """
 
-    bandwidth: Float[Array, ""]  # rad/s
-    phase_bandwidth: Float[Array, ""]  # rad/s, where the phase falls through -135 deg
-    gain_bandwidth: Float[Array, ""]  # rad/s, where the magnitude is 6 dB above that at w180
-    omega_180: Float[Array, ""]  # rad/s, where the phase falls through -180 deg
-    phase_delay: Float[Array, ""]  # s, from the phase at w180 and at 2 w180
-    phase_delay_fit: Float[Array, ""]  # s, from a straight line through the phase between them
-    gain_crossings: Float[Array, ""]  # how often the magnitude falls through that level below w180
-    phase_crossings: Float[Array, ""]  # how often the phase passes -135 or -180 deg
-    standard_errors: dict[str, Array]  # of a measured response, by the names above; else empty
+    bandwidth: Float[Array, ""]
+    phase_bandwidth: Float[Array, ""]
+    gain_bandwidth: Float[Array, ""]
+    omega_180: Float[Array, ""]
+    phase_delay: Float[Array, ""]
+    phase_delay_fit: Float[Array, ""]
+    gain_crossings: Float[Array, ""]
+    phase_crossings: Float[Array, ""]
+    standard_errors: dict[str, Array]
     basis: Basis
     quantity: str = eqx.field(static=True)
-    branch: str = eqx.field(static=True)  # of the phase at the lowest frequency: whose choice
+    branch: str = eqx.field(static=True)
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -80,24 +80,45 @@ class Margins(eqx.Module):
     A gain margin is the factor by which the loop's gain may change: `gain_margin` upwards,
     `gain_reduction` downwards, which only conditionally stable loops have. The lists hold every
     crossing, padded with `nan`; beyond 16, those nearest to -1.
+
+    **Arguments:**
+
+    - `phase_margin`: rad, the smallest; negative beyond -180 deg.
+    - `crossover`: rad/s, of that phase margin.
+    - `delay_margin`: s, the smallest.
+    - `delay_crossover`: rad/s, of that delay margin.
+    - `gain_margin`: smallest factor above 1.
+    - `phase_crossover`: rad/s, of that gain margin.
+    - `gain_reduction`: greatest factor below 1.
+    - `reduction_crossover`: rad/s, of that reduction.
+    - `crossovers`: rad/s, where |L| = 1.
+    - `phase_margins`: rad, -pi to pi, at those crossings.
+    - `delay_margins`: s, at those crossings.
+    - `phase_crossovers`: rad/s, where L is real and negative.
+    - `gain_margins`: 1 / |L| at those crossings.
+    - `unstable_roots`: of the closed loop, by Nyquist's count; nan if unknown.
+    - `left_out`: crossings beyond 16 of a kind.
+    - `standard_errors`: of a measured response, by the names above; else empty.
+    - `basis`: what the numbers were found from.
+    - `unstable_poles`: of L, as they were given.
     """
 
-    phase_margin: Float[Array, ""]  # rad, the smallest; negative beyond -180 deg
-    crossover: Float[Array, ""]  # rad/s, of that phase margin
-    delay_margin: Float[Array, ""]  # s, the smallest
-    delay_crossover: Float[Array, ""]  # rad/s
-    gain_margin: Float[Array, ""]  # smallest factor above 1
-    phase_crossover: Float[Array, ""]  # rad/s
-    gain_reduction: Float[Array, ""]  # greatest factor below 1
-    reduction_crossover: Float[Array, ""]  # rad/s
-    crossovers: Float[Array, " crossings"]  # rad/s, where |L| = 1
-    phase_margins: Float[Array, " crossings"]  # rad, -pi to pi
-    delay_margins: Float[Array, " crossings"]  # s
-    phase_crossovers: Float[Array, " crossings"]  # rad/s, where L is real and negative
-    gain_margins: Float[Array, " crossings"]  # 1 / |L|
-    unstable_roots: Float[Array, ""]  # of the closed loop, by Nyquist's count; nan if unknown
-    left_out: Float[Array, ""]  # crossings beyond 16 of a kind
-    standard_errors: dict[str, Array]  # of a measured response, by the names above; else empty
+    phase_margin: Float[Array, ""]
+    crossover: Float[Array, ""]
+    delay_margin: Float[Array, ""]
+    delay_crossover: Float[Array, ""]
+    gain_margin: Float[Array, ""]
+    phase_crossover: Float[Array, ""]
+    gain_reduction: Float[Array, ""]
+    reduction_crossover: Float[Array, ""]
+    crossovers: Float[Array, " crossings"]
+    phase_margins: Float[Array, " crossings"]
+    delay_margins: Float[Array, " crossings"]
+    phase_crossovers: Float[Array, " crossings"]
+    gain_margins: Float[Array, " crossings"]
+    unstable_roots: Float[Array, ""]
+    left_out: Float[Array, ""]
+    standard_errors: dict[str, Array]
     basis: Basis
     unstable_poles: int = eqx.field(static=True)
 

@@ -30,17 +30,32 @@ class Rejection(eqx.Module):
     """How a loop rejects disturbances: S = 1 / (1 + L), and T = 1 - S.
 
     `str()` says why a number is missing (`nan`), and where a peak lies on the edge of the band.
+
+    **Arguments:**
+
+    - `bandwidth`: rad/s, DRB: where |S| first rises through -3 dB.
+    - `peak`: DRP or Ms: greatest |S|.
+    - `peak_frequency`: rad/s, of that peak.
+    - `complementary_peak`: Mt: greatest |T|.
+    - `complementary_peak_frequency`: rad/s, of that peak.
+    - `start`: |S| at the lowest frequency.
+    - `rivals`: measured points within two standard errors of the peak of S.
+    - `unstable_roots`: of the closed loop, by Nyquist's count; nan if unknown.
+    - `standard_errors`: of a measured response, by the names above; else empty.
+    - `basis`: what the numbers were found from.
+    - `unstable_poles`: of L, as they were given.
+    - `quantity`: what the response is of.
     """
 
-    bandwidth: Float[Array, ""]  # rad/s, DRB: where |S| first rises through -3 dB
-    peak: Float[Array, ""]  # DRP or Ms: greatest |S|
-    peak_frequency: Float[Array, ""]  # rad/s
-    complementary_peak: Float[Array, ""]  # Mt: greatest |T|
-    complementary_peak_frequency: Float[Array, ""]  # rad/s
-    start: Float[Array, ""]  # |S| at the lowest frequency
-    rivals: Float[Array, ""]  # measured points within two standard errors of the peak of S
-    unstable_roots: Float[Array, ""]  # of the closed loop, by Nyquist's count; nan if unknown
-    standard_errors: dict[str, Array]  # of a measured response, by the names above; else empty
+    bandwidth: Float[Array, ""]
+    peak: Float[Array, ""]
+    peak_frequency: Float[Array, ""]
+    complementary_peak: Float[Array, ""]
+    complementary_peak_frequency: Float[Array, ""]
+    start: Float[Array, ""]
+    rivals: Float[Array, ""]
+    unstable_roots: Float[Array, ""]
+    standard_errors: dict[str, Array]
     basis: Basis
     unstable_poles: int = eqx.field(static=True)
     quantity: str = eqx.field(static=True)

@@ -59,13 +59,23 @@ _ORDERS = (8, 5)  # of Gauss' rule in each interval, and of the one that checks 
 
 
 class RmsResponse(eqx.Module):
-    """Root mean square of a response within a band, in the unit of the output."""
+    """Root mean square of a response within a band, in the unit of the output.
+
+    **Arguments:**
+
+    - `rms`: root mean square, in the unit of the output.
+    - `edges`: shares of the power from the lowest and the highest octave.
+    - `integration_error`: of a model's rms, relative.
+    - `incoherent`: share of the power from a measured coherence below 0.6.
+    - `standard_errors`: of a measured response; else empty.
+    - `basis`: what the numbers were found from.
+    """
 
     rms: Float[Array, ""]
-    edges: Float[Array, "2"]  # shares of the power from the lowest and the highest octave
-    integration_error: Float[Array, ""]  # of a model's rms, relative
-    incoherent: Float[Array, ""]  # share of the power from a measured coherence below 0.6
-    standard_errors: dict[str, Array]  # of a measured response; else empty
+    edges: Float[Array, "2"]
+    integration_error: Float[Array, ""]
+    incoherent: Float[Array, ""]
+    standard_errors: dict[str, Array]
     basis: Basis
 
     @property
