@@ -29,6 +29,10 @@ class LocalPolynomial(eqx.Module):
         differenced as often, and the response is divided by the differencing filter.
     - `delay`: approximate delay of the output in s, which is removed before the fit and restored
         afterwards.
+    - `global_order`: largest order, 0 to 20, of a rational model of the whole record with the
+        transients of its ends. The data choose its order; it is subtracted before the local fits
+        and added back, so that modes which still ring at the record's end do not spoil them. 0
+        switches it off.
 
     **Raises:**
 
@@ -39,10 +43,13 @@ class LocalPolynomial(eqx.Module):
     width: float | None = eqx.field(static=True, default=None)
     integrators: int = eqx.field(static=True, default=0)
     delay: float = eqx.field(static=True, default=0.0)
+    global_order: int = eqx.field(static=True, default=12)
 
     def __check_init__(self):
         if self.order not in range(7):
             raise ValueError(f"order is {self.order}: use 0 to 6 (usually 2)")
+        if self.global_order not in range(21):
+            raise ValueError(f"global_order is {self.global_order}: use 0 to 20 (usually 12)")
         if self.width is not None and not 0 < self.width < np.inf:
             raise ValueError(f"width is {self.width} rad/s: it must be positive, or None")
         if self.integrators not in (0, 1, 2, 3):

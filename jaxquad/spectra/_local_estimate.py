@@ -9,6 +9,8 @@ from jaxquad.records import Record
 
 from ._error_covariance import ErrorCovariance
 from ._estimators import LocalPolynomial
+from ._feedback import COHERENT
+from ._global_rest import Rest, shared_errors, subtract_models
 from ._local_fit import (
     Bins,
     check_bins,
@@ -18,20 +20,39 @@ from ._local_fit import (
     record_bins,
     replace_rows,
     smallest_widths,
+    window_slices,
 )
 from ._local_noise import (
+    BANDWIDTH,
+    coloured_gain,
     error_covariance,
     multiple_coherence,
     Noise,
     partial_coherence,
     power_alone,
     smooth_noise,
+    undetermined,
+    unresolved,
 )
 from ._local_width import choose_widths, reach, Respond, Shape
+from ._noise_freedom import covariance_of_bands, smoothed
 from ._remarks import Remark
 
 
 _DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest
+
+
+def joint_factors(fit: LocalFit, inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where T_ru has an inverse, [-G, 1], and that inverse: dG = [-G, 1] dT T_ru^-1."""
+    known = np.isfinite(fit.response[:, 0, 0])
+    through = np.where(known[:, None, None], fit.response[:, :inputs], np.eye(inputs))
+    strength = np.linalg.svd(through, compute_uv=False)
+    known &= strength[:, -1] > _DEPENDENT * strength[:, 0]
+    back = np.linalg.inv(np.where(known[:, None, None], through, np.eye(inputs)))
+    response = fit.response[:, inputs:] @ back
+    outputs = response.shape[1]
+    ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
+    return known, np.concatenate([-response, ones], axis=2), back
 
 
 def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
@@ -41,15 +62,8 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     references taken through T_ru^-1. Source: Pintelon and Schoukens, System Identification,
     2nd ed., section 2.6 (several inputs: 7.2.7).
     """
-    known = np.isfinite(fit.response[:, 0, 0])
-    through = np.where(known[:, None, None], fit.response[:, :inputs], np.eye(inputs))
-    strength = np.linalg.svd(through, compute_uv=False)
-    known &= strength[:, -1] > _DEPENDENT * strength[:, 0]
-    back = np.linalg.inv(np.where(known[:, None, None], through, np.eye(inputs)))
-    response = fit.response[:, inputs:] @ back
-    outputs = response.shape[1]
-    ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
-    left = np.concatenate([-response, ones], axis=2)
+    known, left, back = joint_factors(fit, inputs)
+    through, response = fit.response[:, :inputs], -left[:, :, :inputs]
     blank = np.where(known, 1.0, np.nan)[:, None, None]
     effect = np.swapaxes(back, 1, 2) @ fit.effect * blank
     scatter = left @ fit.scatter @ _adjoint(left) * blank
@@ -116,6 +130,7 @@ class LocalEstimate(NamedTuple):
     errors: ErrorCovariance
     half_width: Grid  # rad/s
     rational: Bool[np.ndarray, " frequencies"]  # where a rational function is used, at a resonance
+    log_noise_covariance: Float[np.ndarray, "frequencies frequencies"]
     remarks: tuple[Remark, ...]
 
 
@@ -135,22 +150,39 @@ def estimate_local_polynomial(
     check_bins(omega, bins, coefficients, order + 1, _FREEDOM)
     grid, at = _with_neighbours(omega, bins)
     least = smallest_widths(grid, bins, coefficients, order + 1, _FREEDOM)
-    respond = _responder(bins, inputs, outputs, order, method)
+    whole = _whole(bins, inputs, outputs, method)
+    rest = subtract_models(bins, *whole, omega[-1], records[0].dt, options.global_order)
     narrow_width = np.maximum(least, _NARROW * grid)
-    narrow = _fit_widened(grid, narrow_width, respond)
-    narrow = _smaller_residual(narrow, respond(grid, narrow_width, "rational"))
+    stack = _fit_narrow(grid, narrow_width, rest, inputs, order)
+    narrow = joint_fit(stack, inputs) if method == "joint" else stack
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
-    first = inputs + outputs if method == "joint" else 0
-    widest = reach(grid, narrow_width, _widest(grid, least), bins, slice(first, first + inputs))
+    edges = window_slices(grid, narrow_width, bins)
+    noise_freedom = smoothed(
+        grid, covariance_of_bands(*edges, narrow.freedom), narrow.freedom, BANDWIDTH
+    )
+    sources = noise
+    if method == "joint":
+        sources = smooth_noise(grid, narrow_width, stack.scatter, stack.freedom)
+    respond = _responder(rest, inputs, order, method, sources)
+    widest = reach(grid, narrow_width, _widest(grid, least), bins, rest.sources)
     chosen = _widths(grid, least, widest, noise, respond, options)
-    width, rational, unresolved = (each[at] for each in chosen)
-    fit = _fit_chosen(omega, width, rational, respond)
-    direct, multiple = _direct_coherence(bins, inputs, outputs, order, grid, narrow_width)
+    width, rational = (each[at] for each in chosen)
+    moved = _fit_chosen(omega, width, rational, _responder(rest, inputs, order, "direct"))
+    doubtful = unresolved(omega, moved, sources, at, bins)
+    moved = replace_rows(moved, doubtful, undetermined(_rows(moved, doubtful)))
+    fit = joint_fit(moved, inputs) if method == "joint" else moved
+    plain = rest
+    if method == "joint":
+        plain = rest._replace(
+            bins=bins, models=(), sources=slice(0, inputs), moved=slice(inputs, inputs + outputs)
+        )
+    direct, multiple = _direct_coherence(plain, inputs, order, grid, narrow_width)
     direct = direct[at]
     coherence = direct
     if method == "joint":
-        stack = _stack(bins, inputs, outputs, grid, narrow_width, "polynomial", order)
         coherence = coherence_of_references(grid, narrow_width, stack, inputs)[at]
+    left, right = _factors(moved, inputs, method)
+    models = shared_errors(rest, bins, omega, moved, sources, left, right)
     back = recolour(omega, options.integrators, options.delay, records[0].dt)[:, None, None]
     known = np.isfinite(fit.response)
     return LocalEstimate(
@@ -158,11 +190,12 @@ def estimate_local_polynomial(
         jnp.asarray(np.where(known, coherence, 0.0)),
         jnp.asarray(np.where(known, direct, 0.0)),
         jnp.asarray(multiple[at]),
-        error_covariance(omega, fit, noise, at, bins, back),
+        error_covariance(omega, fit, noise, at, bins, back, sources, left, models),
         width,
         rational,
-        _remark_on_lost(omega, np.all(known, axis=(1, 2)), least[at], options)
-        + _remark_on_resolution(omega[unresolved]),
+        noise_freedom[np.ix_(at, at)],
+        _remark_on_lost(omega, np.all(known, axis=(1, 2)) | doubtful, least[at], options)
+        + _remark_on_resolution(omega[doubtful & np.any(coherence >= COHERENT, axis=(1, 2))]),
     )
 
 
@@ -186,24 +219,54 @@ def _with_neighbours(
     return grid, np.searchsorted(grid, omega)
 
 
-def _responder(bins: Bins, inputs: int, outputs: int, order: int, method: Method) -> Respond:
-    def direct(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
-        u, y = slice(0, inputs), slice(inputs, inputs + outputs)
-        return local_fit(omega, half_width, bins, u, y, order, shape)
-
-    def joint(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
-        return joint_fit(_stack(bins, inputs, outputs, omega, half_width, shape, order), inputs)
-
-    return direct if method == "direct" else joint
-
-
-def _stack(
-    bins: Bins, inputs: int, outputs: int, omega: Grid, half_width: Grid, shape: Shape, order: int
-) -> LocalFit:
-    """From the references to inputs and outputs."""
+def _whole(bins: Bins, inputs: int, outputs: int, method: Method) -> tuple[slice, slice]:
+    """The channels that move, and those that are moved: by references, all others."""
     first = inputs + outputs
-    references, both = slice(first, first + inputs), slice(0, first)
-    return local_fit(omega, half_width, bins, references, both, order, shape)
+    if method == "joint":
+        return slice(first, first + inputs), slice(0, first)
+    return slice(0, inputs), slice(inputs, first)
+
+
+def _factors(
+    moved: LocalFit, inputs: int, method: Method
+) -> tuple[
+    Complex[np.ndarray, "frequencies outputs moved"],
+    Complex[np.ndarray, "frequencies sources inputs"],
+]:
+    """L and R in dG = L dT R, T from the sources to what they move."""
+    if method == "joint":
+        return joint_factors(moved, inputs)[1:]
+    count, outputs = moved.response.shape[:2]
+    ones = (np.broadcast_to(np.eye(n, dtype=complex), (count, n, n)) for n in (outputs, inputs))
+    return tuple(ones)
+
+
+def _responder(
+    rest: Rest, inputs: int, order: int, method: Method, sources: Noise | None = None
+) -> Respond:
+    """From the sources to what they move, or in the joint estimate from inputs to outputs.
+
+    With the noise of what they move, the fits have its gain instead of that of white noise.
+    """
+
+    def respond(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
+        moved = local_fit(omega, half_width, rest.bins, rest.sources, rest.moved, order, shape)
+        moved = rest.add_models(omega, moved)
+        fit = joint_fit(moved, inputs) if method == "joint" else moved
+        if sources is None:
+            return fit
+        left = _factors(moved, inputs, method)[0]
+        return coloured_gain(fit, sources, left, omega, rest.bins)
+
+    return respond
+
+
+def _fit_narrow(grid: Grid, width: Grid, rest: Rest, inputs: int, order: int) -> LocalFit:
+    """From the sources to what they move, within `width`: its residuals are the noise."""
+    respond = _responder(rest, inputs, order, "direct")
+    fit = _fit_widened(grid, width, respond)
+    fit = _smaller_residual(fit, respond(grid, width, "rational"))
+    return rest.without_followed(grid, width, order, fit)
 
 
 def _smaller_residual(polynomial: LocalFit, rational: LocalFit) -> LocalFit:
@@ -240,11 +303,10 @@ def _widest(grid: Grid, least: Grid) -> Grid:
 
 def _widths(
     grid: Grid, least: Grid, widest: Grid, noise: Noise, respond: Respond, options: LocalPolynomial
-) -> tuple[Grid, Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
+) -> tuple[Grid, Bool[np.ndarray, " frequencies"]]:
     if options.width is None:
         return choose_widths(grid, least, widest, noise, respond)
-    no = np.zeros(grid.size, bool)
-    return np.full(grid.size, float(options.width)), no, no
+    return np.full(grid.size, float(options.width)), np.zeros(grid.size, bool)
 
 
 def _fit_chosen(
@@ -258,12 +320,12 @@ def _fit_chosen(
 
 
 def _direct_coherence(
-    bins: Bins, inputs: int, outputs: int, order: int, grid: Grid, half_width: Grid
+    rest: Rest, inputs: int, order: int, grid: Grid, half_width: Grid
 ) -> tuple[
     Float[np.ndarray, "frequencies outputs inputs"], Float[np.ndarray, "frequencies outputs"]
 ]:
     """Partial and multiple."""
-    fit = _responder(bins, inputs, outputs, order, "direct")(grid, half_width, "polynomial")
+    fit = _responder(rest, inputs, order, "direct")(grid, half_width, "polynomial")
     noise = smooth_noise(grid, half_width, fit.scatter, fit.freedom)
     return partial_coherence(fit, noise.power), multiple_coherence(fit, noise.power)
 
@@ -289,7 +351,8 @@ def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:
     if omega.size == 0:
         return ()
     text = (
-        "the estimate {where} is under-resolved (narrow-band noise or a ringing mode); its error "
-        "bars may be too small. Record longer, or add rest at the end"
+        "no response {where}: the fit there leaves more than ten times the noise nearby, as beside "
+        "a mode that rings or a narrow line in the noise. Record longer, and 3 to 10 s of rest at "
+        "the end"
     )
     return (Remark(text, omega),)

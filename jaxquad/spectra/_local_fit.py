@@ -259,6 +259,7 @@ def _adjoint(x: np.ndarray) -> np.ndarray:
 
 
 _UNEXCITED = 1e-12  # of an input's largest bin: below, it is rounding errors
+_LEAKED = 1e5  # ratio of an input's power to the part of it that transients cannot explain
 _CHUNK = 32  # frequencies solved at once, padded to the longest window among them
 
 
@@ -306,6 +307,7 @@ def local_fit(
         solve = solve_polynomial if shape == "polynomial" else solve_rational
         solution = solve(window.place, u, y, own, order)
         excited = np.all(np.max(np.abs(u), axis=1) > _UNEXCITED * largest, axis=1)
+        excited &= np.all(_leaked(solution, u) < _LEAKED, axis=1)
         size = np.maximum(np.sum(used, axis=1), 1)[:, None, None]
         parts.append((*_padded(solution, excited, longest), products(u) / size))
     back = np.argsort(places)
@@ -314,6 +316,16 @@ def local_fit(
     )
     gain = boost[:, :, None] ** 2 * np.sum(np.abs(effect) ** 2, axis=2)[:, None, :]
     return LocalFit(response, effect, boost, gain, first, scatter, freedom, power)
+
+
+def _leaked(solution: Solution, u: Inputs) -> Float[np.ndarray, "frequencies inputs"]:
+    """Each input's power in the window, to that which determines its response.
+
+    Beyond the end of a sweep the input's transform is what the ends of the record leak, as smooth
+    along frequency as a transient, and says nothing about the response: the ratio is 1e9, or what
+    rounding makes of it. A sweep that reaches the frequency has 2 to 30.
+    """
+    return np.sum(np.abs(solution.effect) ** 2, axis=2) * np.sum(np.abs(u) ** 2, axis=1)
 
 
 def replace_rows(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"], part: LocalFit) -> LocalFit:

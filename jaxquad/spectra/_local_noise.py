@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from ._error_covariance import ErrorCovariance
 from ._local_fit import Bins, LocalFit
 
 
-_BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
+BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
 _UNLIKELY = 1e-4  # chance at which a residual counts as a misfit, or a line in the noise
 
 
@@ -27,6 +27,14 @@ class Noise(NamedTuple):
         place, known = np.log(omega), np.log(self.omega)
         columns = [np.interp(place, known, column) for column in np.log(self.power).T]
         return np.exp(np.stack(columns, axis=1))
+
+    def root_at(
+        self, omega: Float[np.ndarray, " bins"]
+    ) -> Complex[np.ndarray, "bins outputs outputs"]:
+        """Roots of the covariances at other frequencies, correlated as at the nearest one."""
+        near = np.searchsorted(np.sqrt(self.omega[1:] * self.omega[:-1]), omega)
+        scale = np.sqrt(self.power_at(omega) / self.power[near])
+        return self.root()[near] * scale[:, :, None]
 
     def root(self) -> Complex[np.ndarray, "frequencies outputs outputs"]:
         """Roots of the covariances, which change along frequency as slowly as they do."""
@@ -64,11 +72,11 @@ def smooth_noise(
         smooth = _local_lines(place, level, np.where(outlier, 1e-9 * weight, weight))
     if np.any(known):  # Far from all known frequencies the kernel vanishes.
         isolated = np.interp(place, place[known], np.arange(np.sum(known)))
-        isolated = np.abs(place - place[known][np.round(isolated).astype(int)]) > 3 * _BANDWIDTH
+        isolated = np.abs(place - place[known][np.round(isolated).astype(int)]) > 3 * BANDWIDTH
         nearest = [np.interp(place, place[known], column[known]) for column in smooth.T]
         smooth = np.where(isolated[:, None], np.stack(nearest, axis=1), smooth)
     freedom = np.where(known, freedom, 0.0)
-    windows = 1 + np.sqrt(np.pi) * _BANDWIDTH * omega / half_width
+    windows = 1 + np.sqrt(np.pi) * BANDWIDTH * omega / half_width
     correlation = _correlation(place, scatter, raw, freedom)
     return Noise(omega, np.exp(smooth), correlation, freedom * windows)
 
@@ -79,11 +87,11 @@ def _local_lines(
     weight: Float[np.ndarray, "frequencies outputs"],
 ) -> Float[np.ndarray, "frequencies outputs"]:
     offset = place[None, :] - place[:, None]
-    kernel = np.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
+    kernel = np.exp(-0.5 * (offset / BANDWIDTH) ** 2)
     m0, m1, m2 = ((kernel * offset**k) @ weight for k in (0, 1, 2))
     l0, l1 = ((kernel * offset**k) @ (weight * level) for k in (0, 1))
     # A single frequency has no slope: a prior on the slope keeps the line flat there.
-    spread = m2 + 1e-3 * _BANDWIDTH**2 * m0 + 1e-300
+    spread = m2 + 1e-3 * BANDWIDTH**2 * m0 + 1e-300
     return (spread * l0 - m1 * l1) / (spread * m0 - m1**2 + 1e-300)
 
 
@@ -94,7 +102,7 @@ def _correlation(
     weight: Float[np.ndarray, " frequencies"],
 ) -> Complex[np.ndarray, "frequencies outputs outputs"]:
     offset = place[None, :] - place[:, None]
-    kernel = weight[None, :] * np.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
+    kernel = weight[None, :] * np.exp(-0.5 * (offset / BANDWIDTH) ** 2)
     size = np.sqrt(power)
     normal = np.where(weight[:, None, None] > 0, scatter, 0) / (size[:, :, None] * size[:, None, :])
     mixed = np.einsum("fg,gop->fop", kernel, normal) + 1e-12 * np.eye(power.shape[1])
@@ -102,7 +110,21 @@ def _correlation(
     return mixed / (size[:, :, None] * size[:, None, :])
 
 
+class SharedErrors(NamedTuple):
+    """Errors of real parameters p that the noise at some bins has moved by Re(drive W).
+
+    W are circular noises of unit power, `roots` to a bin.
+    """
+
+    slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"]
+    drive: Complex[np.ndarray, "parameters places roots"]
+    places: Int[np.ndarray, " places"]  # bins, rising
+
+
 _CHANCE = 1e-5  # of calling a residual a misfit
+_FALSE_ALARM = 1e-3  # chance that noise alone leaves any of a record's responses unresolved
+_FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
+_ATOMS, _PARAMETERS = 256, 16  # numbers of which those of the noise and the parameters are padded
 _UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
 
 
@@ -113,24 +135,72 @@ def error_covariance(
     at: Int[np.ndarray, " frequencies"],
     bins: Bins,
     back: Complex[np.ndarray, "frequencies 1 1"],
+    sources: Noise,
+    left: Complex[np.ndarray, "frequencies outputs moved"],
+    models: SharedErrors | None,
 ) -> ErrorCovariance:
     """Errors of `fit`, recoloured by `back`; `at` is the place of each frequency in `noise`.
 
     The atoms are the bins, each with the noise of its own frequency. Where the residual is larger
     than chance allows, the error is as much larger: it must not shrink below a local misfit.
+    The noise of the fit is `left` times that of the `sources`, with the factor of the fit's own
+    frequency at all its bins. The same noise disturbs the global `models`, whose response is part
+    of that of `fit`.
     """
-    places = np.minimum(fit.first[:, None] + np.arange(fit.effect.shape[2]), bins.omega.size - 1)
-    power, each = noise.power[at], noise.power_at(bins.omega)
-    colour = each[places] / power[:, None, :]
+    places = window_places(fit, bins)
+    colour = colour_of_noise(sources, left, omega, bins, places)
     inside = np.any(fit.effect != 0, axis=1)
     effect = fit.effect * np.exp(0.5 * np.mean(np.log(colour), axis=2))[:, None, :]
-    scale = fit.boost * np.sqrt(_misfit(fit, noise, at, colour, inside))
-    root = noise.root()[at] * scale[:, :, None]
-    known = np.isfinite(fit.response[:, 0, 0])
-    shared = _on_common_bins(np.where(known[:, None, None], effect * back, 0.0), places)
-    shared[~known, :, 0] = _UNKNOWN
-    kind = np.where(known[:, None, None], root, np.eye(root.shape[1]))
-    return ErrorCovariance(jnp.asarray(omega), jnp.asarray(shared), jnp.asarray(kind))
+    scale = fit.boost * np.sqrt(_misfit(fit, noise, at, colour, inside, _CHANCE))
+    root = left @ sources.root()[at]
+    size = np.sqrt(noise.power[at]) * scale / np.maximum(np.linalg.norm(root, axis=2), 1e-300)
+    root = root * size[:, :, None]
+    known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
+    shared, atoms = _on_common_bins(np.where(known, effect * back, 0.0), places)
+    shared[~known[:, 0, 0], :, 0] = _UNKNOWN
+    kind = np.where(known, root, np.eye(*root.shape[1:]))
+    if models is None:
+        return ErrorCovariance(jnp.asarray(omega), jnp.asarray(shared), jnp.asarray(kind))
+    slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
+    slopes, drive, shared = _on_common_atoms(slopes, models, shared, atoms)
+    arrays = (jnp.asarray(x) for x in (omega, shared, kind))
+    return ErrorCovariance(*arrays, sensitivity=jnp.asarray(slopes), drive=jnp.asarray(drive))
+
+
+def colour_of_noise(
+    sources: Noise,
+    left: Complex[np.ndarray, "frequencies outputs moved"],
+    omega: Float[np.ndarray, " frequencies"],
+    bins: Bins,
+    places: Int[np.ndarray, "frequencies window"],
+) -> Float[np.ndarray, "frequencies window outputs"]:
+    """Power of `left` times the noise at the bins of each window, to that at its centre."""
+    roots, centre = sources.root_at(bins.omega), left @ sources.root_at(omega)
+    if left.shape[1] == left.shape[2] == 1:
+        power = np.abs(roots[:, :, 0]) ** 2
+        return power[places] / sources.power_at(omega)[:, None, :]
+    colour = np.empty((*places.shape, left.shape[1]))
+    for f, mine in enumerate(places):
+        colour[f] = np.sum(np.abs(left[f] @ roots[mine]) ** 2, axis=2)
+    return colour / np.maximum(np.sum(np.abs(centre) ** 2, axis=2), 1e-300)[:, None, :]
+
+
+def window_places(fit: LocalFit, bins: Bins) -> Int[np.ndarray, "frequencies window"]:
+    """The bins of each window, padded."""
+    return np.minimum(fit.first[:, None] + np.arange(fit.effect.shape[2]), bins.omega.size - 1)
+
+
+def coloured_gain(
+    fit: LocalFit,
+    sources: Noise,
+    left: Complex[np.ndarray, "frequencies outputs moved"],
+    omega: Float[np.ndarray, " frequencies"],
+    bins: Bins,
+) -> LocalFit:
+    """The fit with the gain of noise that is of unit power at the window's centre only."""
+    colour = colour_of_noise(sources, left, omega, bins, window_places(fit, bins))
+    gain = np.einsum("fik,fko->foi", np.abs(fit.effect) ** 2, colour)
+    return fit._replace(gain=fit.boost[:, :, None] ** 2 * gain)
 
 
 def partial_coherence(
@@ -160,12 +230,40 @@ def multiple_coherence(
     return explained / (explained + noise)
 
 
+def unresolved(
+    omega: Float[np.ndarray, " frequencies"],
+    fit: LocalFit,
+    noise: Noise,
+    at: Int[np.ndarray, " frequencies"],
+    bins: Bins,
+) -> Bool[np.ndarray, " frequencies"]:
+    """Where `fit` leaves residuals far above the noise, seldom by chance in a whole record."""
+    outputs = fit.response.shape[1]
+    left = np.broadcast_to(np.eye(outputs, dtype=complex), (omega.size, outputs, outputs))
+    colour = colour_of_noise(noise, left, omega, bins, window_places(fit, bins))
+    chance = _FALSE_ALARM / (omega.size * outputs)
+    ratio = _misfit(fit, noise, at, colour, np.any(fit.effect != 0, axis=1), chance)
+    return np.isfinite(fit.response[:, 0, 0]) & np.any(ratio > _FAR_OFF, axis=1)
+
+
+def undetermined(fit: LocalFit) -> LocalFit:
+    """The same windows without a response."""
+    return fit._replace(
+        response=fit.response * np.nan,
+        effect=fit.effect * np.nan,
+        gain=fit.gain * np.nan,
+        scatter=fit.scatter * np.nan,
+        freedom=0 * fit.freedom,
+    )
+
+
 def _misfit(
     fit: LocalFit,
     noise: Noise,
     at: Int[np.ndarray, " frequencies"],
     colour: Float[np.ndarray, "frequencies window outputs"],
     inside: np.ndarray,
+    chance: float,
 ) -> Float[np.ndarray, "frequencies outputs"]:
     """Ratio of residuals to the noise where it is larger than chance allows, else 1."""
     from scipy.special import fdtri
@@ -174,16 +272,52 @@ def _misfit(
     expected = noise.power[at] * np.sum(colour * inside[:, :, None], axis=1) / count
     left = np.real(np.diagonal(fit.scatter, axis1=1, axis2=2)) / expected
     freedom = 2 * np.maximum(fit.freedom, 1.0), 2 * np.maximum(noise.freedom[at], 1.0)
-    return np.where(left > fdtri(*freedom, 1 - _CHANCE)[:, None], left, 1.0)
+    return np.where(left > fdtri(*freedom, 1 - chance)[:, None], left, 1.0)
 
 
 def _on_common_bins(
     effect: Complex[np.ndarray, "frequencies inputs window"],
     places: Int[np.ndarray, "frequencies window"],
-) -> Complex[np.ndarray, "frequencies inputs atoms"]:
+) -> tuple[Complex[np.ndarray, "frequencies inputs atoms"], Int[np.ndarray, " bins"]]:
+    """The effects of all bins that have one, padded with zeros, and these bins."""
     used = np.any(effect != 0, axis=1)
     atoms, column = np.unique(places[used], return_inverse=True)
     row, step = np.nonzero(used)
-    shared = np.zeros((*effect.shape[:2], max(atoms.size, 1)), complex)
+    shared = np.zeros((*effect.shape[:2], _padded(atoms.size, _ATOMS)), complex)
     shared[row, :, column] = effect[row, :, step]
-    return shared
+    return shared, atoms
+
+
+def _padded(count: int, block: int) -> int:
+    """So few sizes that programs compiled for one record serve others."""
+    return max(-(-count // block), 1) * block
+
+
+def _on_common_atoms(
+    slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"],
+    models: SharedErrors,
+    effect: Complex[np.ndarray, "frequencies inputs atoms"],
+    atoms: Int[np.ndarray, " bins"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slopes by the parameters' errors of unit size, their drive by atoms, and padded effects.
+
+    Bins that no local fit uses are one more atom for each parameter, with the same covariance.
+    """
+    parameters, _, roots = models.drive.shape
+    size = np.sqrt(0.5 * np.sum(np.abs(models.drive) ** 2, axis=(1, 2)))
+    size = np.where(size > 0, size, 1.0)
+    unit = models.drive / size[:, None, None]
+    column = np.searchsorted(atoms, models.places)
+    mine = np.isin(models.places, atoms)
+    rest = unit[:, ~mine].reshape(parameters, -1)
+    values, vectors = np.linalg.eigh(np.real(rest @ np.conj(rest).T))
+    count = _padded(atoms.size + parameters, _ATOMS)
+    drive = np.zeros((_padded(parameters, _PARAMETERS), count, roots), complex)
+    drive[:parameters, column[mine]] = unit[:, mine]
+    spare = slice(atoms.size, atoms.size + parameters)
+    drive[:parameters, spare, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
+    known = np.zeros((*slopes.shape[:3], len(drive)), complex)
+    known[..., :parameters] = slopes * size
+    wide = np.zeros((*effect.shape[:2], count), complex)
+    wide[:, :, : atoms.size] = effect[:, :, : atoms.size]
+    return known, drive, wide

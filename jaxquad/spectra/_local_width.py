@@ -15,7 +15,7 @@ _SMOOTHING = 0.2  # of the tests for bias, in ln(omega)
 _CHANCE = 3e-4  # of refusing a window whose differences, averaged over neighbours, are noise
 _CHANCE_ALONE = 1e-5  # of refusing it for the difference at one frequency
 _NOISIER = 4.0  # ratio of variances from which a narrower window counts for less
-_FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
+_QUIETER = 0.7  # ratio of variances from which a narrower window is preferred
 _KNOWN = 0.1  # largest relative error of a rational function that is used
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -26,16 +26,16 @@ Respond = Callable[[Grid, Grid, Shape], LocalFit]
 
 def choose_widths(
     omega: Grid, least: Grid, reach: Grid, noise: Noise, respond: Respond
-) -> tuple[Grid, Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
+) -> tuple[Grid, Bool[np.ndarray, " frequencies"]]:
     """Half-widths from `least` to `reach`, by intersecting confidence intervals.
 
-    Also returns where a rational function is used, and where the response is unresolved.
+    Also returns where a rational function is used.
     A wider window is used while its response agrees with those of all narrower ones within the
     variance of their difference (Goldenshluger and Nemirovski, 1997), at the frequency and on
     average over its neighbours. This test cannot see a bias of the size of the noise, so the window
     used is one step smaller, where the bias is about five times smaller. Where the smallest window
-    leaves more than noise, as at a resonance, a rational function replaces the polynomial; where
-    that is not accurate either, the response is unresolved.
+    leaves more than noise, as at a resonance, a rational function replaces the polynomial, if it is
+    accurate there.
     """
     widest = np.maximum(reach, least)
     steps = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
@@ -45,20 +45,25 @@ def choose_widths(
         wider = width > below
         part = respond(omega[wider], width[wider], "polynomial")
         fits.append(replace_rows(fits[-1], wider, part))
-    rational, unresolved = _resonant(fits, respond(omega, least, "rational"), noise)
+    rational = _resonant(fits, respond(omega, least, "rational"), noise)
     step, each = _widest_unbiased(omega, widths, fits, noise), np.arange(omega.size)
     gain = np.stack([np.mean(fit.gain, axis=(1, 2)) for fit in fits])
+    gain = np.where(np.isfinite(gain), gain, np.inf)
     # At the lowest frequencies one step less can cost more than any bias.
     below = gain[np.maximum(step - 1, 0), each]
     costly = ~(below <= _NOISIER * gain[step, each])
-    climbed = widths[step, each] / np.where(costly, 1.0, _RATIO)
-    return np.where(rational, least, np.maximum(climbed, least)), rational, unresolved
+    climbed = np.maximum(widths[step, each] / np.where(costly, 1.0, _RATIO), least)
+    # In noise that rises steeply to one side, wider is not always better.
+    kept = np.where((widths < climbed) & (gain < _QUIETER * below), gain, np.inf)
+    quiet = np.min(kept, axis=0) < np.inf
+    climbed = np.where(quiet, widths[np.argmin(kept, axis=0), each], climbed)
+    return np.where(rational, least, climbed), rational
 
 
 def _resonant(
     fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise
-) -> tuple[Bool[np.ndarray, " frequencies"], Bool[np.ndarray, " frequencies"]]:
-    """Where a polynomial is wrong and a rational function accurate, and where neither is right.
+) -> Bool[np.ndarray, " frequencies"]:
+    """Where a polynomial is wrong and a rational function accurate.
 
     The error of a rational function is linear in the noise only while it is small.
     """
@@ -71,7 +76,7 @@ def _resonant(
         wrong |= statistic > alone * np.maximum(count, 1)
     error = noise.power[:, :, None] * sharp.gain
     known = np.all(error < _KNOWN**2 * np.abs(sharp.response) ** 2, axis=(1, 2))
-    return wrong & known, ~known & np.any(left > _FAR_OFF, axis=1)
+    return wrong & known
 
 
 def _widest_unbiased(

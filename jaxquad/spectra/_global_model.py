@@ -1,0 +1,335 @@
+"""A rational model of whole records with the transients of their ends, from all bins at once."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from ._local_fit import Bins
+
+
+_BEYOND = 5.0  # ratio of the highest bin that is modelled to the highest frequency asked for
+_MOST_BINS = 20000  # that a model is fitted to
+_TRIAL_BINS = 4000  # with which its order is chosen
+_RELAXATIONS, _STEPS = 12, 20  # of Sanathanan and Koerner, of Gauss and Newton
+_SETTLED, _TRIAL = 1e-6, 1e-3  # relative gain of a step at which the descent, or a trial, ends
+_NEAREST = 1e-9  # size of the denominator, to its largest, so that no pole falls onto a bin
+_EXACT = 1e-20  # share of the output's power that is rounding
+_PER_PARAMETER = 6  # real equations
+_EVEN = 4.0  # ratio of the noise's powers below which it counts as white
+_THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
+_BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of the residual's power: in ln(omega), and bins a side at least
+
+Vector = Float[np.ndarray, " parameters"]
+Powers = Complex[np.ndarray, "bins powers"]
+
+
+class Equations(NamedTuple):
+    """What relates one output to the inputs at some bins, each row times its weight."""
+
+    x: Complex[np.ndarray, " bins"]  # (exp(-j omega dt) - 1) / scale
+    u: Complex[np.ndarray, "bins inputs"]
+    own: Float[np.ndarray, "bins records"]  # the weight in the column of the bin's record, else 0
+    y: Complex[np.ndarray, " bins"]
+
+    def pick(self, rows: Int[np.ndarray, " rows"] | slice) -> "Equations":
+        """Some of the bins."""
+        return Equations(*(field[rows] for field in self))
+
+    def weighted(self, weight: Float[np.ndarray, " bins"]) -> "Equations":
+        """Equations whose noise is `weight` times as large."""
+        column = weight[:, None]
+        return Equations(self.x, self.u * column, self.own * column, self.y * weight)
+
+    def parameters(self, order: int) -> int:
+        """Real coefficients of a model of this order, without the common factor."""
+        inputs, records = self.u.shape[1], self.own.shape[1]
+        return inputs * (order + 1) + records * order + order
+
+
+class Solved(NamedTuple):
+    """Coefficients, and what they leave of the output."""
+
+    denominator: Float[np.ndarray, " powers"]  # of rising powers of x
+    linear: Vector  # numerators, input by input; then transients, record by record
+    below: Complex[np.ndarray, " bins"]  # the denominator's values
+    fitted: Complex[np.ndarray, " bins"]
+    cost: float  # sum of squared residuals
+
+
+class GlobalModel(NamedTuple):
+    """Y = (sum_i B_i U_i + C_r) / A of one output, polynomials in x = (exp(-j omega dt) - 1)/scale.
+
+    Inputs that are held, or linear between samples, reach a system of finite order exactly so, with
+    all their aliases; C_r is the difference of the states at the ends of record r. The errors of
+    the real parameters are Re(drive V), V the transform of the output's noise at `places`.
+    """
+
+    solved: Solved
+    fixed: int  # the power whose coefficient in A sets the common factor
+    scale: float
+    dt: float  # s
+    places: Int[np.ndarray, " places"]
+    drive: Complex[np.ndarray, "parameters places"]
+    follow: Complex[np.ndarray, "places parameters"]  # orthonormal: what the model takes of noise
+    noise: Float[np.ndarray, " places"]  # its power, smoothed, from what the model leaves
+    reach: int  # number of bins, the lowest, that it describes
+
+    @property
+    def order(self) -> int:
+        """Degree of the denominator."""
+        return len(self.solved.denominator) - 1
+
+    def response(
+        self, omega: Float[np.ndarray, " frequencies"], inputs: int
+    ) -> Complex[np.ndarray, "frequencies inputs"]:
+        """B_i / A."""
+        powers = self._powers(omega)
+        above = powers @ self._numerators(inputs).T
+        return above / (powers @ self.solved.denominator)[:, None]
+
+    def response_slopes(
+        self, omega: Float[np.ndarray, " frequencies"], inputs: int
+    ) -> Complex[np.ndarray, "frequencies inputs parameters"]:
+        """Derivatives of `response` with respect to the parameters."""
+        powers, size = self._powers(omega), self.order + 1
+        below = (powers @ self.solved.denominator)[:, None]
+        slopes = np.zeros((omega.size, inputs, self.drive.shape[0]), complex)
+        for i in range(inputs):
+            slopes[:, i, i * size : (i + 1) * size] = powers / below
+        turned = -np.delete(powers, self.fixed, axis=1) / below
+        slopes[:, :, len(self.solved.linear) :] = (
+            self.response(omega, inputs)[:, :, None] * turned[:, None, :]
+        )
+        return slopes
+
+    def at_bins(self, bins: Bins, inputs: slice, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """The modelled output at some bins, and its derivatives with respect to the parameters."""
+        powers = self._powers(bins.omega[rows])
+        u, own = bins.values[rows, inputs], _own(bins.record[rows], bins.records)
+        below = (powers @ self.solved.denominator)[:, None]
+        columns = _regressors(powers, u, own) / below
+        output = columns @ self.solved.linear
+        turned = -np.delete(powers, self.fixed, axis=1) / below
+        return output, np.concatenate([columns, output[:, None] * turned], axis=1)
+
+    def _numerators(self, inputs: int) -> Float[np.ndarray, "inputs powers"]:
+        return self.solved.linear[: inputs * (self.order + 1)].reshape(inputs, -1)
+
+    def _powers(self, omega: Float[np.ndarray, " frequencies"]) -> Powers:
+        x = (np.exp(-1j * omega * self.dt) - 1) / self.scale
+        return x[:, None] ** np.arange(self.order + 1)
+
+
+def global_models(
+    bins: Bins, inputs: slice, outputs: slice, highest: float, dt: float, most: int
+) -> list[GlobalModel | None]:
+    """One model for each output, of the order up to `most` with the least Bayesian information.
+
+    `None` where a model explains no more than chance allows. The bins reach five times `highest`
+    (rad/s). Above 20000 of them every n-th is taken: each is an equation of its own, so thinning
+    costs precision, never resolution. The order is chosen with every n-th of 4000.
+    """
+    reach = int(np.searchsorted(bins.omega, _BEYOND * highest, "right"))
+    places = np.arange(0, reach, -(-reach // _MOST_BINS))
+    lag = np.exp(-1j * dt * bins.omega[places]) - 1
+    scale = float(np.abs(lag[-1])) / 2
+    u, own = bins.values[places, inputs], _own(bins.record[places], bins.records)
+    each = (
+        Equations(lag / scale, u, own, bins.values[places, o])
+        for o in range(outputs.start, outputs.stop)
+    )
+    found = (_identify(equations, bins.omega[places], most) for equations in each)
+    return [
+        None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
+        for one in found
+    ]
+
+
+def _identify(
+    equations: Equations, omega: Float[np.ndarray, " bins"], most: int
+) -> tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray] | None:
+    """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
+    every = slice(None, None, -(-len(omega) // _TRIAL_BINS))
+    first = _choose(equations.pick(every), most)
+    if first is None:
+        return None
+    noise = running_power(omega, _residual(equations, first), np.ones_like(omega))
+    weight = 1 / np.sqrt(noise)
+    if np.max(noise) < _EVEN * np.min(noise):
+        weight = np.full_like(noise, np.mean(weight))
+    white = equations.weighted(weight)
+    chosen = _choose(white.pick(every), most) if np.ptp(weight) > 0 else first
+    if chosen is None:
+        return None
+    solved = _descend(white, chosen.denominator, _SETTLED)
+    fixed = _largest(white.x, solved.denominator)
+    slopes = _real(_slopes(white, solved, fixed))
+    length = np.linalg.norm(slopes, axis=0)
+    left, size, right = np.linalg.svd(slopes / length, full_matrices=False)
+    inverse = np.where(size > 1e-12 * size[0], 1 / np.maximum(size, 1e-300), 0.0)
+    drive = _complex(left) @ (right * inverse[:, None]) / length
+    follow = np.conj(_complex(left))
+    taken = np.sum(np.abs(follow) ** 2, axis=1) / 2
+    noise = running_power(omega, _residual(equations, solved), 1 - taken)
+    return solved, fixed, drive.T * weight, follow, noise
+
+
+def _complex(stacked: Float[np.ndarray, "parts columns"]) -> Complex[np.ndarray, "rows columns"]:
+    """Columns whose products with the noise have as their real part those of the `stacked` ones."""
+    rows = len(stacked) // 2
+    return stacked[:rows] - 1j * stacked[rows:]
+
+
+def _residual(equations: Equations, solved: Solved) -> Complex[np.ndarray, " bins"]:
+    powers = equations.x[:, None] ** np.arange(len(solved.denominator))
+    columns = _regressors(powers, equations.u, equations.own)
+    return equations.y - columns @ solved.linear / (powers @ solved.denominator)
+
+
+def _choose(equations: Equations, most: int) -> Solved | None:
+    count = 2 * len(equations.y)
+    best, least, worse = None, _information(_proportional(equations), 1, count), 0
+    floor = _EXACT * float(np.sum(np.abs(equations.y) ** 2))
+    for order in _orders(most):
+        parameters = equations.parameters(order)
+        if parameters * _PER_PARAMETER > count:
+            break
+        solved = _descend(equations, _relax(equations, order), _TRIAL)
+        value = _information(solved.cost + 0.01 * floor, parameters, count)
+        worse = 0 if value < least else worse + 1
+        if value < least:
+            best, least = solved, value
+        if (worse >= _PATIENCE and order >= _THOROUGH) or solved.cost <= floor:
+            break
+    return best
+
+
+def _orders(most: int) -> Iterator[int]:
+    """All up to 6, then every second."""
+    yield from (order for order in range(1, most + 1) if order <= 6 or (most - order) % 2 == 0)
+
+
+def _information(cost: float, parameters: int, count: int) -> float:
+    return count * np.log(max(cost, 1e-300) / count) + parameters * np.log(count)
+
+
+def _proportional(equations: Equations) -> float:
+    """Squared residuals of gains that do not depend on frequency."""
+    return _solve(equations, np.ones(1)).cost
+
+
+def _relax(equations: Equations, order: int) -> Float[np.ndarray, " powers"]:
+    """The denominator by repeated linear least squares, each weighted by the one before."""
+    powers = equations.x[:, None] ** np.arange(order + 1)
+    columns = _regressors(powers, equations.u, equations.own)
+    joined = np.concatenate([columns, powers * equations.y[:, None]], axis=1)
+    weight, best = np.ones((len(joined), 1)), None
+    for _ in range(_RELAXATIONS):
+        denominator = _null_vector(_real(joined * weight), columns.shape[1])
+        solved = _solve(equations, denominator)
+        if best is not None and solved.cost > 0.999 * best.cost:
+            break
+        best = solved if best is None or solved.cost < best.cost else best
+        weight = 1 / np.abs(solved.below)[:, None]
+    assert best is not None
+    return best.denominator
+
+
+def _null_vector(matrix: Float[np.ndarray, "rows columns"], first: int) -> Vector:
+    """Coefficients of the columns from `first` on, of unit length, that others explain best."""
+    length = np.linalg.norm(matrix, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    corner = np.linalg.qr(matrix / length, mode="r")[first:, first:]
+    return np.linalg.svd(corner)[2][-1] / length[first:]
+
+
+def _descend(
+    equations: Equations, denominator: Float[np.ndarray, " powers"], least_gain: float
+) -> Solved:
+    """Gauss-Newton steps of the denominator, until one gains too little; the rest is linear."""
+    solved = _solve(equations, denominator)
+    floor = _EXACT * float(np.sum(np.abs(equations.y) ** 2))
+    for _ in range(_STEPS):
+        fixed = _largest(equations.x, solved.denominator)
+        slopes = _real(_slopes(equations, solved, fixed))
+        left = np.concatenate([slopes, _real((equations.y - solved.fitted)[:, None])], axis=1)
+        change = _least_squares(left)[len(solved.linear) :]
+        step = np.insert(change, fixed, 0.0)
+        trials = (_solve(equations, solved.denominator + step / 3**k) for k in range(6))
+        better = next((each for each in trials if each.cost < solved.cost), None)
+        if better is None:
+            break
+        gain, solved = 1 - better.cost / solved.cost, better
+        if gain < least_gain or solved.cost < floor:
+            break
+    return solved
+
+
+def _solve(equations: Equations, denominator: Float[np.ndarray, " powers"]) -> Solved:
+    powers = equations.x[:, None] ** np.arange(len(denominator))
+    below = powers @ denominator
+    least = _NEAREST * np.max(np.abs(below))
+    below = np.where(np.abs(below) < least, least, below)
+    columns = _regressors(powers, equations.u, equations.own) / below[:, None]
+    linear = _least_squares(_real(np.concatenate([columns, equations.y[:, None]], axis=1)))
+    fitted = columns @ linear
+    cost = float(np.sum(np.abs(equations.y - fitted) ** 2))
+    return Solved(denominator, linear, below, fitted, cost)
+
+
+def _slopes(
+    equations: Equations, solved: Solved, fixed: int
+) -> Complex[np.ndarray, "bins parameters"]:
+    """Derivatives of the fitted output, all coefficients but the fixed one."""
+    powers = equations.x[:, None] ** np.arange(len(solved.denominator))
+    columns = _regressors(powers, equations.u, equations.own)
+    turned = -solved.fitted[:, None] * np.delete(powers, fixed, axis=1)
+    return np.concatenate([columns, turned], axis=1) / solved.below[:, None]
+
+
+def _largest(x: Complex[np.ndarray, " bins"], denominator: Float[np.ndarray, " powers"]) -> int:
+    """The power whose term is largest over the bins."""
+    size = np.mean(np.abs(x)[:, None] ** np.arange(len(denominator)), axis=0)
+    return int(np.argmax(np.abs(denominator) * size))
+
+
+def _regressors(powers: Powers, u: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Powers times inputs, then all powers but the last times records."""
+    parts = (u[:, :, None] * powers[:, None, :], own[:, :, None] * powers[:, None, :-1])
+    return np.concatenate([part.reshape(len(u), -1) for part in parts], axis=1)
+
+
+def _least_squares(joined: Float[np.ndarray, "rows columns"]) -> Vector:
+    """Coefficients of all columns but the last, which they fit."""
+    length = np.linalg.norm(joined, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    corner = np.linalg.qr(joined / length, mode="r")
+    found = np.linalg.lstsq(corner[:-1, :-1], corner[:-1, -1], rcond=1e-13)[0]
+    return found * length[-1] / length[:-1]
+
+
+def _real(x: Complex[np.ndarray, "rows columns"]) -> Float[np.ndarray, "parts columns"]:
+    return np.concatenate([x.real, x.imag])
+
+
+def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "bins records"]:
+    return (record[:, None] == np.arange(records)).astype(float)
+
+
+def running_power(
+    omega: Float[np.ndarray, " bins"],
+    values: Complex[np.ndarray, " bins"],
+    freedom: Float[np.ndarray, " bins"],
+) -> Float[np.ndarray, " bins"]:
+    """Sum of |values|^2 over that of `freedom`, within a fifth of a neper of each bin."""
+    each = np.arange(omega.size)
+    first = np.searchsorted(omega, omega * np.exp(-_BANDWIDTH))
+    last = np.searchsorted(omega, omega * np.exp(_BANDWIDTH), "right")
+    first = np.maximum(np.minimum(first, each - _NEIGHBOURS), 0)
+    last = np.minimum(np.maximum(last, each + _NEIGHBOURS + 1), omega.size)
+    power, count = (
+        np.concatenate([[0.0], np.cumsum(part)]) for part in (np.abs(values) ** 2, freedom)
+    )
+    return (power[last] - power[first]) / np.maximum(count[last] - count[first], 1.0)

@@ -1,0 +1,157 @@
+"""Local fits of what global models leave, and the errors of both together."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from ._global_model import global_models, GlobalModel
+from ._local_fit import Bins, local_fit, LocalFit
+from ._local_noise import Noise, SharedErrors
+
+
+_MOST_FOLLOWED = 0.8  # share of the residuals' freedom
+_PIECE = 8192  # bins whose slopes are held at once
+
+Grid = Float[np.ndarray, " frequencies"]
+
+
+class Rest(NamedTuple):
+    """Bins without what the models of the `moved` channels explain by the `sources`."""
+
+    bins: Bins
+    models: tuple[GlobalModel | None, ...]  # one for each moved channel
+    sources: slice
+    moved: slice
+
+    @property
+    def parameters(self) -> int:
+        """Of all models."""
+        return sum(model.drive.shape[0] for model in self.models if model is not None)
+
+    def without_followed(
+        self, omega: Grid, half_width: Grid, order: int, fit: LocalFit
+    ) -> LocalFit:
+        """The fit with the scatter of its residuals corrected for the noise that models follow.
+
+        A model takes off as much of the noise as it has parameters; what of it a local fit would
+        have followed by itself is counted already.
+        """
+        scatter, freedom = np.array(fit.scatter), fit.freedom
+        for c, model in enumerate(self.models):
+            if model is None:
+                continue
+            lost = self._followed(model, omega, half_width, order)
+            share = np.minimum(lost / np.maximum(fit.freedom, 1.0), _MOST_FOLLOWED)
+            scatter[:, c] /= np.sqrt(1 - share)[:, None]
+            scatter[:, :, c] /= np.sqrt(1 - share)[:, None]
+            freedom = np.minimum(freedom, fit.freedom * (1 - share))
+        return fit._replace(scatter=scatter, freedom=freedom)
+
+    def _followed(self, model: GlobalModel, omega: Grid, half_width: Grid, order: int) -> Grid:
+        """Complex degrees of freedom of local residuals that the model has taken."""
+        inputs = self.sources.stop - self.sources.start
+        values = np.zeros((len(self.bins.omega), inputs + model.follow.shape[1]), complex)
+        values[:, :inputs] = self.bins.values[:, self.sources]
+        values[model.places, inputs:] = model.follow
+        bins = self.bins._replace(values=values)
+        columns = slice(0, inputs), slice(inputs, values.shape[1])
+        fit = local_fit(omega, half_width, bins, *columns, order, "polynomial")
+        left = np.real(np.trace(np.nan_to_num(fit.scatter), axis1=1, axis2=2))
+        return 0.5 * left * np.maximum(fit.freedom, 1.0)
+
+    def add_models(self, omega: Grid, fit: LocalFit) -> LocalFit:
+        """The fit with the models' responses added back."""
+        inputs, response = fit.response.shape[2], np.array(fit.response)
+        for c, model in enumerate(self.models):
+            if model is not None:
+                response[:, c] += model.response(omega, inputs)
+        return fit._replace(response=response)
+
+
+def subtract_models(
+    bins: Bins, sources: slice, moved: slice, highest: float, dt: float, most: int
+) -> Rest:
+    """Fit a model of order up to `most` to each moved channel, and take it off; 0 for none."""
+    none = (None,) * (moved.stop - moved.start)
+    models = global_models(bins, sources, moved, highest, dt, most) if most else none
+    values = np.array(bins.values)
+    for channel, model in enumerate(models, start=moved.start):
+        if model is None:
+            continue
+        for start in range(0, model.reach, _PIECE):
+            rows = slice(start, min(start + _PIECE, model.reach))
+            values[rows, channel] -= model.at_bins(bins, sources, rows)[0]
+    return Rest(bins._replace(values=values), tuple(models), sources, moved)
+
+
+def model_slopes(
+    rest: Rest, bins: Bins, omega: Grid, fit: LocalFit
+) -> Complex[np.ndarray, "frequencies moved inputs parameters"]:
+    """How the models' parameters move the sum of the models and the local fits.
+
+    A local fit follows what a wrong parameter leaves in its window, so that only the difference of
+    the model's own change at the frequency and of the change that the local fit sees remains.
+    `fit` is from the sources to the moved channels.
+    """
+    inputs = fit.response.shape[2]
+    slopes = np.zeros((omega.size, len(rest.models), inputs, rest.parameters), complex)
+    effect = np.nan_to_num(fit.effect)
+    end = 0
+    for c, model in enumerate(rest.models):
+        if model is None:
+            continue
+        own, end = slice(end, end + model.drive.shape[0]), end + model.drive.shape[0]
+        slopes[:, c, :, own] = model.response_slopes(omega, inputs)
+        slopes[:, c, :, own] -= _seen(model, bins, rest.sources, effect, fit.first)
+    return slopes
+
+
+def _seen(
+    model: GlobalModel,
+    bins: Bins,
+    sources: slice,
+    effect: Complex[np.ndarray, "frequencies inputs window"],
+    first: Int[np.ndarray, " frequencies"],
+) -> Complex[np.ndarray, "frequencies inputs parameters"]:
+    """The local fits' response to the model's slopes at the bins."""
+    total = np.zeros((*effect.shape[:2], model.drive.shape[0]), complex)
+    length = effect.shape[2]
+    for start in range(0, model.reach, _PIECE):
+        stop = min(start + _PIECE, model.reach)
+        slopes = model.at_bins(bins, sources, slice(start, stop))[1]
+        for f in np.flatnonzero((first < stop) & (first + length > start)):
+            low, high = max(first[f], start), min(first[f] + length, stop)
+            total[f] += (
+                effect[f, :, low - first[f] : high - first[f]] @ slopes[low - start : high - start]
+            )
+    return total
+
+
+def shared_errors(
+    rest: Rest,
+    bins: Bins,
+    omega: Grid,
+    fit: LocalFit,
+    noise: Noise,
+    left: Complex[np.ndarray, "frequencies outputs moved"],
+    right: Complex[np.ndarray, "frequencies sources inputs"],
+) -> SharedErrors | None:
+    """Errors of the models' parameters in left (models + `fit`) right; `None` without models.
+
+    `noise` is that of the moved channels.
+    """
+    used = [model for model in rest.models if model is not None]
+    if not used:
+        return None
+    slopes = model_slopes(rest, bins, omega, fit)
+    slopes = np.einsum("foc,fcsp,fsi->foip", left, slopes, right, optimize=True)
+    places = used[0].places
+    roots = noise.root_at(bins.omega[places])
+    lines = roots / np.maximum(np.linalg.norm(roots, axis=2, keepdims=True), 1e-300)
+    drive = [
+        model.drive[:, :, None] * (np.sqrt(model.noise)[:, None] * lines[:, c])
+        for c, model in enumerate(rest.models)
+        if model is not None
+    ]
+    return SharedErrors(slopes, np.concatenate(drive), places)
