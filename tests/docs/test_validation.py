@@ -3,6 +3,8 @@
 import json
 import sys
 
+import jax
+import numpy as np
 import pytest
 from conftest import ROOT
 
@@ -29,3 +31,26 @@ def test_every_result_names_a_command_that_is_there(name):
 def test_the_readme_and_the_site_lead_to_the_page():
     assert "docs/validation.md" in (ROOT / "README.md").read_text()
     assert "validation.md" in (ROOT / "mkdocs.yml").read_text()
+
+
+@pytest.mark.slow
+def test_a_study_continues_where_it_stopped_and_makes_its_tables(tmp_path):
+    from bounds import cramer_rao  # pyright: ignore
+    from healthy import drawn, run  # pyright: ignore
+    from healthy_table import as_tables  # pyright: ignore
+    from plants import make  # pyright: ignore
+
+    plant = make("short-20")
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as a user's
+        run("short-20", [0, 1], tmp_path)
+        run("short-20", [0, 1, 2, 3, 4], tmp_path)
+    rows = drawn(tmp_path / "short-20.jsonl")
+    assert [row["seed"] for row in rows] == [0, 1, 2, 3, 4]
+    bound = cramer_rao(plant)
+    by_plant, by_parameter = as_tables(
+        {"short-20": plant}, {"short-20": rows}, {"short-20": bound}, ""
+    )
+    assert by_plant["rows"][0][0] == plant.title
+    errors = np.array([row["values"] for row in rows]) - plant.truth
+    assert np.all(np.abs(errors) < 6 * bound)
+    assert len(by_parameter["rows"]) == plant.truth.size

@@ -23,6 +23,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 MEMBERS, SEED = 2000, 2026
 KT, J0, LIMIT, DT, DURATION = 0.0468, 0.0552, 10.0, 0.002, 10.0
 DELAY, COULOMB, NOISE = 0.004, 0.002, np.radians(0.02)
+PEAK = 3.6  # of Ms, the limit of the tunes
 EVENTS = (0.0, 2.5, 4.5, 6.5)  # s, at which ITAE's clock starts again
 
 
@@ -219,7 +220,7 @@ def designs() -> dict:
     for name, (controller, free) in cases.items():
         tuned = jq.tune(
             loop(controller), ensemble(), flight(), free=free, objective=objective(),
-            limits=[jq.Limit("sensitivity_peak", at_most=3.6)], key=jax.random.key(0),
+            limits=[jq.Limit("sensitivity_peak", at_most=PEAK)], key=jax.random.key(0),
             progress=False,
         )  # fmt: skip
         assert tuned.certificate is not None
@@ -236,9 +237,11 @@ def row_of(name: str, controller, summary, members: Members) -> list:
     peak, limit = np.nanmax(linear["peak"]), theirs["sensitivity_peak"].worst
     print(name, law, f"{itae.mean():.2f} {itae.max():.2f} {unstable} {peak:.2f}", flush=True)
     share = f"{100 * unstable / len(members.inertia):.1f}"
+    beyond = np.sum(linear["peak"] > PEAK)
     return [
         name, share, f"{100 * summary.unstable / summary.members:.1f} of {summary.members}",
         _pair(itae.mean(), itae.max()), _pair(*certified), f"{peak:.2f}", f"{limit:.2f}",
+        f"{100 * beyond / len(members.inertia):.2f}",
     ]  # fmt: skip
 
 
@@ -263,12 +266,14 @@ def main() -> None:
         ),
         "columns": [
             "design", "unstable %", "certificate: unstable %", "ITAE", "certificate: ITAE",
-            "largest Ms", "certificate: largest Ms",
+            "largest Ms", "certificate: largest Ms", f"Ms beyond {PEAK:g}, %",
         ],
         "rows": rows,
         "notes": [
             "The worst of 2000 members reaches further than the worst of 256: a sample's worst is "
             "no bound. Ms is that of stable members.",
+            f"`jq.tune` was given the limit Ms <= {PEAK:g}; 256 members without a violation "
+            "prove with 95 % confidence that at most 1.2 % are beyond it.",
         ],
     }  # fmt: skip
     if given.members == MEMBERS:
