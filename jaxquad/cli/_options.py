@@ -87,7 +87,8 @@ def add_settings(
             "help": (only or {}).get(key) or option.help,
         }
         if kind.words == 0:
-            group.add_argument(option.flag, action="store_false", **how)
+            on = f"store_{'false' if option.flag.startswith('--no-') else 'true'}"
+            group.add_argument(option.flag, action=on, **how)
             continue
         how |= {"type": kind.read, "metavar": kind.metavar, "choices": kind.choices}
         how |= {"nargs": kind.words} if kind.words > 1 else {}

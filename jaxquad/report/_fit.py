@@ -17,9 +17,13 @@ _CORRELATED = 0.9
 _DASH = "\u2013"
 
 
-def parameter_section(fit: Fit, derived: Sequence[Combination]) -> dict[str, object]:
+def parameter_section(
+    fit: Fit, derived: Sequence[Combination], beside: Mapping[str, str]
+) -> dict[str, object]:
     """Every number with its standard error, and how good the fit is."""
-    heads = ("parameter", "value", "std. error", "95 % interval", "CR, %", "insensitivity, %")
+    heads = ("parameter", "value", "std. error", "95 % interval")
+    heads += ("by noise alone", "width") if fit.discrepancy is not None else ()
+    heads += ("CR, %", "insensitivity, %")
     heads += () if fit.identifiable else ("stopped at",)
     rows = [_parameter(fit, k) for k in range(len(fit.names))]
     rows += [[*_estimate(each), *[_DASH] * (len(heads) - 4)] for each in derived]
@@ -31,6 +35,7 @@ def parameter_section(fit: Fit, derived: Sequence[Combination]) -> dict[str, obj
         "facts": _quality(fit),
         "correlation": _correlation(fit),
         "text": str(fit),
+        "beside": [{"title": title, "text": text} for title, text in beside.items()],
     }
 
 
@@ -45,7 +50,16 @@ def _parameter(fit: Fit, k: int) -> list[str | Cell]:
         cells = [Cell(f"{name} *"), "", cells[2], "not determined"]
     percents = zip((fit.cramer_rao[k], fit.insensitivity[k]), _BOUNDS, strict=True)
     shares = [_marked(f"{x:.2f}" if np.isfinite(x) else "", bool(x > most)) for x, most in percents]
-    return [*cells, *shares, *stopped]
+    return [*cells, *_by_noise(fit, k), *shares, *stopped]
+
+
+def _by_noise(fit: Fit, k: int) -> list[str]:
+    if fit.discrepancy is None:
+        return []
+    if not fit.determined[k]:
+        return ["", ""]
+    low, high = fit.interval(fit.names[k], model_error=False)
+    return [f"{low:.5g} .. {high:.5g}", fit.discrepancy.widths[k]]
 
 
 def _estimate(one: Combination) -> list[str | Cell]:

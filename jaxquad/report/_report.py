@@ -31,6 +31,7 @@ def write_report(
     record: Record | Mapping[str, Record] | None = None,
     checks: Verification | Mapping[str, Verification] | None = None,
     derived: Sequence[Combination] = (),
+    beside: Mapping[str, str] | None = None,
     tuned: Tuned | Certificate | None = None,
     provenance: Provenance | None = None,
     title: str = "",
@@ -51,6 +52,7 @@ def write_report(
     - `others`: further estimates of the same response, by name.
     - `record`, `checks`: the records, and the model simulated on records; one, or several by name.
     - `derived`: rows below the parameters, see `Fit.derived`.
+    - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
     - `provenance`: where the result comes from, see `jaxquad.report.provenance`.
     - `title`: by default "output / input" of the first response.
@@ -76,7 +78,7 @@ def write_report(
         "record": record_section(records) if records else None,
         "response": response_section(frfs, models, others or {}),
         "residuals": residual_section(frfs, models) if models else None,
-        "parameters": parameter_section(fit, derived) if fit.verdict.fitted else None,
+        "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
         "identifiability": identifiability_section(fit),
         "verification": check_section(found) if found else None,
         "tuned": tuned_section(tuned) if tuned is not None else None,

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxquad._core import write_file
-from jaxquad.identify import Agreement, Fit, Verification
+from jaxquad.identify import Agreement, Discrepancy, Fit, Verification
 from jaxquad.spectra import FrequencyResponse
 
 
@@ -79,6 +79,8 @@ def _fit(fit: Fit) -> dict[str, object]:
         ],
         "null_directions": fit.verdict.null_directions,
         "covariance": fit.covariance,
+        "noise_covariance": fit.noise_covariance,
+        "discrepancy": None if fit.discrepancy is None else _discrepancy(fit.discrepancy),
         "cost": fit.cost,
         "average_cost": fit.average_cost,
         "chi_squared": fit.chi_squared,
@@ -96,8 +98,19 @@ def _parameter(fit: Fit, k: int) -> dict[str, object]:
         "standard_error": fit.standard_errors[k],
         "determined": bool(fit.determined[k]),
         "interval_95": fit.interval(fit.names[k]),
+        "noise_standard_error": fit.noise_standard_errors[k],
+        "noise_interval_95": fit.interval(fit.names[k], model_error=False),
+        "width": None if fit.discrepancy is None else fit.discrepancy.widths[k],
         "cramer_rao_percent": fit.cramer_rao[k],
         "insensitivity_percent": fit.insensitivity[k],
+    }
+
+
+def _discrepancy(found: Discrepancy) -> dict[str, object]:
+    return {
+        "amplitude_rad": found.amplitude,
+        "length_ln_omega": found.length,
+        "probability_of_none": found.none,
     }
 
 

@@ -9,14 +9,17 @@ from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
 from jaxquad.identify import (
+    Bands,
     CoherenceWeighted,
     Combination,
+    Explanation,
     factors,
     Fit,
     fit,
     fit_transfer_function,
     guess_lagged_integrator,
     MaximumLikelihood,
+    MISFIT,
     UndeterminedError,
     usable,
     Verification,
@@ -62,6 +65,10 @@ class Identification:
     - `fits`: the fit to each of them.
     - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
       the band; None for one that diverged.
+    - `bands`: the same parameters from the lower and the upper half of the band, where there is a
+      fit.
+    - `explanation`: which further term the response wants, where `settings.explain` asks for it and
+      the misfit exceeds 1.5 random errors.
     - `check`: the second record simulated, where `settings.verify` names one.
     - `proposal`: where the log itself said what is input and output.
     """
@@ -74,6 +81,8 @@ class Identification:
     parts: Mapping[str, Fit | None]
     check: Verification | None
     proposal: Proposal | None
+    bands: Bands | None = None
+    explanation: Explanation | None = None
 
     @property
     def method(self) -> str:
@@ -113,6 +122,15 @@ class Identification:
             return tuple(self.fit.derived(q, name) for name, q in _sums(self.settings).items())
         except UndeterminedError:
             return ()
+
+    @property
+    def beside(self) -> dict[str, str]:
+        """What goes with the fit as text, by title: halves of the band, what explains a misfit."""
+        found: dict[str, Bands | Explanation | None] = {
+            "Lower and upper half of the band": self.bands,
+            "What explains the misfit": self.explanation,
+        }
+        return {title: str(each) for title, each in found.items() if each is not None}
 
     def figures(self) -> dict[str, Figure]:
         """The figures by file name: Bode diagram, records, and the check on a second record."""
@@ -156,6 +174,7 @@ class Identification:
             ]
         if self.parts:
             parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, sums)}"]
+        parts += [f"\n{title}:\n{text}" for title, text in self.beside.items()]
         return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
 
 
@@ -210,7 +229,16 @@ def identify(path: str | Path, settings: IdentifySettings | None = None) -> Iden
     best = methods[0]
     fits[best], parts = _fit_parts(fits[best], responses[best], settings)
     found = Identification(path, settings, records, responses, fits, parts, None, proposal)
-    return dataclasses.replace(found, check=_checked(found))
+    return dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
+
+
+def _fitted_again(found: Identification) -> dict[str, Bands | Explanation | None]:
+    """The halves of the band, and the explanation of a misfit that was asked for."""
+    fit = found.fit
+    if not fit.verdict.fitted or fit.verdict.kind == "no minimum":
+        return {}
+    wanted = found.settings.explain and fit.chi_squared > MISFIT**2
+    return {"bands": fit.bands(), "explanation": fit.explain() if wanted else None}
 
 
 def propose_settings(

@@ -297,6 +297,14 @@ class IdentifySettings(Settings):
         "maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default",
         group=_ESTIMATE,
     )
+    explain: bool = option_field(
+        kinds.SWITCH,
+        False,
+        "where the misfit exceeds 1.5 random errors, fit again with one more pole, zero, pair, "
+        "or damping, and say which the response wants",
+        group=_ESTIMATE,
+        flag="--explain",
+    )
     verify: str | None = option_field(
         kinds.FILE,
         None,

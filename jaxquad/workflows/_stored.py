@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxquad.identify import UndeterminedError, Verification, verify
+from jaxquad.identify import Fit, UndeterminedError, Verification, verify
 from jaxquad.models import LaggedIntegrator, TransferFunction
 from jaxquad.report import provenance, sha256_of, write_report, write_results
 
@@ -42,6 +42,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         "band_rad_per_s": found.band,
         "derived": [each._asdict() for each in found.combinations],
         "provenance": origin.content(),
+        **_content_beside(found),
         **_model_content(found),
     }
     path = write_results(folder, fit=found.fit, frf=found.frf, check=found.check, extra=extra)
@@ -60,6 +61,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         derived=found.combinations,
         provenance=origin,
         formula=found.formula,
+        beside=found.beside,
     )
     return path
 
@@ -71,6 +73,37 @@ def _write_figures(found: Identification, folder: Path) -> None:
             earlier.unlink(missing_ok=True)
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=130)
+
+
+def _content_beside(found: Identification) -> dict[str, object]:
+    """The halves of the band, and what explains the misfit."""
+    content: dict[str, object] = {}
+    if found.bands is not None:
+        halves = {"lower": found.bands.lower, "upper": found.bands.upper}
+        content["half_bands"] = {"split_rad_per_s": found.bands.split} | {
+            name: None if half is None else _intervals(half) for name, half in halves.items()
+        }
+    if found.explanation is not None:
+        tried = [
+            {"term": each.title, "factor": each.formula, "bic_lower_by": each.gain}
+            for each in found.explanation.candidates
+        ]
+        content["explanation"] = {"summary": found.explanation.summary, "tried": tried}
+    return content
+
+
+def _intervals(fit: Fit) -> list[dict[str, object]]:
+    if not fit.verdict.fitted:
+        return []
+    return [
+        {
+            "name": name,
+            "value": fit.values[k],
+            "interval_95": fit.interval(name),
+            "determined": bool(fit.determined[k]),
+        }
+        for k, name in enumerate(fit.names)
+    ]
 
 
 def _model_content(found: Identification) -> dict[str, object]:
