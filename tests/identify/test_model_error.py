@@ -1,0 +1,119 @@
+"""What a model leaves unexplained: intervals that count it, halves of the band, further terms."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import OMEGA, response_of
+
+import jaxquad as jq
+
+
+TRUTH = jq.LaggedIntegrator(80.0, 0.06, 0.03)
+START = jq.LaggedIntegrator(60.0, 0.04, 0.04)
+
+
+class Damped(jq.LaggedIntegrator):
+    """The axis with rate damping, which the model of the fit lacks."""
+
+    damping: float = 0.3  # rad/s
+
+    def frequency_response(self, omega):
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
+        damping = jnp.asarray(self.damping + 0j)
+        return super().frequency_response(omega) * (s / (s + damping))[:, None, None]
+
+
+def total(fit, model_error=True):
+    """Lag + delay and its standard error."""
+    covariance = fit.covariance if model_error else fit.noise_covariance
+    ones = np.array([0.0, 1.0, 1.0])
+    return ones @ fit.values, np.sqrt(ones @ covariance @ ones)
+
+
+@pytest.fixture(scope="module")
+def right():
+    return [jq.fit(START, response_of(TRUTH, seed=k)) for k in range(25)]
+
+
+@pytest.fixture(scope="module")
+def wrong():
+    return [jq.fit(START, response_of(Damped(80.0, 0.06, 0.03), seed=k)) for k in range(25)]
+
+
+def test_a_right_model_costs_little_more_than_its_noise(right):
+    ratios = [fit.standard_errors / fit.noise_standard_errors for fit in right]
+    assert np.all(np.median(ratios, axis=0) < 1.4) and np.min(ratios) >= 1
+    assert np.median([fit.discrepancy.none for fit in right]) > 0.5
+    assert np.all(np.diff(right[0].interval("gain")) > np.diff(noise_interval(right[0])))
+
+
+def noise_interval(fit):
+    return fit.interval("gain", model_error=False)
+
+
+def test_a_wrong_model_is_covered_with_its_error_and_not_by_the_noise(wrong):
+    def covered(model_error):
+        found = [total(fit, model_error) for fit in wrong]
+        inside = [abs(value - 0.09) < 1.96 * error for value, error in found]
+        gains = [fit.interval("gain", model_error=model_error) for fit in wrong]
+        return np.mean(inside), np.mean([low < 80.0 < high for low, high in gains])
+
+    assert np.all(np.array(covered(False)) < 0.5)
+    assert np.all(np.array(covered(True)) > 0.9)
+    assert all(fit.chi_squared > 1.5**2 and fit.discrepancy.none < 0.01 for fit in wrong)
+    assert "prior" in str(wrong[0]) or "data" in str(wrong[0])
+
+
+def test_both_costs_and_both_halves_of_the_band_agree_with_model_error():
+    frf = response_of(Damped(80.0, 0.06, 0.03), seed=1)
+    by_likelihood, by_14 = (
+        jq.fit(START, frf, cost=cost)
+        for cost in (jq.identify.MaximumLikelihood(), jq.identify.CoherenceWeighted())
+    )
+    for name in by_likelihood.names:
+        (low, high), (other_low, other_high) = (
+            fit.interval(name) for fit in (by_likelihood, by_14)
+        )
+        assert low < other_high and other_low < high
+    bands = by_likelihood.bands()
+    assert bands.split == pytest.approx(np.sqrt(OMEGA[0] * OMEGA[-1]))
+    assert not any(bands.overlap(name) is False for name in by_likelihood.names)
+    assert "0.5 .. 3.16 rad/s" in str(bands)
+
+
+def test_what_the_model_lacks_makes_its_points_count_alike():
+    """The floor: a point of a tenth of the random error does not count a hundredfold any more."""
+    frf = response_of(Damped(80.0, 0.06, 0.03), error=0.001, seed=0)
+    points = jq.identify.Points(frf, *(np.full(frf.response.shape, x) for x in (True, 1.0, 0.1)))
+    weights = jq.identify.MaximumLikelihood().weights(points, np.ones(frf.response.shape))
+    np.testing.assert_allclose(weights, 1 / np.hypot(0.001, 0.1))
+
+
+def test_points_that_share_their_noise_count_by_what_is_their_own():
+    """Of pairs of frequencies with the same error, each counts half."""
+    apart = np.repeat(OMEGA[::2], 2) * np.tile([1.0, 1.0001], 15)
+    frf = response_of(TRUTH, omega=apart)
+    noise = np.kron(np.eye(15), np.ones((2, 1)))
+    effect = jnp.asarray(0.02 * np.asarray(frf.response)[:, :, 0] * noise)[:, None, :]
+    errors = jq.spectra.ErrorCovariance(frf.omega, effect, jnp.ones((30, 1, 1), complex))
+    fit = jq.fit(START, dataclasses.replace(frf, errors=errors))
+    np.testing.assert_allclose(fit.origin.points[0].shared, 2.0, rtol=1e-6)
+
+
+def test_where_nothing_was_fitted_nothing_is_fitted_again():
+    nothing = jq.fit(START, response_of(TRUTH, error=1.0))
+    assert nothing.verdict.kind == "too few points"
+    with pytest.raises(ValueError, match="cannot be made again"):
+        nothing.bands()
+
+
+@pytest.mark.slow
+def test_the_missing_term_is_found_and_a_right_model_is_left_alone(right, wrong):
+    found = wrong[0].explain()
+    assert found.candidates[0].title == "rate damping" and found.best is not None
+    assert abs(found.best.values[-1] - 0.3) < 3 * found.best.standard_errors[-1]
+    assert "d = 0." in found.summary and "want rate damping" in str(found)
+    assert right[0].explain().best is None
