@@ -122,8 +122,11 @@ def certify(
         start=None if begun is None else run(begun),
         error="itae" if _moves(flight) else "rms",
     )
-    remarks = [*_remarks(found, loop.controller, drawn), *_beyond_knowledge(loop, ensemble)]
-    remarks += beyond_authority(_authority(loop, drawn), flight)
+    limits_of = _authority(loop, drawn)
+    remarks = _remarks(found, loop.controller, drawn) + beyond_authority(limits_of, flight)
+    if isinstance(ensemble, Ensemble) and ensemble.plants is not None:
+        remarks += _beyond_band(loop.controller, ensemble.plants.band)
+        remarks += _beyond_record(limits_of, ensemble.plants.largest_command)
     return dataclasses.replace(found, remarks=tuple(remarks))
 
 
@@ -151,27 +154,23 @@ def _authority(loop: Loop, drawn: Members) -> Authority | None:
     return find_authority(members.plant, members.drive, members.controller)
 
 
-def _beyond_knowledge(loop: Loop, ensemble: Ensemble | Members) -> list[str]:
-    """Where the design uses more of the plant than was identified, if that is known."""
-    plants = ensemble.plants if isinstance(ensemble, Ensemble) else None
-    if plants is None:
+_ROUNDED = 1.01  # by which a number may exceed what the record knows without a word
+
+
+def _beyond_record(found: Authority | None, largest: float | None) -> list[str]:
+    """Whether the command may exceed all that the record has, where both are known."""
+    limit = np.inf if found is None else float(np.max(np.asarray(found.command)))
+    if largest is None or not np.isfinite(limit) or limit <= _ROUNDED * largest:
         return []
-    found = _beyond_band(loop.controller, plants.band)
-    limit = find_authority(loop.plant, loop.drive, loop.controller)
-    most, known = plants.largest_command, None if limit is None else float(np.max(limit.command))
-    if most is not None and known is not None and known > _ROUNDED * most:
-        found.append(
-            f"the limit of the command, {known:.4g}, is {known / most:.2g} times the largest "
-            f"command of the record, {most:.3g}: the model is not known there. Lower the limit to "
-            f"{most:.2g}, or record larger commands"
-        )
-    return found
-
-
-_ROUNDED = 1.01  # by which a limit is given beyond the record's largest command without a word
+    return [
+        f"the limit of the command, {limit:.4g}, is {limit / largest:.2g} times the largest "
+        f"command of the record, {largest:.3g}: the model is not known there. Lower the limit to "
+        f"{largest:.2g}, or record larger commands"
+    ]
 
 
 def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[str]:
+    """Which bandwidths of a LADRC lie beyond the identified band, where it is known."""
     ladrc = find_ladrc(controller)
     if band is None or ladrc is None:
         return []

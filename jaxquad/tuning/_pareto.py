@@ -18,11 +18,12 @@ from ._cost import Progress, stack_copies
 from ._design_result import DesignResult, DesignSummary, front_point, summarise_design
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty
-from ._parameters import build_design, select_coordinates
-from ._phases import solve
+from ._parameters import build_design, Coordinates, select_coordinates
+from ._phases import find_bounds, Solution, solve
 from ._problem import DeviceChoice, make_problem, TimeSpan
 from ._quantities import QUANTITIES
-from ._tune import draw_or_take, require_kinds, stabilising_rate, tighten
+from ._tune import draw_or_take, judge_descent, require_kinds, stabilising_rate, tighten
+from ._verdict import Verdict
 
 
 def describe_front(pareto: "Pareto") -> str:
@@ -186,6 +187,10 @@ def pareto(
         )
         for k, design in enumerate(designs)
     ]  # fmt: skip
+    certificates = [
+        dataclasses.replace(one, convergence=_judge_point(coordinates, found, k))
+        for k, one in enumerate(certificates)
+    ]
     beside = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}
     certificates[0] = dataclasses.replace(
         certificates[0], designs={"tuned": certificates[0].design}
@@ -194,6 +199,11 @@ def pareto(
         over, held, tuple(designs), tuple(certificates), beside, found.converged,
         found.evaluations, seconds,
     )  # fmt: skip
+
+
+def _judge_point(coordinates: Coordinates, found: Solution, k: int) -> Verdict:
+    bounds = find_bounds(coordinates, found.z[k], found.gradient[k])
+    return judge_descent(found, k, bounds)
 
 
 def _levels(

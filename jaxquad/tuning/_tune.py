@@ -130,7 +130,7 @@ def tune(
         )  # fmt: skip
     found = _limit_results(limits, solution, best)
     bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
-    convergence = _judge_descent(solution, best, bounds, found)
+    convergence = judge_descent(solution, best, bounds, found)
     if certificate is not None:
         certificate = dataclasses.replace(certificate, convergence=convergence)
     return Tuned(
@@ -217,8 +217,8 @@ def _limit_results(
     return tuple(results)
 
 
-def _judge_descent(
-    solution: Solution, index: int, bounds: tuple[Bound, ...], limits: Sequence[LimitResult]
+def judge_descent(
+    solution: Solution, index: int, bounds: tuple[Bound, ...], limits: Sequence[LimitResult] = ()
 ) -> Verdict:
     """The verdict on convergence, where all members could be stabilised."""
     if not solution.stable[index]:

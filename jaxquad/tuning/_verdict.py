@@ -210,7 +210,8 @@ def judge_convergence(
     faults += [f"the limit on {text}" for text in missed]
     ended = f"{evaluations} gradients"
     if not faults:
-        text = f"the descent ended at a stationary point after {ended}: {reason}, {size}"
+        why = f"{reason}, " if reason else ""
+        text = f"the descent ended at a stationary point after {ended}: {why}{size}"
         return Verdict("CONVERGENCE", True, text)
     names = ", ".join(b.name for b in bounds)
     remedies = [f"Hold {names} below it, or penalise what drives it there (activity)"] * bool(
