@@ -252,6 +252,9 @@ def _repair_in_place(
     return times
 
 
+_SMALLEST = 1e-20  # of a channel's size: high powers of it are still numbers
+
+
 def _check_channels(record: Record) -> None:
     for name, times in record.repaired.items():
         if times.size > _MOST_REPAIRED * record.samples:
@@ -269,6 +272,13 @@ def _check_channels(record: Record) -> None:
                 f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s. "
                 f"Choose a range without them (start=, stop=; --start, --stop), or let gaps up to "
                 f"some length in s be interpolated (max_gap=, --max-gap)."
+            )
+        largest = float(np.max(np.abs(values)))
+        if largest and not _SMALLEST <= largest <= 1 / _SMALLEST:
+            raise RecordError(
+                f"channel {name!r} reaches {largest:.3g}: powers of it leave the range of floating "
+                f"point numbers. Give it in another unit, between {_SMALLEST:g} and "
+                f"{1 / _SMALLEST:g}."
             )
         if np.ptp(values) == 0:
             warnings.warn(

@@ -186,3 +186,10 @@ def test_mix_adds_a_weighted_sum_in_the_asked_role(role):
 def test_mix_refuses(name, weights, said):
     with pytest.raises(RecordError, match=said):
         mix(record(), name, weights)
+
+
+@pytest.mark.parametrize("size", [1e160, 1e-200])
+def test_a_size_whose_square_is_no_number_is_refused(size):
+    time = 0.01 * np.arange(100)
+    with pytest.raises(RecordError, match="channel .y. reaches 1e.*another unit"):
+        Record(time, np.sin(time), size * np.sin(time) / np.max(np.abs(np.sin(time))))
