@@ -11,9 +11,11 @@ from jaxquad._core import require_x64
 from jaxquad.records import Record
 
 from ._fit import check_priors
+from ._noise_model import ARMA, AutoRegressive, Noise
+from ._output_error_noise import descend_with_noise
 from ._output_error_problem import descend_by_turns, evaluate_misfits, OutputError, RecordTerm
 from ._output_error_result import assess_output_error
-from ._parameters import Free, name_places, Parameters, select_parameters, Tie
+from ._parameters import Free, name_places, Parameters, Positive, Real, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of
 from ._result import Fit
 from ._simulated import (
@@ -31,9 +33,10 @@ from ._simulated import (
 
 
 def refine(
-    model: PyTree,
+    model: PyTree | Fit,
     record: Record | Sequence[Record],
     *,
+    noise: Noise | None = None,
     free: Free = None,
     tied: Mapping[str, Tie] | None = None,
     hold: str | None = None,
@@ -41,11 +44,13 @@ def refine(
     priors: Sequence[Prior] = (),
     max_steps: int = 64,
 ) -> Fit:
-    """Output-error estimate of a model's `free` parameters in the time domain.
+    """Estimate of a model's `free` parameters in the time domain: output or prediction error.
 
     Outputs are weighted by the variance of their residuals, which is estimated in turn with the
     parameters; `Fit.cost` is in units of it. Standard errors hold for coloured residuals. Each
-    record has its own initial state, trim and noise level.
+    record has its own initial state, trim and noise level. With a `noise` model, the errors of
+    predicting each sample from those before it take the place of the residuals: an efficient
+    estimate in coloured noise, and a consistent one where feedback returns noise to the input.
 
     **Arguments:**
 
@@ -54,8 +59,12 @@ def refine(
         biases on the state derivatives and a shift of each output are eliminated by least squares.
         Any other `eqx.Module` with `init()`, `derivative(state, inputs, disturbance)` and
         `measure(state)` is integrated by diffrax with a disturbance of zero; its initial state is
-        estimated as a change of `init()`.
+        estimated as a change of `init()`. A `jq.identify.Fit` starts from its values, with its
+        free and tied parameters unless others are given.
     - `record`: a `jq.Record` or a list of them.
+    - `noise`: None for white noise (output error), or a model of each output's own noise:
+        `jq.identify.AutoRegressive(order)`, `jq.identify.ARMA(poles, zeros)`, or "auto" for the one
+        of lowest Akaike criterion. `Fit.noise_models` has what was found.
     - `free`, `tied`, `priors`: as in `jq.fit`.
     - `hold`, `band`: as in `jq.verify`, the hold by default as each record says; model and data are
         filtered alike.
@@ -67,20 +76,27 @@ def refine(
 
     **Raises:**
 
-    - `ValueError`: what `jq.fit` and `jq.verify` refuse, and a model that cannot be simulated from
-        its starting values.
+    - `ValueError`: what `jq.fit` and `jq.verify` refuse, a model that cannot be simulated from
+        its starting values, and a band beside a noise model.
     - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
 
     Source: Klein & Morelli, Aircraft System Identification, ch. 6 (modified Newton-Raphson with
-    relaxation, errors corrected for coloured residuals).
+    relaxation, errors corrected for coloured residuals); Ljung, System Identification, ch. 7.
     """
     require_x64("an output-error fit")
     records = _checked(record, max_steps)
+    _check_noise(noise, band)
+    near = isinstance(model, Fit)
+    if isinstance(model, Fit):
+        model, free, tied = _continued(model, free, tied)
     parameters = select_parameters(model, free, tied)
     base = _base(model, parameters, priors)
     terms = tuple(_term(model, one, hold, band) for one in records)
     problem = _with_units(OutputError(base, terms, _fixed_zeros(model, parameters)))
-    descent = descend_by_turns(problem, max_steps)
+    if noise is None:
+        descent = descend_by_turns(problem, max_steps)
+    else:
+        descent = descend_with_noise(problem, noise, max_steps, near=near)
     check_priors(base, descent.solution)
     return assess_output_error(descent, records)
 
@@ -97,6 +113,35 @@ def _checked(record: Record | Sequence[Record], max_steps: int) -> list[Record]:
         if still:
             raise ValueError(f"output {still[0]} is constant: leave it out with jq.records.select")
     return records
+
+
+def _check_noise(noise: Noise | None, band: tuple[float, float] | None) -> None:
+    if not (noise in (None, "auto") or isinstance(noise, AutoRegressive | ARMA)):
+        raise ValueError(
+            f"noise is {noise!r}: give None (white), jq.identify.AutoRegressive(order), "
+            'jq.identify.ARMA(poles, zeros) or "auto"'
+        )
+    if noise is not None and band is not None:
+        raise ValueError(
+            f"band {band} rad/s and a noise model exclude each other: outside the band there is no "
+            "noise left to model. Give noise alone: it weights each frequency by its noise"
+        )
+
+
+def _continued(
+    fit: Fit, free: Free, tied: Mapping[str, Tie] | None
+) -> tuple[PyTree, Free, Mapping[str, Tie] | None]:
+    """The fit's model, with its choice of parameters where no other is given."""
+    known = fit.parameters
+    if tied is None:
+        tied = {place.name: tie for place, tie in known.ties}
+    if free is None:
+        logarithmic = known.logarithmic[: known.count]
+        free = [
+            Positive(name) if log else Real(name, abs(float(scale)))
+            for name, log, scale in zip(known.names, logarithmic, known.scale, strict=False)
+        ]
+    return fit.model, free, tied
 
 
 def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Problem:

@@ -8,10 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxquad._core import minimise_on_host, Normal, RUNNING, solve_definite, STALLED
 
+from ._noise_model import NoiseModel
 from ._problem import prior_misfits, Problem
 from ._simulated import (
     band_filter,
@@ -22,6 +23,7 @@ from ._simulated import (
     Motions,
 )
 from ._solve import describe, Solution
+from ._whitening import Whitener
 
 
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
@@ -39,6 +41,26 @@ class RecordTerm(eqx.Module):
     start: Float[Array, " unknown"]  # units of an unknown initial state; none if it is eliminated
     dt: float = eqx.field(static=True)
     hold: str = eqx.field(static=True)
+    whitener: Whitener | None = None  # of the noise, where it has a model
+
+    def weighted(
+        self, x: Float[Array, "samples outputs *columns"]
+    ) -> Float[Array, "samples outputs *columns"]:
+        """What counts of outputs: within the band, unpredicted by the noise, in units of it."""
+        seen = band_filter(x, self.gain) if self.whitener is None else self.whitener(x)
+        return seen * self.weights.reshape(1, -1, *(1,) * (x.ndim - 2))
+
+    @property
+    def measured(self) -> Float[Array, "samples outputs"]:
+        """The measured output as `weighted` sees it."""
+        return self.y * self.weights[None] if self.whitener is None else self.weighted(self.y)
+
+    @property
+    def counted(self) -> Int[np.ndarray, " outputs"]:
+        """Samples of each output that the noise model predicts."""
+        samples, outputs = self.y.shape
+        unseen = np.zeros(outputs, int) if self.whitener is None else self.whitener.start
+        return samples - np.asarray(unseen)
 
 
 class OutputError(eqx.Module):
@@ -92,9 +114,7 @@ def misfit_and_columns(
         simulated = forced_response(plant, term.u, term.dt, term.hold)
         motions = Motions(*term.motions, ())
         columns = free_response(plant, motions, len(term.u), term.dt)
-    weights = term.weights[None]
-    misfit = (term.y - band_filter(simulated, term.gain)) * weights
-    return misfit, band_filter(columns, term.gain) * weights[:, :, None]
+    return term.measured - term.weighted(simulated), term.weighted(columns)
 
 
 def project_out(
@@ -153,8 +173,16 @@ def evaluate_misfits(z: Float[Array, " n"], problem: OutputError) -> Evaluation:
     return Evaluation(left, slopes, columns, Normal(0.5 * jnp.sum(r**2), J.T @ r, J.T @ J))
 
 
+CLOSE = 1e-6  # last step of a descent, relative to 1 + |z|
 _PASSES = 4  # of noise level and parameters by turns
 _LEVEL = 0.01  # change of the noise level that no longer matters
+
+
+class RecordNoise(NamedTuple):
+    """The noise models of a record's outputs, and what their coefficients do to the misfit."""
+
+    models: tuple[NoiseModel, ...]
+    slopes: Float[np.ndarray, "samples outputs coefficients"]  # weighted as the misfit
 
 
 class Descent(NamedTuple):
@@ -164,9 +192,10 @@ class Descent(NamedTuple):
     z: Float[Array, " n"]  # free parameters and initial states
     solution: Solution
     found: Evaluation
+    noise: tuple[RecordNoise, ...] = ()  # of each record, where it has a model
 
 
-class _Point(NamedTuple):
+class Point(NamedTuple):
     """Where the descent stands. Changes of z below 1e-6 count as none: errors are far larger."""
 
     problem: OutputError
@@ -181,15 +210,15 @@ class _Point(NamedTuple):
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(self.found.normal.gradient), np.asarray(self.found.normal.hessian)
 
-    def moved(self, change: Float[np.ndarray, " n"]) -> "_Point":
+    def moved(self, change: Float[np.ndarray, " n"]) -> "Point":
         return _point(self.problem, self.z + change)
 
 
-def _point(problem: OutputError, z: Float[np.ndarray, " n"]) -> _Point:
-    return _Point(problem, z, evaluate_misfits(jnp.asarray(z), problem))
+def _point(problem: OutputError, z: Float[np.ndarray, " n"]) -> Point:
+    return Point(problem, z, evaluate_misfits(jnp.asarray(z), problem))
 
 
-def descend_by_turns(problem: OutputError, max_steps: int) -> Descent:
+def descend_by_turns(problem: OutputError, max_steps: int, tolerance: float = CLOSE) -> Descent:
     """Parameters and noise level by turns: the maximum of the likelihood of both."""
     base, steps = problem.base, 0
     count = base.parameters.count
@@ -198,20 +227,24 @@ def descend_by_turns(problem: OutputError, max_steps: int) -> Descent:
     common = len(problem.terms) == problem.terms[0].weights.size == 1
     common = common and not base.quantities and not problem.unknown
     for turn in range(_PASSES):
-        stop, status, taken = _descend(problem, z, max_steps)
-        z, steps, found, message = stop.z, steps + taken, stop.found, _message(status, taken)
-        sizes = _sizes(problem, found)
+        stop, status, taken = descend(problem, z, max_steps, tolerance)
+        z, steps, found, message = stop.z, steps + taken, stop.found, message_of(status, taken)
+        sizes = sizes_of(problem, found)
         changed = max(float(np.max(np.abs(np.log(size)))) for size in sizes)
         problem = problem.reweighted(sizes)
         if common or changed < _LEVEL or message or turn == _PASSES - 1:
             break
-    at = jnp.asarray(z)
-    (model, values, slopes), derivatives = _describe(at[:count], base)
-    solution = Solution(
-        at[:count], model, values, slopes, message, not message, steps, derivatives,
-        *_at_zero(base, at[:count]),
-    )  # fmt: skip
-    return Descent(problem, at, solution, found.reweighted(sizes))
+    found = found.reweighted(sizes)
+    return Descent(problem, jnp.asarray(z), describe_stop(base, z, message, steps), found)
+
+
+def describe_stop(base: Problem, z: Float[np.ndarray, " n"], message: str, steps: int) -> Solution:
+    """The model, its values and the priors' slopes where the descent stopped."""
+    at = jnp.asarray(z)[: base.parameters.count]
+    (model, values, slopes), derivatives = _describe(at, base)
+    return Solution(
+        at, model, values, slopes, message, not message, steps, derivatives, *_at_zero(base, at)
+    )
 
 
 _FAR = 7.0  # in ln: a parameter that shrank by a factor of 1000 ran to zero
@@ -230,19 +263,20 @@ def _at_zero(
 _describe = eqx.filter_jit(describe)
 
 
-def _sizes(problem: OutputError, found: Evaluation) -> list[Float[np.ndarray, " outputs"]]:
+def sizes_of(problem: OutputError, found: Evaluation) -> list[Float[np.ndarray, " outputs"]]:
     """Standard deviations of the weighted residuals."""
     sizes = []
     for term, misfit in zip(problem.terms, found.misfits, strict=True):
-        size = np.sqrt(np.mean(np.asarray(misfit) ** 2, axis=0))
+        size = np.sqrt(np.sum(np.asarray(misfit) ** 2, axis=0) / term.counted)
         least = 1e-9 * np.std(np.asarray(term.y), axis=0) * np.asarray(term.weights)
         sizes.append(np.maximum(size, least))
     return sizes
 
 
-def _descend(
-    problem: OutputError, z: Float[np.ndarray, " n"], max_steps: int
-) -> tuple[_Point, int, int]:
+def descend(
+    problem: OutputError, z: Float[np.ndarray, " n"], max_steps: int, tolerance: float = CLOSE
+) -> tuple[Point, int, int]:
+    """The minimum near `z`, to a last step of `tolerance`; why it ended, and after what steps."""
     start = _point(problem, z)
     if not np.isfinite(start.cost):
         raise ValueError(
@@ -251,10 +285,10 @@ def _descend(
             "Start from other values, cut the record with jq.records.trim, or fit in the "
             "frequency domain with jq.fit"
         )
-    return minimise_on_host(start, _Point.moved, max_steps)
+    return minimise_on_host(start, Point.moved, max_steps, tolerance=tolerance)
 
 
-def _message(status: int, steps: int) -> str:
+def message_of(status: int, steps: int) -> str:
     """Why the descent stopped before a minimum; empty at one."""
     if status == RUNNING:
         return f"the maximum of {steps} steps was reached"

@@ -1,5 +1,6 @@
 """From the stop of an output-error fit to a result that states what it is worth."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -38,6 +39,7 @@ from ._output_error_problem import (
     evaluate_misfits,
     Evaluation,
     OutputError,
+    RecordNoise,
     RecordTerm,
     with_fixed_slopes,
 )
@@ -64,12 +66,7 @@ def remarks_on_output_error(
         )
     fed = dict.fromkeys(name for record in records for name in record.reference_names)
     if fed:
-        remarks.append(
-            f"the record has references ({', '.join(fed)}), so a loop may have been closed: output "
-            "error is biased where feedback returns the noise to the input; fit the joint "
-            "estimate instead, "
-            "jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())"
-        )
+        remarks.append(_of_feedback(", ".join(fed), bool(descent.noise)))
     remarks.append(
         "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
         "model: check the model by jq.verify on another record"
@@ -77,9 +74,21 @@ def remarks_on_output_error(
     return remarks
 
 
-def remarks_on_colour(
-    misfits: Sequence[Float[np.ndarray, "samples outputs"]], bread: Matrix, covariance: Matrix
-) -> list[str]:
+def _of_feedback(references: str, modelled: bool) -> str:
+    doubt = "output error is biased where feedback returns the noise to the input; fit"
+    if modelled:
+        doubt = (
+            "the estimate is unbiased only as far as the noise model describes the noise; compare"
+        )
+    return (
+        f"the record has references ({references}), so a loop may have been closed: {doubt} the "
+        "joint estimate"
+        + (" instead" if not modelled else "")
+        + ", jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())"
+    )
+
+
+def remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> list[str]:
     """Remark on residuals whose colour changes the standard errors."""
     white = np.diagonal(scaled_inverse(bread))
     ratio = np.sqrt(np.diagonal(covariance) / np.maximum(white, 1e-300))
@@ -87,16 +96,21 @@ def remarks_on_colour(
     most = float(ratio[np.argmax(np.abs(np.log(ratio)))]) if ratio.size else 1.0
     if 0.67 < most < 1.5:
         return []
+    misfits = [np.asarray(one) for one in descent.found.misfits]
     pairs = [np.sum(one[1:] * one[:-1], axis=0) / np.sum(one**2, axis=0) for one in misfits]
     correlation = max(np.concatenate(pairs), key=abs)
+    if descent.noise:
+        subject, advice = "the noise model leaves the residuals", "try one of higher order"
+    else:
+        subject, advice = "the residuals are", 'noise="auto" weights them by their spectrum'
     return [
-        f"the residuals are coloured (lag-one correlation {correlation:.2f}): standard errors "
-        f"allow for it, and are up to {most:.2g} times those under white noise"
+        f"{subject} coloured (lag-one correlation {correlation:.2f}): standard errors allow for "
+        f"it, and are up to {most:.2g} times those under white noise; {advice}"
     ]
 
 
 class Projected(NamedTuple):
-    """Misfit and slopes of one record, orthogonal to its initial state and trim."""
+    """Misfit and slopes of one record, orthogonal to what else is fitted to it."""
 
     misfit: Float[np.ndarray, "samples outputs"]
     slopes: Float[np.ndarray, "samples outputs all"]  # of the misfit, by relative changes
@@ -113,14 +127,22 @@ class Reduced(NamedTuple):
 
 
 def project_records(
-    problem: OutputError, found: Evaluation, rescale: Float[np.ndarray, " all"]
+    descent: Descent, found: Evaluation, rescale: Float[np.ndarray, " all"]
 ) -> list[Projected]:
-    """Each record with slopes by relative changes, orthogonal to its initial state and trim."""
+    """Each record with slopes by relative changes, orthogonal to what else is fitted to it.
+
+    That is its initial state, its trim and its noise model: the errors are those of a joint
+    estimate, in a closed loop too, where the input depends on the noise.
+    """
     projected, at = [], rescale.size
-    parts = zip(problem.terms, found.misfits, found.slopes, found.columns, strict=True)
-    for term, misfit, slopes, columns in parts:
+    noises = [noise.slopes for noise in descent.noise] or [None] * len(found.misfits)
+    parts = zip(
+        descent.problem.terms, found.misfits, found.slopes, found.columns, noises, strict=True
+    )
+    for term, misfit, slopes, columns, noise in parts:
         slopes, states = np.asarray(slopes), term.start.size
-        own = np.concatenate([np.asarray(columns), slopes[:, :, at : at + states]], axis=2)
+        own = [np.asarray(columns), slopes[:, :, at : at + states]]
+        own = np.concatenate(own if noise is None else [*own, noise], axis=2)
         basis = orthonormal(own)
         mine = slopes[:, :, : rescale.size] * rescale
         share = np.einsum("tok,toa->ka", basis, mine)
@@ -139,7 +161,7 @@ def reduced_rows(
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
     for one, term in zip(projected, terms, strict=True):
         mine = basis[at : at + one.misfit.size].reshape(one.slopes.shape)
-        measured = np.asarray(term.y * term.weights[None])
+        measured = np.asarray(term.measured)
         aim += np.einsum("tok,to->k", mine, one.misfit)
         output += np.einsum("tok,to->k", mine, measured)
         fitted = np.concatenate([mine[:, :, :count], one.nuisance], axis=2)
@@ -180,11 +202,11 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     problem, solution = descent.problem, descent.solution
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
     units, rescale = _units(solution), _rescale(solution, _units(solution))
-    projected = project_records(problem, descent.found, rescale[:count])
+    projected = project_records(descent, descent.found, rescale[:count])
     prior = _prior_rows(solution, units)
     reduced = reduced_rows(projected, problem.terms, count)
     bread, gradient, noise = gauss_newton(reduced, prior, count)
-    rows = sum(one.misfit.size for one in projected)
+    rows = sum(int(np.sum(term.counted)) for term in problem.terms)
     data_cost = sum(float(np.sum(one.misfit**2)) for one in projected)
     cost = data_cost + float(np.sum(prior.misfit**2))
     covariance = calibrated_covariance(bread, noise)
@@ -202,8 +224,10 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         verdict, by_data = _verdict(descent, reduced, prior, covariance, units)
     fitted = count + sum(one.nuisance.shape[2] for one in projected)
     average = cost / sum(one.misfit.shape[1] for one in projected)
-    information = _deviance(problem) + cost + 2 * taken
-    return make_fit(
+    samples = sum(one.misfit.size for one in projected)
+    fitted_to_noise = taken + _coefficients(descent.noise)
+    information = _deviance(problem) + cost * samples / rows + 2 * fitted_to_noise
+    fit = make_fit(
         base,
         solution,
         Estimate(bread, covariance, covariance, units[:count], verdict, decrement),
@@ -211,10 +235,11 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         points=rows,
         remarks=(
             *remarks_on_output_error(descent, records, decrement, taken, verdict),
-            *remarks_on_colour([one.misfit for one in projected], bread, covariance),
+            *remarks_on_colour(descent, bread, covariance),
             *remarks_on_priors(prior.misfit, verdict, by_data),
         ),
     )
+    return dataclasses.replace(fit, noise_models=tuple(noise.models for noise in descent.noise))
 
 
 def _verdict(
@@ -230,7 +255,7 @@ def _verdict(
     found = _identifiability(_information(descent, reduced, covariance, units), free)
     if units.size == count or not any(verdict.undetermined for verdict in found):
         return found
-    projected = project_records(problem, with_fixed_slopes(descent), _rescale(solution, units))
+    projected = project_records(descent, with_fixed_slopes(descent), _rescale(solution, units))
     reduced = reduced_rows(projected, problem.terms, count)
     return _identifiability(_information(descent, reduced, covariance, units), prior)
 
@@ -257,6 +282,10 @@ def _information(
 def _deviance(problem: OutputError) -> float:
     """Twice the logarithms of the noise levels, over all samples."""
     return sum(-2 * len(t.y) * float(np.sum(np.log(np.asarray(t.weights)))) for t in problem.terms)
+
+
+def _coefficients(noise: Sequence[RecordNoise]) -> int:
+    return sum(sum(model.order) for one in noise for model in one.models)
 
 
 def _same(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:
