@@ -152,13 +152,38 @@ def fit_with(
         remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
         return unfitted(model, parameters, too_few, tuple(remarks))
     problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
+    asked, used = used, [m & ~none for m, none in zip(used, problem.silences, strict=True)]
     points = points_of(frfs, used)
     problem, solution, minima = _solve_reweighted(problem, points, options)
     _check_finite(solution)
     check_priors(problem, solution)
     problem, solution, counted = _solve_with_floor(problem, points, solution, options, rounds)
     found = assess(problem, counted, solution, minima)
-    return dataclasses.replace(found, origin=Origin(fit_with, tuple(points), options))
+    remarks = (*found.remarks, *_remarks_on_silence(frfs, asked, problem))
+    origin = Origin(fit_with, tuple(points), options)
+    return dataclasses.replace(found, remarks=remarks, origin=origin)
+
+
+_PRESENT = 0.2  # random error of a response that is there
+
+
+def _remarks_on_silence(
+    frfs: Sequence[FrequencyResponse], asked: Sequence[Mask], problem: Problem
+) -> list[str]:
+    """Remark on responses that were measured, and that the model has none of."""
+    remarks = []
+    for frf, mask, pairs in zip(frfs, asked, problem.silent, strict=True):
+        for o, i in pairs:
+            error = np.asarray(frf.random_error)[mask[:, o, i], o, i]
+            if not error.size or np.mean(error < _PRESENT) < 0.5:
+                continue
+            pair = (frf.output_names[o], frf.input_names[i])
+            remarks.append(
+                f"{pair[0]} answers to {pair[1]} (random error {100 * np.median(error):.2g} % at "
+                f"{error.size} frequencies), but the model's response is zero: these points are "
+                f"left out; free what joins the two, or say band={{{pair}: None}}"
+            )
+    return remarks
 
 
 def _too_few_points(

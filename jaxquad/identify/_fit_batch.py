@@ -15,7 +15,7 @@ from jaxquad.spectra import FrequencyResponse
 from ._assess import assess, Counted, discrepancy_at
 from ._cost import (
     Cost,
-    default_coherence,
+    least_coherence,
     MaximumLikelihood,
     Points,
     points_of,
@@ -23,6 +23,7 @@ from ._cost import (
     usable,
 )
 from ._fit import check_options
+from ._held import held, hold_of
 from ._parameters import Free, Parameters, Place, select_parameters, Tie
 from ._problem import make_problem
 from ._result import Fit
@@ -50,6 +51,7 @@ def solve_batch(
     measured: Complex[Array, "batch frequencies outputs inputs"],
     weights: Float[Array, "..."],
     *,
+    hold: float = 0.0,
     max_steps: int = 64,
     tolerance: float = TOLERANCE,
 ) -> BatchSolution:
@@ -57,8 +59,9 @@ def solve_batch(
 
     `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
     phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count. The model is evaluated
-    one frequency at a time. A member that did not reach a stationary point has `converged` false,
-    and its decrement says how far it is; one in a local minimum shows by its cost alone.
+    one frequency at a time, with inputs held for `hold` s (0: not held). A member that did not
+    reach a stationary point has `converged` false, and its decrement says how far it is; one in a
+    local minimum shows by its cost alone.
     Raises ValueError for shapes that do not match, no batch at all, or a response that at one
     frequency depends on which others are asked for.
     """
@@ -68,7 +71,7 @@ def solve_batch(
             "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
         )
     _check_pointwise(model, omega, measured.shape[1:])
-    return _solve_batch(model, parameters, omega, measured, weights, max_steps, tolerance)
+    return _solve_batch(model, parameters, omega, measured, weights, hold, max_steps, tolerance)
 
 
 def _check_pointwise(model: PyTree, omega: Float[Array, " f"], shape: tuple[int, ...]) -> None:
@@ -93,7 +96,7 @@ def _both_ways(model, omega):
 
 @eqx.filter_jit
 def _solve_batch(
-    model, parameters, omega, measured, weights, max_steps, tolerance
+    model, parameters, omega, measured, weights, hold, max_steps, tolerance
 ) -> BatchSolution:
     size = min(_CHUNK, measured.shape[0])
     used = jnp.any(weights > 0, axis=-1)
@@ -102,7 +105,7 @@ def _solve_batch(
     z0 = jnp.broadcast_to(parameters.start[: parameters.count, None], (parameters.count, size))
 
     def chunk(data):
-        evaluate = lambda z: _normal(model, parameters, z, omega, *data)
+        evaluate = lambda z: _normal(model, parameters, z, hold, omega, *data)
         state = minimise(evaluate, z0, max_steps, tolerance)
         normal = evaluate(state.z)
         left = decrement(normal)
@@ -124,11 +127,11 @@ def _chunked(array: Array, size: int) -> Array:
     return jnp.moveaxis(padded.reshape(-1, size, *array.shape[1:]), 1, -1)
 
 
-def _normal(model, parameters, z, omega, inverse, weights) -> Normal:
+def _normal(model, parameters, z, hold, omega, inverse, weights) -> Normal:
     """Normal equations of all members, frequencies outside and members inside."""
 
     def point(z, omega, inverse, weights):
-        return _point(model, parameters, z, omega, inverse, weights)
+        return _point(model, parameters, z, hold, omega, inverse, weights)
 
     members = jax.vmap(point, in_axes=(0, None, -1, -1))
     everywhere = evaluate_once(jax.vmap(members, in_axes=(None, 0, 0, 0)))
@@ -137,11 +140,11 @@ def _normal(model, parameters, z, omega, inverse, weights) -> Normal:
     return _products(stacked.reshape(len(columns), -1, z.shape[1]))
 
 
-def _point(model, parameters, z, omega, inverse, weights) -> list[Float[Array, "..."]]:
+def _point(model, parameters, z, hold, omega, inverse, weights) -> list[Float[Array, "..."]]:
     """Weighted slopes by each parameter, and then the weighted misfit, at one frequency."""
 
     def response(z):
-        return evaluate_response(_insert(model, parameters, z), omega[None])[0]
+        return evaluate_response(held(_insert(model, parameters, z), hold), omega[None])[0]
 
     here = response(z)
     columns = []
@@ -247,6 +250,7 @@ class _Data(NamedTuple):
     omega: Float[np.ndarray, " frequencies"]
     measured: np.ndarray
     points: list[Points]
+    hold: float  # s
 
 
 def fit_batch(
@@ -288,7 +292,7 @@ def fit_batch(
     check_options(cost, band, min_coherence, max_steps)
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
-    least = default_coherence(cost) if min_coherence is None else min_coherence
+    least = least_coherence(min_coherence, cost, frfs[0])
     data = _stack_responses(frfs, band, least)
     ones = [np.ones(each.used.shape) for each in data.points]
     weights = _weights(cost, data, ones)
@@ -321,7 +325,16 @@ def _stack_responses(frfs: Sequence[FrequencyResponse], band: Range | None, leas
         )
     measured = [np.asarray(frf.response) for frf in frfs]
     kept = [np.where(mask, each, 1.0) for mask, each in zip(used, measured, strict=True)]
-    return _Data(omega, np.stack(kept), points_of(frfs, used))
+    return _Data(omega, np.stack(kept), points_of(frfs, used), _shared_hold(frfs))
+
+
+def _shared_hold(frfs: Sequence[FrequencyResponse]) -> float:
+    holds = sorted({hold_of(frf) for frf in frfs})
+    if len(holds) > 1:
+        raise ValueError(
+            f"the inputs of the responses are held for {holds} s: fit those of one hold together"
+        )
+    return holds[0]
 
 
 def _weights(cost: Cost, data: _Data, ratios) -> np.ndarray:
@@ -333,18 +346,19 @@ def _solve(
     model: PyTree, parameters: Parameters, data: _Data, weights: np.ndarray, max_steps: int
 ) -> BatchSolution:
     arrays = (jnp.asarray(data.omega), jnp.asarray(data.measured), jnp.asarray(weights))
-    return solve_batch(model, parameters, *arrays, max_steps=max_steps)
+    return solve_batch(model, parameters, *arrays, hold=data.hold, max_steps=max_steps)
 
 
 @eqx.filter_jit
-def _responses(model, parameters, z, omega):
-    return eqx.filter_vmap(lambda each: evaluate_response(parameters.insert(model, each), omega))(z)
+def _responses(model, parameters, z, hold, omega):
+    one = lambda each: evaluate_response(held(parameters.insert(model, each), hold), omega)
+    return eqx.filter_vmap(one)(z)
 
 
 def _ratios(
     model: PyTree, parameters: Parameters, data: _Data, found: BatchSolution
 ) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
     """|model / measurement| of every member; 1 where a fit ran away."""
-    responses = _responses(model, parameters, found.z, jnp.asarray(data.omega))
+    responses = _responses(model, parameters, found.z, data.hold, jnp.asarray(data.omega))
     ratios = np.abs(np.asarray(responses) / data.measured)
     return np.where(np.isfinite(ratios) & (ratios > 0), ratios, 1.0)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from jaxquad.models import evaluate_response
+from jaxquad.models import evaluate_response, imaginary
 from jaxquad.spectra import FrequencyResponse
 
 
@@ -45,11 +45,11 @@ class Aliases(eqx.Module):
     ) -> Complex[Array, "frequencies outputs inputs"]:
         """The response, from the model's at the frequencies themselves and at `omega`."""
         columns = (1,) * (own.ndim - 1)
-        upper, lower = jnp.split(others / (1j * self.omega).reshape(-1, *columns), 2)
+        upper, lower = jnp.split(others / imaginary(self.omega).reshape(-1, *columns), 2)
         terms = (upper + jnp.conj(lower)).reshape(*self.upper.shape, *own.shape[1:])
-        at_nodes = jnp.einsum("na...,a->n...", terms, self.weights)
+        at_nodes = jnp.einsum("na...,a->n...", terms, self.weights.astype(terms.dtype))
         aliased = jnp.einsum("fn,n...->f...", self.spread, at_nodes)
-        return self.direct.reshape(-1, *columns) * own + aliased
+        return self.direct.reshape(-1, *columns).astype(own.dtype) * own + aliased
 
 
 def evaluate_sampled(
@@ -119,11 +119,11 @@ def remarks_on_hold(
         k = np.unravel_index(np.argmax(over), over.shape)
         if over[k] > 1:
             return [
-                f"nobody said how long the input keeps each value: held for a sample "
+                "nobody said how long the input keeps each value: held for a sample "
                 f"({1e3 * frf.dt:.3g} ms) it loses {100 * lost[k]:.2g} % at "
-                f"{np.asarray(frf.omega)[k[0]]:.3g} rad/s, {over[k]:.2g} times the error there, and "
-                "half a sample of the delay is its own; say hold= in s, the loop's period for a "
-                "command, 0 for a quantity that was measured (jq.Record, jq.read; --hold)"
+                f"{np.asarray(frf.omega)[k[0]]:.3g} rad/s, {over[k]:.2g} times the error there, "
+                "and half a sample of the delay is its own; say hold= in s, the loop's period for "
+                "a command, 0 for a quantity that was measured (jq.Record, jq.read; --hold)"
             ]
     return []
 
@@ -174,7 +174,8 @@ class _Terms(eqx.Module):
         kept = slice(None) if nodes is None else nodes
         others = self.others.reshape(shape)[:, kept, :count].reshape(-1, *self.own.shape[1:])
         at = None if nodes is None else self.omega[nodes]
-        return np.asarray(_aliases_at(self.omega, self.hold, count, at).total(self.own, others))
+        plan = _aliases_at(self.omega, self.hold, count, at)
+        return np.asarray(plan.total(jnp.asarray(self.own), jnp.asarray(others)))
 
 
 def _places(omega: Float[np.ndarray, " frequencies"], count: int) -> np.ndarray:
@@ -191,14 +192,15 @@ def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None)
     """The aliases of all frequencies, or of the nodes between which they are interpolated."""
     at = omega if nodes is None else nodes
     rate = 2 * np.pi / hold
-    turn = (1 - jnp.exp(-1j * omega * hold)) / hold
-    across = jnp.eye(len(omega)) if nodes is None else jnp.asarray(_interpolation(omega, nodes))
-    steps = rate * np.arange(1, count + 1)
+    omega = jnp.asarray(omega)
+    turn = (1 - jnp.exp(-hold * imaginary(omega))) / hold
+    across = jnp.eye(len(omega)) if nodes is None else _interpolation(np.asarray(omega), nodes)
+    at, steps = jnp.asarray(at)[:, None], jnp.asarray(rate * np.arange(1, count + 1))[None]
     return Aliases(
-        direct=turn / (1j * omega),
-        spread=turn[:, None] * across,
-        upper=jnp.asarray(at)[:, None] + steps,
-        lower=steps - jnp.asarray(at)[:, None],
+        direct=turn / imaginary(omega),
+        spread=turn[:, None] * jnp.asarray(across).astype(turn.dtype),
+        upper=at + steps,
+        lower=steps - at,
         weights=jnp.asarray(_window(count)),
     )
 

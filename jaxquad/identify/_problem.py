@@ -6,9 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, PyTree
+from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad._xla import no_fuse
+from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
 from ._held import Aliases, evaluate_sampled, plan_aliases
@@ -61,6 +62,16 @@ class Problem(eqx.Module):
     weights: tuple[Float[Array, "frequencies outputs inputs 2"], ...]
     known: Float[Array, "priors 2"]  # value, standard error
     aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
+    silent: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True, default=())
+
+    @property
+    def silences(self) -> list[Bool[np.ndarray, "outputs inputs"]]:
+        """The pairs of each response that the model has none of, whatever its parameters are."""
+        masks = [np.zeros(each.shape[1:], dtype=bool) for each in self.measured]
+        for mask, pairs in zip(masks, self.silent, strict=True):
+            for pair in pairs:
+                mask[pair] = True
+        return masks
 
     def weighted(self, weights: Sequence[Float[Array, "..."]]) -> "Problem":
         """The same problem under other weights."""
@@ -93,6 +104,7 @@ def make_problem(
         )
     numbers = [[prior.value, prior.standard_error] for prior in priors]
     shapes = [(*frf.response.shape, 2) for frf in frfs]
+    taken = [condition or unchanged for condition in conditions]
     return Problem(
         model=model,
         parameters=parameters,
@@ -104,10 +116,29 @@ def make_problem(
         weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
         known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
         aliases=tuple(
-            plan_aliases((condition or unchanged)(model), frf)
-            for condition, frf in zip(conditions, frfs, strict=True)
+            plan_aliases(each(model), frf) for each, frf in zip(taken, frfs, strict=True)
+        ),
+        silent=tuple(
+            _silent_pairs(model, parameters, *each) for each in zip(taken, frfs, strict=True)
         ),
     )
+
+
+def _silent_pairs(
+    model: PyTree, parameters: Parameters, condition: Condition, frf: FrequencyResponse
+) -> tuple[tuple[int, int], ...]:
+    """Output and input of the pairs that a model has no response of."""
+    if np.prod(frf.response.shape[1:]) == 1:
+        return ()
+    start = np.asarray(parameters.start)[: parameters.count]
+    moved = start + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
+    tried = condition(parameters.insert(model, jnp.asarray(moved)))
+    found = np.asarray(_evaluate(tried, frf.omega[jnp.array([0, frf.omega.size // 2, -1])]))
+    pairs = np.argwhere(np.all(found == 0, axis=0)).tolist()
+    return tuple((output, source) for output, source in pairs)
+
+
+_evaluate = eqx.filter_jit(evaluate_response)
 
 
 def unchanged(model: PyTree) -> PyTree:
@@ -134,8 +165,12 @@ Part = Float[Array, "outputs inputs frequencies"]
 def _log_ratios(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Part]]:
     # Frequencies come last until all is done: derivatives are then fast loops over them.
     logs = []
-    for model, measured in zip(responses(z, problem), problem.measured, strict=True):
-        here, there = (jnp.moveaxis(x, 0, -1) for x in (_of_same_shape(model, measured), measured))
+    parts = zip(responses(z, problem), problem.measured, problem.silences, strict=True)
+    for model, measured, silent in parts:
+        # Of a response that is zero the logarithm would be infinite: such pairs count as explained.
+        model = _of_same_shape(model, measured)
+        model = jnp.where(silent, measured, model) if np.any(silent) else model
+        here, there = (jnp.moveaxis(x, 0, -1) for x in (model, measured))
         power = jnp.real(there) ** 2 + jnp.imag(there) ** 2
         c, s = jnp.real(there) / power, jnp.imag(there) / power
         logs.append(_logarithm(*_rotate(jnp.real(here), jnp.imag(here), c, s)))

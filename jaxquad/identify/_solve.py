@@ -35,8 +35,8 @@ def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:
     - `problem`: of `jq.identify.make_problem`.
     """
     plain = type(problem.model) is StateSpace and not problem.parameters.ties
-    held = any(each is not None for each in problem.aliases)
-    if held or not plain or any(condition is not unchanged for condition in problem.conditions):
+    plain = plain and all(each is None for each in problem.aliases) and not any(problem.silent)
+    if not plain or any(condition is not unchanged for condition in problem.conditions):
         return normal_equations(residuals, z, problem)
     parts = [part for k in range(len(problem.omega)) for part in _record(z, problem, k)]
     if problem.quantities:

@@ -48,6 +48,8 @@ def one_by_one(response, weights):
         measured=(response,),
         weights=(weights,),
         known=jnp.zeros((0, 2)),
+        aliases=(None,),
+        silent=((),),
     )
     solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
     z0 = problem.parameters.start[:4]
