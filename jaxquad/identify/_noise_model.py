@@ -41,8 +41,8 @@ LONGEST = 8  # poles or zeros of an ARMA model
 class NoiseModel(eqx.Module):
     """An estimated model of one output's noise: white shocks through numerator / denominator."""
 
-    numerator: Float[np.ndarray, " zeros+1"]  # of 1, q^-1, q^-2, ...; begins with 1
-    denominator: Float[np.ndarray, " poles+1"]
+    numerator: Float[np.ndarray, " zero_coefficients"]  # of 1, q^-1, q^-2, ...; begins with 1
+    denominator: Float[np.ndarray, " pole_coefficients"]
     deviation: float  # standard deviation of the shocks, in units of the output
 
     @property
@@ -190,7 +190,9 @@ def _assembled(v: np.ndarray, coefficients: np.ndarray, poles: int) -> NoiseMode
     return _with_deviation(v, _invertible(zeros), np.concatenate([ones, coefficients[:poles]]))
 
 
-def _invertible(numerator: Float[np.ndarray, " zeros+1"]) -> Float[np.ndarray, " zeros+1"]:
+def _invertible(
+    numerator: Float[np.ndarray, " zero_coefficients"],
+) -> Float[np.ndarray, " zero_coefficients"]:
     """Zeros outside the unit circle are reflected into it: the spectrum stays."""
     zeros = np.roots(numerator)
     outside = np.abs(zeros) > 1
