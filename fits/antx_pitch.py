@@ -52,7 +52,7 @@ def late(fit: jq.identify.Fit) -> jq.identify.Combination:
 def row(name: str, fit: jq.identify.Fit) -> str:
     """K, T, tau and T + tau with their standard errors, in ms where it is time."""
     cells = [f"{fit.values[0]:8.1f} +- {fit.standard_errors[0]:4.1f}"]
-    pairs = [*zip(fit.values[1:], fit.standard_errors[1:], strict=True), late(fit)[1:]]
+    pairs = [*zip(fit.values[1:], fit.standard_errors[1:], strict=True), late(fit)[1:3]]
     cells += [f"{1e3 * value:7.2f} +- {1e3 * error:4.2f}" for value, error in pairs]
     return f"  {name:<27}" + "".join(cells)
 

@@ -18,6 +18,7 @@ from ._problem import Condition, Prior
 
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+_FAR = 20.0  # times the edges of the band
 _GAIN = 6.0  # of BIC, from which one structure is strongly preferred (Kass & Raftery, 1995)
 
 
@@ -135,7 +136,8 @@ class Explanation(eqx.Module):
                 f"{before:.1f} random errors: rely on the intervals with model error, or fit the "
                 "part of the band where the model holds"
             )
-        first, after = self.candidates[0], float(np.sqrt(self.best.chi_squared))
+        first = self.candidates[0]
+        after = float(np.sqrt(first.fit.chi_squared))
         count = len(self.whole.names)
         extra = zip(self.best.names[count:], self.best.values[count:], strict=True)
         values = ", ".join(f"{name.split('.')[-1]} = {value:.4g}" for name, value in extra)
@@ -206,7 +208,16 @@ def _try(fit: PyTree, origin: Origin, term: _Term) -> PyTree:
     models = [Extended(model, jnp.asarray(start), term) for start in starts]
     found = [_run(origin, each, options, 0) for each in models]
     known = [each for each in found if each is not None and np.isfinite(each.cost)]
+    known = [each for each in known if _is_near(each, term, origin)]
     return min(known, key=lambda each: each.cost, default=None)
+
+
+def _is_near(fit: PyTree, term: _Term, origin: Origin) -> bool:
+    """Whether the term's frequency lies near the band: far from it, it is a gain or nothing."""
+    low, high = origin.band
+    if term.names[0] == "T":
+        return True
+    return low / _FAR < float(np.asarray(fit.model.extra)[0]) < high * _FAR
 
 
 def _run(origin: Origin, model: PyTree, options: Options, rounds: int) -> PyTree:

@@ -76,10 +76,11 @@ def _by_noise(fit: "Fit", k: int) -> str:
 def _how_wide(fit: "Fit") -> str:
     """What the model leaves unexplained, and what the words under "width" mean."""
     found = fit.discrepancy
-    if found is None or found.none > 0.5:
-        return "95 % intervals with model error; the response shows none"
+    if found is None:
+        return ""
     size, degrees = 100 * 0.6 * found.amplitude, np.degrees(found.amplitude)
-    text = f"95 % intervals with model error: {size:.2g} % and {degrees:.2g} deg are unexplained"
+    text = f"95 % intervals with model error: {size:.2g} % and {degrees:.2g} deg"
+    text += f" (none: probability {100 * found.none:.0f} %)" if found.none > 0.05 else ""
     if "prior" in found.widths:
         text += "; width prior: as models usually err, the response cannot tell"
     return text
