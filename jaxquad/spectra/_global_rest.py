@@ -1,15 +1,17 @@
 """Local fits of what global models leave, and the errors of both together."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from ._global_model import global_models, GlobalModel
 from ._local_fit import Bins, local_fit, LocalFit
 from ._local_noise import Noise, SharedErrors
 
 
+_NEAR = 0.1  # in ln(omega)
 _MOST_FOLLOWED = 0.8  # share of the residuals' freedom
 _PIECE = 8192  # bins whose slopes are held at once
 
@@ -155,3 +157,33 @@ def shared_errors(
         if model is not None
     ]
     return SharedErrors(slopes, np.concatenate(drive), places)
+
+
+_END, _FEWEST = 0.05, 20  # share of a record, and samples, that count as its end
+_MOVING, _LARGE = 4.0, 10.0  # ratios of powers to the noise's: of the end, and of what models leave
+
+
+def left_moving(
+    rest: Rest, columns: Sequence[Float[np.ndarray, "samples channels"]], grid: Grid, noise: Noise
+) -> Bool[np.ndarray, " grid"]:
+    """Where models leave far more than noise of a channel that moves when a record ends.
+
+    There the local fits alone have to tell the response from what still rings, which they cannot do
+    of a mode narrower than their windows. `columns` are the records' channels as transformed, and
+    `noise` is that of the moved channels on the `grid`.
+    """
+    found = np.zeros(grid.size, bool)
+    for c in range(len(rest.models)):
+        power = noise.power_at(rest.bins.omega)[:, c]
+        level = float(np.mean(power))
+        if not any(_end_power(each[:, rest.moved.start + c]) > _MOVING * level for each in columns):
+            continue
+        near = np.abs(np.log(rest.bins.omega[:, None] / grid)) < _NEAR
+        values = np.abs(rest.bins.values[:, rest.moved.start + c]) ** 2 / power
+        found |= (values @ near) > _LARGE * np.maximum(np.sum(near, axis=0), 1)
+    return found
+
+
+def _end_power(values: Float[np.ndarray, " samples"]) -> float:
+    """Mean square at the end, without the mean."""
+    return float(np.var(values[-max(int(_END * len(values)), _FEWEST) :]))

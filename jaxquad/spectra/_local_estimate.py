@@ -10,7 +10,7 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance
 from ._estimators import LocalPolynomial
 from ._feedback import COHERENT
-from ._global_rest import Rest, shared_errors, subtract_models
+from ._global_rest import left_moving, Rest, shared_errors, subtract_models
 from ._local_fit import (
     Bins,
     check_bins,
@@ -20,6 +20,7 @@ from ._local_fit import (
     record_bins,
     replace_rows,
     smallest_widths,
+    transformed_columns,
     window_slices,
 )
 from ._local_noise import (
@@ -168,7 +169,11 @@ def estimate_local_polynomial(
     chosen = _widths(grid, least, widest, noise, respond, options)
     width, rational = (each[at] for each in chosen)
     moved = _fit_chosen(omega, width, rational, _responder(rest, inputs, order, "direct"))
-    doubtful = unresolved(omega, moved, sources, at, bins)
+    ringing = np.zeros(omega.size, bool)
+    if options.global_order:
+        columns = [transformed_columns(record, options.integrators) for record in records]
+        ringing = left_moving(rest, columns, grid, sources)[at]
+    doubtful = unresolved(omega, moved, sources, at, bins, rest.moved) & (options.width is None)
     moved = replace_rows(moved, doubtful, undetermined(_rows(moved, doubtful)))
     fit = joint_fit(moved, inputs) if method == "joint" else moved
     plain = rest
@@ -181,6 +186,7 @@ def estimate_local_polynomial(
     coherence = direct
     if method == "joint":
         coherence = coherence_of_references(grid, narrow_width, stack, inputs)[at]
+    coherent = np.any(coherence >= COHERENT, axis=(1, 2))
     left, right = _factors(moved, inputs, method)
     models = shared_errors(rest, bins, omega, moved, sources, left, right)
     back = recolour(omega, options.integrators, options.delay, records[0].dt)[:, None, None]
@@ -195,7 +201,8 @@ def estimate_local_polynomial(
         rational,
         noise_freedom[np.ix_(at, at)],
         _remark_on_lost(omega, np.all(known, axis=(1, 2)) | doubtful, least[at], options)
-        + _remark_on_resolution(omega[doubtful & np.any(coherence >= COHERENT, axis=(1, 2))]),
+        + _remark_on_resolution(omega[doubtful & coherent])
+        + _remark_on_ringing(omega[ringing & coherent & ~doubtful]),
     )
 
 
@@ -354,5 +361,16 @@ def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:
         "no response {where}: the fit there leaves more than ten times the noise nearby, as beside "
         "a mode that rings or a narrow line in the noise. Record longer, and 3 to 10 s of rest at "
         "the end"
+    )
+    return (Remark(text, omega),)
+
+
+def _remark_on_ringing(omega: Grid) -> tuple[Remark, ...]:
+    if omega.size == 0:
+        return ()
+    text = (
+        "the output still moves when the record ends, and a global model leaves more than ten "
+        "times the noise {where}: a mode that rings there is mistaken for response. Record 3 to "
+        "10 s of rest at the end, sweep wider, or raise global_order"
     )
     return (Remark(text, omega),)

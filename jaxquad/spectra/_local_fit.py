@@ -29,7 +29,7 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
     """
     parts, grids, owners = [], [], []
     for index, record in enumerate(records):
-        columns = _columns(record, integrators)
+        columns = transformed_columns(record, integrators)
         spectra = np.fft.rfft(columns - columns.mean(axis=0), axis=0) / np.sqrt(len(columns))
         last = (len(columns) - 1) // 2
         grid = 2 * np.pi * np.arange(1, last + 1) / (len(columns) * record.dt)
@@ -55,7 +55,8 @@ def recolour(
     return np.exp(-1j * lag * omega) / (1 - np.exp(-1j * dt * omega)) ** integrators
 
 
-def _columns(record: Record, n: int) -> Float[np.ndarray, "samples channels"]:
+def transformed_columns(record: Record, n: int) -> Float[np.ndarray, "samples channels"]:
+    """Channels whose transforms are taken; outputs are differenced `n` times."""
     # A difference looks back by n/2 samples: inputs are taken from as much earlier.
     centre = slice(n - n // 2, record.samples - n // 2)
     outputs = np.diff(record.outputs, n, axis=0)

@@ -123,6 +123,7 @@ class SharedErrors(NamedTuple):
 
 _CHANCE = 1e-5  # of calling a residual a misfit
 _FALSE_ALARM = 1e-3  # chance that noise alone leaves any of a record's responses unresolved
+_HARMLESS = 1e-4  # share of the moved channel's power
 _FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
 _ATOMS, _PARAMETERS = 256, 16  # numbers of which those of the noise and the parameters are padded
 _UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
@@ -157,14 +158,19 @@ def error_covariance(
     root = root * size[:, :, None]
     known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
     shared, atoms = _on_common_bins(np.where(known, effect * back, 0.0), places)
-    shared[~known[:, 0, 0], :, 0] = _UNKNOWN
     kind = np.where(known, root, np.eye(*root.shape[1:]))
-    if models is None:
-        return ErrorCovariance(jnp.asarray(omega), jnp.asarray(shared), jnp.asarray(kind))
-    slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
-    slopes, drive, shared = _on_common_atoms(slopes, models, shared, atoms)
-    arrays = (jnp.asarray(x) for x in (omega, shared, kind))
-    return ErrorCovariance(*arrays, sensitivity=jnp.asarray(slopes), drive=jnp.asarray(drive))
+    slopes = drive = None
+    if models is not None:
+        slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
+        slopes, drive, shared = _on_common_atoms(slopes, models, shared, atoms)
+    shared[~known[:, 0, 0], :, 0] = _UNKNOWN
+    return ErrorCovariance(
+        jnp.asarray(omega),
+        jnp.asarray(shared),
+        jnp.asarray(kind),
+        sensitivity=None if slopes is None else jnp.asarray(slopes),
+        drive=None if drive is None else jnp.asarray(drive),
+    )
 
 
 def colour_of_noise(
@@ -236,14 +242,23 @@ def unresolved(
     noise: Noise,
     at: Int[np.ndarray, " frequencies"],
     bins: Bins,
+    moved: slice,
 ) -> Bool[np.ndarray, " frequencies"]:
-    """Where `fit` leaves residuals far above the noise, seldom by chance in a whole record."""
+    """Where `fit` leaves residuals far above the noise, seldom by chance in a whole record.
+
+    Residuals of less than a hundredth of what `moved` in the window do no harm.
+    """
     outputs = fit.response.shape[1]
     left = np.broadcast_to(np.eye(outputs, dtype=complex), (omega.size, outputs, outputs))
     colour = colour_of_noise(noise, left, omega, bins, window_places(fit, bins))
     chance = _FALSE_ALARM / (omega.size * outputs)
     ratio = _misfit(fit, noise, at, colour, np.any(fit.effect != 0, axis=1), chance)
-    return np.isfinite(fit.response[:, 0, 0]) & np.any(ratio > _FAR_OFF, axis=1)
+    inside = np.any(fit.effect != 0, axis=1)[:, :, None]
+    values = np.abs(bins.values[:, moved]) ** 2
+    power = np.sum(values[window_places(fit, bins)] * inside, axis=1) / np.sum(inside, axis=1)
+    left = np.real(np.diagonal(fit.scatter, axis1=1, axis2=2))
+    large = (ratio > _FAR_OFF) & (left > _HARMLESS * power)
+    return np.isfinite(fit.response[:, 0, 0]) & np.any(large, axis=1)
 
 
 def undetermined(fit: LocalFit) -> LocalFit:
