@@ -103,7 +103,7 @@ def record_of(signal: np.ndarray, rng: np.random.Generator) -> jq.Record:
 
 def identify(record: jq.Record, omega: np.ndarray | None, estimator: Any) -> jq.identify.Fit:
     frf = jq.frequency_response(record, omega, estimator=estimator)
-    return jq.fit(GUESSES[1], frf, cost=jq.identify.MaximumLikelihood(), min_coherence=0.05)
+    return jq.fit(GUESSES[1], frf, min_coherence=0.05)
 
 
 def fly(

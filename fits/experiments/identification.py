@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad.identify import fit, MaximumLikelihood
+from jaxquad.identify import fit
 from jaxquad.models import LaggedIntegrator
 from jaxquad.simulation import Simulation
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial, Periodic
@@ -55,7 +55,7 @@ def _estimate(
         omega = np.geomspace(low, high, _POINTS)
         spectra = LocalPolynomial(integrators=2, delay=0.02)
         response = frequency_response(record, omega, estimator=JointInputOutput(spectra))
-    found = fit(start, response, free=("gain", "lag"), cost=MaximumLikelihood())
+    found = fit(start, response, free=("gain", "lag"))
     if not found.verdict.fitted:
         return _LOST
     gain = found.derived(lambda axis: axis.gain, "b")

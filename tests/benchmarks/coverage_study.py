@@ -138,13 +138,11 @@ def two_inputs() -> Callable[[int], jq.Record]:
 
 def fit_airframe(frf: jq.spectra.FrequencyResponse) -> jq.identify.Fit:
     start = jax.tree.map(lambda x: 1.2 * x, AIRFRAME)
-    return jq.fit(start, frf, cost=jq.identify.MaximumLikelihood())
+    return jq.fit(start, frf)
 
 
 def fit_lateral(frf: jq.spectra.FrequencyResponse) -> jq.identify.Fit:
-    return jq.fit(
-        LATERAL, frf, free=LATERAL_FREE, tied=LATERAL_TIED, cost=jq.identify.MaximumLikelihood()
-    )
+    return jq.fit(LATERAL, frf, free=LATERAL_FREE, tied=LATERAL_TIED)
 
 
 def studies() -> dict[str, Study]:

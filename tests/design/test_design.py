@@ -242,9 +242,7 @@ def test_cramer_rao_is_what_a_maximum_likelihood_fit_prints():
     # One-sided noise of the same relative random error at each line.
     density = 2 * 20.0 * line_power * (error * response) ** 2
     found = predict_accuracy(PLANT, signal, noise=lambda w: np.interp(w, omega, density))
-    fit = jq.fit(
-        PLANT, response_of(PLANT, error=error, omega=omega), cost=jq.identify.MaximumLikelihood()
-    )
+    fit = jq.fit(PLANT, response_of(PLANT, error=error, omega=omega))
     np.testing.assert_allclose(found.cramer_rao, fit.cramer_rao, rtol=1e-6)
 
 

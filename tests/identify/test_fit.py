@@ -169,7 +169,7 @@ def test_a_solver_that_stops_early_is_no_minimum():
 
 
 def test_derived_quantities_carry_the_covariance():
-    fit = jq.fit(START, response_of(TRUTH, seed=3), cost=jq.identify.MaximumLikelihood())
+    fit = jq.fit(START, response_of(TRUTH, seed=3))
     total = fit.derived(lambda m: m.lag + m.delay, "lag + delay")
     by_hand = np.sqrt(np.array([0, 1, 1]) @ fit.covariance @ np.array([0, 1, 1]))
     assert total.standard_error == pytest.approx(by_hand, rel=1e-9)

@@ -222,7 +222,7 @@ def narrow(noise, seed, low=0.5, high=6.0, duration=60.0, omega=None):
     record = jq.Record(sweep.time, sweep.signal, rate, input_names="u", output_names="q")
     frf = jq.frequency_response(record, omega, estimator=jq.spectra.LocalPolynomial(integrators=1))
     start = jq.LaggedIntegrator(gain=70.0, lag=0.02, delay=0.02)
-    return jq.fit(start, frf, cost=jq.identify.MaximumLikelihood())
+    return jq.fit(start, frf)
 
 
 @pytest.mark.parametrize("seed", [0, 3, 4])

@@ -80,7 +80,7 @@ def test_standard_errors_are_the_scatter_under_white_and_coloured_noise(pole):
 def test_time_and_frequency_domain_agree_within_their_errors():
     record = jq.Record(TIME, U, CLEAN + 0.05 * noise(2))
     frf = jq.frequency_response(record, np.geomspace(1.5, 15.0, 40))
-    by_frequency = jq.fit(START, frf, free=FREE, cost=jq.identify.MaximumLikelihood())
+    by_frequency = jq.fit(START, frf, free=FREE)
     by_time = refine(by_frequency.model, record, free=FREE, hold="zero")
     assert by_time.names == by_frequency.names and by_time.identifiable
     late = np.array([0, 0, 0, DT / 2])  # of the held input, which a response includes

@@ -108,7 +108,7 @@ def test_the_antx_model_verifies_on_the_other_flight(data):
     sweep = read(data / "antx_pitch/antx_log2_sweep.npz", start=132.8, stop=158.0)
     estimator = jq.spectra.JointInputOutput(jq.spectra.Welch(integrators=1, delay=0.024))
     frf = jq.frequency_response(prbs, np.geomspace(*band, 80), estimator=estimator)
-    fit = jq.fit(jq.LaggedIntegrator(200.0, 0.02, 0.01), frf, cost=jq.identify.MaximumLikelihood())
+    fit = jq.fit(jq.LaggedIntegrator(200.0, 0.02, 0.01), frf)
     late = fit.derived(lambda m: m.lag + m.delay)
     assert 270 < fit.values[0] < 295 and 0.024 < late.value < 0.029
     check = jq.verify(fit.model, sweep, band=band)

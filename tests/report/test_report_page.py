@@ -23,7 +23,7 @@ def frf():
 
 @pytest.fixture(scope="module")
 def fit(frf):
-    return jq.fit(TRUTH, frf, cost=jq.identify.MaximumLikelihood())
+    return jq.fit(TRUTH, frf)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ def test_not_identifiable_comes_first_and_marks_its_numbers(tmp_path, frf):
     """One record tells L K_t / J_x of an attitude axis, and neither of the two."""
     axis = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.02, delay=0.0)
     response = response_of(axis, error=0.02, seed=1)
-    fit = jq.fit(axis, response, free=("J_x", "K_t", "lag"), cost=jq.identify.MaximumLikelihood())
+    fit = jq.fit(axis, response, free=("J_x", "K_t", "lag"))
     page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=response))
     assert page.text().split()[:3] == ["\u2717", "NOT", "IDENTIFIABLE"]
     assert "individually: J_x and K_t; only L K_t / J_x = " in page.text("header")

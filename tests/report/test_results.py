@@ -21,7 +21,7 @@ def frf():
 
 @pytest.fixture(scope="module")
 def fit(frf):
-    return jq.fit(TRUTH, frf, cost=jq.identify.MaximumLikelihood())
+    return jq.fit(TRUTH, frf)
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +53,7 @@ def test_a_result_file_holds_the_numbers_of_the_fit(tmp_path, fit, frf, check):
 
 def test_what_is_not_determined_keeps_its_number_and_is_marked(tmp_path):
     rig = jq.models.AttitudeAxis(0.197, 0.1188, 0.0552, 0.02)
-    fit = jq.fit(
-        rig, response_of(rig, seed=0), free=("J_x", "K_t"), cost=jq.identify.MaximumLikelihood()
-    )
+    fit = jq.fit(rig, response_of(rig, seed=0), free=("J_x", "K_t"))
     content = json.loads(write_results(tmp_path, fit=fit).read_text())["fit"]
     row = content["parameters"][0]
     assert row["value"] == float(fit.values[0]) and row["standard_error"] is None
