@@ -1,12 +1,12 @@
 """From a measured flight to certified gains: pitch of the ANT-X quadrotor, one command.
 
 The flight with binary noise of `antx_pitch.py` identifies moment M to rate q: K, lag and delay, of
-which only the sum of the last two is well determined; members are drawn from the fit's
-distribution. A scheduled LADRC on the pitch ANGLE (b0 = K at the flown inertia, straight to M, in
-place of the test stand's two loops) is tuned on them and certified on fresh ones. Identified are K,
-lag and delay; the spread of inertia, and of K with the battery, is assumed, and nothing of this has
-been flown. Needs the logs: JAXQUAD_DATA names the folder that holds `antx_pitch/`. Writes JSON,
-figures and a C header under results/tune_antx.
+which the last two trade off; members are drawn from the fit's distribution, model error included.
+A scheduled LADRC on the pitch ANGLE (b0 = K at the flown inertia, straight to M, in place of the
+test stand's two loops) is tuned on them and certified on fresh ones. Identified are K, lag and
+delay; the spread of inertia, and of K with the battery, is assumed, and nothing of this has been
+flown. Needs the logs: JAXQUAD_DATA names the folder that holds `antx_pitch/`. Writes JSON, figures
+and a C header under results/tune_antx.
 """
 
 import os
