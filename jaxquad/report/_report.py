@@ -68,7 +68,7 @@ def write_report(
     records = {"record": record} if isinstance(record, Record) else dict(record or {})
     found = {"verification": checks} if isinstance(checks, Verification) else dict(checks or {})
     models = _models(fit, frfs, models or {})
-    remarks = remarks_of(fit, frfs, found)
+    remarks = remarks_of(fit, found)
     headlines = [fit_headline(fit, len(remarks))]
     headlines += [check_headline(name, check, fit) for name, check in found.items()]
     headlines += verdict_headlines(tuned) if tuned is not None else []
@@ -167,12 +167,9 @@ def verdict_headlines(tuned: Tuned | Certificate) -> list[Headline]:
     return headlines
 
 
-def remarks_of(
-    fit: Fit, frfs: Mapping[str, FrequencyResponse], checks: Mapping[str, Verification]
-) -> list[str]:
-    """Of the fit, its responses and its checks, each once."""
+def remarks_of(fit: Fit, checks: Mapping[str, Verification]) -> list[str]:
+    """Of the fit, with those of its responses that concern it, and of its checks, each once."""
     found = list(fit.remarks)
-    found += [remark for frf in frfs.values() for remark in frf.remarks]
     for name, check in checks.items():
         if not np.isfinite(check.tic):
             found.append(f"{name}: the simulation diverges, so it verifies nothing")

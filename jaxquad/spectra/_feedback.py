@@ -14,6 +14,7 @@ Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
+_CLEAR = 3.0  # standard errors of the slope of the phase
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
 
 
@@ -30,7 +31,7 @@ def phase_rises(
     error: Float[np.ndarray, " frequencies"],
     coherence: Float[np.ndarray, " frequencies"],
 ) -> bool:
-    """Whether the phase increases, by two standard errors, at the top of the coherent band.
+    """Whether the phase increases, by three standard errors, at the top of the coherent band.
 
     Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller that
     filters and delays, increases.
@@ -47,7 +48,7 @@ def phase_rises(
     spread = np.sum(weight * centred**2)
     slope = np.sum(weight * centred * level) / spread
     scatter = np.sum(weight * (level - slope * centred) ** 2) / (len(top) - 2)
-    return bool(slope * np.sqrt(spread / max(scatter, 1.0)) > 2)
+    return bool(slope * np.sqrt(spread / max(scatter, 1.0)) > _CLEAR)
 
 
 def remarks_on_feedback(

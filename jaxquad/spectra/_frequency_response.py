@@ -129,4 +129,6 @@ class FrequencyResponse(eqx.Module):
                 lines.append(
                     f"  {source} -> {output}: coherence above 0.6 at {good.size} frequencies{where}"
                 )
-        return "\n".join(lines + [f"  ! {remark}" for remark in self.remarks])
+        coherent = coherence >= 0.6
+        shown = self.remarks_about(coherent) if np.any(coherent) else self.remarks
+        return "\n".join(lines + [f"  ! {remark}" for remark in shown])
