@@ -165,8 +165,9 @@ def _as_zero(problem: Problem, solution: Solution, low: Sequence[int]) -> Soluti
 
 @eqx.filter_jit
 def _responses(model: PyTree, problem: Problem) -> list[Array]:
-    aliases = zip(problem.conditions, problem.omega, problem.aliases, strict=True)
-    return [evaluate_sampled(condition(model), *where) for condition, *where in aliases]
+    where = zip(problem.omega, problem.aliases, strict=True)
+    terms = zip(problem.conditions, where, strict=True)
+    return [evaluate_sampled(condition(model), *each) for condition, each in terms]
 
 
 def one_sided_limit(problem: Problem, solution: Solution, k: int, inflation: float) -> float:

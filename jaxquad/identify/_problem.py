@@ -149,8 +149,9 @@ def unchanged(model: PyTree) -> PyTree:
 def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, "..."]]:
     """The model's responses in every record's condition, as its samples show them."""
     model = problem.parameters.insert(problem.model, z)
-    terms = zip(problem.conditions, problem.omega, problem.aliases, strict=True)
-    return [evaluate_sampled(condition(model), *where) for condition, *where in terms]
+    where = zip(problem.omega, problem.aliases, strict=True)
+    terms = zip(problem.conditions, where, strict=True)
+    return [evaluate_sampled(condition(model), *each) for condition, each in terms]
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> list[Float[Array, "..."]]:

@@ -83,8 +83,10 @@ def _not_negative(value: object) -> float:
 
 
 def _hold(value: object) -> float | str:
-    if value == "dt" or (_is_number(value) and value >= 0):
-        return value if isinstance(value, str) else float(value)
+    if isinstance(value, str) and value == "dt":
+        return value
+    if _is_number(value) and value >= 0:
+        return float(value)
     raise ValueError('give the seconds for which the input keeps each value, 0 or more, or "dt"')
 
 
