@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from ._checks import in_hertz
 from ._remarks import Remark
 
 
@@ -92,8 +93,8 @@ def _explained_by_reference(
         return []
     text = (
         f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
-        "frequencies, but {where}, the reference "
-        "explains neither. There the controller feeds back noise, and the record holds no "
-        "information on the plant. Excite these frequencies by the reference"
+        f"frequencies, but at {np.sum(dominated)} of them, {in_hertz(omega[dominated])}, the "
+        "reference explains neither. There the controller feeds back noise, and the record holds "
+        "no information on the plant. Excite these frequencies by the reference"
     )
-    return [Remark(text, omega[dominated], pair)]
+    return [Remark(text, pair=pair)]
