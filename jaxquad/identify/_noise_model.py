@@ -129,7 +129,7 @@ def _root_of_lags(v: Float[np.ndarray, " samples"], most: int) -> Float[np.ndarr
     root = np.zeros((most + 1, most + 1))
     for at in range(0, len(windows), _ROWS):
         part = windows[at : at + _ROWS, latest_first]
-        root = np.linalg.qr(np.concatenate([root, part]), mode="r")
+        root = np.asarray(np.linalg.qr(np.concatenate([root, part]), mode="r"))
     return root
 
 

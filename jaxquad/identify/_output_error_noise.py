@@ -37,6 +37,7 @@ _TURNS = 40  # of noise models and parameters, at most
 _FREE = 2  # turns that choose the orders; later ones keep them
 _NEAR = 1e-4  # last step of each turn's descent; Gauss-Newton leaves about its square
 _STILL = 0.01  # standard errors: a change of the estimate that no longer matters
+_NEXT = 0.3  # standard errors between ends of turns that are taken for one
 
 Residuals = list[Float[np.ndarray, "samples outputs"]]  # of each record
 Models = list[list[NoiseModel]]  # of each output of each record
@@ -53,9 +54,10 @@ def descend_with_noise(
     is far off itself.
     Source: Ljung, System Identification, sec. 7.2 and 13.4 (direct method in a closed loop).
     """
-    plain = _under(problem, [white(term.y.shape[1]) for term in problem.terms])
     begin = (_at_start,) if near else (_at_start, _after_output_error)
-    ends = [_by_turns(each(plain, max_steps), noise, max_steps) for each in begin]
+    ends: list[_End] = []
+    for each in begin:
+        ends.append(_by_turns(each(problem, max_steps), noise, max_steps, ends))
     return _described(min(ends, key=_criterion))
 
 
@@ -80,7 +82,8 @@ class _End(NamedTuple):
     models: Models
 
 
-def _by_turns(start: _Start, noise: Noise, max_steps: int) -> _End:
+def _by_turns(start: _Start, noise: Noise, max_steps: int, known: Sequence[_End]) -> _End:
+    """The end of the turns from a start; a known one, if the first turn leads next to it."""
     plain, z, found, steps = start
     kinds: list[list[Noise]] = [[noise] * term.y.shape[1] for term in plain.terms]
     residuals = _first_residuals(found)
@@ -91,13 +94,20 @@ def _by_turns(start: _Start, noise: Noise, max_steps: int) -> _End:
         stop, status, taken = descend(problem, z, max_steps, _NEAR)
         change, steps, message = stop.z - z, steps + taken, message_of(status, taken)
         z = stop.z
-        still = np.sqrt(change @ stop.slopes()[1] @ change) < _STILL
+        for end in () if turn else known:
+            if _distance(stop, z - end.stop.z) < _NEXT:
+                return end
         residuals = _residuals(evaluate_misfits(jnp.asarray(z), plain), models)
-        if message or (turn >= _FREE and still):
+        if message or (turn and _distance(stop, change) < _STILL):
             break
     else:
         message = f"the noise model still changed after {_TURNS} turns"
     return _End(plain, problem, stop, steps, message, residuals, models)
+
+
+def _distance(stop: Point, change: Float[np.ndarray, " n"]) -> float:
+    """Of a change of z, in standard errors."""
+    return float(np.sqrt(max(change @ stop.slopes()[1] @ change, 0.0)))
 
 
 def _criterion(end: _End) -> float:

@@ -70,8 +70,7 @@ def test_noise_models_are_those_that_made_the_noise():
 def test_a_coloured_residual_is_whitened_and_the_estimate_is_that_of_the_known_noise():
     pole, start = 0.9, jq.TransferFunction([8.2], [1.0, 2.9, 20.5], 0.029)
     flight = record(6, pole)
-    free = (FREE[0], jq.identify.Real(FREE[1]), *FREE[2:])
-    first = refine(start, flight, free=free, noise=AutoRegressive(1))
+    first = refine(start, flight, free=FREE, noise=AutoRegressive(1))
     fit = refine(first, flight, noise=AutoRegressive(1))
     assert fit.names == first.names and fit.parameters.logarithmic == first.parameters.logarithmic
     np.testing.assert_array_less(np.abs(fit.values - first.values), 0.05 * fit.standard_errors)
