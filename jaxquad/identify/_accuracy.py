@@ -90,8 +90,8 @@ def noise_effect(
 
 def _through_fit(record: ResponseTerm, count: int) -> Matrix:
     weighted = record.weights[..., None] ** 2 * record.slopes[..., :count]
-    model = np.asarray(record.frf.response) / record.ratio
     used = record.weights[..., :1] > 0
+    model = np.where(used[..., 0], np.asarray(record.frf.response) / record.ratio, 1.0)
     # Magnitude and phase of the misfit are the parts of dT over T.
     columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / model.conj()[..., None]
     return np.asarray(record.frf.errors.project(jnp.asarray(np.where(used, columns, 0.0))))
