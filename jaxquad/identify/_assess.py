@@ -82,6 +82,8 @@ def assess(
     by_noise_alone = problem.weighted([jnp.asarray(each) for each in counted.weights])
     costs = _costs(_records(by_noise_alone, frfs, solution, units), prior, count)
     cost, misfit = costs.cost, costs.chi_squared
+    # Few points of their own noise reach a large misfit by chance: both have to say so.
+    doubted = misfit if discrepancy.none < _DOUBT else min(misfit, 1.0)
     decrement = _decrement(bread, gradient, solution.at_zero)
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
         remedies = ("start from other values", "try many starts at once (starts=20)")
@@ -99,7 +101,7 @@ def assess(
         remarks=(
             *_remarks_on_used(problem, frfs),
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
-            *remarks_on_fit(problem, solution, cost, decrement, misfit, verdict),
+            *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_priors(prior.misfit, verdict, by_data),
             *_remarks_on_discrepancy(discrepancy),
@@ -463,6 +465,7 @@ def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
+_DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
 _LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
 _POOR = 10.0  # ratio above which a local minimum is likely
 _LOCAL = ", or this is a local minimum: try other starting values"
