@@ -138,3 +138,30 @@ def test_standard_errors_are_the_scatter_in_coloured_noise():
     np.testing.assert_array_less(np.abs(ratio - 1), 0.21)
     assert np.all(np.mean(np.abs(errors) < 1.96 * predicted, axis=0) > 0.88)
     assert not any("coloured" in remark for fit in fits for remark in fit.remarks)
+
+
+@pytest.mark.slow
+def test_each_output_of_each_record_has_its_own_noise():
+    F, G = np.array([[-1.0, 2.0], [-4.0, -1.5]]), np.array([[1.0, 0.0], [0.5, 2.0]])
+    truth = jq.StateSpace(F=F, G=G, H0=np.eye(2))
+    rng = np.random.default_rng(9)
+    flights = []
+    for pole in (0.95, 0.5):
+        u = np.repeat(rng.choice([-1.0, 1.0], (SAMPLES // 20, 2)), 20, axis=0)
+        clean = np.asarray(jq.models.simulate_linear(truth, u - u[0], DT))
+        shocks = rng.standard_normal((SAMPLES, 2)) * [0.02, 0.1]
+        coloured = np.asarray(lfilter([1.0], [1, -pole], shocks[:, 0]))
+        flights.append(jq.Record(TIME, u, clean + np.stack([coloured, shocks[:, 1]], 1), hold=DT))
+    start = jq.StateSpace(F=1.1 * F, G=0.9 * G, H0=np.eye(2))
+    free = ("F", "G[0][0]", "G[1][0]", "G[1][1]")
+    fit = refine(start, flights, free=free, noise=AutoRegressive(1))
+    expected = np.array([*F.reshape(-1), 1.0, 0.5, 2.0])
+    np.testing.assert_array_less(np.abs(fit.values - expected), 3.5 * fit.standard_errors)
+    found = np.array([[model.denominator[1] for model in each] for each in fit.noise_models])
+    np.testing.assert_allclose(found, [[-0.95, 0], [-0.5, 0]], atol=0.1)
+    sizes = np.array([[model.deviation for model in each] for each in fit.noise_models])
+    np.testing.assert_allclose(sizes, [[0.02, 0.1]] * 2, rtol=0.1)
+    white = refine(start, flights, free=free)
+    # The first output's slow noise is no longer taken for information.
+    assert np.all(fit.standard_errors < 1.02 * white.standard_errors)
+    assert fit.standard_errors[0] < 0.9 * white.standard_errors[0]
