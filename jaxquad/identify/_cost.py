@@ -5,9 +5,9 @@ from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float, Int
 
-from jaxquad.spectra import FrequencyResponse
+from jaxquad.spectra import ErrorCovariance, FrequencyResponse
 
 
 _LARGEST = 0.3  # random error of a point that counts
@@ -165,11 +165,22 @@ def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[P
     ]
 
 
+def _own_covariance(
+    errors: ErrorCovariance, pair: tuple[int, int], mine: Int[np.ndarray, " used"]
+) -> Complex[np.ndarray, "used used"]:
+    """Of one pair's errors at some frequencies, up to a factor for each of them."""
+    if errors.windows is not None or errors.sensitivity is not None:
+        return errors.between(pair, pair)[np.ix_(mine, mine)]
+    # Without going through JAX, as `between` does: a batch asks this of a thousand responses.
+    effect, noise = np.asarray(errors.effect)[mine, pair[1]], np.asarray(errors.noise)
+    return (effect @ effect.conj().T) * (noise[mine, pair[0]] @ noise[mine, pair[0]].conj().T)
+
+
 def _shared_noise(frf: FrequencyResponse, used: Mask) -> Ratio:
     shared = np.ones(used.shape)
     for o, i in np.ndindex(used.shape[1:]):
         mine = np.flatnonzero(used[:, o, i])
-        covariance = frf.errors.between((o, i), (o, i))[np.ix_(mine, mine)]
+        covariance = _own_covariance(frf.errors, (o, i), mine)
         power = np.maximum(np.real(np.diagonal(covariance)), 1e-300)
         correlation = np.real(covariance * covariance.conj()) / np.outer(power, power)
         shared[mine, o, i] = np.maximum(np.sum(correlation, axis=1), 1.0)
