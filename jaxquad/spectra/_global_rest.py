@@ -11,7 +11,7 @@ from ._local_fit import Bins, local_fit, LocalFit
 from ._local_noise import Noise, SharedErrors
 
 
-_NEAR = 0.1  # in ln(omega)
+_NEAR, _AROUND = 0.05, 0.7  # a mode's neighbourhood and beyond, in ln(omega)
 _MOST_FOLLOWED = 0.8  # share of the residuals' freedom
 _PIECE = 8192  # bins whose slopes are held at once
 
@@ -164,9 +164,9 @@ _MOVING, _LARGE = 4.0, 10.0  # ratios of powers to the noise's: of the end, and 
 
 
 def left_moving(
-    rest: Rest, columns: Sequence[Float[np.ndarray, "samples channels"]], grid: Grid, noise: Noise
+    rest: Rest, columns: Sequence[Float[np.ndarray, "_samples channels"]], grid: Grid, noise: Noise
 ) -> Bool[np.ndarray, " grid"]:
-    """Where models leave far more than noise of a channel that moves when a record ends.
+    """Where models leave a peak, far above the noise, of a channel that moves when a record ends.
 
     There the local fits alone have to tell the response from what still rings, which they cannot do
     of a mode narrower than their windows. `columns` are the records' channels as transformed, and
@@ -178,9 +178,25 @@ def left_moving(
         level = float(np.mean(power))
         if not any(_end_power(each[:, rest.moved.start + c]) > _MOVING * level for each in columns):
             continue
-        near = np.abs(np.log(rest.bins.omega[:, None] / grid)) < _NEAR
         values = np.abs(rest.bins.values[:, rest.moved.start + c]) ** 2 / power
-        found |= (values @ near) > _LARGE * np.maximum(np.sum(near, axis=0), 1)
+        found |= _peaks(np.log(rest.bins.omega), values, np.log(grid))
+    return found
+
+
+def _peaks(
+    place: Float[np.ndarray, " bins"],
+    values: Float[np.ndarray, " bins"],
+    grid: Grid,
+) -> Bool[np.ndarray, " grid"]:
+    """Where `values` are large, and much larger than they are around."""
+    found = np.zeros(grid.size, bool)
+    for f, centre in enumerate(grid):
+        near, around = (
+            values[np.searchsorted(place, centre - far) : np.searchsorted(place, centre + far)]
+            for far in (_NEAR, _AROUND)
+        )
+        level = float(np.mean(near)) if near.size else 0.0
+        found[f] = level > _LARGE * max(1.0, float(np.median(around)) if around.size else 1.0)
     return found
 
 
