@@ -52,11 +52,11 @@ from ._verdict import Bound, pooled_freedom, Verdict, without_numbers
 class Counted(NamedTuple):
     """How the points of a fit count: as the noise says, and with what the model does not explain.
 
-    `weights` are those by the noise alone; those of the problem may have a floor on the error.
+    `weights` are those by the noise alone, where those of the problem have a floor on the error.
     """
 
     points: Sequence[Points]
-    weights: Sequence[Weights]
+    weights: Sequence[Weights] | None
     found: tuple[Mixture, Mixture]
 
 
@@ -79,8 +79,11 @@ def assess(
     bread, gradient, noise, discrepancy = seen.bread, seen.gradient, seen.noise, seen.discrepancy
     halved = ft.partial(_one_sided, seen=seen, names=parameters.names, bounds=bounds)
     by_noise, covariance = halved(seen.by_noise), halved(seen.covariance)
-    by_noise_alone = problem.weighted([jnp.asarray(each) for each in counted.weights])
-    costs = _costs(_records(by_noise_alone, frfs, solution, units), prior, count)
+    plain = seen
+    if counted.weights is not None:
+        alone = problem.weighted([jnp.asarray(each) for each in counted.weights])
+        plain = _look(_records(alone, frfs, solution, units), prior, count)
+    costs = _costs(plain.blocks, prior, plain.bread, plain.noise)
     cost, misfit = costs.cost, costs.chi_squared
     # Few points of their own noise reach a large misfit by chance: both have to say so.
     doubted = misfit if discrepancy.none < _DOUBT else min(misfit, 1.0)
@@ -200,11 +203,22 @@ def _one_sided(
     return covariance
 
 
-def _costs(records: list[ResponseTerm], prior: PriorRows, count: int) -> "Costs":
-    """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
+class _Look(NamedTuple):
+    """What the weights alone make of the records."""
+
+    blocks: list[Block]
+    bread: Matrix
+    noise: Noise
+
+
+def _look(records: list[ResponseTerm], prior: PriorRows, count: int) -> _Look:
     blocks = blocks_of(records)
     bread, _ = gauss_newton(blocks, prior, count)
-    noise = noise_effect(records, blocks, prior, count)
+    return _Look(blocks, bread, noise_effect(records, blocks, prior, count))
+
+
+def _costs(blocks: list[Block], prior: PriorRows, bread: Matrix, noise: Noise) -> "Costs":
+    """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
     data = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
     cost, misfit = data + float(np.sum(prior.misfit**2)), misfit_ratio(data, bread, noise)
     # A misfit beyond the noise is in no covariance of the noise.

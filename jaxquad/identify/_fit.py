@@ -241,17 +241,18 @@ def _solve_with_floor(
     rounds: int,
 ) -> tuple[Problem, Solution, Counted]:
     """Solve again with what the model leaves unexplained as a floor on the random error."""
-    found, cost = discrepancy_at(problem, points, solution), options.cost
+    found, cost, lifted = discrepancy_at(problem, points, solution), options.cost, False
     for _ in range(rounds):
-        lifted = [_with_floor(each, found[0].amplitude) for each in points]
-        weights = _weights(cost, lifted, _ratios(solution))
+        raised = [_with_floor(each, found[0].amplitude) for each in points]
+        weights = _weights(cost, raised, _ratios(solution))
         if _are_close([np.asarray(each) for each in problem.weights], weights, _SETTLED):
             break
-        problem = problem.weighted([jnp.asarray(each) for each in weights])
+        problem, lifted = problem.weighted([jnp.asarray(each) for each in weights]), True
         solution = solve_within_bounds(problem, solution.z, options.solver, options.max_steps)
         _check_finite(solution)
         found = discrepancy_at(problem, points, solution)
-    return problem, solution, Counted(points, _weights(cost, points, _ratios(solution)), found)
+    plain = _weights(cost, points, _ratios(solution)) if lifted else None
+    return problem, solution, Counted(points, plain, found)
 
 
 def _with_floor(points: Points, floor: float) -> Points:
