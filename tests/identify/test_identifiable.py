@@ -237,14 +237,12 @@ def test_what_a_blurred_parameter_is_determined_with_is_named_whatever_direction
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("noise", "seed", "count"), [(15.0, 1, 1), (15.0, 2, 0), (20.0, 0, 0), (20.0, 2, 0)]
-)
-def test_a_combination_whose_error_is_half_its_size_is_not_called_determined(noise, seed, count):
+@pytest.mark.parametrize(("noise", "seed"), [(15.0, 1), (15.0, 2), (20.0, 0), (20.0, 2)])
+def test_a_combination_whose_error_is_a_third_of_its_size_is_not_determined(noise, seed):
     fit = narrow(noise, seed, 1.0, 8.0, duration=20.0, omega=np.geomspace(1.5, 8.0, 40))
-    assert not fit.identifiable and len(fit.combinations) == count
+    assert not fit.identifiable
     for found in fit.combinations:
-        assert found.standard_error <= 0.5 * abs(found.value)
+        assert found.standard_error <= 0.3 * abs(found.value)
 
 
 NARROW = np.geomspace(1.0, 6.0, 30)

@@ -292,3 +292,16 @@ def test_units_are_given_by_name_and_refused_for_channels_that_are_not_read(tmp_
     assert record.unit("q") == "rad/s" and record.unit("M") == ""
     with pytest.raises(RecordError, match="a unit is given for 'p'.*The channels are: M, q"):
         read(path, inputs="M", outputs="q", units={"p": "rad/s"})
+
+
+def test_a_hold_is_kept_as_long_as_a_sample_is_no_shorter(tmp_path):
+    time = np.arange(400) * 0.01
+    path = tmp_path / "log.npz"
+    np.savez(path, time=time, u=np.sin(time), y=np.cos(time))
+    take: dict[str, Any] = {"inputs": "u", "outputs": "y"}
+    assert read(path, **take).hold is None
+    assert read(path, **take, hold="dt").hold == pytest.approx(0.01)
+    assert read(path, **take, hold=0).hold == 0.0
+    assert read(path, **take, hold=0.01, sample_rate=50).hold == 0.01
+    with pytest.warns(RecordWarning, match="resampled to 200 Hz"):
+        assert read(path, **take, hold=0.01, sample_rate=200).hold is None
