@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from textwrap import fill
 
 from healthy_table import shown
 from results import FOLDER, tables
@@ -60,9 +61,10 @@ def _of(name: str) -> list[dict]:
 def _section(table: dict) -> str:
     rows = [table["columns"], ["---"] * len(table["columns"])]
     rows += [[shown(cell) for cell in row] for row in table["rows"]]
-    parts = [f"## {table['title']}", f"`{table['command']}`", table.get("text")]
+    parts = [f"## {table['title']}", f"`{table['command']}`", fill(table.get("text", ""), 110)]
     parts += ["\n".join(f"| {' | '.join(row)} |" for row in rows)]
-    parts += ["\n".join(f"- {note}" for note in table.get("notes", ()))]
+    notes = [fill(f"- {note}", 110, subsequent_indent="  ") for note in table.get("notes", ())]
+    parts += ["\n".join(notes)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
