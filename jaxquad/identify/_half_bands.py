@@ -38,7 +38,7 @@ class Bands(NamedTuple):
         heads = ("parameter", "whole band", f"{low:.3g} .. {self.split:.3g} rad/s")
         heads = (*heads, f"{self.split:.3g} .. {high:.3g} rad/s", "overlap")
         words = {True: "yes", False: "NO", None: "-"}
-        rows = [heads]
+        rows: list[tuple[str, ...]] = [heads]
         for name in self.whole.names:
             cells = [_interval(each, name) for each in (self.whole, self.lower, self.upper)]
             rows.append((name, *cells, words[self.overlap(name)]))
