@@ -1,0 +1,119 @@
+"""The global model below the local polynomials: rings, leakage, and the errors of both."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import signal
+
+from jaxquad.excitation import sweep
+from jaxquad.records import Record
+from jaxquad.spectra import (
+    frequency_response,
+    FrequencyResponse,
+    JointInputOutput,
+    LocalPolynomial,
+)
+
+
+DT = 0.02
+OMEGA = np.geomspace(0.6, 14.0, 40)
+U = sweep(0.3, 15.0, duration=60.0, sample_rate=1 / DT, amplitude=1.0, trim=0.0).signal
+HELD = signal.cont2discrete(([100.0], [1.0, 0.4, 100.0]), DT)  # 10 rad/s, damping ratio 0.02
+
+
+def exact(omega):
+    z = np.exp(1j * omega * DT)
+    return np.polyval(HELD[0][0], z) / np.polyval(HELD[1], z)
+
+
+def ringing(seed, u=U, noise=0.02):
+    y = np.asarray(signal.lfilter(HELD[0][0], HELD[1], u))
+    return y + noise * np.std(y) * np.random.default_rng(seed).standard_normal(y.size)
+
+
+def estimate(seed, **options) -> FrequencyResponse:
+    record = Record(DT * np.arange(U.size), U, ringing(seed))
+    return frequency_response(record, OMEGA, estimator=LocalPolynomial(**options))
+
+
+def parts_over_error(found, response):
+    """Errors of real and imaginary part over the claimed one."""
+    measured = np.asarray(found.response)[:, 0, 0]
+    error = np.asarray(found.random_error)[:, 0, 0] * np.abs(measured)
+    return np.stack([(measured - response).real, (measured - response).imag]) / error
+
+
+def test_a_light_mode_that_rings_at_the_end_is_measured_within_its_errors():
+    found = [estimate(seed) for seed in range(4)]
+    off = np.stack([parts_over_error(each, exact(OMEGA)) for each in found])
+    assert np.max(np.abs(off)) < 4.5 and 0.6 < np.sqrt(np.mean(off**2)) < 1.3
+    alone = parts_over_error(estimate(0, global_order=0), exact(OMEGA))
+    assert np.nanmax(np.abs(alone)) > 20
+    assert not any(each.remarks for each in found)
+
+
+def test_a_model_that_is_too_small_is_remarked_and_rest_is_advised():
+    remarks = " ".join(estimate(0, global_order=1).remarks)
+    assert "still moves when the record ends" in remarks and "rest at the end" in remarks
+
+
+def test_variance_covariance_and_projection_of_shared_parameters_agree():
+    errors = estimate(0).errors
+    assert errors.sensitivity is not None
+    covariance, variance = errors.between((0, 0), (0, 0)), errors.variance()[:, 0, 0]
+    np.testing.assert_allclose(np.diag(covariance).real, variance, rtol=1e-9)
+    # The real part of an error, and the imaginary part, add up to its mean square.
+    columns = np.zeros((OMEGA.size, 1, 1, 2), complex)
+    columns[7, 0, 0] = 1.0, 1.0j
+    parts = np.asarray(errors.project(columns))
+    assert np.trace(parts) == pytest.approx(variance[7], rel=1e-9)
+    turned = errors.scaled(jnp.full(OMEGA.size, 2.0j)).pair(0, 0)
+    np.testing.assert_allclose(turned.variance()[:, 0, 0], 4 * variance, rtol=1e-9)
+
+
+def test_beyond_a_chirp_that_stops_at_once_there_is_no_response():
+    """u = sin(t^2 / 10) ends near 8 rad/s; beyond, its transform is leakage."""
+    time = np.arange(0.0, 40.0, DT)
+    u = np.sin(time**2 / 10)
+    y = signal.lsim(([3.0], [1.0, 2.0]), u, time)[1]
+    omega = np.geomspace(0.8, 30.0, 40)
+    found = frequency_response(Record(time, u, y), omega)
+    response = np.asarray(found.response)[:, 0, 0]
+    assert np.all(np.isnan(response[omega > 11]))
+    inside = omega < 7
+    np.testing.assert_allclose(response[inside], 3 / (1j * omega[inside] + 2), rtol=5e-3)
+
+
+@pytest.mark.slow
+def test_records_that_ring_share_a_model_and_have_transients_of_their_own():
+    off = []
+    for seed in range(6):
+        parts = []
+        for k, length in enumerate((2000, 2600)):
+            u = U[-length:]
+            parts.append(Record(DT * np.arange(length), u, ringing(10 * seed + k, u)))
+        found = frequency_response(parts, OMEGA[10:], estimator=LocalPolynomial())
+        off.append(parts_over_error(found, exact(OMEGA[10:])))
+    assert np.max(np.abs(off)) < 4.5 and 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
+
+
+def closed(seed, gust):
+    """y = G (u + w), u = r - 0.1 (y + noise), the mode G under a weak feedback."""
+    rng = np.random.default_rng(seed)
+    w = gust * np.asarray(signal.lfilter([0.2], [1.0, -0.98], rng.standard_normal(U.size)))
+    above, below = HELD[0][0], HELD[1]
+    loop = np.polyadd(below, 0.1 * above)
+    y = np.asarray(signal.lfilter(above, loop, U + w))
+    return U - 0.1 * y, y
+
+
+@pytest.mark.slow
+def test_the_joint_estimate_knows_the_errors_of_its_two_models():
+    off = []
+    for seed in range(12):
+        u, y = closed(seed, 0.02)
+        record = Record(DT * np.arange(U.size), u, y, U)
+        found = frequency_response(record, OMEGA, estimator=JointInputOutput())
+        off.append(parts_over_error(found, exact(OMEGA)))
+    worst = np.nanmax(np.abs(off), axis=(1, 2))
+    assert np.median(worst) < 4 and 0.7 < np.sqrt(np.nanmean(np.square(off))) < 1.3
