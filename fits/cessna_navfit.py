@@ -51,7 +51,8 @@ def read_sweep(path: Path) -> jq.Record:
 def identify(record: jq.Record) -> tuple[jq.spectra.FrequencyResponse, jq.identify.Fit]:
     """The response by composite windows, and one zero over three poles without delay."""
     frf = jq.frequency_response(record, OMEGA, estimator=jq.spectra.Composite())
-    return frf, fit_transfer_function(frf, zeros=1, poles=3, delay=0.0)
+    cost = jq.identify.CoherenceWeighted()  # Eq. (14), CIFER's
+    return frf, fit_transfer_function(frf, zeros=1, poles=3, delay=0.0, cost=cost)
 
 
 def compared(fit: jq.identify.Fit) -> str:
