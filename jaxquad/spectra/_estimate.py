@@ -63,9 +63,11 @@ def _result(
     spread = np.sqrt(np.asarray(found.errors.variance()) / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(known, spread / np.abs(np.asarray(found.response)), np.inf)
-    columns = (found.response, error, found.coherence, found.direct_coherence)
     names = records[0].output_names, records[0].input_names
-    remarks = remarks_on_feedback(method, omega, *map(np.asarray, columns), names)
+    remarks = remarks_on_feedback(
+        method, omega, np.asarray(found.response), error, np.asarray(found.coherence),
+        np.asarray(found.direct_coherence), names,
+    )  # fmt: skip
     if isinstance(found, LocalEstimate):  # periods show their own distortion
         response, coherence = np.asarray(found.response), np.asarray(found.coherence)
         remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)

@@ -1,5 +1,6 @@
 """Signs that a controller, and not the plant, made the coherence between input and output."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Literal
 
@@ -66,8 +67,8 @@ def remarks_on_feedback(
     `direct` is the coherence from input to output, `coherence` that of the estimate.
     """
     remarks = []
-    for o, i in np.ndindex(response.shape[1:]):
-        pair, known = (names[0][o], names[1][i]), np.isfinite(response[:, o, i])
+    for (o, output), (i, source) in itertools.product(*map(enumerate, names)):
+        pair, known = (output, source), np.isfinite(response[:, o, i])
         if method == "joint":
             remarks += _explained_by_reference(omega, coherence[:, o, i], direct[:, o, i], pair)
             continue

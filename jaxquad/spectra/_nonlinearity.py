@@ -188,9 +188,8 @@ def _harmonics(
     size, angle = np.abs(tone), np.angle(tone)
     waves = [np.fft.fft(size * np.exp(1j * k * angle))[band] / 2 for k in _HARMONICS]
     columns = np.stack([y - np.sum(plant * u, axis=1), *(plant[:, source] * w for w in waves)])
-    sharp = columns - (
-        savgol_filter(columns.real, _TRANSIENT, 2) + 1j * savgol_filter(columns.imag, _TRANSIENT, 2)
-    )
+    slow = [np.asarray(savgol_filter(part, _TRANSIENT, 2)) for part in (columns.real, columns.imag)]
+    sharp = columns - (slow[0] + 1j * slow[1])
     left, seen = sharp[0], sharp[1:]
     noise = np.maximum(_local_mean(np.abs(left) ** 2, band.start), 1e-300)
     weight = np.maximum(np.sum(np.abs(seen) ** 2 / noise, axis=1), 1e-300)

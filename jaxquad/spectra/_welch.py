@@ -1,5 +1,6 @@
 """Responses by averages over windows: one length (Welch) or several (Composite)."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -252,7 +253,7 @@ def remarks_on_leakage(
     least = np.maximum(leakage[1], error)
     with np.errstate(invalid="ignore"):
         ratio = np.where(np.isfinite(least) & np.isfinite(bias), bias / least, 0.0)
-    for o, i in np.ndindex(bias.shape[1:]):
+    for (o, output), (i, source) in itertools.product(*map(enumerate, names)):
         leaked = kernel @ ratio[:, o, i] ** 2 > _LEAKED**2 * np.sum(kernel, axis=1)
         if np.any(leaked):
             text = (
@@ -261,7 +262,7 @@ def remarks_on_leakage(
                 "include it. Use jq.spectra.LocalPolynomial(), which estimates leakage, a longer "
                 "window, or integrators= where the plant integrates"
             )
-            remarks.append(Remark(text, omega[leaked], (names[0][o], names[1][i])))
+            remarks.append(Remark(text, omega[leaked], (output, source)))
     return tuple(remarks)
 
 
@@ -332,15 +333,13 @@ def _result(
 ) -> FrequencyResponse:
     first, dt = records[0], records[0].dt
     independent = _independent(records, segments)
-    columns = (found.response, found.random_error, found.coherence, found.direct_coherence)
-    names = first.output_names, first.input_names
-    remarks = remarks_on_feedback(method, omega, *map(np.asarray, columns), names)
     response, coherence = np.asarray(found.response), np.asarray(found.coherence)
+    error, direct = np.asarray(found.random_error), np.asarray(found.direct_coherence)
+    names = first.output_names, first.input_names
+    remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
-    remarks += remarks_on_leakage(
-        omega, np.asarray(found.leakage), np.asarray(found.random_error), names
-    )
+    remarks += remarks_on_leakage(omega, np.asarray(found.leakage), error, names)
     if max(independent) < 3:
         remarks += (Remark(_FEW.format(count=max(independent))),)
     counts = tuple(len(starts) for _, starts in segments.groups)

@@ -64,8 +64,7 @@ def drive(seconds=60.0):
 
 
 def answer(plant, u):
-    numerator, denominator, _ = signal.cont2discrete(plant, 1 / RATE)
-    return signal.lfilter(np.ravel(numerator), denominator, u)
+    return np.asarray(signal.lfilter(*signal.bilinear(*plant, fs=RATE), u))
 
 
 INTEGRATOR = ([5.0], [0.05, 1.0, 0.0])
@@ -97,8 +96,8 @@ def test_without_noise_little_is_claimed_and_the_bias_is_remarked():
     u = drive()
     record = jq.Record(np.arange(u.size) / RATE, u, answer(MODE, u))
     found = jq.frequency_response(record, OMEGA, estimator=jq.spectra.Welch(15.0))
-    (numerator, denominator, _), z = signal.cont2discrete(MODE, 1 / RATE), np.exp(1j * OMEGA / RATE)
-    exact = np.polyval(np.ravel(numerator), z) / np.polyval(denominator, z)
+    (numerator, denominator), z = signal.bilinear(*MODE, fs=RATE), np.exp(1j * OMEGA / RATE)
+    exact = np.polyval(np.asarray(numerator), z) / np.polyval(np.asarray(denominator), z)
     bias = np.abs(np.asarray(found.response)[:, 0, 0] / exact - 1)
     assert np.median(found.random_error) < 0.05 * np.median(bias)
     (remark,) = [remark for remark in found.remarks if "leakage" in remark]

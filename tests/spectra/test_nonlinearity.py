@@ -39,9 +39,9 @@ def saturation(u, share=0.2):
 def open_loop(actuator, seed, noise=0.05):
     """A mode at 5 rad/s behind an actuator, under coloured noise."""
     u, rng = sweep(), np.random.default_rng(seed)
-    plant = signal.cont2discrete(([40.0], [1.0, 4.0, 25.0]), DT)
-    y = signal.lfilter(np.ravel(plant[0]), plant[1], actuator(u))
-    gust = signal.lfilter([0.2], [1.0, -0.96], rng.standard_normal(SAMPLES))
+    plant = signal.bilinear([40.0], [1.0, 4.0, 25.0], fs=1 / DT)
+    y = np.asarray(signal.lfilter(*plant, actuator(u)))
+    gust = np.asarray(signal.lfilter([0.2], [1.0, -0.96], rng.standard_normal(SAMPLES)))
     return Record(TIME, u, y + noise * np.std(y) * gust)
 
 
@@ -49,7 +49,7 @@ def closed_loop(actuator, seed):
     """A lagged integrator under proportional feedback with gusts; the sweep is the reference."""
     r, rng = sweep(), np.random.default_rng(seed)
     u, y, rate, lagged = np.zeros(SAMPLES), np.zeros(SAMPLES), 0.0, 0.0
-    gust = signal.lfilter([0.01], [1.0, -0.98], rng.standard_normal(SAMPLES))
+    gust = np.asarray(signal.lfilter([0.01], [1.0, -0.98], rng.standard_normal(SAMPLES)))
     error = 0.005 * rng.standard_normal(SAMPLES)
     for k in range(SAMPLES):
         y[k] = rate + error[k]

@@ -43,9 +43,8 @@ def open_loop(plant: tuple, level: float, pole: float):
 
     def fly(actuator: Actuator, rng: np.random.Generator) -> jq.Record:
         u = sweep(rng)
-        numerator, denominator, _ = signal.cont2discrete(plant, DT)
-        y = signal.lfilter(np.ravel(numerator), denominator, actuator(u))
-        noise = signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(u.size))
+        y = np.asarray(signal.lfilter(*signal.bilinear(*plant, fs=1 / DT), actuator(u)))
+        noise = np.asarray(signal.lfilter([1.0], [1.0, -pole], rng.standard_normal(u.size)))
         return jq.Record(DT * np.arange(u.size), u, y + level * np.std(y) * noise / np.std(noise))
 
     return fly
@@ -56,7 +55,7 @@ def closed_loop(gust: float, *, named: bool):
 
     def fly(actuator: Actuator, rng: np.random.Generator) -> jq.Record:
         r = sweep(rng)
-        wind = signal.lfilter([0.2], [1.0, -0.98], rng.standard_normal(r.size))
+        wind = np.asarray(signal.lfilter([0.2], [1.0, -0.98], rng.standard_normal(r.size)))
         sensor = 0.005 * rng.standard_normal(r.size)
         u, y, rate, lagged = np.zeros(r.size), np.zeros(r.size), 0.0, 0.0
         for k in range(r.size):
