@@ -50,7 +50,7 @@ def _separate(roll: Roll) -> Claim:
         {"undetermined, of 2": float(len(lost))},
         roll.joint.identifiable,
     )
-    text = "identification gives J_x = 0.0492 and K_t = 0.1170, each by itself"
+    text = "identification gives J_x = 0.0492 and K_t = 0.1170, individually"
     return Claim("5.2", text, "both are determined", (reading,))
 
 
