@@ -107,6 +107,7 @@ def _adjoint(x: np.ndarray) -> np.ndarray:
 Grid = Float[np.ndarray, " frequencies"]
 
 
+_DIVISIBLE = 0.15  # largest random error of an input's response to the references
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
 _NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are estimated
 _SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
@@ -174,7 +175,10 @@ def estimate_local_polynomial(
         columns = [transformed_columns(record, options.integrators) for record in records]
         ringing = left_moving(rest, columns, grid, sources)[at]
     doubtful = unresolved(omega, moved, sources, at, bins, rest.moved) & (options.width is None)
-    moved = replace_rows(moved, doubtful, undetermined(_rows(moved, doubtful)))
+    lost = doubtful
+    if method == "joint":
+        lost = lost | _unmoved(moved, sources, at, inputs)
+    moved = replace_rows(moved, lost, undetermined(_rows(moved, lost)))
     fit = joint_fit(moved, inputs) if method == "joint" else moved
     plain = rest
     if method == "joint":
@@ -200,10 +204,23 @@ def estimate_local_polynomial(
         width,
         rational,
         noise_freedom[np.ix_(at, at)],
-        _remark_on_lost(omega, np.all(known, axis=(1, 2)) | doubtful, least[at], options)
+        _remark_on_lost(omega, np.all(known, axis=(1, 2)) | lost, least[at], options)
         + _remark_on_resolution(omega[doubtful & coherent])
         + _remark_on_ringing(omega[ringing & coherent & ~doubtful]),
     )
+
+
+def _unmoved(
+    moved: LocalFit, noise: Noise, at: Int[np.ndarray, " frequencies"], inputs: int
+) -> Bool[np.ndarray, " frequencies"]:
+    """Where the references move an input too little to divide by.
+
+    There the joint ratio is that of two noises: -1 over the controller, with hardly any residual.
+    """
+    known, _, back = joint_factors(moved, inputs)
+    effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
+    relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)
+    return known & np.any(relative > _DIVISIBLE, axis=1)
 
 
 def _check_references(record: Record, inputs: int) -> None:
