@@ -55,11 +55,10 @@ def transform_records(
         for mine, (_, local) in zip(starts, layout, strict=True):
             mine += [origin + start for start in local]
         origin += record.samples + max(length for length, _ in layout)
-    joined, leaked = (
-        tuple(
-            mine[0] if len(mine) == 1 else jnp.concatenate(mine) for mine in zip(*kind, strict=True)
-        )
-        for kind in (parts, slopes)
+    joined = tuple(_joined(each) for each in zip(*parts, strict=True))
+    leaked = tuple(
+        Slopes(_joined([one.inputs for one in each]), _joined([one.outputs for one in each]))
+        for each in zip(*slopes, strict=True)
     )
     lengths = [length for length, _ in layouts[0]]
     return Segments(joined, leaked, tuple(zip(lengths, map(tuple, starts), strict=True)))
