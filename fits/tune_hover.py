@@ -70,7 +70,7 @@ def roll(axis: jq.models.AttitudeAxis) -> tuple[jq.DecoupledAxes, jax.Array]:
 def identified(fit: jq.identify.Fit) -> Case:
     """Gain and lag as uncertain as the fit leaves them, and the assumed rest."""
     band = float(OMEGA[0]), float(OMEGA[-1])
-    posterior = jq.ensembles.Posterior(fit, plant=roll, recorded_dt=None, band=band)
+    posterior = jq.ensembles.Posterior(fit, plant=roll, band=band)
     return case_of(posterior.plant, jq.Ensemble(posterior, **ASSUMED))
 
 

@@ -1,6 +1,7 @@
 """The plants that a fit leaves uncertain, and whether the record determines what they need."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -141,6 +142,29 @@ def _axis(gain: Array, lag: Array | None, believed: Array) -> DecoupledAxes:
     return DecoupledAxes((gain * believed)[None], believed[None], lag=lag)
 
 
+def _unmodelled_delay(fit: Fit, recorded_dt: float | None | Literal["as fitted"]) -> float:
+    """Half of a hold that the fit does not model, in s. Raise ValueError where nobody said."""
+    holds = [] if fit.origin is None else [frf.hold for frf in fit.origin.frfs]
+    modelled = bool(holds) and None not in holds
+    if recorded_dt == "as fitted":
+        if modelled:
+            return 0.0
+        raise ValueError(
+            "the fit does not know how long the command was held, so its delay may hold half of "
+            "it: fit a record that says so (jq.Record(..., hold=dt)), or give recorded_dt=, the "
+            "sample interval in s of a command held from sample to sample, None if it was not held"
+        )
+    if recorded_dt is None:
+        return 0.0
+    require_all_positive(recorded_dt=recorded_dt)
+    if modelled:
+        raise ValueError(
+            f"recorded_dt is {recorded_dt:g} s, but the fit models the hold of the command "
+            f"({holds[0]:g} s) already: leave recorded_dt out"
+        )
+    return recorded_dt / 2
+
+
 _LOST = 0.01  # share of a variance that may lie in directions which are not drawn
 _DRAWS = 1024  # by which the longest delay is found
 
@@ -153,7 +177,7 @@ class Posterior(eqx.Module):
     !!! example
 
         ```python
-        posterior = jq.ensembles.Posterior(fit, recorded_dt=0.01, believed=0.0552)
+        posterior = jq.ensembles.Posterior(fit, believed=0.0552)
         loop = jq.Loop(posterior.plant, controller, delay=posterior.delay)
         ensemble = jq.Ensemble(posterior, inertia=jq.ensembles.LogUniform(0.5, 3.0))
         ```
@@ -172,7 +196,7 @@ class Posterior(eqx.Module):
         self,
         fit: Fit,
         *,
-        recorded_dt: float | None,
+        recorded_dt: float | None | Literal["as fitted"] = "as fitted",
         believed: ArrayLike | None = None,
         plant: Given | None = None,
         band: tuple[float, float] | None = None,
@@ -183,10 +207,10 @@ class Posterior(eqx.Module):
         - `fit`: of a `jq.models.AttitudeAxis`, a `jq.LaggedIntegrator` (b = K, from the command to
             rate or angle in rad), a `jq.TransferFunction` of that form, or, with `plant`, of any
             other model.
-        - `recorded_dt`: the sample interval in s of a record whose input was held from sample to
-            sample. Half of it is in the identified delay and is subtracted, down to 0, since a
-            simulated loop holds its inputs itself. None for an input that was not held, and for a
-            fit that models the hold, as that of a record that knows its `hold`.
+        - `recorded_dt`: needed where the record did not say how long its input is held
+            (`Record.hold`): the sample interval in s if it is held from sample to sample, None if
+            it is not held. Half of a hold that the fit does not model is in the identified delay
+            and is subtracted, down to 0, since a simulated loop holds its inputs itself.
         - `believed`: the inertia in kg m^2 that belongs to the gain, where the fit determines only
             b = KT / J: torques in N m and the inertia given to a scheduled controller refer to it.
         - `plant`: a function of the model that returns the pair (`jq.DecoupledAxes`, delay in s).
@@ -197,12 +221,12 @@ class Posterior(eqx.Module):
 
         **Raises:**
 
-        - `ValueError`: the fit found no minimum or has no finite errors, or its model is not known.
+        - `ValueError`: the fit found no minimum or has no finite errors, its model is not known,
+            or `recorded_dt` is missing, or given for a fit that models the hold.
         """
-        if recorded_dt is not None:
-            require_all_positive(recorded_dt=recorded_dt)
         if not isinstance(fit, Fit):
             raise ValueError(f"fit is a {type(fit).__name__}: give the result of jq.fit")
+        self.held_back = _unmodelled_delay(fit, recorded_dt)
         check_drawable(fit, hold_undetermined=True)
         if band is not None and not 0 < band[0] < band[1]:
             raise ValueError(f"band is {band} rad/s: give (low, high), 0 < low < high")
@@ -210,7 +234,6 @@ class Posterior(eqx.Module):
             require_all_positive(largest_command=largest_command)
         self.band, self.largest_command = band, largest_command
         self.fit, self.build = fit, _choose_builder(fit.model, believed, plant)
-        self.held_back = 0.0 if recorded_dt is None else recorded_dt / 2
         self.plant, delay = self.build(fit.model)
         self.delay = float(np.maximum(np.asarray(delay) - self.held_back, 0.0))
         points = draw_unit_points("latin", jax.random.key(0), self.deviates, _DRAWS)

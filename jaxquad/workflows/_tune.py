@@ -144,7 +144,7 @@ def _check_unit(record: Record) -> None:
 
 def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
     record = found.records[0]
-    recorded_dt = record.dt if record.hold is None else None  # a fit that knows it models it
+    recorded_dt = record.dt if record.hold is None else "as fitted"  # commands are held
     posterior = Posterior(
         found.fit, recorded_dt=recorded_dt, believed=settings.inertia, band=found.band,
         largest_command=found.largest_command,

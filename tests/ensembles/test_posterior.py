@@ -308,6 +308,17 @@ def test_half_a_sample_of_the_records_hold_is_taken_off_the_delay_down_to_zero()
     assert half.longest_delay == pytest.approx(0.008)  # whole samples above all draws
 
 
+def test_a_fit_that_models_the_hold_has_the_plants_own_delay():
+    silent = sharp_fit()
+    with pytest.raises(ValueError, match="does not know how long the command was held"):
+        Posterior(silent, believed=1.0)
+    frf = dataclasses.replace(silent.origin.frfs[0], hold=0.0)
+    knows = jq.fit(jq.LaggedIntegrator(280.0, 0.02, 0.02), frf, cost=ML)
+    assert Posterior(knows, believed=1.0).delay == knows.model.delay
+    with pytest.raises(ValueError, match="models the hold of the command"):
+        Posterior(knows, recorded_dt=0.01, believed=1.0)
+
+
 def test_lag_and_delay_keep_the_correlation_of_the_fit():
     fit = sharp_fit()
     members = posterior_of(fit, believed=1.0).draw(4096, KEY)
