@@ -61,7 +61,7 @@ def compared(fit: jq.identify.Fit) -> str:
     (zero,), (one, other) = found.zeros, found.poles
     far, pair = (one, other) if len(one.values) == 1 else (other, one)
     ours = [
-        found.gain[1:],
+        found.gain[1:3],
         *zip((*zero.values, *far.values, *pair.values),
              (*zero.standard_errors, *far.standard_errors, *pair.standard_errors), strict=True),
     ]  # fmt: skip

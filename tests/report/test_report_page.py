@@ -139,7 +139,9 @@ def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
     """Every name, unit, remark, file name and command is hostile, each in another way."""
     u, y, r, unit, source, words = HOSTILE
     record = record_of((u, y, r), (unit, source, words), source=source)
-    named = dataclasses.replace(frf, input_names=(u,), output_names=(y,), remarks=(words,))
+    named = dataclasses.replace(
+        frf, input_names=(u,), output_names=(y,), remarks=(jq.spectra.Remark(words),)
+    )
     outside = dataclasses.replace(fit, remarks=HOSTILE, names=(r, u, "delay"))
     path = write_report(
         tmp_path / "report.html", fit=outside, frf={unit: named}, others={source: named},
