@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from results import write
+from result_files import write
 from scipy.special import stdtrit
 
 import jaxquad as jq

@@ -92,10 +92,10 @@ def _by_plant(titles, judged, rows, draws, command) -> dict:
         "title": "Healthy plants without options",
         "command": command,
         "text": (
-            f"{draws} records of each plant, noise drawn afresh, through `jq.frequency_response` "
-            "and `jq.fit` without options: default estimator, grid and cost; starting values 10 "
-            "to 30 % off. Each cell is the range over the plant's parameters. `coverage`: of 95 % "
-            "intervals, by noise alone and with model error; `scatter`: standard deviation of the "
+            f"{draws} records of each plant (half as many of three inputs), noise drawn afresh, "
+            "through `jq.frequency_response` and `jq.fit` without options: default estimator, "
+            "grid and cost; starting values 10 to 30 % off. Each cell is the range over the "
+            "plant's parameters. `coverage`: of 95 % intervals, by noise alone and with model error; `scatter`: standard deviation of the "
             "estimates over the claimed error (noise alone); `bias`: the largest, in claimed "
             "errors; `rmse / bound`: root mean square error over the Cramer-Rao bound, which is "
             "computed by `tests/studies/bounds.py` without the library. scipy: `csd` and "

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from results import write
+from result_files import write
 from scipy.linalg import expm
 
 import jaxquad as jq

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from result_files import write
 
 import jaxquad as jq
-from results import write
 
 
 jax.config.update("jax_enable_x64", True)

@@ -12,10 +12,10 @@ import argparse
 from collections.abc import Callable
 
 import numpy as np
+from result_files import write
 from scipy import signal
 
 import jaxquad as jq
-from results import write
 
 
 jq.enable_x64()

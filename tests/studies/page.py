@@ -5,7 +5,7 @@ from pathlib import Path
 from textwrap import fill
 
 from healthy_table import shown
-from results import FOLDER, tables
+from result_files import FOLDER, tables
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation.md"

@@ -18,9 +18,9 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from bounds import cramer_rao  # noqa: E402
 from plants import make, Plant, record, start  # noqa: E402
+from result_files import write  # noqa: E402
 
 import jaxquad as jq  # noqa: E402
-from results import write  # noqa: E402
 
 
 CASES = {

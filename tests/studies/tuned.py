@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from results import write
+from result_files import write
 from systems import Continuous, hold, sampled
 
 
