@@ -241,7 +241,7 @@ def _null_vector(matrix: Float[np.ndarray, "rows columns"], first: int) -> Vecto
     """Coefficients of the columns from `first` on, of unit length, that others explain best."""
     length = np.linalg.norm(matrix, axis=0)
     length = np.where(length > 0, length, 1.0)
-    corner = np.linalg.qr(matrix / length, mode="r")[first:, first:]
+    corner = np.asarray(np.linalg.qr(matrix / length, mode="r"))[first:, first:]
     return np.linalg.svd(corner)[2][-1] / length[first:]
 
 
@@ -305,13 +305,13 @@ def _least_squares(joined: Float[np.ndarray, "rows columns"]) -> Vector:
     """Coefficients of all columns but the last, which they fit."""
     length = np.linalg.norm(joined, axis=0)
     length = np.where(length > 0, length, 1.0)
-    corner = np.linalg.qr(joined / length, mode="r")
+    corner = np.asarray(np.linalg.qr(joined / length, mode="r"))
     found = np.linalg.lstsq(corner[:-1, :-1], corner[:-1, -1], rcond=1e-13)[0]
     return found * length[-1] / length[:-1]
 
 
 def _real(x: Complex[np.ndarray, "rows columns"]) -> Float[np.ndarray, "parts columns"]:
-    return np.concatenate([x.real, x.imag])
+    return np.concatenate([np.real(x), np.imag(x)])
 
 
 def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "bins records"]:
