@@ -27,7 +27,7 @@ TEXT = (
     "K e^(-tau s) / (s (T s + 1)) fitted by the defaults to plants with one further term that it "
     "lacks; {draws} draws of each, seed {seed}, 40 frequencies over random bands, random errors of "
     "0.5, 2 and 5 %. For K and for T + tau: how often 95 % intervals by noise alone and with model "
-    "error hold the truth; the median half width of the latter, in per cent, in median actual errors "
+    "error hold the truth; the median half width of the latter, in per cent, in actual errors "
     "(errors), and over that by noise alone (wider)."
 )
 ERRORS = (0.005, 0.02, 0.05)
@@ -178,7 +178,7 @@ def row(title: str, found: list[Outcome]) -> list:
     return [title, len(found), int(np.sum(~known)), *(float(cell) for cell in cells)]
 
 
-COLUMNS = ["plants", "draws", "refused"] + [
+COLUMNS = ["plants", "draws", "lost"] + [
     f"{name} {what}"
     for name in ("K", "T+tau")
     for what in ("noise %", "model %", "width %", "errors", "wider")
@@ -210,7 +210,7 @@ def main() -> None:
             "notes": [
                 "A discrepancy that the parameters can take up themselves cannot be seen: an echo "
                 "or a lead and lag within the band that bend the phase as a lag does.",
-                "`refused`: lag and delay are refused one by one, or the solver diverged.",
+                "`lost`: lag and delay are refused one by one, or the solver diverged.",
             ],
         },
     )
