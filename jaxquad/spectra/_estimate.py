@@ -24,7 +24,7 @@ from ._periodic import estimate_periodic, PeriodicEstimate
 from ._welch import average_windows
 
 
-_CYCLES = 5.0  # of the longest record, in the lowest frequency by default
+_CYCLES = 2.0  # of the longest record, in the lowest frequency by default
 
 Method = Literal["direct", "joint"]
 Grid = Float[np.ndarray, " frequencies"]
@@ -106,7 +106,7 @@ def frequency_response(
 
     - `record`: one `Record`, or several with the same channels and sample rate, which are taken
         together.
-    - `omega`: frequencies in rad/s, increasing; by default 100 log-spaced ones from five cycles of
+    - `omega`: frequencies in rad/s, increasing; by default 100 log-spaced ones from two cycles of
         the longest record to a tenth of the sample rate (the excited lines with
         `jq.spectra.Periodic`).
     - `estimator`: one of `jq.spectra.LocalPolynomial`, `Composite`, `Welch`, `Periodic` and
