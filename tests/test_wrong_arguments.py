@@ -35,7 +35,9 @@ CALLS = {
         WRONG, recorded_dt=None
     ),
     "a float is no frequency response: give": lambda: jq.loops.margins(NUMBER),
-    "estimator is 3.0: give an object with the methods": lambda: jq.AdaptiveLADRC(LOOP.controller, NUMBER, lambda inertia: 1 / inertia),
+    "estimator is 3.0: give an object with the methods": lambda: jq.AdaptiveLADRC(
+        LOOP.controller, NUMBER, lambda inertia: 1 / inertia
+    ),
     "the controller is a DecoupledAxes, which is a plant": lambda: jq.Loop(PLANT, AXES),
 }
 

@@ -554,7 +554,6 @@ def remarks_on_priors(
     return remarks
 
 
-
 def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
     return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
@@ -17,6 +18,9 @@ _TRIED = 32  # frequencies at which the two are chosen
 _TOLERANCE = 1e-8  # of the response, to which they are chosen
 
 
+Numbers = Array | np.ndarray  # of a plan, NumPy's until it is complete
+
+
 class Aliases(eqx.Module):
     """How the response of a held input follows from a model's own at other frequencies.
 
@@ -27,29 +31,33 @@ class Aliases(eqx.Module):
     Source: Franklin, Powell and Workman, "Digital Control of Dynamic Systems", 3rd ed., ch. 5.
     """
 
-    direct: Complex[Array, " frequencies"]  # times G(jw)
-    spread: Complex[Array, "frequencies nodes"]  # times the sum at each node
-    upper: Float[Array, "nodes aliases"]  # rad/s
-    lower: Float[Array, "nodes aliases"]  # rad/s, of the negative frequencies
-    weights: Float[Array, " aliases"]  # of the sum
+    direct: Complex[Numbers, " frequencies"]  # times G(jw)
+    spread: Complex[Numbers, "frequencies nodes"]  # times the sum at each node
+    upper: Float[Numbers, "nodes aliases"]  # rad/s
+    lower: Float[Numbers, "nodes aliases"]  # rad/s, of the negative frequencies
+    weights: Float[Numbers, " aliases"]  # of the sum
 
     @property
-    def omega(self) -> Float[Array, " others"]:
+    def omega(self) -> Float[Numbers, " others"]:
         """All frequencies at which the model is needed beside those of the response, in rad/s."""
-        return jnp.concatenate([self.upper.reshape(-1), self.lower.reshape(-1)])
+        joined = self.upper.reshape(-1), self.lower.reshape(-1)
+        return np.concatenate(joined) if _is_numpy(self.upper) else jnp.concatenate(joined)
 
     def total(
         self,
-        own: Complex[Array, "frequencies outputs inputs"],
-        others: Complex[Array, "others outputs inputs"],
-    ) -> Complex[Array, "frequencies outputs inputs"]:
+        own: Complex[Numbers, "frequencies outputs inputs"],
+        others: Complex[Numbers, "others outputs inputs"],
+    ) -> Complex[Numbers, "frequencies outputs inputs"]:
         """The response, from the model's at the frequencies themselves and at `omega`."""
         columns = (1,) * (own.ndim - 1)
-        upper, lower = jnp.split(others / imaginary(self.omega).reshape(-1, *columns), 2)
-        terms = (upper + jnp.conj(lower)).reshape(*self.upper.shape, *own.shape[1:])
-        at_nodes = jnp.einsum("na...,a->n...", terms, self.weights.astype(terms.dtype))
-        aliased = jnp.einsum("fn,n...->f...", self.spread, at_nodes)
-        return self.direct.reshape(-1, *columns).astype(own.dtype) * own + aliased
+        ratio = others / _imaginary(self.omega).reshape(-1, *columns)
+        upper, lower = ratio[: len(ratio) // 2], ratio[len(ratio) // 2 :]
+        terms = (upper + lower.conj()).reshape(*self.upper.shape, *own.shape[1:])
+        weights = self.weights.astype(terms.dtype).reshape(1, -1, *columns)
+        at_nodes = (terms * weights).sum(1)
+        aliased = self.spread @ at_nodes.reshape(len(at_nodes), -1)
+        own = self.direct.reshape(-1, *columns).astype(own.dtype) * own
+        return own + aliased.reshape(own.shape)
 
 
 def evaluate_sampled(
@@ -141,15 +149,28 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
         return None
     tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
     every = _aliases_at(tried, hold, _COUNTS[-1])
-    found = np.asarray(_evaluate(model, jnp.asarray(tried), every.omega))
+    found = np.asarray(_evaluate(model, tried, every.omega))
     terms = _Terms(tried, hold, every, found[: tried.size], found[tried.size :])
     best = terms.total(_COUNTS[-1], None)
     close = lambda *plan: bool(np.all(np.abs(terms.total(*plan) - best) <= _TOLERANCE * abs(best)))
     count = next(count for count in _COUNTS if close(count, None))
     for nodes in _NODES if omega.size > _NODES[-1] else ():
         if close(count, places := _places(tried, nodes)):
-            return _aliases_at(omega, hold, count, tried[places])
-    return _aliases_at(omega, hold, count)
+            return _on_device(_aliases_at(omega, hold, count, tried[places]))
+    return _on_device(_aliases_at(omega, hold, count))
+
+
+def _on_device(aliases: Aliases) -> Aliases:
+    return jax.tree.map(jnp.asarray, aliases)
+
+
+def _is_numpy(x: Numbers) -> bool:
+    """Whether to plan in NumPy: one-off arithmetic that JAX would compile piece by piece."""
+    return isinstance(x, np.ndarray)
+
+
+def _imaginary(omega: Float[Numbers, "..."]) -> Complex[Numbers, "..."]:
+    return 1j * omega if _is_numpy(omega) else imaginary(omega)
 
 
 @eqx.filter_jit
@@ -174,8 +195,7 @@ class _Terms(eqx.Module):
         kept = slice(None) if nodes is None else nodes
         others = self.others.reshape(shape)[:, kept, :count].reshape(-1, *self.own.shape[1:])
         at = None if nodes is None else self.omega[nodes]
-        plan = _aliases_at(self.omega, self.hold, count, at)
-        return np.asarray(plan.total(jnp.asarray(self.own), jnp.asarray(others)))
+        return _aliases_at(self.omega, self.hold, count, at).total(self.own, others)
 
 
 def _places(omega: Float[np.ndarray, " frequencies"], count: int) -> np.ndarray:
@@ -190,18 +210,17 @@ def _places(omega: Float[np.ndarray, " frequencies"], count: int) -> np.ndarray:
 
 def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None) -> Aliases:
     """The aliases of all frequencies, or of the nodes between which they are interpolated."""
-    at = omega if nodes is None else nodes
-    rate = 2 * np.pi / hold
-    omega = jnp.asarray(omega)
-    turn = (1 - jnp.exp(-hold * imaginary(omega))) / hold
-    across = jnp.eye(len(omega)) if nodes is None else _interpolation(np.asarray(omega), nodes)
-    at, steps = jnp.asarray(at)[:, None], jnp.asarray(rate * np.arange(1, count + 1))[None]
+    at = (omega if nodes is None else nodes)[:, None]
+    steps = 2 * np.pi / hold * np.arange(1, count + 1)[None]
+    exp = np.exp if _is_numpy(omega) else jnp.exp
+    turn = (1 - exp(-hold * _imaginary(omega))) / hold
+    across = np.eye(len(omega)) if nodes is None else _interpolation(np.asarray(omega), nodes)
     return Aliases(
-        direct=turn / imaginary(omega),
-        spread=turn[:, None] * jnp.asarray(across).astype(turn.dtype),
+        direct=turn / _imaginary(omega),
+        spread=turn[:, None] * across.astype(turn.dtype),
         upper=at + steps,
         lower=steps - at,
-        weights=jnp.asarray(_window(count)),
+        weights=_window(count),
     )
 
 

@@ -37,8 +37,8 @@ def _parameters(fit: "Fit") -> list[str]:
     width = max(9, *map(len, names))
     heads = (f"{'parameter':<{width}}", f"{'value':>11}", f"{'std. error':>10}")
     apart = fit.discrepancy is not None
-    heads = (*heads, f"{'95 % interval':>25}", *([_BESIDE] if apart else []))
-    heads = (*heads, f"{'CR %':>7}", f"{'insensitivity %':>15}")
+    heads = (*heads, f"{'95 % interval':>23}", *([_BESIDE] if apart else []))
+    heads = (*heads, f"{'CR %':>7}", f"{'insens. %':>9}")
     heads += () if fit.identifiable else (f"{'stopped at':>11}",)
     lines = [" ".join(heads)]
     for k, name in enumerate(names):
@@ -47,10 +47,10 @@ def _parameters(fit: "Fit") -> list[str]:
         stopped = "" if fit.determined[k] else value
         if stopped:
             value, interval = "-", "not determined"
-        cells = [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>25}"]
+        cells = [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>23}"]
         cells += [_by_noise(fit, k)] if apart else []
-        percent = f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:15.2f}"
-        cells += percent if np.isfinite(fit.insensitivity[k]) else (f"{'-':>7}", f"{'-':>15}")
+        percent = f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:9.2f}"
+        cells += percent if np.isfinite(fit.insensitivity[k]) else (f"{'-':>7}", f"{'-':>9}")
         lines.append(" ".join([f"{name:<{width}}", *cells, f"{stopped:>11}"]).rstrip())
     if apart:
         lines.append(_how_wide(fit))
@@ -79,10 +79,11 @@ def _how_wide(fit: "Fit") -> str:
     if found is None:
         return ""
     size, degrees = 100 * 0.6 * found.amplitude, np.degrees(found.amplitude)
-    text = f"95 % intervals with model error: {size:.2g} % and {degrees:.2g} deg"
-    text += f" (none: probability {100 * found.none:.0f} %)" if found.none > 0.05 else ""
+    text = f"95 % intervals count model error: {size:.2g} % of magnitude, {degrees:.2g} deg"
+    text += " of phase"
+    text += f" (probability of none: {100 * found.none:.0f} %)" if found.none > 0.05 else ""
     if "prior" in found.widths:
-        text += "; width prior: as models usually err, the response cannot tell"
+        text += "\nwidth prior: the record cannot show this error; it is that of usual models"
     return text
 
 

@@ -22,7 +22,8 @@ def test_the_demo_finds_the_truth_of_its_log_within_its_error_bars(demo):
     """The lag's mean over a sample and the hold of the command are exact: no bias is allowed."""
     rows = {row["name"]: row for row in result(demo)["fit"]["parameters"]}
     for name, truth in {"gain": 280.0, "lag": 0.02, "delay": 0.008}.items():
-        assert abs(rows[name]["value"] - truth) < 3 * rows[name]["standard_error"] < 0.06 * truth
+        assert abs(rows[name]["value"] - truth) < 3 * rows[name]["standard_error"] < 0.12 * truth
+        assert rows[name]["noise_standard_error"] < 0.02 * truth
     assert "identif" in (demo / "report.html").read_text().lower()
 
 
@@ -30,6 +31,7 @@ def result(folder):
     return json.loads((folder / "result.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_report_is_written_again_from_the_same_log_only(demo, tmp_path, capsys):
     assert main(["report", str(demo), "--out", str(tmp_path), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
@@ -50,7 +52,7 @@ def test_a_stored_model_is_verified_on_another_record(demo, tmp_path, capsys):
     assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     values = [row["value"] for row in result(demo)["fit"]["parameters"]]
-    record = jq.read(log, inputs="M", outputs="q", start=5, stop=40)
+    record = jq.read(log, inputs="M", outputs="q", start=5, stop=40, hold="dt")
     check = jq.verify(jq.LaggedIntegrator(*values), record, band=tuple(found["band_rad_per_s"]))
     assert found["fit_percent"] == pytest.approx(check.fit_percent) and check.fit_percent > 70
     assert found["band_rad_per_s"] == pytest.approx([np.pi, 24 * np.pi], rel=0.01)
@@ -103,6 +105,7 @@ def test_a_design_that_breaks_a_rule_says_so(words, code, complaint, tmp_path, c
     assert complaint in printed.out + printed.err
 
 
+@pytest.mark.slow
 def test_an_autopilots_log_needs_no_channels(tmp_path, capsys):
     path, out = chirped(tmp_path), tmp_path / "out"
     assert main(["identify", str(path), "--out", str(out), "--no-lag"]) == 0
@@ -226,6 +229,7 @@ def test_what_cannot_be_tuned_is_one_line(demo, capsys, more, complaint):
     assert printed.count("\n") == 1 and complaint in printed
 
 
+@pytest.mark.slow
 def test_an_output_of_unknown_unit_is_refused(demo, tmp_path, capsys):
     """Gains in the wrong unit would be 57 times too large or too small."""
     content = json.loads((demo / "result.json").read_text())

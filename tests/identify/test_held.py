@@ -60,6 +60,7 @@ def test_a_measured_input_has_no_hold(response):
     assert not any("hold=" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
 def test_many_fits_at_once_see_the_hold_as_one_does(response):
     batch = jq.identify.fit_batch(START, [response, response], free=FREE)
     np.testing.assert_allclose(batch.values[1], [400.0, 1.2, 400.0, 0.031], rtol=1e-4)

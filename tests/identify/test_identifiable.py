@@ -89,6 +89,7 @@ def test_a_second_record_under_known_added_inertia_tells_them_apart():
     assert 2 < growth < 8
 
 
+@pytest.mark.slow
 def test_a_static_torque_tells_them_apart():
     """Hanging a known mass on the arm gives L K_t, here to 1 %."""
     prior = jq.identify.Prior(lambda m: m.L * m.K_t, 0.197 * 0.1188, 0.01 * 0.197 * 0.1188)
@@ -119,6 +120,7 @@ def test_lag_and_delay_of_a_narrow_band_are_determined_as_a_sum(band):
     assert abs(total.value - 0.027) < 3 * total.standard_error < 0.01
 
 
+@pytest.mark.slow
 def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
     truth = jq.TransferFunction([8.0], [1.0, 3.0, 9.0])
     fit = jq.fit(truth, response_of(truth, seed=0), cost=ML, free=("numerator", "denominator"))
@@ -178,6 +180,7 @@ def test_a_sum_is_never_taken_for_a_product(values):
         fit.derived(lambda m: m.a * m.b * m.c, "a b c")
 
 
+@pytest.mark.slow
 def test_what_is_no_product_and_no_sum_is_not_named():
     truth, start = summed((2, 2, 2), True), summed((1, 3, 5), True)
     fit = jq.fit(start, response_of(truth, seed=0), cost=ML)
@@ -225,6 +228,7 @@ def narrow(noise, seed, low=0.5, high=6.0, duration=60.0, omega=None):
     return jq.fit(start, frf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3, 4])
 def test_what_a_blurred_parameter_is_determined_with_is_named_whatever_direction_blurs_it(seed):
     fit = narrow(2.0, seed)

@@ -93,6 +93,7 @@ def test_time_and_frequency_domain_agree_within_their_errors():
     assert "numerator[0]" in str(by_time)
 
 
+@pytest.mark.slow
 def test_a_loop_that_may_be_closed_is_spoken_of():
     fit = refined(CLEAN + 0.05 * noise(3), references=U)
     assert any("output error is biased where feedback" in remark for remark in fit.remarks)

@@ -67,6 +67,7 @@ def test_noise_models_are_those_that_made_the_noise():
     np.testing.assert_allclose(several.denominator, POLES, atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_coloured_residual_is_whitened_and_the_estimate_is_that_of_the_known_noise():
     pole, start = 0.9, jq.TransferFunction([8.2], [1.0, 2.9, 20.5], 0.029)
     flight = record(6, pole)

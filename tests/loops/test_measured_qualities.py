@@ -1,6 +1,5 @@
 """Handling qualities of measured responses, their standard errors, and rms values."""
 
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np

@@ -107,6 +107,7 @@ def test_where_noise_dithers_the_encoder_its_gradient_is_the_slope_of_the_mean()
         assert float(high - low) / 0.04 == pytest.approx(float(along(way)), rel=0.05)
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_mode_agree():
     forward = jax.jacfwd(cost, argnums=1)(LADRC, ones(LADRC), residue())
     reverse = jax.grad(cost, argnums=1)(LADRC, ones(LADRC), residue())

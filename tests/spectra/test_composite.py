@@ -61,6 +61,7 @@ def test_the_composite_of_a_90_s_sweep_is_within_half_a_decibel_and_two_degrees(
     assert decibels < 0.46 and degrees < 1.9
 
 
+@pytest.mark.slow
 def test_it_is_better_than_any_of_its_windows():
     for length in (30.0, 12.0):
         assert np.all(np.less(errors(Composite(), draws=2), errors(Welch(length), draws=2)))

@@ -113,7 +113,7 @@ def dominated(found):
     return any(remark.startswith("feedback-dominated") for remark in found.remarks)
 
 
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_flight_without_excitation_is_dominated_by_feedback(data, axis):
     found = measured(
         data / "betaflight_ar8" / "LOG00037.npz",

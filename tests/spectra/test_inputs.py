@@ -189,7 +189,10 @@ def decoupled(seed):
     return Record(np.arange(SAMPLES) / RATE, u, y + noise(seed + 1, 2, 0.05), r)
 
 
-@pytest.mark.parametrize("spectra", [LocalPolynomial(), WELCH, Composite((4.0, 8.0))])
+@pytest.mark.parametrize(
+    "spectra",
+    [LocalPolynomial(), WELCH, pytest.param(Composite((4.0, 8.0)), marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize("joint", [False, True])
 def test_a_pair_without_any_response_has_no_coherence(spectra, joint):
     estimator = JointInputOutput(spectra) if joint else spectra

@@ -93,7 +93,8 @@ def draws(name):
     return [estimate(u, plant(u) + 0.3 * draw(k)) for k in range(DRAWS)]
 
 
-@pytest.mark.parametrize("name", [pytest.param("sweep", marks=pytest.mark.slow), "white noise"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SIGNALS)
 def test_predicted_errors_are_those_of_repeated_draws(name):
     check_calibrated(draws(name), PLANT[:, None, None])
 
@@ -224,7 +225,14 @@ def test_a_width_that_holds_too_few_bins_says_what_would_do():
 
 @pytest.mark.parametrize(
     "options",
-    [{"order": 9}, {"global_order": 21}, {"width": 0.0}, {"width": float("nan")}, {"integrators": 4}, {"delay": -1.0}],
+    [
+        {"order": 9},
+        {"global_order": 21},
+        {"width": 0.0},
+        {"width": float("nan")},
+        {"integrators": 4},
+        {"delay": -1.0},
+    ],
 )
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):

@@ -39,6 +39,7 @@ def ninety_seconds(zeta, k, *, ratio=25.0, options: LocalPolynomial | None = Non
     return found, np.asarray(found.response)[:, 0, 0] / second_order(*model, BAND)
 
 
+@pytest.mark.slow
 def test_a_sweep_of_90_s_gives_half_the_error_of_composite_windows():
     ratios = np.stack([ninety_seconds(0.55, k)[1] for k in range(8)])
     # Five composite windows reach 0.46 dB and 1.9 deg.

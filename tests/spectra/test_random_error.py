@@ -116,6 +116,7 @@ def test_far_frequencies_share_none(draws):
     assert np.all(np.abs(correlation(draws[2]))[apart] < 0.01)
 
 
+@pytest.mark.slow
 def test_without_noise_the_random_error_is_as_small_as_the_leakage():
     found = respond(WHITE, plant(WHITE))
     assert np.all(np.asarray(found.random_error) < 0.02)

@@ -108,8 +108,8 @@ def main() -> None:
             "In the closed loop the bound counts what the reference tells alone; a noise model "
             "also uses what the gusts tell. Output error without a noise model diverges there: "
             "the gusts pass two integrators, and feedback returns them to the input.",
-            "Of 100 draws the claimed error of the gain in the closed loop is 15 % too small (twice "
-            "what draws leave open), those of lag and delay are right.",
+            "Of 100 draws the claimed error of the gain in the closed loop is 15 % too small (twice"
+            " what draws leave open), those of lag and delay are right.",
         ],
     }
     write("refined", study)

@@ -88,6 +88,7 @@ def test_every_start_is_stabilised_first_and_leads_to_the_same_cost(name):
     assert np.flatnonzero(costs < best + 0.01)[0] + 1 <= 15
 
 
+@pytest.mark.slow
 def test_a_second_tune_of_equal_shapes_compiles_nothing(caplog):
     first = tuned("slow")
     with jax.log_compiles():

@@ -32,6 +32,7 @@ def flown(controller, *, limit, step=4.0, torque=0.0, **options):
                    **options)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_drive_that_cannot_hold_the_disturbance_is_no_performance():
     """1 V gives 0.0468 N m of the 0.2 that push."""
     found = flown(jq.LADRC(4.0, 20.0, 1.0), limit=1.0, torque=0.2)
