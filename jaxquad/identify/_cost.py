@@ -10,6 +10,8 @@ from jaxtyping import Bool, Complex, Float, Int
 from jaxquad.spectra import ErrorCovariance, FrequencyResponse
 
 
+_COHERENT, _POOR = 0.6, 0.05  # least coherence: in general, and beside coherent points
+_ENOUGH = 5  # coherent points beside which poor ones count
 _LARGEST = 0.3  # random error of a point that counts
 _DB = 20 / np.log(10)  # dB to a unit of natural logarithm
 _W_g, _W_p = 1.0, 0.01745  # so that 1 dB weighs as much as 7.57 deg
@@ -112,12 +114,14 @@ def least_coherence(given: float | None, cost: Cost, frf: FrequencyResponse) -> 
     """The least coherence of a point that counts: as `given`, or what is best for the cost.
 
     A cost that knows the noise weighs poor points as they deserve; others have to do without them.
-    So has the joint estimate, a ratio, whose error is no longer small where coherence is.
+    So has the joint estimate, a ratio, whose error is no longer small where coherence is; and so
+    has a response that is coherent nowhere: what little it shows may be noise that is fed back.
     """
     if given is not None:
         return given
     weighs = isinstance(cost, MaximumLikelihood) and frf.method == "direct"
-    return 0.05 if weighs else 0.6
+    coherent = np.count_nonzero(usable(frf, None, _COHERENT)) >= _ENOUGH
+    return _POOR if weighs and coherent else _COHERENT
 
 
 Range = tuple[float, float]
