@@ -19,7 +19,8 @@ def without_type_checks():
 
 
 PLANT = jq.DecoupledAxes([0.05], [0.05])
-LOOP = jq.Loop(PLANT, jq.LADRC(10.0, 30.0, 1.0))
+LADRC = jq.LADRC(10.0, 30.0, 1.0)
+LOOP = jq.Loop(PLANT, LADRC)
 WRONG: Any = "flight.csv"
 AXES: Any = PLANT
 NUMBER: Any = 3.0
@@ -36,7 +37,7 @@ CALLS = {
     ),
     "a float is no frequency response: give": lambda: jq.loops.margins(NUMBER),
     "estimator is 3.0: give an object with the methods": lambda: jq.AdaptiveLADRC(
-        LOOP.controller, NUMBER, lambda inertia: 1 / inertia
+        LADRC, NUMBER, lambda inertia: 1 / inertia
     ),
     "the controller is a DecoupledAxes, which is a plant": lambda: jq.Loop(PLANT, AXES),
 }

@@ -67,7 +67,7 @@ def evaluate_sampled(
     if aliases is None:
         return evaluate_response(model, omega)
     both = evaluate_response(model, jnp.concatenate([omega, aliases.omega]))
-    return aliases.total(both[: omega.size], both[omega.size :])
+    return jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
 
 
 class SampledModel(eqx.Module):
@@ -195,7 +195,7 @@ class _Terms(eqx.Module):
         kept = slice(None) if nodes is None else nodes
         others = self.others.reshape(shape)[:, kept, :count].reshape(-1, *self.own.shape[1:])
         at = None if nodes is None else self.omega[nodes]
-        return _aliases_at(self.omega, self.hold, count, at).total(self.own, others)
+        return np.asarray(_aliases_at(self.omega, self.hold, count, at).total(self.own, others))
 
 
 def _places(omega: Float[np.ndarray, " frequencies"], count: int) -> np.ndarray:

@@ -52,7 +52,7 @@ class Scenario(eqx.Module):
     payload: Float[Array, "samples axes ..."] | None = per_member(
         rank=2, default=None
     )  # added inertia, kg m^2
-    dt: float | None = eqx.field(static=True, default=None)  # s
+    dt: float | None = eqx.field(static=True, default=None, kw_only=True)  # s
 
     def __check_init__(self):
         parts = self.parts

@@ -261,8 +261,11 @@ def _factors(
     if method == "joint":
         return joint_factors(moved, inputs)[1:]
     count, outputs = moved.response.shape[:2]
-    ones = (np.broadcast_to(np.eye(n, dtype=complex), (count, n, n)) for n in (outputs, inputs))
-    return tuple(ones)
+    left, right = np.eye(outputs, dtype=complex), np.eye(inputs, dtype=complex)
+    return (
+        np.broadcast_to(left, (count, outputs, outputs)),
+        np.broadcast_to(right, (count, inputs, inputs)),
+    )
 
 
 def _responder(

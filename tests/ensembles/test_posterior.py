@@ -312,7 +312,8 @@ def test_a_fit_that_models_the_hold_has_the_plants_own_delay():
     silent = sharp_fit()
     with pytest.raises(ValueError, match="does not know how long the command was held"):
         Posterior(silent, believed=1.0)
-    frf = dataclasses.replace(silent.origin.frfs[0], hold=0.0)
+    frf = response_of(INTEGRATOR, error=0.01, seed=0, omega=WIDE)
+    frf = dataclasses.replace(frf, hold=0.0)
     knows = jq.fit(jq.LaggedIntegrator(280.0, 0.02, 0.02), frf, cost=ML)
     assert Posterior(knows, believed=1.0).delay == knows.model.delay
     with pytest.raises(ValueError, match="models the hold of the command"):
