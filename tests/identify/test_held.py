@@ -1,6 +1,7 @@
 """Held inputs: what the samples of a record show, against an exact simulation; and silent pairs."""
 
 import dataclasses
+from typing import cast
 
 import numpy as np
 import pytest
@@ -22,12 +23,13 @@ FREE = ("numerator[0]", "denominator[1]", "denominator[2]", "delay")
 def held_output(delay: float) -> np.ndarray:
     """By scipy's exact discretisation, on a grid so fine that the delay is a whole step of it."""
     fine = DT / 20
-    step = cont2discrete(([400.0], [1.0, 1.2, 400.0]), fine, "zoh")
+    found = cont2discrete(([400.0], [1.0, 1.2, 400.0]), fine, "zoh")
+    step = cast(tuple[np.ndarray, np.ndarray, float], found)
     late = round(delay / fine)
     driven = np.concatenate([np.zeros(late), np.repeat(SWEEP, 20)])[: 20 * SWEEP.size]
     from scipy.signal import lfilter
 
-    return lfilter(np.ravel(step[0]), step[1], driven)[::20]
+    return np.asarray(lfilter(np.ravel(step[0]), step[1], driven))[::20]
 
 
 @pytest.fixture(scope="module")

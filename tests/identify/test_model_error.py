@@ -21,6 +21,7 @@ class Damped(jq.LaggedIntegrator):
     damping: float = 0.3  # rad/s
 
     def frequency_response(self, omega):
+        omega = jnp.asarray(omega)
         s = jax.lax.complex(jnp.zeros_like(omega), omega)
         damping = jnp.asarray(self.damping + 0j)
         return super().frequency_response(omega) * (s / (s + damping))[:, None, None]
@@ -100,6 +101,7 @@ def test_points_that_share_their_noise_count_by_what_is_their_own():
     effect = jnp.asarray(0.02 * np.asarray(frf.response)[:, :, 0] * noise)[:, None, :]
     errors = jq.spectra.ErrorCovariance(frf.omega, effect, jnp.ones((30, 1, 1), complex))
     fit = jq.fit(START, dataclasses.replace(frf, errors=errors))
+    assert fit.origin is not None
     np.testing.assert_allclose(fit.origin.points[0].shared, 2.0, rtol=1e-6)
 
 

@@ -1,5 +1,7 @@
 """The global model below the local polynomials: rings, leakage, and the errors of both."""
 
+from typing import cast
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,7 +20,8 @@ from jaxquad.spectra import (
 DT = 0.02
 OMEGA = np.geomspace(0.6, 14.0, 40)
 U = sweep(0.3, 15.0, duration=60.0, sample_rate=1 / DT, amplitude=1.0, trim=0.0).signal
-HELD = signal.cont2discrete(([100.0], [1.0, 0.4, 100.0]), DT)  # 10 rad/s, damping ratio 0.02
+MODE = ([100.0], [1.0, 0.4, 100.0])  # 10 rad/s, damping ratio 0.02
+HELD = cast(tuple[np.ndarray, np.ndarray, float], signal.cont2discrete(MODE, DT))
 
 
 def exact(omega):
@@ -61,11 +64,11 @@ def test_variance_covariance_and_projection_of_shared_parameters_agree():
     errors = estimate(0).errors
     assert errors.sensitivity is not None
     covariance, variance = errors.between((0, 0), (0, 0)), errors.variance()[:, 0, 0]
-    np.testing.assert_allclose(np.diag(covariance).real, variance, rtol=1e-9)
+    np.testing.assert_allclose(np.real(np.diag(covariance)), variance, rtol=1e-9)
     # The real part of an error, and the imaginary part, add up to its mean square.
     columns = np.zeros((OMEGA.size, 1, 1, 2), complex)
     columns[7, 0, 0] = 1.0, 1.0j
-    parts = np.asarray(errors.project(columns))
+    parts = np.asarray(errors.project(jnp.asarray(columns)))
     assert np.trace(parts) == pytest.approx(variance[7], rel=1e-9)
     turned = errors.scaled(jnp.full(OMEGA.size, 2.0j)).pair(0, 0)
     np.testing.assert_allclose(turned.variance()[:, 0, 0], 4 * variance, rtol=1e-9)

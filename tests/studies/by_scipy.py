@@ -22,7 +22,7 @@ def fit(plant: Plant, flown: Flown) -> tuple[np.ndarray, np.ndarray]:
         model = plant.kind.matrices(signs * np.exp(logs)).response(omega)
         model = model * np.exp(-0.5j * omega * (plant.held or 0.0))[:, None, None]
         ratio = np.log(measured[used] / model[used])
-        return np.concatenate([ratio.real, ratio.imag])
+        return np.concatenate([np.real(ratio), np.imag(ratio)])
 
     start = np.log(np.abs(plant.truth))  # the truth: no local minimum spoils the comparison
     found = optimize.least_squares(residuals, start, x_scale=0.1)
@@ -33,18 +33,18 @@ def fit(plant: Plant, flown: Flown) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _response(plant: Plant, flown: Flown):
-    window = len(flown.u) // 5
-    options = dict(fs=1 / plant.dt, nperseg=window, noverlap=window * 4 // 5)
+    window, rate = len(flown.u) // 5, 1 / plant.dt
+    overlap = window * 4 // 5
     x = flown.u if flown.r is None else flown.r
-    cross = lambda a: np.stack(
-        [[signal.csd(c, d, **options)[1] for c in x.T] for d in a.T]
-    ).transpose(2, 0, 1)  # fmt: skip
-    omega = 2 * np.pi * signal.welch(x[:, 0], **options)[0]
+    csd = lambda c, d: signal.csd(c, d, fs=rate, nperseg=window, noverlap=overlap)[1]
+    cross = lambda a: np.stack([[csd(c, d) for c in x.T] for d in a.T]).transpose(2, 0, 1)
+    omega = 2 * np.pi * signal.welch(x[:, 0], fs=rate, nperseg=window, noverlap=overlap)[0]
     inside = (omega >= plant.band[0]) & (omega <= plant.band[1])
     to_y, to_u = cross(flown.y)[inside], cross(flown.u)[inside]
     measured = to_y @ np.linalg.inv(to_u)
     if x.shape[1] > 1:
         return omega[inside], measured, np.ones(measured.shape, bool)
-    coherence = signal.coherence(x[:, 0], flown.y[:, 0], **options)[1][inside]
-    used = (coherence > 0.6)[:, None, None]
+    first = x[:, 0], flown.y[:, 0]
+    coherence = signal.coherence(*first, fs=rate, nperseg=window, noverlap=overlap)[1]
+    used = (coherence[inside] > 0.6)[:, None, None]
     return omega[inside], measured, used if used.sum() > 4 else np.ones_like(used)

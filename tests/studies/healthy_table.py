@@ -37,8 +37,8 @@ def judge(name: str, k: int, truth: float, bound: float, rows: list[dict]) -> Ju
         percent((low <= truth) & (truth <= high)),
         percent((below <= truth) & (truth <= above)),
         np.median((above - below) / (high - low)) if kept else np.nan,
-        np.std(error, ddof=1) / mean_square if len(kept) > 1 else np.nan,
-        np.mean(error) / mean_square if kept else np.nan,
+        float(np.std(error, ddof=1) / mean_square) if len(kept) > 1 else np.nan,
+        float(np.mean(error) / mean_square) if kept else np.nan,
         rms(error) / bound,
         rms(theirs) / bound,
         percent(np.abs(theirs) < 1.96 * their_claim),
@@ -50,7 +50,7 @@ def exact_interval(share: float, draws: int) -> tuple[float, float]:
     hits = round(share / 100 * draws)
     low = beta.ppf(0.025, hits, draws - hits + 1) if hits else 0.0
     high = beta.ppf(0.975, hits + 1, draws - hits) if hits < draws else 1.0
-    return 100 * low, 100 * high
+    return 100 * float(low), 100 * float(high)
 
 
 def as_tables(plants: dict, rows: dict[str, list], bounds: dict, command: str) -> list[dict]:

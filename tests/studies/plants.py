@@ -194,8 +194,9 @@ def _below(corner: float):
 
 
 def open_loop(
-    title, kind, truth, *, wave, seconds, sd, band=None, dt=0.02, held=True, corner=None,
-    shared=None, spoil=None, nuisances=None, lsb=0.0,
+    title, kind, truth, *, wave: Callable[[np.ndarray], np.ndarray] | np.ndarray, seconds, sd,
+    band: tuple[float, float] | None = None, dt=0.02, held=True, corner=None, shared=None,
+    spoil=None, nuisances=None, lsb=0.0,
 ) -> Plant:  # fmt: skip
     """`wave` of time in s or an array drives the plant; noise of standard deviation `sd`.
 
@@ -203,12 +204,14 @@ def open_loop(
     """
     truth = np.asarray(truth, float)
     time = np.arange(round(seconds / dt)) * dt
-    u = _columns(wave(time) if callable(wave) else wave)
+    u = _columns(wave if isinstance(wave, np.ndarray) else wave(time))
 
     def mean(theta):
         if held:
             return respond(kind.matrices(theta), u, dt)
-        smooth = lambda t: _columns(wave(t))
+        assert not isinstance(wave, np.ndarray)
+        drive = wave
+        smooth = lambda t: _columns(drive(t))
         return respond_smoothly(kind.matrices(theta), smooth, time, dt / 20)
 
     clean = mean(truth)
@@ -233,6 +236,7 @@ def open_loop(
         return Bound(mean, shape, spread, None if nuisances is None else nuisances(time))
 
     band = (wave.low, wave.high) if isinstance(wave, Chirp) else band
+    assert band is not None
     return Plant(title, kind, truth, band, dt, dt if held else 0.0, fly, bound)
 
 

@@ -7,7 +7,7 @@ end with the sweep, or 3 s later. Default estimator, 80 frequencies of the sweep
 """
 
 import argparse
-from typing import NamedTuple
+from typing import cast, NamedTuple
 
 import numpy as np
 from result_files import write
@@ -61,7 +61,8 @@ def simulate(setting: Setting, u: np.ndarray, omega: np.ndarray) -> tuple[np.nda
     """Output at the samples, and the response to the held input."""
     y, response, z = np.zeros(u.size), np.zeros(omega.size, complex), np.exp(1j * omega * DT)
     for w, zeta, gain in setting.modes:
-        above, below, _ = signal.cont2discrete(([gain * w**2], [1, 2 * zeta * w, w**2]), DT)
+        held = signal.cont2discrete(([gain * w**2], [1, 2 * zeta * w, w**2]), DT)
+        above, below, _ = cast(tuple[np.ndarray, np.ndarray, float], held)
         y += signal.lfilter(above[0], below, u)
         response += np.polyval(above[0], z) / np.polyval(below, z)
     return y, response
@@ -79,7 +80,7 @@ def row(setting: Setting, seed: int, draws: int, order: int) -> list[float | str
         measured = np.asarray(found.response)[:, 0, 0]
         claimed = np.asarray(found.random_error)[:, 0, 0] * np.abs(measured)
         off = measured - exact
-        ratios.append(np.abs([off.real, off.imag]) / claimed)
+        ratios.append(np.abs([np.real(off), np.imag(off)]) / claimed)
         relative.append(np.abs(off / exact))
         masked += int(np.sum(np.isnan(measured)))
         remarked += bool(found.remarks)
@@ -112,6 +113,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=40)
     draws = parser.parse_args().draws
     tables = []
+    assert __doc__ is not None
     for order, title in (
         (12, "Ring-down at the end of a record"),
         (0, "The same, no global model"),

@@ -154,7 +154,7 @@ def coloured(rng: np.random.Generator, samples: int, dt: float, corner: float) -
     fade = np.exp(-corner * dt)
     white = rng.standard_normal(samples) * np.sqrt(1 - fade**2)
     white[0] /= np.sqrt(1 - fade**2)
-    return signal.lfilter([1.0], [1.0, -fade], white)
+    return np.asarray(signal.lfilter([1.0], [1.0, -fade], white))
 
 
 class Chirp(NamedTuple):

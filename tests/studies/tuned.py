@@ -254,7 +254,10 @@ def main() -> None:
     parser.add_argument("--members", type=int, default=MEMBERS)
     given = parser.parse_args()
     members = draw(given.members, SEED)
-    rows = [row_of(name, *design, members) for name, design in designs().items()]
+    rows = [
+        row_of(name, controller, summary, members)
+        for name, (controller, summary) in designs().items()
+    ]
     study = {
         "title": "Tuned designs, judged again",
         "command": "python tests/studies/tuned.py",
