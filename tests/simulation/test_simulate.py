@@ -44,7 +44,7 @@ def quiet(samples=SAMPLES, **parts) -> Scenario:
     nothing = jnp.zeros((samples, 3))
     held = {name: jnp.broadcast_to(jnp.asarray(x), (samples, 3)) for name, x in parts.items()}
     names = ("reference", "injection", "disturbance", "noise")
-    return Scenario(**(dict.fromkeys(names, nothing) | held))
+    return Scenario(**(dict.fromkeys(names, nothing) | held), dt=None)
 
 
 def independent(plant, inputs, disturbance):

@@ -26,7 +26,8 @@ def axes(inertia: Any = J):
 
 def scenario(**parts) -> Scenario:
     given = dict.fromkeys(("reference", "injection", "disturbance", "noise"), STILL)
-    return Scenario(**(given | {name: STILL + jnp.asarray(x) for name, x in parts.items()}))
+    given |= {name: STILL + jnp.asarray(x) for name, x in parts.items()}
+    return Scenario(**given, dt=None)
 
 
 class Spy(eqx.Module):
