@@ -91,6 +91,8 @@ def assess(
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
         remedies = ("start from other values", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(parameters.names, decrement, cost, *remedies)
+    elif discrepancy.amplitude > _NO_MODEL:
+        verdict = by_data = _no_model(parameters.names, discrepancy)
     else:
         facts = _information(problem, solution, blocks, (covariance, by_noise), units)
         verdict, by_data = _identifiability(facts, prior, bounds)
@@ -480,6 +482,7 @@ def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
 _DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
+_NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
 _LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
 _POOR = 10.0  # ratio above which a local minimum is likely
 _LOCAL = ", or this is a local minimum: try other starting values"
@@ -513,9 +516,20 @@ def remarks_on_fit(
     return remarks
 
 
+def _no_model(names: tuple[str, ...], discrepancy: Discrepancy) -> Verdict:
+    """The verdict on a fit that leaves more than half of the response unexplained."""
+    reason = f"it leaves {100 * min(discrepancy.amplitude, 1.0):.0f} % of the response unexplained"
+    remedies = (
+        "fit the part of the band where it holds (band=)",
+        "fit a model that explains more (Fit.explain() names terms)",
+        "start from other values: this may be a local minimum",
+    )
+    return without_numbers("no model", names, reason, *remedies)
+
+
 def _remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
     """Remark on a model that explains too little of the response for its intervals to be exact."""
-    if not discrepancy.amplitude > _LARGE:
+    if not _LARGE < discrepancy.amplitude <= _NO_MODEL:
         return []
     return [
         f"the model leaves {100 * discrepancy.amplitude:.0f} % of the response unexplained: the "

@@ -115,11 +115,12 @@ def least_coherence(given: float | None, cost: Cost, frf: FrequencyResponse) -> 
 
     A cost that knows the noise weighs poor points as they deserve; others have to do without them.
     So has the joint estimate, a ratio, whose error is no longer small where coherence is; and so
-    has a response that is coherent nowhere: what little it shows may be noise that is fed back.
+    have the direct estimate of a closed loop and a response that is coherent nowhere: what little
+    they show may be noise that is fed back.
     """
     if given is not None:
         return given
-    weighs = isinstance(cost, MaximumLikelihood) and frf.method == "direct"
+    weighs = isinstance(cost, MaximumLikelihood) and frf.method == "direct" and not frf.fed_back
     coherent = np.count_nonzero(usable(frf, None, _COHERENT)) >= _ENOUGH
     return _POOR if weighs and coherent else _COHERENT
 

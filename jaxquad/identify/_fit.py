@@ -95,9 +95,9 @@ def fit(
     - `band`: (low, high) in rad/s. A mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs
         of output and input a band of their own, or leaves them out with `None`.
     - `min_coherence`: frequencies with a lower coherence do not count; by default 0.05, which
-        maximum likelihood can weigh, and 0.6 for other costs, for joint estimates and for responses
-        that reach 0.6 at fewer than five frequencies. Those with a random error above 30 % never
-        count. Both are averaged over a third of an octave.
+        maximum likelihood can weigh, and 0.6 for other costs, for records with references and for
+        responses that reach 0.6 at fewer than five frequencies. Those with a random error above
+        30 % never count. Both are averaged over a third of an octave.
     - `starts`: how many starting points, spread around the model's values in a Latin hypercube.
         `Fit.minima` lists where they ended.
     - `solver`: any optimistix least-squares solver; Levenberg-Marquardt by default.

@@ -169,9 +169,16 @@ def assess_identifiability(information: Information, bounds: tuple[Bound, ...] =
     free = kept[kept < count]
     some = np.ix_(free, free)
 
-    def widened(reduced: np.ndarray) -> np.ndarray:
-        whole = np.zeros((*reduced.shape[:-1], count))
-        whole[..., free] = reduced
+    def completed(values: np.ndarray) -> np.ndarray:
+        """With the bounded ones where they are."""
+        whole = information.values[:count].copy()
+        whole[free] = values
+        return whole
+
+    def widened(rows: np.ndarray) -> np.ndarray:
+        """Directions that do not move the bounded ones."""
+        whole = np.zeros((len(rows), count))
+        whole[:, free] = rows
         return whole
 
     verdict = _assess(
@@ -182,14 +189,14 @@ def assess_identifiability(information: Information, bounds: tuple[Bound, ...] =
             values=information.values[kept],
             units=information.units[kept],
             order=tuple(information.order[k] for k in kept),
-            same=lambda values: information.same(widened(values)),
+            same=lambda values: information.same(completed(values)),
             by_noise=None if information.by_noise is None else information.by_noise[some],
         )
     )
     return dataclasses.replace(
         verdict,
         exact=widened(verdict.exact),
-        alternatives=tuple(widened(values) for values in verdict.alternatives),
+        alternatives=tuple(completed(values) for values in verdict.alternatives),
         bounds=bounds,
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-Kind = Literal["identifiable", "not identifiable", "no minimum", "too few points"]
+Kind = Literal["identifiable", "not identifiable", "no minimum", "no model", "too few points"]
 
 
 class UndeterminedError(ValueError):
@@ -78,7 +78,8 @@ class Verdict(eqx.Module):
 
     `kind` is "identifiable", "not identifiable" (the numbers are those of the best fit, but some
     could be changed together without changing the responses), "no minimum" (the solver stopped
-    before one) or "too few points" (nothing was fitted). `str(verdict)` says what to do.
+    before one), "no model" (the structure leaves more than half of the response unexplained) or
+    "too few points" (nothing was fitted). `str(verdict)` says what to do.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -110,6 +111,9 @@ class Verdict(eqx.Module):
             return "; ".join([known, *map(str, self.bounds)])
         if not self.fitted:
             return f"not identifiable from this record: {'; '.join(self.reasons)}"
+        if self.kind == "no model":
+            reasons = "; ".join(self.reasons)
+            return f"no model of this structure holds, so no parameter is determined: {reasons}"
         if self.kind == "no minimum":
             return f"no minimum was found, so no parameter is determined: {'; '.join(self.reasons)}"
         known = ", ".join(str(combination) for combination in self.combinations)

@@ -118,8 +118,8 @@ class Headline(NamedTuple):
 
 def fit_headline(fit: Fit, remarks: int) -> Headline:
     """Of the fit alone; `remarks` is their number."""
-    if fit.verdict.kind == "no minimum":
-        return Headline("bad", "NO MINIMUM", fit.verdict.summary)
+    if fit.verdict.kind in ("no minimum", "no model"):
+        return Headline("bad", fit.verdict.kind.upper(), fit.verdict.summary)
     if not fit.identifiable:
         return Headline("bad", "NOT IDENTIFIABLE", fit.verdict.summary)
     if fit.chi_squared > MISFIT**2:

@@ -88,6 +88,7 @@ def _result(
         distortion=found.distortion if isinstance(found, PeriodicEstimate) else None,
         dt=records[0].dt,
         hold=records[0].hold,
+        fed_back=bool(records[0].reference_names),
     )
 
 

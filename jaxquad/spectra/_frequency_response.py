@@ -85,6 +85,7 @@ class FrequencyResponse(eqx.Module):
     log_noise_covariance: Float[np.ndarray, "frequencies frequencies"] | None = None
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
+    fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
 
     def __check_init__(self):
         if not isinstance(self.omega, Array | np.ndarray):

@@ -361,6 +361,7 @@ def _result(
         resolution=2 * np.pi / (segments.groups[0][0] * dt),
         dt=dt,
         hold=first.hold,
+        fed_back=bool(first.reference_names),
     )
 
 

@@ -384,6 +384,11 @@ def _with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
     remedies = [excite]
     if kind == "too few points":
         remedies += ["use longer windows (--estimator welch --window S)"]
+    elif kind == "no model":
+        remedies = [
+            "fit the part of the band where it holds (--band, --band-rad)",
+            "fit a model of higher order (--poles), or ask which term is missing (--explain)",
+        ]
     elif settings.poles is not None:
         remedies = ["fit fewer poles and zeros (--poles, --zeros)", excite]
     elif {"lag", "delay"} & set(lost) and settings.lag and settings.delay:
@@ -428,7 +433,8 @@ def _refitted(
 
 
 def _gain_change(where: str, part: Fit | None, found: Fit) -> str:
-    if part is None or not (part.determined[0] and found.determined[0]):
+    known = found.determined[0] or found.verdict.kind == "no model"
+    if part is None or not (part.determined[0] and known):
         return ""
     before, after = found.values[0], part.values[0]
     change = abs(after - before)

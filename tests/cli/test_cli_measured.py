@@ -56,18 +56,19 @@ def test_the_crazyflies_inertia_comes_from_its_thrust_curve(identified, file, in
 
 def test_a_band_that_the_model_does_not_hold_over_is_told(identified):
     code, printed, result = identified("log15", k=1)
-    assert code == 3 and "the model does not hold over the whole band" in printed
-    assert any("above 9.76 rad/s the gain" in remark for remark in result["fit"]["remarks"])
+    assert code == 3 and "NO MODEL of this structure holds" in printed
+    changed = [each for each in result["fit"]["remarks"] if "over the whole band" in each]
+    assert any(each.startswith("above 9.") for each in changed)
     # The table's row of the upper two thirds holds what the thrust curve gives, too.
-    row = next(line for line in printed.splitlines() if line.startswith(" above 9.76"))
+    row = next(line for line in printed.splitlines() if line.startswith(" above 9."))
     assert float(row.split("+-")[3].split()[1]) == pytest.approx(0.07, rel=0.15)
 
 
 def test_feedback_without_an_outside_reference_is_no_plant(identified):
     code, printed, result = identified("LOG00037.BFL")
-    lag = next(row for row in result["fit"]["parameters"] if row["name"] == "lag")
     assert code == 3 and "! feedback-dominated: " in printed
-    assert not result["fit"]["identifiable"] and not lag["determined"]
+    assert not result["fit"]["identifiable"]
+    assert not any(row["determined"] for row in result["fit"].get("parameters", []))
 
 
 def test_a_hover_is_not_identifiable(identified):

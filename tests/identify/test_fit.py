@@ -66,7 +66,7 @@ def test_the_printed_minus_has_no_minimum():
 @pytest.mark.slow
 def test_bounds_and_insensitivities_are_those_of_the_hessian():
     frf = response_of(TRUTH, seed=1)
-    fit = jq.fit(START, frf)
+    fit = jq.fit(START, frf, cost=jq.identify.CoherenceWeighted())
     hessian = np.asarray(
         jax.hessian(lambda z: _smooth_cost(jnp.exp(z), frf))(jnp.log(jnp.asarray(fit.values)))
     )

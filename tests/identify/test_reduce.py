@@ -30,6 +30,7 @@ def roll(*values):
 
 
 START = roll(5.0, 2.0, 0.3, 0.02)
+EQ_14 = jq.identify.CoherenceWeighted()  # a rise is of its average cost
 FREE = ("gain", "damping", jq.identify.Real("spring", 1.0), jq.identify.Real("lag", 0.05))
 ML = jq.identify.MaximumLikelihood()
 
@@ -85,9 +86,11 @@ def test_what_is_there_is_kept_and_the_protocol_says_so():
 def test_a_rise_that_is_allowed_drops_what_the_criterion_would_keep():
     frf = measured(0.0, 0.003, seed=2)
     strict = jq.identify.reduce_structure(
-        START, frf, free=FREE, null={"spring": 0.0}, insensitivity=1.0
+        START, frf, free=FREE, null={"spring": 0.0}, insensitivity=1.0, cost=EQ_14
     )
-    loose = jq.identify.reduce_structure(START, frf, free=FREE, insensitivity=1.0, rise=5.0)
+    loose = jq.identify.reduce_structure(
+        START, frf, free=FREE, insensitivity=1.0, rise=5.0, cost=EQ_14
+    )
     assert "lag" not in strict.dropped
     assert "lag" in loose.dropped
     assert loose.fit.average_cost - loose.first.average_cost < 10.0
