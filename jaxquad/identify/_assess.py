@@ -86,7 +86,7 @@ def assess(
     costs = _costs(plain.blocks, prior, plain.bread, plain.noise)
     cost, misfit = costs.cost, costs.chi_squared
     # Few points of their own noise reach a large misfit by chance: both have to say so.
-    doubted = misfit if discrepancy.none < _DOUBT else min(misfit, 1.0)
+    doubted = misfit if discrepancy.none < DOUBT else min(misfit, 1.0)
     decrement = _decrement(bread, gradient, solution.at_zero)
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
         remedies = ("start from other values", "try many starts at once (starts=20)")
@@ -481,7 +481,7 @@ def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
-_DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
+DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
 _NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
 _LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
 _POOR = 10.0  # ratio above which a local minimum is likely
