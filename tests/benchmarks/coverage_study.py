@@ -165,14 +165,14 @@ def omega_of(name: str, frequencies: int = 50) -> np.ndarray:
 def draw(
     study: Study, omega: np.ndarray, draws: int, first: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Estimates, standard errors and half widths of 95 % intervals, by noise alone.
+    """Estimates, standard errors by noise alone, and half widths of the 95 % intervals.
 
     Each is (draws, parameters), of the seeds from `first` on.
     """
     fits = []
     for seed in range(first, first + draws):
         fit = study.identify(jq.frequency_response(study.fly(seed), omega))
-        intervals = np.array([fit.interval(each, model_error=False) for each in fit.names])
+        intervals = np.array([fit.interval(each) for each in fit.names])
         halves = np.max(np.abs(intervals - fit.values[:, None]), axis=1)
         fits.append((fit.values, fit.noise_standard_errors, halves))
     values, errors, halves = (np.stack(part) for part in zip(*fits, strict=True))
