@@ -83,14 +83,14 @@ def identify_both(
     )
 
 
-def gain_of(fit: jq.identify.Fit) -> jq.identify.Combination:
-    return fit.derived(lambda axis: axis.gain, "L K_t / J_x")
+def gain_of(fit: jq.identify.Fit, *, model_error: bool = True) -> jq.identify.Combination:
+    return fit.derived(lambda axis: axis.gain, "L K_t / J_x", model_error=model_error)
 
 
 def draw_gains(
     draws: int, cases=tuple((name, cost) for name in ESTIMATORS for cost in COSTS), seed: int = 1
 ) -> dict[tuple[str, str], np.ndarray]:
-    """Estimate and standard error of L K_t / J_x by estimator and cost, over noise draws."""
+    """L K_t / J_x, its standard error and that by the noise alone, over noise draws."""
     found, chunk = {case: [] for case in cases}, 25
     for first in range(0, draws, chunk):
         signals = np.repeat(SWEEP.signal[:, None], chunk, axis=1)
@@ -102,27 +102,33 @@ def draw_gains(
                 for name in {name for name, _ in cases}
             }
             for name, cost in cases:
-                gain = gain_of(identify(frfs[name], COSTS[cost]))
-                found[name, cost].append((gain.value, gain.standard_error))
+                fit = identify(frfs[name], COSTS[cost])
+                gain, alone = gain_of(fit), gain_of(fit, model_error=False)
+                found[name, cost].append((gain.value, gain.standard_error, alone.standard_error))
     return {key: np.array(rows) for key, rows in found.items()}
 
 
 def coverage_table(draws: int) -> tuple[str, dict]:
-    """Bias, scatter, predicted error and coverage over noise draws."""
+    """Bias, scatter, standard errors and coverage over noise draws."""
     lines = [
-        f"{draws} noise draws, L K_t / J_x in per cent of the truth",
-        f"{'estimate':<28}{'median error':>13}{'scatter':>9}{'predicted':>11}{'95 % covers':>13}",
+        f"{draws} noise draws, L K_t / J_x in per cent of the truth; by noise alone, and with",
+        "model error: the mean standard error and the share of 95 % intervals that cover",
+        f"{'estimate':<28}{'median error':>13}{'scatter':>9}{'noise':>8}{'covers':>8}"
+        f"{'with model':>12}{'covers':>8}",
     ]
     summary = {}
     for (name, cost), rows in draw_gains(draws).items():
-        error, predicted = rows[:, 0] / TRUTH - 1, rows[:, 1] / TRUTH
-        covered = float(np.mean(np.abs(error) < 1.96 * predicted))
-        numbers = (float(np.median(error)), float(np.std(error)), float(np.mean(predicted)))
-        summary[f"{name}, {cost}"] = dict(
-            zip(("median", "scatter", "predicted"), numbers, strict=True), covered=covered
-        )
-        cells = "".join(f"{100 * x:>{w}.2f}" for x, w in zip(numbers, (13, 9, 11), strict=True))
-        lines.append(f"{name + ', ' + cost:<28}{cells}{100 * covered:>12.1f}%")
+        error, whole, noise = rows[:, 0] / TRUTH - 1, rows[:, 1] / TRUTH, rows[:, 2] / TRUTH
+        covers = [float(np.mean(np.abs(error) < 1.96 * each)) for each in (noise, whole)]
+        numbers = float(np.median(error)), float(np.std(error))
+        means = float(np.mean(noise)), float(np.mean(whole))
+        columns = (*numbers, means[0], covers[0], means[1], covers[1])
+        names = "median scatter noise noise_covers with_model with_model_covers".split()
+        summary[f"{name}, {cost}"] = dict(zip(names, columns, strict=True))
+        widths, places = (13, 9, 8, 8, 12, 8), (2, 2, 2, 1, 2, 1)
+        cells = zip(columns, widths, places, strict=True)
+        line = "".join(f"{100 * x:>{width}.{place}f}" for x, width, place in cells)
+        lines.append(f"{name + ', ' + cost:<28}{line}")
     return "\n".join(lines), summary
 
 

@@ -1,6 +1,5 @@
 """Parameters of models from responses or records, with their accuracy and verification."""
 
-from ._assess import MISFIT as MISFIT
 from ._cost import (
     coherence_weight as coherence_weight,
     CoherenceWeighted as CoherenceWeighted,
@@ -15,6 +14,7 @@ from ._explain import Candidate as Candidate, Explanation as Explanation
 from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
+from ._fit_remarks import MISFIT as MISFIT
 from ._half_bands import Bands as Bands
 from ._held import as_sampled as as_sampled
 from ._noise_model import (

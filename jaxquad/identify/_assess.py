@@ -1,13 +1,12 @@
 """From a solver's stop to a result that states what it is worth."""
 
-import dataclasses
 import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PyTree
+from jaxtyping import Float
 
 from jaxquad.spectra import FrequencyResponse
 
@@ -15,13 +14,10 @@ from ._accuracy import (
     Block,
     blocks_of,
     calibrated_covariance,
-    condition_number,
-    cramer_rao,
     degrees_of_freedom,
     fitted_noise,
     gauss_newton,
     information_root,
-    insensitivity,
     Matrix,
     misfit_ratio,
     Noise,
@@ -39,14 +35,25 @@ from ._discrepancy import (
     find_discrepancy,
     Mixture,
 )
+from ._fit_remarks import (
+    DOUBT,
+    MISFIT,
+    no_minimum,
+    NO_MODEL,
+    no_model,
+    remarks_on_discrepancy,
+    remarks_on_fit,
+    remarks_on_priors,
+)
 from ._held import remarks_on_hold
 from ._identifiability import assess_identifiability, Information, LIMIT
-from ._parameters import Parameters, Place
+from ._make_fit import Costs, Estimate, make_fit
+from ._parameters import Place
 from ._problem import Problem
 from ._result import Fit
 from ._solve import same_responses, Solution
 from ._starts import Minimum, remarks_on_minima
-from ._verdict import Bound, pooled_freedom, Verdict, without_numbers
+from ._verdict import Bound, Verdict
 
 
 class Counted(NamedTuple):
@@ -91,8 +98,8 @@ def assess(
     if decrement > _NO_MINIMUM * max(cost, 1e-9):
         remedies = ("start from other values", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(parameters.names, decrement, cost, *remedies)
-    elif discrepancy.amplitude > _NO_MODEL:
-        verdict = by_data = _no_model(parameters.names, discrepancy)
+    elif discrepancy.amplitude > NO_MODEL:
+        verdict = by_data = no_model(parameters.names, discrepancy)
     else:
         facts = _information(problem, solution, blocks, (covariance, by_noise), units)
         verdict, by_data = _identifiability(facts, prior, bounds)
@@ -109,7 +116,7 @@ def assess(
             *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_priors(prior.misfit, verdict, by_data),
-            *_remarks_on_discrepancy(discrepancy),
+            *remarks_on_discrepancy(discrepancy),
         ),
         minima=minima,
         discrepancy=discrepancy,
@@ -219,7 +226,7 @@ def _look(records: list[ResponseTerm], prior: PriorRows, count: int) -> _Look:
     return _Look(blocks, bread, noise_effect(records, blocks, prior, count))
 
 
-def _costs(blocks: list[Block], prior: PriorRows, bread: Matrix, noise: Noise) -> "Costs":
+def _costs(blocks: list[Block], prior: PriorRows, bread: Matrix, noise: Noise) -> Costs:
     """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
     data = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
     cost, misfit = data + float(np.sum(prior.misfit**2)), misfit_ratio(data, bread, noise)
@@ -244,150 +251,6 @@ def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> lis
     used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
     parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True)]
     return list(dict.fromkeys(remark for part in parts for remark in part))
-
-
-class Estimate(NamedTuple):
-    """What the derivatives at the solution say about the parameters."""
-
-    bread: Matrix  # J'J
-    covariance: Matrix  # of relative changes, with what the model leaves unexplained
-    noise: Matrix  # of relative changes, by the measured noise alone
-    units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
-    verdict: Verdict
-    decrement: float
-
-
-class Costs(NamedTuple):
-    """As in `Fit`."""
-
-    cost: float
-    average_cost: float
-    information: float
-    chi_squared: float
-
-
-def make_fit(
-    problem: Problem,
-    solution: Solution,
-    estimate: Estimate,
-    costs: Costs,
-    *,
-    points: int,
-    remarks: tuple[str, ...],
-    minima: tuple[Minimum, ...] = (),
-    freedom: Float[np.ndarray, " parameters"] | None = None,
-    discrepancy: Discrepancy | None = None,
-) -> Fit:
-    """A result in physical units; `freedom` is that of the noise estimate, infinite without."""
-    bread, covariance, _, units, verdict, decrement = estimate
-    names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
-    freedom = np.full(units.size, np.inf) if freedom is None else freedom
-    verdict = _with_freedom(verdict, pooled_freedom(freedom, np.ones(units.size)))
-    if runaways(problem, solution, verdict):
-        verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
-    physical, unbounded = _physical_covariance(covariance, units, names, verdict)
-    with np.errstate(divide="ignore"):
-        percent = np.where(values == 0, np.nan, 100 * np.abs(units / values))
-    return Fit(
-        model=solution.model,
-        names=names,
-        values=values,
-        standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
-        covariance=physical,
-        noise_covariance=_in_units(estimate.noise, units, unbounded),
-        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
-        insensitivity=insensitivity(bread) * percent,
-        cost=costs.cost,
-        average_cost=costs.average_cost,
-        information=costs.information,
-        chi_squared=costs.chi_squared,
-        newton_decrement=decrement,
-        condition=condition_number(bread),
-        points=points,
-        steps=solution.steps,
-        verdict=verdict,
-        remarks=remarks,
-        parameters=problem.parameters,
-        units=units,
-        relative_covariance=covariance,
-        minima=minima,
-        degrees_of_freedom=freedom,
-        discrepancy=discrepancy,
-    )
-
-
-def _with_freedom(verdict: Verdict, freedom: float) -> Verdict:
-    """The verdict whose combinations have intervals of these degrees of freedom."""
-    known = verdict.combinations
-    combinations = tuple(each._replace(degrees_of_freedom=freedom) for each in known)
-    return dataclasses.replace(verdict, combinations=combinations)
-
-
-def no_minimum(names: tuple[str, ...], decrement: float, cost: float, *remedies: str) -> Verdict:
-    """The verdict on a stop from which a step would still lower the cost."""
-    reason = f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}"
-    return without_numbers("no minimum", names, reason, *remedies)
-
-
-def _physical_covariance(
-    relative: Float[np.ndarray, "parameters parameters"],
-    slopes: Float[np.ndarray, " parameters"],
-    names: tuple[str, ...],
-    verdict: Verdict,
-) -> tuple[Float[np.ndarray, "parameters parameters"], Bool[np.ndarray, " parameters"]]:
-    """The covariance in physical units, nan where it is unbounded, and of which parameters.
-
-    A pseudo-inverse shows no variance along a null direction: there it is unbounded.
-    """
-    rows = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
-    hidden = [row for row in np.array(rows) if row @ relative @ row < (0.5 * LIMIT) ** 2]
-    lost = np.array([name in verdict.undetermined for name in names])
-    unbounded = lost & np.any(
-        np.abs(np.reshape([*hidden, *verdict.exact], (-1, len(names)))) > 1e-6, axis=0
-    )
-    return _in_units(relative, slopes, unbounded), unbounded
-
-
-def _in_units(
-    relative: Matrix, slopes: Float[np.ndarray, " parameters"], unbounded: np.ndarray
-) -> Matrix:
-    """A covariance of relative changes in physical units, nan where it is unbounded."""
-    physical = relative * np.outer(slopes, slopes)
-    physical[unbounded, :] = physical[:, unbounded] = np.nan
-    return physical
-
-
-def unfitted(
-    model: PyTree, parameters: Parameters, verdict: Verdict, remarks: tuple[str, ...] = ()
-) -> Fit:
-    """What a fit returns where there is nothing to fit: the starting values, all marked."""
-    count = parameters.count
-    infinite = np.full(count, np.inf)
-    values = np.asarray(parameters.values(parameters.start[:count]))
-    return Fit(
-        model=model,
-        names=parameters.names,
-        values=values,
-        standard_errors=infinite,
-        covariance=np.full((count, count), np.nan),
-        noise_covariance=np.full((count, count), np.nan),
-        cramer_rao=infinite,
-        insensitivity=infinite,
-        degrees_of_freedom=infinite,
-        cost=np.nan,
-        average_cost=np.nan,
-        information=np.nan,
-        chi_squared=np.nan,
-        newton_decrement=np.nan,
-        condition=np.inf,
-        points=0,
-        steps=0,
-        verdict=verdict,
-        remarks=remarks,
-        parameters=parameters,
-        units=np.asarray(parameters.slopes(parameters.start[:count])),
-        relative_covariance=np.full((count, count), np.nan),
-    )
 
 
 def _decrement(
@@ -479,109 +342,4 @@ def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
     return tuple(ordered.index(place) for place in places)
 
 
-MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
-DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
-_NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
-_LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
-_POOR = 10.0  # ratio above which a local minimum is likely
-_LOCAL = ", or this is a local minimum: try other starting values"
-_FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
-
-
-def remarks_on_fit(
-    problem: Problem,
-    solution: Solution,
-    cost: float,
-    decrement: float,
-    chi_squared: float,
-    verdict: Verdict,
-) -> list[str]:
-    """Runaway parameters, missing convergence, misfit beyond the noise."""
-    remarks = runaways(problem, solution, verdict)
-    no_minimum = decrement > 1e-3 * max(cost, 1e-9)
-    if not solution.converged and (no_minimum or not remarks):
-        remarks.append(f"the solver stopped early: {solution.message}")
-    if no_minimum:
-        remarks.append(
-            f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
-            f"{2 * decrement:.3g}; try other starting values{_opposite(problem, solution)}"
-        )
-    if chi_squared > MISFIT**2:
-        ratio = np.sqrt(chi_squared)
-        remarks.append(
-            f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
-            f"explain the whole response{_LOCAL if ratio > _POOR else ''}"
-        )
-    return remarks
-
-
-def _no_model(names: tuple[str, ...], discrepancy: Discrepancy) -> Verdict:
-    """The verdict on a fit that leaves more than half of the response unexplained."""
-    reason = f"it leaves {100 * min(discrepancy.amplitude, 1.0):.0f} % of the response unexplained"
-    remedies = (
-        "fit the part of the band where it holds (band=)",
-        "fit a model that explains more (Fit.explain() names terms)",
-        "start from other values: this may be a local minimum",
-    )
-    return without_numbers("no model", names, reason, *remedies)
-
-
-def _remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
-    """Remark on a model that explains too little of the response for its intervals to be exact."""
-    if not _LARGE < discrepancy.amplitude <= _NO_MODEL:
-        return []
-    return [
-        f"the model leaves {100 * discrepancy.amplitude:.0f} % of the response unexplained: the "
-        "intervals are rough; fit the part of the band where it holds (band=), or a model that "
-        "explains more (Fit.explain() names terms)"
-    ]
-
-
-def _opposite(problem: Problem, solution: Solution) -> str:
-    """A hint where the model turns the wrong way at the lowest frequencies."""
-    for weights, misfit in zip(problem.weights, solution.sensitivity.misfits, strict=True):
-        used = np.asarray(weights)[..., 0] > 0
-        phases = np.abs(np.asarray(misfit)[..., 1][used])
-        if phases.size and np.median(phases[: max(phases.size // 4, 1)]) > 2.5:
-            return "; the phase is off by about 180 deg: try the other sign of the gain"
-    return ""
-
-
-def remarks_on_priors(
-    pulls: Float[np.ndarray, " priors"], verdict: Verdict, by_data: Verdict
-) -> list[str]:
-    """Parameters that only a prior determines, and priors that the data contradict."""
-    remarks = [
-        f"prior {k + 1} is {abs(pull):.1f} of its standard errors away from the fit: data and "
-        "prior contradict each other; check both"
-        for k, pull in enumerate(pulls)
-        if abs(pull) > 3
-    ]
-    resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
-    if resolved:
-        known = ", ".join(combination.name for combination in by_data.combinations)
-        remarks.append(
-            f"{' and '.join(resolved)}: determined by the prior alone; the record by itself "
-            f"determines {'only ' + known if known else 'none of them'}"
-        )
-    return remarks
-
-
-def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
-    return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
-
-
-def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[str]:
-    """Remarks on parameters that ran to zero or to infinity, as far as nothing bounds them."""
-    names, lost = problem.parameters.names, verdict.undetermined
-    remarks = [
-        f"{names[k]} ran to zero: leave it out, or let its sign change with "
-        f"jq.identify.Real({names[k]!r})"
-        for k in solution.at_zero
-        if names[k] in lost
-    ]
-    for k in np.flatnonzero(_change_of_z(problem, solution) > 2 * _FAR):
-        if problem.parameters.logarithmic[k] and names[k] in lost:
-            remarks.append(f"{names[k]} ran to infinity: start from other values, or leave it out")
-    return remarks

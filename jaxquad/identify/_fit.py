@@ -10,7 +10,7 @@ from jaxquad._core import require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ._assess import assess, Counted, discrepancy_at, DOUBT, unfitted
+from ._assess import assess, Counted, discrepancy_at
 from ._bounds import settle_at_bounds, solve_within_bounds
 from ._cost import (
     Band,
@@ -25,6 +25,8 @@ from ._cost import (
     usable,
     Weights,
 )
+from ._fit_remarks import DOUBT
+from ._make_fit import unfitted
 from ._origin import Options, Origin
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem

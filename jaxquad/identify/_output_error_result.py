@@ -26,14 +26,10 @@ from ._assess import (
     _ranks,
     _rescale,
     _units,
-    Costs,
-    Estimate,
-    make_fit,
-    no_minimum,
-    remarks_on_priors,
-    runaways,
 )
+from ._fit_remarks import no_minimum, remarks_on_priors, runaways
 from ._identifiability import Information
+from ._make_fit import Costs, Estimate, make_fit
 from ._output_error_problem import (
     Descent,
     evaluate_misfits,

@@ -146,6 +146,7 @@ class Fit(eqx.Module):
     parameters: Parameters
     units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
     relative_covariance: Float[np.ndarray, "parameters parameters"]
+    relative_noise_covariance: Float[np.ndarray, "parameters parameters"]  # by the noise alone
     degrees_of_freedom: Float[np.ndarray, " parameters"]  # of the noise estimate behind the errors
     minima: tuple[Minimum, ...] = ()  # distinct stops of several starts, by the first weights
     discrepancy: Discrepancy | None = None  # what the model leaves unexplained, if it was looked at
@@ -197,7 +198,11 @@ class Fit(eqx.Module):
         return float(self.values[k] - reach), float(self.values[k] + reach)
 
     def derived(
-        self, quantity: Callable[[PyTree], Float[Array, ""]], name: str = "derived"
+        self,
+        quantity: Callable[[PyTree], Float[Array, ""]],
+        name: str = "derived",
+        *,
+        model_error: bool = True,
     ) -> Combination:
         """Any function of the model with its standard error: `lambda m: m.lag + m.delay`.
 
@@ -205,6 +210,7 @@ class Fit(eqx.Module):
 
         - `quantity`: from a model to a number.
         - `name`: for messages and print.
+        - `model_error`: as in `interval`.
 
         **Returns:**
 
@@ -225,7 +231,8 @@ class Fit(eqx.Module):
                 f"{name} depends on what this record does not determine ({lost}): fit with a "
                 "jq.identify.Prior or a second record, or ask for a determined combination"
             )
-        error = float(np.sqrt(slope @ self.relative_covariance @ slope))
+        covariance = self.relative_covariance if model_error else self.relative_noise_covariance
+        error = float(np.sqrt(slope @ covariance @ slope))
         return Combination(name, float(quantity(self.model)), error, self.freedom_of(slope))
 
     def bands(self) -> Bands:

@@ -13,9 +13,9 @@ from jaxquad._core import require_x64
 from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ._assess import unfitted
 from ._cost import Band, Cost, least_coherence, MaximumLikelihood, Points
 from ._fit import check_options, fit
+from ._make_fit import unfitted
 from ._parameters import name_places, Parameters, Real
 from ._rational import descend, Rational, Samples
 from ._result import Fit

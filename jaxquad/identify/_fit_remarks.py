@@ -1,0 +1,122 @@
+"""What a fit says about itself: runaway parameters, misfit, no minimum, no model."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ._discrepancy import Discrepancy
+from ._problem import Problem
+from ._solve import Solution
+from ._verdict import Verdict, without_numbers
+
+
+def no_minimum(names: tuple[str, ...], decrement: float, cost: float, *remedies: str) -> Verdict:
+    """The verdict on a stop from which a step would still lower the cost."""
+    reason = f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}"
+    return without_numbers("no minimum", names, reason, *remedies)
+
+
+MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
+NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
+_LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
+_POOR = 10.0  # ratio above which a local minimum is likely
+_LOCAL = ", or this is a local minimum: try other starting values"
+_FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
+
+
+def remarks_on_fit(
+    problem: Problem,
+    solution: Solution,
+    cost: float,
+    decrement: float,
+    chi_squared: float,
+    verdict: Verdict,
+) -> list[str]:
+    """Runaway parameters, missing convergence, misfit beyond the noise."""
+    remarks = runaways(problem, solution, verdict)
+    no_minimum = decrement > 1e-3 * max(cost, 1e-9)
+    if not solution.converged and (no_minimum or not remarks):
+        remarks.append(f"the solver stopped early: {solution.message}")
+    if no_minimum:
+        remarks.append(
+            f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
+            f"{2 * decrement:.3g}; try other starting values{_opposite(problem, solution)}"
+        )
+    if chi_squared > MISFIT**2:
+        ratio = np.sqrt(chi_squared)
+        remarks.append(
+            f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
+            f"explain the whole response{_LOCAL if ratio > _POOR else ''}"
+        )
+    return remarks
+
+
+def no_model(names: tuple[str, ...], discrepancy: Discrepancy) -> Verdict:
+    """The verdict on a fit that leaves more than half of the response unexplained."""
+    reason = f"it leaves {100 * min(discrepancy.amplitude, 1.0):.0f} % of the response unexplained"
+    remedies = (
+        "fit the part of the band where it holds (band=)",
+        "fit a model that explains more (Fit.explain() names terms)",
+        "start from other values: this may be a local minimum",
+    )
+    return without_numbers("no model", names, reason, *remedies)
+
+
+def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
+    """Remark on a model that explains too little of the response for its intervals to be exact."""
+    if not _LARGE < discrepancy.amplitude <= NO_MODEL:
+        return []
+    return [
+        f"the model leaves {100 * discrepancy.amplitude:.0f} % of the response unexplained: the "
+        "intervals are rough; fit the part of the band where it holds (band=), or a model that "
+        "explains more (Fit.explain() names terms)"
+    ]
+
+
+def _opposite(problem: Problem, solution: Solution) -> str:
+    """A hint where the model turns the wrong way at the lowest frequencies."""
+    for weights, misfit in zip(problem.weights, solution.sensitivity.misfits, strict=True):
+        used = np.asarray(weights)[..., 0] > 0
+        phases = np.abs(np.asarray(misfit)[..., 1][used])
+        if phases.size and np.median(phases[: max(phases.size // 4, 1)]) > 2.5:
+            return "; the phase is off by about 180 deg: try the other sign of the gain"
+    return ""
+
+
+def remarks_on_priors(
+    pulls: Float[np.ndarray, " priors"], verdict: Verdict, by_data: Verdict
+) -> list[str]:
+    """Parameters that only a prior determines, and priors that the data contradict."""
+    remarks = [
+        f"prior {k + 1} is {abs(pull):.1f} of its standard errors away from the fit: data and "
+        "prior contradict each other; check both"
+        for k, pull in enumerate(pulls)
+        if abs(pull) > 3
+    ]
+    resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
+    if resolved:
+        known = ", ".join(combination.name for combination in by_data.combinations)
+        remarks.append(
+            f"{' and '.join(resolved)}: determined by the prior alone; the record by itself "
+            f"determines {'only ' + known if known else 'none of them'}"
+        )
+    return remarks
+
+
+def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
+    return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
+
+
+def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[str]:
+    """Remarks on parameters that ran to zero or to infinity, as far as nothing bounds them."""
+    names, lost = problem.parameters.names, verdict.undetermined
+    remarks = [
+        f"{names[k]} ran to zero: leave it out, or let its sign change with "
+        f"jq.identify.Real({names[k]!r})"
+        for k in solution.at_zero
+        if names[k] in lost
+    ]
+    for k in np.flatnonzero(_change_of_z(problem, solution) > 2 * _FAR):
+        if problem.parameters.logarithmic[k] and names[k] in lost:
+            remarks.append(f"{names[k]} ran to infinity: start from other values, or leave it out")
+    return remarks
