@@ -95,4 +95,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    jq.enable_compile_cache()
     main()

@@ -196,4 +196,5 @@ def main(out: Path, seed: int, draws: int) -> None:
 
 
 if __name__ == "__main__":
+    jq.enable_compile_cache()
     main(**vars(options()))

@@ -232,4 +232,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    jq.enable_compile_cache()
     main()

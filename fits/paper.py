@@ -9,6 +9,7 @@ import argparse
 import time
 from pathlib import Path
 
+import jaxquad as jq
 from jaxquad.report import write_json
 from reproduction import (
     adaptation,
@@ -74,4 +75,5 @@ def main(out: Path, seed: int) -> None:
 
 
 if __name__ == "__main__":
+    jq.enable_compile_cache()
     main(**vars(options()))

@@ -107,4 +107,5 @@ def main(scenarios: list[str], quick: bool, seed: int, out: Path) -> None:
 
 
 if __name__ == "__main__":
+    jq.enable_compile_cache()
     main(**vars(options()))

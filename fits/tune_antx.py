@@ -165,6 +165,7 @@ def main(out: Path, seed: int, size: Size, data: Path) -> None:
 
 
 if __name__ == "__main__":
+    jq.enable_compile_cache()
     line = parser(__doc__, "results/tune_antx")
     default = Path(os.environ.get("JAXQUAD_DATA", "../shared/data")) / "antx_pitch"
     line.add_argument("--data", type=Path, default=default, help="folder of the two logs")

@@ -172,5 +172,6 @@ def main(out: Path, seed: int, size: Size) -> None:
 
 
 if __name__ == "__main__":
+    jq.enable_compile_cache()
     given = parser(__doc__, "results/tune_hover").parse_args()
     main(given.out, given.seed, size_of(given))

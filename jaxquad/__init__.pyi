@@ -16,7 +16,7 @@ from . import (
     workflows as workflows,
 )
 from ._core import enable_x64 as enable_x64
-from ._xla import engine as engine
+from ._xla import enable_compile_cache as enable_compile_cache, engine as engine
 from .control import (
     AdaptiveLADRC as AdaptiveLADRC,
     LADRC as LADRC,

@@ -1,58 +1,6 @@
-"""Arrays and checks, the members axis, Levenberg-Marquardt, numbers of threads."""
+"""Arrays and checks, the members axis, Levenberg-Marquardt, numbers of threads, stages."""
 
-from ._arrays import (
-    align as align,
-    as_float as as_float,
-    as_float_or_none as as_float_or_none,
-    is_concrete as is_concrete,
-    is_zero as is_zero,
-    Number as Number,
-    require_all_nonnegative as require_all_nonnegative,
-    require_all_positive as require_all_positive,
-    require_band as require_band,
-    require_finite as require_finite,
-    require_nonnegative as require_nonnegative,
-    require_positive as require_positive,
-    require_vector as require_vector,
-    whole_samples as whole_samples,
-)
-from ._files import write_file as write_file
-from ._gains import (
-    broadcast_gain as broadcast_gain,
-    match_reference as match_reference,
-    multiply_gains as multiply_gains,
-    pick_gain as pick_gain,
-    require_below_sampling as require_below_sampling,
-    require_common_shape as require_common_shape,
-    require_limit as require_limit,
-    require_sample_interval as require_sample_interval,
-    signal_shape as signal_shape,
-)
-from ._levenberg_marquardt import (
-    advance as advance,
-    begin as begin,
-    CONVERGED as CONVERGED,
-    decrement as decrement,
-    Descent as Descent,
-    minimise as minimise,
-    minimise_on_host as minimise_on_host,
-    Normal as Normal,
-    normal_equations as normal_equations,
-    RUNNING as RUNNING,
-    settle as settle,
-    solve_definite as solve_definite,
-    STALLED as STALLED,
-    TOLERANCE as TOLERANCE,
-)
-from ._members import (
-    ensemble_shape as ensemble_shape,
-    mark_members as mark_members,
-    per_member as per_member,
-)
-from ._process import (
-    enable_x64 as enable_x64,
-    one_blas_thread as one_blas_thread,
-    PrecisionError as PrecisionError,
-    require_float64 as require_float64,
-    require_x64 as require_x64,
-)
+import lazy_loader
+
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,11 +1,12 @@
-"""Numbers and arrays that a user gives: refused at once, by name and with the remedy."""
+"""Arrays of JAX from what a user gives."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
+
+from ._checks import is_concrete
 
 
 def as_float(x: ArrayLike | Sequence) -> Array:
@@ -28,93 +29,6 @@ def align(parameter: Array, state: Array) -> Array:
     return parameter.reshape(parameter.shape + (1,) * missing)
 
 
-def is_concrete(x: ArrayLike) -> bool:
-    """Whether `x` has values to check, which a tracer under jit, vmap or grad has not."""
-    return not isinstance(x, Tracer)
-
-
 def is_zero(x: Array) -> bool:
     """Whether `x` is known to be 0 everywhere."""
     return is_concrete(x) and not np.any(np.asarray(x))  # jnp would trace even a constant
-
-
-Number = float | int
-
-
-def require_vector(name: str, value: Array, length: int) -> None:
-    """Raise ValueError unless `value` is `[length]` or `[length, members]`."""
-    if value.ndim == 0 or value.shape[0] != length:
-        raise ValueError(
-            f"{name} has shape {value.shape}, but it must be ({length},), or ({length}, members) "
-            "for an ensemble: give one value for each axis."
-        )
-
-
-def require_finite(name: str, value: ArrayLike) -> None:
-    """Raise ValueError for an inf or nan in `value`."""
-    _require(name, value, np.isfinite, "finite", "look for the NaN or inf in it")
-
-
-def require_positive(name: str, value: ArrayLike, remedy: str = "") -> None:
-    """Raise ValueError unless all of `value` is above 0 and finite."""
-    _require(name, value, lambda x: (x > 0) & np.isfinite(x), "above 0 and finite", remedy)
-
-
-def require_nonnegative(name: str, value: ArrayLike, remedy: str = "") -> None:
-    """Raise ValueError unless all of `value` is 0 or above, and finite."""
-    _require(name, value, lambda x: (x >= 0) & np.isfinite(x), "0 or above and finite", remedy)
-
-
-def require_all_positive(**values: ArrayLike) -> None:
-    """`require_positive` for each of the named values."""
-    for name, value in values.items():
-        require_positive(name, value)
-
-
-def require_all_nonnegative(**values: ArrayLike) -> None:
-    """`require_nonnegative` for each of the named values."""
-    for name, value in values.items():
-        require_nonnegative(name, value)
-
-
-def _require(
-    name: str,
-    value: ArrayLike,
-    valid: Callable[[np.ndarray], np.ndarray],
-    limit: str,
-    remedy: str,
-) -> None:
-    if is_concrete(value) and not np.all(valid(np.asarray(value))):
-        text = f"{name} is {value}, but it must be {limit}"
-        raise ValueError(f"{text}: {remedy}." if remedy else f"{text}.")
-
-
-def require_band(omega_min: Number, omega_max: Number, sample_rate: Number) -> None:
-    """Raise ValueError unless 0 < omega_min < omega_max < Nyquist (rad/s, Hz)."""
-    require_all_positive(omega_min=omega_min, omega_max=omega_max, sample_rate=sample_rate)
-    if omega_max <= omega_min:
-        raise ValueError(
-            f"omega_max {omega_max:.6g} rad/s is not above omega_min {omega_min:.6g} rad/s."
-        )
-    nyquist = np.pi * sample_rate
-    if omega_max >= nyquist:
-        raise ValueError(
-            f"omega_max {omega_max:.6g} rad/s is not below {nyquist:.6g} rad/s, half the "
-            f"sample_rate of {sample_rate:.6g} Hz: sample faster (25 times omega_max is the rule)."
-        )
-
-
-def whole_samples(name: str, seconds: Number, sample_rate: Number, *, fewest: int = 1) -> int:
-    """The number of samples in `seconds`. Raises ValueError unless that is a whole number."""
-    count = seconds * sample_rate
-    if not np.isfinite(count):
-        raise ValueError(f"{name} is {seconds} s at {sample_rate} Hz: it has to be finite.")
-    whole = round(count)
-    if whole < fewest or abs(count - whole) > 1e-6:
-        below = max(fewest, int(np.floor(count)))
-        raise ValueError(
-            f"{name} of {seconds:.9g} s is {count:.6g} samples at {sample_rate:.6g} Hz, not "
-            f"a whole number of at least {fewest}: the nearest are {below / sample_rate:.9g} s and "
-            f"{(below + 1) / sample_rate:.9g} s."
-        )
-    return whole

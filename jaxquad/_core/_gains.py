@@ -6,7 +6,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from ._arrays import align, is_concrete
+from ._arrays import align
+from ._checks import is_concrete
 from ._members import ensemble_shape
 
 

@@ -1,5 +1,9 @@
-"""What knows the compiler: loops as one kernel, compiler options, devices."""
+"""What knows the compiler: loops as one kernel, compiler options, devices, kept programs."""
 
+from ._compile_cache import (
+    enable_compile_cache as enable_compile_cache,
+    share_programs as share_programs,
+)
 from ._devices import (
     asked_devices as asked_devices,
     Devices as Devices,

@@ -12,10 +12,10 @@ from ._options import (
     add_settings,
     Command,
     print_json,
-    ProgressBar,
     settings_of,
     stdout_for_json,
 )
+from ._progress import add_quiet, ProgressBar
 
 
 SOME_FAILED = 4
@@ -29,6 +29,7 @@ def _add(declared: argparse.ArgumentParser) -> None:
         "--again", action="store_true", help="identify logs again that failed before"
     )
     add_json(declared, "the rows of the table")
+    add_quiet(declared)
     add_settings(declared, BatchSettings)
 
 
@@ -37,7 +38,8 @@ def _run(options: argparse.Namespace) -> int:
 
     settings = settings_of(options, BatchSettings)
     out = options.out or Path("results") / options.folder.resolve().name
-    bar = ProgressBar(len(find_logs(options.folder, settings, out=out)))
+    logs = find_logs(options.folder, settings, out=out)
+    bar = ProgressBar(len(logs), quiet=options.quiet)
     with stdout_for_json(options), contextlib.closing(bar):
         rows = batch(
             options.folder,

@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from jaxquad.records import require_file
 from jaxquad.workflows import IdentifySettings
 
 from ._options import (
@@ -19,8 +20,10 @@ from ._options import (
     print_json,
     print_table,
     settings_of,
+    start_computing,
     stdout_for_json,
 )
+from ._progress import add_quiet
 
 
 def _add_channels(declared: argparse.ArgumentParser) -> None:
@@ -85,13 +88,17 @@ def _add_identify(declared: argparse.ArgumentParser) -> None:
     add_config(declared)
     add_out(declared, "results/NAME of the file")
     add_json(declared, "result.json")
+    add_quiet(declared)
     add_settings(declared, IdentifySettings)
 
 
 def _identify(options: argparse.Namespace) -> int:
+    given = settings_of(options, IdentifySettings)
+    for path in (options.file, *([given.verify] if given.verify else [])):
+        require_file(path)
+    start_computing()
     from jaxquad.workflows import identify, propose_settings
 
-    given = settings_of(options, IdentifySettings)
     settings, proposal = propose_settings(options.file, given)
     if proposal is not None:
         with stdout_for_json(options):
@@ -126,12 +133,16 @@ def _add_report(declared: argparse.ArgumentParser) -> None:
     add_log_option(declared)
     add_out(declared, "the folder of the result")
     add_json(declared, "result.json")
+    add_quiet(declared)
 
 
 def _report(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import identify_again, read_result
+    from jaxquad.workflows import read_result
 
     stored = read_result(options.result)
+    start_computing()
+    from jaxquad.workflows import identify_again
+
     found = identify_again(stored, log=options.log)
     return _finish(options, found, options.out or stored.folder)
 
@@ -171,14 +182,19 @@ def _add_verify(declared: argparse.ArgumentParser) -> None:
     add_settings(declared, IdentifySettings, only=_OF_A_RECORD)
     declared.add_argument("--out", type=Path, metavar="PNG", help="draw both outputs into a figure")
     add_json(declared, "the measures of agreement")
+    add_quiet(declared)
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from jaxquad.plot import overlay
-    from jaxquad.report import verification_content
-    from jaxquad.workflows import read_result, verify_result
+    from jaxquad.workflows import read_result
 
     stored = read_result(options.result)
+    require_file(options.file)
+    start_computing()
+    from jaxquad.plot import overlay
+    from jaxquad.report import verification_content
+    from jaxquad.workflows import verify_result
+
     check = verify_result(stored, options.file, given_settings(options, IdentifySettings))
     with stdout_for_json(options):
         for doubt in stored.doubts:
@@ -222,9 +238,11 @@ Then identify your own log:
 def _add_demo(declared: argparse.ArgumentParser) -> None:
     add_out(declared, "results/demo")
     add_json(declared, "result.json")
+    add_quiet(declared)
 
 
 def _demo(options: argparse.Namespace) -> int:
+    start_computing()
     from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
 
     folder = options.out or Path("results/demo")

@@ -8,10 +8,14 @@ import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from jaxquad.records import RecordWarning
+from jaxquad.workflows import SettingsError
+
 from ._batch import BATCH
 from ._design import DESIGN
 from ._identify import CHANNELS, DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
 from ._options import in_flags
+from ._progress import shown_stages
 from ._tune import TUNE
 
 
@@ -38,27 +42,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     options, unknown = make_parser().parse_known_args(argv)
     if unknown:
         return _fail(_describe_unknown(options, unknown), _UNUSABLE)
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    from jaxquad.identify import UndeterminedError
-    from jaxquad.records import RecordWarning
-    from jaxquad.workflows import SettingsError
-
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), shown_stages(options):
         warnings.simplefilter("always", RecordWarning)
         warnings.showwarning = _print_warning
         try:
             return options.run(options)
         except SettingsError as error:
             return _fail(in_flags(error), _UNUSABLE)
-        except UndeterminedError as error:
-            return _fail(str(error), NOT_IDENTIFIABLE)
         except (ValueError, OSError) as error:
-            return _fail(str(error), _UNUSABLE)
+            return _fail(str(error), NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE)
         except KeyboardInterrupt:
             print("jaxquad: interrupted", file=sys.stderr)
             return _INTERRUPTED
+
+
+def _is_undetermined(error: Exception) -> bool:
+    """Without asking for the room of fits, and thereby JAX, where nothing was fitted."""
+    if "jaxquad.identify" not in sys.modules:
+        return False
+    from jaxquad.identify import UndeterminedError
+
+    return isinstance(error, UndeterminedError)
 
 
 def _describe_unknown(options: argparse.Namespace, words: Sequence[str]) -> str:

@@ -122,27 +122,16 @@ def in_flags(error: SettingsError) -> str:
     return re.sub(r"`(\w+)`", lambda key: _FLAGS.get(key[1], key[0]), str(error))
 
 
-class ProgressBar:
-    """A bar on a terminal, plain lines elsewhere."""
+def start_computing() -> None:
+    """JAX in 64 bits, and programs that are kept for the next call.
 
-    def __init__(self, total: int):
-        from tqdm import tqdm
+    What a command can say without JAX it says before.
+    """
+    from jaxquad._core import enable_x64
+    from jaxquad._xla import enable_compile_cache
 
-        self._bar = tqdm(total=total, unit="log", leave=False, disable=None)
-        self.total, self.done = total, 0
-
-    def advance(self, text: str) -> None:
-        """One more is done; `text` says which."""
-        self.done += 1
-        plain = "".join(c if c.isprintable() else "?" for c in text)
-        if self._bar.disable:
-            print(f"{self.done}/{self.total} {plain}", file=sys.stderr, flush=True)
-        else:
-            self._bar.set_postfix_str(plain, refresh=False)
-            self._bar.update()
-
-    def close(self) -> None:
-        self._bar.close()
+    enable_x64()
+    enable_compile_cache()
 
 
 @contextlib.contextmanager

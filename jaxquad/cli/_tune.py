@@ -12,8 +12,10 @@ from ._options import (
     Command,
     print_json,
     settings_of,
+    start_computing,
     stdout_for_json,
 )
+from ._progress import add_quiet
 
 
 NOT_TO_BE_FLOWN = 4
@@ -25,15 +27,19 @@ def _add(declared: argparse.ArgumentParser) -> None:
     add_config(declared)
     add_out(declared, "tuned/ in the folder of the result")
     add_json(declared, "gains and certificate")
+    add_quiet(declared)
     add_settings(declared, TuneSettings)
 
 
 def _run(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import read_result, tune
+    from jaxquad.workflows import read_result
 
     settings = settings_of(options, TuneSettings)
     stored = read_result(options.result)
-    found = tune(stored, settings, log=options.log)
+    start_computing()
+    from jaxquad.workflows import tune
+
+    found = tune(stored, settings, log=options.log, progress=False if options.quiet else None)
     with stdout_for_json(options):
         print(found)
         folder = options.out or stored.folder / "tuned"

@@ -1,8 +1,8 @@
 """A signal to excite a vehicle with, and the rules that it is checked against."""
 
+import dataclasses
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -12,7 +12,8 @@ from jaxquad._core import Number, require_all_positive
 Kind = Literal["sweep", "multisine", "doublet", "3-2-1-1"]
 
 
-class Excitation(eqx.Module):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Excitation:
     """A test signal with uniform time stamps from 0 s.
 
     The band `omega_min` .. `omega_max` is the range of a sweep, the lowest and highest line of a
@@ -23,15 +24,15 @@ class Excitation(eqx.Module):
     time: Float[np.ndarray, " samples"]  # s
     signal: Float[np.ndarray, " samples"]  # in the unit of the amplitude
     lines: Float[np.ndarray, " frequencies"]  # rad/s, of a multisine; none for the others
-    kind: Kind = eqx.field(static=True)
-    omega_min: float = eqx.field(static=True, converter=float)  # rad/s
-    omega_max: float = eqx.field(static=True, converter=float)  # rad/s
-    amplitude: float = eqx.field(static=True, converter=float)  # peak
-    sample_rate: float = eqx.field(static=True, converter=float)  # Hz
-    duration: float = eqx.field(static=True, converter=float)  # s
-    lead_in: float = eqx.field(static=True, converter=float, default=0.0)  # s at omega_min
-    lead: float = eqx.field(static=True, converter=float, default=0.0)  # s of zeros before
-    tail: float = eqx.field(static=True, converter=float, default=0.0)  # s of zeros after
+    kind: Kind
+    omega_min: float  # rad/s
+    omega_max: float  # rad/s
+    amplitude: float  # peak
+    sample_rate: float  # Hz
+    duration: float  # s
+    lead_in: float = 0.0  # s at omega_min
+    lead: float = 0.0  # s of zeros before
+    tail: float = 0.0  # s of zeros after
 
     @property
     def samples(self) -> int:

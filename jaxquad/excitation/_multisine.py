@@ -103,11 +103,11 @@ def multisine(
         np.tile(amplitude / np.abs(wave).max() * wave, periods),
         omega,
         kind="multisine",
-        omega_min=omega[0],
-        omega_max=omega[-1],
-        amplitude=amplitude,
-        sample_rate=sample_rate,
-        duration=period * periods,
+        omega_min=float(omega[0]),
+        omega_max=float(omega[-1]),
+        amplitude=float(amplitude),
+        sample_rate=float(sample_rate),
+        duration=float(period * periods),
     )
 
 

@@ -87,13 +87,13 @@ def _pulses(
         signal,
         np.empty(0),
         kind=kind,
-        omega_min=omega_min,
-        omega_max=omega_max,
-        amplitude=amplitude,
-        sample_rate=sample_rate,
-        duration=shape.size / sample_rate,
-        lead=lead,
-        tail=tail,
+        omega_min=float(omega_min),
+        omega_max=float(omega_max),
+        amplitude=float(amplitude),
+        sample_rate=float(sample_rate),
+        duration=float(shape.size / sample_rate),
+        lead=float(lead),
+        tail=float(tail),
     )
 
 

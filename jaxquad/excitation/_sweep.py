@@ -70,14 +70,14 @@ def sweep(
         amplitude * _envelope(clock, duration, fade_in, fade_out) * wave,
         np.empty(0),
         kind="sweep",
-        omega_min=omega_min,
-        omega_max=omega_max,
-        amplitude=amplitude,
-        sample_rate=sample_rate,
-        duration=duration,
-        lead_in=lead_in,
-        lead=trim,
-        tail=trim,
+        omega_min=float(omega_min),
+        omega_max=float(omega_max),
+        amplitude=float(amplitude),
+        sample_rate=float(sample_rate),
+        duration=float(duration),
+        lead_in=float(lead_in),
+        lead=float(trim),
+        tail=float(trim),
     )
 
 

@@ -1,8 +1,9 @@
+import dataclasses
+import functools as ft
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -26,7 +27,8 @@ Hold = float | int | Literal["dt"] | None
 _MOST_REPAIRED = 0.01  # of a channel, without a warning
 
 
-class Record(eqx.Module):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Record:
     """Uniformly sampled inputs, outputs and references of one run.
 
     **Arguments:**
@@ -65,14 +67,14 @@ class Record(eqx.Module):
     inputs: Float[np.ndarray, "samples inputs"]
     outputs: Float[np.ndarray, "samples outputs"]
     references: Float[np.ndarray, "samples references"]
-    input_names: tuple[str, ...] = eqx.field(static=True)
-    output_names: tuple[str, ...] = eqx.field(static=True)
-    reference_names: tuple[str, ...] = eqx.field(static=True)
-    input_units: tuple[str, ...] = eqx.field(static=True)
-    output_units: tuple[str, ...] = eqx.field(static=True)
-    reference_units: tuple[str, ...] = eqx.field(static=True)
-    source: str = eqx.field(static=True)
-    hold: float | None = eqx.field(static=True)  # s; of the inputs
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    reference_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    reference_units: tuple[str, ...]
+    source: str
+    hold: float | None  # s; of the inputs
     repaired: dict[str, Float[np.ndarray, " repaired"]]  # s; when values were interpolated
 
     def __init__(
@@ -95,23 +97,24 @@ class Record(eqx.Module):
         max_gap: float | int | None = None,
         repaired: Mapping[str, ArrayLike] | None = None,
     ):
-        self.time = _stamps(time, time_unit)
+        put = ft.partial(object.__setattr__, self)
+        put("time", _stamps(time, time_unit))
         rows = self.time.size
-        self.inputs = _columns("inputs", inputs, rows)
-        self.outputs = _columns("outputs", outputs, rows)
+        put("inputs", _columns("inputs", inputs, rows))
+        put("outputs", _columns("outputs", outputs, rows))
         none = np.empty((rows, 0))
-        self.references = none if references is None else _columns("references", references, rows)
-        self.input_names = _as_names(input_names, "u", self.inputs.shape[1])
-        self.output_names = _as_names(output_names, "y", self.outputs.shape[1])
-        self.reference_names = _as_names(reference_names, "r", self.references.shape[1])
-        self.input_units = _as_units(input_units, self.input_names)
-        self.output_units = _as_units(output_units, self.output_names)
-        self.reference_units = _as_units(reference_units, self.reference_names)
-        self.source = source
-        self.hold = self.dt if isinstance(hold, str) and hold == "dt" else _held(hold)
+        put("references", none if references is None else _columns("references", references, rows))
+        put("input_names", _as_names(input_names, "u", self.inputs.shape[1]))
+        put("output_names", _as_names(output_names, "y", self.outputs.shape[1]))
+        put("reference_names", _as_names(reference_names, "r", self.references.shape[1]))
+        put("input_units", _as_units(input_units, self.input_names))
+        put("output_units", _as_units(output_units, self.output_names))
+        put("reference_units", _as_units(reference_units, self.reference_names))
+        put("source", source)
+        put("hold", self.dt if isinstance(hold, str) and hold == "dt" else _held(hold))
         check_distinct(self.names)
         before = {name: np.asarray(each, np.float64) for name, each in (repaired or {}).items()}
-        self.repaired = before | _repair_in_place(self, valid or {}, max_gap)
+        put("repaired", before | _repair_in_place(self, valid or {}, max_gap))
         _check_channels(self)
 
     @property

@@ -1,7 +1,7 @@
+import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -14,7 +14,8 @@ from ._repair import as_float64, longest_gap
 Samples = Float[np.ndarray, " samples"]
 
 
-class Channel(eqx.Module):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Channel:
     """One logged signal with its own time stamps, which may be jittered and have gaps.
 
     **Arguments:**
@@ -30,26 +31,25 @@ class Channel(eqx.Module):
         finite.
     """
 
-    name: str = eqx.field(static=True)
+    name: str
     time: Float[np.ndarray, " samples"]  # s
     values: Float[np.ndarray, " samples"]
-    unit: str = eqx.field(static=True)
+    unit: str
 
     def __init__(self, name: str, time: ArrayLike, values: ArrayLike, unit: str = ""):
-        self.name = name
-        self.time = _absolute(name, time)
-        self.values = as_float64(f"channel {name!r}", values, copy=False)
-        self.unit = unit
-        if self.time.ndim != 1 or self.time.shape != self.values.shape:
+        stamps = _absolute(name, time)
+        numbers = as_float64(f"channel {name!r}", values, copy=False)
+        if stamps.ndim != 1 or stamps.shape != numbers.shape:
             raise RecordError(
-                f"channel {name!r} has values of shape {self.values.shape} for time stamps of "
-                f"shape {self.time.shape}: give one value for each time stamp."
+                f"channel {name!r} has values of shape {numbers.shape} for time stamps of "
+                f"shape {stamps.shape}: give one value for each time stamp."
             )
-        if self.time.size < FEWEST:
+        if stamps.size < FEWEST:
             raise RecordError(
-                f"channel {name!r} has {self.time.size} samples: at least {FEWEST} are needed."
+                f"channel {name!r} has {stamps.size} samples: at least {FEWEST} are needed."
             )
-        check_increasing(f"channel {name!r}", self.time)
+        check_increasing(f"channel {name!r}", stamps)
+        vars(self).update(name=name, time=stamps, values=numbers, unit=unit)
 
     @property
     def rate(self) -> float:

@@ -1,21 +1,6 @@
 """Result files and the HTML report."""
 
-from ._fit import compare_fits as compare_fits
-from ._page import (
-    Cell as Cell,
-    render_page as render_page,
-    Table as Table,
-)
-from ._provenance import (
-    Provenance as Provenance,
-    provenance as provenance,
-    sha256_of as sha256_of,
-    Source as Source,
-)
-from ._report import write_report as write_report
-from ._results import (
-    plain_content as plain_content,
-    verification_content as verification_content,
-    write_json as write_json,
-    write_results as write_results,
-)
+import lazy_loader
+
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,19 +1,10 @@
-import json
-import math
-from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
-import jax
-import numpy as np
-
-from jaxquad._core import write_file
 from jaxquad.identify import Agreement, Discrepancy, Fit, Verification
 from jaxquad.spectra import FrequencyResponse
 
-
-Json = Mapping[str, object]
+from ._json import Json, write_json
 
 
 def write_results(
@@ -149,31 +140,3 @@ def _measures(found: Verification | Agreement) -> dict[str, object]:
         "fit_percent": found.fit_percent,
         "variance_percent": found.variance_percent,
     }
-
-
-def plain_content(value: object) -> Any:
-    """JSON's own types, with null for what is not finite."""
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return plain_content(np.asarray(value).tolist())
-    if isinstance(value, Mapping):
-        return {str(key): plain_content(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain_content(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
-
-
-def write_json(path: str | Path, content: Json) -> Path:
-    """Write a JSON file, whole or not at all.
-
-    **Arguments:**
-
-    - `path`: its folders are made as needed.
-    - `content`: arrays included; numbers that are not finite become null.
-
-    **Returns:** the path.
-
-    **Raises:** TypeError for what JSON cannot hold.
-    """
-    return write_file(path, json.dumps(plain_content(content), indent=2, allow_nan=False) + "\n")

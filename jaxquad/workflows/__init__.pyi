@@ -8,11 +8,10 @@ from ._identify import (
     propose_settings as propose_settings,
 )
 from ._kinds import SettingsError as SettingsError
+from ._result_file import read_result as read_result, StoredResult as StoredResult
 from ._settings import IdentifySettings as IdentifySettings, TuneSettings as TuneSettings
 from ._stored import (
     identify_again as identify_again,
-    read_result as read_result,
-    StoredResult as StoredResult,
     verify_result as verify_result,
 )
 from ._tune import tune as tune, Tuning as Tuning

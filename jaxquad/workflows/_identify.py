@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
+from jaxquad._core import announce
 from jaxquad.identify import (
     Bands,
     CoherenceWeighted,
@@ -226,6 +227,7 @@ def identify(path: str | Path, settings: IdentifySettings | None = None) -> Iden
     for method in methods:
         responses[method], found = _fit_twice(records, method, settings)
         fits[method] = _with_remedies(found, settings)
+    announce("fits to parts of the band")
     best = methods[0]
     fits[best], parts = _fit_parts(fits[best], responses[best], settings)
     found = Identification(path, settings, records, responses, fits, parts, None, proposal)
@@ -279,6 +281,7 @@ def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, 
 
 def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
     """One record for each segment. Raises RecordError, ReadError."""
+    announce(f"reading {path.name}")
     inputs, outputs, references = map(_mix, (settings.input, settings.output, settings.reference))
     asked = {*inputs, *outputs, *references}
     segments: list[Segment] = list(settings.segments) or [(settings.start, settings.stop)]
@@ -311,8 +314,10 @@ def _fit_twice(
     dt, duration = records[0].dt, max(record.duration for record in records)
     omega = np.geomspace(*band, _POINTS) if band else None
     while True:
+        announce(f"{method} response{f', {delay:.4g} s of delay taken out' if delay else ''}")
         estimator = _estimator(settings, method, delay)
         frf = frequency_response(list(records), omega, estimator=estimator)
+        announce(f"fit to the {method} response")
         found = _fitted(frf, settings)
         if not found.verdict.fitted:
             return frf, found

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from jaxquad._core import announce
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
@@ -26,8 +27,9 @@ from jaxquad.tuning import (
 )
 
 from ._identify import Identification
+from ._result_file import StoredResult
 from ._settings import TuneSettings
-from ._stored import identify_again, StoredResult
+from ._stored import identify_again
 
 
 _PULSE, _BACK = 0.375, 0.625  # of the flight: when the torque comes, and the step back
@@ -73,6 +75,7 @@ class Tuning:
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write `tuned.json`, a C header, `report.html` and the figures; returns their paths."""
+        announce("figures and report")
         folder, found, tuned = Path(folder), self.identification, self.tuned
         name = self.settings.name
         known = {k: v for k, v in self.settings.content().items() if v is not None}
@@ -104,6 +107,7 @@ def tune(
     settings: TuneSettings,
     *,
     log: str | Path | None = None,
+    progress: bool | None = None,
 ) -> Tuning:
     """Tune and certify a controller for the angle of an identified axis, as `jaxquad tune` does.
 
@@ -117,6 +121,7 @@ def tune(
     - `result`: what `identify` returned, or the folder of a result, which is identified again.
     - `settings`: what the record does not tell: inertia, limits, noise.
     - `log`: where the log lies, if it was moved.
+    - `progress`: as in `jq.tune`.
 
     **Returns:** a `Tuning`, whose certificate was made on plants that were not tuned on.
 
@@ -129,7 +134,7 @@ def tune(
     record = found.records[0]
     _check_unit(record)
     dt = record.dt if settings.dt is None else settings.dt
-    return Tuning(found, settings, _tuned(found, dt, settings))
+    return Tuning(found, settings, _tuned(found, dt, settings, progress))
 
 
 def _check_unit(record: Record) -> None:
@@ -142,7 +147,9 @@ def _check_unit(record: Record) -> None:
         )
 
 
-def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
+def _tuned(
+    found: Identification, dt: float, settings: TuneSettings, progress: bool | None
+) -> Tuned:
     record = found.records[0]
     recorded_dt = record.dt if record.hold is None else "as fitted"  # commands are held
     posterior = Posterior(
@@ -165,6 +172,7 @@ def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
         plant, ScheduledLADRC(start, schedule), drive=Saturation(settings.limit), dt=dt,
         delay=posterior.delay,
     )  # fmt: skip
+    announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
     return tune_controller(
         loop,
         ensemble,
@@ -176,6 +184,7 @@ def _tuned(found: Identification, dt: float, settings: TuneSettings) -> Tuned:
         fresh=settings.fresh,
         peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
         key=jax.random.key(settings.seed),
+        progress=progress,
     )
 
 

@@ -1,6 +1,8 @@
 """The commands around `jaxquad identify`: demo, report, verify, tune, design, and proposals."""
 
 import json
+import logging
+import time
 
 import numpy as np
 import pytest
@@ -194,6 +196,21 @@ def test_channels_are_listed_as_json(demo, capsys):
     assert main(["channels", str(demo / "demo.csv"), "--json"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert rows["q"]["rate"] == pytest.approx(250)
+
+
+@pytest.mark.parametrize(("more", "said"), [([], "long ...\n"), (["--quiet"], "")])
+def test_a_stage_that_takes_longer_than_a_second_is_a_line(more, said, demo, capsys, monkeypatch):
+    def identify_slowly(*_):
+        for stage, seconds in (("short", 0.0), ("long", 1.5), ("last", 0.0)):
+            logging.getLogger("jaxquad.stages").info(stage)
+            time.sleep(seconds)
+        raise ValueError("enough")
+
+    monkeypatch.setattr("jaxquad.workflows.identify", identify_slowly)
+    words = ["identify", str(demo / "demo.csv"), "--input", "M", "--output", "q", "--json", *more]
+    assert main(words) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"{said}jaxquad: error: enough\n" and not printed.out
 
 
 PLANT = ["--inertia", "0.01", "--limit", "0.2"]

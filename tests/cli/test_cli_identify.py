@@ -16,7 +16,8 @@ def flight(tmp_path_factory):
 
 
 def identify(path, *more, channels=("M=right-left", "q")):
-    return main(["identify", str(path), "--input", channels[0], "--output", channels[1], *more])
+    given = ["--input", channels[0], "--output", channels[1], "--quiet"]
+    return main(["identify", str(path), *given, *more])
 
 
 def result_in(folder):

@@ -1,2 +1,7 @@
 from .._log import Log as Log, Table as Table
-from ._readers import load_log as load_log, load_signals as load_signals, READERS as READERS
+from ._readers import (
+    load_log as load_log,
+    load_signals as load_signals,
+    READERS as READERS,
+    require_file as require_file,
+)

@@ -213,12 +213,18 @@ def _choose_reader(path: Path) -> Reader:
     return reader
 
 
-def _head(path: Path) -> bytes:
-    if path.is_dir():
-        return b""
-    if not path.is_file():
+def require_file(path: str | Path) -> None:
+    """Raise ReadError where there is neither a file nor a folder. Nothing is read."""
+    path = Path(path)
+    if not (path.is_dir() or path.is_file()):
         missing = f"there is no such file in {path.resolve().parent}"
         raise ReadError(f"{path}: {'it is not a regular file' if path.exists() else missing}.")
+
+
+def _head(path: Path) -> bytes:
+    require_file(path)
+    if path.is_dir():
+        return b""
     with path.open("rb") as file:
         head = file.read(HEAD)
     if not head:

@@ -70,8 +70,10 @@ _ONE_AT_A_TIME = threading.Lock()  # matplotlib and warnings belong to the proce
 
 def identify_log(job: Job) -> Content:
     """Identify one log; its report and figures go to `logs/` in the folder of the batch."""
-    import jax
     import matplotlib
+
+    from jaxquad._core import enable_x64
+    from jaxquad._xla import enable_compile_cache, share_programs
 
     from .._identify import identify  # here: a process with other work starts in half the time
 
@@ -81,9 +83,11 @@ def identify_log(job: Job) -> Content:
     with _ONE_AT_A_TIME, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         matplotlib.use("Agg")
-        jax.config.update("jax_enable_x64", True)
+        enable_x64()
+        enable_compile_cache()
         found = identify(job.log, job.settings)
         found.write(folder)
+    share_programs()  # Not only at the end: workers are killed.
     texts = [str(found)] if found.proposal is None else [str(found.proposal), str(found)]
     write_file(folder / "printed.txt", "\n\n".join(texts))
     warned = list(dict.fromkeys(" ".join(str(each.message).split()) for each in caught))

@@ -1,0 +1,17 @@
+from ._edit import detrend as detrend, mix as mix, select as select, trim as trim
+from ._errors import (
+    ReadError as ReadError,
+    RecordError as RecordError,
+    RecordWarning as RecordWarning,
+)
+from ._read import channels as channels, ChannelSummary as ChannelSummary, read as read
+from ._record import Record as Record
+from ._resample import Channel as Channel, resample as resample
+from ._segments import (
+    Mix as Mix,
+    parse_mix as parse_mix,
+    read_segments as read_segments,
+    Segment as Segment,
+)
+from .formats import require_file as require_file
+from .proposals import AXES as AXES, Proposal as Proposal, propose as propose

@@ -1,0 +1,18 @@
+from ._fit import compare_fits as compare_fits
+from ._json import plain_content as plain_content, write_json as write_json
+from ._page import (
+    Cell as Cell,
+    render_page as render_page,
+    Table as Table,
+)
+from ._provenance import (
+    Provenance as Provenance,
+    provenance as provenance,
+    sha256_of as sha256_of,
+    Source as Source,
+)
+from ._report import write_report as write_report
+from ._results import (
+    verification_content as verification_content,
+    write_results as write_results,
+)

@@ -1,0 +1,96 @@
+"""`result.json` as it is read again. Without JAX: a missing result is answered at once."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple, TYPE_CHECKING
+
+from ._settings import IdentifySettings
+
+
+if TYPE_CHECKING:
+    from jaxquad.models import LaggedIntegrator, TransferFunction
+
+
+class StoredResult(NamedTuple):
+    """A `result.json` as `read_result` reads it."""
+
+    folder: Path
+    content: Mapping[str, object]
+    settings: IdentifySettings
+    log: Path
+    hashes: tuple[str, ...]  # SHA-256 of the log, and of the record of a check
+    band: tuple[float, float]  # rad/s, that was fitted
+
+    @property
+    def summary(self) -> str:
+        """What the result says of its identifiability, in one line."""
+        return str(_part(_part(self.content, "fit"), "verdict").get("summary", ""))
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the record determines every parameter."""
+        return _part(self.content, "fit").get("identifiable") is True
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The verdict and the remarks of a result that is not identifiable."""
+        remarks = _part(self.content, "fit").get("remarks")
+        if self.identifiable or not isinstance(remarks, list):
+            return ()
+        return self.summary, *map(str, remarks)
+
+    @property
+    def model(self) -> "LaggedIntegrator | TransferFunction":
+        """The identified model. Raises UndeterminedError where nothing was fitted."""
+        from jaxquad.identify import UndeterminedError
+        from jaxquad.models import LaggedIntegrator, TransferFunction
+
+        known = {each.__name__: each for each in (LaggedIntegrator, TransferFunction)}
+        if "model" not in self.content:
+            raise UndeterminedError(f"the result holds no model: {self.summary}")
+        numbers = dict(_part(self.content, "model"))
+        kind = numbers.pop("kind", None)
+        if kind not in known:
+            kinds = ", ".join(known)
+            raise ValueError(f"the result holds a model of kind {kind!r}: known are {kinds}")
+        try:
+            return known[str(kind)](**numbers)  # pyright: ignore[reportArgumentType]
+        except TypeError as error:
+            raise ValueError(f"the result's model is incomplete: {error}") from error
+
+
+def _part(content: Mapping[str, object], key: str) -> Mapping[str, object]:
+    part = content.get(key)
+    return part if isinstance(part, dict) else {}
+
+
+def read_result(path: str | Path) -> StoredResult:
+    """Read the result in a folder, or a `result.json` itself.
+
+    **Raises:** ValueError for a file that `jaxquad identify` did not write.
+    """
+    path = Path(path)
+    path = path / "result.json" if path.is_dir() else path
+    try:
+        content = json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such result: run jaxquad identify first") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: no result of jaxquad identify: {error}") from error
+    try:
+        content = dict(content)
+        settings = IdentifySettings.from_mapping(content["settings"], f"{path}, settings")
+        files = content["provenance"]["files"]
+        return StoredResult(
+            folder=path.parent,
+            content=content,
+            settings=settings,
+            log=Path(content["record"]["file"]),
+            hashes=tuple(file["sha256"] for file in files),
+            band=(float(content["band_rad_per_s"][0]), float(content["band_rad_per_s"][1])),
+        )
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path}: no result of this version of jaxquad identify: identify the log again"
+        ) from error

@@ -1,0 +1,50 @@
+"""What needs no JAX is answered without it."""
+
+import json
+import subprocess
+import sys
+
+
+PROGRAM = """
+import contextlib, io, json, sys
+from jaxquad.cli import main
+
+answers = []
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        try:
+            code = main(words)
+        except SystemExit as stop:
+            code = stop.code
+    answers.append([words, code, "jax" in sys.modules])
+print(json.dumps(answers))
+"""
+SIGNAL = ["--band", "0.5", "10", "--rate", "500", "--amplitude", "0.2", "--out", "signal.csv"]
+LIGHT = {
+    "--help": 0,
+    "identify --help": 0,
+    "identify log --lagg": 2,
+    "identify missing.csv --input u --output y": 2,
+    "identify log.csv --input u --output y --band 3 1": 2,
+    "identify log.csv --input u --output y --verify missing.csv": 2,
+    "tune missing --inertia 1 --limit 1": 2,
+    "report missing": 2,
+    "verify missing log.csv": 2,
+    "channels log.csv": 0,
+    "channels log.csv --json": 0,
+    "channels missing.csv": 2,
+    "batch missing": 2,
+    " ".join(["design", "sweep", *SIGNAL, "--json"]): 0,
+    " ".join(["design", "multisine", *SIGNAL]): 0,
+}
+
+
+def test_help_lists_designs_and_wrong_options_do_not_import_jax(tmp_path):
+    rows = "".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(50))
+    (tmp_path / "log.csv").write_text(f"time,u,y\n{rows}")
+    asked = json.dumps([line.split() for line in LIGHT])
+    answer = subprocess.run(
+        [sys.executable, "-c", PROGRAM, asked], cwd=tmp_path, capture_output=True, check=True
+    )
+    expected = [[line.split(), code, False] for line, code in LIGHT.items()]
+    assert json.loads(answer.stdout) == expected
