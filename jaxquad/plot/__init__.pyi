@@ -15,5 +15,10 @@ from ._histories import (
     record_figure as record_figure,
     ROWS as ROWS,
 )
-from ._labels import short_names as short_names, unit_label as unit_label, visible as visible
+from ._labels import (
+    plain_ticks as plain_ticks,
+    short_names as short_names,
+    unit_label as unit_label,
+    visible as visible,
+)
 from ._tuning import convergence_figure as convergence_figure, front_figure as front_figure

@@ -15,7 +15,8 @@ from jaxquad.identify import as_sampled
 from jaxquad.models import evaluate_response, Model
 from jaxquad.spectra import FrequencyResponse
 
-from ._labels import plain_ticks, Style
+from ._labels import few_ticks, plain_ticks, Style
+from ._panels import arrange, legend_of, stacked
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
@@ -60,8 +61,7 @@ def bode(
     **Raises:** ValueError for an unknown `pair`.
     """
     o, i = _position(frf, pair)
-    figure = Figure(figsize=(6.5, 7.0), layout="constrained")
-    axes = list(figure.subplots(3, 1, sharex=True, height_ratios=[3, 3, 1.6]))
+    figure, axes = stacked(3)
     measured = _curve(frf, o, i)
     _draw_measured(axes, measured, f"{frf.method} estimate")
     for k, (name, other) in enumerate((others or {}).items()):
@@ -72,7 +72,8 @@ def bode(
         drawn = _model_curve(as_sampled(each, frf), measured, o, i)
         _draw_model(axes, _beside(drawn, measured), name, k)
     _scale(axes, measured)
-    _label(figure, axes, f"{frf.output_names[o]} / {frf.input_names[i]}", title)
+    _label(axes, f"{frf.output_names[o]} / {frf.input_names[i]}")
+    arrange(figure, axes, (2.1, 2.1, 1.1), above=0.45, title=title, legend=legend_of(axes[:1]))
     return figure
 
 
@@ -172,10 +173,12 @@ def _scale(axes: Sequence[Axes], curve: _Curve) -> None:
         axis.set_ylim(shown.min() - margin, shown.max() + margin)
 
 
-def _label(figure: Figure, axes: Sequence[Axes], name: str, title: str) -> None:
+def _label(axes: Sequence[Axes], name: str) -> None:
     for axis, text in zip(axes, (f"|{name}|, dB", "phase, deg", "coherence"), strict=True):
         axis.set_ylabel(text)
-        axis.grid(True, which="both", color="0.9", lw=0.5)
+        axis.grid(True, color="0.9", lw=0.5)
+        few_ticks(axis.yaxis, 5)
+    axes[2].set_yticks((0, 0.5, 1))
     axes[2].axhline(COHERENT, color="0.4", lw=0.8, ls="--")
     axes[2].text(0.995, COHERENT + 0.02, f"{COHERENT}", ha="right", va="bottom", fontsize=8,
                  color="0.3", transform=axes[2].get_yaxis_transform())  # fmt: skip
@@ -186,11 +189,6 @@ def _label(figure: Figure, axes: Sequence[Axes], name: str, title: str) -> None:
     hertz.set_xlabel("frequency, Hz")
     for axis in (axes[2].xaxis, hertz.xaxis):
         plain_ticks(axis)
-    handles, labels = axes[0].get_legend_handles_labels()
-    columns = min(len(labels), 3)
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9)
-    if title:
-        figure.suptitle(title)
 
 
 _SIGMAS = 1.96  # of a normal error, that hold 95 %
@@ -249,8 +247,7 @@ def residual_figure(found: Residuals) -> Figure:
 
     Points whose coherence is below 0.6 are faint.
     """
-    figure = Figure(figsize=(6.5, 4.0), layout="constrained")
-    panels = figure.subplots(2, 1, sharex=True)
+    figure, panels = stacked(2)
     for panel, values, text in (
         (panels[0], found.magnitude, "magnitude"),
         (panels[1], found.phase, "phase"),
@@ -264,8 +261,9 @@ def residual_figure(found: Residuals) -> Figure:
         panel.set_ylim(-reach, reach)
         panel.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         panel.set_ylabel(f"{text} / error")
-        panel.grid(True, which="both", color="0.93", lw=0.5)
+        panel.grid(True, color="0.93", lw=0.5)
     panels[1].set(xscale="log", xlabel="frequency, rad/s")
     panels[1].set_xlim(found.omega[0] / 1.05, found.omega[-1] * 1.05)
     plain_ticks(panels[1].xaxis)
+    arrange(figure, panels, (1.6, 1.6))
     return figure

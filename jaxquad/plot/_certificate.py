@@ -9,9 +9,11 @@ from matplotlib.figure import Figure
 from jaxquad.tuning import Certificate, QUANTITIES, Quantity
 
 from ._labels import draw_limit, marks, plain_ticks, raise_powers
+from ._panels import arrange, legend_of, stacked
 
 
 _TOPS = {"sensitivity_peak": 30.0}  # where the picture ends: more is as good as unstable
+_LETTER = 0.067  # inches, of a design's name
 
 
 def certificate_figure(
@@ -39,17 +41,19 @@ def certificate_figure(
     if unknown:
         raise ValueError(f"no designs {unknown}: choose from {list(certificate.designs)}")
     heights = [0.28 * len(names) + 0.1, *(2.7 for _ in quantities)]
-    figure = Figure(figsize=(7.5, 1.5 + sum(heights)), layout="constrained")
-    panels = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
+    figure, panels = stacked(len(heights))
     place, label = _inertia(certificate)
     _stability(panels[0], certificate, names, place)
     for panel, quantity in zip(panels[1:], quantities, strict=True):
         _members(panel, certificate, quantity, names, place)
     panels[-1].set_xlabel(label)
-    _finish(figure, panels)
+    named = _finish(panels)
     failed = [str(each) for each in certificate.verdicts if each.holds is False]
     lines = [title] if title else [str(certificate).splitlines()[0], *failed]
-    figure.suptitle("\n".join(part for line in lines for part in wrap(line, 95)), fontsize=9)
+    title = "\n".join(part for line in lines for part in wrap(line, 95))
+    longest = max(len(label.get_text()) for label in panels[0].get_yticklabels())
+    left = max(0.9, 0.2 + _LETTER * longest)
+    arrange(figure, panels, heights, width=6.4 + left, left=left, title=title, legend=named)
     return figure
 
 
@@ -58,7 +62,7 @@ def _inertia(certificate: Certificate) -> tuple[np.ndarray, str]:
     inertia = certificate.facts["inertia"]
     mean = lambda x: np.exp(np.mean(np.log(x), axis=0))
     if certificate.nominal is None:
-        return mean(inertia), "inertia J of the member, kg m$^2$"
+        return mean(inertia), raise_powers("inertia J of the member, kg m^2")
     return mean(inertia / certificate.nominal[:, None]), "inertia of the member, J / J0"
 
 
@@ -112,18 +116,15 @@ def _label(shown: Quantity, top: float) -> str:
     )
 
 
-def _finish(figure: Figure, panels: Sequence[Axes]) -> None:
-    named: dict[str, Artist] = {}
-    for panel in panels[1:]:
-        panel.grid(True, which="major", color="0.9", lw=0.5)
-        handles, labels = panel.get_legend_handles_labels()
-        named |= dict(zip(labels, handles, strict=True))
+def _finish(panels: Sequence[Axes]) -> dict[str, Artist]:
+    """Returns the legend."""
     panels[-1].set_xscale("log")
-    for axis in [panels[-1].xaxis, *(panel.yaxis for panel in panels[1:])]:
-        if axis.get_scale() == "log":
-            subs = (1, 2, 3, 5) if axis is panels[-1].xaxis else (1, 2, 5)
-            plain_ticks(axis, subs)
+    for panel in panels[1:]:
+        panel.grid(True, color="0.9", lw=0.5)
+        if panel.get_yscale() == "log":
+            plain_ticks(panel.yaxis)
+    plain_ticks(panels[-1].xaxis)
+    named = legend_of(panels[1:])
     crosses = [name for name in named if name == "linearly unstable"]
     order = [name for name in named if name not in crosses][::-1] + crosses
-    figure.legend([named[name] for name in order], order, loc="outside lower center", ncols=3,
-                  fontsize=9)  # fmt: skip
+    return {name: named[name] for name in order}

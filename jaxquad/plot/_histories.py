@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from jaxquad.identify import Agreement, Verification
 from jaxquad.records import Record
 
-from ._labels import short_names, Style, unit_label, visible
+from ._labels import few_ticks, short_names, Style, unit_label, visible
+from ._panels import arrange, legend_of, stacked
 
 
 Places = Int[np.ndarray, " kept"]
@@ -65,8 +66,7 @@ def record_figure(record: Record, channels: Sequence[tuple[str, str]] | None = N
       outputs.
     """
     channels = channels_of(record) if channels is None else channels
-    figure = Figure(figsize=(6.5, 0.7 + 1.35 * len(channels)), layout="constrained")
-    panels = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    figure, panels = stacked(len(channels))
     labels = short_names([name for _, name in channels])
     for panel, (role, name), label in zip(panels, channels, labels, strict=True):
         scale, unit = unit_label(visible(record.unit(name))[:12])
@@ -74,11 +74,12 @@ def record_figure(record: Record, channels: Sequence[tuple[str, str]] | None = N
         kept = extremes(values)
         panel.plot(record.time[kept], scale * values[kept], color=_COLOURS[role], lw=0.7)
         panel.set_ylabel(unit.removeprefix(", "))
-        panel.set_title(f"{role}: {label}", loc="left", fontsize=9, pad=3)
+        panel.set_title(f"{role}: {label}", loc="left", fontsize=9, pad=3, y=1.0)
+        few_ticks(panel.yaxis, 4)
         panel.grid(True, color="0.9", lw=0.5)
         panel.margins(x=0)
     panels[-1].set_xlabel("time, s")
-    figure.align_ylabels(panels)
+    arrange(figure, panels, [1.0] * len(panels), above=0.2, gap=0.35)
     return figure
 
 
@@ -96,8 +97,7 @@ def overlay(check: Verification, *, title: str = "") -> Figure:
     - `title`: above the figure, before the measures of agreement.
     """
     count = len(check.outputs)
-    figure = Figure(figsize=(6.5, 4.5 if count == 1 else 3.2 * count + 0.6), layout="constrained")
-    axes = list(figure.subplots(2 * count, 1, sharex=True, height_ratios=[3, 1.2] * count))
+    figure, axes = stacked(2 * count)
     shape = (check.time.size, count)
     measured, simulated = check.measured.reshape(shape), check.simulated.reshape(shape)
     for k, one in enumerate(check.outputs):
@@ -108,7 +108,8 @@ def overlay(check: Verification, *, title: str = "") -> Figure:
         f"fit {check.fit_percent:.1f} %, variance accounted for {check.variance_percent:.1f} %, "
         f"TIC {check.tic:.3f}{where}"
     )
-    figure.suptitle(f"{title}\n{numbers}" if title else numbers, fontsize=10)
+    heights = [2.4, 1.0] if count == 1 else [1.8, 0.9] * count
+    arrange(figure, axes, heights, title=f"{title}\n{numbers}" if title else numbers)
     return figure
 
 
@@ -124,6 +125,7 @@ def _draw(
     top.set_ylabel(f"{one.name}{unit}")
     _plot(bottom, time, scale * (measured - simulated), {"color": "tab:red", "lw": 0.9})
     bottom.set_ylabel(f"difference{unit}")
+    few_ticks(bottom.yaxis, 4)
     for axis in axes:
         axis.grid(True, color="0.9", lw=0.5)
         axis.margins(x=0)
@@ -171,9 +173,7 @@ def histories(
     unknown = [text for text in limits or {} if text not in panels]
     if unknown:
         raise ValueError(f"limits for {unknown}, but the panels are {list(panels)}")
-    height = 0.9 + 2.3 * len(panels)
-    figure = Figure(figsize=(6.5, max(height, 3.6)), layout="constrained")
-    axes = list(figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0])
+    figure, axes = stacked(len(panels))
     for axis, (text, curves) in zip(axes, panels.items(), strict=True):
         for name, values in curves.items():
             shown = np.asarray(values, float)
@@ -183,9 +183,8 @@ def histories(
         axis.margins(x=0)
         axis.set_ylim((limits or {}).get(text, axis.get_ylim()))
     axes[-1].set_xlabel("time, s")
-    _legend(figure, axes)
-    if title:
-        figure.suptitle(title, fontsize=10)
+    heights = [2.1 if len(axes) > 1 else 2.5] * len(axes)
+    arrange(figure, axes, heights, title=title, legend=legend_of(axes), handle_length=3.5)
     return figure
 
 
@@ -200,15 +199,3 @@ def _styles(
             f"split {others} over several figures"
         )
     return dict(zip(others, _LINES, strict=False)) | ({target: _TARGET} if target else {})
-
-
-def _legend(figure: Figure, axes: Sequence[Axes]) -> None:
-    named = {}
-    for axis in axes:
-        handles, labels = axis.get_legend_handles_labels()
-        named |= dict(zip(labels, handles, strict=True))
-    columns = min(len(named), 3)
-    figure.legend(
-        named.values(), named.keys(), loc="outside lower center", ncols=columns, fontsize=9,
-        handlelength=3.5,
-    )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 
 # Controls, overrides of the reading direction, halves of surrogate pairs: they break HTML, XML or
@@ -53,16 +53,47 @@ def unit_label(unit: str) -> tuple[float, str]:
     return 1.0, f", {unit}" if unit else ""
 
 
+_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def raise_powers(text: str) -> str:
-    """`deg s^2` with its exponent raised."""
-    return re.sub(r"\^(\d+)", r"$^{\1}$", text)
+    """`deg s^2` with its exponent raised; a letter of the font, which takes no formula."""
+    return re.sub(r"\^(\d+)", lambda power: power[1].translate(_RAISED), text)
 
 
-def plain_ticks(axis: Axis, subs: Sequence[float | int] = (1, 2, 5)) -> None:
-    """Ticks at `subs` of every decade as plain numbers, not as 2 x 10^1."""
-    axis.set_major_locator(LogLocator(subs=subs))
+class _Ticks(LogLocator):
+    """At most so many ticks at round numbers of a logarithmic axis."""
+
+    STEPS = ((1, 1.5, 2, 3, 4, 5, 7), (1, 2, 5), (1,))  # of a decade
+
+    def __init__(self, most: int):
+        super().__init__()
+        self.most = most
+
+    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+        low, high = sorted((vmin, vmax))
+        decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+        ticks = np.empty(0)
+        for steps in self.STEPS:
+            each = np.multiply.outer(decades, steps).ravel()
+            ticks = each[(each >= low * (1 - 1e-9)) & (each <= high * (1 + 1e-9))]
+            if ticks.size <= self.most:
+                break
+        if ticks.size < 2:
+            return MaxNLocator(self.most).tick_values(low, high)
+        return ticks[:: -(-ticks.size // self.most)]
+
+
+def few_ticks(axis: Axis, most: int) -> None:
+    """At most so many intervals of a linear axis, at round numbers."""
+    axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
+
+
+def plain_ticks(axis: Axis, most: int = 6) -> None:
+    """At most so many ticks of a logarithmic axis, as plain numbers, not as 2 x 10^1."""
+    axis.set_major_locator(_Ticks(most))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())
 
 
 def marks(names: Iterable[str]) -> dict[str, Style]:

@@ -1,6 +1,7 @@
 """How a tune went, and the front of several."""
 
 from collections.abc import Sequence
+from textwrap import wrap
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from jaxquad.tuning import DesignResult, Evaluation, front_point, Pareto, QUANTITIES
 
 from ._labels import draw_limit, marks, plain_ticks, raise_powers, Style
+from ._panels import arrange, legend_of, stacked
 
 
 Count = Int[np.ndarray, " evaluations"]
@@ -38,18 +40,15 @@ def convergence_figure(history: Sequence[Evaluation], *, title: str = "") -> Fig
     flying = np.array([one.phase == "optimise" for one in history])
     cost = np.where(flying[:, None], [np.atleast_1d(one.cost) for one in history], np.nan)
     stable = np.array([np.atleast_1d(one.stable) for one in history])
-    figure = Figure(figsize=(6.5, 5.0), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1.6])
+    figure, (top, bottom) = stacked(2)
     _costs(top, count, cost)
     _shares(bottom, count, stable)
     _stabilising((top, bottom), count, flying)
     bottom.set_xlabel("gradient evaluation")
     bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
     bottom.set_xlim(0.5, len(history) + 0.5)
-    if cost.shape[1] > 1:
-        figure.legend(*top.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    if title:
-        figure.suptitle(title, fontsize=10)
+    legend = legend_of([top]) if cost.shape[1] > 1 else None
+    arrange(figure, (top, bottom), (2.6, 1.4), title=title, legend=legend)
     return figure
 
 
@@ -66,8 +65,9 @@ def _costs(panel: Axes, count: Count, cost: Values) -> None:
         panel.plot(count[known], least, lw=1.4, label=f"start {k + 1}", **style)
         panel.plot(count[known], line[known], "o", ms=3, mfc="none", mew=0.8, color=style["color"])
     panel.set(yscale="log", ylabel="cost above the best")
+    plain_ticks(panel.yaxis)
     draw_limit(panel, _CLOSE, "1 %")
-    panel.grid(True, which="major", color="0.9", lw=0.5)
+    panel.grid(True, color="0.9", lw=0.5)
 
 
 def _shares(panel: Axes, count: Count, stable: Values) -> None:
@@ -79,7 +79,7 @@ def _shares(panel: Axes, count: Count, stable: Values) -> None:
         }
         panel.plot(count[known], 100 * line[known], drawstyle="steps-mid", lw=1.4, **style)
     panel.set(ylabel="stable members, %", ylim=(-4, 104))
-    panel.grid(True, which="major", color="0.9", lw=0.5)
+    panel.grid(True, color="0.9", lw=0.5)
 
 
 def _stabilising(
@@ -109,8 +109,7 @@ def front_figure(pareto: Pareto, *, title: str = "") -> Figure:
     - `pareto`: see `jaxquad.tuning`.
     - `title`: by default what is shown.
     """
-    figure = Figure(figsize=(7.0, 5.0), layout="constrained")
-    panel = figure.subplots()
+    figure, [panel] = stacked(1)
     _front(panel, pareto)
     edge = _edge(pareto)
     styles = list(marks(["front", *pareto.peers]).items())[1:]
@@ -124,8 +123,8 @@ def front_figure(pareto: Pareto, *, title: str = "") -> Figure:
     panel.set(xscale="log", yscale="log", ylabel=f"ITAE, {raise_powers('deg s^2')}")
     panel.set_xlabel(f"{_TITLES[pareto.over]} of the members{unit}")
     _ticks(panel)
-    figure.legend(loc="outside lower center", ncols=3, fontsize=9)
-    figure.suptitle(title or _message(pareto), fontsize=10)
+    title = "\n".join(wrap(title or _message(pareto), 95))
+    arrange(figure, [panel], [3.4], width=7.0, title=title, legend=legend_of([panel]))
     return figure
 
 
@@ -180,7 +179,5 @@ def _without(panel: Axes, edge: float) -> None:
 
 def _ticks(panel: Axes) -> None:
     for axis in (panel.xaxis, panel.yaxis):
-        low, high = axis.get_view_interval()
-        subs = (1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 7)
-        plain_ticks(axis, subs)
-    panel.grid(True, which="major", color="0.9", lw=0.5)
+        plain_ticks(axis)
+    panel.grid(True, color="0.9", lw=0.5)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib import rc_context
@@ -63,6 +64,7 @@ def render_page(template: str, **content: object) -> str:
 
 
 _LARGEST = 220_000  # bytes of an SVG; a PNG of the figures here has about half of that
+_OF_TEXTS, _OF_A_MARK, _OF_A_CORNER = 45_000, 145, 14  # bytes
 _DPI = 150  # of a PNG
 _PATH = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
@@ -86,13 +88,9 @@ def embed_figure(
     alt: str,
     caption: str = "",
     ratio: tuple[str, str] | None = None,
-    formulas: bool = False,
 ) -> Image:
-    """What `draw()` returns as an image.
-
-    Texts in it are drawn as they are, dollar signs too, unless they are known to hold `formulas`.
-    """
-    settings = {"svg.hashsalt": "jaxquad", "svg.fonttype": "path", "text.parse_math": formulas}
+    """What `draw()` returns as an image. Texts in it are drawn as they are, dollar signs too."""
+    settings = {"svg.hashsalt": "jaxquad", "svg.fonttype": "path", "text.parse_math": False}
     with warnings.catch_warnings(), rc_context(settings):  # pyright: ignore[reportArgumentType]
         # A letter that the font does not have is drawn as a box: the caption holds it.
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
@@ -104,16 +102,20 @@ def embed_figure(
 
 
 def _encoded(drawn: Figure) -> tuple[str, bytes]:
-    if (layout := drawn.get_layout_engine()) is not None:
-        layout.execute(drawn)  # once: savefig would do it twice, which takes longest of all
-        drawn.set_layout_engine("none")
-    svg = io.BytesIO()
-    drawn.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-    if len(lines := _rounded(svg.getvalue())) <= _LARGEST:
-        return "svg+xml", lines
-    png = io.BytesIO()
-    drawn.savefig(png, format="png", dpi=_DPI, metadata={"Software": None})
-    return "png", png.getvalue()
+    file = io.BytesIO()
+    if _svg_size(drawn) > _LARGEST:
+        drawn.savefig(file, format="png", dpi=_DPI, metadata={"Software": None})
+        return "png", file.getvalue()
+    drawn.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    return "svg+xml", _rounded(file.getvalue())
+
+
+def _svg_size(drawn: Figure) -> int:
+    """In bytes, about: before it is drawn, because that takes longest of all."""
+    lines = [line for panel in drawn.axes for line in panel.get_lines()]
+    marked = sum(np.size(line.get_xdata()) for line in lines if line.get_marker() != "None")
+    joined = sum(np.size(line.get_xdata()) for line in lines if line.get_linestyle() != "None")
+    return _OF_TEXTS + _OF_A_MARK * marked + _OF_A_CORNER * joined
 
 
 def _rounded(svg: bytes) -> bytes:

@@ -38,7 +38,6 @@ def _gains(tuned: Tuned) -> dict[str, object]:
         image = embed_figure(
             lambda: convergence_figure(tuned.history),
             alt="Cost above the best found and share of stable members, by gradient evaluation.",
-            formulas=True,  # powers of ten
         )
     table = Table("Gains", ("gain", "value"), rows)
     return {"table": table, "facts": facts, "remarks": tuned.remarks, "image": image}
@@ -51,7 +50,6 @@ def _certificate(certificate: Certificate) -> dict[str, object]:
         lambda: certificate_figure(certificate, quantities=quantities, designs=designs),
         alt="Every member over its inertia: whether it is stable, and its "
         f"{' and '.join(QUANTITIES[q].title for q in quantities)}, for {', '.join(designs)}.",
-        formulas=True,
     )
     return {
         "verdict": str(certificate).splitlines()[0],

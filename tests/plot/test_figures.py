@@ -5,10 +5,22 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
-from jaxquad.plot import bode, extremes, overlay, record_figure, residuals_of, short_names
+from jaxquad.plot import (
+    bode,
+    extremes,
+    histories,
+    overlay,
+    plain_ticks,
+    record_figure,
+    residual_figure,
+    residuals_of,
+    short_names,
+)
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -75,6 +87,43 @@ def test_an_overlay_shows_degrees_and_the_measures(check):
         lines(top)["measured"].get_ydata(), np.degrees(check.measured), rtol=1e-12
     )
     assert f"{check.fit_percent:.1f} %" in figure.get_suptitle()
+
+
+def of_many_texts(check, frf):
+    """Figures whose titles, legends and numbers take much room."""
+    long = {f"{'identified with a long name'} {k}": TRUTH for k in range(5)}
+    size = np.geomspace(1.0, 1e4, check.time.size)
+    record = jq.Record(check.time, -12345.6 * size, 0.00012 / size, output_units="rad/s")
+    return {
+        "bode": bode(frf, long, others={"direct estimate": frf}, title="two\nlines"),
+        "overlay": overlay(check, title="flight.npz"),
+        "record": record_figure(record),
+        "residuals": residual_figure(residuals_of(frf, TRUTH, 0, 0)),
+        "histories": histories(check.time, {"x, V": dict.fromkeys("abcde", 1e5 * check.measured)}),
+    }
+
+
+def test_nothing_is_cut_off_and_no_legend_lies_on_an_axis(check, frf):
+    """The layout is fixed: it counts lines instead of measuring texts."""
+    for name, figure in of_many_texts(check, frf).items():
+        renderer = FigureCanvasAgg(figure).get_renderer()
+        figure.draw(renderer)
+        inked, size = figure.get_tightbbox(renderer), figure.get_size_inches()
+        assert inked.x0 > 0 and inked.y0 > 0, name
+        assert inked.x1 < size[0] and inked.y1 < size[1], name
+        below = figure.axes[-1].xaxis.get_tightbbox(renderer)
+        for legend in figure.legends:
+            assert legend.get_window_extent(renderer).y1 < below.y0, name
+
+
+def test_logarithmic_axes_have_few_ticks_at_round_numbers():
+    for low, high in ((4.4, 75.4), (0.5, 3.0), (1e-5, 2.0), (6.1, 6.9), (1e-9, 1e9)):
+        panel = Figure().subplots()
+        panel.set(xscale="log", xlim=(low, high))
+        plain_ticks(panel.xaxis)
+        ticks = panel.get_xticks()
+        assert 2 <= ((ticks >= low) & (ticks <= high)).sum() and ticks.size <= 8
+        assert not panel.get_xticks(minor=True).size
 
 
 def test_every_channel_of_a_record_is_drawn():
