@@ -76,6 +76,7 @@ def record_figure(record: Record, channels: Sequence[tuple[str, str]] | None = N
         panel.set_ylabel(unit.removeprefix(", "))
         panel.set_title(f"{role}: {label}", loc="left", fontsize=9, pad=3, y=1.0)
         few_ticks(panel.yaxis, 4)
+        panel.yaxis.set_offset_position("right")  # of a power of ten, else on the title
         panel.grid(True, color="0.9", lw=0.5)
         panel.margins(x=0)
     panels[-1].set_xlabel("time, s")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 
 WIDTH = 6.5
-_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP = 0.9, 0.15, 0.12, 0.5, 0.12
+_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP = 0.9, 0.15, 0.2, 0.5, 0.12
 _LABEL = 0.68  # from a panel to the label of its vertical axis
 _LINE = 0.2  # of a legend or a title
 _LETTER = 0.072  # of a legend, on average
