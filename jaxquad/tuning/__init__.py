@@ -28,6 +28,7 @@ from ._peers import (
     peers as peers,
 )
 from ._quantities import QUANTITIES as QUANTITIES, Quantity as Quantity
+from ._tail import Tail as Tail
 from ._tune import tune as tune
 from ._tuned import LimitResult as LimitResult, Optimum as Optimum, Tuned as Tuned
 from ._verdict import Bound as Bound, Verdict as Verdict

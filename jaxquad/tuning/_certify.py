@@ -1,6 +1,5 @@
 import dataclasses
 import functools as ft
-import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
@@ -8,37 +7,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
-from jaxquad.control import (
-    LADRC,
-    LinearisableController,
-    ObserverController,
-    PID,
-    Reference,
-    schedule_for_analysis,
-)
+from jaxquad.control import Reference
 from jaxquad.ensembles import Ensemble, Members
-from jaxquad.loops import Loop, loop_numbers, LoopNumbers
-from jaxquad.models import DecoupledAxes, Multirotor
-from jaxquad.simulation import (
-    Authority,
-    AuthorityWarning,
-    beyond_authority,
-    evaluate,
-    find_authority,
-    Metrics,
-    Scenario,
-)
+from jaxquad.loops import Loop
+from jaxquad.simulation import Authority, beyond_authority, find_authority, Scenario
 
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
-from ._design_result import DesignResult, measure_distances
+from ._design_result import measure_distances
+from ._evaluate_design import analyse_further, evaluate_design, member_facts
 from ._objective import Limit
-from ._problem import DeviceChoice, TimeSpan
-from ._quantities import LINEAR, QUANTITIES
-
-
-Plant = DecoupledAxes | Multirotor
+from ._problem import decouple, DeviceChoice, TimeSpan
+from ._quantities import QUANTITIES
 
 
 def certify(
@@ -50,6 +31,7 @@ def certify(
     peers: Mapping[str, PyTree] | None = None,
     begun: PyTree | None = None,
     members: int = 256,
+    linear_members: int | None = None,
     key: Key[Array, ""] | None = None,
     events: Sequence[float] = (),
     start: float = 0.0,
@@ -60,7 +42,10 @@ def certify(
 ) -> Certificate:
     """Evaluate a design on members that its tuner never saw, beside its peers.
 
-    A payload counts in the linear loops with the most and the least of it, the worse of all.
+    All designs fly on `members`. The linear loop of the design itself is analysed on many more,
+    because its limits end in the tail of the ensemble: 256 members seldom show what happens to one
+    in 1000. A payload counts in the linear loops with the most and the least of it, the worse of
+    all.
 
     !!! example
 
@@ -79,7 +64,9 @@ def certify(
     - `limits`: what the design has to meet.
     - `peers`: other controllers to stand beside the design, by name.
     - `begun`: the controller that a tuning started from, whose error stands beside the design's.
-    - `members`: how many are drawn.
+    - `members`: how many are drawn to fly.
+    - `linear_members`: how many further members have their linear loops analysed, rounded up to
+        whole multiples of `members`; by default eight times as many as fly, at most 2048.
     - `key`: give the tuner's key, whose training members are other draws; `jax.random.key(0)` by
         default.
     - `events`: times in s at which ITAE's clock starts again and a new step begins.
@@ -109,18 +96,25 @@ def certify(
     span = TimeSpan(tuple(events), start, stop, load_start)
     run = ft.partial(evaluate_design, members=drawn, flight=flight, span=span, devices=devices)
     results = {n: run(x) for n, x in designs.items()}
+    further = None
+    if isinstance(ensemble, Ensemble):
+        further = analyse_further(
+            loop, ensemble, scenario, key, flown=members, count=linear_members
+        )
     known = _provenance(ensemble, drawn, key)
+    known["linear_members"] = 0 if further is None else further.design.members
     known["controller"] = _describe_controller(loop.controller)
     found = Certificate(
         designs=results,
-        distances=measure_distances(results[name], limits, independent=not given),
-        facts=_facts(drawn),
+        distances=measure_distances(results[name], limits, independent=not given, further=further),
+        facts=member_facts(drawn),
         nominal=_nominal_inertia(loop) if isinstance(ensemble, Ensemble) else None,
         provenance=known,
         remarks=(),
         idle=run(_Idle()),
         start=None if begun is None else run(begun),
         error="itae" if _moves(flight) else "rms",
+        further=further,
     )
     limits_of = _authority(loop, drawn)
     remarks = _remarks(found, loop.controller, drawn) + beyond_authority(limits_of, flight)
@@ -199,16 +193,6 @@ def _named(peers: Mapping[str, PyTree], name: str) -> dict[str, PyTree]:
     return dict(peers)
 
 
-def _facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
-    plant = decouple(drawn.plant)
-    given = {"inertia": plant.inertia, "torque_gain": plant.torque_gain, "lag": plant.lag}
-    shape = (plant.shape[0], drawn.size)
-    wide = lambda x: np.broadcast_to(np.asarray(x) if x.ndim > 1 else x[:, None], shape)
-    facts = {n: np.array(wide(x)) for n, x in given.items() if x is not None}
-    facts["delay"] = np.array(np.broadcast_to(np.asarray(drawn.delay), shape))
-    return facts | {"assumed_inertia": np.asarray(drawn.assumed_inertia) / facts["inertia"]}
-
-
 def _nominal_inertia(loop: Loop) -> Float[np.ndarray, " axes"]:
     axes = decouple(loop.plant)
     return np.array(jnp.broadcast_to(axes.inertia, axes.shape))
@@ -219,6 +203,7 @@ def _provenance(given: Ensemble | Members, drawn: Members, key: Key[Array, ""]) 
     names = ("jaxquad", "jax", "jaxlib", "numpy")
     return {
         "members": drawn.size,
+        "linear_members": 0,
         "fresh": fresh,
         "sampling": "random" if fresh else "given",
         "key": np.asarray(jax.random.key_data(key)).tolist() if fresh else None,
@@ -248,128 +233,3 @@ def _remarks(found: Certificate, controller: PyTree, drawn: Members) -> list[str
         remarks.append(f"no Ms and no margins (n/a) over members that are unstable: {text}")
     others = [(n, x.observer_instability) for n, x in found.designs.items() if n != found.name]
     return remarks + [f"of {n}: {why}" for n, why in others if why]
-
-
-def decouple(plant: object) -> DecoupledAxes:
-    """The plant near level flight, one axis at a time."""
-    axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
-    assert isinstance(axes, DecoupledAxes)
-    return axes
-
-
-def evaluate_design(
-    controller: PyTree,
-    members: Members,
-    flight: Scenario,
-    span: TimeSpan,
-    devices: DeviceChoice = None,
-) -> DesignResult:
-    """`controller` on all `members`, in a `flight` that has their noise in it.
-
-    The loop in time holds every limit, the encoder and dry friction. The linear one is exact, and
-    is that of a controller with a method `linear`, a scheduled or adaptive one at the inertia that
-    it is given.
-    """
-    axes = flight.reference.shape[1]
-    loop = members.loop(controller)
-    loop = loop.with_controller(_widen(loop.controller, axes, members.size))
-
-    def run(start: float, stop: float | None, load_start: float | None = None) -> Metrics:
-        return evaluate(
-            loop, flight, start=start, stop=stop, load_start=load_start, devices=devices
-        )
-
-    with warnings.catch_warnings():  # the certificate says it
-        warnings.simplefilter("ignore", AuthorityWarning)
-        whole = run(span.start, span.stop, span.load_start)
-        single = len(span.parts) == 1 and span.load_start is None
-        parts = [whole] if single else [run(*part) for part in span.parts]
-    numbers = _join(whole, parts)
-    linear = _linear(controller, members, flight)
-    if linear is not None:
-        numbers |= {name: linear._asdict()[name] for name in LINEAR}
-    unstable = None if linear is None else ~np.all(linear.stable, axis=0)
-    observed = isinstance(controller, ObserverController)
-    why = controller.observer_instability() if observed else ""
-    diverged = np.asarray(whole.diverged)
-    return DesignResult(numbers, unstable, diverged, diverged | _carried_off(parts, flight), why)
-
-
-_TILTED = np.pi / 2  # rad: a vehicle that is turned further pushes downwards
-
-
-def _carried_off(parts: Sequence[Metrics], flight: Scenario) -> Bool[np.ndarray, " members"]:
-    """Members whose error exceeds all that the reference moves by more than a quarter turn."""
-    reference = np.asarray(flight.reference)
-    moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
-    greatest = np.max([np.asarray(part.peak) for part in parts], axis=(0, 1))
-    return ~(greatest <= _TILTED + moved)
-
-
-_PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what scheduling may change
-
-
-def _widen(controller: PyTree, axes: int, members: int) -> PyTree:
-    """The gains of a LADRC or PID in one shape, so that all of a kind share a compile."""
-    if not isinstance(controller, LADRC | PID):
-        return controller
-    gains = {name: x for name, x in vars(controller).items() if isinstance(x, Array)}
-    full = {name: _full(x, name, axes, members) for name, x in gains.items()}
-    return dataclasses.replace(controller, **full)
-
-
-def _full(gain: Array, name: str, axes: int, members: int) -> Array:
-    shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
-    given = np.asarray(gain)
-    aligned = given.reshape(given.shape + (1,) * (len(shape) - given.ndim)) if given.ndim else given
-    return jnp.asarray(np.broadcast_to(aligned, shape))
-
-
-_INTEGRALS = ("itae", "iae", "ise")
-_WHOLE = ("activity", "energy", "saturation_share", "peak", "rms", "disturbance_rmse")
-
-
-def _join(whole: Metrics, parts: Sequence[Metrics]) -> dict[str, np.ndarray]:
-    stack = lambda name: np.stack([np.asarray(vars(one)[name], float) for one in parts])
-    numbers = {name: np.asarray(vars(whole)[name], float) for name in _WHOLE}
-    numbers["activity_rate"] = numbers["activity"] / (whole.stop - whole.start)
-    numbers["overshoot"] = _greatest(stack("overshoot"))
-    return numbers | {name: stack(name).sum(axis=0) for name in _INTEGRALS}
-
-
-def _greatest(values: Float[np.ndarray, "parts axes members"]) -> np.ndarray:
-    """NaN where no part has a step."""
-    known = ~np.isnan(values)
-    greatest = np.max(np.where(known, values, -np.inf), axis=0)
-    return np.where(known.any(axis=0), greatest, np.nan)
-
-
-def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:
-    scheduled = schedule_for_analysis(controller, members.assumed_inertia)
-    if not isinstance(scheduled, LinearisableController):
-        return None
-    axes = flight.reference.shape[1]
-    loop = members.loop(controller).with_controller(_widen(scheduled, axes, members.size))
-    plants = _with_payloads(members.plant, flight)
-    return _worst([loop_numbers(loop.with_plant(x), range(axes)) for x in plants], members.size)
-
-
-def _worst(loops: Sequence[LoopNumbers], members: int) -> LoopNumbers:
-    """Of the same members as different plants: stable where all are, else NaN as one of them."""
-    each = lambda x: np.broadcast_to(x.reshape(len(x), -1), (len(x), members))
-    loops = [LoopNumbers(*map(each, loop)) for loop in loops]
-    stable = np.all([loop.stable for loop in loops], axis=0)
-    worst = {"abscissa": np.max([loop.abscissa for loop in loops], axis=0)}
-    for name in LoopNumbers._fields[2:]:
-        find = np.min if name.endswith("margin") else np.max
-        found = find([loop._asdict()[name] for loop in loops], axis=0)
-        worst[name] = np.where(stable, found, np.nan)
-    return LoopNumbers(stable, **worst)
-
-
-def _with_payloads(plant: Plant, flight: Scenario) -> list[Plant]:
-    """The plant, and with the most and the least that the flight makes it carry."""
-    if flight.payload is None:
-        return [plant]
-    extremes = [np.max(flight.payload, axis=0), np.min(flight.payload, axis=0)]
-    return [plant, *(plant.with_added_inertia(x) for x in extremes if np.any(x != 0))]

@@ -69,6 +69,30 @@ class DesignResult(eqx.Module):
         return int(np.argmax(np.where(known, values, -np.inf))) if known.any() else None
 
 
+class LinearMembers(NamedTuple):
+    """Further members of an ensemble, of which only the linear loops were analysed."""
+
+    design: DesignResult  # numbers of the linear loop; none of these members has flown
+    facts: dict[str, Float[np.ndarray, "axes members"]]  # as in `Certificate`
+
+
+def with_further(design: DesignResult, further: LinearMembers | None) -> DesignResult:
+    """The linear loops of the members that flew, and of those that did not, in this order."""
+    if further is None:
+        return design
+    join = lambda a, b: np.concatenate([a, b], axis=-1)
+    mine, other = design, further.design
+    names = [name for name in mine.by_axis if name in other.by_axis]
+    assert mine.unstable is not None and other.unstable is not None
+    return DesignResult(
+        {name: join(mine.by_axis[name], other.by_axis[name]) for name in names},
+        join(mine.unstable, other.unstable),
+        join(mine.diverged, other.diverged),
+        join(mine.lost, other.lost),
+        mine.observer_instability,
+    )
+
+
 def _needs_stability(quantity: str) -> bool:
     return QUANTITIES[quantity].linear and quantity != "abscissa"
 
@@ -82,7 +106,7 @@ def _worst_axis(values: Float[np.ndarray, "axes members"], sign: float) -> Numbe
 def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
     """The exact one-sided confidence bound of a share, by Clopper and Pearson.
 
-    None of 256 bounds the share by 1.2 %, none of 3000 by 0.1 %.
+    None of 256 bounds the share by 1.2 %, none of 2304 by 0.13 %.
     Source: Clopper and Pearson, Biometrika 26 (1934).
 
     **Arguments:**
@@ -259,13 +283,20 @@ def beyond_limit(design: DesignResult, distance: Distance) -> Bool[np.ndarray, "
 
 
 def measure_distances(
-    design: DesignResult, limits: Sequence[Limit], *, independent: bool
+    design: DesignResult,
+    limits: Sequence[Limit],
+    *,
+    independent: bool,
+    further: LinearMembers | None = None,
 ) -> tuple[Distance, ...]:
     """Of one design to each of the limits; bounds of shares only for `independent` members.
 
-    Raise ValueError for quantities that were not computed.
+    Limits of the linear loop count `further` members, too. Raise ValueError for quantities that
+    were not computed.
     """
-    return tuple(_distance(design, limit, independent) for limit in limits)
+    every = with_further(design, further)
+    pick = lambda limit: every if QUANTITIES[limit.quantity].linear else design
+    return tuple(_distance(pick(limit), limit, independent) for limit in limits)
 
 
 def _distance(design: DesignResult, limit: Limit, independent: bool) -> Distance:

@@ -7,7 +7,7 @@ from jaxtyping import PyTree
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
 
-from ._certify import decouple, Plant
+from ._problem import decouple, Plant
 
 
 WC, WO = 10.0, 30.0  # rad/s, the paper's

@@ -1,6 +1,7 @@
 """Stabilise, then optimise: all problems in lockstep, limits by an augmented Lagrangian."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -25,8 +26,17 @@ from ._gauss_newton import GaussNewton, minimise_squares
 from ._lbfgs import Descent, Evaluate, LBFGS, minimise
 from ._objective import Limit, Objective
 from ._parameters import build_design, Coordinates
-from ._problem import Problem
+from ._problem import LinearLoops, Problem
 from ._quantities import QUANTITIES
+from ._tail import (
+    forget_multipliers,
+    half_of_reserve,
+    least_critical,
+    Search,
+    search_tail,
+    SEARCHES,
+    Tail,
+)
 from ._verdict import Bound
 
 
@@ -123,6 +133,7 @@ class Solution(NamedTuple):
     beyond: Float[np.ndarray, "problems limits"]  # greatest, as levels: above 0, violated
     multipliers: Multipliers
     result: CostResult
+    tail: Tail
 
 
 def solve(
@@ -135,8 +146,12 @@ def solve(
     method: LBFGS | GaussNewton,
     rate: float,
     progress: Progress,
+    search: Search | None = None,
 ) -> Solution:
     """Both phases of all problems: `objectives` and `limits` hold arrays [problems, ...].
+
+    Where limits are kept on `problem.limited`, a `search` finds members that are beyond them, and
+    the problems descend again with these.
 
     A problem whose members cannot all be made to decay at `rate` (1/s, negative) stays with the
     first phase's best if one of them is unstable. Otherwise no step is taken to where one is, and
@@ -149,13 +164,17 @@ def solve(
     first = runner.stabilise(np.asarray(start, float))
     slowest = runner.slowest(first.z)
     stable = slowest < 0
-    second, multipliers, result, beyond, counts = runner.optimise(first.z, stable)
+    multipliers = initial_multipliers(problem, limits, len(first.z))
+    found, tail = runner.optimise(first.z, stable, stable, multipliers), Tail()
+    if search is not None and problem.limited is not None:
+        found, tail = runner.keep_on_tail(found, stable, search)
+    second, multipliers, result, beyond, counts = found
     return Solution(
         z=second.z, cost=np.where(stable, np.asarray(result.cost), np.nan),
         gradient=second.gradient, stable=stable, stabilised=slowest < rate,
         converged=second.converged & stable, reasons=second.reasons, refusal=memory.refusal,
         evaluations=counts, stabilising=first.evaluations, beyond=beyond, multipliers=multipliers,
-        result=result,
+        result=result, tail=tail,
     )  # fmt: skip
 
 
@@ -242,10 +261,19 @@ class _Runner(eqx.Module):
         objective = take_problem(self.objectives, k)
         return minimise_squares(self.coordinates, self.problem, objective, z, self.method)
 
-    def optimise(self, z: np.ndarray, able: np.ndarray) -> "_Optimised":
-        """The second phase of the problems that are `able`: rounds of multipliers."""
-        multipliers = initial_multipliers(self.problem, self.limits, len(z))
-        on, everyone, rounds = able.copy(), np.ones_like(able), Rounds()
+    def optimise(
+        self,
+        z: np.ndarray,
+        able: np.ndarray,
+        on: np.ndarray,
+        multipliers: Multipliers,
+        met: ArrayLike = MET,
+    ) -> "_Optimised":
+        """The second phase: rounds of multipliers until limits are `met`, to these levels.
+
+        Problems that are `able` fly, even those that are not `on`.
+        """
+        on, everyone, rounds = on.copy(), np.ones_like(able), Rounds()
         counts, beyond = np.zeros(len(z), int), np.full((len(z), len(self.limits)), np.inf)
         result = self.evaluate(z, everyone, able, multipliers)
         _require_finite(result, able)
@@ -261,7 +289,7 @@ class _Runner(eqx.Module):
                 return _Optimised(descent, multipliers, result, beyond, counts)
             multipliers, beyond = update_multipliers(result, multipliers, beyond, on)
             rounds.add(z, np.asarray(result.cost), beyond)
-            on = on & (beyond.max(axis=1) > MET) & ~rounds.stalled
+            on = on & np.any(beyond > met, axis=1) & ~rounds.stalled
             if not on.any() or counts.max() >= _TIMES * most:
                 break
         assert descent is not None
@@ -271,6 +299,44 @@ class _Runner(eqx.Module):
             beyond = np.stack([np.max(x, axis=1) for x in result.beyond], axis=1)
             descent = descent._replace(z=z, gradient=np.asarray(result.gradient))
         return _Optimised(descent, multipliers, result, beyond, counts)
+
+    def keep_on_tail(
+        self, found: "_Optimised", able: np.ndarray, search: Search
+    ) -> tuple["_Optimised", Tail]:
+        """Search for members that are beyond limits, and descend again with the worst of them."""
+        runner, tail, met = self, Tail(), half_of_reserve(self.limits, search.limits)
+        for number in range(SEARCHES):
+            on = able & np.all(found.beyond <= np.maximum(met, MET), axis=1)
+            if not on.any():
+                break
+            at = ft.partial(runner.on_linear_loops, found.descent.z)
+            worst = search_tail(search, number, at, on)
+            tail = Tail(tail.searched + worst.members, worst.beyond, tail.added)
+            self.progress.say(f"{worst.beyond} of {worst.members} members in the tail are beyond")
+            if not worst.beyond:
+                break
+            limited = runner.problem.limited
+            assert limited is not None
+            places = least_critical(found.result, self.limits, on, len(worst.found))
+            problem = dataclasses.replace(runner.problem, limited=worst.put_into(limited, places))
+            runner = dataclasses.replace(runner, problem=problem)
+            begun = forget_multipliers(found.multipliers, self.limits, places)
+            again = runner.optimise(found.descent.z, able, on, begun, met)
+            found = again._replace(
+                descent=_merge(found.descent, again.descent, on),
+                counts=found.counts + again.counts,
+            )
+            tail = tail._replace(added=tail.added + len(worst.found))
+        return found, tail
+
+    def on_linear_loops(
+        self, z: np.ndarray, loops: LinearLoops, limits: tuple[Limit, ...]
+    ) -> CostResult:
+        """Limits of the linear loop on other members, with what is compiled already."""
+        problem = dataclasses.replace(self.problem, limited=loops)
+        runner = dataclasses.replace(self, problem=problem, limits=limits)
+        multipliers = initial_multipliers(problem, limits, len(z))
+        return runner.evaluate(z, np.ones(len(z), bool), False, multipliers)
 
 
 class _Optimised(NamedTuple):

@@ -1,5 +1,6 @@
 """The members of a tune in their flights: everything that does not change while it runs."""
 
+import dataclasses
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
@@ -7,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
+from jaxquad._core import mark_members
 from jaxquad._xla import asked_devices, Devices, devices_for
 from jaxquad.control import schedule_for_analysis, schedule_for_flight
 from jaxquad.ensembles import Members
@@ -31,6 +33,7 @@ from ._objective import Objective
 
 
 DeviceChoice = int | Sequence[jax.Device] | None  # see `jq.evaluate`
+Plant = DecoupledAxes | Multirotor
 
 
 class TimeSpan(NamedTuple):
@@ -74,6 +77,29 @@ class LinearLoops(eqx.Module):
     def members(self) -> int:
         """How many there are."""
         return self.assumed_inertia.shape[-1]
+
+    def replaced(
+        self,
+        places: Int[np.ndarray, " some"],
+        others: "LinearLoops",
+        chosen: Int[np.ndarray, " some"],
+    ) -> "LinearLoops":
+        """The same with the members at `places` replaced by `chosen` ones of the `others`."""
+
+        def put(mine: Array, other: Array, varies: bool) -> Array:
+            if not varies:
+                return mine
+            values = np.array(mine)
+            values[..., places] = np.asarray(other)[..., chosen]
+            return jnp.asarray(values)
+
+        marks = mark_members(self.axes, (self.members,))
+        return dataclasses.replace(
+            self,
+            axes=jax.tree.map(put, self.axes, others.axes, marks),
+            delay=put(self.delay, others.delay, True),
+            assumed_inertia=put(self.assumed_inertia, others.assumed_inertia, True),
+        )
 
     def numbers(
         self, controller: PyTree, wanted: Collection[str], smoothing: float
@@ -181,17 +207,23 @@ def make_problem(
         parts = [(first, until)]
     return Problem(
         loop=loop,
-        linear=_linear_loops(members, devices),
-        limited=None if limited is None else _linear_loops(limited, devices),
+        linear=linear_loops(members, devices),
+        limited=None if limited is None else linear_loops(limited, devices),
         flight=flight,
         window=Window(first, last, loaded, parts[-1][1]),
         parts=tuple(parts),
     )
 
 
-def _linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
-    plant = members.plant
-    axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
+def linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
+    axes = decouple(members.plant)
     places = devices_for(members.size, asked_devices(devices))
     longest = float(members.longest_delay)
     return LinearLoops(axes, members.delay, members.assumed_inertia, longest, members.dt, places)
+
+
+def decouple(plant: object) -> DecoupledAxes:
+    """The plant near level flight, one axis at a time."""
+    axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
+    assert isinstance(axes, DecoupledAxes)
+    return axes

@@ -19,8 +19,9 @@ from ._lbfgs import LBFGS
 from ._objective import Limit, Objective
 from ._parameters import build_design, select_coordinates
 from ._phases import find_bounds, Solution, solve
-from ._problem import DeviceChoice, make_problem, Problem, TimeSpan
+from ._problem import DeviceChoice, linear_loops, LinearLoops, make_problem, Problem, TimeSpan
 from ._quantities import QUANTITIES
+from ._tail import Search
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
 from ._verdict import Bound, judge_convergence, Verdict
 
@@ -53,8 +54,10 @@ def tune(
     First the slowest pole of every member is moved to the left of the knee of the objective's
     penalty on the abscissa (-0.5 1/s without one), which needs no flights. Then the objective is
     minimised through their flights of the scenario. Limits are enforced by an augmented Lagrangian,
-    those of the linear loop on 512 further members. A design whose certificate fails is returned,
-    too, and says so first. Source: docs/tuning.md.
+    those of the linear loop on 512 further members. Then 4096 others are searched for such as are
+    beyond one of these limits; the worst join the 512, and the descent goes on from where it ended,
+    twice at most. A design whose certificate fails is returned, too, and says so first.
+    Source: docs/tuning.md.
 
     !!! example
 
@@ -76,7 +79,7 @@ def tune(
     - `objective`: what is minimised, see `jq.Objective`.
     - `limits`: bounds that the design has to keep.
     - `reserve`: by how much more limits are enforced than asked (0.03 is 3 %), because fresh
-        members reach further than those that were tuned on.
+        members reach further than those that were tuned on. Those that are searched may use it up.
     - `free`: the numbers to tune, as in `jq.fit`; by default those that `controller.tunable()`
         names: wc, wo and b0 or the knots of its map, of a PID all gains that are not 0. Gains keep
         their sign; the knots of a `jq.control.InertiaMap` stay falling.
@@ -113,10 +116,11 @@ def tune(
     problem = make_problem(loop.controller, drawn, scenario, limited, span=span, devices=devices)
     require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
     begun = scatter_starts(coordinates.start, starts, scatter, seed=0)
+    tightened = tuple(tighten(limit, reserve) for limit in limits)
     solution = solve(
         coordinates, problem, begun, stack_copies(objective, starts),
-        stack_copies(tuple(tighten(limit, reserve) for limit in limits), starts),
-        method=method, rate=stabilising_rate(objective), progress=watched,
+        stack_copies(tightened, starts), method=method, rate=stabilising_rate(objective),
+        progress=watched, search=_search(loop, ensemble, limits, starts, key, devices),
     )  # fmt: skip
     seconds, best = watched.seconds, _best(solution)
     tuned = build_design(coordinates, jnp.asarray(solution.z[best]))
@@ -146,6 +150,7 @@ def tune(
         minima=distinct_optima(solution, coordinates),
         evaluations=int(solution.evaluations[best]),
         stabilising=int(solution.stabilising[best]),
+        tail=solution.tail,
         history=tuple(watched.history),
         seconds=seconds,
         remarks=tuple(_remarks(tuned, problem, solution, best, found)),
@@ -173,6 +178,28 @@ def _draw_limited(
     if isinstance(ensemble, Members) or not linear:
         return None
     return ensemble.draw(loop, _WIDE, jax.random.fold_in(key, 1))
+
+
+_FIRST = 2  # folded into the key of the first slice that is searched
+
+
+def _search(
+    loop: Loop,
+    ensemble: Ensemble | Members,
+    limits: Sequence[Limit],
+    starts: int,
+    key: Key[Array, ""],
+    devices: DeviceChoice,
+) -> Search | None:
+    """Members to search for those beyond limits; they may use up the reserve."""
+    if isinstance(ensemble, Members):
+        return None
+
+    def draw(number: int) -> LinearLoops:
+        own = jax.random.fold_in(key, _FIRST + number)
+        return linear_loops(ensemble.fresh(loop, _WIDE, own), devices)
+
+    return Search(draw, stack_copies(tuple(limits), starts))
 
 
 def stabilising_rate(objective: Objective) -> float:

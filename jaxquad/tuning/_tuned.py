@@ -9,6 +9,7 @@ from ._cost import Evaluation
 from ._objective import Limit
 from ._parameters import Coordinates
 from ._phases import Solution
+from ._tail import Tail
 from ._verdict import Bound, Verdict
 
 
@@ -78,7 +79,8 @@ class Tuned(eqx.Module):
     `convergence` of the tuning. Only where all of them hold the design may be flown. `certificate`
     is None if no fresh members were asked for. `limits` and `minima` are on the members that were
     tuned on. `evaluations` counts gradients through the flights of all members, `stabilising` those
-    of the linear loops alone that came before.
+    of the linear loops alone that came before. `tail` says how many members were searched for
+    those beyond a limit of the linear loop, and how many of these were tuned on, too.
     """
 
     controller: PyTree
@@ -93,6 +95,7 @@ class Tuned(eqx.Module):
     convergence: Verdict
     evaluations: int
     stabilising: int
+    tail: Tail  # of the ensemble, searched for members beyond limits of the linear loop
     history: tuple[Evaluation, ...]
     seconds: float  # of the descent, compilation included, without the certificate
     remarks: tuple[str, ...]
@@ -130,6 +133,7 @@ class Tuned(eqx.Module):
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
         lines = [first, *map(str, verdicts), f"tuned: {numbers}", f"  {_describe_effort(self)}"]
         lines += [f"  {_describe_limit(one)}" for one in self.limits]
+        lines += [f"  {_describe_tail(self.tail)}"] if self.tail.searched else []
         lines += _describe_optima(self.minima) if len(self.minima) > 1 else []
         lines += [f"  ! {remark}" for remark in self.remarks]
         return "\n".join([*lines, *map(str, rest)])
@@ -158,6 +162,13 @@ def _describe_limit(one: LimitResult) -> str:
         )
     state = "active" if one.active else "not active"
     return f"limit on {one.limit}: {one.found:.4g} on the members tuned on, {state}"
+
+
+def _describe_tail(tail: Tail) -> str:
+    text = f"limits of the linear loop: {tail.searched} further members searched"
+    if not tail.added:
+        return f"{text}, none beyond"
+    return f"{text}, {tail.added} of the worst added to those tuned on"
 
 
 def _describe_optima(minima: tuple[Optimum, ...]) -> list[str]:

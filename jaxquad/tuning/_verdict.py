@@ -11,8 +11,10 @@ from ._design_result import (
     covers,
     DesignResult,
     Distance,
+    LinearMembers,
     Numbers,
     upper_bound,
+    with_further,
 )
 from ._quantities import QUANTITIES
 
@@ -42,31 +44,62 @@ NOT_TUNED = Verdict("CONVERGENCE", None, "the gains were given, not tuned here")
 
 
 def judge_stability(
-    design: DesignResult, distances: Sequence[Distance], *, independent: bool, place: Place
+    design: DesignResult,
+    distances: Sequence[Distance],
+    *,
+    further: LinearMembers | None = None,
+    independent: bool,
+    place: Place,
 ) -> Verdict:
-    """Whether every member is stable and every limit is met; `place` says which member fails."""
-    failures = [*_instabilities(design, place), *_missed(distances, place)]
-    lost = design.diverged | (False if design.unstable is None else design.unstable)
-    for distance in distances:
-        if covers(distance):
-            lost = lost | beyond_limit(design, distance)
-    kept = _titles([x for x in distances if covers(x)])
-    within = f" and within the limit{'s' * (len(kept) > 1)} on {_join(kept)}" if kept else ""
-    text = f"{_count(~lost)} members are stable{within}"
-    others = _titles([x for x in distances if not covers(x)])
+    """Whether every member is stable and every limit is met; `place` says which member fails.
+
+    `further` members count for their linear loops and for limits on these, by a share of their own.
+    """
+    every = with_further(design, further)
+    failures = [*_instabilities(design, every, place), *_missed(distances, place)]
+    known = independent and not failures
+    kept, others = _split(distances, covers)
+    unstable = np.zeros(every.members, bool) if every.unstable is None else every.unstable
+    if further is None:
+        text = _within(design, unstable | design.diverged, kept, "members are stable", known)
+    else:
+        linear, flown = _split(kept, lambda x: QUANTITIES[x.quantity].linear)
+        text = _within(every, unstable, linear, "members are stable", known)
+        text += f"; {_within(design, design.diverged, flown, 'flights are bounded', known)}"
     if failures:
         remedy = "Lower the bandwidth, tune with a tighter limit, or narrow the ensemble"
         return Verdict("STABILITY", False, "; ".join([*failures, text]), remedy)
-    met = f"; the limit on {_join(others)} is met" if others else ""
-    return Verdict("STABILITY", True, f"{text}{_share(lost, 'are not', independent)}{met}")
+    met = f"; the limit on {_join(_titles(others))} is met" if others else ""
+    return Verdict("STABILITY", True, f"{text}{met}")
 
 
-def _instabilities(design: DesignResult, place: Place) -> list[str]:
+def _split(
+    distances: Sequence[Distance], chosen: Callable[[Distance], bool]
+) -> tuple[list[Distance], list[Distance]]:
+    return [x for x in distances if chosen(x)], [x for x in distances if not chosen(x)]
+
+
+def _within(
+    design: DesignResult,
+    lost: Bool[np.ndarray, " members"],
+    kept: Sequence[Distance],
+    what: str,
+    known: bool,
+) -> str:
+    """How many members are neither lost nor beyond a limit that each has to keep, as a sentence."""
+    for distance in kept:
+        lost = lost | beyond_limit(design, distance)
+    titles = _titles(kept)
+    within = f" and within the limit{'s' * (len(titles) > 1)} on {_join(titles)}" if titles else ""
+    return f"{_count(~lost)} {what}{within}{_share(lost, 'are not', known)}"
+
+
+def _instabilities(design: DesignResult, every: DesignResult, place: Place) -> list[str]:
     found = []
-    if design.unstable is None:
+    if every.unstable is None:
         found.append("the controller has no method linear(), so its stability is not known")
-    elif design.unstable.any():
-        found.append(_where(design, design.unstable, "linearly unstable", place))
+    elif every.unstable.any():
+        found.append(_where(every, every.unstable, "linearly unstable", place))
     if design.diverged.any():
         found.append(_where(design, design.diverged, "diverged in flight", place))
     return found + ([design.observer_instability] if design.observer_instability else [])

@@ -1,0 +1,194 @@
+"""One design on many members: their flights, and their linear loops."""
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, PyTree
+
+from jaxquad.control import (
+    LADRC,
+    LinearisableController,
+    ObserverController,
+    PID,
+    schedule_for_analysis,
+)
+from jaxquad.ensembles import Ensemble, Members
+from jaxquad.loops import Loop, loop_numbers, LoopNumbers
+from jaxquad.simulation import AuthorityWarning, evaluate, Metrics, Scenario
+
+from ._design_result import DesignResult, LinearMembers
+from ._problem import decouple, DeviceChoice, Plant, TimeSpan
+from ._quantities import LINEAR
+
+
+def evaluate_design(
+    controller: PyTree,
+    members: Members,
+    flight: Scenario,
+    span: TimeSpan,
+    devices: DeviceChoice = None,
+) -> DesignResult:
+    """`controller` on all `members`, in a `flight` that has their noise in it.
+
+    The loop in time holds every limit, the encoder and dry friction. The linear one is exact, and
+    is that of a controller with a method `linear`, a scheduled or adaptive one at the inertia that
+    it is given.
+    """
+    axes = flight.reference.shape[1]
+    loop = members.loop(controller)
+    loop = loop.with_controller(_widen(loop.controller, axes, members.size))
+
+    def run(start: float, stop: float | None, load_start: float | None = None) -> Metrics:
+        return evaluate(
+            loop, flight, start=start, stop=stop, load_start=load_start, devices=devices
+        )
+
+    with warnings.catch_warnings():  # the certificate says it
+        warnings.simplefilter("ignore", AuthorityWarning)
+        whole = run(span.start, span.stop, span.load_start)
+        single = len(span.parts) == 1 and span.load_start is None
+        parts = [whole] if single else [run(*part) for part in span.parts]
+    numbers = _join(whole, parts)
+    linear = _linear(controller, members, flight)
+    if linear is not None:
+        numbers |= {name: linear._asdict()[name] for name in LINEAR}
+    unstable = None if linear is None else ~np.all(linear.stable, axis=0)
+    observed = isinstance(controller, ObserverController)
+    why = controller.observer_instability() if observed else ""
+    diverged = np.asarray(whole.diverged)
+    return DesignResult(numbers, unstable, diverged, diverged | _carried_off(parts, flight), why)
+
+
+_MULTIPLE, _MOST = 8, 2048  # of members that fly, and at most
+
+
+def analyse_further(
+    loop: Loop,
+    ensemble: Ensemble,
+    scenario: Scenario,
+    key: Key[Array, ""],
+    *,
+    flown: int,
+    count: int | None,
+) -> LinearMembers | None:
+    """The linear loops of at least `count` further members; None without such loops.
+
+    They come in slices of as many members as have `flown`, which compile nothing anew.
+    """
+    count = min(_MULTIPLE * flown, _MOST) if count is None else count
+    if count == 0:
+        return None
+    keys = jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown))
+    found, facts = [], []
+    for each in keys:
+        drawn = ensemble.fresh(loop, flown, each)
+        still = dataclasses.replace(drawn, noise=None, gust=None)
+        linear = _linear(loop.controller, drawn, still.flight(scenario))
+        if linear is None:
+            return None
+        found.append(linear)
+        facts.append(member_facts(drawn))
+    join = lambda parts: np.concatenate(parts, axis=-1)
+    numbers = {name: join([x._asdict()[name] for x in found]) for name in LINEAR}
+    unstable = ~np.all(join([x.stable for x in found]), axis=0)
+    none = np.zeros_like(unstable)
+    known = {name: join([x[name] for x in facts]) for name in facts[0]}
+    return LinearMembers(DesignResult(numbers, unstable, none, none), known)
+
+
+_FURTHER = 0xF0C5  # folded into the key of members that do not fly
+
+
+def member_facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
+    """Inertia, torque gain, lag and delay in SI units; assumed_inertia over the true one."""
+    plant = decouple(drawn.plant)
+    given = {"inertia": plant.inertia, "torque_gain": plant.torque_gain, "lag": plant.lag}
+    shape = (plant.shape[0], drawn.size)
+    wide = lambda x: np.broadcast_to(np.asarray(x) if x.ndim > 1 else x[:, None], shape)
+    facts = {n: np.array(wide(x)) for n, x in given.items() if x is not None}
+    facts["delay"] = np.array(np.broadcast_to(np.asarray(drawn.delay), shape))
+    return facts | {"assumed_inertia": np.asarray(drawn.assumed_inertia) / facts["inertia"]}
+
+
+_TILTED = np.pi / 2  # rad: a vehicle that is turned further pushes downwards
+
+
+def _carried_off(parts: Sequence[Metrics], flight: Scenario) -> Bool[np.ndarray, " members"]:
+    """Members whose error exceeds all that the reference moves by more than a quarter turn."""
+    reference = np.asarray(flight.reference)
+    moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
+    greatest = np.max([np.asarray(part.peak) for part in parts], axis=(0, 1))
+    return ~(greatest <= _TILTED + moved)
+
+
+_PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what scheduling may change
+
+
+def _widen(controller: PyTree, axes: int, members: int) -> PyTree:
+    """The gains of a LADRC or PID in one shape, so that all of a kind share a compile."""
+    if not isinstance(controller, LADRC | PID):
+        return controller
+    gains = {name: x for name, x in vars(controller).items() if isinstance(x, Array)}
+    full = {name: _full(x, name, axes, members) for name, x in gains.items()}
+    return dataclasses.replace(controller, **full)
+
+
+def _full(gain: Array, name: str, axes: int, members: int) -> Array:
+    shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
+    given = np.asarray(gain)
+    aligned = given.reshape(given.shape + (1,) * (len(shape) - given.ndim)) if given.ndim else given
+    return jnp.asarray(np.broadcast_to(aligned, shape))
+
+
+_INTEGRALS = ("itae", "iae", "ise")
+_WHOLE = ("activity", "energy", "saturation_share", "peak", "rms", "disturbance_rmse")
+
+
+def _join(whole: Metrics, parts: Sequence[Metrics]) -> dict[str, np.ndarray]:
+    stack = lambda name: np.stack([np.asarray(vars(one)[name], float) for one in parts])
+    numbers = {name: np.asarray(vars(whole)[name], float) for name in _WHOLE}
+    numbers["activity_rate"] = numbers["activity"] / (whole.stop - whole.start)
+    numbers["overshoot"] = _greatest(stack("overshoot"))
+    return numbers | {name: stack(name).sum(axis=0) for name in _INTEGRALS}
+
+
+def _greatest(values: Float[np.ndarray, "parts axes members"]) -> np.ndarray:
+    """NaN where no part has a step."""
+    known = ~np.isnan(values)
+    greatest = np.max(np.where(known, values, -np.inf), axis=0)
+    return np.where(known.any(axis=0), greatest, np.nan)
+
+
+def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:
+    scheduled = schedule_for_analysis(controller, members.assumed_inertia)
+    if not isinstance(scheduled, LinearisableController):
+        return None
+    axes = flight.reference.shape[1]
+    loop = members.loop(controller).with_controller(_widen(scheduled, axes, members.size))
+    plants = _with_payloads(members.plant, flight)
+    return _worst([loop_numbers(loop.with_plant(x), range(axes)) for x in plants], members.size)
+
+
+def _worst(loops: Sequence[LoopNumbers], members: int) -> LoopNumbers:
+    """Of the same members as different plants: stable where all are, else NaN as one of them."""
+    each = lambda x: np.broadcast_to(x.reshape(len(x), -1), (len(x), members))
+    loops = [LoopNumbers(*map(each, loop)) for loop in loops]
+    stable = np.all([loop.stable for loop in loops], axis=0)
+    worst = {"abscissa": np.max([loop.abscissa for loop in loops], axis=0)}
+    for name in LoopNumbers._fields[2:]:
+        find = np.min if name.endswith("margin") else np.max
+        found = find([loop._asdict()[name] for loop in loops], axis=0)
+        worst[name] = np.where(stable, found, np.nan)
+    return LoopNumbers(stable, **worst)
+
+
+def _with_payloads(plant: Plant, flight: Scenario) -> list[Plant]:
+    """The plant, and with the most and the least that the flight makes it carry."""
+    if flight.payload is None:
+        return [plant]
+    extremes = [np.max(flight.payload, axis=0), np.min(flight.payload, axis=0)]
+    return [plant, *(plant.with_added_inertia(x) for x in extremes if np.any(x != 0))]

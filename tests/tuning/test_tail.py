@@ -1,0 +1,47 @@
+"""Limits on the tail of an ensemble: what a tune finds there, and what it leaves."""
+
+import jax
+import numpy as np
+import pytest
+from tuning_case import ensemble, equivalent, flight, loop, objective
+
+from jaxquad.loops import loop_numbers
+from jaxquad.tuning import LBFGS, Limit, tune
+from jaxquad.tuning._problem import linear_loops
+from jaxquad.tuning._tail import Worst
+
+
+def loops(seed, count=6):
+    return linear_loops(ensemble().draw(loop(), count, jax.random.key(seed)), None)
+
+
+def test_the_worst_take_the_places_of_others():
+    mine, first, second = loops(0), loops(1), loops(2)
+    worst = Worst([first, second], [(1, 4), (0, 0), (1, 2)], 3)
+    found = worst.put_into(mine, np.array([5, 1, 0]))
+    for pick in (lambda x: x.assumed_inertia[0], lambda x: x.axes.lag[0], lambda x: x.delay):
+        a, b, c = map(pick, (mine, first, second))
+        np.testing.assert_array_equal(pick(found), [c[2], b[0], a[2], a[3], a[4], c[4]])
+    assert worst.members == 12
+
+
+@pytest.mark.slow
+def test_members_of_the_tail_are_tuned_on_where_they_are_beyond_a_limit():
+    """Of 20,000 members that no tuner saw fewer are beyond the limit than without the search."""
+    drawn = ensemble().draw(loop(), 16, jax.random.key(0))
+    given = {"objective": objective(), "fresh": None, "progress": False}
+    limits = [Limit("sensitivity_peak", at_most=3.0)]
+    brief = {"limits": limits, "method": LBFGS(evaluations=25)} | given
+    start = loop(equivalent(4.0, 50.0, 1.8))
+    blind = tune(start, drawn, flight(), **brief)
+    found = tune(start, ensemble(), flight(), members=16, **brief)
+    assert blind.tail.searched == 0 and found.tail.searched in (4096, 8192)
+    assert 0 < found.tail.added <= 128 and found.limits[0].met
+    assert f"{found.tail.added} of the worst added" in str(found)
+    beyond = []
+    for controller in (blind.controller, found.controller):
+        members = ensemble().fresh(loop(), 4000, jax.random.key(9))
+        around = members.loop(controller)
+        numbers = loop_numbers(around, [0])
+        beyond.append(int(np.sum(~(numbers.sensitivity_peak <= 3.0))))
+    assert beyond[1] <= 4 and beyond[1] < 0.2 * beyond[0]
