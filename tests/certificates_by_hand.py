@@ -41,7 +41,8 @@ def certificate(designs, distances=()):
     return Certificate(
         designs, tuple(distances), facts, np.array([0.05]),
         {
-            "members": MEMBERS, "linear_members": 0, "fresh": True, "sampling": "random", "key": [0, 0],
+            "members": MEMBERS, "linear_members": 0, "fresh": True, "sampling": "random",
+            "key": [0, 0],
             "precision": "float64", "ensemble": None, "device": "cpu", "versions": {},
         },
         (),
