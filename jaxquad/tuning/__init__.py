@@ -5,8 +5,10 @@ from ._certify import certify as certify
 from ._cost import Evaluation as Evaluation
 from ._design_result import (
     DesignResult as DesignResult,
+    DesignSummary as DesignSummary,
     Distance as Distance,
     front_point as front_point,
+    LinearMembers as LinearMembers,
     share_interval as share_interval,
     upper_bound as upper_bound,
 )

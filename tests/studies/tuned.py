@@ -17,6 +17,8 @@ import numpy as np
 from result_files import write
 from systems import Continuous, hold, sampled
 
+from jaxquad.tuning import Certificate, DesignSummary
+
 
 sys.path.append(str(Path(__file__).parents[1]))
 
@@ -192,8 +194,16 @@ def _numbers(ladrc) -> tuple[float, float]:
     return float(np.ravel(ladrc.wc)[0]), float(np.ravel(ladrc.wo)[0])
 
 
-def designs() -> dict:
-    """Name to controller, the library's summary of it, and its certificate where it has limits."""
+class Design(NamedTuple):
+    """A controller of the library, its summary of it, and its certificate where it has limits."""
+
+    controller: object
+    summary: DesignSummary
+    certificate: Certificate | None = None
+
+
+def designs() -> dict[str, Design]:
+    """The designs by name."""
     import dataclasses
 
     import jax
@@ -208,7 +218,7 @@ def designs() -> dict:
         loop(printed[first]), ensemble(), flight(), name=first, events=EVENTS, members=256,
         peers={name: printed[name] for name in others}, key=jax.random.key(5), linear_members=0,
     )  # fmt: skip
-    found = {name: (printed[name], judged.summaries[name], None) for name in printed}
+    found = {name: Design(printed[name], judged.summaries[name]) for name in printed}
     start = STARTS["certainty equivalence"]
     halved = dataclasses.replace(
         start,
@@ -225,16 +235,15 @@ def designs() -> dict:
         )  # fmt: skip
         assert tuned.certificate is not None
         print(f"{name}: {tuned.tail}, {tuned.evaluations} gradients\n{tuned.stability}")
-        found[name] = (
-            tuned.controller, tuned.certificate.summaries["tuned"], tuned.certificate,
-        )  # fmt: skip
+        summary = tuned.certificate.summaries["tuned"]
+        found[name] = Design(tuned.controller, summary, tuned.certificate)
     return found
 
 
-def row_of(name: str, controller, summary, certificate, members: Members) -> list:
-    law = law_of(controller)
+def row_of(name: str, design: Design, members: Members) -> list:
+    law = law_of(design.controller)
     flown, linear = fly(law, members, SEED + 1), analyse(law, members)
-    theirs, count = summary.statistics, len(members.inertia)
+    theirs, count = design.summary.statistics, len(members.inertia)
     itae = np.where(np.isfinite(flown["itae"]), flown["itae"], np.inf)
     certified = np.degrees(theirs["itae"].mean), np.degrees(theirs["itae"].worst)
     peak = np.where(linear["unstable"], np.inf, linear["peak"])
@@ -243,9 +252,10 @@ def row_of(name: str, controller, summary, certificate, members: Members) -> lis
     unstable = _interval(int(np.sum(linear["unstable"])), count)
     row = [name, unstable, _pair(itae.mean(), itae.max()), _pair(*certified)]
     row += [share(itae > certified[1]), f"{peak.max():.2f}", share(peak > PEAK)]
-    if certificate is None:
+    if design.certificate is None:
         return [*row, None, None]
-    [limit] = certificate.distances
+    [limit] = design.certificate.distances
+    assert limit.beyond_at_most is not None
     proven = f"{100 * limit.beyond_at_most:.2f}"
     return [*row, f"{limit.found:.2f}, {limit.beyond} of {limit.members}", proven]
 
@@ -268,7 +278,7 @@ def main() -> None:
     parser.add_argument("--members", type=int, default=MEMBERS)
     given = parser.parse_args()
     members = draw(given.members, SEED)
-    rows = [row_of(name, *design, members) for name, design in designs().items()]
+    rows = [row_of(name, design, members) for name, design in designs().items()]
     study = {
         "title": "Tuned designs, judged again",
         "command": "python tests/studies/tuned.py",
