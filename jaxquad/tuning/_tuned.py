@@ -95,10 +95,10 @@ class Tuned(eqx.Module):
     convergence: Verdict
     evaluations: int
     stabilising: int
-    tail: Tail  # of the ensemble, searched for members beyond limits of the linear loop
     history: tuple[Evaluation, ...]
     seconds: float  # of the descent, compilation included, without the certificate
     remarks: tuple[str, ...]
+    tail: Tail = Tail()  # of the ensemble, searched for members beyond limits of the linear loop
 
     @property
     def active(self) -> tuple[Limit, ...]:
