@@ -39,8 +39,6 @@ def repair_values(
     Nothing is repaired unless `valid` or `max_gap` asks for it. The interpolation is monotone
     between neighbours (Fritsch and Butland 1984). What lies at an end, or in a longer gap, is NaN.
     """
-    from scipy.interpolate import PchipInterpolator
-
     none = np.empty(0)
     if valid is None and max_gap is None:
         return RepairedValues(values, none)
@@ -56,6 +54,9 @@ def repair_values(
     filled = bad[apart <= longest_gap(time, max_gap) * (1 + 1e-9)]
     repaired = np.where(good, values, np.nan)
     if filled.size:
+        # Imported here: it takes a quarter of a second, and most records need no repair.
+        from scipy.interpolate import PchipInterpolator
+
         repaired[filled] = PchipInterpolator(time[good], values[good])(time[filled])
     return RepairedValues(repaired, time[filled])
 

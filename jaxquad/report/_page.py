@@ -35,6 +35,14 @@ class Table(NamedTuple):
     texts: int = 1
 
 
+class Headline(NamedTuple):
+    """`level` is good, warn or bad; `word` is the verdict, `reason` why."""
+
+    level: str
+    word: str
+    reason: str
+
+
 @ft.cache
 def _environment() -> Environment:
     return Environment(

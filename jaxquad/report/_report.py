@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,14 +11,16 @@ from jaxquad.identify import Combination, Fit, MISFIT, Verification
 from jaxquad.plot import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
-from jaxquad.tuning import Certificate, Tuned
 
 from ._fit import identifiability_section, parameter_section
-from ._page import render_page
+from ._page import Headline, render_page
 from ._provenance import Provenance, provenance_section
 from ._record import check_section, GOOD_TIC, record_section
 from ._response import residual_section, response_section
-from ._tuned import tuned_section
+
+
+if TYPE_CHECKING:
+    from jaxquad.tuning import Certificate, Tuned
 
 
 def write_report(
@@ -32,7 +34,7 @@ def write_report(
     checks: Verification | Mapping[str, Verification] | None = None,
     derived: Sequence[Combination] = (),
     beside: Mapping[str, str] | None = None,
-    tuned: Tuned | Certificate | None = None,
+    tuned: "Tuned | Certificate | None" = None,
     provenance: Provenance | None = None,
     title: str = "",
     formula: str = "",
@@ -71,7 +73,12 @@ def write_report(
     remarks = remarks_of(fit, found)
     headlines = [fit_headline(fit, len(remarks))]
     headlines += [check_headline(name, check, fit) for name, check in found.items()]
-    headlines += verdict_headlines(tuned) if tuned is not None else []
+    gains = None
+    if tuned is not None:
+        from ._tuned import tuned_section, verdict_headlines  # the room of tuning takes 0.2 s
+
+        headlines += verdict_headlines(tuned)
+        gains = tuned_section(tuned)
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
     sections = {
@@ -81,7 +88,7 @@ def write_report(
         "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
         "identifiability": identifiability_section(fit),
         "verification": check_section(found) if found else None,
-        "tuned": tuned_section(tuned) if tuned is not None else None,
+        "tuned": gains,
         "provenance": provenance_section(provenance) if provenance is not None else None,
     }
     text = render_page(
@@ -106,14 +113,6 @@ def _models(
     if not fit.verdict.fitted:
         return dict(models)
     return {name: models.get(name, fit.model) for name in frfs}
-
-
-class Headline(NamedTuple):
-    """`level` is good, warn or bad; `word` is the verdict, `reason` why."""
-
-    level: str
-    word: str
-    reason: str
 
 
 def fit_headline(fit: Fit, remarks: int) -> Headline:
@@ -151,20 +150,6 @@ def check_headline(name: str, check: Verification, fit: Fit) -> Headline:
     if check.tic < GOOD_TIC:
         return Headline("good", "VERIFIED", f"{numbers} (good: below {GOOD_TIC})")
     return Headline("bad", "VERIFICATION FAILS", f"{numbers} (good: below {GOOD_TIC})")
-
-
-def verdict_headlines(tuned: Tuned | Certificate) -> list[Headline]:
-    """The three verdicts of a design; of gains that were given, those that were asked for."""
-    headlines = []
-    for verdict in tuned.verdicts:
-        if verdict.holds is not None:
-            level, fails = ("good", "") if verdict.holds else ("bad", " FAILS")
-            text = ". ".join(filter(None, (verdict.text, verdict.remedy)))
-            headlines.append(Headline(level, f"{verdict.name}{fails}", text))
-    if isinstance(tuned, Tuned) and tuned.certificate is None:
-        text = "no fresh members were drawn to certify on"
-        headlines.insert(0, Headline("warn", "NOT CERTIFIED", text))
-    return headlines
 
 
 def remarks_of(fit: Fit, checks: Mapping[str, Verification]) -> list[str]:

@@ -6,10 +6,24 @@ from jaxquad.plot import certificate_figure, convergence_figure
 from jaxquad.tuning import Certificate, KNOWN_INERTIA, QUANTITIES, Tuned
 
 from ._fit import count_starts
-from ._page import Cell, embed_figure, Table
+from ._page import Cell, embed_figure, Headline, Table
 
 
 _DRAWN = 7  # designs that can be distinguished in a figure
+
+
+def verdict_headlines(tuned: Tuned | Certificate) -> list[Headline]:
+    """The three verdicts of a design; of gains that were given, those that were asked for."""
+    headlines = []
+    for verdict in tuned.verdicts:
+        if verdict.holds is not None:
+            level, fails = ("good", "") if verdict.holds else ("bad", " FAILS")
+            text = ". ".join(filter(None, (verdict.text, verdict.remedy)))
+            headlines.append(Headline(level, f"{verdict.name}{fails}", text))
+    if isinstance(tuned, Tuned) and tuned.certificate is None:
+        text = "no fresh members were drawn to certify on"
+        headlines.insert(0, Headline("warn", "NOT CERTIFIED", text))
+    return headlines
 
 
 def tuned_section(tuned: Tuned | Certificate) -> dict[str, object]:

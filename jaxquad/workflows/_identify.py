@@ -196,7 +196,7 @@ def identify(path: str | Path, settings: IdentifySettings | None = None) -> Iden
 
     The frequency response is estimated twice: the second time with the delay taken out that the
     first fit has found. With an external reference, the joint input-output estimate is fitted, and
-    the direct one beside it.
+    the direct one, with the same delay taken out, beside it.
 
     **Arguments:**
 
@@ -223,9 +223,9 @@ def identify(path: str | Path, settings: IdentifySettings | None = None) -> Iden
     settings, proposal = propose_settings(path, settings or IdentifySettings())
     records = read_records(path, settings)
     methods = ("joint", "direct") if settings.reference else ("direct",)
-    responses, fits = {}, {}
+    responses, fits, delay = {}, {}, 0.0
     for method in methods:
-        responses[method], found = _fit_twice(records, method, settings)
+        responses[method], found, delay = _fit_twice(records, method, settings, delay)
         fits[method] = _with_remedies(found, settings)
     announce("fits to parts of the band")
     best = methods[0]
@@ -307,10 +307,13 @@ def _mix(text: str | None) -> Mix:
 
 
 def _fit_twice(
-    records: tuple[Record, ...], method: str, settings: IdentifySettings
-) -> tuple[FrequencyResponse, Fit]:
-    """The second response is estimated with the delay that the first fit found taken out."""
-    band, delay = _band(settings), 0.0
+    records: tuple[Record, ...], method: str, settings: IdentifySettings, delay: float
+) -> tuple[FrequencyResponse, Fit, float]:
+    """The second response is estimated with the delay (s) that the first fit found taken out.
+
+    Once is enough where a delay is known. Returns the delay, too.
+    """
+    band = _band(settings)
     dt, duration = records[0].dt, max(record.duration for record in records)
     omega = np.geomspace(*band, _POINTS) if band else None
     while True:
@@ -320,10 +323,10 @@ def _fit_twice(
         announce(f"fit to the {method} response")
         found = _fitted(frf, settings)
         if not found.verdict.fitted:
-            return frf, found
+            return frf, found, delay
         total = dt * round(float(total_delay(found.model)) / dt)
         if delay or not 0 < total < _LONGEST * duration:
-            return frf, found
+            return frf, found, delay
         delay = total
 
 
