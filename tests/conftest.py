@@ -39,6 +39,12 @@ def share_compiled_loops() -> None:
 share_compiled_loops()
 
 
+def pytest_configure(config):
+    """Have quick tests compiled quickly: what they run takes no time. Slow ones run as users do."""
+    if config.option.markexpr == "not slow":
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
+
 def pytest_collection_finish():
     """Let later collections of garbage pass over what was imported: it stays until the end."""
     gc.collect()

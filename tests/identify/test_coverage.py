@@ -12,12 +12,12 @@ from coverage_study import draw, omega_of, studies  # noqa: E402  # pyright: ign
 
 
 pytestmark = pytest.mark.slow
-STUDIES = studies()
+NAMES = ("open loop", "closed loop", "two inputs")
 
 
-@pytest.fixture(scope="module", params=STUDIES, ids=lambda name: name.replace(" ", "-"))
+@pytest.fixture(scope="module", params=NAMES, ids=lambda name: name.replace(" ", "-"))
 def drawn(request):
-    study = STUDIES[request.param]
+    study = studies()[request.param]
     return study, *draw(study, omega_of(request.param, frequencies=25), 100)
 
 

@@ -8,7 +8,7 @@ from scipy import signal
 from jaxquad.models import AttitudeAxis, free_responses, simulate_linear, TransferFunction
 
 
-OMEGA = jnp.geomspace(0.1, 300.0, 60)
+OMEGA = jnp.asarray(np.geomspace(0.1, 300.0, 60))
 DT, SAMPLES = 0.02, 400
 NOISE = jax.random.normal(jax.random.key(0), (SAMPLES,))
 MODELS = {

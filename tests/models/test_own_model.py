@@ -18,7 +18,7 @@ def usual_promotion():
         yield
 
 
-OMEGA = jnp.geomspace(1.0, 60.0, 25)
+OMEGA = jnp.asarray(np.geomspace(1.0, 60.0, 25))
 
 
 class Rate(eqx.Module):

@@ -8,7 +8,7 @@ import pytest
 from jaxquad.models import StateSpace
 
 
-OMEGA = jnp.geomspace(0.01, 300.0, 30)
+OMEGA = jnp.asarray(np.geomspace(0.01, 300.0, 30))
 S = 1j * np.asarray(OMEGA)
 
 

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from jaxquad.models import series, StateSpace
 
 
-OMEGA = jnp.geomspace(0.01, 300.0, 30)
+OMEGA = jnp.asarray(np.geomspace(0.01, 300.0, 30))
 
 
 def system(seed):

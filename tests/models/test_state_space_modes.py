@@ -6,7 +6,7 @@ import pytest
 from jaxquad.models import modes, state_space, StateSpace, TransferFunction
 
 
-OMEGA = jnp.geomspace(0.01, 300.0, 30)
+OMEGA = jnp.asarray(np.geomspace(0.01, 300.0, 30))
 
 
 @pytest.mark.parametrize(

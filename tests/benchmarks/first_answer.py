@@ -1,0 +1,84 @@
+"""Time to the first answer: whole processes, without and with compiled programs from disk."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from resource import getrusage, RUSAGE_CHILDREN
+from typing import NamedTuple
+
+
+ROOT = Path(__file__).parents[2]
+DATA = Path(os.environ.get("JAXQUAD_DATA", ROOT / ".." / "shared" / "data"))
+LOG = DATA / "antx_pitch" / "antx_log3_prbs.npz"
+COMMAND = (str(Path(sys.executable).with_name("jaxquad")),)
+IDENTIFY = (*COMMAND, "identify", str(LOG), "--input", "M", "--output", "q", "--reference", "x0")
+IDENTIFY = (*IDENTIFY, "--rate", "250", "--quiet", "--out", "antx")
+
+
+class Job(NamedTuple):
+    """What a user starts; `after` is what has to have run in the same folder before."""
+
+    name: str
+    command: Sequence[str]
+    after: Sequence[str] = ()
+
+
+class Times(NamedTuple):
+    """Seconds by the clock, and of all processors."""
+
+    wall: float
+    processor: float
+
+
+JOBS = (
+    Job("`import jaxquad`", (sys.executable, "-c", "import jaxquad")),
+    Job("`jaxquad --help`", (*COMMAND, "--help")),
+    Job("`jaxquad identify`, report and figures", IDENTIFY),
+    Job(
+        "`jaxquad tune` on its result",
+        (*COMMAND, "tune", "antx", "--inertia", "0.0552", "--quiet"),
+        IDENTIFY,
+    ),
+    Job("the README's main job", (sys.executable, str(ROOT / "fits" / "hover_roll.py"))),
+)
+
+
+def measured(rounds: int) -> list[list[str]]:
+    """Rows of the table: each job without compiled programs on disk, and with them."""
+    jobs = [job for job in JOBS if LOG.is_file() or str(LOG) not in (*job.command, *job.after)]
+    return [_row(job, rounds) for job in jobs]
+
+
+def _row(job: Job, rounds: int) -> list[str]:
+    with tempfile.TemporaryDirectory() as cache:
+        kept = {"JAX_COMPILATION_CACHE_DIR": cache}
+        cold = _median([_run(job, {"JAXQUAD_CACHE": "off"}) for _ in range(rounds)])
+        _run(job, kept)
+        again = _median([_run(job, kept) for _ in range(rounds)])
+    numbers = (cold.wall, cold.processor, again.wall, again.processor)
+    return [job.name, *(f"{number:.2g}" if number < 10 else f"{number:.0f}" for number in numbers)]
+
+
+def _run(job: Job, told: dict[str, str]) -> Times:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | told
+    with tempfile.TemporaryDirectory() as folder:
+        if job.after:
+            _process(job.after, folder, environment)
+        return _process(job.command, folder, environment)
+
+
+def _process(command: Sequence[str], folder: str, environment: dict[str, str]) -> Times:
+    used, began = getrusage(RUSAGE_CHILDREN), time.perf_counter()
+    ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    wall, now = time.perf_counter() - began, getrusage(RUSAGE_CHILDREN)
+    if ran.returncode not in (0, 4):  # 4: a design that is not to be flown
+        raise RuntimeError(f"{' '.join(command)} ended with {ran.returncode}: {ran.stderr[-500:]}")
+    return Times(wall, now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime)
+
+
+def _median(times: Sequence[Times]) -> Times:
+    return sorted(times)[len(times) // 2]
