@@ -112,6 +112,7 @@ _FREEDOM = 10  # complex degrees of freedom left over by the least window
 _NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are estimated
 _SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
 _WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
+_MOST = 4096  # Fourier bins of a window, unless more lie around a frequency of the grid
 _PER_OCTAVE = 4  # further frequencies, which help to choose the widths
 
 Method = Literal["direct", "joint"]
@@ -154,7 +155,8 @@ def estimate_local_polynomial(
     least = smallest_widths(grid, bins, coefficients, order + 1, _FREEDOM)
     whole = _whole(bins, inputs, outputs, method)
     rest = subtract_models(bins, *whole, omega[-1], records[0].dt, options.global_order)
-    narrow_width = np.maximum(least, _NARROW * grid)
+    most = np.maximum(least, _most(grid, bins))
+    narrow_width = np.clip(_NARROW * grid, least, most)
     stack = _fit_narrow(grid, narrow_width, rest, inputs, order)
     narrow = joint_fit(stack, inputs) if method == "joint" else stack
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
@@ -166,7 +168,7 @@ def estimate_local_polynomial(
     if method == "joint":
         sources = smooth_noise(grid, narrow_width, stack.scatter, stack.freedom)
     respond = _responder(rest, inputs, order, method, sources)
-    widest = reach(grid, narrow_width, _widest(grid, least), bins, rest.sources)
+    widest = reach(grid, narrow_width, np.minimum(_widest(grid, least), most), bins, rest.sources)
     chosen = _widths(grid, least, widest, noise, respond, options)
     width, rational = (each[at] for each in chosen)
     moved = _fit_chosen(omega, width, rational, _responder(rest, inputs, order, "direct"))
@@ -326,6 +328,17 @@ def _fit_widened(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
 
 def _widest(grid: Grid, least: Grid) -> Grid:
     return np.maximum(_WIDEST * grid, _LEAST_SPAN * least)
+
+
+def _most(grid: Grid, bins: Bins) -> Grid:
+    """Half-widths beyond which a window of a long record only costs memory and time.
+
+    Windows that reach half of the way to the next frequency leave nothing of the record out.
+    """
+    density = bins.omega.size / (bins.omega[-1] - bins.omega[0])
+    steps = np.diff(grid)
+    spacing = np.maximum(np.append(steps, steps[-1:]), np.insert(steps, 0, steps[:1]))
+    return np.maximum(spacing, _MOST / density) / 2
 
 
 def _widths(

@@ -30,16 +30,20 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
     parts, grids, owners = [], [], []
     for index, record in enumerate(records):
         columns = transformed_columns(record, integrators)
-        spectra = np.fft.rfft(columns - columns.mean(axis=0), axis=0) / np.sqrt(len(columns))
         last = (len(columns) - 1) // 2
         grid = 2 * np.pi * np.arange(1, last + 1) / (len(columns) * record.dt)
-        spectra = spectra[1 : last + 1]
+        spectra = np.empty((last, columns.shape[1]), complex)
+        for channel, column in zip(spectra.T, columns.T, strict=True):
+            transform = np.fft.rfft(column - column.mean())
+            np.divide(transform[1 : last + 1], np.sqrt(len(columns)), out=channel)
         first = record.inputs.shape[1]
         lag = np.exp(1j * delay * grid)[:, None]
         spectra[:, first : first + record.outputs.shape[1]] *= lag
         parts.append(spectra)
         grids.append(grid)
         owners.append(np.full(last, index))
+    if len(parts) == 1:
+        return Bins(grids[0], owners[0], parts[0], 1)
     omega = np.concatenate(grids)
     order = np.argsort(omega, kind="stable")
     return Bins(
@@ -262,6 +266,7 @@ def _adjoint(x: np.ndarray) -> np.ndarray:
 _UNEXCITED = 1e-12  # of an input's largest bin: below, it is rounding errors
 _LEAKED = 1e5  # ratio of an input's power to the part of it that transients cannot explain
 _CHUNK = 32  # frequencies solved at once, padded to the longest window among them
+_BINS = 32_768  # of them together: more take memory, and no less time
 
 
 class LocalFit(NamedTuple):
@@ -299,8 +304,9 @@ def local_fit(
     first, last = window_slices(omega, half_width, bins)
     largest = np.max(np.abs(bins.values[:, inputs]), axis=0)
     longest = max(int(np.max(last - first)), 1)
-    parts, places = [], np.argsort(last - first, kind="stable")
-    for chunk in np.array_split(places, -(-omega.size // _CHUNK)):
+    fields, places = [], np.argsort(last - first, kind="stable")
+    size = min(_CHUNK, max(_BINS // longest, 1))
+    for chunk in np.array_split(places, -(-omega.size // size)):
         window = _gather(omega[chunk], half_width[chunk], first[chunk], last[chunk], bins)
         values = bins.values[window.index]
         used, own = _own_records(window, order, bins.records)
@@ -309,12 +315,12 @@ def local_fit(
         solution = solve(window.place, u, y, own, order)
         excited = np.all(np.max(np.abs(u), axis=1) > _UNEXCITED * largest, axis=1)
         excited &= np.all(_leaked(solution, u) < _LEAKED, axis=1)
-        size = np.maximum(np.sum(used, axis=1), 1)[:, None, None]
-        parts.append((*_padded(solution, excited, longest), products(u) / size))
-    back = np.argsort(places)
-    response, effect, boost, scatter, freedom, power = (
-        np.concatenate(field)[back] for field in zip(*parts, strict=True)
-    )
+        count = np.maximum(np.sum(used, axis=1), 1)[:, None, None]
+        part = (*_padded(solution, excited, longest), products(u) / count)
+        fields = fields or [np.empty((omega.size, *each.shape[1:]), each.dtype) for each in part]
+        for field, each in zip(fields, part, strict=True):
+            field[chunk] = each
+    response, effect, boost, scatter, freedom, power = fields
     gain = boost[:, :, None] ** 2 * np.sum(np.abs(effect) ** 2, axis=2)[:, None, :]
     return LocalFit(response, effect, boost, gain, first, scatter, freedom, power)
 

@@ -157,12 +157,13 @@ def error_covariance(
     size = np.sqrt(noise.power[at]) * scale / np.maximum(np.linalg.norm(root, axis=2), 1e-300)
     root = root * size[:, :, None]
     known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
-    shared, atoms = _on_common_bins(np.where(known, effect * back, 0.0), places)
+    parameters = 0 if models is None else len(models.drive)
+    shared, atoms = _on_common_bins(np.where(known, effect * back, 0.0), places, parameters)
     kind = np.where(known, root, np.eye(*root.shape[1:]))
     slopes = drive = None
     if models is not None:
         slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
-        slopes, drive, shared = _on_common_atoms(slopes, models, shared, atoms)
+        slopes, drive = _on_common_atoms(slopes, models, atoms, shared.shape[2])
     shared[~known[:, 0, 0], :, 0] = _UNKNOWN
     return ErrorCovariance(
         jnp.asarray(omega),
@@ -181,13 +182,15 @@ def colour_of_noise(
     places: Int[np.ndarray, "frequencies window"],
 ) -> Float[np.ndarray, "frequencies window outputs"]:
     """Power of `left` times the noise at the bins of each window, to that at its centre."""
-    roots, centre = sources.root_at(bins.omega), left @ sources.root_at(omega)
+    lowest = np.min(places, initial=bins.omega.size - 1)
+    inside = bins.omega[lowest : np.max(places, initial=0) + 1]
     if left.shape[1] == left.shape[2] == 1:
-        power = np.abs(roots[:, :, 0]) ** 2
-        return power[places] / sources.power_at(omega)[:, None, :]
+        power = sources.power_at(inside)
+        return power[places - lowest] / sources.power_at(omega)[:, None, :]
+    roots, centre = sources.root_at(inside), left @ sources.root_at(omega)
     colour = np.empty((*places.shape, left.shape[1]))
     for f, mine in enumerate(places):
-        colour[f] = np.sum(np.abs(left[f] @ roots[mine]) ** 2, axis=2)
+        colour[f] = np.sum(np.abs(left[f] @ roots[mine - lowest]) ** 2, axis=2)
     return colour / np.maximum(np.sum(np.abs(centre) ** 2, axis=2), 1e-300)[:, None, :]
 
 
@@ -293,12 +296,13 @@ def _misfit(
 def _on_common_bins(
     effect: Complex[np.ndarray, "frequencies inputs window"],
     places: Int[np.ndarray, "frequencies window"],
+    spare: int,
 ) -> tuple[Complex[np.ndarray, "frequencies inputs atoms"], Int[np.ndarray, " bins"]]:
-    """The effects of all bins that have one, padded with zeros, and these bins."""
+    """The effects of all bins that have one, with zeros for `spare` further atoms, and the bins."""
     used = np.any(effect != 0, axis=1)
     atoms, column = np.unique(places[used], return_inverse=True)
     row, step = np.nonzero(used)
-    shared = np.zeros((*effect.shape[:2], _padded(atoms.size, _ATOMS)), complex)
+    shared = np.zeros((*effect.shape[:2], _padded(atoms.size + spare, _ATOMS)), complex)
     shared[row, :, column] = effect[row, :, step]
     return shared, atoms
 
@@ -311,10 +315,10 @@ def _padded(count: int, block: int) -> int:
 def _on_common_atoms(
     slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"],
     models: SharedErrors,
-    effect: Complex[np.ndarray, "frequencies inputs atoms"],
     atoms: Int[np.ndarray, " bins"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Slopes by the parameters' errors of unit size, their drive by atoms, and padded effects.
+    count: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes by the parameters' errors of unit size, and their drive by `count` atoms.
 
     Bins that no local fit uses are one more atom for each parameter, with the same covariance.
     """
@@ -326,13 +330,10 @@ def _on_common_atoms(
     mine = np.isin(models.places, atoms)
     rest = unit[:, ~mine].reshape(parameters, -1)
     values, vectors = np.linalg.eigh(np.real(rest @ np.conj(rest).T))
-    count = _padded(atoms.size + parameters, _ATOMS)
     drive = np.zeros((_padded(parameters, _PARAMETERS), count, roots), complex)
     drive[:parameters, column[mine]] = unit[:, mine]
     spare = slice(atoms.size, atoms.size + parameters)
     drive[:parameters, spare, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
     known = np.zeros((*slopes.shape[:3], len(drive)), complex)
     known[..., :parameters] = slopes * size
-    wide = np.zeros((*effect.shape[:2], count), complex)
-    wide[:, :, : atoms.size] = effect[:, :, : atoms.size]
-    return known, drive, wide
+    return known, drive

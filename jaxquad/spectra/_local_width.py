@@ -40,10 +40,10 @@ def choose_widths(
     widest = np.maximum(reach, least)
     steps = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
     widths = np.stack([np.minimum(least * _RATIO**m, widest) for m in range(steps)])
-    fits = [respond(omega, widths[0], "polynomial")]
+    fits = [_without_effect(respond(omega, widths[0], "polynomial"))]
     for below, width in zip(widths[:-1], widths[1:], strict=True):
         wider = width > below
-        part = respond(omega[wider], width[wider], "polynomial")
+        part = _without_effect(respond(omega[wider], width[wider], "polynomial"))
         fits.append(replace_rows(fits[-1], wider, part))
     rational = _resonant(fits, respond(omega, least, "rational"), noise)
     step, each = _widest_unbiased(omega, widths, fits, noise), np.arange(omega.size)
@@ -58,6 +58,11 @@ def choose_widths(
     quiet = np.min(kept, axis=0) < np.inf
     climbed = np.where(quiet, widths[np.argmin(kept, axis=0), each], climbed)
     return np.where(rational, least, climbed), rational
+
+
+def _without_effect(fit: LocalFit) -> LocalFit:
+    """The fit without its largest array: the tests look at all widths at once."""
+    return fit._replace(effect=fit.effect[:, :, :0])
 
 
 def _resonant(
