@@ -73,7 +73,7 @@ def _is_own(folder: Path) -> bool:
 def _shared_folder() -> Path:
     folder = os.environ.get(_VARIABLE)
     if folder:
-        return Path(folder)
+        return Path(folder).absolute()
     return Path(platformdirs.user_cache_dir("jaxquad")) / f"programs-{_processor()}"
 
 

@@ -80,7 +80,7 @@ class _Ticks(LogLocator):
             if ticks.size <= self.most:
                 break
         if ticks.size < 2:
-            return MaxNLocator(self.most).tick_values(low, high)
+            return np.asarray(MaxNLocator(self.most).tick_values(low, high))
         return ticks[:: -(-ticks.size // self.most)]
 
 

@@ -164,8 +164,9 @@ def _identify(
     if chosen is None:
         return None
     solved = _descend(white, chosen.denominator, _SETTLED)
-    fixed = _largest(white.x, solved.denominator)
-    slopes = _real(_slopes(white, solved, fixed))
+    basis = _basis(white, len(solved.denominator))
+    fixed = basis.largest(solved.denominator)
+    slopes = _stacked(_slopes(basis, solved, fixed))
     length = np.linalg.norm(slopes, axis=0)
     left, size, right = np.linalg.svd(slopes / length, full_matrices=False)
     inverse = np.where(size > 1e-12 * size[0], 1 / np.maximum(size, 1e-300), 0.0)
@@ -183,9 +184,8 @@ def _complex(stacked: Float[np.ndarray, "parts columns"]) -> Complex[np.ndarray,
 
 
 def _residual(equations: Equations, solved: Solved) -> Complex[np.ndarray, " bins"]:
-    powers = equations.x[:, None] ** np.arange(len(solved.denominator))
-    columns = _regressors(powers, equations.u, equations.own)
-    return equations.y - columns @ solved.linear / (powers @ solved.denominator)
+    basis = _basis(equations, len(solved.denominator))
+    return equations.y - basis.columns @ solved.linear / (basis.powers @ solved.denominator)
 
 
 def _choose(equations: Equations, most: int) -> Solved | None:
@@ -217,18 +217,18 @@ def _information(cost: float, parameters: int, count: int) -> float:
 
 def _proportional(equations: Equations) -> float:
     """Squared residuals of gains that do not depend on frequency."""
-    return _solve(equations, np.ones(1)).cost
+    return _solve(equations, _basis(equations, 1), np.ones(1)).cost
 
 
 def _relax(equations: Equations, order: int) -> Float[np.ndarray, " powers"]:
     """The denominator by repeated linear least squares, each weighted by the one before."""
-    powers = equations.x[:, None] ** np.arange(order + 1)
-    columns = _regressors(powers, equations.u, equations.own)
-    joined = np.concatenate([columns, powers * equations.y[:, None]], axis=1)
-    weight, best = np.ones((len(joined), 1)), None
+    basis = _basis(equations, order + 1)
+    moved = basis.powers * equations.y[:, None]
+    weight, best = np.ones((len(moved), 1)), None
     for _ in range(_RELAXATIONS):
-        denominator = _null_vector(_real(joined * weight), columns.shape[1])
-        solved = _solve(equations, denominator)
+        joined = _stacked(basis.columns * weight, moved * weight)
+        denominator = _null_vector(joined, basis.columns.shape[1])
+        solved = _solve(equations, basis, denominator)
         if best is not None and solved.cost > 0.999 * best.cost:
             break
         best = solved if best is None or solved.cost < best.cost else best
@@ -241,7 +241,7 @@ def _null_vector(matrix: Float[np.ndarray, "rows columns"], first: int) -> Vecto
     """Coefficients of the columns from `first` on, of unit length, that others explain best."""
     length = np.linalg.norm(matrix, axis=0)
     length = np.where(length > 0, length, 1.0)
-    corner = np.asarray(np.linalg.qr(matrix / length, mode="r"))[first:, first:]
+    corner = _triangle(matrix / length)[first:, first:]
     return np.linalg.svd(corner)[2][-1] / length[first:]
 
 
@@ -249,15 +249,15 @@ def _descend(
     equations: Equations, denominator: Float[np.ndarray, " powers"], least_gain: float
 ) -> Solved:
     """Gauss-Newton steps of the denominator, until one gains too little; the rest is linear."""
-    solved = _solve(equations, denominator)
+    basis = _basis(equations, len(denominator))
+    solved = _solve(equations, basis, denominator)
     floor = _EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for _ in range(_STEPS):
-        fixed = _largest(equations.x, solved.denominator)
-        slopes = _real(_slopes(equations, solved, fixed))
-        left = np.concatenate([slopes, _real((equations.y - solved.fitted)[:, None])], axis=1)
-        change = _least_squares(left)[len(solved.linear) :]
+        fixed, left = basis.largest(solved.denominator), equations.y - solved.fitted
+        slopes = _slopes(basis, solved, fixed)
+        change = _least_squares(_stacked(slopes, left[:, None]))[len(solved.linear) :]
         step = np.insert(change, fixed, 0.0)
-        trials = (_solve(equations, solved.denominator + step / 3**k) for k in range(6))
+        trials = (_solve(equations, basis, solved.denominator + step / 3**k) for k in range(6))
         better = next((each for each in trials if each.cost < solved.cost), None)
         if better is None:
             break
@@ -267,32 +267,41 @@ def _descend(
     return solved
 
 
-def _solve(equations: Equations, denominator: Float[np.ndarray, " powers"]) -> Solved:
-    powers = equations.x[:, None] ** np.arange(len(denominator))
-    below = powers @ denominator
+class _Basis(NamedTuple):
+    """What all models of one order have in common."""
+
+    powers: Powers
+    columns: Complex[np.ndarray, "bins parameters"]  # of the numerators and transients
+    size: Float[np.ndarray, " powers"]  # mean over the bins
+
+    def largest(self, denominator: Float[np.ndarray, " powers"]) -> int:
+        """The power whose term is largest over the bins."""
+        return int(np.argmax(np.abs(denominator) * self.size))
+
+
+def _basis(equations: Equations, size: int) -> _Basis:
+    powers = equations.x[:, None] ** np.arange(size)
+    columns = _regressors(powers, equations.u, equations.own)
+    return _Basis(powers, columns, np.mean(np.abs(powers), axis=0))
+
+
+def _solve(
+    equations: Equations, basis: _Basis, denominator: Float[np.ndarray, " powers"]
+) -> Solved:
+    below = basis.powers @ denominator
     least = _NEAREST * np.max(np.abs(below))
     below = np.where(np.abs(below) < least, least, below)
-    columns = _regressors(powers, equations.u, equations.own) / below[:, None]
-    linear = _least_squares(_real(np.concatenate([columns, equations.y[:, None]], axis=1)))
+    columns = basis.columns / below[:, None]
+    linear = _least_squares(_stacked(columns, equations.y[:, None]))
     fitted = columns @ linear
     cost = float(np.sum(np.abs(equations.y - fitted) ** 2))
     return Solved(denominator, linear, below, fitted, cost)
 
 
-def _slopes(
-    equations: Equations, solved: Solved, fixed: int
-) -> Complex[np.ndarray, "bins parameters"]:
+def _slopes(basis: _Basis, solved: Solved, fixed: int) -> Complex[np.ndarray, "bins parameters"]:
     """Derivatives of the fitted output, all coefficients but the fixed one."""
-    powers = equations.x[:, None] ** np.arange(len(solved.denominator))
-    columns = _regressors(powers, equations.u, equations.own)
-    turned = -solved.fitted[:, None] * np.delete(powers, fixed, axis=1)
-    return np.concatenate([columns, turned], axis=1) / solved.below[:, None]
-
-
-def _largest(x: Complex[np.ndarray, " bins"], denominator: Float[np.ndarray, " powers"]) -> int:
-    """The power whose term is largest over the bins."""
-    size = np.mean(np.abs(x)[:, None] ** np.arange(len(denominator)), axis=0)
-    return int(np.argmax(np.abs(denominator) * size))
+    turned = -solved.fitted[:, None] * np.delete(basis.powers, fixed, axis=1)
+    return np.concatenate([basis.columns, turned], axis=1) / solved.below[:, None]
 
 
 def _regressors(powers: Powers, u: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -305,13 +314,27 @@ def _least_squares(joined: Float[np.ndarray, "rows columns"]) -> Vector:
     """Coefficients of all columns but the last, which they fit."""
     length = np.linalg.norm(joined, axis=0)
     length = np.where(length > 0, length, 1.0)
-    corner = np.asarray(np.linalg.qr(joined / length, mode="r"))
+    corner = _triangle(joined / length)
     found = np.linalg.lstsq(corner[:-1, :-1], corner[:-1, -1], rcond=1e-13)[0]
     return found * length[-1] / length[:-1]
 
 
-def _real(x: Complex[np.ndarray, "rows columns"]) -> Float[np.ndarray, "parts columns"]:
-    return np.concatenate([np.real(x), np.imag(x)])
+def _triangle(matrix: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
+    """R of the QR decomposition. numpy.linalg.qr takes twice the time, for copies."""
+    from scipy.linalg.lapack import dgeqrf
+
+    return np.triu(dgeqrf(matrix, overwrite_a=True)[0][: matrix.shape[1]])
+
+
+def _stacked(
+    *parts: Complex[np.ndarray, "rows _"],
+) -> Float[np.ndarray, "stacked columns"]:
+    """Columns side by side, real above imaginary parts, in the order that LAPACK takes."""
+    rows, ends = len(parts[0]), np.cumsum([0, *(part.shape[1] for part in parts)])
+    stacked = np.empty((2 * rows, ends[-1]), order="F")
+    for part, start, end in zip(parts, ends[:-1], ends[1:], strict=True):
+        stacked[:rows, start:end], stacked[rows:, start:end] = part.real, part.imag
+    return stacked
 
 
 def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "bins records"]:

@@ -61,7 +61,7 @@ def test_processes_at_once_leave_whole_programs_for_the_next(tmp_path):
     abandoned = shared / "process-killed"
     abandoned.mkdir()
     for path in (shared / "old-cache", abandoned):
-        os.utime(path, (time.time() - 1e6,) * 2)
+        os.utime(path, (time.time() - 1e6, time.time() - 1e6))
     both = [started(COMPILE, "3", cwd=tmp_path, JAXQUAD_CACHE=str(shared)) for _ in range(2)]
     for imported, returned, own, _ in map(json.loads, map(answer, both)):
         assert imported is None and returned == str(shared) and own.startswith(f"{shared}/process")

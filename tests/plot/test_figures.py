@@ -99,7 +99,7 @@ def of_many_texts(check, frf):
         "overlay": overlay(check, title="flight.npz"),
         "record": record_figure(record),
         "residuals": residual_figure(residuals_of(frf, TRUTH, 0, 0)),
-        "histories": histories(check.time, {"x, V": dict.fromkeys("abcde", 1e5 * check.measured)}),
+        "histories": histories(check.time, {"x, V": {c: 1e5 * check.measured for c in "abcde"}}),
     }
 
 
@@ -112,6 +112,7 @@ def test_nothing_is_cut_off_and_no_legend_lies_on_an_axis(check, frf):
         assert inked.x0 > 0 and inked.y0 > 0, name
         assert inked.x1 < size[0] and inked.y1 < size[1], name
         below = figure.axes[-1].xaxis.get_tightbbox(renderer)
+        assert below is not None
         for legend in figure.legends:
             assert legend.get_window_extent(renderer).y1 < below.y0, name
 
