@@ -1,5 +1,6 @@
 """What knows the compiler: loops as one kernel, compiler options, devices, kept programs."""
 
+from ._accelerator import scan_on_device as scan_on_device
 from ._compile_cache import (
     enable_compile_cache as enable_compile_cache,
     share_programs as share_programs,

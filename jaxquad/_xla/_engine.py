@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 from jaxquad._core import is_concrete
 
+from ._accelerator import why_no_device_kernels
 from ._kernel import why_no_kernels
 from ._switch import Kernel, left_plain, plain_loops, set_kernel, warn_once
 
@@ -33,7 +34,8 @@ def engine(kernel: Kernel | None = None) -> Engine:
     faster. This relies on internals of XLA. It is on for the versions of jaxlib that the tests ran
     on; with any other, a child process tries it once, and its answer is kept in the user's cache
     folder (not with `JAXQUAD_CACHE=off` in the environment). Loops with operations that a kernel
-    cannot hold, or with too many or too large ones, are compiled plain.
+    cannot hold, or with too many or too large ones, are compiled plain. On an NVIDIA GPU the loop
+    of an ensemble of more than 512 members is one kernel.
 
     Where `jq.simulate`, `jq.evaluate` and the like are called outside of `jax.jit`, a kernel that
     does not compile is compiled plain, with a warning. Within a `jax.jit` of your own that cannot
@@ -54,9 +56,15 @@ def engine(kernel: Kernel | None = None) -> Engine:
     """
     if kernel is not None:
         set_kernel(kernel)
-    reason = why_no_kernels()
+    reason = _why_plain()
     bits = compiler_options().get("xla_cpu_prefer_vector_width")
     return Engine(jax.default_backend(), reason is None, bits, reason, left_plain())
+
+
+def _why_plain() -> str | None:
+    """Why loops are compiled plain here; None if they become kernels, of a CPU or of a GPU."""
+    reason = why_no_kernels()
+    return None if why_no_device_kernels() is None else reason
 
 
 class Jit:
@@ -83,7 +91,7 @@ class Jit:
     def __call__(self, *args: PyTree) -> PyTree:
         if not _is_outermost(args):
             return self._plain(*args)
-        if why_no_kernels() is not None:
+        if _why_plain() is not None:
             return self._tuned(*args)
         if self._failed and _shapes(args) in self._failed:
             return self._without_kernels(*args)

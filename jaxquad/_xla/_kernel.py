@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ._canary import why_not_trusted
-from ._switch import is_off, warn_once
+from ._switch import device_kernels, is_off, warn_once
 
 
 try:
@@ -48,6 +48,8 @@ def why_no_kernels() -> str | None:
         return "switched off"
     if jax.default_backend() != "cpu":
         return f"the platform is {jax.default_backend()}, and kernels are for CPUs"
+    if device_kernels.value != "auto":
+        return "kernels of a GPU are being tried"
     if _MISSING is not None:
         warn_once(_MISSING)
         return _MISSING

@@ -10,13 +10,60 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxquad._xla import as_one_kernel
+from jaxquad._xla import as_one_kernel, scan_on_device
 
 from ._delay import Queue
 
 
 _SHORT = 128  # samples that need no blocks
 Step = Callable[..., tuple[PyTree, PyTree]]
+
+
+def scan_members(
+    step: Step,
+    carry: PyTree,
+    xs: PyTree,
+    count: int,
+    members: int | None,
+    queue: Queue | None = None,
+) -> tuple[PyTree, PyTree]:
+    """`scan_in_blocks` of an ensemble, which an accelerator runs as one kernel if it can.
+
+    `members` are on the last axis of the carry; None for a single loop, or for more axes.
+    """
+    plain = lambda step, carry, xs: scan_in_blocks(step, carry, xs, count)
+    if members is not None and queue is None:
+        found = scan_on_device(step, carry, xs, members, plain)
+    elif members is not None and queue is not None and _rows_of(queue) <= _FEW_ROWS:
+        begun = (_in_order(queue), carry)
+        found = scan_on_device(_with_rows(step), begun, xs, members, plain)
+        found = found and (found[0][1], found[1])
+    else:
+        found = None
+    return scan_in_blocks(step, carry, xs, count, queue) if found is None else found
+
+
+_FEW_ROWS = 16  # samples of delay that a kernel of an accelerator keeps among its numbers
+
+
+def _rows_of(queue: Queue) -> int:
+    return 1 + (0 if queue.rows is None else len(queue.rows))
+
+
+def _in_order(queue: Queue) -> tuple[Array, ...]:
+    """The inputs on their way, the oldest first."""
+    return (*(() if queue.rows is None else queue.rows), queue.newest)
+
+
+def _with_rows(step: Step) -> Step:
+    """A step that hands its queue on row by row: a kernel has no place that is known only later."""
+
+    def queued(both: tuple[tuple[Array, ...], PyTree], now: PyTree) -> tuple[PyTree, PyTree]:
+        (oldest, *rows), carry = both
+        carry, (newest, out) = step(carry, now, oldest)
+        return ((*rows, newest), carry), out
+
+    return queued
 
 
 def scan_in_blocks(
@@ -104,9 +151,10 @@ def run_ensemble(
 ) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` of an ensemble of loops: the last carry, and what each sample left.
 
-    On a CPU each chunk of members is one compiled kernel, if it is plain arithmetic; other devices
-    take all members at once. Reverse mode keeps blocks of samples of one chunk at a time. To be
-    called under `jax.jit`, with `compiler_options()` if that is the outermost one.
+    On a CPU each chunk of members is one compiled kernel, if it is plain arithmetic. Other devices
+    take all members at once, and an NVIDIA GPU runs the whole loop as one kernel. Reverse mode
+    keeps blocks of samples of one chunk at a time. To be called under `jax.jit`, with
+    `compiler_options()` if that is the outermost one.
 
     **Arguments:**
 
@@ -125,7 +173,9 @@ def run_ensemble(
     def loop(given: PyTree) -> tuple[PyTree, PyTree]:
         carry, (parts, signals) = given
         count = jax.tree.leaves(signals)[0].shape[0]
-        return scan_in_blocks(lambda carry, now: step(carry, parts, now), carry, signals, count)
+        members = jax.tree.leaves(carry)[0].shape[-1]
+        advance = lambda carry, now: step(carry, parts, now)
+        return scan_members(advance, carry, signals, count, members)
 
     theirs = (True, own)
     return in_chunks(lambda x: as_one_kernel(loop, x), (carry, (parts, signals)), theirs, chunk)

@@ -14,7 +14,7 @@ from jaxquad._core import ensemble_shape, is_concrete, mark_members
 from jaxquad._xla import as_one_kernel
 from jaxquad.loops import CarriesPayload, Loop, Plant
 
-from ._blocks import in_chunks, most_at_once, scan_in_blocks
+from ._blocks import in_chunks, most_at_once, scan_members
 from ._guard import are_sound, guarded
 from ._scenario import Scenario
 from ._step import Carry, LoopStep, make_step, require_runnable, SampleResult
@@ -149,4 +149,6 @@ def _scan(rest: PyTree, arrays: PyTree) -> tuple[PyTree, PyTree]:
         return (inner._replace(queue=None), total), output
 
     count = scenario.reference.shape[0]
-    return scan_in_blocks(advance, (start, carry[1]), (jnp.arange(count), scenario), count, queue)
+    members = step.ensemble[0] if len(step.ensemble) == 1 else None
+    signals = jnp.arange(count), scenario
+    return scan_members(advance, (start, carry[1]), signals, count, members, queue)

@@ -132,7 +132,7 @@ def step(state: State, parts: Any, load: Any) -> tuple[State, None]:
     return State(moved, axes, state.cost + costs[0] + costs[1] + costs[2]), None
 
 
-def costs(tuning: Any, inertia: Any, load: Any, chunk: int = 128) -> Any:
+def costs(tuning: Any, inertia: Any, load: Any, chunk: int | None = 128) -> Any:
     """The cost [members] of 12 tuning parameters, inertias [3, members], torques [samples, 3]."""
     begin = start(inertia.shape[1], inertia.dtype)
     # One sum over the members at the end is cheaper to differentiate than one at every sample.

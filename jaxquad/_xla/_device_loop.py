@@ -1,0 +1,237 @@
+"""The time loop of an ensemble as one kernel on an accelerator, with its derivatives.
+
+XLA launches some kernels for every sample there, and the launches take longer than the arithmetic.
+Forward and reverse mode are one kernel each (`_loop_kernels`). Forward-mode derivatives, second
+ones and batches of ensembles run as plain scans.
+"""
+
+import functools as ft
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, PyTree
+
+from ._accelerator import Result, Scan, Step
+from ._forward_kernel import run_forward
+from ._lanes import NotInLanes, NUMBERS
+from ._loop_kernels import (
+    Flat,
+    is_float,
+    kept_avals,
+    Loop,
+    reverse_in_lanes,
+    split,
+    step_in_lanes,
+)
+from ._reverse_kernel import holds_cotangents, run_reverse
+from ._switch import device_kernels, note, warn_once
+
+
+def scan_in_kernel(
+    step: Step, carry: PyTree, signals: PyTree, members: int, scan: Scan
+) -> Result | None:
+    """`scan(step, carry, signals)`; None, and a note for `engine()`, where no kernel holds it."""
+    jaxpr, consts, result = _trace(step, carry, signals)
+    first, now = jax.tree.leaves(carry), jax.tree.leaves(signals)
+    interpret = device_kernels.value == "interpret"
+    loop = Loop(jaxpr, len(consts), len(first), members, len(now[0]) if now else 0, interpret)
+    reason = _why_not(loop)
+    if reason is not None:
+        note(f"a kernel of a GPU does not hold {reason}")
+        return None
+    found = _loop.bind(*consts, *first, *now, loop=loop, scan=scan, keep=False)
+    return jax.tree.unflatten(result, found)
+
+
+def _trace(step: Step, carry: PyTree, signals: PyTree) -> tuple[ClosedJaxpr, list[Array], PyTree]:
+    """The step as a jaxpr of (consts, carry, now), what it takes from around it, and its result."""
+    now = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), signals)
+    closed, result = jax.make_jaxpr(step, return_shape=True)(carry, now)
+    consts = [x for x in closed.consts if isinstance(x, jax.Array)]
+
+    def opened(*args: Array) -> list[Array]:
+        fresh = iter(args)
+        whole = [next(fresh) if isinstance(x, jax.Array) else x for x in closed.consts]
+        return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, whole))(*fresh)
+
+    shaped = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (*consts, *closed.in_avals)]
+    return jax.make_jaxpr(opened)(*shaped), consts, jax.tree.structure(result)
+
+
+def _why_not(loop: Loop) -> str | None:
+    carry, after = loop.avals[1], loop.results[0]
+    if not loop.avals[2]:
+        return "a loop without signals"
+    if any((a.shape, a.dtype) != (b.shape, b.dtype) for a, b in zip(carry, after, strict=True)):
+        return "a carry that changes its shape"
+    for x in (*loop.given, *loop.out):
+        if x.dtype not in NUMBERS:
+            return f"values of {x.dtype}"
+    return _fits(ft.partial(step_in_lanes, loop))
+
+
+def _fits(write: Callable[[], object]) -> str | None:
+    try:
+        write()
+    except NotInLanes as reason:
+        return str(reason)
+    except Exception as error:  # JAX's operations have changed: do without the kernel.
+        warn_once(f"JAX {jax.__version__} cannot write a kernel ({type(error).__name__}: {error})")
+        return f"a step that fails with {type(error).__name__}"
+    return None
+
+
+def _run_plain(loop: Loop, scan: Scan, *args: Array) -> Flat:
+    consts, carry, signals = split(args, loop.consts, loop.carry)
+    step = jaxpr_as_fun(loop.step)
+
+    def sample(carry: Flat, now: Flat) -> tuple[Flat, Flat]:
+        carry, stored = split(step(*consts, *carry, *now), loop.carry)
+        return carry, stored
+
+    carry, stored = scan(sample, carry, signals)
+    return [*carry, *stored]
+
+
+def _plain(*args: Array, loop: Loop, scan: Scan, keep: bool) -> Flat:
+    # What is kept is for kernels.
+    kept = [jnp.zeros(x.shape, x.dtype) for x in kept_avals(loop)] if keep else []
+    return [*_run_plain(loop, scan, *args), *kept]
+
+
+def _of_wanted(
+    loop: Loop, scan: Scan, args: Sequence[Array], which: tuple[bool, ...]
+) -> tuple[Callable[..., Flat], Flat]:
+    """The float results as a function of the arguments in `which`, and these."""
+
+    def function(*some: Array) -> Flat:
+        fresh = iter(some)
+        whole = [next(fresh) if w else x for w, x in zip(which, args, strict=True)]
+        return [x for x in _run_plain(loop, scan, *whole) if is_float(x.dtype)]
+
+    return function, [x for w, x in zip(which, args, strict=True) if w]
+
+
+def _plain_tangents(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
+    """Of (arguments, kept, tangents)."""
+    given, _, tangents = split(args, len(which), loop.carry)
+    function, some = _of_wanted(loop, scan, given, which)
+    return jax.jvp(function, some, tangents)[1]
+
+
+def _plain_cotangents(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
+    """Of (arguments, kept, cotangents)."""
+    given, _, cotangents = split(args, len(which), loop.carry)
+    function, some = _of_wanted(loop, scan, given, which)
+    return list(jax.vjp(function, *some)[1](cotangents))
+
+
+def _primitive(name: str, kernel: Callable[..., Flat], plain: Callable[..., Flat]) -> Primitive:
+    """Runs `kernel`, and differentiates and batches `plain`."""
+    made = Primitive(name)
+    made.multiple_results = True
+    made.def_impl(lambda *args, **params: jax.jit(ft.partial(kernel, **params))(*args))
+    mlir.register_lowering(made, mlir.lower_fun(kernel, multiple_results=True))
+
+    def derivative(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[Flat, Flat]:
+        moved = tuple(ad.instantiate_zeros(x) for x in tangents)
+        return jax.jvp(ft.partial(plain, **params), tuple(primals), moved)
+
+    def batch(args: Sequence, axes: Sequence, **params: Any) -> tuple[Flat, list[int]]:
+        out = jax.vmap(ft.partial(plain, **params), in_axes=tuple(axes))(*args)
+        return out, [0] * len(out)
+
+    ad.primitive_jvps[made] = derivative
+    batching.primitive_batchers[made] = batch
+    return made
+
+
+def _forward(*args: Array, loop: Loop, scan: Scan, keep: bool) -> Flat:
+    return run_forward(loop, *args, keep=keep)
+
+
+def _reverse(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
+    return run_reverse(loop, *args, which=which)
+
+
+_loop = _primitive("ensemble_loop", _forward, _plain)
+_tangent = _primitive("ensemble_loop_tangent", _plain_tangents, _plain_tangents)
+_cotangent = _primitive("ensemble_loop_cotangent", _reverse, _plain_cotangents)
+
+
+def _shaped(shape: tuple[int, ...], kind: np.dtype) -> ShapedArray:
+    return ShapedArray(shape, kind)
+
+
+def _results(loop: Loop) -> list[ShapedArray]:
+    carry, stored = loop.results
+    timed = [_shaped((loop.count, *x.shape), x.dtype) for x in stored]
+    return [*(_shaped(x.shape, x.dtype) for x in carry), *timed]
+
+
+def _arguments(loop: Loop) -> list[ShapedArray]:
+    consts, carry, signals = loop.avals
+    timed = [_shaped((loop.count, *x.shape), x.dtype) for x in signals]
+    return [*(_shaped(x.shape, x.dtype) for x in (*consts, *carry)), *timed]
+
+
+_loop.def_abstract_eval(
+    lambda *_, loop, scan, keep: [
+        *_results(loop),
+        *(_shaped(x.shape, x.dtype) for x in (kept_avals(loop) if keep else ())),
+    ]
+)
+_tangent.def_abstract_eval(
+    lambda *_, loop, scan, which: [x for x in _results(loop) if is_float(x.dtype)]
+)
+_cotangent.def_abstract_eval(
+    lambda *_, loop, scan, which: [
+        x for x, wanted in zip(_arguments(loop), which, strict=True) if wanted
+    ]
+)
+
+
+def _loop_derivative(
+    primals: Sequence[Array], tangents: Sequence, *, loop: Loop, scan: Scan, keep: bool
+) -> tuple[Flat, list]:
+    which = tuple(not isinstance(x, ad.Zero) for x in tangents)
+    out = _loop.bind(*primals, loop=loop, scan=scan, keep=keep or any(which))
+    results, kept = split(out, len(loop.out))
+    moved = [x for x in tangents if not isinstance(x, ad.Zero)]
+    if any(which):
+        moved = _tangent.bind(*primals, *kept, *moved, loop=loop, scan=scan, which=which)
+    found = iter(moved)
+    still = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
+    out_tangents = [next(found, still(x)) if is_float(x.dtype) else still(x) for x in results]
+    kept = kept if keep else []
+    # What is made of the kept carries is differentiated by the arguments, which lead to them.
+    return [*results, *kept], [*out_tangents, *map(still, kept)]
+
+
+def _transpose(
+    cotangents: Sequence, *args: Any, loop: Loop, scan: Scan, which: tuple[bool, ...]
+) -> list:
+    known, _ = split(args, len(which) + loop.carry)
+    if all(isinstance(x, ad.Zero) for x in cotangents):
+        return [None] * len(args)
+    given = [not isinstance(x, ad.Zero) for x in cotangents]
+    filled = [ad.instantiate_zeros(x) for x in cotangents]
+    reason = _fits(ft.partial(reverse_in_lanes, loop, which))
+    if reason is None and not holds_cotangents(loop, given):
+        reason = "a cotangent of what all members share"
+    if reason is None:
+        found = _cotangent.bind(*known, *filled, loop=loop, scan=scan, which=which)
+    else:
+        note(f"the reverse kernel of a GPU does not hold {reason}")
+        found = _plain_cotangents(*known, *filled, loop=loop, scan=scan, which=which)
+    return [*(None for _ in known), *found]
+
+
+ad.primitive_jvps[_loop] = _loop_derivative
+ad.primitive_transposes[_tangent] = _transpose

@@ -1,0 +1,205 @@
+"""A time loop as one kernel of an accelerator is the plain scan, in values and derivatives.
+
+Pallas' interpreter runs the kernels here. Nothing was run on a GPU: that they become Triton's code
+for one is tested, not that it is fast.
+"""
+
+import functools as ft
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxquad._xla import _switch, scan_on_device
+
+
+MEMBERS, SAMPLES = 70, 7  # a block and a part of one; segments of 3, 3 and 1
+QUICK = {"xla_backend_optimization_level": 0}  # interpreted kernels are long programs
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch):
+    monkeypatch.setattr(_switch, "_said", {})
+
+
+def plain(step, carry, signals):
+    return jax.lax.scan(step, carry, signals)
+
+
+def kernel(step, carry, signals):
+    found = scan_on_device(step, carry, signals, MEMBERS, plain)
+    assert found is not None, _switch.left_plain()
+    return found
+
+
+def compiled(function, *args, mode="interpret"):
+    with _switch.device_kernels(mode):
+        return jax.jit(function, compiler_options=QUICK)(*args)
+
+
+def for_cuda(function, *args):
+    with _switch.device_kernels("compile"):
+        return jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
+
+
+def spread(*shape, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).uniform(0.2, 0.8, shape))
+
+
+def coupled(matrix, gain, carry, now):
+    """Small products, stacks, slices, masks, a short loop: all that is no arithmetic."""
+    (x, level, stopped), (index, reference, noise) = carry, now
+    error = reference[:, None] - x + 0.1 * noise
+    torque = jnp.clip(jnp.tensordot(matrix, error, 1) * gain[None], -0.4, 0.4)
+
+    @jax.checkpoint
+    def substep(x, _):
+        turned = jnp.stack([x[1] * x[2], x[2] * x[0], x[0] * x[1]])
+        return x + 0.05 * (torque - turned), None
+
+    x = jax.lax.scan(substep, x, None, length=2)[0]
+    x = jnp.where(stopped[None], x, jnp.concatenate([x[:1], jnp.flip(x[1:], 0)]))
+    level = jax.lax.cond(index > 3, lambda a: a * 0.9, lambda a: a + jnp.max(x, axis=0), level)
+    stopped = stopped | (jnp.sum(x**2, axis=0) > 1.2)
+    return (x, level, stopped), (jnp.linalg.norm(x, axis=0), jnp.max(reference))
+
+
+def total(scan, matrix, gain, start, reference, noise):
+    carry = (start, jnp.zeros_like(gain), jnp.zeros(MEMBERS, bool))
+    signals = (jnp.arange(SAMPLES), reference, noise)
+    carry, (size, seen) = scan(ft.partial(coupled, matrix, gain), carry, signals)
+    weight = jnp.arange(1.0, MEMBERS + 1).astype(gain.dtype)
+    cost = jnp.sum(carry[0] * weight[None]) + jnp.sum(carry[1] * jnp.sum(size, axis=0) * weight)
+    return cost, (carry, size, seen)
+
+
+def given():
+    sizes = (3, 3), (MEMBERS,), (3, MEMBERS), (SAMPLES, 3), (SAMPLES, 3, MEMBERS)
+    return [spread(*size, seed=k) for k, size in enumerate(sizes)]
+
+
+def test_values_and_gradients_are_those_of_the_plain_scan():
+    """With respect to what members share and what they do not, at the start and in every sample."""
+    both = [jax.value_and_grad(ft.partial(total, scan), argnums=range(5), has_aux=True)
+            for scan in (kernel, plain)]  # fmt: skip
+    found, expected = (jax.tree.leaves(compiled(f, *given())) for f in both)
+    assert not _switch.left_plain()
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_gradient_is_two_kernels_of_a_gpu_and_no_loop_around_them(kind):
+    args = [x.astype(kind) for x in given()]
+    text = for_cuda(jax.grad(lambda *args: total(kernel, *args)[0], range(5)), *args)
+    assert not _switch.left_plain()
+    assert text.count("gpu.triton") == 2
+    assert "stablehlo.while" not in text
+
+
+def squared(scan, x):
+    step = lambda c, now: (c * jnp.sin(c * now), None)
+    return jnp.sum(scan(step, x * jnp.ones((2, MEMBERS)), jnp.arange(1.0, 6.0))[0])
+
+
+MODES = {
+    "forward": jax.jacfwd,
+    "second": lambda f: jax.jacfwd(jax.grad(f)),
+    "twice reverse": lambda f: jax.grad(jax.grad(f)),
+    "batched": lambda f: lambda x: jax.vmap(jax.grad(f))(jnp.stack([x, 2 * x])),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+def test_other_derivatives_run_as_plain_scans(mode):
+    x = jnp.asarray(0.7)
+    found, expected = (compiled(MODES[mode](ft.partial(squared, s)), x) for s in (kernel, plain))
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
+OPERATIONS = {
+    name: getattr(jnp, name)
+    for name in """
+        abs negative ceil floor exp exp2 expm1 log log1p sqrt square cbrt sin cos tan arcsin arccos
+        arctan sinh cosh tanh arcsinh arctanh isfinite sign
+    """.split()
+} | {
+    "arccosh": lambda x: jnp.arccosh(1 + x),
+    "round": lambda x: jnp.round(10 * x),
+    "away": lambda x: jax.lax.round(10 * x, jax.lax.RoundingMethod.AWAY_FROM_ZERO),
+    "rsqrt": jax.lax.rsqrt,
+    "power": lambda x: x**2.5,
+    "integer power": lambda x: x**-3,
+    "logistic": jax.nn.sigmoid,
+    "arctan2": lambda x: jnp.arctan2(x, 0.3 - x),
+    "remainder": lambda x: jax.lax.rem(x, jnp.full_like(x, 0.3)),
+    "clamp": lambda x: jax.lax.clamp(jnp.asarray(0.3, x.dtype), x, jnp.asarray(0.6, x.dtype)),
+    "extremes": lambda x: jnp.maximum(x, 0.5) / jnp.minimum(x, 0.4),
+    "product": lambda x: jnp.prod(x, axis=0, keepdims=True) + x,
+    "running sum": lambda x: jnp.cumsum(x, axis=0),
+    "any and all": lambda x: x + (jnp.any(x > 0.5, 0) ^ jnp.all(x > 0.3, 0))[None].astype(x.dtype),
+    "padded": lambda x: jnp.pad(x, ((1, 2), (0, 0)))[1:3] + jnp.roll(x, 1, axis=0),
+    "placed": lambda x: jax.lax.dynamic_update_slice(x, 2 * x[:1], (1, 0)),
+    "taken": lambda x: x * jax.lax.dynamic_slice(x, (1, 0), (1, MEMBERS)),
+    "two products": lambda x: jnp.einsum("in,jn,ij->jn", x, x, jnp.asarray(ROWS, x.dtype)),
+    "switch": lambda x: jax.lax.switch(2, [jnp.sin, jnp.cos, jnp.tan], x),
+}  # fmt: skip
+ROWS = np.array([[1.0, 2.0], [0.0, 3.0]])
+
+
+def every_operation(scan, x):
+    def step(x, now):
+        out = [f(x).astype(x.dtype) for f in OPERATIONS.values()]
+        return jnp.sin(x) + now, tuple(out)
+
+    return scan(step, x, jnp.full(3, 0.1, x.dtype))
+
+
+@pytest.mark.slow
+def test_each_operation_is_that_of_the_plain_scan():
+    x = spread(2, MEMBERS)
+    found, expected = (compiled(ft.partial(every_operation, s), x) for s in (kernel, plain))
+    for name, one, other in zip(OPERATIONS, found[1], expected[1], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-14, err_msg=name)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_each_operation_becomes_code_for_a_gpu(kind):
+    text = for_cuda(ft.partial(every_operation, kernel), spread(2, MEMBERS).astype(kind))
+    assert text.count("gpu.triton") == 1
+
+
+def test_a_member_that_is_nan_stays_nan():
+    """The maximum and the minimum of Triton would drop it."""
+    x = jnp.full((1, MEMBERS), jnp.nan)
+    step = lambda x, now: (jnp.minimum(jnp.maximum(jnp.clip(x, 0, 1), now), now), None)
+    out, _ = compiled(lambda x: kernel(step, x, jnp.ones(3)), x)
+    assert np.isnan(out).all()
+
+
+REFUSED = {
+    "sort": lambda x: jnp.sort(x, axis=0),
+    "reduce_sum over the members": lambda x: x - jnp.sum(x, axis=1, keepdims=True),
+    "a slice of the members": lambda x: x + x[:, :1],
+    "a loop of 100 iterations": lambda x: jax.lax.fori_loop(0, 100, lambda _, x: 0.9 * x, x),
+    "float16": lambda x: x.astype(jnp.float16).astype(x.dtype),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_a_kernel_cannot_hold_is_left_to_the_plain_scan_and_said(what):
+    run = lambda x: scan_on_device(lambda x, _: (REFUSED[what](x), None), x, ONES, MEMBERS, plain)
+    with _switch.device_kernels("interpret"):
+        assert jax.eval_shape(run, spread(2, MEMBERS)) is None
+    (said,) = _switch.left_plain()
+    assert what in said
+
+
+ONES = np.ones(2)
+
+
+def test_without_a_gpu_no_loop_is_given_to_one():
+    run = lambda x: scan_on_device(lambda x, _: (x, None), x, ONES, 1000, plain)
+    assert jax.default_backend() == "gpu" or jax.eval_shape(run, spread(2, 1000)) is None

@@ -1,0 +1,75 @@
+"""1e5 and 1e6 adaptive loops of 5000 steps on a GPU: the whole time loop is one kernel.
+
+    python -m pytest tests/benchmarks/test_accelerator_speed.py -o addopts= -s
+
+Forward, and the gradient of the mean cost with respect to 12 tuning parameters; best of five runs,
+with what starts a kernel, without copies from and to the host. Skipped where JAX has no GPU.
+"""
+
+import time
+
+import adaptive_loop
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxquad._xla import engine
+
+
+STEPS, ROUNDS = 5000, 5
+CASES = [(100_000, np.float32), (1_000_000, np.float32), (100_000, np.float64)]
+TUNING = (6.0, 4.0, 25.0, 20.0, *(1 / np.linspace(0.5, 2.25, 8)))
+
+
+@pytest.fixture(autouse=True)
+def gpu():
+    if jax.default_backend() != "gpu":
+        pytest.skip(f"the platform is {jax.default_backend()}")
+    with jax.enable_x64(True):
+        yield jax.devices()[0].device_kind
+
+
+def given(members, steps, kind):
+    sizes = np.random.default_rng(0).uniform(0.6, 1.8, (3, members))
+    inertia = np.array(adaptive_loop.INERTIA)[:, None] * sizes
+    t = np.arange(steps) * adaptive_loop.DT
+    load = np.stack([0.05 * np.sin(2 * t), 0.05 * np.sin(3 * t), 0.02 * np.sin(2.5 * t)], 1)
+    return tuple(jnp.asarray(x, kind) for x in (TUNING, inertia, load))
+
+
+def costs(*args):
+    return adaptive_loop.costs(*args, chunk=None)
+
+
+def mean(*args):
+    return jnp.mean(costs(*args))
+
+
+def seconds(run, *args):
+    compiled = jax.jit(run).lower(*args).compile()
+    taken = []
+    for _ in range(ROUNDS + 1):
+        began = time.perf_counter()
+        jax.block_until_ready(compiled(*args))
+        taken.append(time.perf_counter() - began)
+    return min(taken)
+
+
+@pytest.mark.parametrize("members, kind", CASES)
+def test_loops_per_second(gpu, members, kind):
+    args = given(members, STEPS, kind)
+    count = members * STEPS
+    for what, run in (("forward", costs), ("gradient", jax.grad(mean))):
+        taken = seconds(run, *args)
+        name = np.dtype(kind).name
+        print(f"\n{gpu}, {members} loops, {name}, {what}: {count / taken:.3g} loop-steps/s")
+    assert engine().left_plain == ()
+
+
+def test_results_and_gradients_are_those_of_the_plain_scan():
+    args = given(1024, 500, np.float64)
+    plain = lambda *args: jnp.mean(adaptive_loop.plain(*args))
+    for fast, slow in ((costs, adaptive_loop.plain), (jax.grad(mean), jax.grad(plain))):
+        np.testing.assert_allclose(jax.jit(fast)(*args), jax.jit(slow)(*args), rtol=1e-9)
+    assert engine().left_plain == ()
