@@ -1,6 +1,7 @@
 """Identify one log: from its path and settings to fits, text, figures and a folder."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -116,7 +117,7 @@ class Identification:
         """The structure of the model in words."""
         return model_formula(self.settings)
 
-    @property
+    @ft.cached_property
     def combinations(self) -> tuple[Combination, ...]:
         """The sum of lag and delay, where the record determines it."""
         try:
