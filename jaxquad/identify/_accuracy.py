@@ -9,17 +9,21 @@ from jaxtyping import Complex, Float
 
 from jaxquad.spectra import FrequencyResponse
 
+from ._mixing import expected_cost, mix, mix_twice, Mixing
+
 
 Matrix = Float[np.ndarray, "parameters parameters"]
 
 
 class Block(NamedTuple):
-    """One response pair: slopes of ln-magnitude and phase, their weights, and the error."""
+    """One response pair: what the fit lowers, slopes of ln-magnitude and phase, and the error."""
 
-    misfit: Float[np.ndarray, "frequencies 2"]
+    residual: Float[np.ndarray, "frequencies 2"]
+    rows: Float[np.ndarray, "frequencies 2 all"]  # slopes of the residual
     slopes: Float[np.ndarray, "frequencies 2 all"]
     weights: Float[np.ndarray, "frequencies 2"]
     error: Float[np.ndarray, " frequencies"]  # random error relative to the model
+    expected: float  # what noise alone leaves of the squared residuals
 
 
 class PriorRows(NamedTuple):
@@ -34,9 +38,8 @@ def gauss_newton(blocks: list[Block], prior: PriorRows, count: int) -> tuple[Mat
     jacobian = [prior.slopes[:, :count]]
     residual = [prior.misfit]
     for block in blocks:
-        weighted = block.weights[..., None] * block.slopes[..., :count]
-        jacobian.append(weighted.reshape(-1, count))
-        residual.append((block.weights * block.misfit).reshape(-1))
+        jacobian.append(block.rows[..., :count].reshape(-1, count))
+        residual.append(block.residual.reshape(-1))
     j, r = np.concatenate(jacobian), np.concatenate(residual)
     return j.T @ j, j.T @ r
 
@@ -56,6 +59,12 @@ class ResponseTerm(NamedTuple):
     misfit: Float[np.ndarray, "frequencies outputs inputs 2"]
     slopes: Float[np.ndarray, "frequencies outputs inputs 2 all"]
     weights: Float[np.ndarray, "frequencies outputs inputs 2"]
+    mixing: Mixing | None
+
+    def pulls(self, count: int) -> Float[np.ndarray, "frequencies outputs inputs 2 parameters"]:
+        """How far a misfit of each point moves the gradient by each free parameter."""
+        rows = self.weights[..., None] * self.slopes[..., :count]
+        return self.weights[..., None] * mix_twice(self.mixing, rows)
 
     @property
     def ratio(self) -> Complex[np.ndarray, "frequencies outputs inputs"]:
@@ -69,9 +78,14 @@ def blocks_of(records: Sequence[ResponseTerm]) -> list[Block]:
     for record in records:
         # An exact response would have infinite weight.
         error = np.maximum(np.asarray(record.frf.random_error) * np.abs(record.ratio), 1e-7)
+        weights, used = record.weights, record.weights[..., 0] > 0
+        residual = mix(record.mixing, weights * record.misfit)
+        rows = mix(record.mixing, weights[..., None] * record.slopes)
+        known = np.where(used, error, 0.0)
+        expected = expected_cost(record.mixing, weights * known[..., None])
         for o, i in np.ndindex(error.shape[1:]):
-            parts = (record.misfit, record.slopes, record.weights, error)
-            blocks.append(Block(*(part[:, o, i] for part in parts)))
+            parts = (residual, rows, record.slopes, weights, error)
+            blocks.append(Block(*(part[:, o, i] for part in parts), float(expected[o, i])))
     return [block for block in blocks if np.any(block.weights)]
 
 
@@ -80,16 +94,12 @@ def noise_effect(
 ) -> Noise:
     """The responses' errors, with all their correlation, seen through weights and slopes."""
     data = np.sum([_through_fit(record, count) for record in records], axis=0)
-    used = [block.weights[:, 0] > 0 for block in blocks]
-    cost = sum(
-        float(np.sum(block.weights[mine] ** 2 * block.error[mine, None] ** 2))
-        for block, mine in zip(blocks, used, strict=True)
-    )
+    cost = sum(block.expected for block in blocks)
     return Noise(data, prior.slopes[:, :count].T @ prior.slopes[:, :count], cost)
 
 
 def _through_fit(record: ResponseTerm, count: int) -> Matrix:
-    weighted = record.weights[..., None] ** 2 * record.slopes[..., :count]
+    weighted = record.pulls(count)
     used = record.weights[..., :1] > 0
     model = np.where(used[..., 0], np.asarray(record.frf.response) / record.ratio, 1.0)
     # Magnitude and phase of the misfit are the parts of dT over T.
@@ -121,7 +131,7 @@ def degrees_of_freedom(
     for record in records:
         used = record.weights[..., 0] > 0
         error = np.where(used, np.asarray(record.frf.random_error) * np.abs(record.ratio), 0.0)
-        moved = (record.weights[..., None] ** 2 * record.slopes[..., :count]) @ inverse
+        moved = record.pulls(count) @ inverse
         share = np.sum((error[..., None, None] * moved) ** 2, axis=(2, 3))
         variance += np.sum(share, axis=(0, 1))
         covariance = record.frf.log_noise_covariance

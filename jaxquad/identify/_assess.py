@@ -48,6 +48,7 @@ from ._fit_remarks import (
 from ._held import remarks_on_hold
 from ._identifiability import assess_identifiability, Information, LIMIT
 from ._make_fit import Costs, Estimate, make_fit
+from ._mixing import Mixing
 from ._parameters import Place
 from ._problem import Problem
 from ._result import Fit
@@ -64,6 +65,7 @@ class Counted(NamedTuple):
 
     points: Sequence[Points]
     weights: Sequence[Weights] | None
+    mixings: Sequence[Mixing | None] | None
     found: tuple[Mixture, Mixture]
 
 
@@ -88,7 +90,8 @@ def assess(
     by_noise, covariance = halved(seen.by_noise), halved(seen.covariance)
     plain = seen
     if counted.weights is not None:
-        alone = problem.weighted([jnp.asarray(each) for each in counted.weights])
+        weights = [jnp.asarray(each) for each in counted.weights]
+        alone = problem.weighted(weights, counted.mixings)
         plain = _look(_records(alone, frfs, solution, units), prior, count)
     costs = _costs(plain.blocks, prior, plain.bread, plain.noise)
     cost, misfit = costs.cost, costs.chi_squared
@@ -228,7 +231,7 @@ def _look(records: list[ResponseTerm], prior: PriorRows, count: int) -> _Look:
 
 def _costs(blocks: list[Block], prior: PriorRows, bread: Matrix, noise: Noise) -> Costs:
     """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
-    data = sum(float(np.sum((block.weights * block.misfit) ** 2)) for block in blocks)
+    data = sum(float(np.sum(block.residual**2)) for block in blocks)
     cost, misfit = data + float(np.sum(prior.misfit**2)), misfit_ratio(data, bread, noise)
     # A misfit beyond the noise is in no covariance of the noise.
     inflation = misfit if misfit > MISFIT**2 else 1.0
@@ -292,7 +295,8 @@ def _records(
     weights = [np.asarray(each) for each in problem.weights]
     misfits = [np.asarray(each) for each in parts.misfits]
     slopes = [np.asarray(each) * scale for each in parts.slopes]
-    return [ResponseTerm(*each) for each in zip(frfs, misfits, slopes, weights, strict=True)]
+    terms = zip(frfs, misfits, slopes, weights, problem.mixings, strict=True)
+    return [ResponseTerm(*each) for each in terms]
 
 
 def _prior_rows(solution: Solution, units: Float[np.ndarray, " all"]) -> PriorRows:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ._accuracy import Matrix, scaled_inverse
 from ._held import evaluate_sampled
+from ._mixing import mix
 from ._problem import Problem
 from ._solve import describe_once, Solution, solution_at, solve, Stop
 
@@ -96,11 +97,13 @@ def _above_underflow(problem: Problem, solution: Solution) -> Solution:
 def _look(problem: Problem, solution: Solution) -> _Local:
     residual, jacobian = [], []
     parts, count = solution.sensitivity, problem.parameters.count
-    for weights, misfit, slopes in zip(problem.weights, parts.misfits, parts.slopes, strict=True):
+    terms = zip(problem.weights, problem.mixings, parts.misfits, parts.slopes, strict=True)
+    for weights, mixing, misfit, slopes in terms:
         weights = np.asarray(weights)
         used = weights > 0
-        residual.append((weights * np.asarray(misfit))[used])
-        jacobian.append((weights[..., None] * np.asarray(slopes)[..., :count])[used])
+        residual.append(mix(mixing, weights * np.asarray(misfit))[used])
+        scaled = weights[..., None] * np.asarray(slopes)[..., :count]
+        jacobian.append(mix(mixing, scaled)[used])
     r = np.concatenate([*residual, np.asarray(parts.prior_misfits)])
     return _Local(r, np.concatenate([*jacobian, np.asarray(parts.prior_slopes)[:, :count]]))
 

@@ -51,12 +51,17 @@ class Points(eqx.Module):
 
     Neighbouring frequencies share part of their noise: `shared` is the sum of |rho|^2 of a point's
     error with those of all points used, so that `1 / shared` of it is the point's own.
+    `correlations` has the complex rho of the points used of each pair that shares noise, by
+    (output, input).
     """
 
     frf: FrequencyResponse
     used: Mask  # the weights of the others have to be 0
     shared: Ratio
     floor: Ratio  # what the model leaves unexplained, in neper and rad; 0 before that is known
+    correlations: Mapping[tuple[int, int], Complex[np.ndarray, "used used"]] = eqx.field(
+        default_factory=dict
+    )
 
 
 @runtime_checkable
@@ -164,10 +169,11 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
 
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
     """The points of several responses, with a floor of 0."""
-    return [
-        Points(frf, mask, _shared_noise(frf, mask), np.zeros(mask.shape))
-        for frf, mask in zip(frfs, used, strict=True)
-    ]
+    found = []
+    for frf, mask in zip(frfs, used, strict=True):
+        shared, correlations = _shared_noise(frf, mask)
+        found.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations))
+    return found
 
 
 def _own_covariance(
@@ -181,15 +187,25 @@ def _own_covariance(
     return (effect @ effect.conj().T) * (noise[mine, pair[0]] @ noise[mine, pair[0]].conj().T)
 
 
-def _shared_noise(frf: FrequencyResponse, used: Mask) -> Ratio:
-    shared = np.ones(used.shape)
+_ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as independent
+
+
+def _shared_noise(
+    frf: FrequencyResponse, used: Mask
+) -> tuple[Ratio, dict[tuple[int, int], Complex[np.ndarray, "used used"]]]:
+    """As in `Points`; correlations are those of the errors relative to the response."""
+    shared, correlations = np.ones(used.shape), {}
     for o, i in np.ndindex(used.shape[1:]):
         mine = np.flatnonzero(used[:, o, i])
         covariance = _own_covariance(frf.errors, (o, i), mine)
-        power = np.maximum(np.real(np.diagonal(covariance)), 1e-300)
-        correlation = np.real(covariance * covariance.conj()) / np.outer(power, power)
-        shared[mine, o, i] = np.maximum(np.sum(correlation, axis=1), 1.0)
-    return shared
+        size = np.sqrt(np.maximum(np.real(np.diagonal(covariance)), 1e-300))
+        turn = np.exp(-1j * np.angle(np.asarray(frf.response)[mine, o, i])) / size
+        correlation = turn[:, None] * covariance * turn.conj()
+        sums = np.sum(np.abs(correlation) ** 2, axis=1)
+        shared[mine, o, i] = np.maximum(sums, 1.0)
+        if np.any(sums > _ALONE):
+            correlations[o, i] = correlation
+    return shared, correlations
 
 
 def _in_band(frf: FrequencyResponse, band: Band) -> Bool[np.ndarray, "frequencies outputs inputs"]:

@@ -21,9 +21,9 @@ from ._cost import Points
 
 
 LENGTHS = (0.5, 1.0, 2.0)  # in ln(omega); 0.69 is an octave
-MEAN = 0.03  # of the prior of the amplitude, neper
+MEAN = 0.035  # of the prior of the amplitude, neper
 SHARES = np.array([0.6, 1.0])  # of the amplitude, in magnitude and in phase
-_NONE = 0.5  # the prior's mass at a discrepancy of zero
+_NONE = 0.72  # the prior's mass at a discrepancy of zero
 _AMPLITUDES = 16
 _RANK = 16  # of a kernel over a band of two decades: what is left of its variance is below 1 %
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
@@ -172,8 +172,7 @@ def discrepancy_effect(
     """J'W D W J of a discrepancy D of unit amplitude, for each length."""
     total = np.zeros((len(LENGTHS), count, count))
     for record in records:
-        pulls = record.weights[..., None] ** 2 * record.slopes[..., :count]
-        pulls = np.where(record.weights[..., None] > 0, pulls, 0.0)
+        pulls = np.where(record.weights[..., None] > 0, record.pulls(count), 0.0)
         basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
         pulls = pulls * SHARES[:, None]
         along = np.einsum("lfr,foimx->lroimx", basis, pulls, optimize=True)

@@ -27,6 +27,7 @@ from ._cost import (
 )
 from ._fit_remarks import DOUBT
 from ._make_fit import unfitted
+from ._mixing import Mixing, mixings_of
 from ._origin import Options, Origin
 from ._parameters import Free, name_places, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem
@@ -217,7 +218,7 @@ def _solve_reweighted(
     starts, solver, max_steps = options.starts, options.solver, options.max_steps
     cost = options.cost
     weights = _weights(cost, points, [np.ones(each.used.shape) for each in points])
-    problem = problem.weighted([jnp.asarray(each) for each in weights])
+    problem = _weighted(problem, cost, points, weights)
     z, minima = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count]), ()
     if starts == 1:
         solution = solve_within_bounds(problem, z, solver, max_steps)
@@ -229,7 +230,7 @@ def _solve_reweighted(
     again = _weights(cost, points, _ratios(solution))
     if _are_close(weights, again, 1e-4):
         return problem, solution, minima
-    problem = problem.weighted([jnp.asarray(each) for each in again])
+    problem = _weighted(problem, cost, points, again)
     return problem, solve_within_bounds(problem, solution.z, solver, max_steps), minima
 
 
@@ -253,12 +254,14 @@ def _solve_with_floor(
         weights = _weights(cost, raised, _ratios(solution))
         if _are_close([np.asarray(each) for each in problem.weights], weights, _SETTLED):
             break
-        problem, lifted = problem.weighted([jnp.asarray(each) for each in weights]), True
+        problem, lifted = _weighted(problem, cost, raised, weights), True
         solution = solve_within_bounds(problem, solution.z, options.solver, options.max_steps)
         _check_finite(solution)
         found = discrepancy_at(problem, points, solution)
-    plain = _weights(cost, points, _ratios(solution)) if lifted else None
-    return problem, solution, Counted(points, plain, found)
+    if not lifted:
+        return problem, solution, Counted(points, None, None, found)
+    plain = _weights(cost, points, _ratios(solution))
+    return problem, solution, Counted(points, plain, _mixings(cost, points, plain), found)
 
 
 def _with_floor(points: Points, floor: float) -> Points:
@@ -268,6 +271,20 @@ def _with_floor(points: Points, floor: float) -> Points:
 def _are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
     pairs = zip(old, new, strict=True)
     return all(np.allclose(one, other, rtol=share) for one, other in pairs)
+
+
+def _weighted(
+    problem: Problem, cost: Cost, points: Sequence[Points], weights: Sequence[Weights]
+) -> Problem:
+    arrays = [jnp.asarray(each) for each in weights]
+    return problem.weighted(arrays, _mixings(cost, points, weights))
+
+
+def _mixings(
+    cost: Cost, points: Sequence[Points], weights: Sequence[Weights]
+) -> tuple[Mixing | None, ...] | None:
+    """Only a likelihood knows what it would mean that points share noise."""
+    return mixings_of(points, weights) if isinstance(cost, MaximumLikelihood) else None
 
 
 def _weights(cost: Cost, points: Sequence[Points], ratios: Sequence[Ratio]) -> list[Weights]:

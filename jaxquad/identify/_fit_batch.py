@@ -228,7 +228,7 @@ class BatchFit(eqx.Module):
         stop = Stop(z, jnp.asarray(self.converged[k]), reason, jnp.asarray(self.steps[k]))
         solution = solution_at(stop, *_describe(z, problem))
         found = discrepancy_at(problem, [points], solution)
-        return assess(problem, Counted([points], None, found), solution)
+        return assess(problem, Counted([points], None, None, found), solution)
 
     def __str__(self) -> str:
         lost = int(np.sum(~self.converged))

@@ -13,6 +13,7 @@ from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
 from ._held import Aliases, evaluate_sampled, plan_aliases
+from ._mixing import mix_parts, Mixing
 from ._parameters import Parameters
 
 
@@ -63,6 +64,7 @@ class Problem(eqx.Module):
     known: Float[Array, "priors 2"]  # value, standard error
     aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
     silent: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True, default=())
+    mixings: tuple[Mixing | None, ...] = ()  # of the responses, after their weights
 
     @property
     def silences(self) -> list[Bool[np.ndarray, "outputs inputs"]]:
@@ -73,9 +75,12 @@ class Problem(eqx.Module):
                 mask[pair] = True
         return masks
 
-    def weighted(self, weights: Sequence[Float[Array, "..."]]) -> "Problem":
-        """The same problem under other weights."""
-        return dataclasses.replace(self, weights=tuple(weights))
+    def weighted(
+        self, weights: Sequence[Float[Array, "..."]], mixings: Sequence[Mixing | None] | None = None
+    ) -> "Problem":
+        """The same problem under other weights, with points that share noise taken together."""
+        each = [None] * len(weights) if mixings is None else mixings
+        return dataclasses.replace(self, weights=tuple(weights), mixings=tuple(each))
 
 
 def make_problem(
@@ -114,6 +119,7 @@ def make_problem(
         # Where a response is unknown its weight is zero, and nan times zero is not.
         measured=tuple(jnp.where(jnp.isfinite(f.response), f.response, 1.0) for f in frfs),
         weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
+        mixings=(None,) * len(shapes),
         known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
         aliases=tuple(
             plan_aliases(each(model), frf) for each, frf in zip(taken, frfs, strict=True)
@@ -220,12 +226,11 @@ def prior_misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " pri
 
 def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
     """All weighted misfits in one vector: half its squared norm is what the solver lowers."""
-    pairs = zip(_log_ratios(z, problem), problem.weights, strict=True)
-    parts = [
-        (part * jnp.moveaxis(weight[..., k], 0, -1)).reshape(-1)
-        for log, weight in pairs
-        for k, part in enumerate(log)
-    ]
+    triples = zip(_log_ratios(z, problem), problem.weights, problem.mixings, strict=True)
+    parts = []
+    for log, weight, mixing in triples:
+        scaled = (part * jnp.moveaxis(weight[..., k], 0, -1) for k, part in enumerate(log))
+        parts += [part.reshape(-1) for part in mix_parts(mixing, *scaled)]
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 
 

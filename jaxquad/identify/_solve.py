@@ -12,6 +12,7 @@ from jaxquad._core import Normal, normal_equations, RUNNING, STALLED, TOLERANCE
 from jaxquad._xla import no_fuse
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
+from ._mixing import mix_parts
 from ._problem import (
     misfits,
     prior_misfits,
@@ -52,17 +53,19 @@ def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[No
     value, slopes = logarithmic_slopes(matrices, omega, entries)
     misfit, scale = _logarithm(value, problem.measured[k]), parameters.slopes(z)
     weights = jnp.moveaxis(problem.weights[k], (0, 3), (3, 0))
-    return [_products(*each, scale) for each in zip(misfit, slopes, weights, strict=True)]
+    residual = [part * weight for part, weight in zip(misfit, weights, strict=True)]
+    pairs = zip(slopes, weights, strict=True)
+    rows = [no_fuse(_weighted, part, weight, scale) for part, weight in pairs]
+    mixing = problem.mixings[k]
+    mixed = mix_parts(mixing, *residual), mix_parts(mixing, *rows)
+    return [_products(*each) for each in zip(*mixed, strict=True)]
 
 
 def _products(
-    misfit: Float[Array, "outputs inputs frequencies"],
+    residual: Float[Array, "outputs inputs frequencies"],
     slopes: Float[Array, "parameters outputs inputs frequencies"],
-    weights: Float[Array, "outputs inputs frequencies"],
-    scale: Float[Array, " parameters"],
 ) -> Normal:
-    r, rows = (misfit * weights).reshape(-1), no_fuse(_weighted, slopes, weights, scale)
-    rows = rows.reshape(len(scale), -1)
+    r, rows = residual.reshape(-1), slopes.reshape(len(slopes), -1)
     return Normal(0.5 * jnp.sum(r**2), rows @ r, rows @ rows.T)
 
 

@@ -50,6 +50,7 @@ def one_by_one(response, weights):
         known=jnp.zeros((0, 2)),
         aliases=(None,),
         silent=((),),
+        mixings=(None,),
     )
     solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
     z0 = problem.parameters.start[:4]
