@@ -179,7 +179,8 @@ def test_a_parameter_at_zero_is_drawn_on_its_side_of_it():
     assert fit.identifiable and bound.name == "delay" and not fit.remarks
     drawn = np.asarray(fit.ensemble(2000, KEY).delay)
     assert drawn.min() >= 0
-    assert 0.8 < np.mean(drawn < bound.limit) < 0.99
+    # The optimum lies below zero: there the posterior reaches further than the likelihood's limit.
+    assert 0.85 < np.mean(drawn < bound.limit) < 0.99
     assert np.sqrt(np.mean(drawn**2)) == pytest.approx(fit.standard_errors[2], rel=0.05)
 
 

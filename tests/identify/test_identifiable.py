@@ -113,7 +113,7 @@ def test_along_the_null_direction_the_posterior_is_the_prior_and_is_called_so():
 @pytest.mark.parametrize("band", [(3.0, 12.0), (1.0, 6.0)], ids=["inside", "delay runs to zero"])
 def test_lag_and_delay_of_a_narrow_band_are_determined_as_a_sum(band):
     truth = jq.LaggedIntegrator(280.0, 0.016, 0.011)
-    frf = response_of(truth, error=0.03, seed=0, omega=np.geomspace(band[0], band[1], 30))
+    frf = response_of(truth, error=0.04, seed=0, omega=np.geomspace(band[0], band[1], 30))
     fit = jq.fit(jq.LaggedIntegrator(280.0, 0.02, 0.02), frf, free=("lag", "delay"), cost=ML)
     (total,) = fit.combinations
     assert total.name == "lag + delay" and not fit.determined.any()
