@@ -7,6 +7,7 @@ says how long its command is held, or does not.
 """
 
 import argparse
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -80,20 +81,32 @@ def _held_output(model: jq.TransferFunction, u: np.ndarray) -> np.ndarray:
     return y
 
 
-def fits(setting: Setting, draws: int, hold: float | None) -> tuple[np.ndarray, np.ndarray, int]:
-    """Errors over claimed ones and whether the interval holds the truth, by draw; remarks."""
+class Outcome(NamedTuple):
+    """Errors over claimed ones, whether the interval holds the truth, whether there are remarks."""
+
+    scaled: np.ndarray
+    inside: np.ndarray
+    remarked: bool
+
+
+def fits(setting: Setting, draws: int) -> tuple[list[Outcome], list[Outcome]]:
+    """Of each draw, with the hold said and without: the same response, fitted in two ways."""
     time, u, y = flown(setting.model)
-    rng, scaled, inside, remarks = np.random.default_rng(20), [], [], 0
+    rng, said, silent = np.random.default_rng(20), [], []
     for _ in range(draws):
         noisy = y + rng.normal(0, setting.noise * np.std(y), y.size)
-        fit = jq.fit(setting.model, jq.frequency_response(jq.Record(time, u, noisy, hold=hold)),
-                     free=setting.free)  # fmt: skip
-        truth = np.array([_value(setting.model, name) for name in setting.free])
-        ends = np.array([fit.interval(name) for name in setting.free])
-        scaled.append((fit.values - truth) / fit.standard_errors)
-        inside.append((ends[:, 0] <= truth) & (truth <= ends[:, 1]))
-        remarks += bool(fit.remarks)
-    return np.array(scaled), np.array(inside), remarks
+        response = jq.frequency_response(jq.Record(time, u, noisy, hold=DT))
+        said.append(_outcome(setting, response))
+        silent.append(_outcome(setting, dataclasses.replace(response, hold=None)))
+    return said, silent
+
+
+def _outcome(setting: Setting, response: jq.spectra.FrequencyResponse) -> Outcome:
+    fit = jq.fit(setting.model, response, free=setting.free)
+    truth = np.array([_value(setting.model, name) for name in setting.free])
+    ends = np.array([fit.interval(name) for name in setting.free])
+    inside = (ends[:, 0] <= truth) & (truth <= ends[:, 1])
+    return Outcome((fit.values - truth) / fit.standard_errors, inside, bool(fit.remarks))
 
 
 def _value(model: jq.TransferFunction, name: str) -> float:
@@ -110,14 +123,14 @@ def main() -> None:
     rows = []
     chosen = SETTINGS if given.only is None else SETTINGS[given.only : given.only + 1]
     for setting in chosen:
-        for hold in (DT, None):
-            scaled, inside, remarks = fits(setting, given.draws, hold)
+        for hold, found in zip(("said", "not said"), fits(setting, given.draws), strict=True):
+            scaled, inside, remarked = (np.array(part) for part in zip(*found, strict=True))
             for k, name in enumerate(setting.free):
                 rows.append(
                     [
-                        setting.title, "said" if hold else "not said", name,
+                        setting.title, hold, name,
                         100 * inside[:, k].mean(), scaled[:, k].mean(), scaled[:, k].std(),
-                        100 * remarks / given.draws,
+                        100 * remarked.mean(),
                     ]
                 )  # fmt: skip
                 print(*rows[-1], flush=True)
