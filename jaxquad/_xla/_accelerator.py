@@ -18,9 +18,23 @@ def why_no_device_kernels() -> str | None:
     """Why loops of ensembles are compiled plain on this platform; None if they become kernels."""
     if is_off():
         return "switched off"
-    if device_kernels.value == "auto" and jax.default_backend() != "gpu":
+    if device_kernels.value != "auto":
+        return None
+    if jax.default_backend() != "gpu":
         return f"the platform is {jax.default_backend()}, and these kernels are for GPUs"
-    return None
+    return _why_not_trusted()
+
+
+def _why_not_trusted() -> str | None:
+    try:
+        from ._device_trial import why_not_trusted
+    except (ImportError, AttributeError) as error:  # Pallas is experimental: it may move.
+        reason = f"JAX {jax.__version__} lacks what kernels of a GPU are made with ({error})"
+    else:
+        reason = why_not_trusted()
+    if reason is not None:
+        warn_once(reason)
+    return reason
 
 
 def scan_on_device(
@@ -32,13 +46,8 @@ def scan_on_device(
     more members than an array in a kernel has numbers, and smaller ensembles gain little.
     """
     fewest = MOST_CELLS if device_kernels.value == "auto" else 1
-    if why_no_device_kernels() is not None or members <= fewest:
+    if members <= fewest or why_no_device_kernels() is not None:
         return None
-    try:
-        from ._device_loop import scan_in_kernel
-    except (ImportError, AttributeError) as error:  # Pallas is experimental: it may move.
-        warn_once(
-            f"this JAX ({jax.__version__}) lacks what a GPU's kernels are made with ({error})"
-        )
-        return None
+    from ._device_loop import scan_in_kernel
+
     return scan_in_kernel(step, carry, signals, members, scan)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import _switch, scan_on_device
+from jaxquad._xla import _device_trial, _switch, scan_on_device
 
 
 MEMBERS, SAMPLES = 70, 7  # a block and a part of one; segments of 3, 3 and 1
@@ -203,3 +203,28 @@ ONES = np.ones(2)
 def test_without_a_gpu_no_loop_is_given_to_one():
     run = lambda x: scan_on_device(lambda x, _: (x, None), x, ONES, 1000, plain)
     assert jax.default_backend() == "gpu" or jax.eval_shape(run, spread(2, 1000)) is None
+
+
+def trial():
+    with _switch.device_kernels("interpret"):
+        return _device_trial.why_not_trusted.__wrapped__()
+
+
+@pytest.mark.slow
+def test_kernels_are_compared_with_a_plain_loop_before_they_are_trusted(monkeypatch):
+    said = []
+    jax.jit(lambda x: said.append(trial()))(1.0)  # while another program is traced
+    assert said == [None]
+    monkeypatch.setattr(_device_trial, "_by_kernel", lambda *args: plain(args[0], *args[1:]))
+    assert trial() is None
+    wrong = lambda step, carry, signals: plain(step, carry, signals[::-1])
+    monkeypatch.setattr(_device_trial, "_by_kernel", wrong)
+    assert "differs from a plain loop" in str(trial())
+
+
+def test_a_trial_that_fails_tells_why(monkeypatch):
+    def fails(*_):
+        raise RuntimeError("no such instruction")
+
+    monkeypatch.setattr(_device_trial, "_by_kernel", fails)
+    assert "no such instruction" in str(trial())
