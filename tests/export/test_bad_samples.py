@@ -48,9 +48,14 @@ def library(request, tmp_path_factory):
         text += _DRIVER.replace("START", start).replace("TOLD", told).replace("$", str(k))
     (folder / "laws.c").write_text(text)
     flags = [*STRICT, "-Wno-unused-function", *OPTIONS[request.param]]
-    command = ["gcc", "-std=c99", *flags, "-shared", "-fPIC", "laws.c", "-o", "laws.so", "-lm"]
-    subprocess.run(command, cwd=folder, check=True)
-    return ctypes.CDLL(str(folder / "laws.so"))
+    compiled = ["gcc", "-std=c99", *flags, "-fPIC", "-c", "laws.c", "-o", "laws.o"]
+    # Linked without -Ofast, which would have this whole process flush denormals to zero.
+    linked = ["gcc", "-shared", "laws.o", "-o", "laws.so", "-lm"]
+    for command in (compiled, linked):
+        subprocess.run(command, cwd=folder, check=True)
+    loaded = ctypes.CDLL(str(folder / "laws.so"))
+    assert np.nextafter(0.0, 1.0) * np.ones(1) > 0
+    return loaded
 
 
 @pytest.fixture(params=NAMES)
