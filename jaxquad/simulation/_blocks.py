@@ -13,8 +13,10 @@ from jaxtyping import Array, PyTree
 from jaxquad._xla import as_one_kernel, scan_on_device
 
 from ._delay import Queue
+from ._guard import KEPT
 
 
+_POLICY = jax.checkpoint_policies.save_only_these_names(KEPT)
 _SHORT = 128  # samples that need no blocks
 Step = Callable[..., tuple[PyTree, PyTree]]
 
@@ -79,7 +81,7 @@ def scan_in_blocks(
     if length > count:
         step, xs = _until(count, step), (jnp.arange(length), jax.tree.map(_lengthened(length), xs))
     # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
-    step = jax.checkpoint(step, prevent_cse=False)
+    step = jax.checkpoint(step, prevent_cse=False, policy=_POLICY)
     if queue is not None:
         step, carry, xs = _with_queue(step), (queue, carry), (jnp.arange(length), xs)
 

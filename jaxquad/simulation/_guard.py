@@ -9,8 +9,13 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PyTree
 
+
+# What reverse mode keeps of every sample: who runs and what was measured. Without it, it would compute
+# each sample twice over, once for these and once for the derivatives.
+KEPT = "kept_of_sample"
 
 # In SI units no angle, rate, voltage or squared rotor speed comes near it.
 VAST = 1e9
@@ -67,12 +72,17 @@ def guarded(
 @guarded.defjvp
 def _guarded_jvp(sample, ensemble, primals, tangents):
     rest, carry, *others = primals
-    out = sample(carry, *others)
-    runs = out[0].running
+    following, result = sample(carry, *others)
+    runs = _keep(following.running)
+    out = following._replace(running=runs), jax.tree.map(_keep, result)
     carry = choose(runs, carry, rest, ensemble)
     moved = jax.jvp(sample, (carry, *others), tangents[1:])[1]
     still = jax.tree.map(lambda t: t if _is_void(t) else jnp.zeros_like(t), moved)
     return out, choose(runs, moved, still, ensemble)
+
+
+def _keep(x: Array) -> Array:
+    return checkpoint_name(x, KEPT)
 
 
 def _is_void(tangent: Array) -> bool:

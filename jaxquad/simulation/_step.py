@@ -47,19 +47,47 @@ def runge_kutta(
     )
 
 
+_STAGES = ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))  # how far ahead, and the weights
+
+
+def _rolled_runge_kutta(
+    derivative: Callable[[PyTree], PyTree], state: PyTree, dt: Float[ArrayLike, "*ensemble"]
+) -> PyTree:
+    """`runge_kutta` with its stages in a loop, whose derivative is compiled once.
+
+    Its gradient compiles in half the time. In an ensemble it runs as fast; a single loop, whose
+    arithmetic takes no longer than to hand on a state, is a quarter slower.
+    """
+    spans = jax.tree.map(lambda x: _over(dt, x), state)
+
+    def stage(carry: tuple[PyTree, PyTree], now: tuple[Array, Array]) -> tuple[PyTree, None]:
+        (slope, total), (share, weight) = carry, now
+        slope = derivative(jax.tree.map(lambda x, h, k: x + share * h * k, state, spans, slope))
+        return (slope, jax.tree.map(lambda t, k: t + weight * k, total, slope)), None
+
+    still = jax.tree.map(jnp.zeros_like, state)
+    dtype = jnp.result_type(*jax.tree.leaves(state))
+    stages = tuple(jnp.asarray(x, dtype) for x in _STAGES)
+    total = jax.lax.scan(stage, (still, still), stages)[0][1]
+    return jax.tree.map(lambda x, h, t: x + h * t, state, spans, total)
+
+
 def integrate(
     derivative: Callable[[PyTree], PyTree],
     state: PyTree,
     duration: Float[ArrayLike, "*ensemble"],
     substeps: int,
+    *,
+    rolled: bool = False,
 ) -> PyTree:
-    """`duration` seconds in `substeps` equal Runge-Kutta steps."""
+    """`duration` seconds in `substeps` equal Runge-Kutta steps, the stages of each in a loop or not."""
+    step = _rolled_runge_kutta if rolled else runge_kutta
     if substeps == 1:
-        return runge_kutta(derivative, state, duration)
+        return step(derivative, state, duration)
 
     @jax.checkpoint
     def substep(state: PyTree, _: None) -> tuple[PyTree, None]:
-        return runge_kutta(derivative, state, duration / substeps), None
+        return step(derivative, state, duration / substeps), None
 
     return jax.lax.scan(substep, state, None, length=substeps)[0]
 
@@ -197,17 +225,20 @@ class LoopStep(eqx.Module):
         if happens.payload is not None and isinstance(plant, CarriesPayload):
             plant = plant.with_added_inertia(happens.payload)
 
-        def hold(state: PyTree, inputs: Array, duration: Float[ArrayLike, "*ensemble"]) -> PyTree:
+        def hold(state: PyTree, now: tuple[Array, ArrayLike]) -> tuple[PyTree, None]:
+            inputs, duration = now
             slope = lambda x: plant.derivative(x, inputs, happens.disturbance)
-            return integrate(slope, state, duration, self.substeps)
+            rolled = self.ensemble != ()
+            return integrate(slope, state, duration, self.substeps, rolled=rolled), None
 
         if line is None:
-            return None, hold(carry.state, inputs, dt)
+            return None, hold(carry.state, (inputs, dt))[0]
         past, early, late = line.step(carry.past, inputs)
         if not line.splits:
-            return past, hold(carry.state, late, dt)
+            return past, hold(carry.state, (late, dt))[0]
         share = line.share(inputs)
-        return past, hold(hold(carry.state, early, share * dt), late, (1 - share) * dt)
+        both = jnp.stack([early, late]), jnp.stack([share, 1 - share]) * dt
+        return past, jax.lax.scan(hold, carry.state, both)[0]  # the plant is compiled once
 
 
 def require_runnable(controller: object) -> Controller:
