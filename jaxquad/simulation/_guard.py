@@ -13,8 +13,8 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PyTree
 
 
-# What reverse mode keeps of every sample: who runs and what was measured. Without it, it would compute
-# each sample twice over, once for these and once for the derivatives.
+# What reverse mode keeps of a sample: who runs and what was measured. Otherwise it would compute
+# each sample twice, for these and for the derivatives.
 KEPT = "kept_of_sample"
 
 # In SI units no angle, rate, voltage or squared rotor speed comes near it.

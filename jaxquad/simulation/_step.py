@@ -80,7 +80,7 @@ def integrate(
     *,
     rolled: bool = False,
 ) -> PyTree:
-    """`duration` seconds in `substeps` equal Runge-Kutta steps, the stages of each in a loop or not."""
+    """`duration` seconds in `substeps` equal Runge-Kutta steps, whose stages may be `rolled`."""
     step = _rolled_runge_kutta if rolled else runge_kutta
     if substeps == 1:
         return step(derivative, state, duration)

@@ -77,13 +77,17 @@ def evaluate_cost(
 ) -> CostResult:
     """Value and gradient for each problem that is `on`; zeros for the others."""
     arrays, rest = eqx.partition(subproblem, eqx.is_array)
+    common, fixed = eqx.partition((coordinates, problem), eqx.is_array)
+
+    @jax.jit  # traced once, for its shapes and for its use
+    def run(z: Array, mine: PyTree, common: PyTree) -> CostResult:
+        return _evaluate_one(z, *eqx.combine(common, fixed), eqx.combine(mine, rest))
 
     def one(given: tuple[Array, Array, PyTree]) -> CostResult:
         z, on, mine = given
-        run = lambda z: _evaluate_one(z, coordinates, problem, eqx.combine(mine, rest))
-        shapes = jax.eval_shape(run, z)
-        skip = lambda z: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return jax.lax.cond(on, run, skip, z)
+        shapes = jax.eval_shape(run, z, mine, common)
+        skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return jax.lax.cond(on, run, skip, z, mine, common)
 
     # One after the other: the members of each fill the machine, and none waits for another's phase.
     return jax.lax.map(one, (z, on, arrays))
