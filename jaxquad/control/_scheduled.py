@@ -132,7 +132,14 @@ def gain_at(map: InertiaToGain, inertia: Float[ArrayLike, "..."]) -> Array:
         raise ValueError(f"inertia is {inertia}: give one value per axis, in kg m^2.")
     shape = signal_shape(inertia, ensemble_shape(map))
     wide = inertia.reshape(inertia.shape + (1,) * (len(shape) - inertia.ndim))
-    return as_float(map(jnp.broadcast_to(wide, shape)))
+    return as_float(_evaluate_map(map, wide, shape))
+
+
+@eqx.filter_jit  # as one program: a tune evaluates it for each ensemble that it draws
+def _evaluate_map(
+    map: InertiaToGain, inertia: Float[Array, "..."], shape: tuple[int, ...]
+) -> Array:
+    return map(jnp.broadcast_to(inertia, shape))
 
 
 def tunable_of(owner: str, part: object) -> dict[str, Transform | None]:

@@ -222,9 +222,11 @@ class Members(eqx.Module):
 
         - `ValueError`: the scenario is for other axes or for another number of members.
         """
-        count = self._checked(scenario)
-        added = self._drawn(count)
-        parts = {name: _add(vars(scenario)[name], x) for name, x in added.items()}
+        shape = (self._checked(scenario), self.axes)
+        parts = _add_drawn(
+            scenario, self.keys, self.noise, self.gust, self.payload, shape, self.dt,
+            self.gust_corner,
+        )  # fmt: skip
         where = lambda s: [vars(s)[name] for name in parts]
         return eqx.tree_at(where, scenario, list(parts.values()), is_leaf=lambda x: x is None)
 
@@ -242,17 +244,6 @@ class Members(eqx.Module):
             )
         return samples
 
-    def _drawn(self, samples: int) -> dict[str, Float[Array, "samples axes members"]]:
-        shape, drawn = (samples, self.axes), {}
-        if self.noise is not None:
-            drawn["noise"] = _white(self.keys, shape).astype(self.noise.dtype) * self.noise[None]
-        if self.gust is not None:
-            unit = _gusts(self.keys, shape, self.gust_corner, self.dt)
-            drawn["disturbance"] = unit.astype(self.gust.dtype) * self.gust[None]
-        if self.payload is not None:
-            drawn["payload"] = self.payload.signal(samples, self.dt)
-        return drawn
-
 
 @eqx.filter_jit
 def _take(members: Members, places: Int[Array, " some"]) -> Members:
@@ -269,14 +260,34 @@ def _require_indices(indices: ArrayLike | Sequence[int], size: int) -> Array:
     return places
 
 
-@eqx.filter_jit
+@eqx.filter_jit  # as one program: eager, it would be a dozen for each shape
+def _add_drawn(
+    scenario: Scenario,
+    keys: Key[Array, " members"],
+    noise: Float[Array, "axes members"] | None,
+    gust: Float[Array, "axes members"] | None,
+    payload: MemberPayload | None,
+    shape: tuple[int, int],
+    dt: float,
+    corner: float,
+) -> dict[str, Float[Array, "samples axes members"]]:
+    """The parts of the scenario that members add to, with what they add."""
+    drawn = {}
+    if noise is not None:
+        drawn["noise"] = _white(keys, shape).astype(noise.dtype) * noise[None]
+    if gust is not None:
+        drawn["disturbance"] = _gusts(keys, shape, corner, dt).astype(gust.dtype) * gust[None]
+    if payload is not None:
+        drawn["payload"] = payload.signal(shape[0], dt)
+    return {name: _add(vars(scenario)[name], x) for name, x in drawn.items()}
+
+
 def _white(keys: Key[Array, " members"], shape: tuple[int, int]) -> Array:
     # In single precision, so that float32 and float64 fly through the same noise.
     draw = lambda key: jax.random.normal(jax.random.fold_in(key, 0), shape, jnp.float32)
     return jax.vmap(draw, out_axes=-1)(keys)
 
 
-@eqx.filter_jit
 def _gusts(keys: Key[Array, " members"], shape: tuple[int, int], corner: float, dt: float) -> Array:
     def draw(key: Key[Array, ""]) -> Array:
         return gauss_markov(jax.random.fold_in(key, 1), shape, deviation=1.0, corner=corner, dt=dt)

@@ -47,13 +47,13 @@ def runge_kutta(
     )
 
 
-_STAGES = ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))  # how far ahead, and the weights
+_STAGES = ((0.0, 0.5, 0.5, 1.0), (1.0, 2.0, 2.0, 1.0))  # how far ahead, and sixfold weights
 
 
 def _rolled_runge_kutta(
     derivative: Callable[[PyTree], PyTree], state: PyTree, dt: Float[ArrayLike, "*ensemble"]
 ) -> PyTree:
-    """`runge_kutta` with its stages in a loop, whose derivative is compiled once.
+    """`runge_kutta` in the same order, its stages in a loop: the derivative is compiled once.
 
     Its gradient compiles in half the time. In an ensemble it runs as fast; a single loop, whose
     arithmetic takes no longer than to hand on a state, is a quarter slower.
@@ -69,7 +69,7 @@ def _rolled_runge_kutta(
     dtype = jnp.result_type(*jax.tree.leaves(state))
     stages = tuple(jnp.asarray(x, dtype) for x in _STAGES)
     total = jax.lax.scan(stage, (still, still), stages)[0][1]
-    return jax.tree.map(lambda x, h, t: x + h * t, state, spans, total)
+    return jax.tree.map(lambda x, h, t: x + h / 6 * t, state, spans, total)
 
 
 def integrate(

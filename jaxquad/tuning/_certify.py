@@ -145,7 +145,10 @@ def _moves(flight: Scenario) -> bool:
 
 def _authority(loop: Loop, drawn: Members) -> Authority | None:
     members = drawn.loop(loop.controller)
-    return find_authority(members.plant, members.drive, members.controller)
+    return _find_authority(members.plant, members.drive, members.controller)
+
+
+_find_authority = eqx.filter_jit(find_authority)  # many small operations, as one program
 
 
 _ROUNDED = 1.01  # by which a number may exceed what the record knows without a word
