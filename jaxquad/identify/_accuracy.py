@@ -71,13 +71,19 @@ class ResponseTerm(NamedTuple):
         """Measurement over model."""
         return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
 
+    @property
+    def error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """Random error relative to the model."""
+        off = np.abs(self.ratio) ** self.frf.error_exponent()
+        return np.asarray(self.frf.random_error) * off
+
 
 def blocks_of(records: Sequence[ResponseTerm]) -> list[Block]:
     """One block per response pair that has usable frequencies."""
     blocks = []
     for record in records:
         # An exact response would have infinite weight.
-        error = np.maximum(np.asarray(record.frf.random_error) * np.abs(record.ratio), 1e-7)
+        error = np.maximum(record.error, 1e-7)
         weights, used = record.weights, record.weights[..., 0] > 0
         residual = mix(record.mixing, weights * record.misfit)
         rows = mix(record.mixing, weights[..., None] * record.slopes)
@@ -102,8 +108,9 @@ def _through_fit(record: ResponseTerm, count: int) -> Matrix:
     weighted = record.pulls(count)
     used = record.weights[..., :1] > 0
     model = np.where(used[..., 0], np.asarray(record.frf.response) / record.ratio, 1.0)
+    off = np.where(used[..., 0], np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent())
     # Magnitude and phase of the misfit are the parts of dT over T.
-    columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / model.conj()[..., None]
+    columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / (model.conj() * off)[..., None]
     return np.asarray(record.frf.errors.project(jnp.asarray(np.where(used, columns, 0.0))))
 
 
@@ -130,7 +137,7 @@ def degrees_of_freedom(
     variance, doubt = np.diagonal(inverse @ noise.priors @ inverse).copy(), np.zeros(count)
     for record in records:
         used = record.weights[..., 0] > 0
-        error = np.where(used, np.asarray(record.frf.random_error) * np.abs(record.ratio), 0.0)
+        error = np.where(used, record.error, 0.0)
         moved = record.pulls(count) @ inverse
         share = np.sum((error[..., None, None] * moved) ** 2, axis=(2, 3))
         variance += np.sum(share, axis=(0, 1))

@@ -100,7 +100,8 @@ class MaximumLikelihood(eqx.Module):
     """The likelihood of Gaussian noise: squared logarithm of the ratio over its random error.
 
     The random error is taken relative to the model: relative to the measurement, points that came
-    out low by chance would weigh more. The logarithm is unbiased for circular noise. Points that
+    out low by chance would weigh more, and points of a joint estimate whose denominator came out
+    high. The logarithm is unbiased for circular noise. Points that
     share their noise with neighbours count by what is their own, and what the model leaves
     unexplained is a floor on the random error.
     """
@@ -108,7 +109,8 @@ class MaximumLikelihood(eqx.Module):
     def weights(self, points: Points, ratio: Ratio) -> Weights:
         # 1e-7 keeps noise-free records from weights that overflow.
         # Where the model is off by far, as at the start, the measurement is the better guide.
-        error = np.maximum(np.asarray(points.frf.random_error), 1e-7) / np.clip(ratio, 1 / 3, 3)
+        off = np.clip(ratio, 1 / 3, 3) ** -points.frf.error_exponent()
+        error = np.maximum(np.asarray(points.frf.random_error), 1e-7) * off
         with np.errstate(invalid="ignore"):  # an unknown response has an infinite error
             deviation = np.hypot(error * np.sqrt(points.shared), points.floor)
         root = np.where(points.used, 1 / deviation, 0.0)

@@ -90,7 +90,7 @@ def _look(
     whole, gains, along, errors = rows.T @ rows, [], [], []
     for record, counted in zip(records, points, strict=True):
         used = record.weights[..., 0] > 0
-        error = np.maximum(np.asarray(record.frf.random_error) * np.abs(record.ratio), 1e-7)
+        error = np.maximum(record.error, 1e-7)
         inverse = np.where(used, error**-2 / counted.shared, 0.0)
         columns = np.concatenate([record.slopes[..., :count], record.misfit[..., None]], axis=-1)
         columns = np.where(used[..., None, None], columns, 0.0)

@@ -125,6 +125,7 @@ def select_pair(frf: FrequencyResponse, output: int | str, input: int | str) -> 
         coherence=pick(frf.coherence),
         random_error=pick(frf.random_error),
         errors=frf.errors.pair(o, i),
+        divided=None if frf.divided is None else frf.divided[:, o : o + 1, i : i + 1],
         direct_coherence=pick(frf.direct_coherence),
         multiple_coherence=frf.multiple_coherence[:, o : o + 1],
         input_names=frf.input_names[i : i + 1],

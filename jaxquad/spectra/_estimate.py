@@ -85,6 +85,7 @@ def _result(
         remarks=remarks + found.remarks,
         integrators=integrators,
         log_noise_covariance=found.log_noise_covariance,
+        divided=found.divided if isinstance(found, LocalEstimate) else None,
         distortion=found.distortion if isinstance(found, PeriodicEstimate) else None,
         dt=records[0].dt,
         hold=records[0].hold,

@@ -64,8 +64,10 @@ class FrequencyResponse(eqx.Module):
     Where the inputs cannot be separated, the response is nan and its random error infinite.
     `errors` is the covariance of all random errors: neighbouring frequencies share part of their
     noise. `log_noise_covariance` says how well that noise is known: the covariance of the logarithm
-    of its estimated power between frequencies; without it, the noise counts as known. `remarks` are
-    what a user of the response should know: sentences that know the frequencies they are about.
+    of its estimated power between frequencies; without it, the noise counts as known. A joint
+    estimate divides by the inputs' responses to the references: `divided` is the share of the
+    squared error that these make. `remarks` are what a user of the response should know: sentences
+    that know the frequencies they are about.
     """
 
     omega: Float[Array, " frequencies"]  # rad/s
@@ -83,6 +85,7 @@ class FrequencyResponse(eqx.Module):
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Float[np.ndarray, "frequencies frequencies"] | None = None
+    divided: Float[np.ndarray, "frequencies outputs inputs"] | None = None  # 0 to 1; 0 without
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
@@ -119,6 +122,16 @@ class FrequencyResponse(eqx.Module):
         response = np.asarray(self.response)[:, output, input]
         covariance = self.errors.between((output, input), (output, input))
         return covariance / np.outer(response, response.conj())
+
+    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """The power p of |measurement / model| in the random error relative to a model.
+
+        Noise of a numerator is relative to the measured one: error |measurement| / |model|, p = 1.
+        Noise of a denominator turns this round: one that came out large by chance makes the
+        response small and its own relative error small, p = -1.
+        """
+        shape = self.response.shape
+        return np.ones(shape) if self.divided is None else 1 - 2 * self.divided
 
     def __str__(self) -> str:
         omega, coherence = np.asarray(self.omega), np.asarray(self.coherence)

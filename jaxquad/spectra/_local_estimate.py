@@ -96,6 +96,25 @@ def coherence_of_references(
     return np.minimum(through, alone / (alone + moved))
 
 
+def share_of_inputs(
+    left: Complex[np.ndarray, "frequencies outputs moved"],
+    noise: Noise,
+    at: Int[np.ndarray, " frequencies"],
+    inputs: int,
+) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    """Share of a joint estimate's squared error that the noise of T_ru makes, and not of T_ry.
+
+    `left` is [-G, 1]; half of what both make together counts.
+    """
+    root = noise.root()[at]
+    whole = left @ root
+    of_inputs = left[:, :, :inputs] @ root[:, :inputs]
+    power = np.sum(np.abs(whole) ** 2, axis=2)
+    mine = np.sum(np.real(of_inputs * np.conj(whole)), axis=2)
+    share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
+    return np.repeat(share[:, :, None], inputs, axis=2)
+
+
 def _diagonal(x: Complex[np.ndarray, "frequencies a a"]) -> Float[np.ndarray, "frequencies a"]:
     return np.real(np.diagonal(x, axis1=1, axis2=2))
 
@@ -134,6 +153,7 @@ class LocalEstimate(NamedTuple):
     half_width: Grid  # rad/s
     rational: Bool[np.ndarray, " frequencies"]  # where a rational function is used, at a resonance
     log_noise_covariance: Float[np.ndarray, "frequencies frequencies"]
+    divided: Float[np.ndarray, "frequencies outputs inputs"] | None  # of a joint estimate
     remarks: tuple[Remark, ...]
 
 
@@ -206,6 +226,7 @@ def estimate_local_polynomial(
         width,
         rational,
         noise_freedom[np.ix_(at, at)],
+        share_of_inputs(left, sources, at, inputs) if method == "joint" else None,
         _remark_on_lost(omega, np.all(known, axis=(1, 2)) | lost, least[at], options)
         + _remark_on_resolution(omega[doubtful & coherent])
         + _remark_on_ringing(omega[ringing & coherent & ~doubtful]),

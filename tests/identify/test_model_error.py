@@ -93,6 +93,22 @@ def test_what_the_model_lacks_makes_its_points_count_alike():
     np.testing.assert_allclose(weights, 1 / np.hypot(0.001, 0.1))
 
 
+@pytest.mark.parametrize("divided", [0.0, 1.0])
+def test_a_point_counts_alike_whichever_way_its_noise_turned_out(divided):
+    """1 + n in the numerator or, of a joint estimate, in the denominator: 0.02 of the truth."""
+    luck = np.linspace(0.7, 1.4, OMEGA.size)[:, None, None]
+    frf = response_of(TRUTH, error=0.02)
+    measured = dataclasses.replace(
+        frf,
+        response=jnp.asarray(np.asarray(frf.response) * luck ** (1 - 2 * divided)),
+        random_error=jnp.asarray(0.02 / luck),  # over what came out: numerator or denominator
+        divided=np.full(luck.shape, divided),
+    )
+    points = jq.identify.Points(measured, *(np.full(luck.shape, x) for x in (True, 1.0, 0.0)))
+    ratio = np.abs(np.asarray(frf.response) / np.asarray(measured.response))
+    np.testing.assert_allclose(jq.identify.MaximumLikelihood().weights(points, ratio), 1 / 0.02)
+
+
 def test_points_that_share_their_noise_count_by_what_is_their_own():
     """Of pairs of frequencies with the same error, each counts half."""
     apart = np.repeat(OMEGA[::2], 2) * np.tile([1.0, 1.0001], 15)
