@@ -17,6 +17,10 @@ from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from ._fit_remarks import MISFIT as MISFIT
 from ._half_bands import Bands as Bands
 from ._held import as_sampled as as_sampled
+from ._known_loop import (
+    KnownController as KnownController,
+    SampledFeedback as SampledFeedback,
+)
 from ._noise_model import (
     ARMA as ARMA,
     AutoRegressive as AutoRegressive,

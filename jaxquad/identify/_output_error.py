@@ -11,6 +11,7 @@ from jaxquad._core import require_x64
 from jaxquad.records import Record
 
 from ._fit import check_priors
+from ._known_loop import feedback_response, KnownController
 from ._noise_model import ARMA, AutoRegressive, Noise
 from ._output_error_noise import descend_with_noise
 from ._output_error_problem import descend_by_turns, evaluate_misfits, OutputError, RecordTerm
@@ -39,6 +40,7 @@ def refine(
     noise: Noise | None = None,
     free: Free = None,
     tied: Mapping[str, Tie] | None = None,
+    loop: KnownController | None = None,
     hold: str | None = None,
     band: tuple[float, float] | None = None,
     priors: Sequence[Prior] = (),
@@ -50,7 +52,10 @@ def refine(
     parameters; `Fit.cost` is in units of it. Standard errors hold for coloured residuals. Each
     record has its own initial state, trim and noise level. With a `noise` model, the errors of
     predicting each sample from those before it take the place of the residuals: an efficient
-    estimate in coloured noise, and a consistent one where feedback returns noise to the input.
+    estimate in coloured noise, and a consistent one where feedback returns noise to the input, as
+    far as the noise model is right. With the controller of the `loop` the residuals are those of
+    the closed loop, S (y - G u): what its references do not explain. That is consistent whatever
+    the noise, and a noise model makes it efficient.
 
     **Arguments:**
 
@@ -66,6 +71,9 @@ def refine(
         `jq.identify.AutoRegressive(order)`, `jq.identify.ARMA(poles, zeros)`, or "auto" for the one
         of lowest Akaike criterion. `Fit.noise_models` has what was found.
     - `free`, `tied`, `priors`: as in `jq.fit`.
+    - `loop`: the controller that closed the loop in which the record was flown, as `jq.PID` or
+        `jq.LADRC`: anything with a method `linear()`, taken as exact and without limits. The
+        reference need not be in the record. One input and one output, held at the record's rate.
     - `hold`, `band`: as in `jq.verify`, the hold by default as each record says; model and data are
         filtered alike.
     - `max_steps`: of the solver.
@@ -77,7 +85,8 @@ def refine(
     **Raises:**
 
     - `ValueError`: what `jq.fit` and `jq.verify` refuse, a model that cannot be simulated from
-        its starting values, and a band beside a noise model.
+        its starting values, a band beside a noise model or a loop, and a controller that does not
+        go with the record.
     - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
 
     Source: Klein & Morelli, Aircraft System Identification, ch. 6 (modified Newton-Raphson with
@@ -86,12 +95,17 @@ def refine(
     require_x64("an output-error fit")
     records = _checked(record, max_steps)
     _check_noise(noise, band)
+    if loop is not None and band is not None:
+        raise ValueError(
+            f"band {band} rad/s and a loop exclude each other: leave the band out, a noise model "
+            'weights each frequency by its noise (noise="auto")'
+        )
     near = isinstance(model, Fit)
     if isinstance(model, Fit):
         model, free, tied = _continued(model, free, tied)
     parameters = select_parameters(model, free, tied)
     base = _base(model, parameters, priors)
-    terms = tuple(_term(model, one, hold, band) for one in records)
+    terms = tuple(_term(model, one, hold, band, loop) for one in records)
     problem = _with_units(OutputError(base, terms, _fixed_zeros(model, parameters)))
     if noise is None:
         descent = descend_by_turns(problem, max_steps)
@@ -165,12 +179,22 @@ def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Pro
 
 
 def _term(
-    model: PyTree, record: Record, hold: str | None, band: tuple[float, float] | None
+    model: PyTree,
+    record: Record,
+    hold: str | None,
+    band: tuple[float, float] | None,
+    loop: KnownController | None,
 ) -> RecordTerm:
     u, between = inputs_between_samples(record, hold)
     gain = band_gain(band, record)
     gain = None if gain is None else jnp.asarray(gain)
+    feedback = None if loop is None else jnp.asarray(feedback_response(loop, record, between))
     if isinstance(model, DifferentialModel) and not isinstance(model, Linear):
+        if loop is not None:
+            raise ValueError(
+                f"{type(model).__name__} is given by its differential equation, but a loop needs a "
+                "linear model: give a jq.TransferFunction or a jq.StateSpace"
+            )
         motions, start = None, jnp.ones(count_states(model))
         _check_measured(model, record)
     else:
@@ -181,7 +205,7 @@ def _term(
         motions, start = (found.slow, found.fast), jnp.zeros(0)
     y = band_filter(jnp.asarray(record.outputs), gain)
     weights = 1 / jnp.std(y, axis=0)
-    return RecordTerm(u, y, weights, gain, motions, start, record.dt, between)
+    return RecordTerm(u, y, weights, gain, motions, start, record.dt, between, feedback=feedback)
 
 
 def _check_measured(model: DifferentialModel, record: Record) -> None:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxquad._core import minimise_on_host, Normal, RUNNING, solve_definite, STALLED
 
+from ._known_loop import close_loop
 from ._noise_model import NoiseModel
 from ._problem import prior_misfits, Problem
 from ._simulated import (
@@ -42,6 +43,7 @@ class RecordTerm(eqx.Module):
     dt: float = eqx.field(static=True)
     hold: str = eqx.field(static=True)
     whitener: Whitener | None = None  # of the noise, where it has a model
+    feedback: Float[Array, " samples"] | None = None  # of a known loop, after a unit of output
 
     def weighted(
         self, x: Float[Array, "samples outputs *columns"]
@@ -114,6 +116,9 @@ def misfit_and_columns(
         simulated = forced_response(plant, term.u, term.dt, term.hold)
         motions = Motions(*term.motions, ())
         columns = free_response(plant, motions, len(term.u), term.dt)
+        if term.feedback is not None:
+            closed = lambda x: term.weighted(close_loop(plant, x, term.feedback, term.dt))
+            return closed(term.y - simulated), closed(columns)
     return term.measured - term.weighted(simulated), term.weighted(columns)
 
 

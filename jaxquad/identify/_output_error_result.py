@@ -61,7 +61,8 @@ def remarks_on_output_error(
             "instance those of jq.fit"
         )
     fed = dict.fromkeys(name for record in records for name in record.reference_names)
-    if fed:
+    closed = any(term.feedback is not None for term in descent.problem.terms)
+    if fed and not closed:
         remarks.append(_of_feedback(", ".join(fed), bool(descent.noise)))
     remarks.append(
         "the noise level is estimated from the residuals, so misfit / random error is 1 for any "

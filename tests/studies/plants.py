@@ -336,7 +336,7 @@ _LONG = Chirp(0.6, 20.0, 60.0)
 _THETA = (10.0, 1.5, 0.08, 0.03)
 _FLIES = (12.0, 0.05, 0.03)
 _BUMP = (2.0, 0.4, 6.0, 0.03)
-_PID = Loop(0.7, 0.3, 0.28)
+FLIES_WITH = Loop(0.7, 0.3, 0.28)
 
 
 def _in_turn(first: Chirp, second: Chirp):
@@ -356,12 +356,12 @@ MAKERS: dict[str, Callable[[], Plant]] = {
         corner=3.0,
     ),
     "closed-setpoint": lambda: closed_loop(
-        "closed loop, swept set-point, gusts", ANGLE, _FLIES, _PID,
+        "closed loop, swept set-point, gusts", ANGLE, _FLIES, FLIES_WITH,
         wave=Chirp(0.5, 15.0, 80.0, amplitude=0.3), seconds=86, gust=0.03, noise=0.003,
         at_input=False,
     ),
     "closed-input": lambda: closed_loop(
-        "closed loop, swept command, gusts", ANGLE, _FLIES, _PID,
+        "closed loop, swept command, gusts", ANGLE, _FLIES, FLIES_WITH,
         wave=Chirp(0.5, 15.0, 80.0, amplitude=0.3), seconds=86, gust=0.03, noise=0.003,
         at_input=True,
     ),
