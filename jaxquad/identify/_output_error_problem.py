@@ -116,8 +116,8 @@ def misfit_and_columns(
         simulated = forced_response(plant, term.u, term.dt, term.hold)
         motions = Motions(*term.motions, ())
         columns = free_response(plant, motions, len(term.u), term.dt)
-        if term.feedback is not None:
-            closed = lambda x: term.weighted(close_loop(plant, x, term.feedback, term.dt))
+        if (feedback := term.feedback) is not None:
+            closed = lambda x: term.weighted(close_loop(plant, x, feedback, term.dt))
             return closed(term.y - simulated), closed(columns)
     return term.measured - term.weighted(simulated), term.weighted(columns)
 

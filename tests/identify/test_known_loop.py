@@ -1,11 +1,11 @@
 """Refinement of records from a loop whose controller is known."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import lfilter
 
 import jaxquad as jq
 from jaxquad.control import LinearController, PID
@@ -37,8 +37,9 @@ class Filtered(NamedTuple):
 
 def loop_filters():
     """Numerators and the common denominator, of q^-1: of y to the reference, and of S."""
-    plant = cont2discrete(([12.0], [0.05, 1.0, 0.0]), DT)
-    B, A = plant[0].ravel(), plant[1]
+    rate, fade = DT / 0.05, np.exp(-DT / 0.05)  # of 12 / (s (0.05 s + 1)), held for DT
+    B = 0.6 * np.array([0.0, rate - 1 + fade, 1 - fade - rate * fade])
+    A = np.array([1.0, -1 - fade, fade])
     P, Q = np.array([GAIN * (1 - KEEP)]), np.array([1.0, -KEEP])
     loop = np.convolve(B, P)
     whole = np.convolve(A, Q)
@@ -86,11 +87,12 @@ def test_the_command_of_a_pid_is_that_of_its_steps():
 
 def test_what_does_not_go_with_a_loop_is_refused():
     record, _ = flown(0)
-    for options, message in (
+    refused: list[tuple[dict[str, Any], str]] = [
         ({"loop": Filtered(0.01)}, "computes every 0.01 s"),
         ({"loop": Filtered(), "hold": "first"}, "is not held"),
         ({"loop": Filtered(), "band": (1.0, 10.0)}, "a loop exclude each other"),
-    ):
+    ]
+    for options, message in refused:
         with pytest.raises(ValueError, match=message):
             refine(TRUTH, record, free=FREE, **options)
 
