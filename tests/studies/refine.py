@@ -141,8 +141,8 @@ def main() -> None:
             "Of 100 draws the claimed error of the gain in the closed loop is 15 % too small (twice"
             " what draws leave open), those of lag and delay are right. With the controller known "
             "and a noise model, those of all three are 10 to 20 % too small, and the estimate is "
-            "no better than without the controller: what `loop=` buys is that it does not rest on the "
-            "noise model.",
+            "no better than without the controller: what `loop=` buys is that it does not rest on "
+            "the noise model.",
         ],
     }
     write("refined", study)
