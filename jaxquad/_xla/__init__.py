@@ -1,6 +1,9 @@
 """What knows the compiler: loops as one kernel, compiler options, devices, kept programs."""
 
-from ._accelerator import scan_on_device as scan_on_device
+from ._accelerator import (
+    scan_on_device as scan_on_device,
+    why_no_device_kernels as why_no_device_kernels,
+)
 from ._compile_cache import (
     enable_compile_cache as enable_compile_cache,
     share_programs as share_programs,

@@ -26,6 +26,7 @@ from ._loop_kernels import (
     kept_avals,
     Loop,
     reverse_in_lanes,
+    size,
     split,
     step_in_lanes,
 )
@@ -64,12 +65,18 @@ def _trace(step: Step, carry: PyTree, signals: PyTree) -> tuple[ClosedJaxpr, lis
     return jax.make_jaxpr(opened)(*shaped), consts, jax.tree.structure(result)
 
 
+_MOST_HELD = 128  # numbers between two samples: a thread has 255 registers
+
+
 def _why_not(loop: Loop) -> str | None:
     carry, after = loop.avals[1], loop.results[0]
     if not loop.avals[2]:
         return "a loop without signals"
     if any((a.shape, a.dtype) != (b.shape, b.dtype) for a, b in zip(carry, after, strict=True)):
         return "a carry that changes its shape"
+    held = sum(size(loop, x) for x in carry)
+    if held > _MOST_HELD:
+        return f"a carry of {held} numbers for each member"
     for x in (*loop.given, *loop.out):
         if x.dtype not in NUMBERS:
             return f"values of {x.dtype}"

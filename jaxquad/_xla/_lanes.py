@@ -120,9 +120,7 @@ class Lanes:
         self.count += 1
         if self.count > _MOST_OPERATIONS:
             raise NotInLanes(f"more than {_MOST_OPERATIONS} operations in a sample")
-        if any(np.ndim(x) for x in row):
-            row = [self.wide(x) for x in row]
-        return rule(equation, *row)
+        return rule(equation, *self._alike(row))
 
     def fold(self, name: str, lanes: Sequence[Lane]) -> Lane:
         """The sum, the product, ... of some lanes, by halves."""
@@ -133,10 +131,14 @@ class Lanes:
         return lanes[0]
 
     def pair(self, name: str, a: Lane, b: Lane) -> Lane:
-        if np.ndim(a) or np.ndim(b):
-            a, b = self.wide(a), self.wide(b)
         self.count += 1
-        return reduction(name)(a, b)
+        return reduction(name)(*self._alike((a, b)))
+
+    def _alike(self, row: Sequence[Lane]) -> Sequence[Lane]:
+        """Lanes of one shape. Pallas does not compile arithmetic between literals alone."""
+        if any(np.ndim(x) for x in row) or all(isinstance(x, np.generic) for x in row):
+            return [self.wide(x) for x in row]
+        return row
 
     def is_members(self, shape: Shape, axis: int | np.integer) -> bool:
         return shape[axis] == self.members

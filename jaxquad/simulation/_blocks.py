@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxquad._xla import as_one_kernel, scan_on_device
+from jaxquad._xla import as_one_kernel, scan_on_device, why_no_device_kernels
 
 from ._delay import Queue
 from ._guard import KEPT
@@ -33,23 +33,16 @@ def scan_members(
 
     `members` are on the last axis of the carry; None for a single loop, or for more axes.
     """
+    if members is None or why_no_device_kernels() is not None:
+        return scan_in_blocks(step, carry, xs, count, queue)
     plain = lambda step, carry, xs: scan_in_blocks(step, carry, xs, count)
-    if members is not None and queue is None:
+    if queue is None:
         found = scan_on_device(step, carry, xs, members, plain)
-    elif members is not None and queue is not None and _rows_of(queue) <= _FEW_ROWS:
+    else:
         begun = (_in_order(queue), carry)
         found = scan_on_device(_with_rows(step), begun, xs, members, plain)
         found = found and (found[0][1], found[1])
-    else:
-        found = None
     return scan_in_blocks(step, carry, xs, count, queue) if found is None else found
-
-
-_FEW_ROWS = 16  # samples of delay that a kernel of an accelerator keeps among its numbers
-
-
-def _rows_of(queue: Queue) -> int:
-    return 1 + (0 if queue.rows is None else len(queue.rows))
 
 
 def _in_order(queue: Queue) -> tuple[Array, ...]:

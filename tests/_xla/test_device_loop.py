@@ -144,6 +144,7 @@ OPERATIONS = {
     "placed": lambda x: jax.lax.dynamic_update_slice(x, 2 * x[:1], (1, 0)),
     "taken": lambda x: x * jax.lax.dynamic_slice(x, (1, 0), (1, MEMBERS)),
     "two products": lambda x: jnp.einsum("in,jn,ij->jn", x, x, jnp.asarray(ROWS, x.dtype)),
+    "constants": lambda x: x + jnp.sqrt(jnp.full_like(x, 2.0)) ** 3,
     "switch": lambda x: jax.lax.switch(2, [jnp.sin, jnp.cos, jnp.tan], x),
 }  # fmt: skip
 ROWS = np.array([[1.0, 2.0], [0.0, 3.0]])
