@@ -323,7 +323,7 @@ def _least_squares(joined: Float[np.ndarray, "rows columns"]) -> Vector:
 
 def _triangle(matrix: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
     """R of the QR decomposition. numpy.linalg.qr takes twice the time, for copies."""
-    from scipy.linalg.lapack import dgeqrf
+    from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
 
     return np.triu(dgeqrf(matrix, overwrite_a=True)[0][: matrix.shape[1]])
 
@@ -335,7 +335,7 @@ def _stacked(
     rows, ends = len(parts[0]), np.cumsum([0, *(part.shape[1] for part in parts)])
     stacked = np.empty((2 * rows, ends[-1]), order="F")
     for part, start, end in zip(parts, ends[:-1], ends[1:], strict=True):
-        stacked[:rows, start:end], stacked[rows:, start:end] = part.real, part.imag
+        stacked[:rows, start:end], stacked[rows:, start:end] = np.real(part), np.imag(part)
     return stacked
 
 
