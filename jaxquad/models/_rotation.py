@@ -35,8 +35,8 @@ def sincos(
     """Sine and cosine of angles in rad, by short polynomials that a CPU computes 8 at a time.
 
     For loops of many small steps, where the library functions cost several times as much. Within
-    1.4 units of rounding of 1, up to 1e9 rad (1e6 in single precision); nan beyond. Differentiable
-    to any order.
+    1.4 units of rounding of 1, up to 1e9 rad (1e6 in single precision, where large angles need
+    fused products and sums, as optimised code has them); nan beyond. Differentiable to any order.
     """
     x = jnp.where(jnp.abs(x) <= (1e6 if x.dtype == jnp.float32 else 1e9), x, jnp.nan)
     near, below = jnp.round(x * _PER_PI), jnp.floor(x * _PER_PI)
