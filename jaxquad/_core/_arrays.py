@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
@@ -11,7 +12,11 @@ from ._checks import is_concrete
 
 def as_float(x: ArrayLike | Sequence) -> Array:
     """`x` as an array of the default float type (a list of integers too)."""
-    return jnp.asarray(x, dtype=jnp.result_type(float))
+    dtype = jnp.result_type(float)
+    if any(isinstance(each, jax.Array) for each in jax.tree.leaves(x)):
+        return jnp.asarray(x, dtype=dtype)
+    # Of numbers jnp.asarray compiles a program for each new shape.
+    return jax.device_put(np.asarray(x, dtype=dtype))
 
 
 def as_float_or_none(x: ArrayLike | Sequence | None) -> Array | None:

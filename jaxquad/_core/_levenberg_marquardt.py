@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 TOLERANCE = 1e-8  # of a step, relative to 1 + |z|, and of the root of the cost it would save
 RUNNING, CONVERGED, STALLED = 0, 1, 2
-_DAMPING = 3e-2  # of the first step, in units of the largest diagonal element of the Hessian
+DAMPING = 3e-2  # of the first step, in units of the largest diagonal element of the Hessian
 _SHRINKING = 0.1  # the least factor from one step to the next that is believed
 
 
@@ -46,7 +46,7 @@ Evaluate = Callable[[Float[Array, " parameters *batch"]], Normal]
 def minimise(
     evaluate: Evaluate,
     z0: Float[Array, " parameters *batch"],
-    max_steps: int,
+    max_steps: int | Int[Array, ""],
     tolerance: float = TOLERANCE,
 ) -> Descent:
     """Lower half the sum of squares of every member until all have stopped.
@@ -71,7 +71,7 @@ def begin(z0: Float[Array, " parameters *batch"]) -> Descent:
     zero, none = jnp.zeros(z0.shape[1:], z0.dtype), jnp.zeros_like(z0)
     hessian = jnp.zeros((len(z0), *z0.shape), z0.dtype)
     normal, counter = Normal(zero + jnp.inf, none, hessian), jnp.zeros(zero.shape, int)
-    levels = zero + _DAMPING, zero + 2.0
+    levels = zero + DAMPING, zero + 2.0
     return Descent(z0, normal, *levels, none, zero, zero + jnp.inf, counter, counter + RUNNING)
 
 
@@ -83,7 +83,9 @@ def settle(state: Descent) -> Descent:
     return state._replace(status=status)
 
 
-def advance(evaluate: Evaluate, state: Descent, max_steps: int, tolerance: float) -> Descent:
+def advance(
+    evaluate: Evaluate, state: Descent, max_steps: int | Int[Array, ""], tolerance: float
+) -> Descent:
     """One step of every member that is still running."""
     trial = state.z + state.change
     normal = evaluate(trial)
@@ -122,7 +124,7 @@ def _with_next_step(state: Descent, tolerance: float) -> Descent:
     left = size * jnp.clip(size / state.size, _SHRINKING, 1.0)
     enough = (left <= tolerance) | (predicted <= tolerance**2 * state.normal.cost)
     # A step that damping has shortened says nothing about the distance to the minimum.
-    last = (state.status == RUNNING) & definite & (state.damping <= _DAMPING) & enough
+    last = (state.status == RUNNING) & definite & (state.damping <= DAMPING) & enough
     return state._replace(
         z=_select(last, state.z + change, state.z),
         change=change,
@@ -160,24 +162,27 @@ def minimise_on_host(
     *,
     tolerance: float = 1e-6,
     saving: float = 1e-12,
+    damping: float = 1e-3,
 ) -> tuple[P, int, int]:
     """The descent of `minimise` for one problem, as a loop of Python; also its status and steps.
 
     `move` makes the next point from a point and a step, whose coordinates may be those of that
     point alone. For a few steps whose evaluation is compiled already, or is NumPy: compiling the
     loop would take longer than running it. It ends at a step below `tolerance` relative to
-    1 + |z|, or one that would save less than `saving` of the cost. RUNNING means that the steps
-    are used up.
+    1 + |z|, or one that would save less than `saving` of the cost. `damping` is that of the first
+    step. RUNNING means that the steps are used up.
     """
-    here, damping, growth = start, 1e-3, 2.0
+    if not np.isfinite(start.cost):
+        return start, STALLED, 0
+    here, growth, undamped = start, 2.0, max(1e-2, damping)
     gradient, hessian = here.slopes()
     for step in range(max_steps):
         extra = damping * max(np.max(np.diagonal(hessian)), 1e-300)
         damped = hessian + extra * np.eye(gradient.size)
-        change = -np.linalg.lstsq(damped, gradient, rcond=None)[0]
+        change = -_solved(damped, gradient)
         predicted = 0.5 * change @ (extra * change - gradient)
         short = np.max(np.abs(change) / (1 + np.abs(here.z))) <= tolerance
-        last = damping <= 1e-2 and (short or predicted <= saving * here.cost)
+        last = damping <= undamped and (short or predicted <= saving * here.cost)
         there = move(here, change)
         saved = here.cost - there.cost
         # The last step may lose what rounding makes of it.
@@ -193,6 +198,13 @@ def minimise_on_host(
         if damping > 1e16:
             return here, STALLED, step + 1
     return here, RUNNING, max_steps
+
+
+def _solved(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.solve(matrix, vector)
+    except np.linalg.LinAlgError:
+        return np.linalg.lstsq(matrix, vector, rcond=None)[0]
 
 
 def _relative(

@@ -33,9 +33,9 @@ def require_x64(what: str) -> None:
 def require_float64(what: str, array: Array) -> None:
     """Raise a `PrecisionError` if `array` was created in single precision."""
     require_x64(what)
-    if jnp.asarray(array).dtype in (jnp.float32, jnp.complex64):
+    if array.dtype in (jnp.float32, jnp.complex64):
         raise PrecisionError(
-            f"{what} is {jnp.asarray(array).dtype}: create it after "
+            f"{what} is {array.dtype}: create it after "
             "jaxquad.enable_x64(), or convert it with jnp.asarray(x, float)"
         )
 

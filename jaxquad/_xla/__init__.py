@@ -26,4 +26,5 @@ from ._engine import (
 )
 from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse
 from ._kernel import as_one_kernel as as_one_kernel
+from ._shared import run_shared as run_shared
 from ._swap import swap_row as swap_row

@@ -12,6 +12,7 @@ from jaxquad._core import (
     as_float_or_none,
     broadcast_gain,
     ensemble_shape,
+    is_concrete,
     match_reference,
     per_member,
     pick_gain,
@@ -448,4 +449,6 @@ def place_pd(
     The controller.
     """
     gain = as_float(gain)
+    if is_concrete(gain):
+        gain = np.asarray(gain)  # JAX would compile each operation
     return PD(natural_frequency**2 / gain, 2 * damping * natural_frequency / gain, dt=dt)

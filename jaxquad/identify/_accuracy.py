@@ -1,9 +1,9 @@
 """From the derivatives at the solution to covariances, bounds and conditioning (host side)."""
 
+import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -111,7 +111,7 @@ def _through_fit(record: ResponseTerm, count: int) -> Matrix:
     off = np.where(used[..., 0], np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent())
     # Magnitude and phase of the misfit are the parts of dT over T.
     columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / (model.conj() * off)[..., None]
-    return np.asarray(record.frf.errors.project(jnp.asarray(np.where(used, columns, 0.0))))
+    return record.frf.errors.project(np.where(used, columns, 0.0))
 
 
 def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -> Matrix:
@@ -161,6 +161,13 @@ def fitted_noise(bread: Matrix, noise: Noise) -> float:
 
 def scaled_inverse(matrix: Matrix) -> Matrix:
     """Pseudo-inverse after unit scaling of the diagonal."""
+    return _scaled_inverse(matrix.tobytes(), len(matrix))
+
+
+@ft.lru_cache(maxsize=64)
+def _scaled_inverse(elements: bytes, count: int) -> Matrix:
+    # Ten parts of an assessment ask for the inverse of the same matrix.
+    matrix = np.frombuffer(elements).reshape(count, count)
     scale = np.sqrt(np.diagonal(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     unit = matrix / np.outer(scale, scale)

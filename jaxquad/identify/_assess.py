@@ -4,7 +4,6 @@ import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -49,6 +48,7 @@ from ._held import remarks_on_hold
 from ._identifiability import assess_identifiability, Information, LIMIT
 from ._make_fit import Costs, Estimate, make_fit
 from ._mixing import Mixing
+from ._origin import Origin
 from ._parameters import Place
 from ._problem import Problem
 from ._result import Fit
@@ -74,8 +74,14 @@ def assess(
     counted: Counted,
     solution: Solution,
     minima: tuple[Minimum, ...] = (),
+    *,
+    further: Sequence[str] = (),
+    origin: Origin | None = None,
 ) -> Fit:
-    """Costs, bounds, calibrated covariance and identifiability at the solution."""
+    """Costs, bounds, calibrated covariance and identifiability at the solution.
+
+    The fit gets the `further` remarks and its `origin`.
+    """
     parameters, count = problem.parameters, problem.parameters.count
     frfs = [each.frf for each in counted.points]
     units = _units(solution)
@@ -90,8 +96,7 @@ def assess(
     by_noise, covariance = halved(seen.by_noise), halved(seen.covariance)
     plain = seen
     if counted.weights is not None:
-        weights = [jnp.asarray(each) for each in counted.weights]
-        alone = problem.weighted(weights, counted.mixings)
+        alone = problem.weighted(counted.weights, counted.mixings)
         plain = _look(_records(alone, frfs, solution, units), prior, count)
     costs = _costs(plain.blocks, prior, plain.bread, plain.noise)
     cost, misfit = costs.cost, costs.chi_squared
@@ -120,9 +125,11 @@ def assess(
             *remarks_on_minima(problem, solution, bread, minima),
             *remarks_on_priors(prior.misfit, verdict, by_data),
             *remarks_on_discrepancy(discrepancy),
+            *further,
         ),
         minima=minima,
         discrepancy=discrepancy,
+        origin=origin,
     )
 
 

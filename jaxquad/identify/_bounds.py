@@ -10,15 +10,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Float
 
 from ._accuracy import Matrix, scaled_inverse
-from ._held import evaluate_sampled
 from ._mixing import mix
 from ._problem import Problem
-from ._solve import describe_once, Solution, solution_at, solve, Stop
+from ._solve import Solution, solution_at, solve
 
 
 _RISE = 2.71  # of the cost, at the end of a one-sided 95 % interval
@@ -51,10 +49,10 @@ class _Local(NamedTuple):
 
 
 def solve_within_bounds(
-    problem: Problem, z: Float[Array, " parameters"], solver: eqx.Module | None, max_steps: int
+    problem: Problem, z: Point, solver: eqx.Module | None, max_steps: int
 ) -> Solution:
     """Solve from `z`; parameters that belong at zero are there, wherever the path to it ended."""
-    solution = solve(problem, jnp.asarray(z), solver, max_steps)
+    solution = solve(problem, z, solver, max_steps)
     return settle_at_bounds(problem, solution, solver, max_steps)
 
 
@@ -81,7 +79,7 @@ def settle_at_bounds(
             return _as_zero(problem, _polished(problem, at, low, solution), low)
         change = step.copy()
         change[low] = np.log(np.maximum(step[low], _AT_ZERO) * shown[low])
-        solution = solve(problem, jnp.asarray(z + change), solver, max_steps)
+        solution = solve(problem, z + change, solver, max_steps)
     return solution
 
 
@@ -148,29 +146,20 @@ def _polished(
 
 
 def _at(problem: Problem, z: Point, like: Solution) -> Solution:
-    stop = Stop(jnp.asarray(z), jnp.asarray(True), jnp.asarray(1), jnp.asarray(like.steps))
-    return solution_at(stop, *describe_once(stop.z, problem))
+    return solution_at(problem, z, steps=like.steps)
 
 
 def _as_zero(problem: Problem, solution: Solution, low: Sequence[int]) -> Solution:
     """The same with values of exactly 0, where the model has a response there."""
-    values = np.array(solution.values)
-    values[low] = 0.0
-    count = problem.parameters.count
-    model = problem.parameters.replace(problem.model, jnp.asarray(values[:count]))
-    units = np.asarray(solution.slopes)[list(low)] / _AT_ZERO
+    units = solution.slopes[list(low)] / _AT_ZERO
     marked = solution._replace(at_zero=tuple(low), units_at_zero=tuple(units.tolist()))
-    found = _responses(model, problem)
-    if not all(bool(np.all(np.isfinite(np.asarray(each)))) for each in found):
+    z = solution.z.copy()
+    z[low] = -np.inf  # the logarithm of 0
+    at = solution_at(problem, z)
+    # A response of 0 has a magnitude of -inf.
+    if not all(np.all(each < np.inf) for each in at.sensitivity.misfits):
         return marked
-    return marked._replace(values=jnp.asarray(values), model=model)
-
-
-@eqx.filter_jit
-def _responses(model: PyTree, problem: Problem) -> list[Array]:
-    where = zip(problem.omega, problem.aliases, strict=True)
-    terms = zip(problem.conditions, where, strict=True)
-    return [evaluate_sampled(condition(model), *each) for condition, each in terms]
+    return marked._replace(values=at.values, model=at.model)
 
 
 def one_sided_limit(problem: Problem, solution: Solution, k: int, inflation: float) -> float:

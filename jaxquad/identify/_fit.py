@@ -2,7 +2,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -162,10 +161,9 @@ def fit_with(
     _check_finite(solution)
     check_priors(problem, solution)
     problem, solution, counted = _solve_with_floor(problem, points, solution, options, rounds)
-    found = assess(problem, counted, solution, minima)
-    remarks = (*found.remarks, *_remarks_on_silence(frfs, asked, problem))
+    further = _remarks_on_silence(frfs, asked, problem)
     origin = Origin(fit_with, tuple(points), options)
-    return dataclasses.replace(found, remarks=remarks, origin=origin)
+    return assess(problem, counted, solution, minima, further=further, origin=origin)
 
 
 _PRESENT = 0.2  # random error of a response that is there
@@ -219,7 +217,7 @@ def _solve_reweighted(
     cost = options.cost
     weights = _weights(cost, points, [np.ones(each.used.shape) for each in points])
     problem = _weighted(problem, cost, points, weights)
-    z, minima = jnp.asarray(np.asarray(problem.parameters.start)[: problem.parameters.count]), ()
+    z, minima = np.asarray(problem.parameters.start)[: problem.parameters.count], ()
     if starts == 1:
         solution = solve_within_bounds(problem, z, solver, max_steps)
     else:
@@ -276,8 +274,7 @@ def _are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> 
 def _weighted(
     problem: Problem, cost: Cost, points: Sequence[Points], weights: Sequence[Weights]
 ) -> Problem:
-    arrays = [jnp.asarray(each) for each in weights]
-    return problem.weighted(arrays, _mixings(cost, points, weights))
+    return problem.weighted(weights, _mixings(cost, points, weights))
 
 
 def _mixings(
@@ -293,7 +290,7 @@ def _weights(cost: Cost, points: Sequence[Points], ratios: Sequence[Ratio]) -> l
 
 def _ratios(solution: Solution) -> list[Ratio]:
     """|model / measurement| at a solution."""
-    return [np.exp(np.asarray(part)[..., 0]) for part in solution.sensitivity.misfits]
+    return [np.exp(part[..., 0]) for part in solution.sensitivity.misfits]
 
 
 def require_responses(frf: object) -> list[FrequencyResponse]:

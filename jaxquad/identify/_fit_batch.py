@@ -1,4 +1,6 @@
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -7,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
-from jaxquad._core import CONVERGED, decrement, minimise, Normal, require_x64, TOLERANCE
+from jaxquad._core import (
+    CONVERGED,
+    decrement,
+    minimise,
+    Normal,
+    require_x64,
+    STALLED,
+    TOLERANCE,
+)
 from jaxquad._xla import evaluate_once
 from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
@@ -24,32 +34,33 @@ from ._cost import (
 )
 from ._fit import check_options
 from ._held import held, hold_of
-from ._parameters import Free, Parameters, Place, select_parameters, Tie
+from ._parameters import Free, Numbers, Parameters, Place, select_parameters, Tie
 from ._problem import make_problem
 from ._result import Fit
-from ._solve import describe, solution_at, Stop
+from ._solve import solution_at, stopped_early
 
 
 _CHUNK = 64  # fits side by side: their Jacobians stay in the cache
+_AT_ONCE = 128  # fits of one call
 
 
 class BatchSolution(NamedTuple):
     """Where the fit of every response of a batch stopped."""
 
-    z: Float[Array, "batch parameters"]
-    values: Float[Array, "batch parameters"]  # physical
-    cost: Float[Array, " batch"]  # sum of squares
-    decrement: Float[Array, " batch"]  # what one more step would save of half the cost
-    steps: Int[Array, " batch"]
-    converged: Bool[Array, " batch"]  # stopped, and with nothing left to save
+    z: Float[Numbers, "batch parameters"]
+    values: Float[Numbers, "batch parameters"]  # physical
+    cost: Float[Numbers, " batch"]  # sum of squares
+    decrement: Float[Numbers, " batch"]  # what one more step would save of half the cost
+    steps: Int[Numbers, " batch"]
+    converged: Bool[Numbers, " batch"]  # stopped, and with nothing left to save
 
 
 def solve_batch(
     model: PyTree,
     parameters: Parameters,
-    omega: Float[Array, " frequencies"],
-    measured: Complex[Array, "batch frequencies outputs inputs"],
-    weights: Float[Array, "..."],
+    omega: Float[Numbers, " frequencies"],
+    measured: Complex[Numbers, "batch frequencies outputs inputs"],
+    weights: Float[Numbers, "..."],
     *,
     hold: float = 0.0,
     max_steps: int = 64,
@@ -71,10 +82,11 @@ def solve_batch(
             "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
         )
     _check_pointwise(model, omega, measured.shape[1:])
-    return _solve_batch(model, parameters, omega, measured, weights, hold, max_steps, tolerance)
+    data = (np.asarray(omega), np.asarray(measured), np.asarray(weights))
+    return _solve_portions(model, parameters, *data, hold, max_steps, tolerance)
 
 
-def _check_pointwise(model: PyTree, omega: Float[Array, " f"], shape: tuple[int, ...]) -> None:
+def _check_pointwise(model: PyTree, omega: Float[Numbers, " f"], shape: tuple[int, ...]) -> None:
     whole, single = (np.asarray(part) for part in _both_ways(model, omega))
     if whole.shape != shape:
         raise ValueError(
@@ -94,15 +106,41 @@ def _both_ways(model, omega):
     return evaluate_response(model, omega), single
 
 
-@eqx.filter_jit
-def _solve_batch(
+def _portions(batch: int) -> list[Int[np.ndarray, "chunks chunk"]]:
+    """The members of each call, by chunks; the last are filled up with the last member.
+
+    Calls have few sizes, so that a batch of another length compiles nothing.
+    """
+    size = min(_AT_ONCE, 1 << (batch - 1).bit_length())
+    places = np.minimum(np.arange(batch + -batch % size), batch - 1)
+    return list(places.reshape(-1, -(-size // _CHUNK), min(size, _CHUNK)))
+
+
+def _solve_portions(
     model, parameters, omega, measured, weights, hold, max_steps, tolerance
 ) -> BatchSolution:
-    size = min(_CHUNK, measured.shape[0])
-    used = jnp.any(weights > 0, axis=-1)
+    batch, used = len(measured), np.any(weights > 0, axis=-1)
     # Points that do not count may hold anything, NaN included.
-    inverse = jnp.where(used, 1 / jnp.where(used, measured, 1.0), 1.0)
-    z0 = jnp.broadcast_to(parameters.start[: parameters.count, None], (parameters.count, size))
+    with np.errstate(invalid="ignore"):
+        inverse = np.where(used, 1 / np.where(used, measured, 1.0), 1.0)
+
+    def solve(members):
+        data = tuple(np.moveaxis(array[members], 1, -1) for array in (inverse, weights))
+        found = _solve_portion(model, parameters, omega, data, hold, max_steps, tolerance)
+        return jax.tree.map(np.asarray, found)
+
+    first, *others = _portions(batch)
+    found = [solve(first)]  # it compiles; a program runs on one core
+    if others:
+        with ThreadPoolExecutor(max_workers=min(len(others), os.cpu_count() or 1)) as pool:
+            found += pool.map(solve, others)
+    return BatchSolution(*(np.concatenate(each)[:batch] for each in zip(*found, strict=True)))
+
+
+@eqx.filter_jit
+def _solve_portion(model, parameters, omega, data, hold, max_steps, tolerance) -> BatchSolution:
+    count, size = parameters.count, data[0].shape[-1]
+    z0 = jnp.broadcast_to(parameters.start[:count, None], (count, size))
 
     def chunk(data):
         evaluate = lambda z: _normal(model, parameters, z, hold, omega, *data)
@@ -113,18 +151,9 @@ def _solve_batch(
         converged = (state.status == CONVERGED) & level
         return state.z, 2 * normal.cost, left, state.steps, converged
 
-    stacked = jax.lax.map(chunk, (_chunked(inverse, size), _chunked(weights, size)))
-    batch = measured.shape[0]
+    stacked = jax.lax.map(chunk, data)
     z, *facts = (jnp.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1]) for part in stacked)
-    values = jax.vmap(parameters.values)(z)
-    return BatchSolution(z[:batch], values[:batch], *(part[:batch] for part in facts))
-
-
-def _chunked(array: Array, size: int) -> Array:
-    """[chunks, ..., size], the last chunk filled up with the last member."""
-    fill = [(0, -array.shape[0] % size)] + [(0, 0)] * (array.ndim - 1)
-    padded = jnp.pad(array, fill, mode="edge")
-    return jnp.moveaxis(padded.reshape(-1, size, *array.shape[1:]), 1, -1)
+    return BatchSolution(z, jax.vmap(parameters.values)(z), *facts)
 
 
 def _normal(model, parameters, z, hold, omega, inverse, weights) -> Normal:
@@ -221,12 +250,11 @@ class BatchFit(eqx.Module):
         batch, where that is no floor on the random error as it is in `jq.fit`: it would take each
         response through a solution of its own.
         """
-        points, z = self.points[k], jnp.asarray(self.z[k])
+        points, steps = self.points[k], int(self.steps[k])
         problem = make_problem(self.model, self.parameters, [points.frf])
-        problem = problem.weighted([jnp.asarray(self.weights[k])])
-        reason = jnp.asarray(1 if self.converged[k] else 2)
-        stop = Stop(z, jnp.asarray(self.converged[k]), reason, jnp.asarray(self.steps[k]))
-        solution = solution_at(stop, *_describe(z, problem))
+        problem = problem.weighted([self.weights[k]])
+        message = "" if self.converged[k] else stopped_early(STALLED, steps)
+        solution = solution_at(problem, self.z[k], message, steps)
         found = discrepancy_at(problem, [points], solution)
         return assess(problem, Counted([points], None, None, found), solution)
 
@@ -239,9 +267,6 @@ class BatchFit(eqx.Module):
             for row in zip(self.names, middle, low, high, strict=True):
                 lines.append("{:<16} median {:11.5g}, 5 to 95 %: {:.5g} .. {:.5g}".format(*row))
         return "\n".join(lines)
-
-
-_describe = eqx.filter_jit(describe)
 
 
 class _Data(NamedTuple):
@@ -345,7 +370,7 @@ def _weights(cost: Cost, data: _Data, ratios) -> np.ndarray:
 def _solve(
     model: PyTree, parameters: Parameters, data: _Data, weights: np.ndarray, max_steps: int
 ) -> BatchSolution:
-    arrays = (jnp.asarray(data.omega), jnp.asarray(data.measured), jnp.asarray(weights))
+    arrays = (data.omega, data.measured, weights)
     return solve_batch(model, parameters, *arrays, hold=data.hold, max_steps=max_steps)
 
 
@@ -359,6 +384,10 @@ def _ratios(
     model: PyTree, parameters: Parameters, data: _Data, found: BatchSolution
 ) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
     """|model / measurement| of every member; 1 where a fit ran away."""
-    responses = _responses(model, parameters, found.z, data.hold, jnp.asarray(data.omega))
-    ratios = np.abs(np.asarray(responses) / data.measured)
+    parts = [
+        _responses(model, parameters, found.z[members.reshape(-1)], data.hold, data.omega)
+        for members in _portions(len(found.z))
+    ]
+    responses = np.concatenate(parts)[: len(found.z)]
+    ratios = np.abs(responses / data.measured)
     return np.where(np.isfinite(ratios) & (ratios > 0), ratios, 1.0)

@@ -1,13 +1,13 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from ._cost import Band, Range
 from ._origin import free_again, Origin
 from ._parameters import with_values
+from ._problem import on_device
 
 
 class Bands(NamedTuple):
@@ -77,7 +77,7 @@ def model_to_start_from(fit: PyTree) -> PyTree:
     parameters, values = fit.parameters, np.asarray(fit.values)
     small = 0.05 * np.asarray(parameters.scale)[: values.size]
     places = parameters.places[: values.size]
-    return with_values(fit.model, places, jnp.asarray(np.where(values == 0, small, values)))
+    return on_device(with_values(fit.model, places, np.where(values == 0, small, values)))
 
 
 def fit_bands(fit: PyTree) -> Bands:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
@@ -18,7 +17,7 @@ _TRIED = 32  # frequencies at which the two are chosen
 _TOLERANCE = 1e-8  # of the response, to which they are chosen
 
 
-Numbers = Array | np.ndarray  # of a plan, NumPy's until it is complete
+Numbers = Array | np.ndarray
 
 
 class Aliases(eqx.Module):
@@ -156,12 +155,8 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
     count = next(count for count in _COUNTS if close(count, None))
     for nodes in _NODES if omega.size > _NODES[-1] else ():
         if close(count, places := _places(tried, nodes)):
-            return _on_device(_aliases_at(omega, hold, count, tried[places]))
-    return _on_device(_aliases_at(omega, hold, count))
-
-
-def _on_device(aliases: Aliases) -> Aliases:
-    return jax.tree.map(jnp.asarray, aliases)
+            return _aliases_at(omega, hold, count, tried[places])
+    return _aliases_at(omega, hold, count)
 
 
 def _is_numpy(x: Numbers) -> bool:

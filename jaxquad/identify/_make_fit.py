@@ -10,8 +10,9 @@ from ._accuracy import condition_number, cramer_rao, insensitivity, Matrix
 from ._discrepancy import Discrepancy
 from ._fit_remarks import runaways
 from ._identifiability import LIMIT
+from ._origin import Origin
 from ._parameters import Parameters
-from ._problem import Problem
+from ._problem import on_device, Problem
 from ._result import Fit
 from ._solve import Solution
 from ._starts import Minimum
@@ -49,6 +50,7 @@ def make_fit(
     minima: tuple[Minimum, ...] = (),
     freedom: Float[np.ndarray, " parameters"] | None = None,
     discrepancy: Discrepancy | None = None,
+    origin: Origin | None = None,
 ) -> Fit:
     """A result in physical units; `freedom` is that of the noise estimate, infinite without."""
     bread, covariance, _, units, verdict, decrement = estimate
@@ -61,7 +63,7 @@ def make_fit(
     with np.errstate(divide="ignore"):
         percent = np.where(values == 0, np.nan, 100 * np.abs(units / values))
     return Fit(
-        model=solution.model,
+        model=on_device(solution.model),
         names=names,
         values=values,
         standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
@@ -86,6 +88,7 @@ def make_fit(
         minima=minima,
         degrees_of_freedom=freedom,
         discrepancy=discrepancy,
+        origin=origin,
     )
 
 

@@ -174,7 +174,7 @@ def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Pro
         omega=(),
         measured=(),
         weights=(),
-        known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
+        known=np.asarray(numbers, dtype=float).reshape(-1, 2),
     )
 
 
@@ -187,24 +187,23 @@ def _term(
 ) -> RecordTerm:
     u, between = inputs_between_samples(record, hold)
     gain = band_gain(band, record)
-    gain = None if gain is None else jnp.asarray(gain)
-    feedback = None if loop is None else jnp.asarray(feedback_response(loop, record, between))
+    feedback = None if loop is None else np.asarray(feedback_response(loop, record, between))
     if isinstance(model, DifferentialModel) and not isinstance(model, Linear):
         if loop is not None:
             raise ValueError(
                 f"{type(model).__name__} is given by its differential equation, but a loop needs a "
                 "linear model: give a jq.TransferFunction or a jq.StateSpace"
             )
-        motions, start = None, jnp.ones(count_states(model))
+        motions, start = None, np.ones(count_states(model))
         _check_measured(model, record)
     else:
         plant = linear_model(model)
         check_channels(plant, record)
         check_growth(plant, record)
         found = unknown_motions(plant, record.duration)
-        motions, start = (found.slow, found.fast), jnp.zeros(0)
-    y = band_filter(jnp.asarray(record.outputs), gain)
-    weights = 1 / jnp.std(y, axis=0)
+        motions, start = (found.slow, found.fast), np.zeros(0)
+    y = band_filter(np.asarray(record.outputs), gain)
+    weights = 1 / np.std(y, axis=0)
     return RecordTerm(u, y, weights, gain, motions, start, record.dt, between, feedback=feedback)
 
 
@@ -222,7 +221,7 @@ def _with_units(problem: OutputError) -> OutputError:
     if not problem.unknown:
         return problem
     count = problem.base.parameters.count
-    z = jnp.concatenate([problem.base.parameters.start[:count], jnp.zeros(problem.unknown)])
+    z = np.concatenate([problem.base.parameters.start[:count], np.zeros(problem.unknown)])
     slopes = evaluate_misfits(z, problem).slopes
     terms, at = [], count
     for term, one in zip(problem.terms, slopes, strict=True):
@@ -235,7 +234,7 @@ def _with_units(problem: OutputError) -> OutputError:
                 "jq.records.trim"
             )
         seen = sizes > 1e-6 * np.max(sizes, initial=0.0)
-        start = jnp.asarray(np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0))
+        start = np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0)
         terms.append(dataclasses.replace(term, start=start))
         at += term.start.size
     return dataclasses.replace(problem, terms=tuple(terms))

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -97,7 +96,7 @@ def _by_turns(start: _Start, noise: Noise, max_steps: int, known: Sequence[_End]
         for end in () if turn else known:
             if _distance(stop, z - end.stop.z) < _NEXT:
                 return end
-        residuals = _residuals(evaluate_misfits(jnp.asarray(z), plain), models)
+        residuals = _residuals(evaluate_misfits(np.asarray(z), plain), models)
         if message or (turn and _distance(stop, change) < _STILL):
             break
     else:
@@ -125,14 +124,14 @@ def _described(end: _End) -> Descent:
     sizes = sizes_of(problem, stop.found)
     solution = describe_stop(problem.base, stop.z, message, steps)
     found, noises = stop.found.reweighted(sizes), _noises(plain, residuals, models)
-    return Descent(problem.reweighted(sizes), jnp.asarray(stop.z), solution, found, noises)
+    return Descent(problem.reweighted(sizes), np.asarray(stop.z), solution, found, noises)
 
 
 def _at_start(plain: OutputError, max_steps: int) -> _Start:
     parameters = plain.base.parameters
     z = np.zeros(parameters.count + plain.unknown)
     z[: parameters.count] = np.asarray(parameters.start)[: parameters.count]
-    found = evaluate_misfits(jnp.asarray(z), plain)
+    found = evaluate_misfits(np.asarray(z), plain)
     if not all(np.all(np.isfinite(misfit)) for misfit in found.misfits):
         return _after_output_error(plain, max_steps)
     sizes = sizes_of(plain, found)

@@ -14,6 +14,7 @@ from jaxquad._core import minimise_on_host, Normal, RUNNING, solve_definite, STA
 
 from ._known_loop import close_loop
 from ._noise_model import NoiseModel
+from ._parameters import Numbers
 from ._problem import prior_misfits, Problem
 from ._simulated import (
     band_filter,
@@ -23,7 +24,7 @@ from ._simulated import (
     linear_model,
     Motions,
 )
-from ._solve import describe, Solution
+from ._solve import Solution, solution_at
 from ._whitening import Whitener
 
 
@@ -34,26 +35,26 @@ _LOOSE = 1e-2  # standard errors per unit of initial state: holds what has no ef
 class RecordTerm(eqx.Module):
     """A record as the fit sees it."""
 
-    u: Float[Array, "samples inputs"]
-    y: Float[Array, "samples outputs"]  # within the band
-    weights: Float[Array, " outputs"]  # one over the residual's standard deviation
-    gain: Float[Array, " bins"] | None  # of the band, over frequency
-    motions: tuple[Float[Array, "states slow"], Float[Array, "states fast"]] | None
-    start: Float[Array, " unknown"]  # units of an unknown initial state; none if it is eliminated
+    u: Float[Numbers, "samples inputs"]
+    y: Float[Numbers, "samples outputs"]  # within the band
+    weights: Float[Numbers, " outputs"]  # one over the residual's standard deviation
+    gain: Float[Numbers, " bins"] | None  # of the band, over frequency
+    motions: tuple[Float[Numbers, "states slow"], Float[Numbers, "states fast"]] | None
+    start: Float[Numbers, " unknown"]  # units of an unknown initial state; none if it is eliminated
     dt: float = eqx.field(static=True)
     hold: str = eqx.field(static=True)
     whitener: Whitener | None = None  # of the noise, where it has a model
     feedback: Float[Array, " samples"] | None = None  # of a known loop, after a unit of output
 
     def weighted(
-        self, x: Float[Array, "samples outputs *columns"]
-    ) -> Float[Array, "samples outputs *columns"]:
+        self, x: Float[Numbers, "samples outputs *columns"]
+    ) -> Float[Numbers, "samples outputs *columns"]:
         """What counts of outputs: within the band, unpredicted by the noise, in units of it."""
         seen = band_filter(x, self.gain) if self.whitener is None else self.whitener(x)
         return seen * self.weights.reshape(1, -1, *(1,) * (x.ndim - 2))
 
     @property
-    def measured(self) -> Float[Array, "samples outputs"]:
+    def measured(self) -> Float[Numbers, "samples outputs"]:
         """The measured output as `weighted` sees it."""
         return self.y * self.weights[None] if self.whitener is None else self.weighted(self.y)
 
@@ -75,7 +76,7 @@ class OutputError(eqx.Module):
     def reweighted(self, sizes: Sequence[Float[np.ndarray, " outputs"]]) -> "OutputError":
         """The same problem with its residuals divided by `sizes`."""
         terms = [
-            dataclasses.replace(term, weights=term.weights / jnp.asarray(size))
+            dataclasses.replace(term, weights=np.asarray(term.weights) / size)
             for term, size in zip(self.terms, sizes, strict=True)
         ]
         return dataclasses.replace(self, terms=tuple(terms))
@@ -86,14 +87,14 @@ class OutputError(eqx.Module):
         return sum(term.start.size for term in self.terms)
 
 
-def split(z: Float[Array, " n"], problem: OutputError) -> list[Float[Array, " part"]]:
+def split(z: Float[Numbers, " n"], problem: OutputError) -> list[Float[Numbers, " part"]]:
     """The parameters, and then each record's initial state."""
     ends = np.cumsum([0, *(term.start.size for term in problem.terms)])
     count = z.size - problem.unknown
     return [z[:count], *(z[count + a : count + b] for a, b in zip(ends, ends[1:], strict=False))]
 
 
-def insert_parameters(z: Float[Array, " n"], problem: OutputError) -> PyTree:
+def insert_parameters(z: Float[Numbers, " n"], problem: OutputError) -> PyTree:
     """The model at these parameters; what is 0 and fixed stays known to be 0 under jit."""
     model = problem.base.parameters.insert(problem.base.model, z)
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
@@ -159,7 +160,7 @@ class Evaluation(NamedTuple):
 
 
 @eqx.filter_jit
-def evaluate_misfits(z: Float[Array, " n"], problem: OutputError) -> Evaluation:
+def evaluate_misfits(z: Float[Numbers, " n"], problem: OutputError) -> Evaluation:
     """Everything at the first parameters and the initial states `z`."""
 
     def simulated(z):
@@ -194,7 +195,7 @@ class Descent(NamedTuple):
     """Where the descent ended, and all that the result is made from."""
 
     problem: OutputError  # under the final noise level
-    z: Float[Array, " n"]  # free parameters and initial states
+    z: Float[np.ndarray, " n"]  # free parameters and initial states
     solution: Solution
     found: Evaluation
     noise: tuple[RecordNoise, ...] = ()  # of each record, where it has a model
@@ -220,7 +221,7 @@ class Point(NamedTuple):
 
 
 def _point(problem: OutputError, z: Float[np.ndarray, " n"]) -> Point:
-    return Point(problem, z, evaluate_misfits(jnp.asarray(z), problem))
+    return Point(problem, z, evaluate_misfits(np.asarray(z), problem))
 
 
 def descend_by_turns(problem: OutputError, max_steps: int, tolerance: float = CLOSE) -> Descent:
@@ -240,32 +241,27 @@ def descend_by_turns(problem: OutputError, max_steps: int, tolerance: float = CL
         if common or changed < _LEVEL or message or turn == _PASSES - 1:
             break
     found = found.reweighted(sizes)
-    return Descent(problem, jnp.asarray(z), describe_stop(base, z, message, steps), found)
+    return Descent(problem, np.asarray(z), describe_stop(base, z, message, steps), found)
 
 
 def describe_stop(base: Problem, z: Float[np.ndarray, " n"], message: str, steps: int) -> Solution:
     """The model, its values and the priors' slopes where the descent stopped."""
-    at = jnp.asarray(z)[: base.parameters.count]
-    (model, values, slopes), derivatives = _describe(at, base)
-    return Solution(
-        at, model, values, slopes, message, not message, steps, derivatives, *_at_zero(base, at)
-    )
+    at = np.asarray(z)[: base.parameters.count]
+    low, sizes = _at_zero(base, at)
+    return solution_at(base, at, message, steps)._replace(at_zero=low, units_at_zero=sizes)
 
 
 _FAR = 7.0  # in ln: a parameter that shrank by a factor of 1000 ran to zero
 
 
 def _at_zero(
-    base: Problem, z: Float[Array, " parameters"]
+    base: Problem, z: Float[np.ndarray, " parameters"]
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Parameters that ran to zero, and their sizes at the start."""
     start, scale = (np.asarray(x)[: z.size] for x in (base.parameters.start, base.parameters.scale))
     logarithmic = np.array(base.parameters.logarithmic[: z.size])
     low = np.flatnonzero(logarithmic & (np.asarray(z) - start < -_FAR))
     return tuple(low.tolist()), tuple((scale[low] * np.exp(start[low])).tolist())
-
-
-_describe = eqx.filter_jit(describe)
 
 
 def sizes_of(problem: OutputError, found: Evaluation) -> list[Float[np.ndarray, " outputs"]]:
@@ -329,7 +325,7 @@ def _slopes(descent: Descent, k: int, values: np.ndarray) -> list:
     for step in (_STEP_FIXED_SLOPES, -_STEP_FIXED_SLOPES):
         moved = values.copy()
         moved[k] *= np.exp(step)
-        model = problem.base.parameters.replace(problem.base.model, jnp.asarray(moved))
+        model = problem.base.parameters.replace(problem.base.model, moved)
         base = dataclasses.replace(problem.base, model=model)
         ends.append(evaluate_misfits(descent.z, dataclasses.replace(problem, base=base)).misfits)
     return [

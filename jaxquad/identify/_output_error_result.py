@@ -5,7 +5,6 @@ import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -294,7 +293,7 @@ def _same(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:
     if np.any(logarithmic & (ratio <= 0)):
         return False
     z = np.where(logarithmic, np.log(np.where(logarithmic, ratio, 1.0)), ratio)
-    other = evaluate_misfits(jnp.concatenate([jnp.asarray(z), descent.z[count:]]), problem).misfits
+    other = evaluate_misfits(np.concatenate([np.asarray(z), descent.z[count:]]), problem).misfits
     return all(
         _close(np.asarray(new), np.asarray(old), term)
         for new, old, term in zip(other, found.misfits, problem.terms, strict=True)

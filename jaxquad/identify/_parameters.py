@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._core import require_float64
+from jaxquad._core import is_concrete, require_float64
 
 
 class Positive(NamedTuple):
@@ -24,6 +24,8 @@ class Real(NamedTuple):
     name: str
     scale: float | None = None
 
+
+Numbers = Array | np.ndarray
 
 Free = Sequence[str | Positive | Real] | Callable[[PyTree], PyTree] | None
 
@@ -42,41 +44,44 @@ Tie = Callable[[PyTree], Float[Array, ""]]
 class Parameters(eqx.Module):
     """Free numbers first, then the fixed nonzero ones; `z` is the vector that a solver moves.
 
-    Tied numbers follow the others: each is a function of the model.
+    Tied numbers follow the others: each is a function of the model. With a NumPy `z` all is done
+    in NumPy, which compiles nothing, and models hold NumPy arrays.
     """
 
     places: tuple[Place, ...] = eqx.field(static=True)
     ties: tuple[tuple[Place, Tie], ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)  # of free ones
-    scale: Float[Array, " all"]
-    start: Float[Array, " all"]  # z at the starting values
+    scale: Float[Numbers, " all"]
+    start: Float[Numbers, " all"]  # z at the starting values
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters."""
         return tuple(place.name for place in self.places[: self.count])
 
-    def values(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
+    def values(self, z: Float[Numbers, " n"]) -> Float[Numbers, " n"]:
         """Physical values of the first parameters."""
-        n = z.shape[0]
-        return self.scale[:n] * jnp.where(np.array(self.logarithmic[:n]), jnp.exp(z), z)
+        n, xp = z.shape[0], _namespace(z)
+        with np.errstate(over="ignore"):
+            return self.scale[:n] * xp.where(np.array(self.logarithmic[:n]), xp.exp(z), z)
 
-    def slopes(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
+    def slopes(self, z: Float[Numbers, " n"]) -> Float[Numbers, " n"]:
         """Derivatives of the physical values with respect to `z`."""
-        n = z.shape[0]
-        ones = jnp.ones_like(z)
-        return self.scale[:n] * jnp.where(np.array(self.logarithmic[:n]), jnp.exp(z), ones)
+        n, xp = z.shape[0], _namespace(z)
+        ones = xp.ones_like(z)
+        with np.errstate(over="ignore"):
+            return self.scale[:n] * xp.where(np.array(self.logarithmic[:n]), xp.exp(z), ones)
 
-    def insert(self, model: PyTree, z: Float[Array, " n"]) -> PyTree:
+    def insert(self, model: PyTree, z: Float[Numbers, " n"]) -> PyTree:
         """The model with its first `n` parameters set, and what is tied to them."""
         return self.replace(model, self.values(z))
 
-    def replace(self, model: PyTree, values: Float[Array, " n"]) -> PyTree:
+    def replace(self, model: PyTree, values: Float[Numbers, " n"]) -> PyTree:
         """The model with other physical values of its first `n` parameters."""
-        model = with_values(model, self.places[: values.shape[0]], values)
+        model, xp = with_values(model, self.places[: values.shape[0]], values), _namespace(values)
         for place, tie in self.ties:
-            value = jnp.asarray(tie(model))
+            value = xp.asarray(tie(model))
             if value.shape != ():
                 raise ValueError(
                     f"{place.name} is tied to an array of shape {value.shape}: return one number"
@@ -85,14 +90,23 @@ class Parameters(eqx.Module):
         return model
 
 
-def with_values(model: PyTree, places: Sequence[Place], values: Float[Array, " n"]) -> PyTree:
-    """Return `model` with the numbers at `places` replaced by `values`."""
+def _namespace(x: Numbers):
+    return np if isinstance(x, np.ndarray) else jnp
+
+
+def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, " n"]) -> PyTree:
+    """Return `model` with the numbers at `places` replaced by `values`; see `Parameters`."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
+    if _namespace(values) is np:
+        leaves = [np.array(leaf) if is_concrete(leaf) else leaf for leaf in leaves]
     for leaf in {place.leaf for place in places}:
         mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
         index = np.array([places[k].index for k in mine])
-        flat = leaves[leaf].reshape(-1).at[index].set(values[mine])
+        if isinstance(leaves[leaf], np.ndarray) and _namespace(values) is np:
+            leaves[leaf].reshape(-1)[index] = values[mine]
+            continue
+        flat = jnp.asarray(leaves[leaf]).reshape(-1).at[index].set(values[mine])
         leaves[leaf] = flat.reshape(leaves[leaf].shape)
     return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
@@ -146,9 +160,7 @@ def select_parameters(
     ordered = tuple(place for place, _, _ in chosen) + tuple(fixed)
     ratio = np.array([values[p.name] for p in ordered]) / np.array(scales)
     start = np.where(logs, np.log(np.where(logs, ratio, 1.0)), ratio)
-    return Parameters(
-        ordered, ties, logs, len(chosen), jnp.asarray(scales, float), jnp.asarray(start)
-    )
+    return Parameters(ordered, ties, logs, len(chosen), np.asarray(scales, float), start)
 
 
 def _tied(places: list[Place], tied: Mapping[str, Tie]) -> tuple[tuple[Place, Tie], ...]:

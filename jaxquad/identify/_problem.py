@@ -14,7 +14,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._held import Aliases, evaluate_sampled, plan_aliases
 from ._mixing import mix_parts, Mixing
-from ._parameters import Parameters
+from ._parameters import Numbers, Parameters
 
 
 Condition = Callable[[PyTree], PyTree]
@@ -58,10 +58,10 @@ class Problem(eqx.Module):
     parameters: Parameters
     conditions: tuple[Condition, ...] = eqx.field(static=True)
     quantities: tuple[Condition, ...] = eqx.field(static=True)  # that a prior speaks of
-    omega: tuple[Float[Array, " frequencies"], ...]
-    measured: tuple[Complex[Array, "frequencies outputs inputs"], ...]
-    weights: tuple[Float[Array, "frequencies outputs inputs 2"], ...]
-    known: Float[Array, "priors 2"]  # value, standard error
+    omega: tuple[Float[Numbers, " frequencies"], ...]
+    measured: tuple[Complex[Numbers, "frequencies outputs inputs"], ...]
+    weights: tuple[Float[Numbers, "frequencies outputs inputs 2"], ...]
+    known: Float[Numbers, "priors 2"]  # value, standard error
     aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
     silent: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True, default=())
     mixings: tuple[Mixing | None, ...] = ()  # of the responses, after their weights
@@ -75,8 +75,35 @@ class Problem(eqx.Module):
                 mask[pair] = True
         return masks
 
+    def parts(self) -> list["Problem"]:
+        """Problems of one record each, and one of the priors, for what no weight matters to."""
+        if len(self.omega) == 1 and not self.quantities:
+            return [dataclasses.replace(self, weights=(), mixings=())]
+        none = dataclasses.replace(
+            self,
+            conditions=(),
+            omega=(),
+            measured=(),
+            weights=(),
+            mixings=(),
+            aliases=(),
+            silent=(),
+        )
+        bare = dataclasses.replace(none, quantities=(), known=np.zeros((0, 2)))
+        names = ("conditions", "omega", "measured", "aliases", "silent")
+        fields = zip(
+            self.conditions, self.omega, self.measured, self.aliases, self.silent, strict=True
+        )
+        records = [
+            dataclasses.replace(bare, **{name: (x,) for name, x in zip(names, each, strict=True)})
+            for each in fields
+        ]
+        return [*records, none] if self.quantities else records
+
     def weighted(
-        self, weights: Sequence[Float[Array, "..."]], mixings: Sequence[Mixing | None] | None = None
+        self,
+        weights: Sequence[Float[Numbers, "..."]],
+        mixings: Sequence[Mixing | None] | None = None,
     ) -> "Problem":
         """The same problem under other weights, with points that share noise taken together."""
         each = [None] * len(weights) if mixings is None else mixings
@@ -113,21 +140,36 @@ def make_problem(
     return Problem(
         model=model,
         parameters=parameters,
-        conditions=tuple(condition or unchanged for condition in conditions),
+        conditions=tuple(taken),
         quantities=tuple(quantity_of(prior.quantity) for prior in priors),
-        omega=tuple(frf.omega for frf in frfs),
-        # Where a response is unknown its weight is zero, and nan times zero is not.
-        measured=tuple(jnp.where(jnp.isfinite(f.response), f.response, 1.0) for f in frfs),
-        weights=tuple(jnp.asarray(np.zeros(shape)) for shape in shapes),
+        omega=tuple(np.asarray(frf.omega) for frf in frfs),
+        measured=tuple(_known(np.asarray(frf.response)) for frf in frfs),
+        weights=tuple(np.zeros(shape) for shape in shapes),
         mixings=(None,) * len(shapes),
-        known=jnp.asarray(numbers, dtype=float).reshape(-1, 2),
+        known=np.asarray(numbers, dtype=float).reshape(-1, 2),
         aliases=tuple(
-            plan_aliases(each(model), frf) for each, frf in zip(taken, frfs, strict=True)
+            plan_aliases(each(on_host(model)), frf) for each, frf in zip(taken, frfs, strict=True)
         ),
         silent=tuple(
             _silent_pairs(model, parameters, *each) for each in zip(taken, frfs, strict=True)
         ),
     )
+
+
+def _known(response: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
+    """Where a response is unknown its weight is zero, and nan times zero is not."""
+    return np.where(np.isfinite(response), response, 1.0)
+
+
+def on_host(model: PyTree) -> PyTree:
+    """The model with NumPy arrays: what a condition or a tie does to it is compiled nowhere."""
+    return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, model)
+
+
+def on_device(model: PyTree) -> PyTree:
+    """The model with JAX's arrays in the place of NumPy's."""
+    arrays, rest = eqx.partition(model, eqx.is_array)
+    return eqx.combine(jax.device_put(arrays), rest)
 
 
 def _silent_pairs(
@@ -138,8 +180,9 @@ def _silent_pairs(
         return ()
     start = np.asarray(parameters.start)[: parameters.count]
     moved = start + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
-    tried = condition(parameters.insert(model, jnp.asarray(moved)))
-    found = np.asarray(_evaluate(tried, frf.omega[jnp.array([0, frf.omega.size // 2, -1])]))
+    tried = condition(parameters.insert(model, moved))
+    omega = np.asarray(frf.omega)[[0, frf.omega.size // 2, -1]]
+    found = np.asarray(_evaluate(tried, omega))
     pairs = np.argwhere(np.all(found == 0, axis=0)).tolist()
     return tuple((output, source) for output, source in pairs)
 
@@ -160,16 +203,11 @@ def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, ".
     return [evaluate_sampled(condition(model), *each) for condition, each in terms]
 
 
-def misfits(z: Float[Array, " n"], problem: Problem) -> list[Float[Array, "..."]]:
-    """`ln|T/T^|` and wrapped phase of `T/T^` in rad, on a last axis of two, per record."""
-    logs = _log_ratios(z, problem)
-    return [jnp.stack([jnp.moveaxis(part, -1, 0) for part in log], axis=-1) for log in logs]
-
-
 Part = Float[Array, "outputs inputs frequencies"]
 
 
 def _log_ratios(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Part]]:
+    """`ln|T/T^|` and wrapped phase of `T/T^` in rad, per record."""
     # Frequencies come last until all is done: derivatives are then fast loops over them.
     logs = []
     parts = zip(responses(z, problem), problem.measured, problem.silences, strict=True)
@@ -234,23 +272,13 @@ def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residua
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 
 
-class Sensitivity(NamedTuple):
-    """Derivatives at the solution, with respect to free and then fixed parameters."""
+def misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
+    """The magnitudes and then the phases of one record after the other, then the priors.
 
-    misfits: list[Float[Array, "..."]]
-    slopes: list[Float[Array, "..."]]  # of the misfits
-    prior_misfits: Float[Array, " priors"]
-    prior_slopes: Float[Array, "priors all"]
-
-
-def sensitivity(z: Float[Array, " all"], problem: Problem) -> Sensitivity:
-    """Misfits and their Jacobians over all parameters."""
-    return Sensitivity(
-        misfits(z, problem),
-        jax.jacfwd(misfits)(z, problem),
-        prior_misfits(z, problem),
-        jax.jacfwd(prior_misfits)(z, problem),
-    )
+    Each is (outputs, inputs, frequencies), flattened.
+    """
+    parts = [part.reshape(-1) for log in _log_ratios(z, problem) for part in log]
+    return jnp.concatenate([*parts, prior_misfits(z, problem)])
 
 
 def quantity_of(name_or_function: str | Condition) -> Condition:

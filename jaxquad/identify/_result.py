@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from jaxquad._xla import run_shared
+
 from ._accuracy import Matrix
 from ._discrepancy import Discrepancy
 from ._explain import explain_misfit, Explanation
@@ -222,10 +224,9 @@ class Fit(eqx.Module):
         """
         if not self.verdict.fitted:
             raise UndeterminedError(f"{name} has no value: {self.verdict.summary}")
-        here = jnp.asarray(self.values)
-        gradient = jax.grad(lambda x: quantity(self.parameters.replace(self.model, x)))(here)
-        slope = np.asarray(gradient) * self.units
-        if self._depends_on_undetermined(quantity, slope):
+        value, gradient = self._value_and_gradient(quantity, self.values)
+        slope = gradient * self.units
+        if self._depends_on_undetermined(quantity, slope, value):
             lost = ", ".join(self.verdict.undetermined)
             raise UndeterminedError(
                 f"{name} depends on what this record does not determine ({lost}): fit with a "
@@ -233,7 +234,7 @@ class Fit(eqx.Module):
             )
         covariance = self.relative_covariance if model_error else self.relative_noise_covariance
         error = float(np.sqrt(slope @ covariance @ slope))
-        return Combination(name, float(quantity(self.model)), error, self.freedom_of(slope))
+        return Combination(name, value, error, self.freedom_of(slope))
 
     def bands(self) -> Bands:
         """The same parameters from the lower and from the upper half of the band.
@@ -298,19 +299,34 @@ class Fit(eqx.Module):
         return draw_models(self, scores, hold_undetermined=hold_undetermined)
 
     def _depends_on_undetermined(
-        self, quantity: Callable[[PyTree], Float[Array, ""]], slope: np.ndarray
+        self,
+        quantity: Callable[[PyTree], Float[Array, ""]],
+        slope: Float[np.ndarray, " parameters"],
+        here: float,
     ) -> bool:
         """Whether a quantity changes where the responses do not."""
         verdict = self.verdict
         along_null = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
         on_curved = [slope[self.names.index(name)] != 0 for name in verdict.curved]
-        here = float(quantity(self.model))
-        others = [
-            float(quantity(self.parameters.replace(self.model, jnp.asarray(values))))
-            for values in verdict.alternatives
-        ]
+        others = [self._value_and_gradient(quantity, each)[0] for each in verdict.alternatives]
         differs = [abs(other - here) > 1e-6 * abs(here) for other in others]
         return bool(np.any(along_null) or any(on_curved) or any(differs))
+
+    def _value_and_gradient(
+        self, quantity: Callable[[PyTree], Float[Array, ""]], values: Float[np.ndarray, " n"]
+    ) -> tuple[float, Float[np.ndarray, " n"]]:
+        """Of a quantity at physical values of the free parameters."""
+        arrays, rest = eqx.partition(self.model, eqx.is_inexact_array)
+
+        def of_values(x, arrays):
+            return quantity(self.parameters.replace(eqx.combine(arrays, rest), x))
+
+        function = jax.value_and_grad(of_values)
+        try:
+            found = run_shared(function, values, arrays)
+        except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
+            found = function(jnp.asarray(values), arrays)
+        return float(found[0]), np.asarray(found[1])
 
     def __str__(self) -> str:
         return fit_table(self)

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,9 @@ from jaxquad.models import (
     TransferFunction,
 )
 from jaxquad.records import Record
+
+
+Numbers = Array | np.ndarray
 
 
 def band_gain(
@@ -42,30 +46,31 @@ def band_gain(
 
 
 def band_filter(
-    x: Float[Array, " samples *columns"], gain: Float[Array, " bins"] | None
-) -> Float[Array, " samples *columns"]:
+    x: Float[Numbers, " samples *columns"], gain: Float[Numbers, " bins"] | None
+) -> Float[Numbers, " samples *columns"]:
     """`x` within the band; outside the record it continues mirrored through its two ends."""
     if gain is None:
         return x
+    xp = np if isinstance(x, np.ndarray) else jnp
     # A straight line is far below any band, and what is left after it starts and ends at 0.
     ones = (1,) * (x.ndim - 1)
-    along = jnp.linspace(0.0, 1.0, len(x)).reshape(-1, *ones)
+    along = xp.linspace(0.0, 1.0, len(x)).reshape(-1, *ones)
     level = x - x[:1] - along * (x[-1:] - x[:1])
-    periodic = jnp.concatenate([level, -level[-2:0:-1]])
-    spectrum = jnp.fft.rfft(periodic, axis=0)
+    periodic = xp.concatenate([level, -level[-2:0:-1]])
+    spectrum = xp.fft.rfft(periodic, axis=0)
     weighted = gain.reshape(-1, *ones).astype(spectrum.dtype) * spectrum
-    return jnp.fft.irfft(weighted, len(periodic), axis=0)[: len(x)]
+    return xp.fft.irfft(weighted, len(periodic), axis=0)[: len(x)]
 
 
 def inputs_between_samples(
     record: Record, hold: str | None
-) -> tuple[Float[Array, "samples inputs"], str]:
+) -> tuple[Float[np.ndarray, "samples inputs"], str]:
     """The inputs, and how they run between their samples: "zero" (held) or "first" (straight).
 
     Where `hold` does not say, the record does: held where they keep each value for a sample,
     straight where nobody knows. What is held for less is straight, and half its hold late.
     """
-    u = jnp.asarray(record.inputs)
+    u = np.asarray(record.inputs)
     if hold not in ("first", "zero", None):
         raise ValueError(
             f'hold is {hold!r}: give "first" (straight between samples), "zero" (held), or None '
@@ -76,7 +81,7 @@ def inputs_between_samples(
         return u, hold or "first"
     if share > 1 - 1e-6:
         return u, "zero"
-    return u - 0.5 * share * jnp.diff(u, axis=0, prepend=u[:1]), "first"
+    return u - 0.5 * share * np.diff(u, axis=0, prepend=u[:1]), "first"
 
 
 _RELATIVE, _ABSOLUTE = 1e-8, 1e-10  # tolerances of the states within one sample
@@ -126,7 +131,7 @@ def count_states(plant: DifferentialModel) -> int:
 
 def integrate_plant(
     plant: DifferentialModel,
-    u: Float[Array, "samples inputs"],
+    u: Float[Numbers, "samples inputs"],
     start: Float[Array, " states"],
     dt: float,
     hold: str,
@@ -185,8 +190,8 @@ class Motions(NamedTuple):
     look alike: a bias on a fast state is the transient of an initial value and a shift.
     """
 
-    slow: Float[Array, "states slow"]
-    fast: Float[Array, "states fast"]  # the slower ones first
+    slow: Float[Numbers, "states slow"]
+    fast: Float[Numbers, "states fast"]  # the slower ones first
     groups: tuple[int, ...]  # how many of the fast columns belong to each speed
 
 
@@ -230,7 +235,10 @@ def check_growth(plant: TransferFunction | StateSpace, record: Record) -> None:
 
 
 def forced_response(
-    plant: TransferFunction | StateSpace, u: Float[Array, "samples inputs"], dt: float, hold: str
+    plant: TransferFunction | StateSpace,
+    u: Float[Numbers, "samples inputs"],
+    dt: float | Float[Array, ""],
+    hold: str,
 ) -> Float[Array, "samples outputs"]:
     """The outputs under inputs that stood at their first values before the record, from rest."""
     u = u - u[:1]
@@ -243,18 +251,21 @@ def unknown_motions(plant: TransferFunction | StateSpace, duration: float) -> Mo
     """The invariant subspaces of all speeds; slow is what a fifth of the record does not damp."""
     A = _dynamics(plant)
     if not len(A):
-        return Motions(jnp.zeros((0, 0)), jnp.zeros((0, 0)), ())
+        return Motions(np.zeros((0, 0)), np.zeros((0, 0)), ())
     edges = _edges(-np.real(np.linalg.eigvals(A)) * duration / _SLOW)
     within = lambda low, high: _subspace(A * duration / _SLOW, low, high)
     slow = within(-np.inf, edges[0])
     parts = [within(low, high) for low, high in zip(edges, edges[1:], strict=False)]
     parts = parts or [slow[:, :0]]
     groups = tuple(part.shape[1] for part in parts if part.shape[1])
-    return Motions(jnp.asarray(slow), jnp.asarray(np.concatenate(parts, axis=1)), groups)
+    return Motions(slow, np.concatenate(parts, axis=1), groups)
 
 
 def free_response(
-    plant: TransferFunction | StateSpace, motions: Motions, samples: int, dt: float
+    plant: TransferFunction | StateSpace,
+    motions: Motions,
+    samples: int,
+    dt: float | Float[Array, ""],
 ) -> Float[Array, "samples outputs unknowns"]:
     """The outputs of a unit shift of each output, of unit biases and of unit initial values."""
     outputs = len(plant.H0) if isinstance(plant, StateSpace) else 1
@@ -264,8 +275,21 @@ def free_response(
     start, bias = free_responses(plant, samples, dt)
     if isinstance(plant, TransferFunction):
         start, bias = start[:, None], bias[:, None]
-    dot = lambda x, way: jnp.einsum("toi,ik->tok", x, way, precision="highest")
+    dot = lambda x, way: jnp.einsum("toi,ik->tok", x, jnp.asarray(way), precision="highest")
     return jnp.concatenate([shifts, dot(bias, motions.slow), dot(start, motions.fast)], axis=2)
+
+
+@eqx.filter_jit
+def forced_and_free(
+    plant: TransferFunction | StateSpace,
+    motions: Motions,
+    u: Float[Numbers, "samples inputs"],
+    dt: Float[Array, ""],
+    hold: str,
+) -> tuple[Float[Array, "samples outputs"], Float[Array, "samples outputs unknowns"]]:
+    """`forced_response` and `free_response` by one program."""
+    free = free_response(plant, motions, len(u), dt)
+    return forced_response(plant, u, dt, hold), free
 
 
 def _dynamics(plant: TransferFunction | StateSpace) -> Float[np.ndarray, "states states"]:

@@ -8,20 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
-from jaxquad._core import Normal, normal_equations, RUNNING, STALLED, TOLERANCE
+from jaxquad._core import (
+    CONVERGED,
+    DAMPING,
+    minimise,
+    minimise_on_host,
+    Normal,
+    normal_equations,
+    RUNNING,
+    STALLED,
+    TOLERANCE,
+)
 from jaxquad._xla import no_fuse
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
+from ._evaluate import as_residuals, evaluate, Evaluation
 from ._mixing import mix_parts
-from ._problem import (
-    misfits,
-    prior_misfits,
-    Problem,
-    residuals,
-    Sensitivity,
-    sensitivity,
-    unchanged,
-)
+from ._problem import prior_misfits, Problem, residuals, unchanged
 
 
 def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:
@@ -35,14 +38,19 @@ def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:
     - `z`: the free parameters as the solver sees them.
     - `problem`: of `jq.identify.make_problem`.
     """
-    plain = type(problem.model) is StateSpace and not problem.parameters.ties
-    plain = plain and all(each is None for each in problem.aliases) and not any(problem.silent)
-    if not plain or any(condition is not unchanged for condition in problem.conditions):
+    if not _is_plain(problem):
         return normal_equations(residuals, z, problem)
     parts = [part for k in range(len(problem.omega)) for part in _record(z, problem, k)]
     if problem.quantities:
         parts.append(normal_equations(prior_misfits, z, problem))
     return ft.reduce(lambda a, b: jax.tree.map(jnp.add, a, b), parts)
+
+
+def _is_plain(problem: Problem) -> bool:
+    """Whether slopes are products of the resolvent's columns and rows."""
+    plain = type(problem.model) is StateSpace and not problem.parameters.ties
+    plain = plain and all(each is None for each in problem.aliases) and not any(problem.silent)
+    return plain and all(condition is unchanged for condition in problem.conditions)
 
 
 def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[Normal]:
@@ -90,13 +98,22 @@ def _entry(name: str) -> Entry:
     return Entry(field, row, column)
 
 
+class Sensitivity(NamedTuple):
+    """Misfits and their derivatives with respect to free and then fixed parameters."""
+
+    misfits: list[Float[np.ndarray, "frequencies outputs inputs 2"]]  # magnitude and phase
+    slopes: list[Float[np.ndarray, "frequencies outputs inputs 2 all"]]  # of the misfits
+    prior_misfits: Float[np.ndarray, " priors"]
+    prior_slopes: Float[np.ndarray, "priors all"]
+
+
 class Solution(NamedTuple):
     """Where the solver stopped, why, and the derivatives there."""
 
-    z: Float[Array, " parameters"]
-    model: PyTree
-    values: Float[Array, " all"]  # physical, of free and then fixed parameters
-    slopes: Float[Array, " all"]  # of the physical values with respect to z
+    z: Float[np.ndarray, " parameters"]
+    model: PyTree  # with NumPy's arrays
+    values: Float[np.ndarray, " all"]  # physical, of free and then fixed parameters
+    slopes: Float[np.ndarray, " all"]  # of the physical values with respect to z
     message: str
     converged: bool
     steps: int
@@ -125,43 +142,103 @@ _MESSAGES = {
 
 def solve(
     problem: Problem,
-    z0: Float[Array, " parameters"],
+    z0: Float[np.ndarray, " parameters"],
     solver: eqx.Module | None,
     max_steps: int,
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
-    stop = descend(problem, z0, solver, max_steps)
-    return solution_at(stop, *describe_once(stop.z, problem))
+    if solver is None and not _is_plain(problem):
+        return _solve_on_host(problem, z0, max_steps)
+    stop = _descend(problem, z0, solver, max_steps)
+    steps = int(stop.steps)
+    message = "" if stop.converged else f"{_reason(stop.reason)} (after {steps} steps)"
+    return solution_at(problem, np.asarray(stop.z), message, steps)
 
 
-def solution_at(stop: Stop, facts: tuple, derivatives: Sensitivity) -> Solution:
-    """A stop with its reason in words, on the host."""
-    converged, steps = bool(stop.converged), int(stop.steps)
-    message = "" if converged else f"{_reason(stop.reason)} (after {steps} steps)"
-    model, values, slopes = facts
-    return Solution(stop.z, model, values, slopes, message, converged, steps, derivatives)
+def stopped_early(status: int, steps: int) -> str:
+    """Why the default solver stopped before a minimum."""
+    return f"{_MESSAGES[status]} (after {steps} steps)"
+
+
+def solution_at(
+    problem: Problem, z: Float[np.ndarray, " parameters"], message: str = "", steps: int = 0
+) -> Solution:
+    """The model and all derivatives at `z`; the `message` says why it is no minimum."""
+    return _solution(problem, np.asarray(z), evaluate(problem, np.asarray(z)), message, steps)
+
+
+def _solution(
+    problem: Problem, z: Float[np.ndarray, " n"], found: Evaluation, message: str, steps: int
+) -> Solution:
+    parameters = problem.parameters
+    z_all = np.array(parameters.start)
+    z_all[: z.size] = z
+    values, slopes = parameters.values(z_all), parameters.slopes(z_all)
+    model = parameters.replace(problem.model, values[: z.size])
+    derivatives = _sensitivity(problem, found)
+    return Solution(z, model, values, slopes, message, not message, steps, derivatives)
+
+
+def _sensitivity(problem: Problem, found: Evaluation) -> Sensitivity:
+    misfits, slopes, start = [], [], 0
+    for measured in problem.measured:
+        shape, size = (2, *measured.shape[1:], len(measured)), 2 * measured.size
+        mine = slice(start, start + size)
+        misfits.append(np.moveaxis(found.misfits[mine].reshape(shape), (0, 3), (3, 0)))
+        rows = found.slopes[:, mine].reshape(-1, *shape)
+        slopes.append(np.moveaxis(rows, (0, 1, 4), (4, 3, 0)))
+        start += size
+    return Sensitivity(misfits, slopes, found.misfits[start:], found.slopes[:, start:].T)
+
+
+class _Point(NamedTuple):
+    """Where a descent on the host stands."""
+
+    problem: Problem
+    z: Float[np.ndarray, " parameters"]
+    found: Evaluation
+    cost: float
+    rows: Float[np.ndarray, "parameters residuals"]  # weighted
+    gradient: Float[np.ndarray, " parameters"]
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.gradient, self.rows @ self.rows.T
+
+    def moved(self, change: Float[np.ndarray, " parameters"]) -> "_Point":
+        return _point(self.problem, self.z + change)
+
+
+def _point(problem: Problem, z: Float[np.ndarray, " n"]) -> _Point:
+    found = evaluate(problem, z)
+    r = as_residuals(problem, found.misfits)
+    rows = as_residuals(problem, found.slopes[: z.size])
+    gradient, cost = rows @ r, float(0.5 * (r @ r))
+    finite = np.isfinite(cost) and np.all(np.isfinite(gradient))
+    return _Point(problem, z, found, cost if finite else np.inf, rows, gradient)
+
+
+def _solve_on_host(
+    problem: Problem, z0: Float[np.ndarray, " parameters"], max_steps: int
+) -> Solution:
+    start = _point(problem, np.asarray(z0))
+    stop, status, steps = minimise_on_host(
+        start, _Point.moved, max_steps, tolerance=TOLERANCE, saving=TOLERANCE**2, damping=DAMPING
+    )
+    message = "" if status == CONVERGED else stopped_early(status, steps)
+    return _solution(problem, stop.z, stop.found, message, steps)
 
 
 @eqx.filter_jit
-def descend(
-    problem: Problem, z0: Float[Array, " parameters"], solver: eqx.Module | None, max_steps: int
+def _descend(
+    problem: Problem,
+    z0: Float[Array, " parameters"],
+    solver: eqx.Module | None,
+    max_steps: int,
 ) -> Stop:
-    """The minimisation alone, in one compiled call."""
-    return least_squares(
-        residuals, z0, problem, solver=solver, max_steps=max_steps, normal=problem_normal
-    )
-
-
-def describe(z: Float[Array, " parameters"], problem: Problem) -> tuple[tuple, Sensitivity]:
-    """Model, values and slopes at `z`, and the derivatives by all parameters."""
-    parameters = problem.parameters
-    z_all = parameters.start.at[: z.size].set(z)
-    model = parameters.insert(problem.model, z)
-    facts = (model, parameters.values(z_all), parameters.slopes(z_all))
-    return facts, sensitivity(z_all, problem)
-
-
-describe_once = eqx.filter_jit(describe)
+    if solver is not None:
+        return least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
+    state = minimise(lambda z: problem_normal(z, problem), z0, max_steps)
+    return Stop(state.z, state.status == CONVERGED, state.status, state.steps)
 
 
 def least_squares(
@@ -237,11 +314,16 @@ def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> 
     if np.any(logarithmic & (ratio < 0)):
         return False
     z = np.where(logarithmic, np.log(np.where(logarithmic, np.maximum(ratio, 1e-300), 1.0)), ratio)
-    moved = _misfits(jnp.asarray(z), problem)
-    return all(
-        np.allclose(new, old, atol=1e-6, rtol=0, equal_nan=True)
-        for new, old in zip(moved, solution.sensitivity.misfits, strict=True)
-    )
+    moved, start = evaluate(problem, z).misfits, 0
+    for old in solution.sensitivity.misfits:
+        new = moved[start : start + old.size]
+        lined_up = np.moveaxis(old, (3, 0), (0, 3)).reshape(-1)
+        if not np.allclose(new, lined_up, atol=1e-6, rtol=0, equal_nan=True):
+            return False
+        start += old.size
+    return True
 
 
-_misfits = eqx.filter_jit(misfits)
+def cost_at(problem: Problem, z: Float[np.ndarray, " parameters"]) -> float:
+    """The sum of squares at values of the free parameters."""
+    return float(np.sum(as_residuals(problem, evaluate(problem, z).misfits) ** 2))

@@ -6,14 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxquad._core import CONVERGED, decrement, Descent, minimise, Normal, RUNNING, TOLERANCE
 
 from ._accuracy import Matrix
-from ._parameters import Parameters
+from ._parameters import Numbers, Parameters
 from ._problem import Problem, residuals
-from ._solve import describe, least_squares, problem_normal, Solution, solution_at, Stop
+from ._solve import cost_at, least_squares, problem_normal, Solution, solution_at
 
 
 MINIMUM = "minimum"
@@ -115,9 +115,9 @@ def solve_from_many(
 
     - `ValueError`: no start has a finite response.
     """
-    z, status, normal, steps, bent = _solve_all(problem, jnp.asarray(starts), solver, max_steps)
-    host = jax.tree.map(np.asarray, (z, status, normal, bent))
-    found = _distinct(problem.parameters, *host)
+    stops = _solve_all(problem, np.asarray(starts), solver, max_steps)
+    host = jax.tree.map(np.asarray, stops)
+    found = _distinct(problem.parameters, host)
     if not any(np.isfinite(point.cost) for point in found):
         raise ValueError(
             f"the model's response is not finite at any of {len(starts)} starts: check the model "
@@ -125,15 +125,23 @@ def solve_from_many(
         )
     best = min(found, key=lambda point: (not point.is_minimum, point.cost))
     k = best.starts[0]
-    stop = Stop(z[k], jnp.asarray(best.is_minimum), status[k], steps[k])
-    return solution_at(stop, *_describe(z[k], problem)), found
+    message = "" if best.is_minimum else best.kind
+    return solution_at(problem, best.z, message, int(host.steps[k])), found
 
 
-_describe = eqx.filter_jit(describe)
+class _Stops(NamedTuple):
+    """Where every start ended; the first axis is that of the starts."""
+
+    z: Numbers
+    status: Numbers
+    steps: Numbers
+    normal: Normal
+    decrement: Numbers
+    bent: Numbers  # second derivatives of half the cost
 
 
 @eqx.filter_jit
-def _solve_all(problem, starts, solver, max_steps):
+def _solve_all(problem, starts, solver, max_steps) -> _Stops:
     def normal_at(z):
         return problem_normal(z, problem)
 
@@ -149,17 +157,12 @@ def _solve_all(problem, starts, solver, max_steps):
     normal = jax.vmap(normal_at)(z)
     # Forward over forward: a model need not support reverse differentiation.
     bent = jax.vmap(jax.jacfwd(lambda z: normal_at(z).gradient))(z)
-    return z, status, normal, steps, bent
+    return _Stops(z, status, steps, normal, jax.vmap(decrement)(normal), bent)
 
 
-def _distinct(
-    parameters: Parameters,
-    z: np.ndarray,
-    status: np.ndarray,
-    normal: Normal,
-    bent: Float[np.ndarray, "starts parameters parameters"],
-) -> tuple[Minimum, ...]:
+def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
     """The distinct stops: those within a millionth of the cost are one."""
+    z, normal = stops.z, stops.normal
     order = [int(k) for k in np.argsort(normal.cost) if np.isfinite(normal.cost[k])]
     groups: list[list[int]] = []
     for k in order:
@@ -169,11 +172,11 @@ def _distinct(
                 break
         else:
             groups.append([k])
-    points = [_point(parameters, z, status, normal, bent, group) for group in groups]
+    points = [_point(parameters, stops, group) for group in groups]
     lost = tuple(k for k in range(len(z)) if not np.isfinite(normal.cost[k]))
     if lost:
         first = z[lost[0]]
-        values = np.asarray(parameters.values(jnp.asarray(first)))
+        values = parameters.values(first)
         points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOT_FINITE))
     return tuple(points)
 
@@ -186,18 +189,18 @@ def _same(difference: np.ndarray, normal: Normal, one: int, other: int) -> bool:
     return near or bool(0.5 * difference @ normal.hessian[one] @ difference <= floor)
 
 
-def _point(parameters, z, status, normal, bent, group) -> Minimum:
+def _point(parameters: Parameters, stops: _Stops, group: list[int]) -> Minimum:
     k = group[0]
-    left = float(decrement(Normal(*(jnp.asarray(part[k]) for part in normal))))
-    curvature = _curvature(bent[k])
+    left, cost = float(stops.decrement[k]), float(stops.normal.cost[k])
+    curvature = _curvature(np.asarray(stops.bent[k]))
     return Minimum(
-        cost=2 * float(normal.cost[k]),
-        z=z[k],
-        values=np.asarray(parameters.values(jnp.asarray(z[k]))),
+        cost=2 * cost,
+        z=np.asarray(stops.z[k]),
+        values=np.asarray(parameters.values(np.asarray(stops.z[k]))),
         starts=tuple(sorted(group)),
         decrement=left,
         curvature=curvature,
-        kind=_kind(int(status[k]), left, float(normal.cost[k]), curvature),
+        kind=_kind(int(stops.status[k]), left, cost, curvature),
     )
 
 
@@ -248,13 +251,8 @@ def _falls_aside(problem: Problem, solution: Solution, bread: Matrix) -> bool:
     size = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
     values, vectors = np.linalg.eigh(bread / np.outer(size, size))
     weakest = vectors[:, 0] / size
-    z, here = solution.z, float(_cost(solution.z, problem))
+    here = cost_at(problem, solution.z)
     step = np.sqrt(1e-2 * max(here, 1e-12) / max(values[0], 1e-12))
     step = min(step, _ASIDE / max(np.max(np.abs(weakest)), 1e-300))
-    sides = [float(_cost(z + sign * jnp.asarray(step * weakest), problem)) for sign in (1, -1)]
+    sides = [cost_at(problem, solution.z + sign * step * weakest) for sign in (1, -1)]
     return min(sides) < here * (1 - 1e-6) - 1e-12
-
-
-@eqx.filter_jit
-def _cost(z: Float[Array, " parameters"], problem: Problem) -> Float[Array, ""]:
-    return jnp.sum(residuals(z, problem) ** 2)

@@ -1,11 +1,11 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxquad._core import require_x64
+from jaxquad.models import StateSpace, TransferFunction
 from jaxquad.records import Record
 
 from ._accuracy import orthonormal, projected_noise
@@ -14,8 +14,7 @@ from ._simulated import (
     band_gain,
     check_channels,
     check_growth,
-    forced_response,
-    free_response,
+    forced_and_free,
     inputs_between_samples,
     linear_model,
     Motions,
@@ -174,12 +173,7 @@ def verify(
     u, between = inputs_between_samples(record, hold)
     check_growth(plant, record)
     motions = unknown_motions(plant, record.duration)
-    parts = [
-        jnp.asarray(record.outputs),
-        forced_response(plant, u, record.dt, between),
-        free_response(plant, motions, record.samples, record.dt),
-    ]
-    gain = None if gain is None else jnp.asarray(gain)
+    parts = [np.asarray(record.outputs), *_simulated(plant, motions, u, record.dt, between)]
     measured, driven, columns = (np.asarray(band_filter(part, gain)) for part in parts)
     unknowns, kept = _unknowns(measured - driven, columns, motions, _spread(record, measured))
     simulated = driven + columns[:, :, :kept] @ unknowns
@@ -212,6 +206,24 @@ def _weights(weights: Sequence[float] | None, record: Record) -> Float[np.ndarra
             f"{', '.join(record.output_names)}"
         )
     return shares
+
+
+_PER_OCTAVE = 8  # lengths of records for which there is a program
+
+
+def _simulated(
+    plant: TransferFunction | StateSpace,
+    motions: Motions,
+    u: Float[np.ndarray, "samples inputs"],
+    dt: float,
+    hold: str,
+) -> tuple[Float[np.ndarray, "samples outputs"], Float[np.ndarray, "samples outputs unknowns"]]:
+    """What inputs and unknown motions do, by a program for records of about this length."""
+    samples = len(u)
+    step = max(2 ** (samples.bit_length() - 1) // _PER_OCTAVE, 1)
+    padded = np.pad(u, ((0, -samples % step), (0, 0)), mode="edge")
+    driven, columns = forced_and_free(plant, motions, padded, np.asarray(dt), hold)
+    return np.asarray(driven)[:samples], np.asarray(columns)[:samples]
 
 
 def _spread(record: Record, measured: np.ndarray) -> Float[np.ndarray, " outputs"]:

@@ -13,15 +13,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxquad._core import ensemble_shape
 from jaxquad.control import LinearController, LinearisableController
-from jaxquad.models import LinearAxis, split_delay
+from jaxquad.models import LinearAxis, matrix_exponential, split_delay
 from jaxquad.records import AXES
 
 from ._loop import Loop
 from ._protocols import assumed_gain, LinearisablePlant
-
-
-_TERMS = 18  # of the series at a norm of 1: 1 / 19! is below the last bit
-_SQUARINGS = 30
 
 
 class SampledAxis(NamedTuple):
@@ -70,26 +66,7 @@ def _propagate(
     """What held inputs and the state make of the state after `time`: Van Loan's augmentation."""
     states, columns = inputs.shape
     both = jnp.concatenate([flow, inputs], axis=1) * time
-    return _exponential(jnp.pad(both, ((0, columns), (0, 0))))[:states]
-
-
-def _exponential(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    # The series with scaling and squaring: a fraction of jax.scipy.linalg.expm's compile time, no
-    # LAPACK under vmap.
-    size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(matrix), axis=0)), 1.0)
-    halvings = jax.lax.stop_gradient(jnp.clip(jnp.ceil(jnp.log2(size)), 0, _SQUARINGS))
-    small = matrix * jnp.exp2(-halvings)
-    unit = jnp.eye(len(matrix), dtype=matrix.dtype)
-
-    def nest(power: Array, k: Array) -> tuple[Array, None]:
-        return unit + jnp.dot(small, power, precision="highest") / k, None
-
-    def square(power: Array, k: Array) -> tuple[Array, None]:
-        return jnp.where(k < halvings, jnp.dot(power, power, precision="highest"), power), None
-
-    terms = jnp.arange(_TERMS, 0, -1, dtype=matrix.dtype)
-    series = jax.lax.scan(nest, unit, terms)[0]
-    return jax.lax.scan(square, series, jnp.arange(_SQUARINGS, dtype=matrix.dtype))[0]
+    return matrix_exponential(jnp.pad(both, ((0, columns), (0, 0))))[:states]
 
 
 Place = tuple[Int[Array, ""], ...]  # of a member

@@ -2,12 +2,11 @@ import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._core import per_member
+from jaxquad._core import as_float, per_member
 from jaxquad.control import LinearController, LinearisableController, ScheduledController
 from jaxquad.models import Multirotor
 
@@ -90,7 +89,7 @@ class Loop(eqx.Module):
         self.plant, self.controller, self.drive, self.encoder = plant, controller, drive, encoder
         self.dt, self.substeps, self.bound = float(dt), substeps, float(bound)
         self.queue, self.longest_delay = _queue_of(delay, self.dt, longest_delay), longest_delay
-        self.delay = jnp.asarray(delay, dtype=float)
+        self.delay = as_float(delay)
 
     def __check_init__(self):
         if not (isinstance(self.substeps, int | np.integer) and self.substeps >= 1):

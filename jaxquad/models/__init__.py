@@ -5,6 +5,7 @@ from ._attitude import Attitude as Attitude
 from ._connect import realise as realise, series as series, state_space as state_space
 from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
 from ._entry_slopes import Entry as Entry, logarithmic_slopes as logarithmic_slopes
+from ._exponential import matrix_exponential as matrix_exponential
 from ._modes import Mode as Mode, modes as modes
 from ._multirotor import (
     CRAZYFLIE as CRAZYFLIE,

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
+from jaxquad._core import as_float
+
 
 Frequencies = ArrayLike | Sequence[float | int]  # rad/s
 
@@ -64,7 +66,7 @@ def with_arrays(model: PyTree) -> PyTree:
     What is no number to fit belongs into a field of `eqx.field(static=True)`.
     """
     number = lambda x: isinstance(x, int | float) and not isinstance(x, bool)
-    return jax.tree.map(lambda x: jnp.asarray(float(x)) if number(x) else x, model)
+    return jax.tree.map(lambda x: as_float(x) if number(x) else x, model)
 
 
 def as_frequencies(omega: Frequencies) -> Float[Array, "..."]:

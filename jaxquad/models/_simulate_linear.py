@@ -5,21 +5,23 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import expm
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxquad._core import require_all_positive
 
 from ._connect import realise
+from ._exponential import matrix_exponential
 from ._state_space import explicit, StateSpace
 from ._transfer_function import TransferFunction
 
+
+Number = float | Float[Array, ""]
 
 _WHOLE = 1e-9  # samples; a delay this close to whole samples is whole, whatever the rounding
 
 
 def split_delay(
-    delay: Float[Array, "*n"], dt: float
+    delay: Float[Array, "*n"], dt: Number
 ) -> tuple[Int[Array, "*n"], Float[Array, "*n"]]:
     """Whole samples of a delay in s, and the rest in samples; differentiable through the rest."""
     shift = jax.lax.stop_gradient(jnp.floor(delay / dt + _WHOLE))
@@ -31,7 +33,7 @@ def propagation(
     B: Float[Array, "states inputs"],
     late: Float[Array, " inputs"],
     span: Float[Array, ""],
-    dt: float,
+    dt: Number,
 ) -> tuple[Float[Array, "states states"], Float[Array, "segments states"]]:
     """What the first `span` samples of a sample `dt` s long make of the state and of the inputs.
 
@@ -51,7 +53,8 @@ def _crossing(A, b, late, span, dt):
     # From value and change of a segment to those over the part of it that acts.
     last = jnp.stack([jnp.stack([one, 1 - late]), jnp.stack([zero, old])])
     first = jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, new])])
-    (before, of_old), (after, of_new) = (_propagate(A, b, part * dt) for part in (old, new))
+    both = jax.vmap(lambda time: _propagate(A, b, time))(jnp.stack([old, new]) * dt)
+    (before, of_old), (after, of_new) = (jax.tree.map(lambda x, k=k: x[k], both) for k in (0, 1))
     drive = [_dot(after, _dot(of_old, last)), _dot(of_new, first)]
     return _dot(after, before), jnp.concatenate(drive, axis=1)
 
@@ -63,12 +66,12 @@ def _propagate(
     states = len(A)
     plant = jnp.pad(jnp.concatenate([A, B], axis=1) * time, ((0, 0), (0, 1)))
     line = jnp.eye(2, states + 2, k=states + 1, dtype=A.dtype)
-    step = expm(jnp.concatenate([plant, line]))[:states]
+    step = matrix_exponential(jnp.concatenate([plant, line]))[:states]
     return step[:, :states], step[:, states:]
 
 
 def delay_input(
-    segments: Float[Array, "samples 2"], delay: Float[Array, ""], dt: float
+    segments: Float[Array, "samples 2"], delay: Float[Array, ""], dt: Number
 ) -> Float[Array, " samples"]:
     """The input itself, `delay` s late, at the samples; where it jumps, the value just after."""
     shift, late = split_delay(delay, dt)
@@ -140,7 +143,7 @@ _HOLDS = ("zero", "first")
 def simulate_linear(
     model: TransferFunction | StateSpace,
     u: Float[ArrayLike, " samples"] | Float[ArrayLike, "samples inputs"],
-    dt: float,
+    dt: Number,
     *,
     hold: str = "zero",
 ) -> Float[Array, " samples"] | Float[Array, "samples outputs"]:
@@ -174,7 +177,7 @@ def simulate_linear(
 
 
 def free_responses(
-    model: TransferFunction | StateSpace, samples: int, dt: float
+    model: TransferFunction | StateSpace, samples: int, dt: Number
 ) -> tuple[Float[Array, "samples *outputs states"], Float[Array, "samples *outputs states"]]:
     """The outputs due to each unit initial state, and due to each unit constant bias.
 
@@ -236,7 +239,7 @@ def _segments(u: Float[Array, "samples inputs"], hold: str) -> Float[Array, "inp
 
 @eqx.filter_jit
 def _simulate(
-    plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: float
+    plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: Number
 ) -> Float[Array, "samples outputs"]:
     shift, late = split_delay(plant.input_delay, dt)
     parts = [jax.vmap(shift_samples)(segments, shift + n) for n in (1, 0)]
@@ -256,7 +259,7 @@ def _late_outputs(
     states: Float[Array, "samples states"],
     acting: Float[Array, "samples segments"],
     late: Float[Array, " inputs"],
-    dt: float,
+    dt: Number,
 ) -> Float[Array, "samples outputs"]:
     # An output that is late shows the state somewhere within an earlier sample.
     def output(row, delay):
@@ -269,7 +272,7 @@ def _late_outputs(
 
 
 def _direct_outputs(
-    plant: _Plant, D: Array, segments: Float[Array, "inputs samples 2"], dt: float
+    plant: _Plant, D: Array, segments: Float[Array, "inputs samples 2"], dt: Number
 ) -> Float[Array, "samples outputs"]:
     wait = jnp.zeros(len(D), D.dtype) if plant.output_delay is None else plant.output_delay
     one = lambda wait, late, segments: delay_input(segments, wait + late, dt)
@@ -280,7 +283,7 @@ def _direct_outputs(
 
 @eqx.filter_jit
 def _free_outputs(
-    plant: _Plant, samples: int, dt: float
+    plant: _Plant, samples: int, dt: Number
 ) -> tuple[Float[Array, "samples outputs states"], Float[Array, "samples outputs states"]]:
     A, states = plant.A, len(plant.A)
     block = jnp.zeros((2 * states, 2 * states), A.dtype)
@@ -288,7 +291,7 @@ def _free_outputs(
     bias = jnp.zeros_like(plant.C) if plant.bias is None else plant.bias
     rows = jnp.concatenate([plant.C, bias], axis=1)
     if plant.output_delay is not None:
-        back = jax.vmap(lambda delay: expm(-delay * block))(plant.output_delay)
+        back = jax.vmap(lambda delay: matrix_exponential(-delay * block))(plant.output_delay)
         rows = jnp.einsum("oi,oij->oj", rows, back, precision="highest")
-    found = free_motion(rows, expm(block * dt), samples)
+    found = free_motion(rows, matrix_exponential(block * dt), samples)
     return found[:, :, :states], found[:, :, states:]

@@ -20,6 +20,16 @@ from jaxquad._core import (
 from ._protocols import as_frequencies, Frequencies
 
 
+def _on_host_if_known(*numbers: Array | np.ndarray) -> tuple[Array | np.ndarray, ...]:
+    """The numbers in NumPy where all have values: JAX would compile each operation on them."""
+    on_host = _namespace(*numbers) is np
+    return tuple(np.asarray(x) for x in numbers) if on_host else numbers
+
+
+def _namespace(*numbers: Array | np.ndarray):
+    return np if all(map(is_concrete, numbers)) else jnp
+
+
 def imaginary(omega: Frequencies) -> Complex[Array, "..."]:
     """s = j omega, in the precision of `omega`; whole numbers become floats."""
     omega = as_frequencies(omega)
@@ -133,10 +143,11 @@ class LaggedIntegrator(eqx.Module):
 
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials; a known lag of 0 is left out."""
-        one, zero = jnp.ones_like(self.lag), jnp.zeros_like(self.lag)
-        first = [one] if is_zero(self.lag) else [self.lag, one]
-        denominator = jnp.stack([*first, *[zero] * self.integrators])
-        return TransferFunction(self.gain[None], denominator, self.delay)
+        gain, lag, xp = *_on_host_if_known(self.gain, self.lag), _namespace(self.gain, self.lag)
+        one, zero = xp.ones_like(lag), xp.zeros_like(lag)
+        first = [one] if is_zero(self.lag) else [lag, one]
+        denominator = xp.stack([*first, *[zero] * self.integrators])
+        return TransferFunction(gain[None], denominator, self.delay)
 
 
 class AttitudeAxis(eqx.Module):
@@ -191,14 +202,14 @@ class AttitudeAxis(eqx.Module):
 
         A lag of 0 has no pole and is left out. Under jit its value is unknown: it must not be 0.
         """
-        zero = jnp.zeros_like(self.J_x)
-        rigid = jnp.stack([self.J_x, self.K_af, zero])
-        if is_zero(self.lag):
-            denominator = rigid
-        else:
-            denominator = jnp.convolve(rigid, jnp.stack([self.lag, jnp.ones_like(self.lag)]))
-        return TransferFunction((self.L * self.K_t)[None], denominator, self.delay)
+        numbers = self.L, self.K_t, self.J_x, self.K_af, self.lag
+        (L, K_t, J_x, K_af, lag), xp = _on_host_if_known(*numbers), _namespace(*numbers)
+        denominator = xp.stack([J_x, K_af, xp.zeros_like(J_x)])
+        if not is_zero(self.lag):
+            denominator = xp.convolve(denominator, xp.stack([lag, xp.ones_like(lag)]))
+        return TransferFunction(xp.reshape(L * K_t, (1,)), denominator, self.delay)
 
     def with_added_inertia(self, inertia: ArrayLike) -> "AttitudeAxis":
         """The same axis carrying a known extra `inertia` in kg m^2."""
-        return dataclasses.replace(self, J_x=self.J_x + as_float(inertia))
+        J_x, added = _on_host_if_known(self.J_x, as_float(inertia))
+        return dataclasses.replace(self, J_x=J_x + added)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 from matplotlib.axes import Axes
@@ -109,14 +108,26 @@ def _phase(
 
 def _model_curve(model: Model, measured: _Curve, o: int, i: int) -> _Curve:
     omega = np.geomspace(measured.omega[0], measured.omega[-1], 300)
-    response = np.asarray(model_response(model, jnp.asarray(omega)))[:, o, i]
+    response = model_response(model, omega)[:, o, i]
     phase = np.degrees(np.unwrap(np.angle(response)))
     one, none = np.ones_like(omega), np.zeros_like(omega)
     return _Curve(omega, 20 * np.log10(np.abs(response)), phase, one, none)
 
 
-@eqx.filter_jit
+_AT_ONCE = 512  # frequencies of a program, so that two curves of a model share it
+
+
 def model_response(
+    model: Model, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, "frequencies outputs inputs"]:
+    """The response of a model at frequencies in rad/s."""
+    padded = np.pad(omega, (0, -omega.size % _AT_ONCE), mode="edge").reshape(-1, _AT_ONCE)
+    parts = [np.asarray(_response(model, each)) for each in padded]
+    return np.concatenate(parts)[: omega.size]
+
+
+@eqx.filter_jit
+def _response(
     model: Model, omega: Float[Array, " frequencies"]
 ) -> Complex[Array, "frequencies outputs inputs"]:
     return evaluate_response(model, omega)
@@ -228,8 +239,8 @@ def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int)
     - `frf`, `model`: the measured response, and a model with `frequency_response(omega)`.
     - `output`, `source`: places of output and input.
     """
-    omega = jnp.asarray(frf.omega)
-    modelled = np.asarray(model_response(as_sampled(model, frf), omega))[:, output, source]
+    omega = np.asarray(frf.omega)
+    modelled = model_response(as_sampled(model, frf), omega)[:, output, source]
     pair = (slice(None), output, source)
     with np.errstate(all="ignore"):
         difference = np.log(np.asarray(frf.response)[pair] / modelled)

@@ -126,7 +126,7 @@ def beyond_authority(found: Authority | None, scenario: Scenario) -> list[str]:
     messages = []
     for k, name in enumerate(axis_names(torque.shape[1])):
         for limit, what in limits:
-            least, asked = np.asarray(limit[min(k, len(limit) - 1)]), torque[:, k]
+            least, asked = np.asarray(limit)[min(k, len(limit) - 1)], torque[:, k]
             asked = asked.reshape(asked.shape + (1,) * (least.ndim + 1 - asked.ndim))
             share = np.mean(asked > (1 + 1e-6) * least)
             if share:

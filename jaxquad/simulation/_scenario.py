@@ -246,8 +246,8 @@ def excite(
     if axis not in AXES:
         raise ValueError(f"axis {axis!r}: choose one of {', '.join(AXES)}")
     _check_excitation(signal, dt, torque_noise, torque_corner, sensor_noise)
-    levels = jnp.asarray([torque_noise, torque_corner, sensor_noise], dtype=float)
-    return _excited(jnp.asarray(signal, dtype=float), key, levels, float(dt), AXES.index(axis))
+    levels = as_float([torque_noise, torque_corner, sensor_noise])
+    return _excited(as_float(signal), key, levels, float(dt), AXES.index(axis))
 
 
 def _check_excitation(

@@ -1,6 +1,7 @@
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
@@ -79,7 +80,7 @@ class Simulation(eqx.Module):
             raise ValueError("the loop diverged, so its flight cannot be a record: stabilise it")
         place = (slice(None), k) if member is None else (slice(None), k, member)
         command, angle, sweep = (
-            np.asarray(x[place]) for x in (self.command, self.measurement, self.injection)
+            np.asarray(x)[place] for x in (self.command, self.measurement, self.injection)
         )
         excited = np.ptp(sweep) > 0
         return Record(
@@ -131,9 +132,9 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     """
     check_run(loop, scenario)
     run, places = placed(loop, scenario, devices)
-    ((angle, *others), running), authority = gathered(_run(*run, places))
+    ((angle, *others), diverged), authority = gathered(_run(*run, places))
     warn_beyond_authority(authority, scenario)
-    time = jnp.asarray(loop.dt * np.arange(angle.shape[0]), angle.dtype)
+    time = jax.device_put((loop.dt * np.arange(angle.shape[0])).astype(angle.dtype))
     measurement, command, saturated, signals = others
     return Simulation(
         time=time,
@@ -142,7 +143,7 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
         command=command,
         saturated=saturated,
         signals=signals,
-        diverged=~running,
+        diverged=diverged,
         scenario=scenario,
         dt=loop.dt,
         authority=authority,
@@ -160,7 +161,7 @@ def _run(
     require_memory(
         what, size_of(stored), "take jq.evaluate, which stores none, or jq.simulation.in_slices"
     )
-    return (stored, running), found
+    return (stored, ~running), found
 
 
 def _store(run: Run, nothing: None) -> tuple[PyTree, Bool[Array, "*ensemble"]]:

@@ -2,12 +2,9 @@ import dataclasses
 import functools as ft
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Shaped
 
-from ._transform import turn
 from ._window import coefficients
 
 
@@ -24,13 +21,13 @@ class Placement(eqx.Module):
     dt: float = eqx.field(static=True)  # s
     shape: str = eqx.field(static=True)
 
-    def at(self, times: Float[Array, " times"]) -> Float[Array, "windows times"]:
+    def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "windows times"]:
         """Values of all windows, scaled so that a sum over `self.times` equals one over samples."""
         level, cosine = coefficients(self.shape)
         into = (times[None, :] - self.starts[:, None]) / self.lengths[:, None]
-        values = level - cosine * jnp.cos(2 * np.pi * into)
+        values = level - cosine * np.cos(2 * np.pi * into)
         step = (self.times[1] - self.times[0]) / self.dt
-        return jnp.where((into >= 0) & (into < 1), values, 0.0) * jnp.sqrt(step)
+        return np.where((into >= 0) & (into < 1), values, 0.0) * np.sqrt(step)
 
 
 def place_windows(
@@ -64,6 +61,9 @@ def window_products(
     return step * (values @ values.T)
 
 
+Numbers = Array | np.ndarray
+Places = Shaped[np.ndarray, " places"]
+
 _CHUNK = 512  # times taken at once, so that a long record fits the memory
 
 
@@ -86,44 +86,34 @@ class ErrorCovariance(eqx.Module):
     part of the noise apart. They need atoms without windows and `share`.
     """
 
-    omega: Float[Array, " frequencies"]  # rad/s
-    effect: Complex[Array, "frequencies inputs atoms"]
-    noise: Complex[Array, "frequencies outputs roots"]
-    share: Float[Array, "frequencies outputs inputs groups"] | None = None  # 1 without
+    omega: Float[Numbers, " frequencies"]  # rad/s
+    effect: Complex[Numbers, "frequencies inputs atoms"]
+    noise: Complex[Numbers, "frequencies outputs roots"]
+    share: Float[Numbers, "frequencies outputs inputs groups"] | None = None  # 1 without
     windows: Placement | None = None
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)  # one group without
-    sensitivity: Complex[Array, "frequencies outputs inputs parameters"] | None = None
-    drive: Complex[Array, "parameters atoms roots"] | None = None
+    sensitivity: Complex[Numbers, "frequencies outputs inputs parameters"] | None = None
+    drive: Complex[Numbers, "parameters atoms roots"] | None = None
 
-    @eqx.filter_jit
     def project(
-        self, columns: Complex[Array, "frequencies outputs inputs columns"]
-    ) -> Float[Array, "columns columns"]:
+        self, columns: Complex[Numbers, "frequencies outputs inputs columns"]
+    ) -> Float[np.ndarray, "columns columns"]:
         """Covariance of Re(sum of `conj(columns) dT`) over frequencies, outputs and inputs."""
-        share = self._share()
-        drawn = jnp.einsum(
-            "foip,foc,foig->fgicp", jnp.conj(columns), self.noise, share.astype(columns.dtype)
-        )
-        count, moved = columns.shape[3], self._moved(columns)
-        start = jnp.zeros((count, count), self.omega.dtype)
-
-        def add(total, times):
-            part = jnp.einsum("fgit,fgicp->tcp", self._at(times), drawn)
-            if self.drive is not None:
-                part += jnp.einsum("nac,np->acp", _taken(self.drive, times), moved)
+        columns, count = np.asarray(columns), columns.shape[3]
+        weighted = columns.conj()[..., None, :] * _share(self)[..., None]  # f o i g p
+        drawn = np.einsum("foigp,foc->figcp", weighted, np.asarray(self.noise))
+        total, moved = np.zeros((count, count)), _moved(self, columns)
+        for atoms in _chunks(self):
+            seen = _at(self, atoms)
+            frequencies, groups, inputs, places = seen.shape
+            seen = seen.reshape(-1, places).T
+            along = np.swapaxes(drawn, 1, 2).reshape(frequencies * groups * inputs, -1)
+            part = (seen @ along).reshape(places, -1, count)
+            if moved is not None:
+                part += np.einsum("nac,np->acp", np.asarray(self.drive)[:, atoms], moved)
             part = part.reshape(-1, count)
-            return total + 0.5 * jnp.real(part.T @ jnp.conj(part)), None
-
-        return jax.lax.scan(add, start, self._times())[0]
-
-    def _moved(
-        self, columns: Complex[Array, "frequencies outputs inputs columns"]
-    ) -> Complex[Array, "parameters columns"] | None:
-        """What each real parameter adds to Re(sum of `conj(columns) dT`)."""
-        if self.sensitivity is None:
-            return None
-        total = jnp.einsum("foip,foin->np", jnp.conj(columns), self.sensitivity)
-        return jnp.real(total).astype(columns.dtype)
+            total += 0.5 * np.real(part.T @ part.conj())
+        return total
 
     def variance(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
@@ -149,8 +139,7 @@ class ErrorCovariance(eqx.Module):
         self, first: tuple[int, int], second: tuple[int, int]
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
         """Covariance E[dT dT^H] of two pairs (output, input) between all pairs of frequencies."""
-        times = self._times().reshape(-1)
-        atoms, share, noise = (np.asarray(x) for x in (self._at(times), self._share(), self.noise))
+        atoms, share, noise = _at(self, _places(self)), _share(self), np.asarray(self.noise)
         one, other = (
             np.einsum("fgt,fg->ft", atoms[:, :, i], share[:, o, i]) for o, i in (first, second)
         )
@@ -158,8 +147,8 @@ class ErrorCovariance(eqx.Module):
         total = (one @ other.conj().T) * shared
         if self.sensitivity is None or self.drive is None:
             return total
-        drive = np.asarray(_taken(self.drive, times))
-        mine, its = (np.asarray(self.sensitivity[:, o, i]) for o, i in (first, second))
+        drive = np.asarray(self.drive)
+        mine, its = (np.asarray(self.sensitivity)[:, o, i] for o, i in (first, second))
         local = [
             np.einsum("ft,ntc,fc->fn", effect, np.conj(drive), noise[:, pair[0]], optimize=True)
             for effect, pair in ((one, first), (other, second))
@@ -170,60 +159,64 @@ class ErrorCovariance(eqx.Module):
 
     def pair(self, output: int, input: int) -> "ErrorCovariance":
         """That of a single response."""
-        o, i = slice(output, output + 1), slice(input, input + 1)
+        o, i, slope = slice(output, output + 1), slice(input, input + 1), self.sensitivity
         return dataclasses.replace(
             self,
-            effect=self.effect[:, i],
-            noise=self.noise[:, o],
-            share=None if self.share is None else self.share[:, o, i],
-            sensitivity=None if self.sensitivity is None else self.sensitivity[:, o, i],
+            effect=np.asarray(self.effect)[:, i],
+            noise=np.asarray(self.noise)[:, o],
+            share=None if self.share is None else np.asarray(self.share)[:, o, i],
+            sensitivity=None if slope is None else np.asarray(slope)[:, o, i],
         )
 
-    def scaled(self, factor: Complex[Array, " frequencies"]) -> "ErrorCovariance":
+    def scaled(self, factor: Complex[Numbers, " frequencies"]) -> "ErrorCovariance":
         """That of the errors times `factor`."""
-        columns, slope = jnp.asarray(factor)[:, None, None], self.sensitivity
-        turned = None if slope is None else slope * columns[..., None]
-        return dataclasses.replace(self, effect=self.effect * columns, sensitivity=turned)
-
-    def _share(self) -> Float[Array, "frequencies outputs inputs groups"]:
-        shape = (*self.noise.shape[:2], self.effect.shape[1], 1)
-        return jnp.ones(shape) if self.share is None else self.share
-
-    def _times(self) -> Float[Array, "chunks chunk"]:
-        """Places of independent noise: times in s, or numbers of atoms; -1 is padding."""
-        atoms = np.arange(float(self.effect.shape[2]))
-        places = jnp.asarray(atoms if self.windows is None else self.windows.times)
-        chunk = min(_CHUNK, places.size)
-        return jnp.pad(places, (0, -places.size % chunk), constant_values=-1.0).reshape(-1, chunk)
-
-    def _at(
-        self, times: Float[Array, " times"]
-    ) -> Complex[Array, "frequencies groups inputs times"]:
-        """Contribution of unit noise at these times to the errors, by group of atoms."""
-        if self.windows is None:
-            return jnp.moveaxis(_taken(jnp.moveaxis(self.effect, 2, 1), times), 1, 2)[:, None]
-        seen = self.windows.at(times)
-        turned = turn(self.omega[:, None] * times[None, :])
-        ends = np.cumsum(self.counts or (self.effect.shape[2],))
-        parts = [
-            jnp.einsum("fia,at->fit", effect, windows.astype(effect.dtype))
-            for effect, windows in zip(
-                jnp.split(self.effect, ends[:-1], axis=2), jnp.split(seen, ends[:-1]), strict=True
-            )
-        ]
-        return jnp.stack(parts, axis=1) * turned[:, None, None, :]
+        columns, slope = np.asarray(factor)[:, None, None], self.sensitivity
+        turned = None if slope is None else np.asarray(slope) * columns[..., None]
+        effect = np.asarray(self.effect) * columns
+        return dataclasses.replace(self, effect=effect, sensitivity=turned)
 
 
-def _taken(
-    values: Complex[Array, "rows atoms columns"], places: Float[Array, " places"]
-) -> Complex[Array, "rows places columns"]:
-    """Values at these atoms; 0 where the place is padding."""
-    inside = (places >= 0).astype(values.dtype)
-    return jnp.take(values, jnp.maximum(places, 0.0).astype(int), axis=1) * inside[None, :, None]
+def _moved(
+    errors: ErrorCovariance, columns: Complex[np.ndarray, "frequencies outputs inputs columns"]
+) -> Float[np.ndarray, "parameters columns"] | None:
+    """What each real parameter adds to Re(sum of `conj(columns) dT`)."""
+    if errors.sensitivity is None or errors.drive is None:
+        return None
+    slope = np.asarray(errors.sensitivity)
+    return np.real(np.tensordot(slope, columns.conj(), axes=((0, 1, 2), (0, 1, 2))))
+
+
+def _share(errors: ErrorCovariance) -> Float[np.ndarray, "frequencies outputs inputs groups"]:
+    shape = (*errors.noise.shape[:2], errors.effect.shape[1], 1)
+    return np.ones(shape) if errors.share is None else np.asarray(errors.share)
+
+
+def _places(errors: ErrorCovariance) -> Places:
+    """Where there is independent noise: times in s, or numbers of atoms."""
+    return np.arange(errors.effect.shape[2]) if errors.windows is None else errors.windows.times
+
+
+def _chunks(errors: ErrorCovariance) -> list[Places]:
+    places = _places(errors)
+    return [places[k : k + _CHUNK] for k in range(0, places.size, _CHUNK)]
+
+
+def _at(
+    errors: ErrorCovariance, places: Places
+) -> Complex[np.ndarray, "frequencies groups inputs places"]:
+    """Contribution of unit noise at these places to the errors, by group of atoms."""
+    effect = np.asarray(errors.effect)
+    if errors.windows is None:
+        return effect[:, None, :, places]
+    seen = errors.windows.at(places)
+    turned = np.exp(-1j * np.asarray(errors.omega)[:, None] * places[None, :])
+    ends = np.cumsum(errors.counts or (effect.shape[2],))
+    groups = zip(np.split(effect, ends[:-1], axis=2), np.split(seen, ends[:-1]), strict=True)
+    return np.stack([part @ windows for part, windows in groups], axis=1) * turned[:, None, None]
 
 
 def independent_errors(
-    omega: Float[Array, " frequencies"], variance: Float[Array, "frequencies outputs inputs"]
+    omega: Float[Numbers, " frequencies"], variance: Float[Numbers, "frequencies outputs inputs"]
 ) -> ErrorCovariance:
     """The covariance of uncorrelated errors.
 
@@ -234,10 +227,8 @@ def independent_errors(
 
     **Returns:** an `ErrorCovariance`.
     """
-    share = jnp.sqrt(jnp.asarray(variance))
+    share = np.sqrt(np.asarray(variance))
     count, outputs, inputs = share.shape
     effect = np.eye(count * inputs, dtype=complex).reshape(count, inputs, count * inputs)
     noise = np.broadcast_to(np.eye(outputs, dtype=complex), (count, outputs, outputs))
-    return ErrorCovariance(
-        jnp.asarray(omega), jnp.asarray(effect), jnp.asarray(noise), share[:, :, :, None]
-    )
+    return ErrorCovariance(np.asarray(omega), effect, noise, share[:, :, :, None])

@@ -1,7 +1,7 @@
 from collections.abc import Sequence
 from typing import Literal
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
@@ -59,26 +59,24 @@ def _result(
     method: Method,
     integrators: int,
 ) -> FrequencyResponse:
-    known = np.isfinite(np.asarray(found.response))
-    spread = np.sqrt(np.asarray(found.errors.variance()) / 2)
+    response, coherence, direct = found.response, found.coherence, found.direct_coherence
+    spread = np.sqrt(found.errors.variance() / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.where(known, spread / np.abs(np.asarray(found.response)), np.inf)
+        error = np.where(np.isfinite(response), spread / np.abs(response), np.inf)
     names = records[0].output_names, records[0].input_names
-    remarks = remarks_on_feedback(
-        method, omega, np.asarray(found.response), error, np.asarray(found.coherence),
-        np.asarray(found.direct_coherence), names,
-    )  # fmt: skip
+    remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
     if isinstance(found, LocalEstimate):  # periods show their own distortion
-        response, coherence = np.asarray(found.response), np.asarray(found.coherence)
         remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
+    # Not jnp.asarray: it compiles a program for each new shape.
+    put = jax.device_put
     return FrequencyResponse(
-        omega=jnp.asarray(omega),
-        response=found.response,
-        coherence=found.coherence,
-        random_error=jnp.asarray(error),
+        omega=put(omega),
+        response=put(response),
+        coherence=put(coherence),
+        random_error=put(error),
         errors=found.errors,
-        direct_coherence=found.direct_coherence,
-        multiple_coherence=found.multiple_coherence,
+        direct_coherence=put(direct),
+        multiple_coherence=put(found.multiple_coherence),
         method=method,
         input_names=records[0].input_names,
         output_names=records[0].output_names,

@@ -1,9 +1,8 @@
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
@@ -145,10 +144,10 @@ class LocalEstimate(NamedTuple):
     references explain. `direct_coherence` is always from input to output.
     """
 
-    response: Complex[Array, "frequencies outputs inputs"]
-    coherence: Float[Array, "frequencies outputs inputs"]
-    direct_coherence: Float[Array, "frequencies outputs inputs"]
-    multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
+    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    coherence: Float[np.ndarray, "frequencies outputs inputs"]
+    direct_coherence: Float[np.ndarray, "frequencies outputs inputs"]
+    multiple_coherence: Float[np.ndarray, "frequencies outputs"]  # of an output with all inputs
     errors: ErrorCovariance
     half_width: Grid  # rad/s
     rational: Bool[np.ndarray, " frequencies"]  # where a rational function is used, at a resonance
@@ -218,10 +217,10 @@ def estimate_local_polynomial(
     back = recolour(omega, options.integrators, options.delay, records[0].dt)[:, None, None]
     known = np.isfinite(fit.response)
     return LocalEstimate(
-        jnp.asarray(fit.response * back),
-        jnp.asarray(np.where(known, coherence, 0.0)),
-        jnp.asarray(np.where(known, direct, 0.0)),
-        jnp.asarray(multiple[at]),
+        fit.response * back,
+        np.where(known, coherence, 0.0),
+        np.where(known, direct, 0.0),
+        multiple[at],
         error_covariance(omega, fit, noise, at, bins, back, sources, left, models),
         width,
         rational,

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
@@ -165,13 +164,7 @@ def error_covariance(
         slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
         slopes, drive = _on_common_atoms(slopes, models, atoms, shared.shape[2])
     shared[~known[:, 0, 0], :, 0] = _UNKNOWN
-    return ErrorCovariance(
-        jnp.asarray(omega),
-        jnp.asarray(shared),
-        jnp.asarray(kind),
-        sensitivity=None if slopes is None else jnp.asarray(slopes),
-        drive=None if drive is None else jnp.asarray(drive),
-    )
+    return ErrorCovariance(np.asarray(omega), shared, kind, sensitivity=slopes, drive=drive)
 
 
 def colour_of_noise(

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
@@ -218,10 +217,10 @@ class PeriodicEstimate(NamedTuple):
     """Responses at the excited lines; nan and a huge error where undetermined."""
 
     omega: Float[np.ndarray, " frequencies"]  # rad/s
-    response: Complex[Array, "frequencies outputs inputs"]
-    coherence: Float[Array, "frequencies outputs inputs"]
-    direct_coherence: Float[Array, "frequencies outputs inputs"]
-    multiple_coherence: Float[Array, "frequencies outputs"]  # of an output with all inputs
+    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    coherence: Float[np.ndarray, "frequencies outputs inputs"]
+    direct_coherence: Float[np.ndarray, "frequencies outputs inputs"]
+    multiple_coherence: Float[np.ndarray, "frequencies outputs"]  # of an output with all inputs
     errors: ErrorCovariance
     distortion: Distortion
     log_noise_covariance: Float[np.ndarray, "frequencies frequencies"]
@@ -255,10 +254,10 @@ def estimate_periodic(
     direct, lesser = _coherence(fit, scatter, periods, lines)
     return PeriodicEstimate(
         grid[lines],
-        jnp.asarray(np.where(fit.known[:, None, None], fit.response, np.nan)),
-        jnp.asarray(lesser if method == "joint" else direct),
-        jnp.asarray(direct),
-        jnp.asarray(_multiple(fit, scatter)),
+        np.where(fit.known[:, None, None], fit.response, np.nan),
+        lesser if method == "joint" else direct,
+        direct,
+        _multiple(fit, scatter),
         _errors(grid[lines], fit, scatter),
         _distortion(grid[lines], fit, scatter, records[0], len(records)),
         _log_noise_covariance(grid[lines], fit, scatter),
@@ -346,7 +345,7 @@ def _errors(
     effect[np.arange(count), :, np.arange(count)] = root
     effect = effect.reshape(count, inputs, -1)
     noise = np.where(fit.known[:, None, None], scatter.root, np.eye(scatter.root.shape[1]))
-    return ErrorCovariance(jnp.asarray(omega), jnp.asarray(effect), jnp.asarray(noise))
+    return ErrorCovariance(omega, effect, noise)
 
 
 def _log_noise_covariance(

@@ -104,7 +104,8 @@ class Identification:
     @property
     def band(self) -> tuple[float, float]:
         """The frequencies that were fitted, in rad/s."""
-        return float(self.frf.omega[0]), float(self.frf.omega[-1])
+        omega = np.asarray(self.frf.omega)
+        return float(omega[0]), float(omega[-1])
 
     @property
     def largest_command(self) -> float:
@@ -367,7 +368,7 @@ def _fitted(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
 def _start(frf: FrequencyResponse, settings: IdentifySettings) -> LaggedIntegrator:
     """What is fixed at zero is added to what is free."""
     guess = guess_lagged_integrator(frf, settings.integrators)
-    total = total_delay(guess)
+    total = np.asarray(guess.lag) + np.asarray(guess.delay)
     lag = 0.0 if not settings.lag else guess.lag if settings.delay else total
     delay = 0.0 if not settings.delay else guess.delay if settings.lag else total
     return LaggedIntegrator(guess.gain, lag, delay, settings.integrators)

@@ -19,7 +19,7 @@ import jaxquad as jq
 from jaxquad.identify import select_parameters
 from jaxquad.identify._cost import points_of, usable
 from jaxquad.identify._problem import make_problem
-from jaxquad.identify._solve import descend
+from jaxquad.identify._solve import solve
 from jaxquad.models import simulate_linear, StateSpace
 
 
@@ -111,7 +111,7 @@ def problem():
     parameters = select_parameters(model(START), NAMES)
     cost, points = _OneSolve(), points_of([frf], [usable(frf, None, 0.6)])[0]
     made = make_problem(model(START), parameters, [frf])
-    return made.weighted([jnp.asarray(cost.weights(points, np.ones(points.used.shape)))])
+    return made.weighted([cost.weights(points, np.ones(points.used.shape))])
 
 
 @pytest.mark.benchmark(group="state-space fit")
@@ -120,10 +120,10 @@ def test_scipy_least_squares(benchmark):
 
 
 @pytest.mark.benchmark(group="state-space fit")
-def test_descend(benchmark):
+def test_solve(benchmark):
     made = problem()
     z = made.parameters.start[: TRUTH.size]
-    found = benchmark(lambda: descend(made, z, None, 256).z.block_until_ready())
+    found = benchmark(lambda: solve(made, z, None, 256).z)
     values = np.asarray(made.parameters.values(found))
     np.testing.assert_allclose(values, peer(), rtol=1e-4, atol=1e-6)
 

@@ -1,0 +1,110 @@
+"""A problem's misfits and their slopes on the host, by a program for each kind of record."""
+
+import functools as ft
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ._mixing import Mixing
+from ._parameters import Numbers
+from ._problem import misfits, Problem
+
+
+class Evaluation(NamedTuple):
+    """The misfits of a problem, as `misfits` lines them up, and their slopes by all parameters."""
+
+    misfits: Float[np.ndarray, " residuals"]
+    slopes: Float[np.ndarray, "all residuals"]
+
+
+def evaluate(problem: Problem, z: Float[np.ndarray, " parameters"]) -> Evaluation:
+    """Unweighted misfits and slopes at values of the free parameters.
+
+    Records of equal shape share a program, whatever they are weighted by: compiling it takes longer
+    than a fit.
+    """
+    z_all = np.array(problem.parameters.start)
+    z_all[: z.size] = z
+    found = [run(z_all, arrays) for run, arrays in _programs(_Same(problem))]
+    parts = [(np.asarray(r), np.asarray(rows)) for r, rows in found]
+    if len(parts) == 1:
+        return Evaluation(*parts[0])
+    none = np.zeros(0), np.zeros((z_all.size, 0))
+    misfits, slopes = zip(none, *parts, strict=True)
+    return Evaluation(np.concatenate(misfits), np.concatenate(slopes, axis=1))
+
+
+def as_residuals(
+    problem: Problem, lined_up: Float[np.ndarray, "*columns residuals"]
+) -> Float[np.ndarray, "*columns residuals"]:
+    """Misfits, or their slopes, weighted and with points that share noise taken together."""
+    parts, start = [], 0
+    for weights, mixing in zip(problem.weights, problem.mixings, strict=True):
+        part = lined_up[..., start : start + weights.size] * _in_line(np.asarray(weights))
+        start += weights.size
+        parts.append(part if mixing is None else _mixed(mixing, part, weights.shape))
+    rest = lined_up[..., start:]
+    return np.concatenate([*parts, rest], axis=-1) if len(parts) != 1 or rest.size else parts[0]
+
+
+def _in_line(values: Float[np.ndarray, "frequencies outputs inputs 2"]) -> np.ndarray:
+    return np.moveaxis(values, (3, 0), (0, 3)).reshape(-1)
+
+
+def _mixed(mixing: Mixing, part: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    count, outputs, inputs, _ = shape
+    both = part.reshape(-1, 2, outputs, inputs, count)
+    joined = np.moveaxis(both[:, 0] + 1j * both[:, 1], 0, -1)
+    turned = np.moveaxis(mixing.factor @ joined, -1, 0)
+    return np.stack([np.real(turned), np.imag(turned)], axis=1).reshape(part.shape)
+
+
+Program = Callable[[np.ndarray, list[Numbers]], tuple[Array, Array]]
+
+
+class _Same:
+    """A problem whatever its weights: equal where it was made once and weighted anew."""
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+
+    def _what(self) -> tuple[PyTree, ...]:
+        return self.problem.model, self.problem.measured, self.problem.parameters
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self._what())))
+
+    def __eq__(self, other: object) -> bool:
+        pairs = zip(self._what(), other._what(), strict=True) if isinstance(other, _Same) else ()
+        return isinstance(other, _Same) and all(mine is its for mine, its in pairs)
+
+
+@ft.lru_cache(maxsize=8)
+def _programs(same: _Same) -> list[tuple[Program, list[Numbers]]]:
+    programs = []
+    for part in same.problem.parts():
+        leaves, structure = jax.tree.flatten(part)
+        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        rest = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+        programs.append((_program(structure, rest), arrays))
+    return programs
+
+
+@ft.lru_cache(maxsize=128)
+def _program(structure: PyTree, rest: tuple[PyTree, ...]) -> Program:
+    def run(z: Float[Array, " all"], arrays: Sequence[Array]):
+        given = iter(arrays)
+        leaves = [next(given) if leaf is None else leaf for leaf in rest]
+        problem = jax.tree.unflatten(structure, leaves)
+
+        def along(change):
+            return jax.jvp(lambda z: misfits(z, problem), (z,), (change,))
+
+        return jax.vmap(along, out_axes=(None, 0))(jnp.eye(z.size, dtype=z.dtype))
+
+    return jax.jit(run)
