@@ -34,6 +34,6 @@ def align(parameter: Array, state: Array) -> Array:
     return parameter.reshape(parameter.shape + (1,) * missing)
 
 
-def is_zero(x: Array) -> bool:
+def is_zero(x: Array | np.ndarray) -> bool:
     """Whether `x` is known to be 0 everywhere."""
     return is_concrete(x) and not np.any(np.asarray(x))  # jnp would trace even a constant

@@ -44,7 +44,7 @@ class RecordTerm(eqx.Module):
     dt: float = eqx.field(static=True)
     hold: str = eqx.field(static=True)
     whitener: Whitener | None = None  # of the noise, where it has a model
-    feedback: Float[Array, " samples"] | None = None  # of a known loop, after a unit of output
+    feedback: Float[Numbers, " samples"] | None = None  # of a known loop, after a unit of output
 
     def weighted(
         self, x: Float[Numbers, "samples outputs *columns"]

@@ -284,7 +284,7 @@ def forced_and_free(
     plant: TransferFunction | StateSpace,
     motions: Motions,
     u: Float[Numbers, "samples inputs"],
-    dt: Float[Array, ""],
+    dt: Float[Numbers, ""],
     hold: str,
 ) -> tuple[Float[Array, "samples outputs"], Float[Array, "samples outputs unknowns"]]:
     """`forced_response` and `free_response` by one program."""

@@ -210,9 +210,10 @@ class _Point(NamedTuple):
 
 def _point(problem: Problem, z: Float[np.ndarray, " n"]) -> _Point:
     found = evaluate(problem, z)
-    r = as_residuals(problem, found.misfits)
-    rows = as_residuals(problem, found.slopes[: z.size])
-    gradient, cost = rows @ r, float(0.5 * (r @ r))
+    with np.errstate(invalid="ignore", over="ignore"):  # a model that is not finite there
+        r = as_residuals(problem, found.misfits)
+        rows = as_residuals(problem, found.slopes[: z.size])
+        gradient, cost = rows @ r, float(0.5 * (r @ r))
     finite = np.isfinite(cost) and np.all(np.isfinite(gradient))
     return _Point(problem, z, found, cost if finite else np.inf, rows, gradient)
 
@@ -326,4 +327,5 @@ def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> 
 
 def cost_at(problem: Problem, z: Float[np.ndarray, " parameters"]) -> float:
     """The sum of squares at values of the free parameters."""
-    return float(np.sum(as_residuals(problem, evaluate(problem, z).misfits) ** 2))
+    with np.errstate(invalid="ignore", over="ignore"):
+        return float(np.sum(as_residuals(problem, evaluate(problem, z).misfits) ** 2))

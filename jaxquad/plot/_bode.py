@@ -128,7 +128,7 @@ def model_response(
 
 @eqx.filter_jit
 def _response(
-    model: Model, omega: Float[Array, " frequencies"]
+    model: Model, omega: Float[Array | np.ndarray, " frequencies"]
 ) -> Complex[Array, "frequencies outputs inputs"]:
     return evaluate_response(model, omega)
 
