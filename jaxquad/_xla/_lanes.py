@@ -161,4 +161,4 @@ _CALLS = {
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr",
     "remat2": "jaxpr",
 }  # fmt: skip
-_KEPT = {"copy", "copy_p", "stop_gradient", "optimization_barrier", "enter_kernel", "leave_kernel"}
+_KEPT = set("copy copy_p stop_gradient optimization_barrier enter_kernel leave_kernel name".split())

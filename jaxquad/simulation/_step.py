@@ -67,7 +67,8 @@ def _rolled_runge_kutta(
 
     still = jax.tree.map(jnp.zeros_like, state)
     dtype = jnp.result_type(*jax.tree.leaves(state))
-    stages = tuple(jnp.asarray(x, dtype) for x in _STAGES)
+    ahead, weights = _STAGES
+    stages = jnp.asarray(ahead, dtype), jnp.asarray(weights, dtype)
     total = jax.lax.scan(stage, (still, still), stages)[0][1]
     return jax.tree.map(lambda x, h, t: x + h / 6 * t, state, spans, total)
 

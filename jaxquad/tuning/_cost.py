@@ -81,7 +81,8 @@ def evaluate_cost(
 
     @jax.jit  # traced once, for its shapes and for its use
     def run(z: Array, mine: PyTree, common: PyTree) -> CostResult:
-        return _evaluate_one(z, *eqx.combine(common, fixed), eqx.combine(mine, rest))
+        of, members = eqx.combine(common, fixed)
+        return _evaluate_one(z, of, members, eqx.combine(mine, rest))
 
     def one(given: tuple[Array, Array, PyTree]) -> CostResult:
         z, on, mine = given
