@@ -60,9 +60,10 @@ class Aliases(eqx.Module):
 
 
 def evaluate_sampled(
-    model: PyTree, omega: Float[Array, " frequencies"], aliases: Aliases | None
+    model: PyTree, omega: Float[Numbers, " frequencies"], aliases: Aliases | None
 ) -> Complex[Array, "frequencies outputs inputs"]:
     """A model's response as a sampled record shows it; without aliases its own."""
+    omega = jnp.asarray(omega)
     if aliases is None:
         return evaluate_response(model, omega)
     both = evaluate_response(model, jnp.concatenate([omega, aliases.omega]))

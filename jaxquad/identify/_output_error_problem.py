@@ -48,10 +48,11 @@ class RecordTerm(eqx.Module):
 
     def weighted(
         self, x: Float[Numbers, "samples outputs *columns"]
-    ) -> Float[Numbers, "samples outputs *columns"]:
+    ) -> Float[Array, "samples outputs *columns"]:
         """What counts of outputs: within the band, unpredicted by the noise, in units of it."""
+        x = jnp.asarray(x)
         seen = band_filter(x, self.gain) if self.whitener is None else self.whitener(x)
-        return seen * self.weights.reshape(1, -1, *(1,) * (x.ndim - 2))
+        return jnp.asarray(seen) * self.weights.reshape(1, -1, *(1,) * (x.ndim - 2))
 
     @property
     def measured(self) -> Float[Numbers, "samples outputs"]:
@@ -118,9 +119,10 @@ def misfit_and_columns(
         motions = Motions(*term.motions, ())
         columns = free_response(plant, motions, len(term.u), term.dt)
         if (feedback := term.feedback) is not None:
-            closed = lambda x: term.weighted(close_loop(plant, x, feedback, term.dt))
+            late = jnp.asarray(feedback)
+            closed = lambda x: term.weighted(close_loop(plant, x, late, term.dt))
             return closed(term.y - simulated), closed(columns)
-    return term.measured - term.weighted(simulated), term.weighted(columns)
+    return jnp.asarray(term.measured) - term.weighted(simulated), term.weighted(columns)
 
 
 def project_out(
@@ -164,7 +166,7 @@ def evaluate_misfits(z: Float[Numbers, " n"], problem: OutputError) -> Evaluatio
     """Everything at the first parameters and the initial states `z`."""
 
     def simulated(z):
-        values, *starts = split(z, problem)
+        values, *starts = map(jnp.asarray, split(z, problem))
         model = insert_parameters(values, problem)
         pairs = [
             misfit_and_columns(model, *each) for each in zip(starts, problem.terms, strict=True)

@@ -78,7 +78,7 @@ class Problem(eqx.Module):
     def parts(self) -> list["Problem"]:
         """Problems of one record each, and one of the priors, for what no weight matters to."""
         if len(self.omega) == 1 and not self.quantities:
-            return [dataclasses.replace(self, weights=(), mixings=())]
+            return [self.weighted(())]
         none = dataclasses.replace(
             self,
             conditions=(),
@@ -182,7 +182,7 @@ def _silent_pairs(
     moved = start + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
     tried = condition(parameters.insert(model, moved))
     omega = np.asarray(frf.omega)[[0, frf.omega.size // 2, -1]]
-    found = np.asarray(_evaluate(tried, omega))
+    found = np.asarray(_evaluate(tried, jax.device_put(omega)))
     pairs = np.argwhere(np.all(found == 0, axis=0)).tolist()
     return tuple((output, source) for output, source in pairs)
 
@@ -241,7 +241,7 @@ def _rotate(real: Part, imag: Part, c: Part, s: Part) -> tuple[Part, Part]:
 
 
 def _of_same_shape(
-    model: Complex[Array, "..."], measured: Complex[Array, "frequencies outputs inputs"]
+    model: Complex[Array, "..."], measured: Complex[Numbers, "frequencies outputs inputs"]
 ) -> Complex[Array, "frequencies outputs inputs"]:
     # Broadcasting would fit one output to all of them silently.
     if model.shape != measured.shape:
@@ -253,7 +253,7 @@ def _of_same_shape(
     return model
 
 
-def prior_misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " priors"]:
+def prior_misfits(z: Float[Numbers, " n"], problem: Problem) -> Float[Array, " priors"]:
     """Known quantities: departure in standard errors."""
     model = problem.parameters.insert(problem.model, z)
     values = [quantity(model) for quantity in problem.quantities]

@@ -132,7 +132,7 @@ def count_states(plant: DifferentialModel) -> int:
 def integrate_plant(
     plant: DifferentialModel,
     u: Float[Numbers, "samples inputs"],
-    start: Float[Array, " states"],
+    start: Float[Numbers, " states"],
     dt: float,
     hold: str,
 ) -> Float[Array, "samples outputs"]:
@@ -288,6 +288,7 @@ def forced_and_free(
     hold: str,
 ) -> tuple[Float[Array, "samples outputs"], Float[Array, "samples outputs unknowns"]]:
     """`forced_response` and `free_response` by one program."""
+    dt = jnp.asarray(dt)
     free = free_response(plant, motions, len(u), dt)
     return forced_response(plant, u, dt, hold), free
 

@@ -55,11 +55,11 @@ def _is_plain(problem: Problem) -> bool:
 
 def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[Normal]:
     """Of one record, magnitude and phase apart: side by side they would have to be copied."""
-    parameters, omega = problem.parameters, problem.omega[k]
+    parameters, omega = problem.parameters, jnp.asarray(problem.omega[k])
     matrices = matrices_of(parameters.insert(problem.model, z))
     entries = [_entry(place.name) for place in parameters.places[: z.size]]
     value, slopes = logarithmic_slopes(matrices, omega, entries)
-    misfit, scale = _logarithm(value, problem.measured[k]), parameters.slopes(z)
+    misfit, scale = _logarithm(value, jnp.asarray(problem.measured[k])), parameters.slopes(z)
     weights = jnp.moveaxis(problem.weights[k], (0, 3), (3, 0))
     residual = [part * weight for part, weight in zip(misfit, weights, strict=True)]
     pairs = zip(slopes, weights, strict=True)
@@ -149,7 +149,7 @@ def solve(
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
     if solver is None and not _is_plain(problem):
         return _solve_on_host(problem, z0, max_steps)
-    stop = _descend(problem, z0, solver, max_steps)
+    stop = _descend(problem, jax.device_put(z0), solver, max_steps)
     steps = int(stop.steps)
     message = "" if stop.converged else f"{_reason(stop.reason)} (after {steps} steps)"
     return solution_at(problem, np.asarray(stop.z), message, steps)
@@ -173,7 +173,7 @@ def _solution(
     parameters = problem.parameters
     z_all = np.array(parameters.start)
     z_all[: z.size] = z
-    values, slopes = parameters.values(z_all), parameters.slopes(z_all)
+    values, slopes = np.asarray(parameters.values(z_all)), np.asarray(parameters.slopes(z_all))
     model = parameters.replace(problem.model, values[: z.size])
     derivatives = _sensitivity(problem, found)
     return Solution(z, model, values, slopes, message, not message, steps, derivatives)

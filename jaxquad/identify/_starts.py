@@ -167,7 +167,7 @@ def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
     groups: list[list[int]] = []
     for k in order:
         for group in groups:
-            if _same(z[group[0]] - z[k], normal, group[0], k):
+            if _same(np.asarray(z[group[0]] - z[k]), normal, group[0], k):
                 group.append(k)
                 break
         else:
@@ -175,8 +175,8 @@ def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
     points = [_point(parameters, stops, group) for group in groups]
     lost = tuple(k for k in range(len(z)) if not np.isfinite(normal.cost[k]))
     if lost:
-        first = z[lost[0]]
-        values = parameters.values(first)
+        first = np.asarray(z[lost[0]])
+        values = np.asarray(parameters.values(first))
         points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOT_FINITE))
     return tuple(points)
 

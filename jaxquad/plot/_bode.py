@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 from matplotlib.axes import Axes
@@ -130,7 +131,7 @@ def model_response(
 def _response(
     model: Model, omega: Float[Array | np.ndarray, " frequencies"]
 ) -> Complex[Array, "frequencies outputs inputs"]:
-    return evaluate_response(model, omega)
+    return evaluate_response(model, jnp.asarray(omega))
 
 
 def _beside(curve: _Curve, measured: _Curve) -> _Curve:
