@@ -29,6 +29,9 @@ _RANK = 16  # of a kernel over a band of two decades: what is left of its varian
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
 _FOLLOWS = 1.25  # factor by which such a width grows
 
+_PAIR = ["einsum_path", (0, 1)]  # to search for a path takes longer than the products
+_TRIPLE = [*_PAIR, (0, 1)]
+
 Widths = Float[np.ndarray, " parameters"]
 
 
@@ -94,7 +97,7 @@ def _look(
         inverse = np.where(used, error**-2 / counted.shared, 0.0)
         columns = np.concatenate([record.slopes[..., :count], record.misfit[..., None]], axis=-1)
         columns = np.where(used[..., None, None], columns, 0.0)
-        whole += np.einsum("foimx,foi,foimy->xy", columns, inverse, columns, optimize=True)
+        whole += np.einsum("foimx,foi,foimy->xy", columns, inverse, columns, optimize=_TRIPLE)
         parts = _components(np.asarray(record.frf.omega), used, inverse, columns)
         gains.append(parts[0])
         along.append(parts[1])
@@ -109,11 +112,11 @@ def _components(omega, used, inverse, columns) -> tuple[np.ndarray, np.ndarray]:
     inverse, columns = inverse[:, pairs], columns[:, pairs]
     basis = kernel_basis(omega.tobytes())
     weighted = basis[:, :, :, None] * inverse[None, :, None, :]  # length frequency rank pair
-    gram = np.einsum("lfrp,lfs->lprs", weighted, basis, optimize=True)
-    seen = np.einsum("lfrp,fpmx->lprmx", weighted, columns, optimize=True)
+    gram = np.einsum("lfrp,lfs->lprs", weighted, basis, optimize=_PAIR)
+    seen = np.einsum("lfrp,fpmx->lprmx", weighted, columns, optimize=_PAIR)
     gains, turned = np.linalg.eigh(gram)
-    seen = np.einsum("lprk,lprmx->lpkmx", turned, seen, optimize=True) * SHARES[:, None]
-    products = np.einsum("lpkmx,lpkmy->lpkmxy", seen, seen, optimize=True)
+    seen = np.einsum("lprk,lprmx->lpkmx", turned, seen, optimize=_PAIR) * SHARES[:, None]
+    products = np.einsum("lpkmx,lpkmy->lpkmxy", seen, seen, optimize=_PAIR)
     gains = np.maximum(gains, 0.0)[..., None] * SHARES**2
     lengths, width = len(basis), columns.shape[-1]
     return gains.reshape(lengths, -1), products.reshape(lengths, -1, width**2)
@@ -175,7 +178,7 @@ def discrepancy_effect(
         pulls = np.where(record.weights[..., None] > 0, record.pulls(count), 0.0)
         basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
         pulls = pulls * SHARES[:, None]
-        along = np.einsum("lfr,foimx->lroimx", basis, pulls, optimize=True)
+        along = np.einsum("lfr,foimx->lroimx", basis, pulls, optimize=_PAIR)
         along = along.reshape(len(LENGTHS), -1, count)
         total += np.swapaxes(along, 1, 2) @ along
     return total

@@ -95,6 +95,8 @@ def make_fit(
 def _with_freedom(verdict: Verdict, freedom: float) -> Verdict:
     """The verdict whose combinations have intervals of these degrees of freedom."""
     known = verdict.combinations
+    if not known:
+        return verdict
     combinations = tuple(each._replace(degrees_of_freedom=freedom) for each in known)
     return dataclasses.replace(verdict, combinations=combinations)
 
