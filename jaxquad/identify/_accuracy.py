@@ -90,8 +90,9 @@ def blocks_of(records: Sequence[ResponseTerm]) -> list[Block]:
         known = np.where(used, error, 0.0)
         expected = expected_cost(record.mixing, weights * known[..., None])
         for o, i in np.ndindex(error.shape[1:]):
-            parts = (residual, rows, record.slopes, weights, error)
-            blocks.append(Block(*(part[:, o, i] for part in parts), float(expected[o, i])))
+            at = (slice(None), o, i)
+            parts = residual[at], rows[at], record.slopes[at], weights[at], error[at]
+            blocks.append(Block(*parts, float(expected[o, i])))
     return [block for block in blocks if np.any(block.weights)]
 
 

@@ -64,7 +64,8 @@ def _result(
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(np.isfinite(response), spread / np.abs(response), np.inf)
     names = records[0].output_names, records[0].input_names
-    remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
+    measured = omega, response, error, coherence, direct
+    remarks = remarks_on_feedback(method, *measured, names, found.errors)
     if isinstance(found, LocalEstimate):  # periods show their own distortion
         remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     # Not jnp.asarray: it compiles a program for each new shape.

@@ -1,13 +1,15 @@
 """Signs that a controller, and not the plant, made the coherence between input and output."""
 
+import functools as ft
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from ._checks import in_hertz
+from ._error_covariance import ErrorCovariance
 from ._remarks import Remark
 
 
@@ -16,7 +18,7 @@ Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
-_CLEAR = 3.0  # standard errors of the slope of the phase
+_CHANCE = 1.35e-3  # of calling the phase of any pair rising: 3 standard errors of a single slope
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
 
 
@@ -27,16 +29,22 @@ def dominated_by_feedback(
     return (direct >= COHERENT) & (by_reference < COHERENT)
 
 
+Covariance = Callable[[], Complex[np.ndarray, "frequencies frequencies"]]
+
+
 def phase_rises(
-    omega: Float[np.ndarray, " frequencies"],
-    phase: Float[np.ndarray, " frequencies"],
-    error: Float[np.ndarray, " frequencies"],
-    coherence: Float[np.ndarray, " frequencies"],
+    omega: Grid,
+    response: Complex[np.ndarray, " frequencies"],
+    error: Grid,
+    coherence: Grid,
+    covariance: Covariance | None = None,
+    clear: float = 3.0,
 ) -> bool:
-    """Whether the phase increases, by three standard errors, at the top of the coherent band.
+    """Whether the phase increases, by `clear` standard errors, at the top of the coherent band.
 
     Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller that
-    filters and delays, increases.
+    filters and delays, increases. Neighbours share noise, which makes a slope less certain than its
+    many points say: the response's `covariance` is asked for where these say that it rises.
     """
     good = np.flatnonzero(coherence >= COHERENT)
     top = good[omega[good] >= omega[good[-1]] / _TOP] if len(good) else good
@@ -45,12 +53,18 @@ def phase_rises(
     weight = 1 / np.maximum(error[top], 1e-3) ** 2
     weight = np.minimum(weight, 4 * np.median(weight))
     centred = omega[top] - np.average(omega[top], weights=weight)
-    level = np.unwrap(phase)[top]
+    level = np.unwrap(np.angle(response))[top]
     level = level - np.average(level, weights=weight)
     spread = np.sum(weight * centred**2)
-    slope = np.sum(weight * centred * level) / spread
+    pull = weight * centred / spread
+    slope = float(pull @ level)
     scatter = np.sum(weight * (level - slope * centred) ** 2) / (len(top) - 2)
-    return bool(slope * np.sqrt(spread / max(scatter, 1.0)) > _CLEAR)
+    variance = max(float(scatter), 1.0) / spread
+    if covariance is not None and slope > clear * np.sqrt(variance):
+        turned = pull / np.conj(response[top])
+        shared = turned.conj() @ covariance()[np.ix_(top, top)] @ turned
+        variance = max(variance, 0.5 * float(np.real(shared)))
+    return bool(slope > clear * np.sqrt(variance))
 
 
 def remarks_on_feedback(
@@ -61,20 +75,26 @@ def remarks_on_feedback(
     coherence: Pairs,
     direct: Pairs,
     names: tuple[Sequence[str], Sequence[str]],
+    errors: ErrorCovariance | None = None,
 ) -> tuple[Remark, ...]:
     """Remarks on feedback that a user of the response has to know; `names` of outputs and inputs.
 
-    `direct` is the coherence from input to output, `coherence` that of the estimate.
+    `direct` is the coherence from input to output, `coherence` that of the estimate, `errors` those
+    of the response; without them, its points count as independent.
     """
-    remarks = []
+    from scipy.special import ndtri
+
+    remarks, clear = [], float(ndtri(1 - _CHANCE / (len(names[0]) * len(names[1]))))
     for (o, output), (i, source) in itertools.product(*map(enumerate, names)):
         pair, known = (output, source), np.isfinite(response[:, o, i])
         if method == "joint":
             remarks += _explained_by_reference(omega, coherence[:, o, i], direct[:, o, i], pair)
             continue
-        phase = np.angle(np.where(known, response[:, o, i], 1.0))
+        here = np.where(known, response[:, o, i], 1.0)
         error_here = np.where(known, error[:, o, i], np.inf)
-        if phase_rises(omega, phase, error_here, np.where(known, coherence[:, o, i], 0.0)):
+        level = np.where(known, coherence[:, o, i], 0.0)
+        covariance = None if errors is None else ft.partial(errors.between, (o, i), (o, i))
+        if phase_rises(omega, here, error_here, level, covariance, clear):
             remarks.append(Remark(_RISES, omega[coherence[:, o, i] >= COHERENT], pair))
     return tuple(dict.fromkeys(remarks))
 

@@ -85,11 +85,11 @@ def test_feedback_dominates_where_only_input_and_output_are_coherent():
 
 
 def tilted(delay, *, scatter=0.05, coherence=0.9):
-    """The phase of a lag or, of -1/C with a delayed controller, a lead; wrapped, with noise."""
+    """The response of a lag or, of -1/C with a delayed controller, a lead; with noise."""
     noise = scatter * np.random.default_rng(0).standard_normal(OMEGA.size)
     phase = np.angle(np.exp(1j * (noise - delay * OMEGA)))
     flat = np.full(OMEGA.size, 1.0)
-    return OMEGA, phase, scatter * flat, coherence * flat
+    return OMEGA, np.exp(1j * phase), scatter * flat, coherence * flat
 
 
 def test_the_phase_of_a_lag_falls_and_that_of_an_inverse_controller_rises():
@@ -101,6 +101,14 @@ def test_the_phase_of_a_lag_falls_and_that_of_an_inverse_controller_rises():
 def test_a_rise_within_its_error_or_without_coherence_is_none():
     assert not phase_rises(*tilted(-0.0001))
     assert not phase_rises(*tilted(-0.01, coherence=0.5))
+
+
+def test_a_rise_that_all_frequencies_share_by_chance_is_none():
+    """Neighbours' errors turn the phase together, by a slope whose standard error is the rise's."""
+    omega, response, *rest = tilted(-0.01)
+    together = 0.01 * np.sqrt(2) * omega * response
+    assert phase_rises(omega, response, *rest)
+    assert not phase_rises(omega, response, *rest, lambda: np.outer(together, together.conj()))
 
 
 def measured(path, **options):
