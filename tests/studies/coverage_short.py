@@ -62,7 +62,7 @@ def one_input(seconds: float) -> Case:
     time = np.arange(u.size) * DT
 
     def identify(rng: np.random.Generator) -> jq.identify.Fit:
-        record = jq.Record(time, u, y + 0.3 * np.std(y) * rng.standard_normal(y.size))
+        record = jq.Record(time, u, y + 0.3 * np.std(y) * rng.standard_normal(y.size), hold=0.0)
         return jq.fit(MODE_START, jq.frequency_response(record), free=MODE_FREE)
 
     return Case(f"1 input, {seconds:g} s", identify, MODE_TRUTH)
@@ -88,7 +88,9 @@ def three_inputs(seconds: float) -> Case:
 
     def identify(rng: np.random.Generator) -> jq.identify.Fit:
         noise = 0.1 * np.std(y, axis=0) * rng.standard_normal(y.shape)
-        return jq.fit(LAGS, jq.frequency_response(jq.Record(time, u, y + noise)), free=LAGS_FREE)
+        return jq.fit(
+            LAGS, jq.frequency_response(jq.Record(time, u, y + noise, hold=0.0)), free=LAGS_FREE
+        )
 
     return Case(f"3 inputs, {seconds:g} s", identify, LAGS_TRUTH, share=5)
 
@@ -104,7 +106,7 @@ def few_periods(periods: int, lines: int) -> Case:
     y, time = passed(MODE, u[:, None], periodic=True)[:, 0], np.arange(u.size) * DT
 
     def identify(rng: np.random.Generator) -> jq.identify.Fit:
-        record = jq.Record(time, u, y + 0.3 * np.std(y) * rng.standard_normal(y.size))
+        record = jq.Record(time, u, y + 0.3 * np.std(y) * rng.standard_normal(y.size), hold=0.0)
         spectra = jq.spectra.Periodic(samples * DT, discard=0)
         return jq.fit(MODE_START, jq.frequency_response(record, estimator=spectra), free=MODE_FREE)
 
