@@ -99,9 +99,10 @@ def _look(problem: Problem, solution: Solution) -> _Local:
     for weights, mixing, misfit, slopes in terms:
         weights = np.asarray(weights)
         used = weights > 0
-        residual.append(mix(mixing, weights * np.asarray(misfit))[used])
-        scaled = weights[..., None] * np.asarray(slopes)[..., :count]
-        jacobian.append(mix(mixing, scaled)[used])
+        with np.errstate(invalid="ignore", over="ignore"):  # a model that is not finite there
+            residual.append(mix(mixing, weights * np.asarray(misfit))[used])
+            scaled = weights[..., None] * np.asarray(slopes)[..., :count]
+            jacobian.append(mix(mixing, scaled)[used])
     r = np.concatenate([*residual, np.asarray(parts.prior_misfits)])
     return _Local(r, np.concatenate([*jacobian, np.asarray(parts.prior_slopes)[:, :count]]))
 

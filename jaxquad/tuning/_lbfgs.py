@@ -33,7 +33,7 @@ class LBFGS(eqx.Module):
     - `ValueError`: a count is below 1, or a step is not above 0.
     """
 
-    evaluations: int = 60
+    evaluations: int = 100
     tolerance: float = 1e-4
     gradient_tolerance: float = 1e-4
     memory: int = 10

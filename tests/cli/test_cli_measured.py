@@ -94,7 +94,7 @@ def test_a_limit_far_beyond_the_record_gives_no_design_to_be_flown(identified, t
     code = main(["tune", str(tmp_path), *vehicle])
     printed = capsys.readouterr().out
     assert code == 4 and printed.startswith(
-        "CERTIFICATE FAILS on 64 fresh members, not to be flown"
+        "CERTIFICATE FAILS on 64 fresh members (576 linear loops), not to be flown"
     )
     assert "members are lost" in printed and "FAIL CONVERGENCE" in printed
     assert "ladrc.wo" in printed and "stands at its bound" in printed

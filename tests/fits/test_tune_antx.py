@@ -1,4 +1,4 @@
-"""From a measured flight to certified gains, as fits/tune_antx.py does it, with few members."""
+"""From a measured flight to certified gains, as fits/tune_antx.py does it."""
 
 import importlib
 import json
@@ -13,7 +13,7 @@ import pytest
 from conftest import ROOT
 
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 SCRIPT = ROOT / "fits" / "tune_antx.py"
@@ -21,16 +21,16 @@ SCRIPT = ROOT / "fits" / "tune_antx.py"
 
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory):
-    """The folder of a quick run, and what it printed."""
+    """The folder of the run, and what it printed."""
     sys.path.insert(0, str(ROOT / "fits"))
     try:
         script = importlib.import_module("tune_antx")
-        quick = importlib.import_module("experiments.tuning").QUICK
+        size = importlib.import_module("experiments.tuning").Size()
     finally:
         sys.path.remove(str(ROOT / "fits"))
     out, printed = tmp_path_factory.mktemp("tune_antx"), StringIO()
     with redirect_stdout(printed):
-        script.main(out, 0, quick, data / "antx_pitch")
+        script.main(out, 0, size, data / "antx_pitch")
     return out, printed.getvalue()
 
 
