@@ -167,6 +167,7 @@ def _unmodelled_delay(fit: Fit, recorded_dt: float | None | Literal["as fitted"]
 
 _LOST = 0.01  # share of a variance that may lie in directions which are not drawn
 _DRAWS = 1024  # by which the longest delay is found
+_ROOM = 1.25  # over it: thousands of members hold longer ones, and need not be another program
 
 
 class Posterior(eqx.Module):
@@ -249,7 +250,7 @@ class Posterior(eqx.Module):
     ) -> tuple[DecoupledAxes, Float[np.ndarray, "1 members"], float]:
         """Plants, their delays in s, and the longest that a loop of this `dt` reckons with."""
         plant, delay = self._drawn(scores)
-        longest = max(_whole_samples_above(x, dt) for x in (self.longest, np.max(delay)))
+        longest = max(_whole_samples_above(x, dt) for x in (_ROOM * self.longest, np.max(delay)))
         return plant, delay[None], longest
 
     def _drawn(

@@ -94,7 +94,7 @@ class Problem(eqx.Module):
         fields = zip(
             self.conditions, self.omega, self.measured, self.aliases, self.silent, strict=True
         )
-        records = [
+        records: list[Problem] = [
             dataclasses.replace(bare, **{name: (x,) for name, x in zip(names, each, strict=True)})
             for each in fields
         ]

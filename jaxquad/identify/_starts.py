@@ -8,12 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import CONVERGED, decrement, Descent, minimise, Normal, RUNNING, TOLERANCE
+from jaxquad._core import (
+    CONVERGED,
+    decrement,
+    Descent,
+    minimise,
+    Normal,
+    RUNNING,
+    STALLED,
+    TOLERANCE,
+)
 
 from ._accuracy import Matrix
 from ._parameters import Numbers, Parameters
 from ._problem import Problem, residuals
-from ._solve import cost_at, least_squares, problem_normal, Solution, solution_at
+from ._solve import cost_at, least_squares, problem_normal, Solution, solution_at, stopped_early
 
 
 MINIMUM = "minimum"
@@ -125,8 +134,11 @@ def solve_from_many(
         )
     best = min(found, key=lambda point: (not point.is_minimum, point.cost))
     k = best.starts[0]
+    status, steps = int(host.status[k]), int(host.steps[k])
     message = "" if best.is_minimum else best.kind
-    return solution_at(problem, best.z, message, int(host.steps[k])), found
+    if message and status in (RUNNING, STALLED):
+        message = stopped_early(status, steps)
+    return solution_at(problem, best.z, message, steps), found
 
 
 class _Stops(NamedTuple):

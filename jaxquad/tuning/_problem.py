@@ -99,6 +99,7 @@ class LinearLoops(eqx.Module):
             axes=jax.tree.map(put, self.axes, others.axes, marks),
             delay=put(self.delay, others.delay, True),
             assumed_inertia=put(self.assumed_inertia, others.assumed_inertia, True),
+            longest_delay=max(self.longest_delay, others.longest_delay),
         )
 
     def numbers(

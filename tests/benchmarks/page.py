@@ -43,7 +43,7 @@ PAIRS = (
     Pair(
         "the same, the minimisation alone",
         "test_fit_speed.py",
-        "test_descend",
+        "test_solve",
         "test_scipy_least_squares",
         "scipy",
     ),
@@ -51,7 +51,7 @@ PAIRS = (
     Pair(
         "state-space fit, 20 parameters",
         "test_state_space_speed.py",
-        "test_descend",
+        "test_solve",
         "test_scipy_least_squares",
         "scipy",
     ),

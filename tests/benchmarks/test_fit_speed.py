@@ -94,7 +94,7 @@ def test_solve(benchmark, frf):
     problem = make_problem(_model(), parameters, [frf])
     points = points_of([frf], [usable(frf, None, 0.6)])[0]
     problem = problem.weighted([cost.weights(points, np.ones(points.used.shape))])
-    found = benchmark(lambda: solve(problem, parameters.start[:5], None, 256).z)
+    found = benchmark(lambda: solve(problem, np.asarray(parameters.start[:5]), None, 256).z)
     np.testing.assert_allclose(np.exp(found), _peer(frf), rtol=1e-5)
 
 

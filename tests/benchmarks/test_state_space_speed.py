@@ -122,7 +122,7 @@ def test_scipy_least_squares(benchmark):
 @pytest.mark.benchmark(group="state-space fit")
 def test_solve(benchmark):
     made = problem()
-    z = made.parameters.start[: TRUTH.size]
+    z = np.asarray(made.parameters.start[: TRUTH.size])
     found = benchmark(lambda: solve(made, z, None, 256).z)
     values = np.asarray(made.parameters.values(found))
     np.testing.assert_allclose(values, peer(), rtol=1e-4, atol=1e-6)

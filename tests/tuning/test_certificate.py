@@ -141,21 +141,20 @@ def test_limits_of_the_linear_loop_count_members_that_do_not_fly():
         judged(limits=(Limit("sensitivity_peak", at_most=3.0),), linear_members=count)
         for count in (0, 48)
     )
-    further = many.further.design
+    assert many.further is not None
+    further, facts = many.further.design, many.further.facts
     assert further.members == 48 and set(further.by_axis) < set(many.design.by_axis)
     np.testing.assert_array_equal(many.design.of("itae"), alone.design.of("itae"))
-    assert not np.isin(many.further.facts["inertia"], many.facts["inertia"]).any()
-    for gain, stable in zip(
-        (many.further.facts["torque_gain"] / many.further.facts["inertia"])[0],
-        ~further.unstable, strict=True,
-    ):  # fmt: skip
+    assert not np.isin(facts["inertia"], many.facts["inertia"]).any()
+    gains, stable = (facts["torque_gain"] / facts["inertia"])[0], ~np.asarray(further.unstable)
+    for gain, holds in zip(gains, stable, strict=True):
         poles = np.linalg.eigvals(ladrc_loop.loop(gain, 0.848)[0])
-        assert (np.max(np.abs(poles)) < 1) == stable
+        assert (np.max(np.abs(poles)) < 1) == holds
     [mine], [theirs] = alone.distances, many.distances
-    lost = np.sum(further.unstable | (further.of("sensitivity_peak") > 3.0))
+    lost = np.sum(np.asarray(further.unstable) | (further.of("sensitivity_peak") > 3.0))
     assert theirs.members == 72 and theirs.beyond == mine.beyond + lost > mine.beyond
     assert theirs.beyond_at_most == upper_bound(int(theirs.beyond), 72)
-    assert many.member(30)["inertia"] == many.further.facts["inertia"][:, 6]
+    assert many.member(30)["inertia"] == facts["inertia"][:, 6]
 
 
 @pytest.mark.parametrize("beyond, without, met", [(1, 0, True), (2, 0, False), (1, 1, False)])
