@@ -125,10 +125,11 @@ class GlobalModel(NamedTuple):
 def global_models(
     bins: Bins, inputs: slice, outputs: slice, highest: float, dt: float, most: int
 ) -> list[GlobalModel | None]:
-    """One model for each output, of the order up to `most` with the least of Akaike's criterion.
+    """One model for each output, of the order up to `most` with the least criterion.
 
-    A Bayesian criterion stops where what is left hides in the noise of single bins; in a local
-    window that would be a bias. `None` where a model explains no more than chance allows. The bins
+    It asks for more than Akaike's, under which a pole and a zero settle where the noise of single
+    bins happens to rise, and for less than a Bayesian one, which stops where what is left hides in
+    that noise; in a local window that would be a bias. `None` where a model explains no more than chance allows. The bins
     reach five times `highest` (rad/s). Above 20000 of them every n-th is taken: each is an equation
     of its own, so thinning costs precision, never resolution. The order is chosen with every n-th
     of 4000.
@@ -214,7 +215,7 @@ def _orders(most: int) -> Iterator[int]:
 
 
 def _information(cost: float, parameters: int, count: int) -> float:
-    return count * np.log(max(cost, 1e-300) / count) + 2 * parameters
+    return count * np.log(max(cost, 1e-300) / count) + _PRICE * parameters
 
 
 def _proportional(equations: Equations) -> float:
