@@ -19,6 +19,7 @@ _EXACT = 1e-20  # share of the output's power that is rounding
 _PER_PARAMETER = 6  # real equations
 _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
 _THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
+_PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
 _BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of the residual's power: in ln(omega), and bins a side at least
 
 Vector = Float[np.ndarray, " parameters"]
@@ -129,10 +130,10 @@ def global_models(
 
     It asks for more than Akaike's, under which a pole and a zero settle where the noise of single
     bins happens to rise, and for less than a Bayesian one, which stops where what is left hides in
-    that noise; in a local window that would be a bias. `None` where a model explains no more than chance allows. The bins
-    reach five times `highest` (rad/s). Above 20000 of them every n-th is taken: each is an equation
-    of its own, so thinning costs precision, never resolution. The order is chosen with every n-th
-    of 4000.
+    that noise; in a local window that would be a bias. `None` where a model explains no more than
+    chance allows. The bins reach five times `highest` (rad/s). Above 20000 of them every n-th is
+    taken: each is an equation of its own, so thinning costs precision, never resolution. The order
+    is chosen with every n-th of 4000.
     """
     reach = int(np.searchsorted(bins.omega, _BEYOND * highest, "right"))
     places = np.arange(0, reach, -(-reach // _MOST_BINS))
