@@ -36,7 +36,7 @@ import jaxquad as jq  # noqa: E402
 
 
 ROOT = Path(__file__).parents[2]
-COMMAND = "python tests/studies/healthy.py --draws 400"
+COMMAND = "python tests/studies/healthy.py --draws {}"
 HALF = ("three-inputs",)  # plants of which half as many draws are made: each costs several times
 LONG = ("two-inputs", "three-inputs", "closed-setpoint", "closed-input")  # these start first
 AT_ONCE = 20  # runs that are simulated side by side
@@ -142,7 +142,7 @@ def main() -> None:
     }
     plants = {name: make(name) for name in names}
     bounds = {name: cramer_rao(plant) for name, plant in plants.items()}
-    tables = as_tables(plants, rows, bounds, COMMAND)
+    tables = as_tables(plants, rows, bounds, COMMAND.format(given.draws))
     print(printed(tables))
     if names == list(MAKERS):
         print(write("healthy", tables))
