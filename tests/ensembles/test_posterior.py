@@ -306,7 +306,8 @@ def test_half_a_sample_of_the_records_hold_is_taken_off_the_delay_down_to_zero()
     np.testing.assert_allclose(half.delay, whole.delay - 0.005, atol=1e-15)
     assert np.all(np.asarray(none.delay) == 0) and none.longest_delay == 0
     assert np.mean(whole.delay) == pytest.approx(fit.values[2], rel=1e-3)
-    assert half.longest_delay == pytest.approx(0.008)  # whole samples above all draws
+    assert half.longest_delay == pytest.approx(0.01)  # whole samples, a quarter above all draws
+    assert half.longest_delay >= 1.25 * np.max(half.delay)
 
 
 def test_a_fit_that_models_the_hold_has_the_plants_own_delay():
