@@ -41,9 +41,7 @@ def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mi
 def _mixing(points: Points, weights: Weights) -> Mixing | None:
     if not points.correlations:
         return None
-    count, outputs, inputs = points.used.shape
-    identity = np.eye(count, dtype=complex)
-    factor, correlation = np.array(np.broadcast_to(identity, (2, outputs, inputs, count, count)))
+    factor, correlation = unmixed(points.used.shape)
     for (o, i), shared in points.correlations.items():
         mine = np.flatnonzero(points.used[:, o, i])
         # A floor on the error is the points' own.
@@ -54,6 +52,13 @@ def _mixing(points: Points, weights: Weights) -> Mixing | None:
         factor[o, i][np.ix_(mine, mine)] = root
         correlation[o, i][np.ix_(mine, mine)] = shared
     return Mixing(factor, correlation)
+
+
+def unmixed(shape: tuple[int, ...]) -> Mixing:
+    """The mixing of (frequencies, outputs, inputs) that share no noise: identities."""
+    count, outputs, inputs = shape
+    identity = np.eye(count, dtype=complex)
+    return Mixing(*np.array(np.broadcast_to(identity, (2, outputs, inputs, count, count))))
 
 
 def mix(

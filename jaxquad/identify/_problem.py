@@ -13,7 +13,7 @@ from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
 from ._held import Aliases, evaluate_sampled, plan_aliases
-from ._mixing import mix_parts, Mixing
+from ._mixing import mix_parts, Mixing, unmixed
 from ._parameters import Numbers, Parameters
 
 
@@ -108,6 +108,11 @@ class Problem(eqx.Module):
         """The same problem under other weights, with points that share noise taken together."""
         each = [None] * len(weights) if mixings is None else mixings
         return dataclasses.replace(self, weights=tuple(weights), mixings=tuple(each))
+
+    def mixed(self) -> "Problem":
+        """The same with the identity as mixing where points share no noise: of one structure."""
+        pairs = zip(self.mixings, self.measured, strict=True)
+        return self.weighted(self.weights, [each or unmixed(like.shape) for each, like in pairs])
 
 
 def make_problem(

@@ -9,10 +9,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from jaxquad._core import (
-    CONVERGED,
-    DAMPING,
-    minimise,
-    minimise_on_host,
     Normal,
     normal_equations,
     RUNNING,
@@ -98,6 +94,9 @@ def _entry(name: str) -> Entry:
     return Entry(field, row, column)
 
 
+_SHORT = 3e4  # residuals times parameters squared: a few ms for a whole descent
+
+
 class Sensitivity(NamedTuple):
     """Misfits and their derivatives with respect to free and then fixed parameters."""
 
@@ -147,9 +146,11 @@ def solve(
     max_steps: int,
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
-    if solver is None and not _is_plain(problem):
-        return _solve_on_host(problem, z0, max_steps)
-    stop = _descend(problem, jax.device_put(z0), solver, max_steps)
+    if sum(each.size for each in problem.weights) * z0.size**2 < _SHORT:
+        problem, descend = problem.mixed(), _descend_short
+    else:
+        descend = _descend_long
+    stop = descend(problem, jax.device_put(z0), solver, max_steps)
     steps = int(stop.steps)
     message = "" if stop.converged else f"{_reason(stop.reason)} (after {steps} steps)"
     return solution_at(problem, np.asarray(stop.z), message, steps)
@@ -164,13 +165,7 @@ def solution_at(
     problem: Problem, z: Float[np.ndarray, " parameters"], message: str = "", steps: int = 0
 ) -> Solution:
     """The model and all derivatives at `z`; the `message` says why it is no minimum."""
-    return _solution(problem, np.asarray(z), evaluate(problem, np.asarray(z)), message, steps)
-
-
-def _solution(
-    problem: Problem, z: Float[np.ndarray, " n"], found: Evaluation, message: str, steps: int
-) -> Solution:
-    parameters = problem.parameters
+    found, parameters = evaluate(problem, np.asarray(z)), problem.parameters
     z_all = np.array(parameters.start)
     z_all[: z.size] = z
     values, slopes = np.asarray(parameters.values(z_all)), np.asarray(parameters.slopes(z_all))
@@ -191,55 +186,20 @@ def _sensitivity(problem: Problem, found: Evaluation) -> Sensitivity:
     return Sensitivity(misfits, slopes, found.misfits[start:], found.slopes[:, start:].T)
 
 
-class _Point(NamedTuple):
-    """Where a descent on the host stands."""
-
-    problem: Problem
-    z: Float[np.ndarray, " parameters"]
-    found: Evaluation
-    cost: float
-    rows: Float[np.ndarray, "parameters residuals"]  # weighted
-    gradient: Float[np.ndarray, " parameters"]
-
-    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.gradient, self.rows @ self.rows.T
-
-    def moved(self, change: Float[np.ndarray, " parameters"]) -> "_Point":
-        return _point(self.problem, self.z + change)
-
-
-def _point(problem: Problem, z: Float[np.ndarray, " n"]) -> _Point:
-    found = evaluate(problem, z)
-    with np.errstate(invalid="ignore", over="ignore"):  # a model that is not finite there
-        r = as_residuals(problem, found.misfits)
-        rows = as_residuals(problem, found.slopes[: z.size])
-        gradient, cost = rows @ r, float(0.5 * (r @ r))
-    finite = np.isfinite(cost) and np.all(np.isfinite(gradient))
-    return _Point(problem, z, found, cost if finite else np.inf, rows, gradient)
-
-
-def _solve_on_host(
-    problem: Problem, z0: Float[np.ndarray, " parameters"], max_steps: int
-) -> Solution:
-    start = _point(problem, np.asarray(z0))
-    stop, status, steps = minimise_on_host(
-        start, _Point.moved, max_steps, tolerance=TOLERANCE, saving=TOLERANCE**2, damping=DAMPING
-    )
-    message = "" if status == CONVERGED else stopped_early(status, steps)
-    return _solution(problem, stop.z, stop.found, message, steps)
-
-
-@eqx.filter_jit
 def _descend(
     problem: Problem,
     z0: Float[Array, " parameters"],
     solver: eqx.Module | None,
     max_steps: int,
 ) -> Stop:
-    if solver is not None:
-        return least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
-    state = minimise(lambda z: problem_normal(z, problem), z0, max_steps)
-    return Stop(state.z, state.status == CONVERGED, state.status, state.steps)
+    return least_squares(
+        residuals, z0, problem, solver=solver, max_steps=max_steps, normal=problem_normal
+    )
+
+
+# A short descent takes less time than LLVM's optimisation of its program would.
+_descend_long = eqx.filter_jit(_descend)
+_descend_short = eqx.filter_jit(_descend, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def least_squares(
