@@ -1,5 +1,6 @@
 """Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
 
+from . import autopilots as autopilots
 from ._adaptive_ladrc import AdaptiveLADRC as AdaptiveLADRC
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
 from ._observers import (

@@ -1,0 +1,313 @@
+"""The filters of flight controllers' firmware, as each builds them, and chains of them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Complex, Float
+
+from jaxquad._core import as_float, broadcast_gain, is_concrete, per_member, require_positive
+
+
+class Section(NamedTuple):
+    """y[n] = b0 u[n] + b1 u[n-1] + b2 u[n-2] - a1 y[n-1] - a2 y[n-2]."""
+
+    b0: Float[Array, "..."]
+    b1: Float[Array, "..."]
+    b2: Float[Array, "..."]
+    a1: Float[Array, "..."]
+    a2: Float[Array, "..."]
+
+
+Frequencies = Float[Array | np.ndarray, " frequencies"] | Sequence[float]  # Hz
+Memory = tuple[tuple[Array, Array], ...]  # of each section, in its transposed form
+
+
+@runtime_checkable
+class Filter(Protocol):
+    """A filter that runs at a fixed rate: `PT1`, `Butterworth`, `Notch`, or your own."""
+
+    def sections(self, rate_hz: float) -> tuple[Section, ...]:
+        """Its difference equations at so many samples a second, one after the other."""
+        ...
+
+    def in_words(self) -> str:
+        """Kind and cutoff, for tables."""
+        ...
+
+
+_PT2, _PT3 = 1.553773974, 1.961459177  # cutoff of each pole over that of the whole, at -3 dB
+
+
+def first_order(cutoff_hz: Float[Array, "..."], rate_hz: float) -> Section:
+    """x += k (u - x) with k = w/(w + 1), w = 2 pi cutoff/rate; PX4's and ArduPilot's alpha is k."""
+    w = 2 * np.pi * cutoff_hz / rate_hz
+    k = w / (w + 1)
+    return Section(k, jnp.zeros_like(k), jnp.zeros_like(k), k - 1, jnp.zeros_like(k))
+
+
+class PT1(eqx.Module):
+    """A first-order low-pass by backward differences: Betaflight's pt1, PX4's AlphaFilter.
+
+    ArduPilot's FLTT, FLTE and FLTD are the same. A cutoff of 0 lets everything pass.
+
+    **Arguments:**
+
+    - `cutoff_hz`: one value, one per axis, or `[axes, *ensemble]`; 0 is off.
+    """
+
+    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+
+    def sections(self, rate_hz: float) -> tuple[Section, ...]:
+        on = self.cutoff_hz > 0
+        section = first_order(jnp.where(on, self.cutoff_hz, 1.0), rate_hz)
+        b0 = jnp.where(on, section.b0, 1.0)
+        return (section._replace(b0=b0, a1=b0 - 1),)
+
+    def in_words(self) -> str:
+        return f"pt1 {_listed(self.cutoff_hz)} Hz"
+
+
+class PT2(eqx.Module):
+    """Two equal first-order low-passes, together -3 dB at `cutoff_hz`: Betaflight's pt2."""
+
+    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+
+    def __check_init__(self):
+        require_positive("cutoff_hz", self.cutoff_hz, "leave the filter out to switch it off")
+
+    def sections(self, rate_hz: float) -> tuple[Section, ...]:
+        return (first_order(_PT2 * self.cutoff_hz, rate_hz),) * 2
+
+    def in_words(self) -> str:
+        return f"pt2 {_listed(self.cutoff_hz)} Hz"
+
+
+class PT3(eqx.Module):
+    """Three equal first-order low-passes, together -3 dB at `cutoff_hz`: Betaflight's pt3."""
+
+    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+
+    def __check_init__(self):
+        require_positive("cutoff_hz", self.cutoff_hz, "leave the filter out to switch it off")
+
+    def sections(self, rate_hz: float) -> tuple[Section, ...]:
+        return (first_order(_PT3 * self.cutoff_hz, rate_hz),) * 3
+
+    def in_words(self) -> str:
+        return f"pt3 {_listed(self.cutoff_hz)} Hz"
+
+
+class Butterworth(eqx.Module):
+    """The second-order Butterworth low-pass by the bilinear transform, exact at its cutoff.
+
+    It is PX4's, ArduPilot's and the Crazyflie's LowPassFilter2p, and Betaflight's biquad (quality
+    1/sqrt(2)) and state-variable low-pass.
+    """
+
+    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+
+    def __check_init__(self):
+        require_positive("cutoff_hz", self.cutoff_hz, "leave the filter out to switch it off")
+
+    def sections(self, rate_hz: float) -> tuple[Section, ...]:
+        _require_below_nyquist("cutoff_hz", self.cutoff_hz, rate_hz)
+        w = jnp.tan(np.pi * self.cutoff_hz / rate_hz)
+        c = 1 + np.sqrt(2.0) * w + w**2
+        b0 = w**2 / c
+        return (Section(b0, 2 * b0, b0, 2 * (w**2 - 1) / c, (1 - np.sqrt(2.0) * w + w**2) / c),)
+
+    def in_words(self) -> str:
+        return f"Butterworth 2 {_listed(self.cutoff_hz)} Hz"
+
+
+class Notch(eqx.Module):
+    """A notch by the bilinear transform: Betaflight's notches, and ArduPilot's.
+
+    **Arguments:** (each one value, one per axis, or `[axes, *ensemble]`)
+
+    - `centre_hz`: where it attenuates most.
+    - `quality`: the centre over the width between its -3 dB points; see `betaflight_quality`
+        and `ardupilot_notch`.
+    - `residual`: the gain that is left at the centre; Betaflight's RPM notches have 1 - weight.
+    """
+
+    centre_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    quality: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    residual: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+
+    def __check_init__(self):
+        require_positive("centre_hz", self.centre_hz, "leave the notch out to switch it off")
+        require_positive("quality", self.quality, "give the centre over the width")
+
+    def sections(self, rate_hz: float) -> tuple[Section, ...]:
+        _require_below_nyquist("centre_hz", self.centre_hz, rate_hz)
+        w = 2 * np.pi * self.centre_hz / rate_hz
+        return (_notch(jnp.cos(w), jnp.sin(w) / (2 * self.quality), self.residual),)
+
+    def in_words(self) -> str:
+        return f"notch {_listed(self.centre_hz)} Hz, Q {_listed(self.quality)}"
+
+
+class BandwidthNotch(eqx.Module):
+    """PX4's notch: about -3 dB at half of `bandwidth_hz` on both sides of `centre_hz`."""
+
+    centre_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    bandwidth_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+
+    def __check_init__(self):
+        require_positive("centre_hz", self.centre_hz, "leave the notch out to switch it off")
+        require_positive("bandwidth_hz", self.bandwidth_hz, "give the width at -3 dB")
+
+    def sections(self, rate_hz: float) -> tuple[Section, ...]:
+        _require_below_nyquist("centre_hz", self.centre_hz, rate_hz)
+        width = jnp.tan(np.pi * self.bandwidth_hz / rate_hz)
+        cosine = jnp.cos(2 * np.pi * self.centre_hz / rate_hz)
+        return (_notch(cosine, width, jnp.zeros_like(width)),)
+
+    def in_words(self) -> str:
+        return f"notch {_listed(self.centre_hz)} Hz, {_listed(self.bandwidth_hz)} Hz wide"
+
+
+def _notch(cosine: Array, width: Array, residual: Array) -> Section:
+    over, middle = 1 + width, -2 * cosine / (1 + width)
+    b0, b2 = (1 + width * residual) / over, (1 - width * residual) / over
+    return Section(b0, middle, b2, middle, (1 - width) / over)
+
+
+def betaflight_quality(centre_hz: ArrayLike, lower_hz: ArrayLike) -> Float[Array, "..."]:
+    """The quality of a Betaflight notch with this centre and lower cutoff, in Hz."""
+    centre, lower = as_float(centre_hz), as_float(lower_hz)
+    return centre * lower / (centre**2 - lower**2)
+
+
+def ardupilot_notch(centre_hz: ArrayLike, bandwidth_hz: ArrayLike, attenuation_db: float) -> Notch:
+    """ArduPilot's notch (INS_HNTCH_BW, INS_HNTCH_ATT): `attenuation_db` deep at its centre."""
+    centre, width = as_float(centre_hz), as_float(bandwidth_hz)
+    octaves = 2 * jnp.log2(centre / (centre - width / 2))
+    quality = jnp.sqrt(2.0**octaves) / (2.0**octaves - 1)
+    return Notch(centre, quality, 10 ** (-attenuation_db / 20))
+
+
+class FilterShare(NamedTuple):
+    """What one filter of a chain does, or the whole chain."""
+
+    name: str
+    response: Complex[Array, " frequencies"]
+    delay_ms: Float[Array, " frequencies"]  # phase over angular frequency
+
+
+class FilterChain(eqx.Module):
+    """Filters one after the other, all run at `rate_hz`.
+
+        chain = FilterChain((PT1(500.0), Notch(180.0, 5.0), PT1(350.0)), rate_hz=8000.0)
+        for share in chain.shares([10.0, 50.0]): print(share.name, share.delay_ms)
+
+    **Arguments:**
+
+    - `filters`: see `Filter`; those that are switched off are left out.
+    - `rate_hz`: samples a second.
+
+    **Raises:**
+
+    - `ValueError`: the rate is not above 0, or a filter lies beyond half of it.
+    """
+
+    filters: tuple[Filter, ...] = ()
+    rate_hz: float = eqx.field(static=True, default=1000.0)
+
+    def __check_init__(self):
+        require_positive("rate_hz", self.rate_hz, "give samples per second")
+        self.sections()
+
+    def sections(self) -> tuple[Section, ...]:
+        """The difference equations of all filters."""
+        return tuple(x for each in self.filters for x in each.sections(self.rate_hz))
+
+    def response(self, frequency_hz: Frequencies) -> Complex[Array, " frequencies"]:
+        """The complex response at these frequencies in Hz."""
+        return _response(self.sections(), as_float(frequency_hz), self.rate_hz)
+
+    def delay_ms(self, frequency_hz: Frequencies) -> Float[Array, " frequencies"]:
+        """The phase delay in ms at these frequencies in Hz, which are above 0."""
+        return _delay_ms(self.sections(), as_float(frequency_hz), self.rate_hz)
+
+    def shares(self, frequency_hz: Frequencies) -> tuple[FilterShare, ...]:
+        """Response and delay of each filter alone, and last of the whole chain.
+
+        The responses multiply to that of the whole, and the delays add up to its delay.
+        """
+        at = as_float(frequency_hz)
+        parts = [(each.in_words(), each.sections(self.rate_hz)) for each in self.filters]
+        return tuple(
+            FilterShare(name, _response(x, at, self.rate_hz), _delay_ms(x, at, self.rate_hz))
+            for name, x in [*parts, ("all", self.sections())]
+        )
+
+    def init(self, like: Float[Array, "..."]) -> Memory:
+        """At rest, for signals shaped as `like`."""
+        zero = jnp.zeros_like(like)
+        return ((zero, zero),) * len(self.sections())
+
+    def step(self, memory: Memory, sample: Float[Array, "..."]) -> tuple[Memory, Array]:
+        """The filtered `sample`."""
+        return run_sections(self.sections(), memory, sample)
+
+
+def run_sections(
+    sections: Sequence[Section], memory: Memory, sample: Array
+) -> tuple[Memory, Array]:
+    """One sample through all sections."""
+    after = []
+    for section, (first, second) in zip(sections, memory, strict=True):
+        b0, b1, b2, a1, a2 = (broadcast_gain(x, sample) for x in section)
+        passed = b0 * sample + first
+        after.append((b1 * sample - a1 * passed + second, b2 * sample - a2 * passed))
+        sample = passed
+    return tuple(after), sample
+
+
+@eqx.filter_jit
+def _response(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
+    result = jax.lax.complex(jnp.ones_like(frequency_hz), jnp.zeros_like(frequency_hz))
+    for section in sections:
+        result = result * _section_response(section, frequency_hz, rate_hz)
+    return result
+
+
+@eqx.filter_jit
+def _delay_ms(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
+    """Section by section: the phase of each stays within half a turn, that of a chain does not."""
+    phase = jnp.zeros_like(frequency_hz)
+    for section in sections:
+        phase = phase + jnp.angle(_section_response(section, frequency_hz, rate_hz))
+    return -1e3 * phase / (2 * np.pi * frequency_hz)
+
+
+def _section_response(section: Section, frequency_hz: Array, rate_hz: float) -> Array:
+    if any(x.size > 1 for x in section):
+        raise ValueError(
+            "the filter has one cutoff per axis or member: take one axis before asking for its "
+            "response."
+        )
+    turn = 2 * np.pi * frequency_hz / rate_hz
+    back = jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))  # 1/z
+    b0, b1, b2, a1, a2 = (x.reshape(()).astype(back.dtype) for x in section)
+    return (b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2))
+
+
+def _require_below_nyquist(name: str, value: Array, rate_hz: float) -> None:
+    if is_concrete(value) and not np.all(np.asarray(value) < rate_hz / 2):
+        raise ValueError(
+            f"{name} is {_listed(value)} Hz, but at {rate_hz:g} Hz it must be below "
+            f"{rate_hz / 2:g} Hz: lower it, or leave the filter out as the firmware does."
+        )
+
+
+def _listed(value: Array) -> str:
+    if not is_concrete(value):
+        return "?"
+    return ", ".join(f"{x:g}" for x in np.unique(np.asarray(value)))

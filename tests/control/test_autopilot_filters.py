@@ -1,0 +1,144 @@
+"""The filters of the firmwares against scipy.signal, and chains of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import signal
+
+from jaxquad.control.autopilots import (
+    ardupilot_notch,
+    BandwidthNotch,
+    betaflight_quality,
+    Butterworth,
+    FilterChain,
+    Notch,
+    PT1,
+    PT2,
+    PT3,
+)
+
+
+RATE = 4000.0
+CUTOFF = 93.0
+NOISE = np.random.default_rng(1).standard_normal(200)
+
+
+def prewarped(centre, quality, residual=0.0):
+    """scipy's bilinear transform of the analogue notch that is right at its centre."""
+    w = 2 * RATE * np.tan(np.pi * centre / RATE)
+    below = [1, w / quality, w**2]
+    return signal.bilinear([1, residual * w / quality, w**2], below, RATE)
+
+
+def first_order(cutoff):
+    numerator, denominator, _ = signal.cont2discrete(
+        ([1.0], [1 / (2 * np.pi * cutoff), 1.0]), 1 / RATE, method="backward_diff"
+    )
+    return np.ravel(numerator), np.ravel(denominator)
+
+
+def repeated(pair, times):
+    return [np.poly1d(x) ** times for x in map(np.poly1d, pair)]
+
+
+OCTAVES = 2 * np.log2(180 / (180 - 20))
+DEPTH = ardupilot_notch(180.0, 40.0, 30.0)
+CASES = {
+    "pt1": (PT1(CUTOFF), first_order(CUTOFF)),
+    "pt2": (PT2(CUTOFF), repeated(first_order(CUTOFF / np.sqrt(np.sqrt(2) - 1)), 2)),
+    "pt3": (PT3(CUTOFF), repeated(first_order(CUTOFF / np.sqrt(np.cbrt(2) - 1)), 3)),
+    "Butterworth": (Butterworth(CUTOFF), signal.butter(2, CUTOFF, fs=RATE)),
+    "notch of Betaflight": (
+        Notch(300.0, betaflight_quality(300.0, 200.0)),
+        prewarped(300.0, 300 * 200 / (300**2 - 200**2)),
+    ),
+    "notch of PX4": (BandwidthNotch(180.0, 20.0), signal.iirnotch(180.0, 9.0, fs=RATE)),
+    "notch of ArduPilot": (
+        DEPTH,
+        prewarped(180.0, np.sqrt(2**OCTAVES) / (2**OCTAVES - 1), 10 ** (-30 / 20)),
+    ),
+}
+
+
+def run(chain, samples):
+    step = lambda memory, sample: chain.step(memory, sample)
+    run = jax.jit(lambda: jax.lax.scan(step, chain.init(jnp.zeros(())), samples)[1])
+    return np.asarray(run())
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_every_filter_is_scipys(kind):
+    filter, (numerator, denominator) = CASES[kind]
+    expected = signal.lfilter(np.asarray(numerator), np.asarray(denominator), NOISE)
+    rough = 1e-8 if kind in ("pt2", "pt3") else 1e-12  # their factors have nine digits
+    found = run(FilterChain((filter,), RATE), jnp.asarray(NOISE))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=rough)
+
+
+@pytest.mark.parametrize(
+    ("kind", "order", "factor"), [(PT2, 2, 1.553773974), (PT3, 3, 1.961459177)]
+)
+def test_pt2_and_pt3_are_chains_of_equal_first_order_filters(kind, order, factor):
+    numerator, denominator = repeated(first_order(CUTOFF * factor), order)
+    expected = signal.lfilter(np.asarray(numerator), np.asarray(denominator), NOISE)
+    found = run(FilterChain((kind(CUTOFF),), RATE), jnp.asarray(NOISE))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+CHAIN = FilterChain(tuple(filter for filter, _ in CASES.values()), RATE)
+FREQUENCIES = np.array([1.0, 40.0, 250.0, 900.0])
+
+
+def test_shares_multiply_and_add_up_to_the_chain():
+    *parts, whole = CHAIN.shares(FREQUENCIES)
+    product = np.prod([x.response for x in parts], axis=0)
+    np.testing.assert_allclose(product, whole.response, rtol=1e-12)
+    np.testing.assert_allclose(sum(x.delay_ms for x in parts), whole.delay_ms, rtol=1e-12)
+    expected = np.prod(
+        [
+            signal.freqz(*map(np.asarray, pair), worN=FREQUENCIES, fs=RATE)[1]
+            for _, pair in CASES.values()
+        ],
+        axis=0,
+    )
+    np.testing.assert_allclose(whole.response, expected, rtol=1e-7)  # digits of pt2 and pt3
+
+
+def test_the_delay_of_slow_signals_is_the_group_delay():
+    numerator, denominator = signal.butter(2, 40.0, fs=RATE)
+    expected = signal.group_delay((numerator, denominator), w=[0.01], fs=RATE)[1] / RATE * 1e3
+    found = FilterChain((Butterworth(40.0),), RATE).delay_ms([0.01])
+    assert found[0] == pytest.approx(expected[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(("cutoff", "delay"), [(40.0, 5.7), (20.0, 11.9)])
+def test_the_default_gyro_filters_of_px4_and_ardupilot_delay_by_6_and_12_ms(cutoff, delay):
+    around = np.array([4.99, 5.01])  # Hz: the group delay is the slope of the phase in turns
+    turns = around * FilterChain((Butterworth(cutoff),), 1000.0).delay_ms(around)
+    assert round(float(turns[1] - turns[0]) / 0.02, 1) == delay
+
+
+def test_a_cutoff_of_zero_lets_everything_pass():
+    np.testing.assert_array_equal(run(FilterChain((PT1(0.0),), RATE), jnp.asarray(NOISE)), NOISE)
+
+
+def test_the_response_is_differentiable_by_cutoff_and_quality():
+    def gain(x):
+        chain = FilterChain((Butterworth(x[0]), Notch(x[1], x[2]), PT3(x[0]), PT1(x[1])), RATE)
+        return jnp.abs(chain.response(np.array([150.0])))[0] + chain.delay_ms([30.0])[0]
+
+    at = np.array([120.0, 200.0, 3.0])
+    gain = jax.jit(gain)
+    slopes = jax.jacfwd(gain)(jnp.asarray(at))
+    steps = 1e-5 * at
+    differences = [
+        (gain(jnp.asarray(at + h)) - gain(jnp.asarray(at - h))) / (2 * h.sum())
+        for h in np.diag(steps)
+    ]
+    np.testing.assert_allclose(slopes, differences, rtol=1e-6)
+
+
+def test_a_filter_beyond_half_the_rate_is_refused():
+    with pytest.raises(ValueError, match="below 200 Hz"):
+        FilterChain((Butterworth(250.0),), 400.0)
