@@ -1,4 +1,5 @@
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -15,8 +16,14 @@ from jaxquad._core import (
 )
 
 from ._modes import transmission_zeros
+from ._pade import check_order, Explicit, require_package, without_delays
 from ._protocols import as_frequencies, Frequencies
 from ._response import Matrices, response
+
+
+if TYPE_CHECKING:
+    import control
+    import scipy.signal
 
 
 class StateSpace(eqx.Module):
@@ -83,6 +90,34 @@ class StateSpace(eqx.Module):
             output_delay=pick(self.output_delay, rows),
         )
 
+    def to_control(self, *, pade: int | None = None) -> "control.StateSpace":
+        """The same model for python-control (extra `interop`): x' = A x + B u, y = C x + D u.
+
+        **Arguments:**
+
+        - `pade`: the order of the Pade approximations of the delays, 1 to 10; needed where there
+            are delays. Each adds as many states.
+
+        **Raises:**
+
+        - `ValueError`: there is a delay, but no order.
+        - `ImportError`: python-control is not installed.
+        """
+        return require_package("control").StateSpace(*_rational(self, pade))
+
+    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.StateSpace":
+        """The same model for scipy.signal, whose `lsim`, `step` and `bode` take it.
+
+        **Arguments:**
+
+        - `pade`: as in `to_control`.
+
+        **Raises:**
+
+        - `ValueError`: there is a delay, but no order.
+        """
+        return require_package("scipy.signal").StateSpace(*_rational(self, pade))
+
     @property
     def poles(self) -> np.ndarray:
         """Eigenvalues of M^-1 F, rad/s; on the host, so not under jit."""
@@ -140,6 +175,16 @@ def matrices_of(model: StateSpace) -> Matrices:
 
 def _host(model: StateSpace) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(part) for part in explicit(model))
+
+
+def _rational(model: StateSpace, pade: int | None) -> Explicit:
+    """The model on the host, its delays approximated."""
+    plain = Explicit(*(np.asarray(part, float) for part in _host(model)))
+    outputs, inputs = plain.D.shape
+    late = lambda delay, n: np.zeros(n) if delay is None else np.asarray(delay, float)
+    by_input, by_output = late(model.input_delay, inputs), late(model.output_delay, outputs)
+    check_order(np.concatenate([by_input, by_output]), pade)
+    return plain if pade is None else without_delays(plain, by_input, by_output, pade)
 
 
 def _arrays(model: StateSpace) -> dict[str, Array]:

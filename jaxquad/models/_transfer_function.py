@@ -1,6 +1,8 @@
 """Models of one input and one output in s."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -17,7 +19,45 @@ from jaxquad._core import (
     require_positive,
 )
 
+from ._pade import check_order, pade_coefficients, require_package
 from ._protocols import as_frequencies, Frequencies
+
+
+if TYPE_CHECKING:
+    import control
+    import scipy.signal
+
+
+@runtime_checkable
+class HasCoefficients(Protocol):
+    """A transfer function of python-control (outputs per inputs) or of scipy.signal (one pair)."""
+
+    num: Sequence | np.ndarray
+    den: Sequence | np.ndarray
+    dt: float | int | bool | None  # s; None or 0 where it is continuous
+
+
+def coefficients_of(
+    system: HasCoefficients,
+) -> tuple[list[list[np.ndarray]], list[list[np.ndarray]]]:
+    """Numerators and denominators, outputs per inputs, without leading zeros."""
+    return _rows(system.num), _rows(system.den)
+
+
+def _rows(given: Sequence | np.ndarray) -> list[list[np.ndarray]]:
+    # scipy.signal has one array, a row for each output; python-control rows of arrays.
+    rows = [[row] for row in np.atleast_2d(given)] if isinstance(given, np.ndarray) else given
+    trim = lambda x: np.trim_zeros(np.atleast_1d(np.asarray(x, float)), "f")
+    return [[trim(x) if np.any(x) else np.zeros(1) for x in row] for row in rows]
+
+
+def require_continuous(dt: float | int | bool | None) -> None:
+    """Raise ValueError for a sampled system."""
+    if dt:
+        raise ValueError(
+            f"The system is sampled (dt = {dt}), and models here are continuous: convert the one "
+            "that it was sampled from, or fit one to its response with jq.fit_transfer_function."
+        )
 
 
 def _on_host_if_known(*numbers: Array | np.ndarray) -> tuple[Array | np.ndarray, ...]:
@@ -44,22 +84,35 @@ class TransferFunction(eqx.Module):
         ```python
         # 10 e^(-0.02 s) / (s (s + 4))
         model = jq.TransferFunction([10.0], [1.0, 4.0, 0.0], delay=0.02)
+        same = jq.TransferFunction(control.tf([10.0], [1.0, 4.0, 0.0]), delay=0.02)
         ```
 
     **Arguments:**
 
-    - `numerator`, `denominator`: coefficients, the highest power of s first.
+    - `numerator`, `denominator`: coefficients, the highest power of s first. Or, as the only one of
+        the two, a continuous transfer function of python-control or scipy.signal with one input and
+        one output.
     - `delay`: in s.
 
     **Raises:**
 
-    - `ValueError`: the numerator has the higher degree, the denominator starts with 0, or the delay
-        is negative.
+    - `ValueError`: the numerator has the higher degree, the denominator starts with 0, the delay is
+        negative, or the system that is given is sampled or has several inputs or outputs.
     """
 
     numerator: Float[Array, " zeros"] = eqx.field(converter=as_float)
     denominator: Float[Array, " poles"] = eqx.field(converter=as_float)
     delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # s
+
+    def __init__(
+        self,
+        numerator: ArrayLike | Sequence | HasCoefficients,
+        denominator: ArrayLike | Sequence | None = None,
+        delay: ArrayLike = 0.0,
+    ):
+        if denominator is None:
+            numerator, denominator = _one_pair(numerator)
+        self.numerator, self.denominator, self.delay = numerator, denominator, delay
 
     def __check_init__(self):
         above, below = self.numerator.size, self.denominator.size
@@ -95,6 +148,34 @@ class TransferFunction(eqx.Module):
             self.delay + other.delay,
         )
 
+    def to_control(self, *, pade: int | None = None) -> "control.TransferFunction":
+        """The same model for python-control (extra `interop`).
+
+        **Arguments:**
+
+        - `pade`: the order of the Pade approximation of the delay, 1 to 10; needed where there is
+            a delay.
+
+        **Raises:**
+
+        - `ValueError`: there is a delay, but no order.
+        - `ImportError`: python-control is not installed.
+        """
+        return require_package("control").TransferFunction(*_rational(self, pade))
+
+    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.TransferFunction":
+        """The same model for scipy.signal, whose `lsim`, `step` and `bode` take it.
+
+        **Arguments:**
+
+        - `pade`: as in `to_control`.
+
+        **Raises:**
+
+        - `ValueError`: there is a delay, but no order.
+        """
+        return require_package("scipy.signal").TransferFunction(*_rational(self, pade))
+
     @property
     def poles(self) -> np.ndarray:
         """Roots of the denominator, rad/s; on the host, so not under jit."""
@@ -104,6 +185,37 @@ class TransferFunction(eqx.Module):
     def zeros(self) -> np.ndarray:
         """Roots of the numerator, rad/s; on the host, so not under jit."""
         return np.roots(np.asarray(self.numerator))
+
+
+def _one_pair(
+    system: ArrayLike | Sequence | HasCoefficients,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of a system that stands in the place of a numerator."""
+    if not isinstance(system, HasCoefficients):
+        raise ValueError(
+            "TransferFunction has a numerator and no denominator: give both, or a transfer "
+            "function of python-control or scipy.signal."
+        )
+    require_continuous(system.dt)
+    above, below = coefficients_of(system)
+    if len(above) * len(above[0]) != 1:
+        raise ValueError(
+            f"The system has {len(above)} outputs and {len(above[0])} inputs: pick one pair, "
+            "system[0, 0], or convert all with jq.models.from_control."
+        )
+    return above[0][0], below[0][0]
+
+
+def _rational(model: TransferFunction, pade: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator with the delay approximated."""
+    above, below, delay = (
+        np.asarray(x, float) for x in (model.numerator, model.denominator, model.delay)
+    )
+    check_order(delay, pade)
+    if pade is None or not delay:
+        return above, below
+    over, under = pade_coefficients(float(delay), pade)
+    return np.convolve(above, over), np.convolve(below, under)
 
 
 class LaggedIntegrator(eqx.Module):
@@ -140,6 +252,14 @@ class LaggedIntegrator(eqx.Module):
         s = imaginary(omega)
         gain, lag, delay = (x.astype(s.dtype) for x in (self.gain, self.lag, self.delay))
         return (gain * jnp.exp(-delay * s) / ((lag * s + 1) * s**self.integrators))[:, None, None]
+
+    def to_control(self, *, pade: int | None = None) -> "control.TransferFunction":
+        """`transfer_function().to_control(pade=)`: the same model for python-control."""
+        return self.transfer_function().to_control(pade=pade)
+
+    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.TransferFunction":
+        """`transfer_function().to_scipy(pade=)`: the same model for scipy.signal."""
+        return self.transfer_function().to_scipy(pade=pade)
 
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials; a known lag of 0 is left out."""
@@ -196,6 +316,14 @@ class AttitudeAxis(eqx.Module):
         )
         rigid = s * (inertia * s + damping)
         return (lever * jnp.exp(-delay * s) / (rigid * (lag * s + 1)))[:, None, None]
+
+    def to_control(self, *, pade: int | None = None) -> "control.TransferFunction":
+        """`transfer_function().to_control(pade=)`: the same model for python-control."""
+        return self.transfer_function().to_control(pade=pade)
+
+    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.TransferFunction":
+        """`transfer_function().to_scipy(pade=)`: the same model for scipy.signal."""
+        return self.transfer_function().to_scipy(pade=pade)
 
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials.
