@@ -28,7 +28,7 @@ from ._fit_remarks import DOUBT
 from ._make_fit import unfitted
 from ._mixing import Mixing, mixings_of
 from ._origin import Options, Origin
-from ._parameters import Free, name_places, Parameters, select_parameters, Tie
+from ._parameters import find_place, Free, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem
 from ._result import Fit
 from ._solve import Solution
@@ -336,12 +336,9 @@ def _check_priors_against(model: PyTree, priors: Sequence[Prior], cost: Cost) ->
             "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave cost= "
             "at its default, jq.identify.MaximumLikelihood()"
         )
-    known = [place.name for place in name_places(model)] if priors else []
     for prior in priors:
-        if isinstance(prior.quantity, str) and prior.quantity not in known:
-            raise ValueError(
-                f"no parameter {prior.quantity!r} for a prior; the model has: {', '.join(known)}"
-            )
+        if isinstance(prior.quantity, str):
+            find_place(model, prior.quantity, "for a prior")
 
 
 def _check_finite(solution: Solution) -> None:

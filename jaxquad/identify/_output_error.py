@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxquad._core import require_x64
+from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
 from ._fit import check_priors
@@ -16,7 +17,7 @@ from ._noise_model import ARMA, AutoRegressive, Noise
 from ._output_error_noise import descend_with_noise
 from ._output_error_problem import descend_by_turns, evaluate_misfits, OutputError, RecordTerm
 from ._output_error_result import assess_output_error
-from ._parameters import Free, name_places, Parameters, Positive, Real, select_parameters, Tie
+from ._parameters import find_place, Free, Parameters, Positive, Real, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of
 from ._result import Fit
 from ._simulated import (
@@ -103,6 +104,7 @@ def refine(
     near = isinstance(model, Fit)
     if isinstance(model, Fit):
         model, free, tied = _continued(model, free, tied)
+    model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
     base = _base(model, parameters, priors)
     terms = tuple(_term(model, one, hold, band, loop) for one in records)
@@ -159,12 +161,9 @@ def _continued(
 
 
 def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Problem:
-    known = [place.name for place in name_places(model)]
     for prior in priors:
-        if isinstance(prior.quantity, str) and prior.quantity not in known:
-            raise ValueError(
-                f"no parameter {prior.quantity!r} for a prior; the model has: {', '.join(known)}"
-            )
+        if isinstance(prior.quantity, str):
+            find_place(model, prior.quantity, "for a prior")
     numbers = [[prior.value, prior.standard_error] for prior in priors]
     return Problem(
         model=model,

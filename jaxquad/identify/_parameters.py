@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import is_concrete, require_float64
+from jaxquad.models import StateSpace
 
 
 class Positive(NamedTuple):
@@ -36,6 +37,7 @@ class Place(NamedTuple):
     name: str
     leaf: int
     index: int
+    path: str  # `F[1][1]`, which is the name too unless the model gives it one
 
 
 Tie = Callable[[PyTree], Float[Array, ""]]
@@ -114,15 +116,43 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
 def name_places(model: PyTree) -> list[Place]:
     """Every floating-point number of a model: `lag`, `numerator[0]`, `axis.inertia[2]`."""
     arrays = eqx.filter(model, eqx.is_inexact_array)
-    places = []
+    places, given = [], _given_names(model)
     for leaf, (path, array) in enumerate(jax.tree_util.tree_flatten_with_path(arrays)[0]):
         name = jax.tree_util.keystr(path, simple=True, separator=".")
         require_float64(f"parameter {name}", array)
         for index in range(array.size):
             place = np.unravel_index(index, array.shape)
-            suffix = "".join(f"[{i}]" for i in place)
-            places.append(Place(name + suffix, leaf, index))
+            entry = name + "".join(f"[{i}]" for i in place)
+            places.append(Place(given.get(entry, entry), leaf, index, entry))
     return places
+
+
+def _given_names(model: PyTree) -> dict[str, str]:
+    """Entry -> name of what the state spaces in a model name: `axis.F[1][1]` -> `axis.Lp`."""
+    is_named = lambda x: isinstance(x, StateSpace)
+    found = {}
+    for path, node in jax.tree_util.tree_flatten_with_path(model, is_leaf=is_named)[0]:
+        if isinstance(node, StateSpace):
+            place = jax.tree_util.keystr(path, simple=True, separator=".")
+            prefix = f"{place}." if place else ""
+            found |= {prefix + entry: prefix + name for name, entry in node.names}
+    return found
+
+
+def find_place(model: PyTree, name: str, purpose: str) -> Place:
+    """The number of that name or path; ValueError where the model has none for the `purpose`."""
+    places = name_places(model)
+    by_name = _by_name(places)
+    if name not in by_name:
+        raise ValueError(
+            f"no parameter {name!r} {purpose}; the model has: {', '.join(p.name for p in places)}"
+        )
+    return by_name[name]
+
+
+def _by_name(places: Sequence[Place]) -> dict[str, Place]:
+    """Each place by its path and by its name."""
+    return {place.path: place for place in places} | {place.name: place for place in places}
 
 
 def select_parameters(
@@ -164,10 +194,11 @@ def select_parameters(
 
 
 def _tied(places: list[Place], tied: Mapping[str, Tie]) -> tuple[tuple[Place, Tie], ...]:
-    by_name = {place.name: place for place in places}
+    by_name = _by_name(places)
     for name, tie in tied.items():
         if name not in by_name:
-            raise ValueError(f"no parameter {name!r} to tie; the model has: {', '.join(by_name)}")
+            known = ", ".join(place.name for place in places)
+            raise ValueError(f"no parameter {name!r} to tie; the model has: {known}")
         if not callable(tie):
             raise ValueError(
                 f"{name} is tied to {tie!r}: give a function of the model, "
@@ -184,7 +215,7 @@ def _expand(model: PyTree, places: list[Place], free: Free) -> list[str | Positi
     items = []
     for item in [free] if isinstance(free, str | Positive | Real) else free:
         name = item if isinstance(item, str) else item.name
-        whole = [place.name for place in places if place.name.startswith(f"{name}[")]
+        whole = [place.name for place in places if place.path.startswith(f"{name}[")]
         items += whole if isinstance(item, str) and whole else [item]
     return items
 
@@ -208,9 +239,11 @@ def _choose(
     item: str | Positive | Real, places: list[Place], values: dict[str, float]
 ) -> tuple[Place, bool, float]:
     name = item if isinstance(item, str) else item.name
-    by_name = {place.name: place for place in places}
+    by_name = _by_name(places)
     if name not in by_name:
-        raise ValueError(f"no parameter {name!r} in the model; it has: {', '.join(by_name)}")
+        known = ", ".join(place.name for place in places)
+        raise ValueError(f"no parameter {name!r} in the model; it has: {known}")
+    name = by_name[name].name
     value = values[name]
     if not np.isfinite(value):
         raise ValueError(f"parameter {name} starts at {value}: give a finite starting value")

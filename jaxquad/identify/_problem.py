@@ -14,7 +14,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._held import Aliases, evaluate_sampled, plan_aliases
 from ._mixing import mix_parts, Mixing, unmixed
-from ._parameters import Numbers, Parameters
+from ._parameters import find_place, Numbers, Parameters
 
 
 Condition = Callable[[PyTree], PyTree]
@@ -299,10 +299,6 @@ class _Named(NamedTuple):
     name: str
 
     def __call__(self, model: PyTree) -> Float[Array, ""]:
-        arrays = eqx.filter(model, eqx.is_inexact_array)
-        for path, array in jax.tree_util.tree_flatten_with_path(arrays)[0]:
-            name = jax.tree_util.keystr(path, simple=True, separator=".")
-            if self.name.split("[")[0] == name:
-                index = tuple(int(part.rstrip("]")) for part in self.name.split("[")[1:])
-                return array[index]
-        raise ValueError(f"a prior names {self.name!r}, which the model does not have")
+        place = find_place(model, self.name, "for a prior")
+        leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+        return leaves[place.leaf].reshape(-1)[place.index]

@@ -53,7 +53,7 @@ def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[No
     """Of one record, magnitude and phase apart: side by side they would have to be copied."""
     parameters, omega = problem.parameters, jnp.asarray(problem.omega[k])
     matrices = matrices_of(parameters.insert(problem.model, z))
-    entries = [_entry(place.name) for place in parameters.places[: z.size]]
+    entries = [_entry(place.path) for place in parameters.places[: z.size]]
     value, slopes = logarithmic_slopes(matrices, omega, entries)
     misfit, scale = _logarithm(value, jnp.asarray(problem.measured[k])), parameters.slopes(z)
     weights = jnp.moveaxis(problem.weights[k], (0, 3), (3, 0))

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from jaxquad._core import as_float
@@ -61,12 +62,19 @@ def evaluate_response(
 
 
 def with_arrays(model: PyTree) -> PyTree:
-    """`model` with each `float` and `int` in it as an array, so that it can be free in a fit.
+    """`model` with every number in it as an array of floats, so that it can be free in a fit.
 
-    What is no number to fit belongs into a field of `eqx.field(static=True)`.
+    Python's `float` and `int`, and arrays of whole numbers. What is no number to fit, such as an
+    index or a count, belongs into a field of `eqx.field(static=True)`.
     """
-    number = lambda x: isinstance(x, int | float) and not isinstance(x, bool)
-    return jax.tree.map(lambda x: as_float(x) if number(x) else x, model)
+    return jax.tree.map(lambda x: as_float(x) if _is_number(x) else x, model)
+
+
+def _is_number(x: object) -> bool:
+    """Whether JAX would not take it for a parameter, although it is a number."""
+    if isinstance(x, np.ndarray | np.generic | jax.Array):
+        return bool(jnp.issubdtype(x.dtype, jnp.integer))
+    return isinstance(x, int | float) and not isinstance(x, bool)
 
 
 def as_frequencies(omega: Frequencies) -> Float[Array, "..."]:

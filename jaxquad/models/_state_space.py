@@ -1,4 +1,4 @@
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -26,12 +26,18 @@ if TYPE_CHECKING:
     import scipy.signal
 
 
+def _as_pairs(
+    names: Mapping[str, str] | Sequence[tuple[str, str]],
+) -> tuple[tuple[str, str], ...]:
+    return tuple(dict(names).items())
+
+
 class StateSpace(eqx.Module):
     """M x' = F x + G u(t - input_delay), y(t + output_delay) = H0 x + H1 x': CIFER's DERIVID form.
 
     x' is the derivative that the delayed input causes, so H1 x' holds accelerations as they are
-    measured. A term that is None is no parameter of a fit. In `free=` the entries are named
-    `F[0][1]`, `input_delay[0]`.
+    measured. A term that is None is no parameter of a fit. In `free=` and in tables the entries are
+    `F[0][1]`, `input_delay[0]`, or what `names` calls them.
     Source: Tischler & Remple, eq. 12.6 to 12.12; Eq. (11) and (29) of the paper.
 
     **Arguments:**
@@ -39,11 +45,12 @@ class StateSpace(eqx.Module):
     - `F`: (states, states); `G`: (states, inputs); `H0`: (outputs, states).
     - `H1`: (outputs, states), or None for none; `M`: (states, states), or None for the unit matrix.
     - `input_delay`: (inputs,) in s; `output_delay`: (outputs,) in s; None for none.
+    - `names`: of entries, as `{"Lp": "F[1][1]", "Lda": "G[1][0]"}`.
 
     **Raises:**
 
-    - `ValueError`: the shapes do not fit together, a value is not finite, a delay is negative, or M
-        is singular.
+    - `ValueError`: the shapes do not fit together, a value is not finite, a delay is negative, M is
+        singular, or a name stands for no entry.
     """
 
     F: Float[Array, "states states"] = eqx.field(converter=as_float)
@@ -57,9 +64,13 @@ class StateSpace(eqx.Module):
     output_delay: Float[Array, " outputs"] | None = eqx.field(
         converter=as_float_or_none, default=None
     )  # s
+    names: tuple[tuple[str, str], ...] = eqx.field(  # (name, entry)
+        converter=_as_pairs, default=(), static=True
+    )
 
     def __check_init__(self):
         _check_shapes(self)
+        _check_names(self)
         for name, value in _arrays(self).items():
             if name.endswith("delay"):
                 require_nonnegative(name, value, "a model cannot answer before its input")
@@ -79,6 +90,7 @@ class StateSpace(eqx.Module):
     def select(self, outputs: Sequence[int], inputs: Sequence[int]) -> "StateSpace":
         """The model of some channels, by position and in the order given."""
         rows, columns = np.array(outputs, int), np.array(inputs, int)
+        moved = [(name, _select_entry(at, outputs, inputs)) for name, at in self.names]
         pick = lambda x, where: None if x is None else x[where]
         return StateSpace(
             F=self.F,
@@ -88,6 +100,7 @@ class StateSpace(eqx.Module):
             M=self.M,
             input_delay=pick(self.input_delay, columns),
             output_delay=pick(self.output_delay, rows),
+            names=[(name, entry) for name, entry in moved if entry],
         )
 
     def to_control(self, *, pade: int | None = None) -> "control.StateSpace":
@@ -221,6 +234,44 @@ def _check_shapes(model: StateSpace) -> None:
                 f"{name} has shape {arrays[name].shape}, but {states} states, {inputs} inputs and "
                 f"{outputs} outputs need {shape}: look at F, G and H0 too."
             )
+
+
+def _check_names(model: StateSpace) -> None:
+    if not model.names:
+        return
+    arrays = _arrays(model)
+    entries = {f"{k}{_index(i)}": k for k, x in arrays.items() for i in np.ndindex(x.shape)}
+    for name, entry in model.names:
+        if entry not in entries:
+            known = ", ".join(f"{k} {x.shape}" for k, x in arrays.items())
+            raise ValueError(
+                f"names gives {name!r} to {entry!r}, which the model does not have: write an entry "
+                f"as 'F[1][1]' or 'input_delay[0]', counted from 0. The model has {known}."
+            )
+        if name.split("[")[0] in arrays or not name:
+            raise ValueError(f"The name {name!r} for {entry} is that of an array: choose another.")
+    named = [entry for _, entry in model.names]
+    twice = sorted({entry for entry in named if named.count(entry) > 1})
+    if twice:
+        raise ValueError(f"names gives {twice[0]} two names: give each entry one.")
+
+
+def _index(place: Sequence[int]) -> str:
+    return "".join(f"[{i}]" for i in place)
+
+
+def _select_entry(entry: str, outputs: Sequence[int], inputs: Sequence[int]) -> str:
+    """Where an entry is after `StateSpace.select`; empty where it is left out."""
+    field, *index = entry.replace("]", "").split("[")
+    place = [int(i) for i in index]
+    axis = {"G": 1, "H0": 0, "H1": 0, "input_delay": 0, "output_delay": 0}.get(field)
+    if axis is None:
+        return entry
+    kept = inputs if field in ("G", "input_delay") else outputs
+    if place[axis] not in kept:
+        return ""
+    place[axis] = list(kept).index(place[axis])
+    return f"{field}{_index(place)}"
 
 
 def _check_mass(M: Array | None) -> None:

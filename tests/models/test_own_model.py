@@ -74,3 +74,11 @@ def test_whole_numbers_become_parameters_and_static_ones_do_not():
 def test_frequencies_may_be_whole_numbers_in_a_list(model):
     found = model.frequency_response([1, 2, 5])
     np.testing.assert_array_equal(found, model.frequency_response(jnp.array([1.0, 2.0, 5.0])))
+
+
+@pytest.mark.parametrize("number", [280, np.int64(280), np.array(280), jnp.asarray(280)])
+def test_no_kind_of_whole_number_is_left_out_of_the_parameters(number):
+    found = with_arrays(Rate(number, 0.05))  # pyright: ignore
+    assert found.gain.dtype == np.float64 and found.gain == 280.0
+    places = jq.identify.name_places(found)
+    assert [place.name for place in places] == ["gain", "lag"]
