@@ -58,7 +58,7 @@ class Page(HTMLParser):
 
     def text(self, *within):
         """All that is shown, or what is shown inside elements of these kinds."""
-        skipped = {"style", "title"} - set(within)
+        skipped = {"style", "title", "script"} - set(within)
         return "".join(
             text
             for path, text in self.texts

@@ -2,6 +2,7 @@ from ._bode import (
     bode as bode,
     COHERENT as COHERENT,
     Model as Model,
+    model_response as model_response,
     residual_figure as residual_figure,
     Residuals as Residuals,
     residuals_of as residuals_of,

@@ -14,7 +14,8 @@ from jaxquad.plot import (
 )
 from jaxquad.records import Record
 
-from ._page import Cell, embed_figure, Image, short_unit, Table
+from ._figure import embed_figure, Image
+from ._page import Cell, short_unit, Table
 
 
 GOOD_TIC = 0.25  # Theil inequality coefficient, below which agreement is good

@@ -12,11 +12,12 @@ from jaxquad.plot import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
+from ._answers import answer_section
 from ._fit import identifiability_section, parameter_section
 from ._page import Headline, render_page
 from ._provenance import Provenance, provenance_section
 from ._record import check_section, GOOD_TIC, record_section
-from ._response import residual_section, response_section
+from ._response import response_section
 
 
 if TYPE_CHECKING:
@@ -41,8 +42,11 @@ def write_report(
 ) -> Path:
     """Write one self-contained HTML page on a fit, whole or not at all.
 
-    The verdict and all remarks come first. Figures are inside the page, there is no script, nothing
-    is fetched from elsewhere, and every text from a log is escaped.
+    The verdict and all remarks come first, then what the log can answer and what to fly next,
+    results, and records at the end. Figures are inside the page; under a pointer they show the
+    numbers of their curves, and they can be enlarged. The script that does this is part of the
+    page, and the page's policy lets no other run. Nothing is fetched from elsewhere, and every text
+    from a log is escaped.
 
     **Arguments:**
 
@@ -82,13 +86,13 @@ def write_report(
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
     sections = {
-        "record": record_section(records) if records else None,
+        "answers": answer_section(fit, first, next(iter(records.values()), None), found),
+        "tuned": gains,
         "response": response_section(frfs, models, others or {}),
-        "residuals": residual_section(frfs, models) if models else None,
         "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
         "identifiability": identifiability_section(fit),
         "verification": check_section(found) if found else None,
-        "tuned": gains,
+        "record": record_section(records) if records else None,
         "provenance": provenance_section(provenance) if provenance is not None else None,
     }
     text = render_page(

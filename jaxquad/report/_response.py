@@ -18,7 +18,7 @@ from jaxquad.plot import (
 )
 from jaxquad.spectra import FrequencyResponse
 
-from ._page import embed_figure, Image
+from ._figure import embed_figure, Image
 
 
 _PAIRS = 6  # responses that are drawn, of all estimates together
@@ -29,31 +29,29 @@ def response_section(
     models: Mapping[str, Model],
     others: Mapping[str, FrequencyResponse],
 ) -> list[dict[str, object]]:
-    """A Bode diagram of every response; `models` by the names of the `frfs`."""
+    """A Bode diagram of every response, beside its residuals; `models` by the names of `frfs`."""
     share = max(1, _PAIRS // len(frfs))
     return [
         {
             "name": name if len(frfs) > 1 else "",
-            "images": [_bode(frf, models.get(name), others, *p) for p in pairs(frf, share)],
+            "images": _images(frf, models.get(name), others, share),
             "left_out": left_out(frf, share),
         }
         for name, frf in frfs.items()
     ]
 
 
-def residual_section(
-    frfs: Mapping[str, FrequencyResponse], models: Mapping[str, Model]
-) -> list[dict[str, object]]:
-    """The residuals of every response."""
-    share = max(1, _PAIRS // len(frfs))
-    return [
-        {
-            "name": name if len(frfs) > 1 else "",
-            "images": [_residuals(frf, models[name], *p) for p in pairs(frf, share)],
-            "left_out": "",
-        }
-        for name, frf in frfs.items()
-    ]
+def _images(
+    frf: FrequencyResponse,
+    model: Model | None,
+    others: Mapping[str, FrequencyResponse],
+    most: int,
+) -> list[Image]:
+    images = []
+    for pair in pairs(frf, most):
+        images.append(_bode(frf, model, others, *pair))
+        images += [] if model is None else [_residuals(frf, model, *pair)]
+    return images
 
 
 def pairs(frf: FrequencyResponse, most: int) -> list[tuple[int, int]]:

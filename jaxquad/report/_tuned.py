@@ -5,8 +5,9 @@ import numpy as np
 from jaxquad.plot import certificate_figure, convergence_figure
 from jaxquad.tuning import Certificate, KNOWN_INERTIA, QUANTITIES, Tuned
 
+from ._figure import embed_figure
 from ._fit import count_starts
-from ._page import Cell, embed_figure, Headline, Table
+from ._page import Cell, Headline, Table
 
 
 _DRAWN = 7  # designs that can be distinguished in a figure

@@ -1,0 +1,364 @@
+"""What a log can answer and what not, in plain words, and the flight that would answer the rest."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxquad.excitation import three_two_one_one
+from jaxquad.identify import as_sampled, Fit, MISFIT, Verification, with_values
+from jaxquad.plot import COHERENT, model_response
+from jaxquad.records import Record
+from jaxquad.spectra import FrequencyResponse
+
+
+Grid = Float[np.ndarray, " frequencies"]
+_LOOSE = 0.2  # half of a 95 % interval over the value: CIFER's Cramer-Rao guideline of 20 %
+_AIM = 0.8  # coherence that a flight is planned for
+_FAINT = 0.2  # coherence below which its estimate says nothing
+_LOUDER = 2.0  # times the amplitude that is advised at most: linear ranges are not known
+_LONGER = 2.0  # times the duration
+_CYCLES = 5  # of the lowest frequency: Tischler & Remple, sec. 5.4
+_SHORTEST = 20.0  # s, of a sweep
+_SEEN = 0.3  # of the largest share, where a parameter shows itself apart from the others
+_SAME = 1e-4  # share of a parameter's effect that no other can make, below which none can be seen
+
+
+class Flight(NamedTuple):
+    """What to fly next, and why."""
+
+    what: str
+    facts: Mapping[str, str]
+    why: Sequence[str]
+
+
+class _Need(NamedTuple):
+    """A band in rad/s to excite, by how many times the accuracy has to grow, and why."""
+
+    low: float
+    high: float
+    factor: float
+    why: str
+
+
+def answer_section(
+    fit: Fit,
+    frf: FrequencyResponse,
+    record: Record | None,
+    checks: Mapping[str, Verification],
+) -> dict[str, object]:
+    """Verdict in plain words, lists of what is answered and what not, and the next flight."""
+    return {
+        "plain": _plain(fit, frf),
+        "can": _can(fit, frf, checks),
+        "cannot": _cannot(fit, frf, record, checks),
+        "flight": next_flight(fit, frf, record, checks),
+    }
+
+
+def in_both(low: float, high: float) -> str:
+    """A band in Hz, with rad/s behind it."""
+    turn = 2 * np.pi
+    return f"{low / turn:.3g} to {high / turn:.3g} Hz ({low:.3g} to {high:.3g} rad/s)"
+
+
+def _plain(fit: Fit, frf: FrequencyResponse) -> str:
+    kind = fit.verdict.kind
+    if kind == "too few points":
+        return "This log excites the vehicle too little: nothing could be fitted to it."
+    if kind == "no model":
+        return (
+            "No model of this structure behaves like the vehicle in this log. Its numbers are not "
+            "to be used."
+        )
+    if kind == "no minimum":
+        return "The fit found no best values, so that its numbers are not to be used."
+    ratio = np.sqrt(fit.chi_squared)
+    if not fit.identifiable:
+        lost = " and ".join(fit.verdict.undetermined)
+        return (
+            f"The model can behave like the vehicle, but this log alone does not say what {lost} "
+            f"{'is' if len(fit.verdict.undetermined) == 1 else 'are one by one'}: other values "
+            "explain it as well."
+        )
+    if fit.chi_squared > MISFIT**2:
+        return (
+            f"The model follows the vehicle only roughly: it misses the measured response by "
+            f"{ratio:.1f} times its random error. The intervals of its parameters count that."
+        )
+    good = _good(frf)
+    band = f" from {in_both(*_ends(frf, good))}" if good.any() else ""
+    return (
+        f"The model behaves like the vehicle{band}, to within the random error of the measurement, "
+        "and the log determines every free parameter."
+    )
+
+
+def _good(frf: FrequencyResponse) -> Bool[np.ndarray, " frequencies"]:
+    return np.all(np.asarray(frf.coherence) >= COHERENT, axis=(1, 2))
+
+
+def _ends(frf: FrequencyResponse, where: Bool[np.ndarray, " frequencies"]) -> tuple[float, float]:
+    omega = np.asarray(frf.omega)[where]
+    return float(omega[0]), float(omega[-1])
+
+
+def _reach(fit: Fit, k: int) -> float:
+    """Half of the 95 % interval over the value."""
+    low, high = fit.interval(fit.names[k])
+    return float((high - low) / 2 / max(abs(float(fit.values[k])), 1e-300))
+
+
+def _loose(fit: Fit) -> list[int]:
+    """Parameters that are not determined, or known to 20 % only."""
+    limits = [bound.name for bound in fit.verdict.bounds]
+    known = [not fit.determined[k] or _reach(fit, k) > _LOOSE for k in range(len(fit.names))]
+    return [k for k, is_loose in enumerate(known) if is_loose and fit.names[k] not in limits]
+
+
+def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -> list[str]:
+    good, answers = _good(frf), []
+    if good.any():
+        error = float(np.median(np.asarray(frf.random_error)[good]))
+        answers.append(
+            f"How {', '.join(frf.output_names)} answers to {', '.join(frf.input_names)} from "
+            f"{in_both(*_ends(frf, good))}: to {100 * error:.2g} % of magnitude and "
+            f"{np.degrees(error):.2g} deg of phase (median standard error)."
+        )
+    if fit.verdict.fitted:
+        answers += [
+            f"{name}: {fit.values[k]:.4g} \u00b1 {100 * _reach(fit, k):.2g} % (95 %)."
+            for k, name in enumerate(fit.names)
+            if fit.determined[k] and _reach(fit, k) <= _LOOSE
+        ]
+        answers += [f"{each.name}: {each.value:.4g}." for each in fit.combinations]
+    answers += [
+        f"What happens in {name}: predicted, TIC {c.tic:.3f}." for name, c in checks.items()
+    ]
+    return answers or ["Nothing about this vehicle."]
+
+
+def _cannot(
+    fit: Fit,
+    frf: FrequencyResponse,
+    record: Record | None,
+    checks: Mapping[str, Verification],
+) -> list[str]:
+    omega, lacks = np.asarray(frf.omega), []
+    for k in _loose(fit) if fit.verdict.fitted else []:
+        name = fit.names[k]
+        known = f"only to \u00b1 {100 * _reach(fit, k):.2g} % (95 %)"
+        lacks.append(f"{name}: {known if fit.determined[k] else 'not by itself'}.")
+    lacks += [f"The response from {in_both(*band)}: incoherent." for band in poor_bands(frf)]
+    lacks.append(f"Anything above {omega[-1] / (2 * np.pi):.3g} Hz: it was not estimated there.")
+    if record is not None and not record.reference_names:
+        lacks.append(
+            "How the closed loop follows its reference, and which part of the response is "
+            "feedback: no reference was recorded."
+        )
+    if not checks:
+        lacks.append("Whether the model predicts another flight: no second log was simulated.")
+    return lacks
+
+
+def poor_bands(frf: FrequencyResponse) -> list[tuple[float, float]]:
+    """Bands in rad/s of at least three neighbours whose coherence is below 0.6."""
+    omega, bad = np.asarray(frf.omega), ~_good(frf)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(int)))
+    runs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+    return [(float(omega[a]), float(omega[b - 1])) for a, b in runs if b - a >= 3]
+
+
+def next_flight(
+    fit: Fit,
+    frf: FrequencyResponse,
+    record: Record | None,
+    checks: Mapping[str, Verification],
+) -> Flight:
+    """The flight that answers most of what is open, from the fit's own numbers.
+
+    A loose parameter asks for the band in which it acts as no other does, and for an accuracy that
+    grows with amplitude and with the root of time. A poor band asks for the amplitude that brings
+    its coherence to 0.8. With every parameter known, a 3-2-1-1 verifies the model.
+    """
+    poor = _needs_of_bands(frf)
+    needs = _needs_of_parameters(fit, frf) if _is_usable(fit) else poor
+    if not fit.identifiable and not needs and not fit.verdict.remedies:
+        low, high = float(frf.omega[0]) / 2, float(frf.omega[-1]) * 2
+        needs = [_Need(low, high, _LOUDER, "the band of this record does not determine the model")]
+    if needs:
+        return _sweep([*needs, *poor], frf, record)
+    if not fit.identifiable and fit.verdict.remedies:
+        what = "No further flight of the same kind helps. " + _sentence(fit.verdict.remedies[0])
+        return Flight(what, {}, [_sentence(each) for each in fit.verdict.remedies[1:]])
+    wished = [f"Only if you need it: {_sweep([each], frf, record).what}" for each in poor]
+    if checks:
+        what = "None for this model: tune with it, then fly the tuned gains."
+        return Flight(what, {}, [*(_sentence(each.why) for each in poor), *wished])
+    found = _verification(frf, record)
+    return found._replace(why=[*found.why, *wished])
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _is_usable(fit: Fit) -> bool:
+    return fit.verdict.kind in ("identifiable", "not identifiable")
+
+
+def _needs_of_bands(frf: FrequencyResponse) -> list[_Need]:
+    omega, needs = np.asarray(frf.omega), []
+    for low, high in poor_bands(frf):
+        inside = (omega >= low) & (omega <= high)
+        level = float(np.median(np.asarray(frf.coherence)[inside]))
+        factor = np.sqrt(_AIM / (1 - _AIM) * (1 - level) / max(level, _FAINT))
+        text = f"the coherence is {level:.2g} from {in_both(low, high)}; {_AIM:g} is the aim"
+        needs.append(_Need(low, high, float(factor), text))
+    return needs
+
+
+def _needs_of_parameters(fit: Fit, frf: FrequencyResponse) -> list[_Need]:
+    loose = _loose(fit)
+    if not loose:
+        return []
+    omega, apart = _apart(fit, frf)
+    needs = []
+    for k in loose:
+        if not apart[k].any():
+            continue
+        seen = omega[apart[k] >= np.sqrt(_SEEN) * apart[k].max()]
+        low, high = _towards(float(omega[apart[k].argmax()]), seen, frf)
+        reach = _reach(fit, k)
+        by_noise = float(np.diff(fit.interval(fit.names[k], model_error=False))[0] / 2)
+        by_noise /= max(abs(float(fit.values[k])), 1e-300)
+        factor = by_noise / _LOOSE if np.isfinite(by_noise) else np.inf
+        known = (
+            f"is known to \u00b1 {100 * reach:.2g} %" if fit.determined[k] else "is not determined"
+        )
+        text = f"the parameter {fit.names[k]} {known}, and shows itself from {in_both(low, high)}"
+        needs.append(_Need(low, high, max(factor, 1.0), text))
+    return needs
+
+
+def _towards(peak: float, seen: Grid, frf: FrequencyResponse) -> tuple[float, float]:
+    """The band of what is seen, which leaves the measured one on the side of the peak only."""
+    low, high = float(frf.omega[0]), float(frf.omega[-1])
+    if peak > np.sqrt(low * high):
+        return max(low, float(seen[0])), float(seen[-1])
+    return float(seen[0]), min(high, float(seen[-1]))
+
+
+_STEP = 1e-4  # relative, of a parameter
+_NONE = 1e-3  # of a parameter's start, below which it has run to zero
+
+
+def _apart(
+    fit: Fit, frf: FrequencyResponse
+) -> tuple[Grid, Float[np.ndarray, "parameters frequencies"]]:
+    """What each parameter does to ln G that no other does, from half to twice the measured band.
+
+    Zero where the others make the same.
+    """
+    omega = np.geomspace(float(frf.omega[0]) / 2, float(frf.omega[-1]) * 2, 200)
+    places = fit.parameters.places[: len(fit.names)]
+    values, size = _beside_zero(fit)
+
+    def response(moved: Float[np.ndarray, " parameters"]) -> np.ndarray:
+        model = with_values(fit.model, places, moved)
+        return model_response(as_sampled(model, frf), omega).reshape(omega.size, -1)
+
+    columns = []
+    for step in _STEP * np.diag(size):
+        change = np.log(response(values + step) / response(values - step)) / (2 * _STEP)
+        columns.append(np.stack([change.real, change.imag]).ravel())
+    effects = np.array(columns).T
+    rests = _rests(effects)
+    sizes = [np.linalg.norm(each, axis=0) for each in (rests, effects)]
+    rests[:, sizes[0] < _SAME * sizes[1]] = 0.0
+    rests = rests.reshape(2, omega.size, -1, len(values))
+    per_second = np.sqrt(omega / omega[0])  # high frequencies take less time
+    return omega, np.sqrt(np.sum(rests**2, axis=(0, 2))).T * per_second
+
+
+def _beside_zero(
+    fit: Fit,
+) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, " parameters"]]:
+    """The values and their sizes; what ran to zero, where it does nothing, is at its start."""
+    values = np.asarray(fit.values, float)
+    start = np.asarray(fit.parameters.scale)[: values.size]
+    values = np.where(np.abs(values) < _NONE * np.abs(start), start, values)
+    return values, np.abs(values)
+
+
+def _rests(columns: Float[np.ndarray, "points parameters"]) -> np.ndarray:
+    """What of each column no other makes."""
+    rests = columns.copy()
+    for k in range(columns.shape[1]):
+        others = np.delete(columns, k, axis=1)
+        rests[:, k] -= others @ np.linalg.lstsq(others, columns[:, k], rcond=None)[0]
+    return rests
+
+
+def _sweep(needs: Sequence[_Need], frf: FrequencyResponse, record: Record | None) -> Flight:
+    measured = float(frf.omega[0]), float(frf.omega[-1])
+    low = min(each.low for each in needs)
+    high = max(each.high for each in needs)
+    low, high = min(low, measured[1] / 10), max(high, measured[0] * 10)  # at least a decade
+    factor = max(each.factor for each in needs)
+    louder = float(np.clip(factor, 1.0, _LOUDER))
+    longer = min((factor / louder) ** 2, _LONGER)
+    now = 0.0 if record is None else record.duration
+    seconds = max(now * longer, _CYCLES * 2 * np.pi / low, _SHORTEST)
+    source, text = _amplitude(frf, record, louder)
+    facts = {
+        "axis": f"{', '.join(frf.output_names)}, by {source}",
+        "frequencies": f"sweep from {in_both(low, high)}",
+        "amplitude": text,
+        "seconds": f"{_rounded(seconds):g}" + (f" (now {now:.3g})" if now else ""),
+    }
+    what = (
+        f"A sweep of {source} from {low / (2 * np.pi):.2g} to {high / (2 * np.pi):.2g} Hz, "
+        f"{text.split(' (')[0]}, for {_rounded(seconds):g} s."
+    )
+    return Flight(what, facts, [_sentence(each.why) for each in needs])
+
+
+def _rounded(seconds: float) -> float:
+    return float(np.ceil(seconds / 5) * 5)
+
+
+def _amplitude(frf: FrequencyResponse, record: Record | None, louder: float) -> tuple[str, str]:
+    """The channel to excite, and its amplitude in words: that of the record, times `louder`."""
+    if record is None:
+        return frf.input_names[0], f"{louder:.2g} times the amplitude of this record"
+    name = record.reference_names[0] if record.reference_names else record.input_names[0]
+    values = record.channel(name)
+    peak = float(np.max(np.abs(values - np.median(values))))
+    unit = f" {record.unit(name)}" if record.unit(name) else ""
+    text = f"amplitude {louder * peak:.2g}{unit}"
+    if louder > 1:
+        return name, f"{text} ({louder:.2g} times this record's; less if the motors saturate)"
+    return name, f"{text} (as in this record)"
+
+
+def _verification(frf: FrequencyResponse, record: Record | None) -> Flight:
+    """A 3-2-1-1 whose spectrum peaks in the middle of the band."""
+    good = _good(frf)
+    low, high = _ends(frf, good if good.any() else np.ones_like(good))
+    unit = three_two_one_one(width=1.0, amplitude=1.0, sample_rate=20.0)
+    width = float(np.sqrt(unit.omega_min * unit.omega_max / (low * high)))
+    source, text = _amplitude(frf, record, 1.0)
+    facts = {
+        "axis": f"{', '.join(frf.output_names)}, by {source}",
+        "pulses": f"3-2-1-1, the shortest pulse {width:.2g} s, so that it peaks at "
+        f"{np.sqrt(low * high) / (2 * np.pi):.2g} Hz",
+        "amplitude": text,
+        "seconds": f"{7 * width + 4:.2g}, rest before and after included",
+    }
+    what = (
+        f"A 3-2-1-1 on {source} with a shortest pulse of {width:.2g} s, to verify the model on a "
+        "flight that it was not fitted to."
+    )
+    return Flight(what, facts, ["The log determines this model: what is missing is a check."])

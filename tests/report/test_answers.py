@@ -1,0 +1,81 @@
+"""What a page says of a log in plain words, and which flight it asks for."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from html_pages import record_of, TRUTH
+from synthetic import response_of
+
+import jaxquad as jq
+from jaxquad.report._answers import answer_section, next_flight, poor_bands
+
+
+BELOW = np.geomspace(0.5, 6.0, 30)  # rad/s, where neither the lag nor the delay is seen apart
+
+
+def record():
+    return record_of(("M", "q", "r"), ("V", "rad/s", "V"))
+
+
+def band_of(flight):
+    """In rad/s."""
+    low, high = re.findall(r"\(([\d.]+) to ([\d.]+) rad/s\)", flight.facts["frequencies"])[0]
+    return float(low), float(high)
+
+
+def fitted(frf):
+    return jq.fit(TRUTH, frf)
+
+
+def test_the_flight_that_is_asked_for_makes_a_loose_parameter_known():
+    frf = response_of(TRUTH, error=0.02, seed=3, omega=BELOW)
+    fit = fitted(frf)
+    flight = next_flight(fit, frf, record(), {})
+    low, high = band_of(flight)
+    assert "lag" in " ".join(flight.why) and high > 1.5 * BELOW[-1]
+    wider = response_of(TRUTH, error=0.01, seed=4, omega=np.geomspace(low, high, 30))
+    again = fitted(wider)
+    before, after = (f.standard_errors[f.names.index("lag")] for f in (fit, again))
+    assert after < before / 4
+
+
+def test_the_flight_names_channel_amplitude_and_seconds():
+    frf = response_of(TRUTH, error=0.02, seed=3, omega=BELOW)
+    flown = record()
+    flight = next_flight(fitted(frf), frf, flown, {})
+    assert flight.facts["axis"] == "y0, by r" and " V (" in flight.facts["amplitude"]
+    seconds = float(flight.facts["seconds"].split()[0])
+    assert seconds >= 5 * 2 * np.pi / band_of(flight)[0] and seconds <= 2 * flown.duration + 10
+
+
+def test_a_known_model_is_to_be_verified_and_then_needs_nothing():
+    frf = response_of(TRUTH, error=0.005, seed=0)
+    fit, flown = fitted(frf), record()
+    assert "3-2-1-1" in next_flight(fit, frf, flown, {}).what
+    found = answer_section(fit, frf, flown, {"b": jq.verify(TRUTH, flown)})
+    assert found["flight"].what.startswith("None")
+    assert any(text.startswith("lag: 0.01") for text in found["can"])
+    assert "determines every free parameter" in found["plain"]
+
+
+def test_what_no_flight_tells_apart_asks_for_no_flight():
+    axis = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.02, delay=0.0)
+    frf = response_of(axis, error=0.01, seed=1)
+    fit = jq.fit(axis, frf, free=("J_x", "K_t", "lag"))
+    flight = next_flight(fit, frf, None, {})
+    assert flight.what.startswith("No further flight of the same kind helps") and not flight.facts
+    assert any("J_x" in text for text in answer_section(fit, frf, None, {})["cannot"])
+
+
+def test_an_incoherent_band_is_named():
+    frf = response_of(TRUTH, error=0.005, seed=0)
+    omega = np.asarray(frf.omega)
+    low = omega < 1.5
+    quiet = dataclasses.replace(frf, coherence=frf.coherence.at[low].set(0.2))
+    [(first, last)] = poor_bands(quiet)
+    assert first == pytest.approx(omega[0]) and last == pytest.approx(omega[low][-1])
+    found = answer_section(fitted(frf), quiet, None, {})
+    assert any("incoherent" in text for text in found["cannot"])
+    assert any("Only if you need it" in text for text in found["flight"].why)
