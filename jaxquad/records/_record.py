@@ -2,7 +2,8 @@ import dataclasses
 import functools as ft
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
+from pathlib import Path
+from typing import Literal, TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,10 @@ from ._clock import (
 )
 from ._errors import RecordError, RecordWarning, unknown_name
 from ._repair import as_float64, check_ranges, repair_values, Valid
+
+
+if TYPE_CHECKING:
+    import pandas
 
 
 Names = str | Sequence[str] | None
@@ -149,6 +154,104 @@ class Record:
         """The unit of one channel, empty where unknown."""
         units = self.input_units + self.output_units + self.reference_units
         return units[_position(self, name)]
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: "pandas.DataFrame",
+        *,
+        inputs: Names = None,
+        outputs: Names = None,
+        references: Names = None,
+        time: str | None = None,
+        time_unit: TimeUnit | None = None,
+        sample_rate: float | int | None = None,
+        max_gap: float | int | None = None,
+        units: Mapping[str, str] | None = None,
+        hold: Hold = None,
+        source: str = "",
+    ) -> "Record":
+        """A record of columns of a table of pandas (extra `interop`).
+
+        **Arguments:**
+
+        - `frame`: its time stamps are the column `time`, or t, time, time_s or timestamp, or else
+            the index. Dates become s since the first.
+        - `inputs`, `outputs`, `references`: names of columns. A table of `to_dataframe` knows them.
+        - `time_unit`, `max_gap`, `hold`, `source`: as in `Record`.
+        - `sample_rate`: of the record, in Hz, where the stamps are not uniform; see
+            `jq.records.resample`.
+        - `units`: name of a column -> unit.
+
+        **Raises:**
+
+        - `RecordError`: as `Record`, and for columns that are missing or hold no numbers.
+        """
+        from ._dataframe import from_dataframe
+
+        return from_dataframe(
+            frame,
+            (inputs, outputs, references),
+            time=time,
+            time_unit=time_unit,
+            sample_rate=sample_rate,
+            max_gap=max_gap,
+            units=units,
+            hold=hold,
+            source=source,
+        )
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A table of pandas (extra `interop`): a column per channel over the time in s.
+
+        What columns cannot say (roles, units, hold) is in `DataFrame.attrs`, from which
+        `from_dataframe` takes it.
+        """
+        from ._dataframe import to_dataframe
+
+        return to_dataframe(self)
+
+    @classmethod
+    def from_iddata(
+        cls, path: str | Path, *, variable: str | None = None, references: Names = None
+    ) -> "Record":
+        """A record of a MAT file with the fields of an `iddata` of MATLAB's toolbox.
+
+        The object itself cannot be read outside of MATLAB. A struct of its properties can, as
+        MATLAB makes it by `s = get(z); save('z.mat', 's', '-v7')`: y, u, Ts, and where they are
+        there Tstart, SamplingInstants, TimeUnit, InputName, OutputName, InputUnit, OutputUnit and
+        InterSample (zoh is a hold of Ts, bl one of 0).
+
+        **Arguments:**
+
+        - `path`: the file, of version 5 to 7.
+        - `variable`: the struct, where there are several.
+        - `references`: names of inputs that are external references.
+
+        **Raises:**
+
+        - `ReadError`: the file is damaged, or has no such struct.
+        - `RecordError`: as `Record`.
+        """
+        from ._iddata import from_iddata
+
+        return from_iddata(path, variable, references)
+
+    def to_iddata(self, path: str | Path, *, variable: str = "z") -> Path:
+        """A MAT file from which MATLAB makes an `iddata`; references become further inputs.
+
+        In MATLAB: `load z.mat; z = iddata(z.y, z.u, z.Ts, 'InputName', z.InputName)`.
+
+        **Arguments:**
+
+        - `path`: the file to write.
+        - `variable`: the name of the struct in it.
+
+        **Returns:** the path.
+        """
+        from ._iddata import to_iddata
+
+        return to_iddata(self, path, variable)
 
     def __str__(self) -> str:
         roles = ("inputs", "outputs", "references")
