@@ -24,11 +24,12 @@ from ._options import (
     stdout_for_json,
 )
 from ._progress import add_quiet
+from ._words import in_options, with_options
 
 
 def _add_channels(declared: argparse.ArgumentParser) -> None:
     add_log(declared)
-    add_settings(declared, IdentifySettings, only={"time": "", "time_unit": ""})
+    add_settings(declared, IdentifySettings, only={"time": "", "time_unit": "", "dt": ""})
     add_json(declared, "the list")
 
 
@@ -36,8 +37,8 @@ def _channels(options: argparse.Namespace) -> int:
     from jaxquad.records import channels
 
     given = vars(options)
-    time, unit = given.get("time"), given.get("time_unit")
-    found = channels(options.file, time=time, time_unit=unit)
+    time, unit, dt = given.get("time"), given.get("time_unit"), given.get("dt")
+    found = channels(options.file, time=time, time_unit=unit, dt=dt)
     if options.json:
         print_json([channel._asdict() for channel in found])
         return 0
@@ -70,8 +71,9 @@ _CODES = "exit codes: 0 done, 2 unusable input, 3 the record does not determine 
 
 def _finish(options: argparse.Namespace, found, folder: Path | None, note: str = "") -> int:
     """Print an identification, write its folder, and tell whether it is identifiable."""
+    found = with_options(found)
     with stdout_for_json(options):
-        print(found)
+        print(in_options(str(found)))
         path = found.write(folder)
         names = ", ".join(["report.html", *found.figures()])
         print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
@@ -166,6 +168,7 @@ _OF_A_RECORD = {
     "output": "the output, likewise",
     "time": "",
     "time_unit": "",
+    "dt": "",
     "rate": "resample to this rate; by default that of the result",
     "valid": "",
     "max_gap": "",

@@ -9,14 +9,13 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from jaxquad.records import RecordWarning
-from jaxquad.workflows import SettingsError
 
 from ._batch import BATCH
 from ._design import DESIGN
 from ._identify import CHANNELS, DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
-from ._options import in_flags
 from ._progress import shown_stages
 from ._tune import TUNE
+from ._words import in_options
 
 
 _COMMANDS = (DEMO, CHANNELS, IDENTIFY, VERIFY, REPORT, TUNE, DESIGN, BATCH)
@@ -47,10 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.showwarning = _print_warning
         try:
             return options.run(options)
-        except SettingsError as error:
-            return _fail(in_flags(error), _UNUSABLE)
         except (ValueError, OSError) as error:
-            return _fail(str(error), NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE)
+            code = NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE
+            return _fail(in_options(str(error)), code)
         except KeyboardInterrupt:
             print("jaxquad: interrupted", file=sys.stderr)
             return _INTERRUPTED
@@ -83,7 +81,7 @@ def _fail(message: str, code: int) -> int:
 
 
 def _print_warning(message: Warning | str, *_: object) -> None:
-    print("!", *str(message).split(), file=sys.stderr)
+    print("!", *in_options(str(message)).split(), file=sys.stderr)
 
 
 def make_parser() -> argparse.ArgumentParser:

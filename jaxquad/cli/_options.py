@@ -4,13 +4,12 @@ import argparse
 import contextlib
 import gc
 import json
-import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jaxquad.workflows import BatchSettings, IdentifySettings, SettingsError, TuneSettings
+from jaxquad.workflows import BatchSettings, IdentifySettings, TuneSettings
 
 
 Run = Callable[[argparse.Namespace], int]
@@ -109,18 +108,6 @@ def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
     if options.config is None:
         return settings.from_mapping(given)
     return settings.from_toml(options.config).changed(given)
-
-
-_FLAGS = {
-    key: option.flag
-    for settings in (BatchSettings, TuneSettings, IdentifySettings)
-    for key, option in settings.options().items()
-}
-
-
-def in_flags(error: SettingsError) -> str:
-    """The message of an error with flags for the keys of settings."""
-    return re.sub(r"`(\w+)`", lambda key: _FLAGS.get(key[1], key[0]), str(error))
 
 
 def start_computing() -> None:

@@ -131,7 +131,7 @@ def remarks_on_hold(
                 f"({1e3 * frf.dt:.3g} ms) it loses {100 * lost[k]:.2g} % at "
                 f"{np.asarray(frf.omega)[k[0]]:.3g} rad/s, {over[k]:.2g} times the error there, "
                 "and half a sample of the delay is its own; say hold= in s, the loop's period for "
-                "a command, 0 for a quantity that was measured (jq.Record, jq.read; --hold)"
+                "a command, 0 for a quantity that was measured (jq.Record, jq.read)"
             ]
     return []
 

@@ -38,9 +38,18 @@ def doubt_of_seconds(stamps: Times) -> str:
         else f"{1 / step:.3g} Hz if that is in s, {1e3 / step:.4g} Hz in ms"
     )
     return (
-        f"steps by {step:.6g}, {doubt}. Give its unit (time_unit=, --time-unit): ms, us or ns, or "
-        f"s if the log really is that slow"
+        f"steps by {step:.6g}, {doubt}. Give its unit (time_unit=): ms, us or ns, or s if the log "
+        f"really is that slow; for a count of rows give the sampling interval (dt=)"
     )
+
+
+def steady(stamps: np.ndarray) -> bool:
+    """Whether numbers rise as a clock does: always, and mostly by steps of nearly one size."""
+    if stamps.size < FEWEST or not np.isfinite(stamps).all():
+        return False
+    steps = np.diff(stamps.astype(np.float64))
+    usual = np.abs(steps / np.median(steps) - 1) < 0.5 if (steps > 0).all() else np.zeros(1)
+    return bool(np.mean(usual) > 0.9)
 
 
 def dates_in_seconds(stamps: np.ndarray) -> np.ndarray | None:

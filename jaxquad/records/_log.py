@@ -4,9 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ._clock import dates_in_seconds
+from ._clock import dates_in_seconds, FEWEST
 from ._errors import printable, ReadError
 
 
@@ -16,13 +16,15 @@ class Table:
 
     A column has one or two dimensions and any real dtype, and may be a strided view. Its values
     times its `scale` (1 by default) are in its `unit`. Without a `time` the time stamps are found
-    by their name, as `read` describes.
+    by their name, as `read` describes. A column with blank cells holds its values alone, and `rows`
+    says in which rows of the table they stand.
     """
 
     columns: Mapping[str, np.ndarray]
     time: Float[np.ndarray, " samples"] | None = None  # s
     units: Mapping[str, str] = dataclasses.field(default_factory=dict)
     scales: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    rows: Mapping[str, Bool[np.ndarray, " rows"]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Signal:
     clock: str  # the name of its time base, empty if the log does not say
     unit: str
     scale: float
+    rows: Bool[np.ndarray, " rows"] | None = None  # of the table that hold a value; None: all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,10 +62,12 @@ class Signals:
 def flattened(log: Log) -> Signals:
     """The numeric columns of a log with one or two dimensions, by their full names.
 
-    In a table with a clock, columns of another length, such as parameters, are left out.
+    In a table with a clock, columns of another length, such as parameters, are left out. In one
+    without, a matrix whose rows are the channels is turned.
     """
     arrays, clocks = {}, {}
     for table_name, table in log.tables.items():
+        lengths = {len(each) for each in table.columns.values() if each.ndim == 1}
         clock = "" if table.time is None else f"clock of {table_name}".removesuffix(" of ")
         if table.time is not None:
             clocks[clock] = table.time
@@ -73,8 +78,18 @@ def flattened(log: Log) -> Signals:
                 seconds = dates_in_seconds(values)
                 values, unit = (values, unit) if seconds is None else (seconds, "s")
             if is_data(values) and (table.time is None or len(values) == table.time.size):
-                arrays[full] = Signal(values, clock, unit, scale)
+                turned = table.time is None and _has_channel_rows(values, lengths)
+                values = values.T if turned else values
+                arrays[full] = Signal(values, clock, unit, scale, table.rows.get(name))
     return Signals(arrays, clocks)
+
+
+def _has_channel_rows(matrix: np.ndarray, lengths: set[int]) -> bool:
+    """Too few rows for a record, or as many columns as other arrays of the file have samples."""
+    if matrix.ndim != 2:
+        return False
+    rows, columns = matrix.shape
+    return rows < FEWEST <= columns or (columns in lengths and rows not in lengths)
 
 
 def add_columns(

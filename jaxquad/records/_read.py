@@ -46,14 +46,18 @@ class ChannelSummary(NamedTuple):
 
 
 def channels(
-    path: str | Path, *, time: str | None = None, time_unit: TimeUnit | None = None
+    path: str | Path,
+    *,
+    time: str | None = None,
+    time_unit: TimeUnit | None = None,
+    dt: float | int | None = None,
 ) -> list[ChannelSummary]:
     """List the channels that `read` can take from a file.
 
     **Arguments:**
 
     - `path`: the file, of any format that `read` knows.
-    - `time`, `time_unit`: as in `read`.
+    - `time`, `time_unit`, `dt`: as in `read`.
 
     **Returns:** a `ChannelSummary` for each channel, which prints as one line.
 
@@ -63,10 +67,10 @@ def channels(
     """
     signals = load_signals(path)
     try:
-        timebases = Timebases(signals, time, time_unit)
+        timebases = Timebases(signals, time, time_unit, dt)
     except ReadError as error:
         raise located(error, path) from error
-    return [_summary(timebases, name) for name in signal_names(signals, time)]
+    return [_summary(timebases, name) for name in signal_names(signals, time, dt)]
 
 
 def _summary(timebases: Timebases, name: str) -> ChannelSummary:
@@ -95,6 +99,7 @@ def read(
     stop: float | int | None = None,
     time: str | None = None,
     time_unit: TimeUnit | None = None,
+    dt: float | int | None = None,
     max_gap: float | int | None = None,
     units: Mapping[str, str] | None = None,
     hold: Hold = None,
@@ -116,10 +121,15 @@ def read(
         are kept bit by bit; others are resampled (see `resample`) to the lowest of their own rates,
         rounded to three digits.
     - `start`, `stop`: first and last time in s of the file's own time, which the record keeps.
-    - `time`: the array with the time stamps, where the format does not define them. The time
-        stamps of `x` are `t_x`, else those that `time` names, else t, time, time_s or timestamp.
+    - `time`: the array with the time stamps, where the format does not define them, or those with
+        seconds and nanoseconds, as `"sec+nanosec"`. The time stamps of `x` are `t_x`, else those
+        that `time` names, else t, time, time_s, timestamp or such a pair in the same struct, in
+        those around it, in the whole file, else those of its topic (`imu_time` for `imu_x`), else
+        the first column of its matrix if that rises steadily.
     - `time_unit`: of the time stamps. `None` means what the file says, else s, and then refuses
         steps of 0.25 and more, which may be milliseconds.
+    - `dt`: the sampling interval in s of a table without time stamps, whose rows are equally
+        spaced. Its time begins at 0.
     - `max_gap`: the longest gap that is interpolated, in s: of time stamps (see `resample`), and of
         values that are not finite, which by default are refused.
     - `units`: channel name of the record -> unit, for figures and tables; by default those of the
@@ -146,7 +156,7 @@ def read(
     """
     roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
-    channels = _channels(path, names, time, time_unit)
+    channels = _channels(path, names, time, time_unit, dt)
     check_ranges(valid or {}, names)
     channels, repaired = _repaired(channels, valid or {}, max_gap)
     span = _shared_grid(channels, start, stop) if sample_rate is None else None
@@ -215,15 +225,17 @@ def _mixes(selection: Selection) -> Mixes:
 
 
 def _channels(
-    path: str | Path, names: Sequence[str], time: str | None, time_unit: TimeUnit | None
+    path: str | Path,
+    names: Sequence[str],
+    time: str | None,
+    time_unit: TimeUnit | None,
+    dt: float | int | None,
 ) -> list[Channel]:
     signals = load_signals(path)
     if not names:
-        raise ReadError(
-            f"{path}: no channels are named. Name them (inputs=, outputs=; --input, --output)."
-        )
+        raise ReadError(f"{path}: no channels are named. Name them (inputs=, outputs=).")
     try:
-        timebases = Timebases(signals, time, time_unit)
+        timebases = Timebases(signals, time, time_unit, dt)
         return [timebases.channel(name) for name in names]
     except ReadError as error:
         raise located(error, path) from error

@@ -376,8 +376,8 @@ def _check_channels(record: Record) -> None:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
                 f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s. "
-                f"Choose a range without them (start=, stop=; --start, --stop), or let gaps up to "
-                f"some length in s be interpolated (max_gap=, --max-gap)."
+                f"Choose a range without them (start=, stop=), or let gaps up to some "
+                f"length in s be interpolated (max_gap=)."
             )
         largest = float(np.max(np.abs(values)))
         if largest and not _SMALLEST <= largest <= 1 / _SMALLEST:

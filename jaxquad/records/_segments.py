@@ -71,6 +71,7 @@ class _Options(NamedTuple):
 
     time: str | None
     time_unit: TimeUnit | None
+    dt: float | int | None
     units: Mapping[str, str]
     hold: Hold
     max_gap: float | int | None
@@ -87,6 +88,7 @@ def read_segments(
     sample_rate: Number | None = None,
     time: str | None = None,
     time_unit: TimeUnit | None = None,
+    dt: Number | None = None,
     units: Mapping[str, str] | None = None,
     hold: Hold = None,
     max_gap: Number | None = None,
@@ -101,7 +103,7 @@ def read_segments(
     - `inputs`, `outputs`, `references`: name -> channel or its power (`m1^2`) -> weight, as
         `parse_mix` returns it.
     - `sample_rate`: in Hz; by default that of the slowest segment.
-    - `time`, `time_unit`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
+    - `time`, `time_unit`, `dt`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
 
     **Returns:** a `Record` for each segment. Each warning about the file is given once.
 
@@ -112,7 +114,7 @@ def read_segments(
     """
     _check(segments)
     roles = (inputs, outputs, references or {})
-    options = _Options(time, time_unit, units or {}, hold, max_gap, valid or {})
+    options = _Options(time, time_unit, dt, units or {}, hold, max_gap, valid or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         records = [_mixed(path, roles, each, sample_rate, options) for each in segments]
@@ -158,6 +160,7 @@ def _mixed(
         stop=segment[1],
         time=options.time,
         time_unit=options.time_unit,
+        dt=options.dt,
         hold=options.hold,
         max_gap=options.max_gap,
         valid=options.valid,

@@ -32,7 +32,7 @@ def check_compatible(records: Sequence[Record]) -> None:
         if not math.isclose(other.dt, first.dt, rel_tol=1e-6):
             raise ValueError(
                 f"the records are sampled at {first.sample_rate:.6g} and {other.sample_rate:.6g} "
-                "Hz: read them with the same sample rate (sample_rate=, --rate)"
+                "Hz: read them with the same sample rate (sample_rate=)"
             )
         names = (other.input_names, other.output_names, other.reference_names)
         if names != (first.input_names, first.output_names, first.reference_names):
@@ -40,7 +40,7 @@ def check_compatible(records: Sequence[Record]) -> None:
         if other.hold != first.hold:
             raise ValueError(
                 f"the inputs of the records are held for {first.hold} and {other.hold} s: give all "
-                "records of one response the same hold (hold=, --hold)"
+                "records of one response the same hold (hold=)"
             )
 
 
@@ -74,7 +74,7 @@ def check_references(records: Sequence[Record]) -> None:
         raise ValueError(
             f"the joint estimate needs one external reference for each input, but the record has "
             f"{len(names)} references {list(names)} for {len(inputs)} inputs {list(inputs)}. Name "
-            "them (references=, --reference), select other channels with jq.records.select, or use "
+            "them (references=), select other channels with jq.records.select, or use "
             "a direct estimate (estimator=jq.spectra.LocalPolynomial())"
         )
 

@@ -136,7 +136,7 @@ class Welch(eqx.Module):
         if length <= 30:
             raise ValueError(
                 f"a window of {length} samples is too short for frequencies up to a tenth of the "
-                "sample rate: use a longer window (window_length=, --window), or give the "
+                "sample rate: use a longer window (window_length=), or give the "
                 "frequencies (omega=)"
             )
         return np.geomspace(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt), 100)

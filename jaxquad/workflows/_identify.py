@@ -296,6 +296,7 @@ def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
         sample_rate=settings.rate,
         time=settings.time,
         time_unit=settings.time_unit,
+        dt=settings.dt,
         units={name: unit for name, unit in settings.units.items() if name in asked},
         max_gap=settings.max_gap,
         valid=settings.valid,

@@ -207,9 +207,20 @@ class IdentifySettings(Settings):
         group=_RUN,
         flag="--unit",
     )
-    time: str | None = option_field(kinds.TEXT, None, "the channel that holds the time", group=_RUN)
+    time: str | None = option_field(
+        kinds.TEXT,
+        None,
+        "the channel that holds the time, or the two with seconds and nanoseconds: sec+nanosec",
+        group=_RUN,
+    )
     time_unit: Literal["s", "ms", "us", "ns"] | None = option_field(
         kinds.TIME_UNIT, None, "its unit", group=_RUN
+    )
+    dt: float | None = option_field(
+        kinds.DURATION,
+        None,
+        "the sampling interval of a table without time, whose rows are equally spaced",
+        group=_RUN,
     )
     rate: float | None = option_field(
         kinds.HERTZ,
@@ -334,6 +345,10 @@ class IdentifySettings(Settings):
             )
         if self.band is not None and self.band_rad is not None:
             raise SettingsError("`band` (Hz) and `band_rad` (rad/s) are both given: keep one")
+        if self.dt is not None and (self.time is not None or self.time_unit is not None):
+            raise SettingsError(
+                "`dt` is for a table without time: leave `time` and `time_unit` out"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

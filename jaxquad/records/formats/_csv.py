@@ -3,10 +3,12 @@ import functools as ft
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._clock import FEWEST
 from .._errors import ReadError
 from .._log import Log, Table
 
@@ -114,6 +116,7 @@ def _is_regular(
 Line = tuple[int, str]  # number in the file from 1, text
 _LONGEST_LINE = 1 << 20  # bytes
 _BLOCK = 1 << 22  # bytes parsed at once
+_BLANK = 0.1  # of a column: with more blank cells, the table holds several topics
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -125,10 +128,39 @@ def load(path: Path) -> Log:
     """The columns of a text table by the names in its header row.
 
     Cells are separated by commas, semicolons, tabs or blanks; lines with # are comments, the
-    last of which may be the header. Raises ReadError with the line and the column.
+    last of which may be the header. Without a header the columns are those of a matrix `data`. In a
+    table of several topics the cells of a column are blank where its topic has no message. Raises
+    ReadError with the line and the column.
     """
     content = _as_utf8(path.read_bytes())
-    names, separator, place, number = _header(content)
+    header = _header(content)
+    try:
+        values = _rows(content, header)
+    except _BlankCell as error:
+        return _topics(content, header, error)
+    if not header.named:
+        last = f"data[{len(values) - 1}]"
+        remark = f"the file has no line of channel names: its columns are called data[0] .. {last}"
+        return Log({"": Table({"data": values.T})}, (remark,))
+    return Log({"": Table(dict(zip(header.names, values, strict=True)))})
+
+
+class _Header(NamedTuple):
+    """What the lines above the numbers say, and where those begin."""
+
+    names: list[str]
+    named: bool
+    separator: str | None
+    place: int  # byte
+    number: int  # of the line
+
+
+class _BlankCell(ReadError):
+    """A cell without a number, in a table that has one elsewhere in its column."""
+
+
+def _rows(content: bytes, header: _Header) -> Float[np.ndarray, "columns rows"]:
+    names, _, separator, place, number = header
     values, rows = np.empty((len(names), _most_rows(content, place, len(names)))), 0
     for begin, end in _blocks(content, place):
         block = content[begin:end]
@@ -136,7 +168,42 @@ def load(path: Path) -> Log:
         number += block.count(b"\n")
     if not rows:
         raise ReadError(f"the file has only a header ({', '.join(names)}) and no row of numbers")
-    return Log({"": Table(dict(zip(names, values[:, :rows], strict=True)))})
+    return values[:, :rows]
+
+
+def _topics(content: bytes, header: _Header, error: _BlankCell) -> Log:
+    """A table in which a row has the values of one topic, or each topic rows of its own.
+
+    Raises `error` where a few cells are blank only: those are missing values.
+    """
+    lines = enumerate(content[header.place :].decode().split("\n"), start=header.number)
+    rows = [
+        _numbers((number, text), header.names, header.separator, blank=np.nan)
+        for number, text in lines
+        if text.strip() and not text.lstrip().startswith("#")
+    ]
+    columns = np.array(rows).T
+    held = ~np.isnan(columns)
+    counts = dict(zip(header.names, held.sum(axis=1).tolist(), strict=True))
+    partly = {name for name, count in counts.items() if 0 < count < len(rows)}
+    rarest = min(partly or counts, key=lambda name: counts[name] or len(rows))
+    if counts[rarest] < FEWEST or (partly and 1 - counts[rarest] / len(rows) < _BLANK):
+        raise error
+    found = {
+        name: (values[there], there)
+        for name, values, there in zip(header.names, columns, held, strict=True)
+        if counts[name]
+    }
+    remarks = []
+    if partly:
+        remarks += [
+            f"cells are blank where a topic has no message: {rarest!r}, for instance, has "
+            f"{counts[rarest]} values in {len(rows)} rows"
+        ]
+    if empty := [name for name in header.names if not counts[name]]:
+        remarks.append(f"columns without any value were left out: {', '.join(empty)}")
+    rows_of = {name: there for name, (_, there) in found.items() if name in partly}
+    return Log({"": Table({n: v for n, (v, _) in found.items()}, rows=rows_of)}, tuple(remarks))
 
 
 def _most_rows(content: bytes, place: int, columns: int) -> int:
@@ -178,8 +245,7 @@ def _as_utf8(content: bytes) -> bytes:
     return content
 
 
-def _header(content: bytes) -> tuple[list[str], str | None, int, int]:
-    """Names, separator, and the byte and line number where the numbers begin."""
+def _header(content: bytes) -> _Header:
     comment = ""
     for number, begin, end in _line_places(content):
         text = content[begin:end].decode().strip(" ")
@@ -191,15 +257,12 @@ def _header(content: bytes) -> tuple[list[str], str | None, int, int]:
         separator = next((mark for mark in ";\t," if mark in text), None)
         cells = split(text, separator)
         if not all(map(_is_number, cells)):
-            return _distinct(cells), separator, end + 1, number + 1
+            return _Header(_distinct(cells), True, separator, end + 1, number + 1)
         names = split(comment, separator) if comment else []
-        if len(names) != len(cells):
-            raise ReadError(
-                f"line {number} has numbers where the header should be: "
-                f"add a line with the {len(cells)} channel names above it"
-            )
-        return _distinct(names), separator, begin, number
-    raise ReadError("the file holds no table: it needs a line of names and lines of numbers")
+        named = len(names) == len(cells)
+        names = _distinct(names) if named else [f"data[{k}]" for k in range(len(cells))]
+        return _Header(names, named, separator, begin, number)
+    raise ReadError("the file holds no table: it needs lines of numbers, below a line of names")
 
 
 def _distinct(names: list[str]) -> list[str]:
@@ -255,7 +318,10 @@ def _parse_rows(
     return np.array(rows).reshape(-1, len(names))
 
 
-def _numbers(row: Line, header: list[str], separator: str | None) -> list[float]:
+def _numbers(
+    row: Line, header: list[str], separator: str | None, *, blank: float | None = None
+) -> list[float]:
+    """The numbers of a line; a cell without one is `blank`."""
     number, text = row
     cells = split(text, separator)
     if len(cells) != len(header):
@@ -264,14 +330,17 @@ def _numbers(row: Line, header: list[str], separator: str | None) -> list[float]
             f"or its separator changes"
         )
     try:
-        return [float(cell) for cell in cells]
+        return [blank if blank is not None and not cell else float(cell) for cell in cells]
     except ValueError as error:
-        i = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        what = f"{cells[i][:40]!r} is not a number" if cells[i] else "the cell is blank"
-        raise ReadError(
-            f"line {number}, column {i + 1} ({header[i]!r}): {what}. Correct or delete the row; "
-            f"write decimals with a point"
-        ) from error
+        wrong = (i for i, cell in enumerate(cells) if not _is_number(cell))
+        i = next(i for i in wrong if cells[i] or blank is None)
+        place = f"line {number}, column {i + 1} ({header[i]!r})"
+        if cells[i]:
+            what = f"{cells[i][:40]!r} is not a number"
+            raise ReadError(
+                f"{place}: {what}. Correct or delete the row; write decimals with a point"
+            ) from error
+        raise _BlankCell(f"{place}: the cell is blank. Fill it in, or delete the row") from error
 
 
 def _is_number(cell: str) -> bool:

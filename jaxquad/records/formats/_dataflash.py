@@ -91,6 +91,7 @@ def load(path: Path) -> Log:
         if each.name in rows and each.name not in _ABOUT:
             columns = {name: rows[each.name][name] for name in each.columns}
             tables |= tables_of(each, columns, scaled)
+    remarks += _find_rate_unit(tables, scaled)
     return Log(tables, tuple(remarks), "ardupilot", _parameters(rows.get("PARM")))
 
 
@@ -254,6 +255,41 @@ def _labels(
     return units, scales, instance
 
 
+_RATES = ("RDes", "R", "PDes", "P", "YDes", "Y")  # of RATE: set-points and rates
+_GYROS = {"R": "GyrX", "P": "GyrY", "Y": "GyrZ"}  # of IMU, in rad/s
+_DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)}  # rate over gyro
+
+
+def _find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
+    """Give RATE its unit in logs before FMTU, by the size of IMU's gyro; returns the remark."""
+    rate, imu = tables.get("RATE"), tables.get("IMU", tables.get("IMU[0]"))
+    if rate is None or scaled.letters.get("RATE"):
+        return []
+    ratio = _rate_over_gyro(rate, imu)
+    near = 57.3 if ratio is None else min(_DEGREES, key=lambda each: abs(np.log(ratio / each)))
+    unit, scale = _DEGREES[near]
+    named = [name for name in _RATES if name in rate.columns]
+    tables["RATE"] = Table(
+        rate.columns,
+        rate.time,
+        {**rate.units, **dict.fromkeys(named, unit)},
+        {**rate.scales, **dict.fromkeys(named, scale)},
+    )
+    why = "as ArduPilot 3.4 and later log it" if ratio is None else f"{ratio:.3g} times IMU's gyro"
+    hundredths = " (logged in hundredths)" if scale != 1.0 else ""
+    return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
+
+
+def _rate_over_gyro(rate: Table, imu: Table | None) -> float | None:
+    """Of the deviations over all axes; None where there is no gyro, or nothing turned."""
+    pairs = [] if imu is None else [(rate.columns.get(r), imu.columns.get(g)) for r, g in
+                                    _GYROS.items()]  # fmt: skip
+    known = [(r, g) for r, g in pairs if r is not None and g is not None]
+    turned, measured = (np.sqrt(sum(float(np.var(c)) for c in each)) for each in
+                        (zip(*known, strict=True) if known else ((), ())))  # fmt: skip
+    return float(turned / measured) if measured > 1e-3 and turned > 0 else None
+
+
 _MOST_TYPES = 1000
 _MOST_COLUMNS = 64
 
@@ -283,6 +319,7 @@ def load_text(path: Path) -> Log:
             skipped += odd
             tables |= tables_of(each, columns, scaled, applied=True)
     remarks = [f"{skipped} lines that match no format were left out"] if skipped else []
+    remarks += _find_rate_unit(tables, scaled)
     settings = {cells[-2]: cells[-1] for cells in _split(lines.get("PARM", [])) if len(cells) >= 2}
     return Log(tables, tuple(remarks), "ardupilot", settings)
 

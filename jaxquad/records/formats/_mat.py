@@ -33,6 +33,7 @@ _CLASSES = {
     6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
 }  # fmt: skip
 _DEEPEST = 8  # structs within structs
+_MOST_STRUCTS = 64  # of one array
 
 
 class _Element(NamedTuple):
@@ -60,7 +61,7 @@ def sniff(head: bytes, path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """The real numeric variables, and those in scalar structs as `s.q`; others are left out."""
+    """The real numeric variables, and those in structs as `s.q` or `s[1].q`; no others."""
     content = path.read_bytes()
     if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
         raise ReadError(
@@ -139,8 +140,9 @@ def _variable(
     shape = np.frombuffer(parts[1].body[: len(parts[1].body) // 4 * 4], f"{order}i4")
     name = prefix + bytes(parts[2].body).decode("latin-1")
     kind, is_complex = flags & 0xFF, flags & 0x0800
-    if kind == _STRUCT and depth < _DEEPEST and len(parts) >= 5 and (shape == 1).all():
-        return _struct(parts, order, name, depth, budget)
+    count = int(np.prod(shape.astype(object)))
+    if kind == _STRUCT and depth < _DEEPEST and len(parts) >= 5 and 1 <= count <= _MOST_STRUCTS:
+        return _structs(parts, order, name, count, depth, budget)
     if kind not in _CLASSES or is_complex or len(parts) < 4:
         return {}
     # Numbers are stored in the smallest type that fits, regardless of their class.
@@ -149,9 +151,10 @@ def _variable(
     return {name: _squeezed(numbers.astype(_CLASSES[kind]), shape, name, matrix.offset)}
 
 
-def _struct(
-    parts: list[_Element], order: str, name: str, depth: int, budget: _Budget
+def _structs(
+    parts: list[_Element], order: str, name: str, count: int, depth: int, budget: _Budget
 ) -> dict[str, np.ndarray]:
+    """The fields of a struct, or of an array of structs, one struct after the other."""
     width = int(np.frombuffer(parts[3].body[:4], f"{order}i4")[0]) if len(parts[3].body) >= 4 else 0
     if width <= 0:
         return {}
@@ -160,10 +163,11 @@ def _struct(
         table[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(table), width)
     ]
     arrays: dict[str, np.ndarray] = {}
-    for field, part in zip(names, parts[5:], strict=False):
+    fields = [(f"{name}[{k}]" if count > 1 else name, n) for k in range(count) for n in names]
+    for (owner, field), part in zip(fields, parts[5:], strict=False):
         if part.kind == _MATRIX:
             # A field's matrix has no name of its own.
-            arrays |= _variable(part, order, f"{name}.{field}", depth + 1, budget)
+            arrays |= _variable(part, order, f"{owner}.{field}", depth + 1, budget)
     return arrays
 
 

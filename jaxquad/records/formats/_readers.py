@@ -170,7 +170,10 @@ def load_signals(path: str | Path) -> Signals:
     """
     signals = flattened(load_log(path))
     if not signals.arrays:
-        raise ReadError(f"{path}: the file holds no numeric array of one or two dimensions.")
+        raise ReadError(
+            f"{path}: the file holds no numeric array of one or two dimensions. Objects of MATLAB "
+            f"(timeseries, timetable) are not read: save an array, or a structure with time."
+        )
     return signals
 
 

@@ -1,0 +1,75 @@
+"""Messages of the library in the words of the command line.
+
+The library speaks Python: `max_gap=` is an argument, `jq.verify` a function. Someone who typed
+`jaxquad identify` needs the option, `--max-gap`, or the command, `jaxquad verify`.
+"""
+
+import dataclasses
+import re
+from typing import TYPE_CHECKING
+
+from jaxquad.workflows import BatchSettings, IdentifySettings, TuneSettings
+
+
+if TYPE_CHECKING:
+    from jaxquad.workflows import Identification
+
+
+_FLAGS = {
+    key: option.flag
+    for settings in (BatchSettings, TuneSettings, IdentifySettings)
+    for key, option in settings.options().items()
+}
+_ARGUMENTS = _FLAGS | {  # those of `read`, `frequency_response` and `fit`, whose names differ
+    "inputs": "--input",
+    "outputs": "--output",
+    "references": "--reference",
+    "sample_rate": "--rate",
+    "window_length": "--window",
+    "band": "--band-rad",  # of a fit, in rad/s
+}
+_PHRASES = {
+    r",? or build a jq\.Record from its arrays": "",
+    r", jq\.records\.channels\b": "",
+    r" \(jq\.Record, jq\.read\)": "",
+    r"jq\.read\(\.\.\., sample_rate=\) or jq\.records\.resample": "--rate",
+    r" \(estimator=jq\.spectra\.LocalPolynomial\(\)\)": " (without --reference)",
+    r"select other channels with jq\.records\.select, or ": "",
+    r"pick channels with jq\.records\.select": "name one channel each with --input and --output",
+    r"(leave it out) with jq\.records\.select": r"\1",
+    r"(?:, or give the frequencies )?\(omega=\)": "",
+    r"jq\.spectra\.LocalPolynomial\(\)": "--estimator local",
+    r", or let its sign change with jq\.identify\.Real\([^)]*\)": " (--no-lag, --no-delay)",
+    r"fit with a jq\.identify\.Prior or a second record, or ask for a determined combination":
+        "fit without one of them (--no-lag, --no-delay), or fly again with more excitation",
+    r"Fit\.explain\(\)": "--explain",
+    r"jq\.verify\b": "jaxquad verify",
+    r"jq\.propose\b": "jaxquad identify",
+    r"jq\.(?:excitation\.)?sweep\b": "jaxquad design sweep",
+    r" \(leave it out of free=\)": "",
+    r", jq\.frequency_response\(\.\.\., estimator=jq\.spectra\.JointInputOutput\(\)\)":
+        " (--reference)",
+}  # fmt: skip
+
+
+def in_options(text: str) -> str:
+    """A message with options in place of Python's arguments, and of the keys of settings."""
+    for phrase, replacement in _PHRASES.items():
+        text = re.sub(phrase, replacement, text)
+    text = re.sub(r"`(\w+)`", lambda key: _FLAGS.get(key[1], key[0]), text)
+    text = re.sub(r"\b([a-z_]+)=(?=[\s),;.:]|$)", lambda key: _ARGUMENTS.get(key[1], key[0]), text)
+    return re.sub(r"\(([a-z_]+)=(?=[^\s=])", _with_value, text)
+
+
+def _with_value(found: re.Match[str]) -> str:
+    flag = _ARGUMENTS.get(found[1])
+    return f"({flag} " if flag else found[0]
+
+
+def with_options(found: "Identification") -> "Identification":
+    """An identification whose remarks are in the words of the command line."""
+    fits = {
+        name: dataclasses.replace(fit, remarks=tuple(map(in_options, fit.remarks)))
+        for name, fit in found.fits.items()
+    }
+    return dataclasses.replace(found, fits=fits)
