@@ -1,5 +1,17 @@
 """The rate loops of Betaflight, PX4, ArduPilot and Crazyflie, and the filters that they run."""
 
+from ._ardupilot import ArduPilotAttitude as ArduPilotAttitude, ArduPilotRate as ArduPilotRate
+from ._betaflight import (
+    adrc_b0 as adrc_b0,
+    BetaflightADRC as BetaflightADRC,
+    BetaflightAngle as BetaflightAngle,
+    BetaflightPID as BetaflightPID,
+    DMax as DMax,
+    dynamic_cutoff as dynamic_cutoff,
+    ItermRelax as ItermRelax,
+    tpa_factor as tpa_factor,
+)
+from ._crazyflie import CrazyflieAttitude as CrazyflieAttitude, CrazyflieRate as CrazyflieRate
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
     BandwidthNotch as BandwidthNotch,
@@ -14,3 +26,5 @@ from ._filters import (
     PT3 as PT3,
     Section as Section,
 )
+from ._law import FirmwareLoop as FirmwareLoop, LoopState as LoopState
+from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate

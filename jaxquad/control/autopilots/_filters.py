@@ -13,17 +13,21 @@ from jaxquad._core import as_float, broadcast_gain, is_concrete, per_member, req
 
 
 class Section(NamedTuple):
-    """y[n] = b0 u[n] + b1 u[n-1] + b2 u[n-2] - a1 y[n-1] - a2 y[n-2]."""
+    """y[n] = b0 u[n] + b1 u[n-1] + b2 u[n-2] - a1 y[n-1] - a2 y[n-2]; or without b2 and a2."""
 
     b0: Float[Array, "..."]
     b1: Float[Array, "..."]
-    b2: Float[Array, "..."]
     a1: Float[Array, "..."]
-    a2: Float[Array, "..."]
+    b2: Float[Array, "..."] | None = None
+    a2: Float[Array, "..."] | None = None
+
+    @property
+    def order(self) -> int:
+        return 1 if self.b2 is None else 2
 
 
 Frequencies = Float[Array | np.ndarray, " frequencies"] | Sequence[float]  # Hz
-Memory = tuple[tuple[Array, Array], ...]  # of each section, in its transposed form
+Memory = tuple[tuple[Array, ...], ...]  # of each section, in its transposed form
 
 
 @runtime_checkable
@@ -46,7 +50,7 @@ def first_order(cutoff_hz: Float[Array, "..."], rate_hz: float) -> Section:
     """x += k (u - x) with k = w/(w + 1), w = 2 pi cutoff/rate; PX4's and ArduPilot's alpha is k."""
     w = 2 * np.pi * cutoff_hz / rate_hz
     k = w / (w + 1)
-    return Section(k, jnp.zeros_like(k), jnp.zeros_like(k), k - 1, jnp.zeros_like(k))
+    return Section(k, jnp.zeros_like(k), k - 1)
 
 
 class PT1(eqx.Module):
@@ -118,7 +122,8 @@ class Butterworth(eqx.Module):
         w = jnp.tan(np.pi * self.cutoff_hz / rate_hz)
         c = 1 + np.sqrt(2.0) * w + w**2
         b0 = w**2 / c
-        return (Section(b0, 2 * b0, b0, 2 * (w**2 - 1) / c, (1 - np.sqrt(2.0) * w + w**2) / c),)
+        a1, a2 = 2 * (w**2 - 1) / c, (1 - np.sqrt(2.0) * w + w**2) / c
+        return (Section(b0, 2 * b0, a1, b0, a2),)
 
     def in_words(self) -> str:
         return f"Butterworth 2 {_listed(self.cutoff_hz)} Hz"
@@ -175,7 +180,7 @@ class BandwidthNotch(eqx.Module):
 def _notch(cosine: Array, width: Array, residual: Array) -> Section:
     over, middle = 1 + width, -2 * cosine / (1 + width)
     b0, b2 = (1 + width * residual) / over, (1 - width * residual) / over
-    return Section(b0, middle, b2, middle, (1 - width) / over)
+    return Section(b0, middle, middle, b2, (1 - width) / over)
 
 
 def betaflight_quality(centre_hz: ArrayLike, lower_hz: ArrayLike) -> Float[Array, "..."]:
@@ -249,12 +254,16 @@ class FilterChain(eqx.Module):
 
     def init(self, like: Float[Array, "..."]) -> Memory:
         """At rest, for signals shaped as `like`."""
-        zero = jnp.zeros_like(like)
-        return ((zero, zero),) * len(self.sections())
+        return rest_of(self.sections(), like)
 
     def step(self, memory: Memory, sample: Float[Array, "..."]) -> tuple[Memory, Array]:
         """The filtered `sample`."""
         return run_sections(self.sections(), memory, sample)
+
+
+def rest_of(sections: Sequence[Section], like: Array) -> Memory:
+    """What sections remember that have seen nothing but zeros."""
+    return tuple((jnp.zeros_like(like),) * each.order for each in sections)
 
 
 def run_sections(
@@ -262,12 +271,51 @@ def run_sections(
 ) -> tuple[Memory, Array]:
     """One sample through all sections."""
     after = []
-    for section, (first, second) in zip(sections, memory, strict=True):
-        b0, b1, b2, a1, a2 = (broadcast_gain(x, sample) for x in section)
-        passed = b0 * sample + first
-        after.append((b1 * sample - a1 * passed + second, b2 * sample - a2 * passed))
+    for section, held in zip(sections, memory, strict=True):
+        b0, b1, a1 = (broadcast_gain(x, sample) for x in section[:3])
+        passed = b0 * sample + held[0]
+        first = b1 * sample - a1 * passed
+        if section.b2 is None or section.a2 is None:
+            after.append((first,))
+        else:
+            b2, a2 = broadcast_gain(section.b2, sample), broadcast_gain(section.a2, sample)
+            after.append((first + held[1], b2 * sample - a2 * passed))
         sample = passed
     return tuple(after), sample
+
+
+def run_between(
+    groups: Sequence[Sequence[Section]],
+    memories: Sequence[Memory],
+    before: Array,
+    sample: Array,
+    count: int,
+) -> tuple[tuple[Memory, ...], tuple[Array, ...]]:
+    """`count` samples on the straight line from `before` (left out) to `sample`, through groups.
+
+    Each group of sections takes what the one before it gives. Returns what the groups remember,
+    and the last sample of each.
+    """
+
+    def advance(memories: Sequence[Memory], part: Array):
+        now, after, passed = before + part * (sample - before), [], []
+        for sections, memory in zip(groups, memories, strict=True):
+            memory, now = run_sections(sections, memory, now)
+            after.append(memory)
+            passed.append(now)
+        return tuple(after), tuple(passed)
+
+    parts = jnp.arange(1, count + 1, dtype=sample.dtype) / count
+    if count <= _UNROLLED:
+        passed = (sample,) * len(groups)
+        for k in range(count):
+            memories, passed = advance(memories, parts[k])
+        return tuple(memories), passed
+    memories, passed = jax.lax.scan(advance, tuple(memories), parts)
+    return memories, tuple(x[-1] for x in passed)
+
+
+_UNROLLED = 2
 
 
 @eqx.filter_jit
@@ -288,14 +336,15 @@ def _delay_ms(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) 
 
 
 def _section_response(section: Section, frequency_hz: Array, rate_hz: float) -> Array:
-    if any(x.size > 1 for x in section):
+    if any(x is not None and x.size > 1 for x in section):
         raise ValueError(
             "the filter has one cutoff per axis or member: take one axis before asking for its "
             "response."
         )
     turn = 2 * np.pi * frequency_hz / rate_hz
     back = jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))  # 1/z
-    b0, b1, b2, a1, a2 = (x.reshape(()).astype(back.dtype) for x in section)
+    whole = [jnp.zeros_like(section.b0) if x is None else x for x in section]
+    b0, b1, a1, b2, a2 = (x.reshape(()).astype(back.dtype) for x in whole)
     return (b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2))
 
 
