@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.plot import bode, overlay
+from jaxquad.plot import bode, compare
 from jaxquad.report import write_results
 
 
@@ -87,9 +87,9 @@ def main() -> None:
     gains = {name: [float(f.values[0]), float(f.standard_errors[0])] for name, f in fits.items()}
     extra = {"late": sums, "gain": gains}
     write_results(options.out, fit=best, frf=frfs["joint"], check=check, extra=extra)
-    figure = bode(frfs["joint"], {"identified": best.model}, others={"direct": frfs["direct"]})
-    figure.savefig(options.out / "bode.png", dpi=130)
-    overlay(check).savefig(options.out / "verification.png", dpi=130)
+    panels = bode(frfs["joint"], {"identified": best.model}, {"direct": frfs["direct"]})
+    panels.figure.savefig(options.out / "bode.png", dpi=130)
+    compare(check).figure.savefig(options.out / "verification.png", dpi=130)
     seconds = time.perf_counter() - began
     print(f"\n{options.out}: result.json, bode.png, verification.png; {seconds:.1f} s")
 

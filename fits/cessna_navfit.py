@@ -86,8 +86,8 @@ def main() -> None:
     print(record, frf, fit, factors(fit), "", compared(fit), sep="\n")
     extra = {"cifer": PRINTED | {"cost": PRINTED_COST}, "factors": str(factors(fit))}
     write_results(options.out, fit=fit, frf=frf, extra=extra)
-    figure = bode(frf, {"identified": fit.model, "as CIFER printed": CIFER})
-    figure.savefig(options.out / "bode.png", dpi=130)
+    panels = bode(frf, {"identified": fit.model, "as CIFER printed": CIFER})
+    panels.figure.savefig(options.out / "bode.png", dpi=130)
     seconds = time.perf_counter() - began
     print(f"\n{options.out}: result.json, bode.png; {seconds:.1f} s")
 

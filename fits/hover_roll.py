@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.plot import bode, overlay
+from jaxquad.plot import bode
 from jaxquad.report import provenance, write_report, write_results
 
 
@@ -176,9 +176,9 @@ def main(out: Path, seed: int, draws: int) -> None:
         table, extra["coverage"] = coverage_table(draws)
         print(f"\n{table}")
     write_results(out, fit=both, frf=frfs["joint"], check=check, extra=extra)
-    figure = bode(frfs["joint"], {"identified": both.model}, others={"direct": frfs["direct"]})
-    figure.savefig(out / "bode.png", dpi=130)
-    overlay(check).savefig(out / "verification.png", dpi=130)
+    panels = bode(frfs["joint"], {"identified": both.model}, {"direct": frfs["direct"]})
+    panels.figure.savefig(out / "bode.png", dpi=130)
+    jq.plot.compare(check).figure.savefig(out / "verification.png", dpi=130)
     loaded_name = f"with {ADDED} kg m^2 of added inertia"
     write_report(
         out / "report.html",

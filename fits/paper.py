@@ -68,8 +68,8 @@ def main(out: Path, seed: int) -> None:
         10: figures.estimates(loops, "pulse, half of the period", 10),
         11: figures.estimates(loops, "sine", 11),
     }
-    for number, figure in drawn.items():
-        figure.savefig(out / f"figure_{number}.png", dpi=130)
+    for number, panels in drawn.items():
+        panels.figure.savefig(out / f"figure_{number}.png", dpi=130)
     seconds = time.perf_counter() - began
     print(f"\n{out}: ledger.md, ledger.json, figure_5.png to figure_11.png; {seconds:.1f} s")
 

@@ -26,6 +26,7 @@ from .ensembles import Ensemble as Ensemble
 from .excitation import multisine as multisine, sweep as sweep
 from .export import c_header as c_header
 from .identify import (
+    compare as compare,
     fit as fit,
     fit_transfer_function as fit_transfer_function,
     refine as refine,

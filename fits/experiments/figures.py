@@ -100,7 +100,7 @@ def payload(
     inertias[target] = truth.inertia[0, member] + carried
     panels = {"roll, deg": angles, "inertia, kg m$^2$": inertias}
     title = "payload J0 to 2 J0 from 15 to 30 s, under 0.3 N m of torque with a period of 5 s"
-    return histories(done.time, panels, target=target, title=title)
+    return histories(done.time, panels, target=target, title=title).figure
 
 
 def _pareto(rows: list[Row], design: str) -> tuple[list[float], list[float], tuple[float, float]]:

@@ -165,8 +165,8 @@ def write(
     }
     if front is not None:
         figures["front.png"] = front_figure(front, title=_title(front, found.certificate))
-    for file, figure in figures.items():
-        figure.savefig(out / file, dpi=130)
+    for file, panels in figures.items():
+        panels.figure.savefig(out / file, dpi=130)
     header = jq.export.write_c_header(out / f"{name}.h", found.ladrc.controller, name=name, axes=1)
     return ["result.json", "certificate.json", *figures, header.name]
 

@@ -28,6 +28,7 @@ from ._gains import (
     require_sample_interval as require_sample_interval,
     signal_shape as signal_shape,
 )
+from ._json import plain_content as plain_content
 from ._levenberg_marquardt import (
     advance as advance,
     begin as begin,

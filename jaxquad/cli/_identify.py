@@ -194,7 +194,7 @@ def _verify(options: argparse.Namespace) -> int:
     stored = read_result(options.result)
     require_file(options.file)
     start_computing()
-    from jaxquad.plot import overlay
+    from jaxquad.plot import compare, headless
     from jaxquad.report import verification_content
     from jaxquad.workflows import verify_result
 
@@ -205,7 +205,8 @@ def _verify(options: argparse.Namespace) -> int:
         print(check)
         if options.out:
             options.out.parent.mkdir(parents=True, exist_ok=True)
-            overlay(check, title=options.file.name).savefig(options.out, dpi=130)
+            with headless():
+                compare(check, title=options.file.name).figure.savefig(options.out, dpi=130)
             print(options.out)
     if options.json:
         known = {"identifiable": stored.identifiable, "verdict": stored.summary}

@@ -132,7 +132,7 @@ def stdout_for_json(options: argparse.Namespace) -> Iterator[None]:
 
 
 def print_json(content: object) -> None:
-    from jaxquad.report import plain_content
+    from jaxquad._core import plain_content
 
     print(json.dumps(plain_content(content), indent=2, allow_nan=False))
 

@@ -1,5 +1,6 @@
 """Parameters of models from responses or records, with their accuracy and verification."""
 
+from ._compare import compare as compare, Comparison as Comparison
 from ._cost import (
     coherence_weight as coherence_weight,
     CoherenceWeighted as CoherenceWeighted,
@@ -8,6 +9,12 @@ from ._cost import (
     paper_cost as paper_cost,
     Points as Points,
     usable as usable,
+)
+from ._curves import (
+    model_response as model_response,
+    ResponseBand as ResponseBand,
+    step_response as step_response,
+    StepResponse as StepResponse,
 )
 from ._discrepancy import Discrepancy as Discrepancy
 from ._explain import Candidate as Candidate, Explanation as Explanation
@@ -51,7 +58,7 @@ from ._result import (
     Fit as Fit,
     known_covariance as known_covariance,
 )
-from ._simulated import integrate_plant as integrate_plant
+from ._simulated import integrate_plant as integrate_plant, linear_model as linear_model
 from ._solve import least_squares as least_squares, problem_normal as problem_normal
 from ._starts import (
     Minimum as Minimum,

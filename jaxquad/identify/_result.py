@@ -4,19 +4,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
+from jaxquad._core import plain_content
 from jaxquad._xla import run_shared
+from jaxquad.records import Record
 
 from ._accuracy import Matrix
+from ._content import fit_content
+from ._curves import fitted_response, fitted_step_response, ResponseBand, StepResponse
 from ._discrepancy import Discrepancy
 from ._explain import explain_misfit, Explanation
 from ._half_bands import Bands, fit_bands
 from ._noise_model import NoiseModel
 from ._origin import Origin
 from ._parameters import Parameters
+from ._simulated import linear_model
 from ._starts import Minimum
 from ._verdict import Combination, pooled_freedom, reach_of_interval, UndeterminedError, Verdict
+from ._verify import Verification, verify
 
 
 _SHOWN = 6  # optima of several starts
@@ -181,6 +187,88 @@ class Fit(eqx.Module):
         unbounded = np.isinf(self.standard_errors)
         return np.where(unbounded, np.inf, np.sqrt(np.diagonal(self.noise_covariance)))
 
+    def __getitem__(self, name: str) -> float:
+        """The value of one parameter: `fit["gain"]`. Raises KeyError for a name it does not have.
+
+        `fit.interval(name)` has its error.
+        """
+        return float(self.values[self._place(name)])
+
+    def _place(self, name: str) -> int:
+        if name not in self.names:
+            raise KeyError(f"no free parameter {name!r}: this fit has {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def __call__(
+        self,
+        record: Record,
+        *,
+        band: tuple[float, float] | None = None,
+        hold: str | None = None,
+    ) -> Verification:
+        """Simulate the model on a record and compare: `jq.verify(fit.model, record)`.
+
+        **Arguments:**
+
+        - `record`: one that was not fitted.
+        - `band`, `hold`: as in `jq.verify`.
+
+        **Returns:** a `jq.identify.Verification`, with the simulated output.
+
+        **Raises:** what `jq.verify` raises; UndeterminedError where nothing was fitted.
+        """
+        self._require_model("a simulation")
+        return verify(self.model, record, band=band, hold=hold)
+
+    def _require_model(self, what: str) -> None:
+        if not self.verdict.fitted:
+            raise UndeterminedError(f"{what} needs a fitted model: {self.verdict.summary}")
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Poles of the model in rad/s; see `jq.models.modes` for damping and frequency.
+
+        `jq.identify.factors(fit)` has those of a `jq.TransferFunction` with standard errors.
+        """
+        return linear_model(self.model).poles
+
+    def step_response(self, time: Float[ArrayLike, " samples"]) -> StepResponse:
+        """The answer to a unit step of each input, with its 95 % band, model error included.
+
+        **Arguments:**
+
+        - `time`: equally spaced, from 0, in s.
+
+        **Returns:** a `jq.identify.StepResponse`: `time`, `value`, `low`, `high`.
+
+        **Raises:** ValueError for other times, for a model that cannot be simulated, and where
+        nothing was fitted.
+        """
+        self._require_model("a step response")
+        return fitted_step_response(self, time, self._covariance_of_curves())
+
+    def response_band(self, omega: Float[ArrayLike, " frequencies"]) -> ResponseBand:
+        """The frequency response with its 95 % band, model error included, by first order.
+
+        **Arguments:**
+
+        - `omega`: in rad/s.
+
+        **Returns:** a `jq.identify.ResponseBand`.
+
+        **Raises:** ValueError where nothing was fitted.
+        """
+        self._require_model("a response")
+        return fitted_response(self, omega, self._covariance_of_curves())
+
+    def _covariance_of_curves(self) -> Matrix:
+        """Of relative changes. Directions along which no response changes are left out."""
+        return self.relative_covariance if self.identifiable else known_covariance(self)
+
+    def to_dict(self) -> dict[str, object]:
+        """All numbers as JSON holds them, as in `result.json`: None for what is not finite."""
+        return plain_content(fit_content(self))
+
     def interval(self, name: str, *, model_error: bool = True) -> tuple[float, float]:
         """The 95 % interval of one parameter.
 
@@ -190,7 +278,7 @@ class Fit(eqx.Module):
         - `model_error`: count what the model's structure leaves unexplained, as
             `standard_errors` do; False for the measured noise alone.
         """
-        k = self.names.index(name)
+        k = self._place(name)
         for bound in self.verdict.bounds:
             if bound.name == name:
                 limit = bound.limit if model_error else bound.noise_limit

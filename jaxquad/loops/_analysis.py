@@ -137,6 +137,11 @@ class LoopResponse(eqx.Module):
     loop: OpenLoop
     kind: str = eqx.field(static=True)
 
+    @property
+    def dt(self) -> float:
+        """The sample interval in s."""
+        return self.loop.dt
+
     def frequency_response(
         self, omega: Float[Array, " frequencies"]
     ) -> Complex[Array, "frequencies 1 1"]:

@@ -1,18 +1,9 @@
-from ._bode import (
-    bode as bode,
-    COHERENT as COHERENT,
-    Model as Model,
-    model_response as model_response,
-    residual_figure as residual_figure,
-    Residuals as Residuals,
-    residuals_of as residuals_of,
-)
+from ._bode import bode as bode, coherence as coherence, COHERENT as COHERENT
 from ._certificate import certificate_figure as certificate_figure
 from ._histories import (
     channels_of as channels_of,
     extremes as extremes,
     histories as histories,
-    overlay as overlay,
     record_figure as record_figure,
     ROWS as ROWS,
 )
@@ -22,4 +13,7 @@ from ._labels import (
     unit_label as unit_label,
     visible as visible,
 )
+from ._panels import headless as headless, Panels as Panels
+from ._predictions import compare as compare, step as step
+from ._residuals import resid as resid, Residuals as Residuals, residuals_of as residuals_of
 from ._tuning import convergence_figure as convergence_figure, front_figure as front_figure

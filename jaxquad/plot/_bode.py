@@ -1,27 +1,29 @@
-"""Responses over frequency, measured and modelled, and what lies between them."""
+"""Responses over frequency, measured and modelled."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import ArrayLike, Bool, Complex, Float
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from jaxquad.identify import as_sampled
-from jaxquad.models import evaluate_response, Model
-from jaxquad.spectra import FrequencyResponse
-
-from ._labels import few_ticks, plain_ticks, Style
-from ._panels import arrange, legend_of, stacked
+from ._labels import few_ticks, look_of, plain_ticks, Style
+from ._panels import arrange, Given, legend_of, Panels, stacked, WIDTH
+from ._shown import (
+    Channels,
+    channels_shown,
+    frequencies_of,
+    Measured,
+    measured_and_modelled,
+    Modelled,
+    response_beside,
+    Thing,
+)
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
-_LINES = ["-", "--", "-.", ":"]
 _MARKS = ["x", "+", "^", "s"]
+_COLUMN = 4.6  # inches, of one input of several
 
 
 class _Curve(NamedTuple):
@@ -29,77 +31,117 @@ class _Curve(NamedTuple):
     magnitude: Float[np.ndarray, " frequencies"]  # dB
     phase: Float[np.ndarray, " frequencies"]  # deg
     coherence: Float[np.ndarray, " frequencies"]
-    error: Float[np.ndarray, " frequencies"]  # 1 sigma: relative, and in rad
-
-    @property
-    def good(self) -> Bool[np.ndarray, " frequencies"]:
-        return self.coherence >= COHERENT
+    decibels: Float[np.ndarray, " frequencies"]  # half of the 95 % band
+    degrees: Float[np.ndarray, " frequencies"]
+    good: Bool[np.ndarray, " frequencies"]  # used by the fit, or coherent
 
 
 def bode(
-    frf: FrequencyResponse,
-    models: Model | Mapping[str, Model] | None = None,
-    *,
-    others: Mapping[str, FrequencyResponse] | None = None,
+    *shown: Thing,
     pair: tuple[str, str] | None = None,
+    omega: Float[ArrayLike, " frequencies"] | None = None,
+    ax: Given = None,
     title: str = "",
-) -> Figure:
-    """Draw magnitude, phase and coherence of a measured response, beside models.
+) -> Panels:
+    """Draw magnitude, phase and coherence of measured responses and of models.
 
-    The grey band holds 95 % of the random error. Points whose coherence is below 0.6 are faint and
-    have no band. As the paper's Figure 5.
+    The first measured response has points with a grey band that holds 95 % of its random error.
+    Points that a fit did not use, or whose coherence is below 0.6, are grey and have no band. The
+    model of a fit has a band of 95 %, model error included. Several inputs and outputs are a grid:
+    an input for each column. As the paper's Figure 5.
+
+    !!! example
+
+        ```python
+        jq.plot.bode(fit)
+        jq.plot.bode(response, {"identified": fit, "data sheet": model}).figure.savefig("bode.png")
+        ```
 
     **Arguments:**
 
-    - `frf`: the measured response.
-    - `models`: a model with `frequency_response(omega)`, or several by the text of the legend. They
-        are drawn as the record's samples show them, with the hold of its input.
-    - `others`: further estimates of the same response, by the text of the legend.
-    - `pair`: names of output and input; by default the first of each.
+    - `shown`: what to draw: models with `frequency_response(omega)`, measured responses, records,
+        fits of `jq.fit`, loops (broken at the command); one by one, in lists, or in mappings from
+        the texts of the legend. Models are drawn as a record's samples show them, with the hold of
+        its input.
+    - `pair`: names of output and input; by default all pairs.
+    - `omega`: where models are drawn, in rad/s; by default where there are measurements, else
+        about poles and zeros.
+    - `ax`: axes to draw into, as many as panels: magnitude, phase and, with a measured response,
+        coherence, from top to bottom; of several pairs row by row.
     - `title`: above the figure.
 
-    **Raises:** ValueError for an unknown `pair`.
+    **Returns:** `jq.plot.Panels`, the axes.
+
+    **Raises:** ValueError for an unknown `pair`, for things without a frequency response, and for
+    more than there are lines or marks.
     """
-    o, i = _position(frf, pair)
-    figure, axes = stacked(3)
-    measured = _curve(frf, o, i)
-    _draw_measured(axes, measured, f"{frf.method} estimate")
-    for k, (name, other) in enumerate((others or {}).items()):
-        _draw_other(axes, _beside(_curve(other, *_position(other, pair)), measured), name, k)
-    if not isinstance(models, Mapping):
-        models = {"model": models} if models is not None else {}
-    for k, (name, each) in enumerate(models.items()):
-        drawn = _model_curve(as_sampled(each, frf), measured, o, i)
-        _draw_model(axes, _beside(drawn, measured), name, k)
-    _scale(axes, measured)
-    _label(axes, f"{frf.output_names[o]} / {frf.input_names[i]}")
-    arrange(figure, axes, (2.1, 2.1, 1.1), above=0.45, title=title, legend=legend_of(axes[:1]))
-    return figure
+    measured, modelled = measured_and_modelled(shown, "bode")
+    channels = channels_shown(measured, modelled)
+    places = channels.places(pair)
+    columns = len({i for _, i in places})
+    grid = frequencies_of(measured, modelled, None if omega is None else np.asarray(omega, float))
+    beside = measured[0].frf if measured else None
+    responses = [response_beside(each, grid, beside) for each in modelled]
+    rows = 3 if measured else 2
+    panels = stacked(rows * len(places), ax, columns=columns)
+    for place in range(len(places)):
+        axes = _block(panels, place, columns, rows)
+        o, i = places[place]
+        curves = [_measured_curve(each, o, i) for each in measured]
+        drawn = [
+            _model_curve(each, grid, found[:, o, i], o, i)
+            for each, found in zip(modelled, responses, strict=True)
+        ]
+        _draw_pair(axes, list(zip(measured, curves, strict=True)),
+                   list(zip(modelled, drawn, strict=True)))  # fmt: skip
+        _label(axes, channels, o, i, top=place < columns, bottom=place >= len(places) - columns)
+    heights = [2.1, 2.1, 1.1][:rows] * (len(places) // columns)
+    gaps = (([0.12] * (rows - 1) + [0.3]) * (len(places) // columns))[:-1]
+    width = WIDTH if columns == 1 else _COLUMN * columns
+    legend = legend_of(_block(panels, 0, columns, rows)[:1])
+    return arrange(panels, heights, columns=columns, width=width, above=0.45, gap=gaps,
+                   title=title, legend=legend, handle_length=2.6)  # fmt: skip
 
 
-def _position(frf: FrequencyResponse, pair: tuple[str, str] | None) -> tuple[int, int]:
-    if pair is None:
-        return 0, 0
-    output, source = pair
-    if output not in frf.output_names or source not in frf.input_names:
-        raise ValueError(
-            f"no response {pair}: outputs are {frf.output_names}, inputs {frf.input_names}"
-        )
-    return frf.output_names.index(output), frf.input_names.index(source)
+def _block(panels: Panels, place: int, columns: int, rows: int) -> list[Axes]:
+    """The panels of one pair, from top to bottom."""
+    row, column = divmod(place, columns)
+    return [panels[(row * rows + k) * columns + column] for k in range(rows)]
 
 
-def _curve(frf: FrequencyResponse, o: int, i: int) -> _Curve:
+def _draw_pair(
+    axes: Sequence[Axes],
+    measured: Sequence[tuple[Measured, _Curve]],
+    modelled: Sequence[tuple[Modelled, _Curve]],
+) -> None:
+    """All curves on the 360 deg branch of the first one."""
+    first = next(curve for _, curve in [*measured, *modelled])
+    for k, (each, curve) in enumerate(measured):
+        if k == 0:
+            _draw_measured(axes, curve, each)
+        else:
+            _draw_other(axes, _beside(curve, first), each.name, k - 1)
+    for k, (each, curve) in enumerate(modelled):
+        _draw_model(axes, _beside(curve, first), each, k)
+    _scale(axes, first, bool(measured))
+
+
+def _measured_curve(each: Measured, o: int, i: int) -> _Curve:
+    frf = each.frf
     coherence = np.asarray(frf.coherence)[:, o, i]
+    good = coherence >= COHERENT if each.used is None else np.asarray(each.used)[:, o, i]
     angle = np.angle(np.asarray(frf.response)[:, o, i])
-    omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)[:, o, i]
-    return _Curve(omega, frf.magnitude_db[:, o, i], _phase(angle, coherence), coherence, error)
+    omega, error = np.asarray(frf.omega), 1.96 * np.asarray(frf.random_error)[:, o, i]
+    decibels, degrees = 20 / np.log(10) * error, np.degrees(error)
+    magnitude = frf.magnitude_db[:, o, i]
+    return _Curve(omega, magnitude, _phase(angle, good), coherence, decibels, degrees, good)
 
 
 def _phase(
-    angle: Float[np.ndarray, " frequencies"], coherence: Float[np.ndarray, " frequencies"]
+    angle: Float[np.ndarray, " frequencies"], good: Bool[np.ndarray, " frequencies"]
 ) -> Float[np.ndarray, " frequencies"]:
-    """Degrees, unwrapped over coherent points only: one noisy point would turn all after it."""
-    place, good = np.arange(angle.size), coherence >= COHERENT
+    """Degrees, unwrapped over good points only: one noisy point would turn all after it."""
+    place = np.arange(angle.size)
     if not good.any():
         return np.degrees(angle)
     near = np.interp(place, place[good], np.unwrap(angle[good]))
@@ -107,55 +149,46 @@ def _phase(
     return phase - 360 * np.round((np.median(phase[good]) + 180) / 360)
 
 
-def _model_curve(model: Model, measured: _Curve, o: int, i: int) -> _Curve:
-    omega = np.geomspace(measured.omega[0], measured.omega[-1], 300)
-    response = model_response(model, omega)[:, o, i]
+def _model_curve(
+    each: Modelled,
+    omega: Float[np.ndarray, " frequencies"],
+    response: Complex[np.ndarray, " frequencies"],
+    o: int,
+    i: int,
+) -> _Curve:
     phase = np.degrees(np.unwrap(np.angle(response)))
-    one, none = np.ones_like(omega), np.zeros_like(omega)
-    return _Curve(omega, 20 * np.log10(np.abs(response)), phase, one, none)
+    phase -= 360 * np.round(phase[0] / 360 + 0.01)  # -180 rather than 180 deg
+    none, one = np.zeros_like(omega), np.ones_like(omega)
+    decibels, degrees = none, none
+    if each.fit is not None:
+        band = each.fit.response_band(omega)
+        decibels, degrees = band.decibels[:, o, i], band.degrees[:, o, i]
+    with np.errstate(divide="ignore"):
+        magnitude = 20 * np.log10(np.abs(response))
+    return _Curve(omega, magnitude, phase, one, decibels, degrees, one > 0)
 
 
-_AT_ONCE = 512  # frequencies of a program, so that two curves of a model share it
-
-
-def model_response(
-    model: Model, omega: Float[np.ndarray, " frequencies"]
-) -> Complex[np.ndarray, "frequencies outputs inputs"]:
-    """The response of a model at frequencies in rad/s."""
-    padded = np.pad(omega, (0, -omega.size % _AT_ONCE), mode="edge").reshape(-1, _AT_ONCE)
-    parts = [np.asarray(_response(model, each)) for each in padded]
-    return np.concatenate(parts)[: omega.size]
-
-
-@eqx.filter_jit
-def _response(
-    model: Model, omega: Float[Array | np.ndarray, " frequencies"]
-) -> Complex[Array, "frequencies outputs inputs"]:
-    return evaluate_response(model, jnp.asarray(omega))
-
-
-def _beside(curve: _Curve, measured: _Curve) -> _Curve:
-    """The curve on the same 360 deg branch as the measurement's coherent points."""
-    good = measured.good if measured.good.any() else slice(None)
-    omega = measured.omega[good]
-    difference = np.interp(omega, curve.omega, curve.phase) - measured.phase[good]
+def _beside(curve: _Curve, first: _Curve) -> _Curve:
+    """The curve on the same 360 deg branch as the good points of the first one."""
+    good = first.good if first.good.any() else slice(None)
+    difference = np.interp(first.omega[good], curve.omega, curve.phase) - first.phase[good]
     return curve._replace(phase=curve.phase - 360 * np.round(np.median(difference) / 360))
 
 
-def _draw_measured(axes: Sequence[Axes], curve: _Curve, name: str) -> None:
-    omega, good = curve.omega, curve.good
-    decibels = 20 / np.log(10) * curve.error
+def _draw_measured(axes: Sequence[Axes], curve: _Curve, each: Measured) -> None:
+    omega, good, name = curve.omega, curve.good, each.name
+    why = "not used" if each.used is not None else f"coherence below {COHERENT}"
     for axis, level, error in (
-        (axes[0], curve.magnitude, decibels),
-        (axes[1], curve.phase, np.degrees(curve.error)),
+        (axes[0], curve.magnitude, curve.decibels),
+        (axes[1], curve.phase, curve.degrees),
     ):
         if good.any():
-            reach = np.where(good, 1.96 * error, np.nan)
+            reach = np.where(good, error, np.nan)
             low, high = level - reach, level + reach
             axis.fill_between(omega, low, high, color="0.75", lw=0, label="95 % band")
             axis.plot(omega[good], level[good], "o", ms=3.5, color="0.15", label=name)
         if not good.all():
-            label = f"{name}, coherence below {COHERENT}"
+            label = f"{name}, {why}"
             axis.plot(omega[~good], level[~good], "o", ms=3, mfc="none", mec="0.7", label=label)
     axes[2].plot(omega, curve.coherence, "o-", ms=2.5, lw=0.8, color="0.15")
 
@@ -168,114 +201,111 @@ def _draw_other(axes: Sequence[Axes], curve: _Curve, name: str, k: int) -> None:
     axes[2].plot(curve.omega, curve.coherence, ls=":", marker=mark, ms=3, lw=0.8, color="tab:red")
 
 
-def _draw_model(axes: Sequence[Axes], curve: _Curve, name: str, k: int) -> None:
-    style: Style = dict(ls=_LINES[k % len(_LINES)], lw=1.6, color="tab:blue", label=name)
-    axes[0].plot(curve.omega, curve.magnitude, **style)
-    axes[1].plot(curve.omega, curve.phase, **style)
+def _draw_model(axes: Sequence[Axes], curve: _Curve, each: Modelled, k: int) -> None:
+    style = look_of(k, each.name)
+    for axis, level, reach in (
+        (axes[0], curve.magnitude, curve.decibels),
+        (axes[1], curve.phase, curve.degrees),
+    ):
+        if each.fit is not None:
+            axis.fill_between(curve.omega, level - reach, level + reach, alpha=0.3, lw=0,
+                              color=style["color"], label=f"{each.name}, 95 %")  # fmt: skip
+        axis.plot(curve.omega, level, **style)
 
 
-def _scale(axes: Sequence[Axes], curve: _Curve) -> None:
-    """Axes that show every coherent point and the models, whatever the other points do."""
-    if not curve.good.any():
+def _scale(axes: Sequence[Axes], first: _Curve, measured: bool) -> None:
+    """Axes that show every good point and the models, whatever the other points do."""
+    if not first.good.any():
         return
-    for axis, level in ((axes[0], curve.magnitude), (axes[1], curve.phase)):
+    for axis, level in ((axes[0], first.magnitude), (axes[1], first.phase)):
         lines = [line.get_ydata() for line in axis.get_lines() if line.get_linestyle() != "None"]
-        shown = np.concatenate([level[curve.good], *lines])
+        shown = np.concatenate([level[first.good], *(np.asarray(y, float) for y in lines)])
+        shown = shown[np.isfinite(shown)]
         margin = 0.06 * np.ptp(shown) + 1
         axis.set_ylim(shown.min() - margin, shown.max() + margin)
 
 
-def _label(axes: Sequence[Axes], name: str) -> None:
-    for axis, text in zip(axes, (f"|{name}|, dB", "phase, deg", "coherence"), strict=True):
+def _label(
+    axes: Sequence[Axes], channels: Channels, o: int, i: int, *, top: bool, bottom: bool
+) -> None:
+    name, unit = channels.ratio(o, i), channels.unit(o, i)
+    size = f"|{name}|, dB" if name else "magnitude, dB"
+    texts = (f"{size}\n({unit})" if unit else size, "phase, deg", "coherence")
+    for axis, text in zip(axes, texts, strict=False):
         axis.set_ylabel(text)
         axis.grid(True, color="0.9", lw=0.5)
         few_ticks(axis.yaxis, 5)
-    axes[2].set_yticks((0, 0.5, 1))
-    axes[2].axhline(COHERENT, color="0.4", lw=0.8, ls="--")
-    axes[2].text(0.995, COHERENT + 0.02, f"{COHERENT}", ha="right", va="bottom", fontsize=8,
-                 color="0.3", transform=axes[2].get_yaxis_transform())  # fmt: skip
-    axes[2].set(ylim=(0, 1.02), xscale="log", xlabel="frequency, rad/s")
+    if len(axes) > 2:
+        _coherence_axis(axes[2])
+    axes[0].set_xscale("log")
+    for axis in axes:
+        plain_ticks(axis.xaxis)
+    if bottom:
+        axes[-1].set_xlabel("frequency, rad/s")
+    if top:
+        add_hertz(axes[0])
+
+
+def _coherence_axis(axis: Axes) -> None:
+    axis.set_yticks((0, 0.5, 1))
+    axis.set_ylim(0, 1.02)
+    axis.axhline(COHERENT, color="0.4", lw=0.8, ls="--")
+    axis.text(0.995, COHERENT + 0.02, f"{COHERENT}", ha="right", va="bottom", fontsize=8,
+              color="0.3", transform=axis.get_yaxis_transform())  # fmt: skip
+
+
+def add_hertz(axis: Axes) -> None:
+    """A second horizontal axis above, in Hz, of one in rad/s."""
     turn = 2 * np.pi
     functions = (lambda omega: omega / turn, lambda hertz: hertz * turn)
-    hertz = axes[0].secondary_xaxis("top", functions=functions)
+    hertz = axis.secondary_xaxis("top", functions=functions)
     hertz.set_xlabel("frequency, Hz")
-    for axis in (axes[2].xaxis, hertz.xaxis):
-        plain_ticks(axis)
+    plain_ticks(hertz.xaxis)
 
 
-_SIGMAS = 1.96  # of a normal error, that hold 95 %
-_OUTSIDE = 6.0  # standard errors, where the picture ends at least
-
-
-class Residuals(NamedTuple):
-    """Measured minus model, of one response, in units of its random error."""
-
-    omega: Float[np.ndarray, " frequencies"]  # rad/s
-    magnitude: Float[np.ndarray, " frequencies"]
-    phase: Float[np.ndarray, " frequencies"]
-    decibels: Float[np.ndarray, " frequencies"]  # the same in dB
-    degrees: Float[np.ndarray, " frequencies"]  # and in deg
-    coherent: Bool[np.ndarray, " frequencies"]
-
-    @property
-    def outside(self) -> float:
-        """Share of the coherent points beyond 1.96 errors: 5 % if the model explains them."""
-        return float(np.mean(np.abs(self._both) > _SIGMAS)) if self.coherent.any() else np.nan
-
-    @property
-    def rms(self) -> float:
-        """Of the coherent points: 1 if the model explains them."""
-        return float(np.sqrt(np.mean(self._both**2))) if self.coherent.any() else np.nan
-
-    @property
-    def _both(self) -> Float[np.ndarray, " points"]:
-        return np.concatenate([self.magnitude[self.coherent], self.phase[self.coherent]])
-
-
-def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int) -> Residuals:
-    """The logarithm of measured over modelled response, whose parts are magnitude and phase.
+def coherence(
+    *shown: Thing,
+    pair: tuple[str, str] | None = None,
+    ax: Given = None,
+    title: str = "",
+) -> Panels:
+    """Draw the coherence of measured responses over frequency.
 
     **Arguments:**
 
-    - `frf`, `model`: the measured response, and a model with `frequency_response(omega)`.
-    - `output`, `source`: places of output and input.
+    - `shown`: measured responses, records or fits, as in `jq.plot.bode`.
+    - `pair`: names of output and input; by default a panel for each pair.
+    - `ax`: axes to draw into, one for each pair.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
+
+    **Raises:** ValueError for what was not measured, and for an unknown `pair`.
     """
-    omega = np.asarray(frf.omega)
-    modelled = model_response(as_sampled(model, frf), omega)[:, output, source]
-    pair = (slice(None), output, source)
-    with np.errstate(all="ignore"):
-        difference = np.log(np.asarray(frf.response)[pair] / modelled)
-        error = np.maximum(np.asarray(frf.random_error)[pair], 1e-7)
-        size, angle = np.real(difference), np.imag(difference)
-        known = np.isfinite(difference) & np.isfinite(error)
-        coherent = known & (np.asarray(frf.coherence)[pair] >= COHERENT)
-        decibels, degrees = 20 / np.log(10) * size, np.degrees(angle)
-        omega = np.asarray(frf.omega)
-        return Residuals(omega, size / error, angle / error, decibels, degrees, coherent)
+    measured, modelled = measured_and_modelled(shown, "coherence")
+    if not measured:
+        names = ", ".join(each.name for each in modelled)
+        raise ValueError(f"{names}: a model has no coherence; give a measured response or a record")
+    channels = channels_shown(measured, modelled)
+    places = channels.places(pair)
+    panels = stacked(len(places), ax)
+    for panel, (o, i) in zip(panels, places, strict=True):
+        for k, each in enumerate(measured):
+            curve = _measured_curve(each, o, i)
+            look: Style = look_of(k, each.name) | {"lw": 1.2}
+            panel.plot(curve.omega, curve.coherence, **look)
+        panel.set_ylabel(f"coherence\n{channels.ratio(o, i)}")
+        panel.grid(True, color="0.9", lw=0.5)
+        _coherence_axis(panel)
+    finish_frequencies(panels)
+    legend = legend_of(panels[:1]) if len(measured) > 1 else None
+    return arrange(panels, [1.8] * len(places), above=0.45, title=title, legend=legend)
 
 
-def residual_figure(found: Residuals) -> Figure:
-    """Draw residuals over frequency, with the band that holds 95 % of them if the model is right.
-
-    Points whose coherence is below 0.6 are faint.
-    """
-    figure, panels = stacked(2)
-    for panel, values, text in (
-        (panels[0], found.magnitude, "magnitude"),
-        (panels[1], found.phase, "phase"),
-    ):
-        panel.axhspan(-_SIGMAS, _SIGMAS, color="0.87", lw=0)
-        panel.axhline(0, color="0.4", lw=0.8)
-        good, faint = found.coherent, ~found.coherent & np.isfinite(values)
-        panel.plot(found.omega[faint], values[faint], "o", ms=3, mfc="none", mec="0.7")
-        panel.plot(found.omega[good], values[good], "o", ms=3.5, color="0.15")
-        reach = max(_OUTSIDE, 1.1 * np.max(np.abs(values[good]), initial=0.0))
-        panel.set_ylim(-reach, reach)
-        panel.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        panel.set_ylabel(f"{text} / error")
-        panel.grid(True, color="0.93", lw=0.5)
-    panels[1].set(xscale="log", xlabel="frequency, rad/s")
-    panels[1].set_xlim(found.omega[0] / 1.05, found.omega[-1] * 1.05)
-    plain_ticks(panels[1].xaxis)
-    arrange(figure, panels, (1.6, 1.6))
-    return figure
+def finish_frequencies(panels: Panels) -> None:
+    """A logarithmic axis in rad/s below, and in Hz above."""
+    panels[-1].set(xscale="log", xlabel="frequency, rad/s")
+    for panel in panels:
+        panel.set_xscale("log")
+        plain_ticks(panel.xaxis)
+    add_hertz(panels[0])

@@ -4,12 +4,11 @@ from textwrap import wrap
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxquad.tuning import Certificate, QUANTITIES, Quantity
 
 from ._labels import draw_limit, marks, plain_ticks, raise_powers
-from ._panels import arrange, legend_of, stacked
+from ._panels import arrange, Given, legend_of, Panels, stacked
 
 
 _TOPS = {"sensitivity_peak": 30.0}  # where the picture ends: more is as good as unstable
@@ -21,8 +20,9 @@ def certificate_figure(
     *,
     quantities: Sequence[str] = ("itae", "sensitivity_peak"),
     designs: Sequence[str] | None = None,
+    ax: Given = None,
     title: str = "",
-) -> Figure:
+) -> Panels:
     """Draw every member of a certificate over its inertia: stability, then further quantities.
 
     Linearly unstable members have a cross, and no Ms or margin. Limits are dashed lines.
@@ -32,7 +32,10 @@ def certificate_figure(
     - `certificate`: see `jq.certify`.
     - `quantities`: names of `jaxquad.tuning`, a panel for each.
     - `designs`: the names of those that are drawn; all by default.
+    - `ax`: axes to draw into: one for the stability, one for each quantity.
     - `title`: by default the verdict, and what fails.
+
+    **Returns:** `jq.plot.Panels`.
 
     **Raises:** ValueError for unknown designs, and for more than there are marks.
     """
@@ -41,7 +44,7 @@ def certificate_figure(
     if unknown:
         raise ValueError(f"no designs {unknown}: choose from {list(certificate.designs)}")
     heights = [0.28 * len(names) + 0.1, *(2.7 for _ in quantities)]
-    figure, panels = stacked(len(heights))
+    panels = stacked(len(heights), ax)
     place, label = _inertia(certificate)
     _stability(panels[0], certificate, names, place)
     for panel, quantity in zip(panels[1:], quantities, strict=True):
@@ -53,8 +56,7 @@ def certificate_figure(
     title = "\n".join(part for line in lines for part in wrap(line, 95))
     longest = max(len(label.get_text()) for label in panels[0].get_yticklabels())
     left = max(0.9, 0.2 + _LETTER * longest)
-    arrange(figure, panels, heights, width=6.4 + left, left=left, title=title, legend=named)
-    return figure
+    return arrange(panels, heights, width=6.4 + left, left=left, title=title, legend=named)
 
 
 def _inertia(certificate: Certificate) -> tuple[np.ndarray, str]:

@@ -4,14 +4,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from jaxquad.identify import Agreement, Verification
 from jaxquad.records import Record
 
 from ._labels import few_ticks, short_names, Style, unit_label, visible
-from ._panels import arrange, legend_of, stacked
+from ._panels import arrange, Given, legend_of, Panels, stacked
 
 
 Places = Int[np.ndarray, " kept"]
@@ -54,7 +51,13 @@ def channels_of(record: Record) -> list[tuple[str, str]]:
     return [(role, name) for role, names in roles.items() for name in names]
 
 
-def record_figure(record: Record, channels: Sequence[tuple[str, str]] | None = None) -> Figure:
+def record_figure(
+    record: Record,
+    channels: Sequence[tuple[str, str]] | None = None,
+    *,
+    ax: Given = None,
+    title: str = "",
+) -> Panels:
     """Draw the channels of a record over time, stacked; angles in degrees.
 
     A long channel is drawn through its extremes, so that no peak is lost.
@@ -64,9 +67,13 @@ def record_figure(record: Record, channels: Sequence[tuple[str, str]] | None = N
     - `record`: what was flown.
     - `channels`: pairs of role and name, see `channels_of`; by default all references, inputs and
       outputs.
+    - `ax`: axes to draw into, one for each channel.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
     """
     channels = channels_of(record) if channels is None else channels
-    figure, panels = stacked(len(channels))
+    panels = stacked(len(channels), ax)
     labels = short_names([name for _, name in channels])
     for panel, (role, name), label in zip(panels, channels, labels, strict=True):
         scale, unit = unit_label(visible(record.unit(name))[:12])
@@ -80,63 +87,7 @@ def record_figure(record: Record, channels: Sequence[tuple[str, str]] | None = N
         panel.grid(True, color="0.9", lw=0.5)
         panel.margins(x=0)
     panels[-1].set_xlabel("time, s")
-    arrange(figure, panels, [1.0] * len(panels), above=0.2, gap=0.35)
-    return figure
-
-
-Samples = Float[np.ndarray, " samples"]
-
-
-def overlay(check: Verification, *, title: str = "") -> Figure:
-    """Draw measured and simulated outputs over time, with their difference below each.
-
-    Angles are in degrees. A long curve is drawn through its extremes, so that no peak is lost.
-
-    **Arguments:**
-
-    - `check`: see `jq.verify`.
-    - `title`: above the figure, before the measures of agreement.
-    """
-    count = len(check.outputs)
-    figure, axes = stacked(2 * count)
-    shape = (check.time.size, count)
-    measured, simulated = check.measured.reshape(shape), check.simulated.reshape(shape)
-    for k, one in enumerate(check.outputs):
-        _draw(axes[2 * k : 2 * k + 2], check.time, measured[:, k], simulated[:, k], one)
-    axes[-1].set_xlabel("time, s")
-    where = f", {check.band[0]:.3g}..{check.band[1]:.3g} rad/s" if check.band else ""
-    numbers = (
-        f"fit {check.fit_percent:.1f} %, variance accounted for {check.variance_percent:.1f} %, "
-        f"TIC {check.tic:.3f}{where}"
-    )
-    heights = [2.4, 1.0] if count == 1 else [1.8, 0.9] * count
-    arrange(figure, axes, heights, title=f"{title}\n{numbers}" if title else numbers)
-    return figure
-
-
-def _draw(
-    axes: Sequence[Axes], time: Samples, measured: Samples, simulated: Samples, one: Agreement
-) -> None:
-    top, bottom = axes
-    scale, unit = unit_label(one.unit)
-    model = {"color": "tab:blue", "lw": 1.6, "ls": "--", "label": "simulated, open loop"}
-    _plot(top, time, scale * measured, {"color": "0.15", "lw": 1.0, "label": "measured"})
-    _plot(top, time, scale * simulated, model)
-    top.legend(loc="upper right", fontsize=9, ncols=2)
-    top.set_ylabel(f"{one.name}{unit}")
-    _plot(bottom, time, scale * (measured - simulated), {"color": "tab:red", "lw": 0.9})
-    bottom.set_ylabel(f"difference{unit}")
-    few_ticks(bottom.yaxis, 4)
-    for axis in axes:
-        axis.grid(True, color="0.9", lw=0.5)
-        axis.margins(x=0)
-    low, high = top.get_ylim()
-    top.set_ylim(low, high + 0.15 * (high - low))
-
-
-def _plot(panel: Axes, time: Samples, values: Samples, style: Style) -> None:
-    kept = extremes(values)
-    panel.plot(time[kept], values[kept], **style)
+    return arrange(panels, [1.0] * len(panels), above=0.2, gap=0.35, title=title)
 
 
 _LINES = [
@@ -155,8 +106,9 @@ def histories(
     *,
     target: str | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
+    ax: Given = None,
     title: str = "",
-) -> Figure:
+) -> Panels:
     """Draw curves over time in stacked panels; they differ in their lines as well as in colour.
 
     **Arguments:**
@@ -166,7 +118,10 @@ def histories(
       "roll, deg". A name has the same line in all panels. Values that are not finite are left out.
     - `target`: the name of a set-point or a truth, drawn behind the others as a wide grey line.
     - `limits`: of vertical axes, by their text.
+    - `ax`: axes to draw into, one for each panel.
     - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
 
     **Raises:** ValueError for more curves than there are lines, and for limits of an unknown panel.
     """
@@ -174,7 +129,7 @@ def histories(
     unknown = [text for text in limits or {} if text not in panels]
     if unknown:
         raise ValueError(f"limits for {unknown}, but the panels are {list(panels)}")
-    figure, axes = stacked(len(panels))
+    axes = stacked(len(panels), ax)
     for axis, (text, curves) in zip(axes, panels.items(), strict=True):
         for name, values in curves.items():
             shown = np.asarray(values, float)
@@ -185,8 +140,7 @@ def histories(
         axis.set_ylim((limits or {}).get(text, axis.get_ylim()))
     axes[-1].set_xlabel("time, s")
     heights = [2.1 if len(axes) > 1 else 2.5] * len(axes)
-    arrange(figure, axes, heights, title=title, legend=legend_of(axes), handle_length=3.5)
-    return figure
+    return arrange(axes, heights, title=title, legend=legend_of(axes), handle_length=3.5)
 
 
 def _styles(

@@ -26,6 +26,23 @@ _MARKS = (
     {"marker": "*", "color": "0.4", "mfc": "0.7", "ms": 6.0, "mew": 0.6},
 )
 Style = dict[str, Any]  # keyword arguments of `Axes.plot`
+LINES: tuple[Style, ...] = (  # told apart by dash, by lightness and by colour
+    {"color": "tab:blue", "ls": "-", "lw": 1.6},
+    {"color": "tab:red", "ls": "--", "lw": 1.6},
+    {"color": "tab:green", "ls": "-.", "lw": 1.4},
+    {"color": "tab:purple", "ls": (0, (1, 1.2)), "lw": 1.8},
+    {"color": "0.45", "ls": (0, (6, 1, 1, 1, 1, 1)), "lw": 1.4},
+)
+
+
+def look_of(k: int, name: str) -> Style:
+    """The line of one of several models. Raises ValueError beyond the last there is."""
+    if k >= len(LINES):
+        raise ValueError(
+            f"{name} is curve {k + 1}, too many to be distinguished, {len(LINES)} is the most: "
+            "split them over several figures"
+        )
+    return LINES[k] | {"label": name}
 
 
 def visible(text: str) -> str:

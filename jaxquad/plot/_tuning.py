@@ -6,13 +6,12 @@ from textwrap import wrap
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxquad.tuning import DesignResult, Evaluation, front_point, Pareto, QUANTITIES
 
 from ._labels import draw_limit, marks, plain_ticks, raise_powers, Style
-from ._panels import arrange, legend_of, stacked
+from ._panels import arrange, Given, legend_of, Panels, stacked
 
 
 Count = Int[np.ndarray, " evaluations"]
@@ -22,7 +21,9 @@ _LEAST = 1e-5  # of the cost above the best, that is drawn
 _CLOSE = 0.01  # costs are logarithms: within 1 % of the optimum
 
 
-def convergence_figure(history: Sequence[Evaluation], *, title: str = "") -> Figure:
+def convergence_figure(
+    history: Sequence[Evaluation], *, ax: Given = None, title: str = ""
+) -> Panels:
     """Draw how a tune went, by gradient evaluation: cost above the best, share of stable members.
 
     While members are made stable (grey) nothing is flown, and there is no cost.
@@ -30,7 +31,10 @@ def convergence_figure(history: Sequence[Evaluation], *, title: str = "") -> Fig
     **Arguments:**
 
     - `history`: `Tuned.history`; several starts have a line each.
+    - `ax`: two axes to draw into.
     - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
 
     **Raises:** ValueError for an empty history.
     """
@@ -40,7 +44,8 @@ def convergence_figure(history: Sequence[Evaluation], *, title: str = "") -> Fig
     flying = np.array([one.phase == "optimise" for one in history])
     cost = np.where(flying[:, None], [np.atleast_1d(one.cost) for one in history], np.nan)
     stable = np.array([np.atleast_1d(one.stable) for one in history])
-    figure, (top, bottom) = stacked(2)
+    panels = stacked(2, ax)
+    top, bottom = panels
     _costs(top, count, cost)
     _shares(bottom, count, stable)
     _stabilising((top, bottom), count, flying)
@@ -48,8 +53,7 @@ def convergence_figure(history: Sequence[Evaluation], *, title: str = "") -> Fig
     bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
     bottom.set_xlim(0.5, len(history) + 0.5)
     legend = legend_of([top]) if cost.shape[1] > 1 else None
-    arrange(figure, (top, bottom), (2.6, 1.4), title=title, legend=legend)
-    return figure
+    return arrange(panels, (2.6, 1.4), title=title, legend=legend)
 
 
 def _costs(panel: Axes, count: Count, cost: Values) -> None:
@@ -99,7 +103,7 @@ def _stabilising(
 _TITLES = {"activity_rate": "mean activity", "sensitivity_peak": "worst Ms"}
 
 
-def front_figure(pareto: Pareto, *, title: str = "") -> Figure:
+def front_figure(pareto: Pareto, *, ax: Given = None, title: str = "") -> Panels:
     """Draw a Pareto front: ITAE over activity or Ms on fresh members, with other designs beside it.
 
     A design with unstable members has a cross and their share; over Ms it stands at the right end.
@@ -107,9 +111,13 @@ def front_figure(pareto: Pareto, *, title: str = "") -> Figure:
     **Arguments:**
 
     - `pareto`: see `jaxquad.tuning`.
+    - `ax`: axes to draw into.
     - `title`: by default what is shown.
+
+    **Returns:** `jq.plot.Panels`.
     """
-    figure, [panel] = stacked(1)
+    panels = stacked(1, ax)
+    [panel] = panels
     _front(panel, pareto)
     edge = _edge(pareto)
     styles = list(marks(["front", *pareto.peers]).items())[1:]
@@ -124,8 +132,7 @@ def front_figure(pareto: Pareto, *, title: str = "") -> Figure:
     panel.set_xlabel(f"{_TITLES[pareto.over]} of the members{unit}")
     _ticks(panel)
     title = "\n".join(wrap(title or _message(pareto), 95))
-    arrange(figure, [panel], [3.4], width=7.0, title=title, legend=legend_of([panel]))
-    return figure
+    return arrange(panels, [3.4], width=7.0, title=title, legend=legend_of(panels))
 
 
 def _message(pareto: Pareto) -> str:

@@ -1,5 +1,5 @@
 from ._fit import compare_fits as compare_fits
-from ._json import plain_content as plain_content, write_json as write_json
+from ._json import write_json as write_json
 from ._page import (
     Cell as Cell,
     render_page as render_page,

@@ -7,8 +7,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxquad.excitation import three_two_one_one
-from jaxquad.identify import as_sampled, Fit, MISFIT, Verification, with_values
-from jaxquad.plot import COHERENT, model_response
+from jaxquad.identify import (
+    as_sampled,
+    Fit,
+    MISFIT,
+    model_response,
+    Verification,
+    with_values,
+)
+from jaxquad.plot import COHERENT
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 
-from jaxquad.plot import visible
+from jaxquad.plot import headless, Panels, visible
 
 
 _LARGEST = 220_000  # bytes of an SVG; a PNG of the figures here has about half of that
@@ -40,7 +40,7 @@ class Image(NamedTuple):
 
 
 def embed_figure(
-    draw: Callable[[], Figure],
+    draw: Callable[[], Panels],
     *,
     alt: str,
     caption: str = "",
@@ -48,10 +48,11 @@ def embed_figure(
 ) -> Image:
     """What `draw()` returns as an image. Texts in it are drawn as they are, dollar signs too."""
     settings = {"svg.hashsalt": "jaxquad", "svg.fonttype": "path", "text.parse_math": False}
-    with warnings.catch_warnings(), rc_context(settings):  # pyright: ignore[reportArgumentType]
+    silent = warnings.catch_warnings()
+    with headless(), silent, rc_context(settings):  # pyright: ignore[reportArgumentType]
         # A letter that the font does not have is drawn as a box: the caption holds it.
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
-        drawn = draw()
+        drawn = draw().figure
         _make_narrow(drawn)
         kind, data = _encoded(drawn)
     width, height = (f"{_WIDTH * inches:.0f}" for inches in drawn.get_size_inches())

@@ -6,7 +6,7 @@ from dataclasses import replace
 from jaxquad.identify import Verification
 from jaxquad.plot import (
     channels_of,
-    overlay,
+    compare,
     record_figure,
     ROWS,
     short_names,
@@ -82,7 +82,7 @@ def _overlay(name: str, check: Verification) -> Image:
         outputs=tuple(replace(one, name=n, unit=short_unit(one.unit)) for one, n in outputs),
     )
     return embed_figure(
-        lambda: overlay(short),
+        lambda: compare(short),
         alt=f"Measured and simulated {check.output_name} over time, {name}: fit "
         f"{check.fit_percent:.1f} %, TIC {check.tic:.3f}.",
     )

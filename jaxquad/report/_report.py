@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxquad._core import write_file
 from jaxquad.identify import Combination, Fit, MISFIT, Verification
-from jaxquad.plot import Model
+from jaxquad.models import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 

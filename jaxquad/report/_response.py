@@ -7,15 +7,8 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad.plot import (
-    bode,
-    COHERENT,
-    Model,
-    residual_figure,
-    Residuals,
-    residuals_of,
-    short_names,
-)
+from jaxquad.models import Model
+from jaxquad.plot import bode, COHERENT, resid, Residuals, residuals_of, short_names
 from jaxquad.spectra import FrequencyResponse
 
 from ._figure import embed_figure, Image
@@ -81,7 +74,7 @@ def _bode(
     }
     coherence = _coherence(frf, output, source)
     return embed_figure(
-        lambda: bode(short, {"identified": model} if model else None, others=beside, pair=pair),
+        lambda: bode(short, beside, {"identified": model} if model else {}, pair=pair),
         alt=f"Bode diagram of {_name(frf, output, source)}: magnitude, phase and coherence with "
         f"their 95 % band{' and the identified model' if model is not None else ''}. {coherence}",
         ratio=(frf.output_names[output], frf.input_names[source]),
@@ -114,7 +107,7 @@ def _residuals(frf: FrequencyResponse, model: Model, output: int, source: int) -
     found = residuals_of(frf, model, output, source)
     summary = _summary(found)
     return embed_figure(
-        lambda: residual_figure(found),
+        lambda: resid(found),
         alt=f"Residuals of {_name(frf, output, source)} over frequency, in units of the random "
         f"error. {summary}",
         ratio=(frf.output_names[output], frf.input_names[source]),

@@ -89,6 +89,8 @@ def _result(
         dt=records[0].dt,
         hold=records[0].hold,
         fed_back=bool(records[0].reference_names),
+        input_units=records[0].input_units,
+        output_units=records[0].output_units,
     )
 
 

@@ -89,6 +89,8 @@ class FrequencyResponse(eqx.Module):
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
+    input_units: tuple[str, ...] = eqx.field(static=True, default=())  # empty where unknown
+    output_units: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         if not isinstance(self.omega, Array | np.ndarray):

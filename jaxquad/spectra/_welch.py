@@ -362,6 +362,8 @@ def _result(
         dt=dt,
         hold=first.hold,
         fed_back=bool(first.reference_names),
+        input_units=first.input_units,
+        output_units=first.output_units,
     )
 
 

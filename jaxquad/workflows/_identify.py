@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib.figure import Figure
 
 from jaxquad._core import announce
 from jaxquad.identify import (
@@ -28,7 +27,7 @@ from jaxquad.identify import (
     verify,
 )
 from jaxquad.models import LaggedIntegrator, TransferFunction
-from jaxquad.plot import bode, overlay, record_figure
+from jaxquad.plot import bode, compare, headless, Panels, record_figure
 from jaxquad.records import Mix, parse_mix, Proposal, propose, read_segments, Record, Segment
 from jaxquad.report import compare_fits
 from jaxquad.spectra import (
@@ -135,18 +134,19 @@ class Identification:
         }
         return {title: str(each) for title, each in found.items() if each is not None}
 
-    def figures(self) -> dict[str, Figure]:
+    def figures(self) -> dict[str, Panels]:
         """The figures by file name: Bode diagram, records, and the check on a second record."""
-        models = {"identified": self.fit.model} if self.fit.verdict.fitted else None
+        models = {"identified": self.fit} if self.fit.verdict.fitted else {}
         others = {f"{name} estimate": self.responses[name] for name in list(self.responses)[1:]}
-        figures = {
-            f"record{'' if k == 1 else f'_{k}'}.png": record_figure(record)
-            for k, record in enumerate(self.records, start=1)
-        }
-        figures["bode.png"] = bode(self.frf, models, others=others, title=self.path.name)
-        if self.check is not None:
-            title = Path(self.settings.verify or "").name
-            figures["verification.png"] = overlay(self.check, title=title)
+        with headless():
+            figures = {
+                f"record{'' if k == 1 else f'_{k}'}.png": record_figure(record)
+                for k, record in enumerate(self.records, start=1)
+            }
+            figures["bode.png"] = bode(self.frf, others, models, title=self.path.name)
+            if self.check is not None:
+                title = Path(self.settings.verify or "").name
+                figures["verification.png"] = compare(self.check, title=title)
         return figures
 
     def write(self, folder: str | Path | None = None) -> Path:

@@ -65,8 +65,8 @@ def _write_figures(found: Identification, folder: Path) -> None:
     for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
         if earlier.name not in figures:
             earlier.unlink(missing_ok=True)
-    for name, figure in figures.items():
-        figure.savefig(folder / name, dpi=130)
+    for name, panels in figures.items():
+        panels.figure.savefig(folder / name, dpi=130)
 
 
 def _content_beside(found: Identification) -> dict[str, object]:

@@ -6,15 +6,15 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, plain_content
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
 from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
-from jaxquad.plot import certificate_figure, convergence_figure
+from jaxquad.plot import certificate_figure, convergence_figure, headless
 from jaxquad.records import Record
-from jaxquad.report import plain_content, provenance, write_json, write_report
+from jaxquad.report import provenance, write_json, write_report
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
 from jaxquad.tuning import (
     KNOWN_INERTIA,
@@ -82,11 +82,12 @@ class Tuning:
         origin = provenance(found.path, settings=known)
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
-        figures = {"convergence.png": convergence_figure(tuned.history)}
-        if tuned.certificate is not None:
-            figures["certificate.png"] = certificate_figure(tuned.certificate)
-        for file, figure in figures.items():
-            figure.savefig(folder / file, dpi=130)
+        with headless():
+            figures = {"convergence.png": convergence_figure(tuned.history)}
+            if tuned.certificate is not None:
+                figures["certificate.png"] = certificate_figure(tuned.certificate)
+        for file, panels in figures.items():
+            panels.figure.savefig(folder / file, dpi=130)
         write_report(
             folder / "report.html",
             fit=found.fit,

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -12,18 +13,27 @@ from synthetic import OMEGA, response_of
 import jaxquad as jq
 from jaxquad.plot import (
     bode,
+    compare,
     extremes,
+    headless,
     histories,
-    overlay,
+    Panels,
     plain_ticks,
     record_figure,
-    residual_figure,
+    resid,
     residuals_of,
     short_names,
 )
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    """pyplot keeps what it has made."""
+    yield
+    plt.close("all")
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +55,14 @@ def lines(axis) -> dict[str, Any]:
 
 
 def test_a_bode_figure_names_its_axes_with_units(frf):
-    magnitude, phase, coherence = bode(frf, {"truth": TRUTH}).axes[:3]
+    magnitude, phase, coherence = bode(frf, {"truth": TRUTH})[:3]
     assert magnitude.get_ylabel() == "|y0 / u0|, dB"
     assert phase.get_ylabel() == "phase, deg"
     assert coherence.get_xlabel() == "frequency, rad/s" and coherence.get_xscale() == "log"
 
 
 def test_the_band_is_the_95_per_cent_band_of_the_random_error(frf):
-    magnitude = bode(frf).axes[0]
+    magnitude = bode(frf)[0]
     (band,) = magnitude.collections
     corners = np.asarray(band.get_paths()[0].vertices)
     at_first = corners[np.isclose(corners[:, 0], OMEGA[0]), 1]
@@ -63,15 +73,15 @@ def test_the_band_is_the_95_per_cent_band_of_the_random_error(frf):
 def test_the_model_is_drawn_on_the_branch_of_the_measured_phase():
     """A delay of many turns, and a response that starts beyond -180 deg."""
     slow = jq.LaggedIntegrator(280.0, 0.016, 1.0)
-    figure = bode(response_of(slow), {"model": slow})
-    measured, model = (lines(figure.axes[1])[name] for name in ("joint estimate", "model"))
+    panels = bode(response_of(slow), {"model": slow})
+    measured, model = (lines(panels[1])[name] for name in ("joint estimate", "model"))
     drawn = np.interp(measured.get_xdata(), model.get_xdata(), model.get_ydata())
     assert np.max(np.abs(drawn - measured.get_ydata())) < 2  # deg, of linear interpolation
 
 
 def test_points_without_coherence_are_shown_apart(frf):
     weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence.at[:5].set(0.3))
-    drawn = lines(bode(weak, others={"direct": frf}).axes[0])
+    drawn = lines(bode(weak, {"direct": frf})[0])
     assert len(drawn["joint estimate"].get_xdata()) == OMEGA.size - 5
     assert len(drawn["joint estimate, coherence below 0.6"].get_xdata()) == 5
     assert drawn["direct"].get_marker() != drawn["joint estimate"].get_marker()
@@ -80,13 +90,13 @@ def test_points_without_coherence_are_shown_apart(frf):
 
 
 def test_an_overlay_shows_degrees_and_the_measures(check):
-    figure = overlay(check)
-    top, bottom = figure.axes
+    panels = compare(check)
+    top, bottom = panels
     assert top.get_ylabel() == "q, deg/s" and bottom.get_xlabel() == "time, s"
     np.testing.assert_allclose(
         lines(top)["measured"].get_ydata(), np.degrees(check.measured), rtol=1e-12
     )
-    assert f"{check.fit_percent:.1f} %" in figure.get_suptitle()
+    assert f"{check.fit_percent:.1f} %" in panels.figure.get_suptitle()
 
 
 def of_many_texts(check, frf):
@@ -95,17 +105,18 @@ def of_many_texts(check, frf):
     size = np.geomspace(1.0, 1e4, check.time.size)
     record = jq.Record(check.time, -12345.6 * size, 0.00012 / size, output_units="rad/s")
     return {
-        "bode": bode(frf, long, others={"direct estimate": frf}, title="two\nlines"),
-        "overlay": overlay(check, title="flight.npz"),
+        "bode": bode(frf, long, {"direct estimate": frf}, title="two\nlines"),
+        "overlay": compare(check, title="flight.npz"),
         "record": record_figure(record),
-        "residuals": residual_figure(residuals_of(frf, TRUTH, 0, 0)),
+        "residuals": resid(TRUTH, frf),
         "histories": histories(check.time, {"x, V": {c: 1e5 * check.measured for c in "abcde"}}),
     }
 
 
 def test_nothing_is_cut_off_and_no_legend_lies_on_an_axis(check, frf):
     """The layout is fixed: it counts lines instead of measuring texts."""
-    for name, figure in of_many_texts(check, frf).items():
+    for name, panels in of_many_texts(check, frf).items():
+        figure = panels.figure
         renderer = FigureCanvasAgg(figure).get_renderer()
         figure.draw(renderer)
         inked, size = figure.get_tightbbox(renderer), figure.get_size_inches()
@@ -130,7 +141,7 @@ def test_logarithmic_axes_have_few_ticks_at_round_numbers():
 def test_every_channel_of_a_record_is_drawn():
     time = np.arange(100) * 0.01
     record = jq.Record(time, np.sin(time), np.cos(time), np.sin(2 * time), output_units="rad")
-    panels = record_figure(record).axes
+    panels = record_figure(record)
     assert [axis.get_title("left") for axis in panels] == ["reference: r", "input: u", "output: y"]
     assert [axis.get_ylabel() for axis in panels] == ["", "", "deg"]
 
@@ -173,8 +184,32 @@ def test_a_long_verification_keeps_the_extremes_of_every_curve():
     check = jq.identify.Verification(
         time, measured, simulated, 0.1, 0.05, 90.0, 99.0, (one,), none, none, none, 0, None
     )
-    top, bottom = overlay(check).axes
+    top, bottom = compare(check)
     drawn = lines(top)["measured"]
     assert len(drawn.get_xdata()) < 3000 and np.isin(drawn.get_xdata(), time).all()
     assert np.ptp(drawn.get_ydata()) == np.ptp(measured)
     assert np.ptp(bottom.get_lines()[0].get_ydata()) == np.ptp(measured - simulated)
+
+
+def test_figures_are_those_of_pyplot_unless_they_are_headless(frf):
+    bode(frf)
+    before = plt.get_fignums()
+    with headless():
+        assert isinstance(bode(frf), Panels)
+    assert len(before) == 1 and plt.get_fignums() == before
+
+
+def test_what_is_drawn_goes_into_the_axes_that_are_given(frf, check):
+    figure, axes = plt.subplots(3)
+    assert tuple(bode(frf, {"truth": TRUTH}, ax=axes)) == tuple(axes)
+    assert "truth" in lines(axes[0]) and axes[0].get_legend() and not figure.legends
+    figure, axes = plt.subplots(2)
+    compare(check, ax=list(axes))
+    assert len(figure.axes) == 2 and "measured" in lines(axes[0])
+    with pytest.raises(ValueError, match="ax holds 2 axes, but this plot draws 3"):
+        bode(frf, ax=axes)
+
+
+def test_a_notebook_prints_nothing_beside_a_figure(frf):
+    """IPython asks for this method, and shows no text of what has it."""
+    assert bode(frf)._ipython_display_() is None

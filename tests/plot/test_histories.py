@@ -3,14 +3,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxquad.plot import histories
+from jaxquad.plot import headless, histories
+
+
+@pytest.fixture(autouse=True)
+def without_pyplot():
+    with headless():
+        yield
 
 
 TIME = np.linspace(0, 1, 50)
 
 
-def lines(figure) -> dict[str, Any]:
-    return {line.get_label(): line for axis in figure.axes for line in axis.get_lines()}
+def lines(panels) -> dict[str, Any]:
+    return {line.get_label(): line for axis in panels for line in axis.get_lines()}
 
 
 def test_curves_differ_in_their_lines_and_the_target_lies_behind():
@@ -23,18 +29,18 @@ def test_curves_differ_in_their_lines_and_the_target_lies_behind():
 
 
 def test_a_name_has_one_line_in_all_panels_and_one_entry_in_the_legend():
-    figure = histories(TIME, {"roll": {"x": TIME, "y": TIME}, "pitch": {"y": 2 * TIME}})
-    roll, pitch = figure.axes
+    panels = histories(TIME, {"roll": {"x": TIME, "y": TIME}, "pitch": {"y": 2 * TIME}})
+    roll, pitch = panels
     assert pitch.get_lines()[0].get_linestyle() == roll.get_lines()[1].get_linestyle() == "--"
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["x", "y"]
-    assert [axis.get_ylabel() for axis in figure.axes] == ["roll", "pitch"]
+    assert [text.get_text() for text in panels.figure.legends[0].get_texts()] == ["x", "y"]
+    assert [axis.get_ylabel() for axis in panels] == ["roll", "pitch"]
 
 
 def test_what_is_not_finite_is_left_out_and_limits_hold():
     wild = np.where(TIME > 0.5, np.inf, TIME)
-    figure = histories(TIME, {"roll": {"x": wild}}, limits={"roll": (-1.0, 2.0)})
-    assert not np.isinf(np.asarray(lines(figure)["x"].get_ydata(), float)).any()
-    assert figure.axes[0].get_ylim() == (-1.0, 2.0)
+    panels = histories(TIME, {"roll": {"x": wild}}, limits={"roll": (-1.0, 2.0)})
+    assert not np.isinf(np.asarray(lines(panels)["x"].get_ydata(), float)).any()
+    assert panels[0].get_ylim() == (-1.0, 2.0)
 
 
 def test_too_many_curves_and_unknown_panels_are_refused():

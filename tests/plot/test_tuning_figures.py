@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from certificates_by_hand import certificate, front, INERTIA, judged, missed
 
-from jaxquad.plot import certificate_figure, convergence_figure, front_figure
+from jaxquad.plot import certificate_figure, convergence_figure, front_figure, headless
 from jaxquad.tuning import Evaluation
+
+
+@pytest.fixture(autouse=True, scope="module")
+def without_pyplot():
+    with headless():
+        yield
 
 
 def lines(panel) -> dict[str, Any]:
@@ -27,12 +33,12 @@ def shown():
 
 
 def test_the_verdict_stands_above_and_the_axes_have_units(shown):
-    title = shown.get_suptitle().replace("\n", " ")
+    title = shown.figure.get_suptitle().replace("\n", " ")
     assert title.startswith(
         "CERTIFICATE FAILS on 12 fresh members, not to be flown: STABILITY FAIL STABILITY: Ms, "
         "worst, at most 1.5: 2"
     )
-    stability, itae, peak = shown.axes
+    stability, itae, peak = shown
     assert itae.get_ylabel() == "ITAE, deg s²" and peak.get_ylabel().startswith("Ms")
     assert peak.get_xlabel() == "inertia of the member, J / J0" and peak.get_xscale() == "log"
     texts = [label.get_text() for label in stability.get_yticklabels()]
@@ -40,7 +46,7 @@ def test_the_verdict_stands_above_and_the_axes_have_units(shown):
 
 
 def test_unstable_members_have_a_cross_and_no_ms(shown):
-    _, itae, peak = shown.axes
+    _, itae, peak = shown
     np.testing.assert_allclose(lines(itae)["linearly unstable"].get_xdata(), INERTIA[[2, 7]])
     assert "linearly unstable" not in lines(peak)
     assert lines(peak)["other"].get_xdata().size == INERTIA.size - 2
@@ -49,7 +55,7 @@ def test_unstable_members_have_a_cross_and_no_ms(shown):
 
 
 def test_designs_differ_in_their_marks_and_limits_are_lines(shown):
-    _, itae, peak = shown.axes
+    _, itae, peak = shown
     drawn = lines(itae)
     assert drawn["tuned"].get_marker() != drawn["other"].get_marker()
     assert [line.get_ydata()[0] for line in peak.get_lines() if line.get_ls() == "--"] == [1.5]
@@ -70,7 +76,7 @@ def test_a_front_shows_mean_worst_and_peers_with_their_unstable_share():
         judged(3.0, 2.0, 10.0),
         judged(9.0, 2.0, 5.0),
     ]
-    panel = front_figure(front(points, peers={"bad": judged(20.0, 2.0, 3.0, (1, 2, 3))})).axes[0]
+    panel = front_figure(front(points, peers={"bad": judged(20.0, 2.0, 3.0, (1, 2, 3))}))[0]
     drawn = lines(panel)
     np.testing.assert_allclose(drawn["front, mean"].get_ydata(), [6.0, 3.0])
     np.testing.assert_allclose(drawn["front, worst member"].get_ydata(), [8.0, 3.0])
@@ -83,7 +89,7 @@ def test_a_front_shows_mean_worst_and_peers_with_their_unstable_share():
 def test_a_peer_without_ms_stands_beyond_all_others():
     points = [judged(4.0, 2.0), judged(3.0, 3.0)]
     found = front(points, over="sensitivity_peak", peers={"bad": judged(1.0, 2.0, unstable=(0,))})
-    panel = front_figure(found).axes[0]
+    panel = front_figure(found)[0]
     assert lines(panel)["bad"].get_xdata()[0] > 3.0
     assert "no Ms" in [text.get_text() for text in panel.texts]
 
@@ -94,8 +100,7 @@ def test_convergence_is_drawn_from_where_flights_begin():
         evaluation("optimise", [1.0, 0.5], [1, 1]),
         evaluation("optimise", [0.1, 0.6], [1, 1]),
     ]
-    figure = convergence_figure(history)
-    top, bottom = figure.axes
+    top, bottom = convergence_figure(history)
     first, second = lines(top)["start 1"], lines(top)["start 2"]
     np.testing.assert_array_equal(first.get_xdata(), [2, 3])
     np.testing.assert_allclose(first.get_ydata(), [0.9, 1e-5])

@@ -1,0 +1,27 @@
+"""Values as JSON holds them."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+
+@runtime_checkable
+class _AsArray(Protocol):
+    """NumPy's and JAX's arrays and scalars."""
+
+    def __array__(self) -> np.ndarray: ...
+
+
+def plain_content(value: object) -> Any:
+    """JSON's own types, with null for what is not finite."""
+    if isinstance(value, _AsArray):
+        return plain_content(np.asarray(value).tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain_content(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_content(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
