@@ -6,6 +6,7 @@ would follow any bias. So each point has a share of doubt, noise of its own, as 
 all the points that it shares noise with.
 """
 
+import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,7 +42,7 @@ def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mi
 def _mixing(points: Points, weights: Weights) -> Mixing | None:
     if not points.correlations:
         return None
-    factor, correlation = unmixed(points.used.shape)
+    factor, correlation = (np.array(each) for each in unmixed(points.used.shape))
     for (o, i), shared in points.correlations.items():
         mine = np.flatnonzero(points.used[:, o, i])
         # A floor on the error is the points' own.
@@ -54,11 +55,12 @@ def _mixing(points: Points, weights: Weights) -> Mixing | None:
     return Mixing(factor, correlation)
 
 
+@ft.lru_cache(maxsize=8)
 def unmixed(shape: tuple[int, ...]) -> Mixing:
     """The mixing of (frequencies, outputs, inputs) that share no noise: identities."""
     count, outputs, inputs = shape
     identity = np.eye(count, dtype=complex)
-    return Mixing(*np.array(np.broadcast_to(identity, (2, outputs, inputs, count, count))))
+    return Mixing(*np.broadcast_to(identity, (2, outputs, inputs, count, count)))
 
 
 def mix(

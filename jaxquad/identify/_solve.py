@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -198,8 +198,9 @@ def _descend(
 
 
 # A short descent takes less time than LLVM's optimisation of its program would.
+_QUICK: dict[str, Any] = {"compiler_options": {"xla_backend_optimization_level": 0}}
 _descend_long = eqx.filter_jit(_descend)
-_descend_short = eqx.filter_jit(_descend, compiler_options={"xla_backend_optimization_level": 0})
+_descend_short = eqx.filter_jit(_descend, **_QUICK)
 
 
 def least_squares(
