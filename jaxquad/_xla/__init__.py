@@ -25,6 +25,11 @@ from ._engine import (
     Jit as Jit,
 )
 from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse
-from ._kernel import as_one_kernel as as_one_kernel
+from ._kernel import as_one_kernel as as_one_kernel, why_no_kernels as why_no_kernels
+from ._real_parts import (
+    in_real_parts as in_real_parts,
+    NotInRealPartsError as NotInRealPartsError,
+)
 from ._shared import run_shared as run_shared
 from ._swap import swap_row as swap_row
+from ._vector_functions import arctan2 as arctan2, sincos as sincos

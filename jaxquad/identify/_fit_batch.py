@@ -10,19 +10,24 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from jaxquad._core import (
+    advance,
+    begin,
     CONVERGED,
     decrement,
-    minimise,
+    Descent,
     Normal,
     require_x64,
+    RUNNING,
+    settle,
     STALLED,
     TOLERANCE,
 )
-from jaxquad._xla import evaluate_once
+from jaxquad._xla import Jit
 from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
 from ._assess import assess, Counted, discrepancy_at
+from ._batch_normal import Batch, Evaluate, Member, normal_equations_of
 from ._cost import (
     Cost,
     least_coherence,
@@ -34,14 +39,15 @@ from ._cost import (
 )
 from ._fit import check_options
 from ._held import held, hold_of
-from ._parameters import Free, Numbers, Parameters, Place, select_parameters, Tie
+from ._mixing import Mixing, mixings_of
+from ._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ._problem import make_problem
 from ._result import Fit
 from ._solve import solution_at, stopped_early
 
 
-_CHUNK = 64  # fits side by side: their Jacobians stay in the cache
-_AT_ONCE = 128  # fits of one call
+_CHUNK = 64  # fits side by side
+_CHUNKS = 8  # of one call
 
 
 class BatchSolution(NamedTuple):
@@ -55,6 +61,9 @@ class BatchSolution(NamedTuple):
     converged: Bool[Numbers, " batch"]  # stopped, and with nothing left to save
 
 
+Mixings = Sequence[Mixing | None]
+
+
 def solve_batch(
     model: PyTree,
     parameters: Parameters,
@@ -62,17 +71,20 @@ def solve_batch(
     measured: Complex[Numbers, "batch frequencies outputs inputs"],
     weights: Float[Numbers, "..."],
     *,
+    mixings: Mixings = (),
+    start: Float[Numbers, "batch parameters"] | None = None,
     hold: float = 0.0,
     max_steps: int = 64,
     tolerance: float = TOLERANCE,
 ) -> BatchSolution:
-    """Fit every response of the batch from the same start, by Levenberg-Marquardt.
+    """Fit every response of the batch, by Levenberg-Marquardt.
 
     `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
-    phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count. The model is evaluated
-    one frequency at a time, with inputs held for `hold` s (0: not held). A member that did not
-    reach a stationary point has `converged` false, and its decrement says how far it is; one in a
-    local minimum shows by its cost alone.
+    phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count; `mixings`, one for each
+    member or none at all, take points together that share noise. All start from the model's values,
+    or from `start`. The model is evaluated one frequency at a time, with inputs held for `hold` s
+    (0: not held). A member that did not reach a stationary point has `converged` false, and its
+    decrement says how far it is; one in a local minimum shows by its cost alone.
     Raises ValueError for shapes that do not match, no batch at all, or a response that at one
     frequency depends on which others are asked for.
     """
@@ -81,17 +93,62 @@ def solve_batch(
             f"measured has shape {measured.shape} and weights {weights.shape}: give at least one "
             "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
         )
-    _check_pointwise(model, omega, measured.shape[1:])
-    data = (np.asarray(omega), np.asarray(measured), np.asarray(weights))
-    return _solve_portions(model, parameters, *data, hold, max_steps, tolerance)
+    omega, count = np.asarray(omega), len(omega)
+    where = Batch(model, parameters, hold, _pad(omega), np.asarray(count))
+    _check_pointwise(where, measured.shape[2:])
+    members = _members(np.asarray(measured), np.asarray(weights), mixings)
+    if start is None:
+        start = np.broadcast_to(
+            parameters.start[: parameters.count], (len(measured), parameters.count)
+        )
+    return _solve_calls(where, members, np.asarray(start), max_steps, tolerance)
 
 
-def _check_pointwise(model: PyTree, omega: Float[Numbers, " f"], shape: tuple[int, ...]) -> None:
-    whole, single = (np.asarray(part) for part in _both_ways(model, omega))
-    if whole.shape != shape:
+def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
+    """What the members are fitted to, each on the first axis."""
+    used = np.any(weights > 0, axis=-1)
+    # Points that do not count may hold anything, NaN included.
+    with np.errstate(invalid="ignore"):
+        inverse = _pad(np.where(used, 1 / np.where(used, measured, 1.0), 1.0), 1)
+    weights = np.array(_pad(weights, 1))
+    weights[:, measured.shape[1] :] = 0
+    shared = any(each is not None for each in mixings)
+    factor = _factors(mixings, measured.shape, inverse.shape[1]) if shared else None
+    return Member((inverse.real, inverse.imag), weights, factor)
+
+
+def _factors(
+    mixings: Mixings, shape: tuple[int, ...], length: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Real and imaginary parts; the identity for members whose points share no noise."""
+    batch, count, outputs, inputs = shape
+    real = np.zeros((batch, length, length, outputs, inputs))
+    imag = np.zeros_like(real)
+    for k, mixing in enumerate(mixings):
+        factor = np.eye(count)[:, :, None, None]
+        factor = factor if mixing is None else np.moveaxis(mixing.factor, (0, 1), (2, 3))
+        real[k, :count, :count], imag[k, :count, :count] = factor.real, factor.imag
+    return real, imag
+
+
+def _padded(size: int) -> int:
+    """The frequencies of a program that takes this many: few lengths, few programs."""
+    power = 1 << max(size - 1, 15).bit_length()
+    return power * 3 // 4 if size <= power * 3 // 4 else power
+
+
+def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Filled up with the last frequency."""
+    size = array.shape[axis]
+    return np.take(array, np.minimum(np.arange(_padded(size)), size - 1), axis)
+
+
+def _check_pointwise(where: Batch, shape: tuple[int, ...]) -> None:
+    whole, single = (np.asarray(part) for part in _both_ways(where.model, where.omega))
+    if whole.shape != (*where.omega.shape, *shape):
         raise ValueError(
-            f"the model's response has shape {whole.shape}, the measured ones {shape} (frequencies,"
-            " outputs, inputs): pick channels with jq.records.select, or extend the model"
+            f"the model's response has shape {whole.shape[1:]}, the measured ones {shape} (outputs,"
+            " inputs): pick channels with jq.records.select, or extend the model"
         )
     if not np.allclose(whole, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(whole))):
         raise ValueError(
@@ -106,30 +163,26 @@ def _both_ways(model, omega):
     return evaluate_response(model, omega), single
 
 
-def _portions(batch: int) -> list[Int[np.ndarray, "chunks chunk"]]:
-    """The members of each call, by chunks; the last are filled up with the last member.
-
-    Calls have few sizes, so that a batch of another length compiles nothing.
-    """
-    size = min(_AT_ONCE, 1 << (batch - 1).bit_length())
-    places = np.minimum(np.arange(batch + -batch % size), batch - 1)
-    return list(places.reshape(-1, -(-size // _CHUNK), min(size, _CHUNK)))
+def _calls(batch: int, chunks: int) -> list[Int[np.ndarray, "chunks chunk"]]:
+    """The members that each call solves, by chunks; the last are filled up with the last member."""
+    places = np.minimum(np.arange(batch + -batch % _CHUNK), batch - 1).reshape(-1, _CHUNK)
+    calls = max(-(-len(places) // chunks), min(len(places), os.cpu_count() or 1))
+    return np.array_split(places, calls)
 
 
-def _solve_portions(
-    model, parameters, omega, measured, weights, hold, max_steps, tolerance
+def _solve_calls(
+    where: Batch, members: Member, start: np.ndarray, max_steps: int, tolerance: float
 ) -> BatchSolution:
-    batch, used = len(measured), np.any(weights > 0, axis=-1)
-    # Points that do not count may hold anything, NaN included.
-    with np.errstate(invalid="ignore"):
-        inverse = np.where(used, 1 / np.where(used, measured, 1.0), 1.0)
+    batch = len(start)
+    chunks = _CHUNKS if members.factor is None else 1  # factors are large
 
-    def solve(members):
-        data = tuple(np.moveaxis(array[members], 1, -1) for array in (inverse, weights))
-        found = _solve_portion(model, parameters, omega, data, hold, max_steps, tolerance)
-        return jax.tree.map(np.asarray, found)
+    def solve(places: Int[np.ndarray, "chunks chunk"]) -> BatchSolution:
+        mine, z0 = jax.tree.map(lambda x: _arrange(x, places, chunks), (members, start))
+        options = np.asarray(len(places)), np.asarray(max_steps), tolerance
+        found = _solve_call(where, mine, z0, *options)
+        return BatchSolution(*(np.asarray(part)[: places.size] for part in found))
 
-    first, *others = _portions(batch)
+    first, *others = _calls(batch, chunks)
     found = [solve(first)]  # it compiles; a program runs on one core
     if others:
         with ThreadPoolExecutor(max_workers=min(len(others), os.cpu_count() or 1)) as pool:
@@ -137,95 +190,61 @@ def _solve_portions(
     return BatchSolution(*(np.concatenate(each)[:batch] for each in zip(*found, strict=True)))
 
 
-@eqx.filter_jit
-def _solve_portion(model, parameters, omega, data, hold, max_steps, tolerance) -> BatchSolution:
-    count, size = parameters.count, data[0].shape[-1]
-    z0 = jnp.broadcast_to(parameters.start[:count, None], (count, size))
-
-    def chunk(data):
-        evaluate = lambda z: _normal(model, parameters, z, hold, omega, *data)
-        state = minimise(evaluate, z0, max_steps, tolerance)
-        normal = evaluate(state.z)
-        left = decrement(normal)
-        level = left <= 1e-6 * normal.cost + 1e-12
-        converged = (state.status == CONVERGED) & level
-        return state.z, 2 * normal.cost, left, state.steps, converged
-
-    stacked = jax.lax.map(chunk, data)
-    z, *facts = (jnp.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1]) for part in stacked)
-    return BatchSolution(z, jax.vmap(parameters.values)(z), *facts)
+def _arrange(array: np.ndarray, places: Int[np.ndarray, "chunks chunk"], chunks: int) -> np.ndarray:
+    """Chunks first and members last; all calls have one size, so that few programs are compiled."""
+    mine = np.moveaxis(array[places], 1, -1)
+    filled = np.zeros((chunks, *mine.shape[1:]), mine.dtype)
+    filled[: len(places)] = mine
+    return filled
 
 
-def _normal(model, parameters, z, hold, omega, inverse, weights) -> Normal:
-    """Normal equations of all members, frequencies outside and members inside."""
+@Jit
+def _solve_call(where, members, z0, chunks, max_steps, tolerance) -> BatchSolution:
+    """Solve the first `chunks` of the chunks that there is room for."""
 
-    def point(z, omega, inverse, weights):
-        return _point(model, parameters, z, hold, omega, inverse, weights)
-
-    members = jax.vmap(point, in_axes=(0, None, -1, -1))
-    everywhere = evaluate_once(jax.vmap(members, in_axes=(None, 0, 0, 0)))
-    columns = everywhere(list(z), omega, inverse, weights)
-    stacked = jnp.stack([jnp.moveaxis(column, 1, -1) for column in columns])
-    return _products(stacked.reshape(len(columns), -1, z.shape[1]))
-
-
-def _point(model, parameters, z, hold, omega, inverse, weights) -> list[Float[Array, "..."]]:
-    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency."""
-
-    def response(z):
-        return evaluate_response(held(_insert(model, parameters, z), hold), omega[None])[0]
-
-    here = response(z)
-    columns = []
-    for k in range(len(z)):
-        # One parameter at a time: what does not depend on it costs nothing.
-        along = lambda x, k=k: response([*z[:k], x, *z[k + 1 :]])
-        slope = jax.jvp(along, (z[k],), (jnp.ones_like(z[k]),))[1] / here
-        columns.append(jnp.stack([jnp.real(slope), jnp.imag(slope)], axis=-1) * weights)
-    ratio = here * inverse
-    size = jnp.real(ratio) ** 2 + jnp.imag(ratio) ** 2
-    phase = jnp.arctan2(jnp.imag(ratio), jnp.real(ratio))
-    return [*columns, jnp.stack([0.5 * jnp.log(size), phase], axis=-1) * weights]
-
-
-def _insert(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) -> PyTree:
-    """As `Parameters.insert`, but without a vector that would make each depend on all."""
-    logs, scale = parameters.logarithmic, parameters.scale
-    values = [scale[k] * (jnp.exp(x) if logs[k] else x) for k, x in enumerate(z)]
-    model = _write(model, parameters.places, values)
-    for place, tie in parameters.ties:
-        model = _write(model, (place,), [jnp.asarray(tie(model))])
-    return model
-
-
-def _write(model: PyTree, places: tuple[Place, ...], values: list[Float[Array, ""]]) -> PyTree:
-    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(arrays)
-    for leaf in {place.leaf for place, _ in zip(places, values, strict=False)}:
-        flat = list(leaves[leaf].reshape(-1))
-        for place, value in zip(places, values, strict=False):
-            if place.leaf == leaf:
-                flat[place.index] = value
-        shape = leaves[leaf].shape
-        leaves[leaf] = flat[0] if shape == () else jnp.stack(flat).reshape(shape)
-    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
-
-
-def _products(columns: Float[Array, "columns points batch"]) -> Normal:
-    """All scalar products of the columns in one pass over the points."""
-    n = columns.shape[0] - 1
-    first, second = np.tril_indices(n + 1)
+    def chunk(k):
+        mine, start = jax.tree.map(
+            lambda x: jax.lax.dynamic_index_in_dim(x, k, keepdims=False), (members, z0)
+        )
+        return _descend(normal_equations_of(where, mine), start, max_steps, tolerance)
 
     def add(k, total):
-        point = columns[:, k]
-        return total + point[first] * point[second]
+        return jax.tree.map(lambda out, x: out.at[k].set(x), total, chunk(k))
 
-    start = jnp.zeros((first.size, columns.shape[-1]), columns.dtype)
-    sums = jax.lax.fori_loop(0, columns.shape[1], add, start)
-    place = np.zeros((n + 1, n + 1), int)
-    place[first, second] = place[second, first] = np.arange(first.size)
-    matrix = sums[place]
-    return Normal(0.5 * matrix[n, n], matrix[n, :n], matrix[:n, :n])
+    shapes = jax.eval_shape(chunk, jnp.zeros((), int))
+    room = jax.tree.map(lambda x: jnp.zeros((len(z0), *x.shape), x.dtype), shapes)
+    stacked = jax.lax.fori_loop(0, chunks, add, room)
+    z, *facts = (jnp.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1]) for part in stacked)
+    return BatchSolution(z, jax.vmap(where.parameters.values)(z), *facts)
+
+
+class _Walk(NamedTuple):
+    """A descent, and the normal equations at the last point that was evaluated."""
+
+    state: Descent
+    normal: Normal
+    ended: Bool[Array, ""]
+
+
+def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) -> tuple:
+    """Where members stop, with the cost, what is left to save, steps, and whether they converged.
+
+    As `minimise` does, and with one evaluation at the end, in the same loop: it compiles once.
+    """
+
+    def step(walk: _Walk) -> _Walk:
+        state = walk.state
+        running = jnp.any((state.status == RUNNING) & (state.steps < max_steps))
+        state = state._replace(change=jnp.where(running, state.change, 0.0))
+        normal = evaluate(state.z + state.change)
+        return _Walk(advance(lambda _: normal, state, max_steps, tolerance), normal, ~running)
+
+    start = begin(z0)
+    walk = _Walk(start, start.normal, jnp.asarray(False))
+    state, normal, _ = jax.lax.while_loop(lambda walk: ~walk.ended, step, walk)
+    left = decrement(normal)
+    converged = (settle(state).status == CONVERGED) & (left <= 1e-6 * normal.cost + 1e-12)
+    return state.z, 2 * normal.cost, left, state.steps, converged
 
 
 class BatchFit(eqx.Module):
@@ -241,6 +260,7 @@ class BatchFit(eqx.Module):
     parameters: Parameters
     points: tuple[Points, ...]
     weights: Float[np.ndarray, "batch frequencies outputs inputs 2"]
+    mixed: bool = eqx.field(static=True)  # whether points that share noise count together
     z: Float[np.ndarray, "batch parameters"]
 
     def fit(self, k: int) -> Fit:
@@ -252,7 +272,8 @@ class BatchFit(eqx.Module):
         """
         points, steps = self.points[k], int(self.steps[k])
         problem = make_problem(self.model, self.parameters, [points.frf])
-        problem = problem.weighted([self.weights[k]])
+        mixings = mixings_of([points], [self.weights[k]]) if self.mixed else None
+        problem = problem.weighted([self.weights[k]], mixings)
         message = "" if self.converged[k] else stopped_early(STALLED, steps)
         solution = solution_at(problem, self.z[k], message, steps)
         found = discrepancy_at(problem, [points], solution)
@@ -320,16 +341,21 @@ def fit_batch(
     least = least_coherence(min_coherence, cost, frfs[0])
     data = _stack_responses(frfs, band, least)
     ones = [np.ones(each.used.shape) for each in data.points]
-    weights = _weights(cost, data, ones)
-    found = _solve(model, parameters, data, weights, max_steps)
+    weights, mixed = _weights(cost, data, ones), isinstance(cost, MaximumLikelihood)
+    # Without a floor on the errors, they do not depend on the weights.
+    mixings = mixings_of(data.points, weights) if mixed else ()
+    arrays, options = (data.omega, data.measured), {"hold": data.hold, "max_steps": max_steps}
+    found = solve_batch(model, parameters, *arrays, weights, mixings=mixings, **options)
     again = _weights(cost, data, _ratios(model, parameters, data, found))
     if not np.allclose(weights, again, rtol=1e-4):
-        weights, found = again, _solve(model, parameters, data, again, max_steps)
-    facts = (found.values, found.cost, found.decrement, found.steps, found.converged)
+        weights, start = again, np.where(np.isfinite(found.z), found.z, 0.0)
+        found = solve_batch(
+            model, parameters, *arrays, weights, mixings=mixings, start=start, **options
+        )
     return BatchFit(
-        parameters.names, *(np.asarray(part) for part in facts),
+        parameters.names, found.values, found.cost, found.decrement, found.steps, found.converged,
         model=model, parameters=parameters, points=tuple(data.points), weights=weights,
-        z=np.asarray(found.z),
+        mixed=mixed, z=found.z,
     )  # fmt: skip
 
 
@@ -367,27 +393,23 @@ def _weights(cost: Cost, data: _Data, ratios) -> np.ndarray:
     return np.stack([cost.weights(*row) for row in rows])
 
 
-def _solve(
-    model: PyTree, parameters: Parameters, data: _Data, weights: np.ndarray, max_steps: int
-) -> BatchSolution:
-    arrays = (data.omega, data.measured, weights)
-    return solve_batch(model, parameters, *arrays, hold=data.hold, max_steps=max_steps)
-
-
 @eqx.filter_jit
-def _responses(model, parameters, z, hold, omega):
-    one = lambda each: evaluate_response(held(parameters.insert(model, each), hold), omega)
-    return eqx.filter_vmap(one)(z)
+def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
+    def one(z):
+        model = held(where.parameters.insert(where.model, z), where.hold)
+        return jnp.abs(evaluate_response(model, where.omega))
+
+    return jax.vmap(one)(z)
 
 
 def _ratios(
     model: PyTree, parameters: Parameters, data: _Data, found: BatchSolution
 ) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
     """|model / measurement| of every member; 1 where a fit ran away."""
-    parts = [
-        _responses(model, parameters, found.z[members.reshape(-1)], data.hold, data.omega)
-        for members in _portions(len(found.z))
-    ]
-    responses = np.concatenate(parts)[: len(found.z)]
-    ratios = np.abs(responses / data.measured)
+    batch, count = len(found.z), data.omega.size
+    where = Batch(model, parameters, data.hold, _pad(data.omega), np.asarray(count))
+    places = np.minimum(np.arange(batch + -batch % _CHUNK), batch - 1).reshape(-1, _CHUNK)
+    sizes = np.concatenate([np.asarray(_sizes(where, found.z[each])) for each in places])
+    with np.errstate(invalid="ignore"):
+        ratios = sizes[:batch, :count] / np.abs(data.measured)
     return np.where(np.isfinite(ratios) & (ratios > 0), ratios, 1.0)

@@ -4,9 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from sweep_logs import swept
+from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad._xla import evaluate_once
+from jaxquad._xla import arctan2, evaluate_once, in_real_parts, NotInRealPartsError
 from jaxquad.identify import select_parameters
 from jaxquad.identify._fit_batch import solve_batch
 from jaxquad.identify._problem import Problem, residuals, unchanged
@@ -69,6 +71,61 @@ def test_every_member_is_at_the_minimum_that_optimistix_finds():
         assert found.cost[k] == pytest.approx(cost, rel=1e-12)
 
 
+def test_points_that_share_noise_count_together_as_in_one_fit():
+    time, command, rate = swept(1)
+    omega = np.geomspace(0.8, 30.0, 24)
+    noise = np.random.default_rng(0).normal(0, 0.2, rate.size)
+    records = [jq.Record(time, command, rate), jq.Record(time, command, rate + noise)]
+    start = jq.LaggedIntegrator(60.0, 0.05, 0.01)
+    frfs = [jq.frequency_response(record, omega) for record in records]
+    batch = jq.identify.fit_batch(start, frfs)
+    assert batch.points[0].correlations
+    for k, frf in enumerate(frfs):
+        one, member = jq.fit(start, frf), batch.fit(k)
+        np.testing.assert_allclose(batch.values[k], one.values, rtol=1e-6)
+        np.testing.assert_allclose(member.standard_errors, one.standard_errors, rtol=1e-5)
+        assert batch.costs[k] == pytest.approx(one.cost, rel=1e-7)
+        assert str(member.verdict) == str(one.verdict)
+
+
+@pytest.mark.slow
+def test_all_ways_to_the_normal_equations_end_at_the_same_minimum():
+    frfs = [response_of(START, correlation=c, seed=k) for k, c in enumerate((0.6, 0.0, 0.3))]
+    fit = lambda: jq.identify.fit_batch(START, frfs, free=FREE)
+    kernels = fit()
+    jq.engine(kernel="off")
+    try:
+        jax.clear_caches()
+        plain = fit()
+    finally:
+        jq.engine(kernel="auto")
+        jax.clear_caches()
+    np.testing.assert_allclose(kernels.values, plain.values, rtol=1e-8)
+    np.testing.assert_allclose(kernels.costs, plain.costs, rtol=1e-12)
+
+
+def test_other_numbers_of_members_and_frequencies_compile_nothing():
+    _, responses = measured()
+    compiled, responses, weights = [], np.asarray(responses), np.asarray(WEIGHTS)
+    parameters, omega = select_parameters(START, FREE), np.asarray(OMEGA)
+
+    def listen(event, _, **facts):
+        if "backend_compile" in event:
+            compiled.append(facts.get("fun_name"))
+
+    solved(responses)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for members, frequencies in ((1, 30), (7, 25), (65, 27), (MEMBERS, 30)):
+            mine = (slice(members), slice(frequencies))
+            data = omega[:frequencies], responses[mine], weights[mine]
+            found = solve_batch(START, parameters, *data)
+            assert len(found.z) == members and np.all(found.converged)
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert not compiled
+
+
 def test_without_noise_the_truth_comes_back():
     truth, responses = measured(noise=0.0)
     np.testing.assert_allclose(solved(responses).values, truth, rtol=1e-9)
@@ -118,3 +175,33 @@ def test_expensive_functions_evaluated_once_are_the_same_functions():
 
     for got, expected in zip(jax.jit(evaluate_once(function))(x, y), function(x, y), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-14)
+
+
+def test_complex_arithmetic_in_real_parts_is_the_same_arithmetic():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-3.0, 3.0, (2, 500))
+
+    def function(x, y):
+        z = jax.lax.complex(x, y)
+        s = jax.lax.complex(jnp.zeros_like(x), y)
+        terms = jnp.exp(-s) / (z + 2j), z**-3, jnp.conj(z) * s, jnp.where(x > 0, z, s), jnp.log(z)
+        parts = [(jnp.real(term), jnp.imag(term)) for term in terms]
+        return parts, jnp.abs(z - s), jnp.arctan2(y, x), jnp.sum(jnp.stack([z, s]), axis=0).imag
+
+    found, expected = (
+        jax.tree.leaves(each) for each in (in_real_parts(function, x, y), function(x, y))
+    )
+    for got, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-15)
+    with pytest.raises(NotInRealPartsError):
+        in_real_parts(lambda x: jnp.linalg.inv(jnp.reshape(x[:4], (2, 2))), x)
+
+
+def test_arctangents_of_all_quadrants():
+    angle = np.linspace(-np.pi, np.pi, 4001)[1:-1]
+    for size in (1e-150, 1.0, 1e150):
+        found = arctan2(size * np.sin(angle), size * np.cos(angle))
+        np.testing.assert_allclose(
+            found, np.arctan2(size * np.sin(angle), size * np.cos(angle)), atol=5e-16
+        )
+    assert arctan2(jnp.zeros(()), jnp.zeros(())) == 0

@@ -9,7 +9,7 @@ import pytest
 from jaxquad.control import LADRC
 from jaxquad.loops import Loop, per_member
 from jaxquad.models import DecoupledAxes
-from jaxquad.models._rotation import sincos
+from jaxquad._xla import sincos
 from jaxquad.simulation import (
     evaluate,
     metrics,

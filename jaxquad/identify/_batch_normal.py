@@ -1,0 +1,228 @@
+"""Normal equations of many fits side by side: members on the last axis, one frequency at a time."""
+
+import functools as ft
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxquad._core import Normal
+from jaxquad._xla import (
+    as_one_kernel,
+    evaluate_once,
+    in_real_parts,
+    NotInRealPartsError,
+    why_no_kernels,
+)
+from jaxquad.models import evaluate_response
+
+from ._held import held
+from ._parameters import Parameters, Place
+
+
+class Member(NamedTuple):
+    """What members are fitted to, after the axes of each array that are named here.
+
+    Frequencies are filled up to a length that many records share; only `count` of them count.
+    """
+
+    inverse: tuple[Array, Array]  # frequencies outputs inputs: 1 / measured, real and imaginary
+    weights: Array  # frequencies outputs inputs 2
+    factor: tuple[Array, Array] | None  # frequencies frequencies outputs inputs, a `Mixing`'s
+
+
+class Batch(NamedTuple):
+    """One structure and where it is evaluated."""
+
+    model: PyTree
+    parameters: Parameters
+    hold: float  # s
+    omega: Float[Array, " frequencies"]
+    count: Int[Array, ""]  # of the frequencies
+
+
+Column = tuple[Array, Array]  # of slopes or misfits: magnitudes and phases, weighted
+Evaluate = Callable[[Float[Array, "parameters members"]], Normal]
+
+
+def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
+    """Cost, gradient and Gauss-Newton Hessian of members on the last axis of `member`.
+
+    As one kernel where the model is plain arithmetic, at a quarter of the cost; any other model is
+    evaluated at all frequencies at once.
+    """
+
+    def evaluate(z: Float[Array, "parameters members"]) -> Normal:
+        if why_no_kernels() is None and _fits_a_kernel(z, member):
+            accumulate = ft.partial(_accumulate, batch)
+            try:
+                return _assemble(as_one_kernel(accumulate, z, batch.omega, batch.count, member))
+            except NotInRealPartsError:
+                pass
+        return _at_all_frequencies(batch, z, member)
+
+    return evaluate
+
+
+_WIDEST = 4096  # numbers of one array's arithmetic in a kernel
+_MOST_PARAMETERS = 12  # of a kernel; it grows with their square
+
+
+def _fits_a_kernel(z: Array, member: Member) -> bool:
+    wide = member.weights[0].size // 2
+    if member.factor is not None:
+        wide *= len(z) + 1
+    return wide < _WIDEST and len(z) <= _MOST_PARAMETERS
+
+
+def _lower(columns: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(columns) for j in range(i + 1)]
+
+
+def _accumulate(
+    batch: Batch, z: Array, omega: Array, count: Int[Array, ""], member: Member
+) -> list[Float[Array, " members"]]:
+    """The scalar products of all columns, frequency by frequency."""
+    columns_at = ft.partial(_columns_at, batch, z, omega, member)
+    if member.factor is not None:
+        columns_at = _mix(columns_at, omega, count, member.factor, len(z) + 1)
+    pairs = _lower(len(z) + 1)
+
+    def add(k, total):
+        columns = columns_at(k)
+        return [t + _dot(columns[i], columns[j]) for t, (i, j) in zip(total, pairs, strict=True)]
+
+    return jax.lax.fori_loop(0, count, add, [jnp.zeros_like(z[0]) for _ in pairs])
+
+
+def _dot(a: Column, b: Column) -> Float[Array, " members"]:
+    return jnp.sum(a[0] * b[0] + a[1] * b[1], axis=(0, 1))
+
+
+def _columns_at(batch: Batch, z: Array, omega: Array, member: Member, k: Array) -> list[Column]:
+    point = jax.vmap(ft.partial(_point, batch), in_axes=(0, None, -1, -1, -1), out_axes=-1)
+    here = lambda array: jax.lax.dynamic_index_in_dim(array, k, keepdims=False)
+    data = *map(here, member.inverse), here(member.weights)
+    return in_real_parts(point, list(z), here(omega), *data)
+
+
+def _mix(
+    columns_at: Callable[[Array], list[Column]],
+    omega: Array,
+    count: Int[Array, ""],
+    factor: tuple[Array, Array],
+    columns: int,
+) -> Callable[[Array], list[Column]]:
+    """The same columns with points that share noise taken together, by a triangular factor."""
+    shape = (omega.size, columns, *factor[0].shape[2:])
+    zero = jnp.zeros(shape, omega.dtype), jnp.zeros(shape, omega.dtype)
+
+    def store(k, stored):
+        parts = map(jnp.stack, zip(*columns_at(k), strict=True))
+        pairs = zip(stored, parts, strict=True)
+        return tuple(jax.lax.dynamic_update_index_in_dim(s, part, k, 0) for s, part in pairs)
+
+    stored = jax.lax.fori_loop(0, count, store, zero)
+
+    def mixed_at(k):
+        def add(g, total):
+            c, s = (_two_indices(part, k, g) for part in factor)
+            real, imag = (jax.lax.dynamic_index_in_dim(x, g, keepdims=False) for x in stored)
+            return total[0] + (c * real - s * imag), total[1] + (s * real + c * imag)
+
+        zero = jnp.zeros(shape[1:], omega.dtype), jnp.zeros(shape[1:], omega.dtype)
+        real, imag = jax.lax.fori_loop(0, k + 1, add, zero)
+        return [(real[n], imag[n]) for n in range(columns)]
+
+    return mixed_at
+
+
+def _two_indices(array: Array, k: Array, g: Array) -> Array:
+    first, rest = (1, 1), array.shape[2:]
+    start = (k, g, *(jnp.zeros_like(k) for _ in rest))
+    return jax.lax.dynamic_slice(array, start, (*first, *rest))[0]
+
+
+def _at_all_frequencies(batch: Batch, z: Array, member: Member) -> Normal:
+    """Frequencies outside and members inside."""
+    members = jax.vmap(ft.partial(_point, batch), in_axes=(0, None, -1, -1, -1), out_axes=-1)
+    everywhere = evaluate_once(jax.vmap(members, in_axes=(None, 0, 0, 0, 0)))
+    columns = everywhere(list(z), batch.omega, *member.inverse, member.weights)
+    real, imag = map(jnp.stack, zip(*columns, strict=True))
+    if member.factor is not None:
+        factor = jax.lax.complex(*member.factor)
+        mixed = jnp.einsum("fgoib,cgoib->cfoib", factor, jax.lax.complex(real, imag))
+        real, imag = jnp.real(mixed), jnp.imag(mixed)
+    points = [part.reshape(len(columns), -1, z.shape[1]) for part in (real, imag)]
+    return _assemble(_products(jnp.concatenate(points, axis=1)))
+
+
+def _products(columns: Float[Array, "columns points members"]) -> Float[Array, "pairs members"]:
+    """All scalar products of the columns in one pass over the points."""
+    first, second = np.array(_lower(len(columns))).T
+
+    def add(k, total):
+        point = columns[:, k]
+        return total + point[first] * point[second]
+
+    start = jnp.zeros((first.size, columns.shape[-1]), columns.dtype)
+    return jax.lax.fori_loop(0, columns.shape[1], add, start)
+
+
+def _assemble(products: Sequence[Array] | Array) -> Normal:
+    n = (math.isqrt(8 * len(products) + 1) - 1) // 2 - 1  # pairs of n + 1 columns
+    place = np.zeros((n + 1, n + 1), int)
+    for k, (i, j) in enumerate(_lower(n + 1)):
+        place[i, j] = place[j, i] = k
+    matrix = jnp.stack([products[k] for k in place.reshape(-1)])
+    matrix = matrix.reshape(n + 1, n + 1, -1)
+    return Normal(0.5 * matrix[n, n], matrix[n, :n], matrix[:n, :n])
+
+
+def _point(
+    batch: Batch, z: list[Array], omega: Array, real: Array, imag: Array, weights: Array
+) -> list[Column]:
+    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency."""
+
+    def response(z):
+        model = held(_insert(batch.model, batch.parameters, z), batch.hold)
+        return evaluate_response(model, omega[None])[0]
+
+    here, columns = response(z), []
+    for k in range(len(z)):
+        # One parameter at a time: what does not depend on it costs nothing.
+        along = lambda x, k=k: response([*z[:k], x, *z[k + 1 :]])
+        slope = jax.jvp(along, (z[k],), (jnp.ones_like(z[k]),))[1] / here
+        columns.append((jnp.real(slope) * weights[..., 0], jnp.imag(slope) * weights[..., 1]))
+    ratio = here * jax.lax.complex(real, imag)
+    size = jnp.real(ratio) ** 2 + jnp.imag(ratio) ** 2
+    phase = jnp.arctan2(jnp.imag(ratio), jnp.real(ratio))
+    return [*columns, (0.5 * jnp.log(size) * weights[..., 0], phase * weights[..., 1])]
+
+
+def _insert(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) -> PyTree:
+    """As `Parameters.insert`, but without a vector that would make each depend on all."""
+    logs, scale = parameters.logarithmic, parameters.scale
+    values = [scale[k] * (jnp.exp(x) if logs[k] else x) for k, x in enumerate(z)]
+    model = _write(model, parameters.places, values)
+    for place, tie in parameters.ties:
+        model = _write(model, (place,), [jnp.asarray(tie(model))])
+    return model
+
+
+def _write(model: PyTree, places: tuple[Place, ...], values: list[Float[Array, ""]]) -> PyTree:
+    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    for leaf in {place.leaf for place, _ in zip(places, values, strict=False)}:
+        flat = list(leaves[leaf].reshape(-1))
+        for place, value in zip(places, values, strict=False):
+            if place.leaf == leaf:
+                flat[place.index] = value
+        shape = leaves[leaf].shape
+        leaves[leaf] = flat[0] if shape == () else jnp.stack(flat).reshape(shape)
+    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
