@@ -1,5 +1,6 @@
 from . import (
     control as control,
+    datasets as datasets,
     design as design,
     ensembles as ensembles,
     excitation as excitation,

@@ -10,7 +10,7 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "jaxquad"
 ORDER = (
-    "_core", "_xla", "records", "excitation", "models", "spectra", "identify", "design", "control",
+    "_core", "_xla", "records", "datasets", "excitation", "models", "spectra", "identify", "design", "control",
     "loops", "simulation", "ensembles", "tuning", "export", "plot", "report", "workflows", "cli",
 )  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)

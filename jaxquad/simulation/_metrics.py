@@ -11,6 +11,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from jaxquad.records import AXES
 
 
+if TYPE_CHECKING:
+    import xarray
+
+
 NUMBERS = (
     "itae", "iae", "ise", "overshoot", "rise_time", "settling_time", "settling_time_5", "peak",
     "rms", "disturbance_rmse", "activity", "energy", "saturation_share",
@@ -165,6 +169,15 @@ class Metrics(eqx.Module):
     def summary(self) -> Summary:
         """Mean, 95 % quantile, worst and CVaR20 of every number over the ensemble."""
         return summarise(self)
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Every number with its dimensions `axis` and `member`, for xarray (extra `interop`).
+
+        Each variable has its unit in `attrs`, the dataset the window in s.
+        """
+        from ._labelled import to_xarray
+
+        return to_xarray(self, axis_names(self.itae.shape[0]))
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -235,3 +235,16 @@ def test_one_loop_prints_in_degrees_by_axis():
     assert text.splitlines()[1].split() == ["roll", "pitch"]
     assert "IAE                deg s            0.4          0" in text
     assert "pitch" not in text.split("!", 1)[1]
+
+
+def test_labelled_metrics_hold_every_number_with_its_unit(steps):
+    pytest.importorskip("xarray", reason="xarray is not installed: pip install 'jaxquad[interop]'")
+    table = steps.to_xarray()
+    assert dict(table.sizes) == {"axis": 1, "member": ZETA.size} and table.axis.item() == "roll"
+    arrays = {k: x for k, x in vars(steps).items() if isinstance(x, jax.Array)}
+    assert set(table.data_vars) == set(arrays)
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(table[name].values, values)
+    assert (table.itae.units, table.rise_time.units) == ("rad s^2", "s")
+    assert steps.normalised().to_xarray().ise.units == "s"
+    assert (table.start, table.stop) == (steps.start, steps.stop)

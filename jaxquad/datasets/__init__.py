@@ -1,0 +1,6 @@
+"""Measured flights that others have published: found on this machine, or downloaded."""
+
+import lazy_loader
+
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
