@@ -240,12 +240,16 @@ Then identify your own log:
 
 
 def _add_demo(declared: argparse.ArgumentParser) -> None:
+    text = "identify a measured flight instead: a quadrotor on a pitch rig (JAXQUAD_DATA)"
+    declared.add_argument("--flight", action="store_true", help=text)
     add_out(declared, "results/demo")
     add_json(declared, "result.json")
     add_quiet(declared)
 
 
 def _demo(options: argparse.Namespace) -> int:
+    if options.flight:
+        return _demo_flight(options)
     start_computing()
     from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
 
@@ -255,13 +259,32 @@ def _demo(options: argparse.Namespace) -> int:
     return _finish(options, identify(log, DEMO), folder, note)
 
 
+_NEXT_FLIGHT = """
+
+The flight is measured: an ANT-X quadrotor on a pitch rig in closed loop, with a binary sequence on
+the set-point x0 of its position.
+Look at {report}"""
+
+
+def _demo_flight(options: argparse.Namespace) -> int:
+    from jaxquad.workflows import find_demo_flight
+
+    log, settings = find_demo_flight()  # before JAX: it may have nothing to compute
+    start_computing()
+    from jaxquad.workflows import identify
+
+    folder = options.out or Path("results/demo_flight")
+    return _finish(options, identify(log, settings), folder, _NEXT_FLIGHT)
+
+
 DEMO = Command(
     "demo",
     "write a simulated log whose true model is known, and identify it",
     """example:
   jaxquad demo
+  jaxquad demo --flight
 
-exit codes: 0 done, 2 the folder cannot be written
+exit codes: 0 done, 2 the folder cannot be written, or the flight is not found
 """,
     _add_demo,
     _demo,

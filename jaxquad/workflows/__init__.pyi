@@ -1,7 +1,12 @@
 from ._batch._jobs import Job as Job
 from ._batch._run import batch as batch, find_logs as find_logs
 from ._batch._settings import BatchSettings as BatchSettings, Override as Override
-from ._demo import DEMO as DEMO, DEMO_TRUTH as DEMO_TRUTH, write_demo_log as write_demo_log
+from ._demo import (
+    DEMO as DEMO,
+    DEMO_TRUTH as DEMO_TRUTH,
+    find_demo_flight as find_demo_flight,
+    write_demo_log as write_demo_log,
+)
 from ._identify import (
     Identification as Identification,
     identify as identify,

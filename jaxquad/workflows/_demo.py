@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import write_file
+from jaxquad.datasets import FILES, locate
 from jaxquad.excitation import sweep
 
 from ._settings import IdentifySettings
@@ -32,6 +33,24 @@ def write_demo_log(path: str | Path) -> Path:
     columns = (signal.time, signal.signal, command, rate)
     rows = ("{:.6f},{:.8g},{:.8g},{:.8g}\n".format(*row) for row in zip(*columns, strict=True))
     return write_file(Path(path), f"time,x0,M,q\n{''.join(rows)}")
+
+
+def find_demo_flight() -> tuple[Path, IdentifySettings]:
+    """The measured flight of `jaxquad demo --flight`, and the settings to identify it with.
+
+    **Raises:**
+
+    - `ReadError`: it is neither on this machine nor can it be downloaded.
+    """
+    path = locate(FILES["antx_pitch prbs"])
+    field = ".value" if path.suffix == ".mat" else ""  # its publisher's file has structs
+    named = {role: f"{name}{field}" for role, name in _FLIGHT_CHANNELS.items()}
+    return path, IdentifySettings(
+        **named, units={f"q{field}": "rad/s"}, rate=250.0, start=50.0, stop=76.0, band=(0.7, 12.0)
+    )
+
+
+_FLIGHT_CHANNELS = {"input": "M", "output": "q", "reference": "x0"}
 
 
 def _simulated(swept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -107,3 +107,11 @@ def test_a_limit_far_beyond_the_record_gives_no_design_to_be_flown(identified, t
         assert "13 times the largest command of the record" in text
         assert "rad/s lies beyond the identified band of 4.4 to 75.4 rad/s" in text
     assert "CONVERGENCE FAILS" in page
+
+
+def test_the_demo_of_a_measured_flight_is_the_pitch_rig(data, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("JAXQUAD_DATA", str(data))
+    assert main(["demo", "--flight", "--out", str(tmp_path)]) == 0
+    found = numbers(json.loads((tmp_path / "result.json").read_text()))
+    assert 270 < found["gain"] < 295
+    assert "measured: an ANT-X quadrotor" in capsys.readouterr().out

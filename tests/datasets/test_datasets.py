@@ -11,6 +11,7 @@ import pytest
 from scipy.io import savemat
 
 import jaxquad as jq
+from jaxquad.cli import main
 from jaxquad.datasets import DataFile, FILES, locate
 from jaxquad.records import ReadError
 
@@ -100,6 +101,11 @@ def test_what_has_no_checksum_is_asked_for_by_its_origin(tmp_path, monkeypatch):
     monkeypatch.setenv("JAXQUAD_DATA", str(tmp_path))
     record = jq.datasets.antx_pitch()  # its publisher's layout: a struct per channel
     np.testing.assert_allclose(record.channel("q"), np.sin(2 * record.time), atol=2e-3)
+
+
+def test_the_demo_says_where_to_get_its_flight_before_it_computes(capsys):
+    assert main(["demo", "--flight"]) == 2
+    assert "take it from https://github.com/" in capsys.readouterr().err
 
 
 def test_every_file_that_can_be_downloaded_is_pinned():

@@ -75,7 +75,9 @@ def lay_out(place, folder, request):
 
 def run(command, folder):
     scripts = Path(sys.executable).parent
-    environment = os.environ | {"PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}"}
+    data = Path(os.environ.get("JAXQUAD_DATA", ROOT / ".." / "shared" / "data")).resolve()
+    path = f"{scripts}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "JAXQUAD_DATA": str(data)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
