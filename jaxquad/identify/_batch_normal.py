@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxquad._core import Normal
 from jaxquad._xla import (
@@ -19,10 +19,13 @@ from jaxquad._xla import (
     NotInRealPartsError,
     why_no_kernels,
 )
-from jaxquad.models import evaluate_response
+from jaxquad.models import evaluate_response, StateSpace
 
 from ._held import held
+from ._mixing import Mixing
 from ._parameters import Parameters, Place
+from ._problem import Problem, unchanged
+from ._solve import problem_normal
 
 
 class Member(NamedTuple):
@@ -47,17 +50,22 @@ class Batch(NamedTuple):
 
 
 Column = tuple[Array, Array]  # of slopes or misfits: magnitudes and phases, weighted
-Evaluate = Callable[[Float[Array, "parameters members"]], Normal]
+Active = Bool[Array, " members"]
+Evaluate = Callable[[Float[Array, "parameters members"], Active], Normal]
 
 
 def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
     """Cost, gradient and Gauss-Newton Hessian of members on the last axis of `member`.
 
-    As one kernel where the model is plain arithmetic, at a quarter of the cost; any other model is
-    evaluated at all frequencies at once.
+    A plain `jq.StateSpace` has slopes of its own, one member after the other, without those that
+    are not active. Any other model of plain arithmetic becomes one kernel, at a quarter of the cost
+    of what evaluates the rest: at all frequencies at once.
     """
 
-    def evaluate(z: Float[Array, "parameters members"]) -> Normal:
+    if _is_plain_state_space(batch):
+        return _one_by_one(batch, member)
+
+    def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
         if why_no_kernels() is None and _fits_a_kernel(z, member):
             accumulate = ft.partial(_accumulate, batch)
             try:
@@ -67,6 +75,47 @@ def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
         return _at_all_frequencies(batch, z, member)
 
     return evaluate
+
+
+def _is_plain_state_space(batch: Batch) -> bool:
+    return type(batch.model) is StateSpace and not batch.parameters.ties and not batch.hold
+
+
+def _one_by_one(batch: Batch, member: Member) -> Evaluate:
+    members = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), member)
+    problems = jax.vmap(ft.partial(_problem_of_one, batch))(members)
+
+    def one(given):
+        active, z, problem = given
+        shapes = jax.eval_shape(problem_normal, z, problem)
+        skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return jax.lax.cond(active, problem_normal, skip, z, problem)
+
+    def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
+        found = jax.lax.map(one, (active, z.T, problems))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), found)
+
+    return evaluate
+
+
+def _problem_of_one(batch: Batch, member: Member) -> Problem:
+    mixing = None
+    if member.factor is not None:
+        factor = jnp.moveaxis(jax.lax.complex(*member.factor), (0, 1), (2, 3))
+        mixing = Mixing(factor, factor)  # correlations matter to nothing here
+    return Problem(
+        model=batch.model,
+        parameters=batch.parameters,
+        conditions=(unchanged,),
+        quantities=(),
+        omega=(batch.omega,),
+        measured=(1 / jax.lax.complex(*member.inverse),),
+        weights=(member.weights,),
+        known=np.zeros((0, 2)),
+        aliases=(None,),
+        silent=((),),
+        mixings=(mixing,),
+    )
 
 
 _WIDEST = 4096  # numbers of one array's arithmetic in a kernel

@@ -133,8 +133,8 @@ def _factors(
 
 def _padded(size: int) -> int:
     """The frequencies of a program that takes this many: few lengths, few programs."""
-    power = 1 << max(size - 1, 15).bit_length()
-    return power * 3 // 4 if size <= power * 3 // 4 else power
+    step = max(8, 1 << max((size - 1).bit_length() - 3, 0))
+    return size + -size % step
 
 
 def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
@@ -234,10 +234,11 @@ def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) 
 
     def step(walk: _Walk) -> _Walk:
         state = walk.state
-        running = jnp.any((state.status == RUNNING) & (state.steps < max_steps))
-        state = state._replace(change=jnp.where(running, state.change, 0.0))
-        normal = evaluate(state.z + state.change)
-        return _Walk(advance(lambda _: normal, state, max_steps, tolerance), normal, ~running)
+        active = (state.status == RUNNING) & (state.steps < max_steps)
+        ended = ~jnp.any(active)
+        state = state._replace(change=jnp.where(ended, 0.0, state.change))
+        normal = evaluate(state.z + state.change, active | ended)
+        return _Walk(advance(lambda _: normal, state, max_steps, tolerance), normal, ended)
 
     start = begin(z0)
     walk = _Walk(start, start.normal, jnp.asarray(False))

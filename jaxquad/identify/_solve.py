@@ -15,7 +15,7 @@ from jaxquad._core import (
     STALLED,
     TOLERANCE,
 )
-from jaxquad._xla import no_fuse
+from jaxquad._xla import arctan2, no_fuse
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
 from ._evaluate import as_residuals, evaluate, Evaluation
@@ -85,7 +85,7 @@ def _logarithm(value: Split, measured: Complex[Array, "frequencies outputs input
     b = value.imag * real - value.real * imag
     power = real * real + imag * imag
     size = (value.real * value.real + value.imag * value.imag) / power
-    return Split(0.5 * jnp.log(size), jnp.arctan2(b, a))
+    return Split(0.5 * jnp.log(size), arctan2(b, a))
 
 
 def _entry(name: str) -> Entry:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxquad._xla import no_fuse
+from jaxquad._xla import no_fuse, sincos
 
 
 class Split(NamedTuple):
@@ -224,7 +224,7 @@ def _apply_delay(parts: Split, late: Array | None, omega: Float[Array, " frequen
     if late is None:
         return parts
     angle = late[:, :, None] * omega[None, None]
-    (real, imag), c, s = parts, no_fuse(jnp.cos, angle), no_fuse(jnp.sin, angle)
+    (real, imag), (s, c) = parts, no_fuse(sincos, angle)
     return Split(real * c + imag * s, imag * c - real * s)
 
 

@@ -56,6 +56,13 @@ PAIRS = (
         "scipy",
     ),
     Pair(
+        "200 such fits",
+        "test_state_space_speed.py",
+        "test_batch_of_200",
+        "test_200_by_scipy",
+        "scipy",
+    ),
+    Pair(
         "output error, 22,500 samples, 4 parameters, with all doubts",
         "test_output_error_speed.py",
         "test_refine_with_all_its_doubts",

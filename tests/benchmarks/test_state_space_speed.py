@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 import jaxquad as jq
 from jaxquad.identify import select_parameters
 from jaxquad.identify._cost import points_of, usable
+from jaxquad.identify._fit_batch import solve_batch
 from jaxquad.identify._problem import make_problem
 from jaxquad.identify._solve import solve
 from jaxquad.models import simulate_linear, StateSpace
@@ -126,6 +127,27 @@ def test_solve(benchmark):
     found = benchmark(lambda: solve(made, z, None, 256).z)
     values = np.asarray(made.parameters.values(found))
     np.testing.assert_allclose(values, peer(), rtol=1e-4, atol=1e-6)
+
+
+FITS = 200
+
+
+@pytest.mark.benchmark(group="200 state-space fits")
+def test_200_by_scipy(benchmark):
+    benchmark.pedantic(lambda: [peer() for _ in range(FITS)], rounds=1)
+
+
+@pytest.mark.benchmark(group="200 state-space fits")
+def test_batch_of_200(benchmark):
+    rng = np.random.default_rng(5)
+    truth = numpy_response(TRUTH)
+    noise = rng.standard_normal((2, FITS, *truth.shape))
+    responses = truth * (1 + ERROR * (noise[0] + 1j * noise[1]))
+    responses[0], made = MEASURED, problem()
+    data = OMEGA, responses, np.full((*responses.shape, 2), 1 / ERROR)
+    found = benchmark(lambda: solve_batch(model(START), made.parameters, *data))
+    np.testing.assert_allclose(found.values[0], peer(), rtol=1e-4, atol=1e-6)
+    assert np.all(found.converged)
 
 
 @jax.jit

@@ -104,6 +104,20 @@ def test_all_ways_to_the_normal_equations_end_at_the_same_minimum():
     np.testing.assert_allclose(kernels.costs, plain.costs, rtol=1e-12)
 
 
+@pytest.mark.slow
+def test_state_spaces_are_fitted_as_single_ones_are():
+    F, G = [[-1.0, 0.3], [0.2, -4.0]], [[2.0], [1.5]]
+    truth = jq.StateSpace(F=F, G=G, H0=np.eye(2), input_delay=[0.05])
+    start = jq.StateSpace(F=np.multiply(F, 1.2), G=G, H0=np.eye(2), input_delay=[0.04])
+    free = ("F[0][0]", "F[1][1]", "G[0][0]", "G[1][0]", "input_delay[0]")
+    frfs = [response_of(truth, seed=k) for k in range(3)]
+    batch = jq.identify.fit_batch(start, frfs, free=free)
+    for k, frf in enumerate(frfs):
+        one = jq.fit(start, frf, free=free)
+        np.testing.assert_allclose(batch.values[k], one.values, rtol=1e-7)
+        assert batch.costs[k] == pytest.approx(one.cost, rel=1e-10)
+
+
 def test_other_numbers_of_members_and_frequencies_compile_nothing():
     _, responses = measured()
     compiled, responses, weights = [], np.asarray(responses), np.asarray(WEIGHTS)

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxquad._xla import sincos
 from jaxquad.control import LADRC
 from jaxquad.loops import Loop, per_member
 from jaxquad.models import DecoupledAxes
-from jaxquad._xla import sincos
 from jaxquad.simulation import (
     evaluate,
     metrics,
