@@ -13,5 +13,6 @@ from ._segments import (
     read_segments as read_segments,
     Segment as Segment,
 )
+from ._settings import read_settings as read_settings, Settings as Settings
 from .formats import require_file as require_file
 from .proposals import AXES as AXES, Proposal as Proposal, propose as propose

@@ -26,5 +26,13 @@ from ._filters import (
     PT3 as PT3,
     Section as Section,
 )
+from ._flown import (
+    ardupilot_loop as ardupilot_loop,
+    betaflight_loop as betaflight_loop,
+    FlownBetaflight as FlownBetaflight,
+    FlownLoop as FlownLoop,
+    px4_loop as px4_loop,
+    replay_terms as replay_terms,
+)
 from ._law import FirmwareLoop as FirmwareLoop, LoopState as LoopState
 from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate

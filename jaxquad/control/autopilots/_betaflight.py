@@ -97,8 +97,9 @@ class DMax(eqx.Module):
     ) -> tuple[tuple[PyTree, PyTree], Signal]:  # fmt: skip
         """Of the D gain, 1 or above."""
         held, quick = chains[0].step(memory[0], delta)
-        most = broadcast_gain(self.ceiling, delta) / broadcast_gain(d, delta)
-        most = jnp.maximum(most, 1.0)
+        base = broadcast_gain(d, delta)
+        most = broadcast_gain(self.ceiling, delta) / jnp.where(base > 0, base, 1.0)
+        most = jnp.where(base > 0, jnp.maximum(most, 1.0), 1.0)
         of_gyro = jnp.abs(quick) * broadcast_gain(self.gyro_gain, delta)
         of_setpoint = jnp.abs(speed) * broadcast_gain(self.setpoint_gain, delta)
         smooth, share = chains[1].step(memory[1], jnp.maximum(of_gyro, of_setpoint))

@@ -204,7 +204,7 @@ def bounded(value: Signal, limit: Array) -> Signal:
     return jnp.clip(value, -most, most)
 
 
-def low_pass_share(cutoff_hz: Array, dt: float, like: Signal) -> Signal:
+def low_pass_share(cutoff_hz: Array, dt: float, like: Signal) -> Array:
     """k of x += k (u - x), 1 for a cutoff of 0: the alpha of PX4 and ArduPilot."""
     on = cutoff_hz > 0
     w = 2 * np.pi * dt * jnp.where(on, cutoff_hz, 1.0)

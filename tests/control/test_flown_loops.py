@@ -1,0 +1,97 @@
+"""The loop that a log's parameters describe, and a measured log's terms computed again."""
+
+import numpy as np
+import pytest
+
+from jaxquad.control.autopilots import (
+    ardupilot_loop,
+    betaflight_loop,
+    px4_loop,
+    replay_terms,
+)
+from jaxquad.records import read_settings
+from jaxquad.records.formats import load_log
+
+
+HEADER = {
+    "looptime": "125", "pid_process_denom": "2", "rollPID": "45,80,40", "pitchPID": "47,84,46",
+    "yawPID": "45,80,0", "d_min": "30,34,0", "ff_weight": "120,125,120", "d_max_gain": "37",
+    "d_max_advance": "20", "gyro_lpf1_dyn_hz": "250,500", "gyro_lpf2_static_hz": "500",
+    "dterm_lpf1_dyn_hz": "75,150", "dterm_lpf1_dyn_expo": "5", "dterm_lpf2_static_hz": "150",
+    "gyro_notch_hz": "200,0", "gyro_notch_cutoff": "150,0", "yaw_lowpass_hz": "100",
+    "iterm_relax": "1", "iterm_relax_type": "1", "iterm_relax_cutoff": "15", "tpa_rate": "65",
+    "tpa_breakpoint": "1350", "tpa_mode": "1", "pidsum_limit": "500", "pidsum_limit_yaw": "400",
+    "dyn_notch_count": "3",
+}  # fmt: skip
+
+
+def test_a_header_gives_the_loop_that_it_describes():
+    flown = betaflight_loop(HEADER, (4, 5, 0))
+    law = flown.law
+    assert law.dt == pytest.approx(250e-6) and law.gyro.rate_hz == pytest.approx(8000)
+    np.testing.assert_array_equal(law.p, [45, 47, 45])
+    np.testing.assert_array_equal(law.d, [30, 34, 0])  # d_min is the base
+    np.testing.assert_array_equal(law.d_max.ceiling, [40, 46, 0])
+    words = [x.in_words() for x in (*law.gyro.filters, *law.filters, *law.dterm)]
+    assert [x.split()[0] for x in words] == ["pt1", "pt1", "notch", "pt1", "pt1"]
+    assert float(law.dterm[0].cutoff_hz) == pytest.approx(105.4, abs=0.1)
+    assert float(flown.at(0.0).dterm[0].cutoff_hz) == 75
+    assert float(flown.at(1.0).tpa) == pytest.approx(0.35) and float(flown.at(1.0).tpa_p) == 1
+    assert any("dynamic notches" in x for x in flown.unmodelled)
+
+
+def test_from_2025_on_d_is_the_base():
+    values = {**HEADER, "rollPID": "45,80,30", "d_max": "40,46,0"}
+    law = betaflight_loop(values, (2025, 12, 0)).law
+    assert float(law.d[0]) == 30 and float(law.d_max.ceiling[0]) == 40
+    np.testing.assert_allclose(law.integral_limit, [400, 400, 320])
+
+
+def test_a_header_without_gains_is_refused():
+    with pytest.raises(ValueError, match="rollPID"):
+        betaflight_loop({"looptime": "125"}, (4, 5, 0))
+
+
+def test_px4s_parameters_give_its_loop():
+    gains = {f"MC_{x}RATE_{k}": "0.1" for x in ("ROLL", "PITCH", "YAW") for k in "PID"}
+    flown = px4_loop({**gains, "IMU_GYRO_RATEMAX": "1000", "IMU_GYRO_NF0_FRQ": "90",
+                      "MC_YAW_TQ_CUTOFF": "2", "IMU_GYRO_DNF_EN": "1"})  # fmt: skip
+    law = flown.law
+    assert law.dt == 1e-3 and len(law.gyro.filters) == 2
+    np.testing.assert_array_equal(law.torque_hz, [0, 0, 2])
+    assert flown.unmodelled[0].startswith("IMU_GYRO_DNF_EN")
+
+
+def test_ardupilots_parameters_give_its_loop():
+    gains = {f"ATC_RAT_{x}_{k}": "0.1" for x in ("RLL", "PIT", "YAW") for k in "PID"}
+    flown = ardupilot_loop({**gains, "ATC_RAT_YAW_FLTE": "2.5", "INS_GYRO_RATE": "1",
+                            "INS_GYRO_FILTER": "40", "ATC_RAT_RLL_SMAX": "60"})  # fmt: skip
+    law = flown.law
+    assert law.dt == 1 / 400 and law.gyro.rate_hz == 2000
+    np.testing.assert_array_equal(law.error_hz, [0, 0, 2.5])
+    assert np.all(np.isinf(law.pd_limit)) and "SMAX" in flown.unmodelled[0]
+
+
+@pytest.mark.slow
+def test_the_terms_of_a_measured_log_follow_from_its_set_point_and_gyro(data):
+    path = data / "betaflight_ar8" / "LOG00037.BFL"
+    settings = read_settings(path)
+    flown = betaflight_loop(settings.values, settings.version)
+    table = load_log(path).tables[""].columns  # sample by sample, whatever their time stamps say
+    columns = lambda kind, axes=3: np.stack([table[f"{kind}[{k}]"] for k in range(axes)], 1) * 1.0
+    r, y = np.deg2rad(columns("setpoint")), np.deg2rad(columns("gyroADC"))
+    throttle = np.clip((table["rcCommand[3]"] - 1000) / 1000, 0, 1)
+    found = replay_terms(flown, r, y, throttle, dt=1e-3, integral=columns("axisI"))
+    after = slice(100, None)  # 0.1 s for the filters
+    miss = {
+        name: np.median(
+            np.abs(np.asarray(found[name])[:, :k] - columns(f"axis{name}", k))[after], 0
+        )
+        for name, k in (("P", 3), ("I", 3), ("D", 2), ("F", 3))
+    }
+    assert np.all(miss["P"] <= 1) and np.all(miss["F"] <= 1)
+    assert np.all(miss["I"] <= 2) and np.all(miss["D"] <= 2)
+    # D is small in most of this flight: where it is not, it must follow, at its full size.
+    d = columns("axisD", 2)
+    for k in (0, 1):
+        assert np.corrcoef(np.asarray(found["D"])[after, k], d[after, k])[0, 1] > 0.9
