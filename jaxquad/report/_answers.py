@@ -111,6 +111,16 @@ def _ends(frf: FrequencyResponse, where: Bool[np.ndarray, " frequencies"]) -> tu
     return float(omega[0]), float(omega[-1])
 
 
+def _measured(frf: FrequencyResponse) -> tuple[float, float]:
+    return _ends(frf, np.ones(frf.omega.size, bool))
+
+
+def _beyond(frf: FrequencyResponse) -> tuple[float, float]:
+    """From half to twice the measured band."""
+    low, high = _measured(frf)
+    return low / 2, high * 2
+
+
 def _reach(fit: Fit, k: int) -> float:
     """Half of the 95 % interval over the value."""
     low, high = fit.interval(fit.names[k])
@@ -192,7 +202,7 @@ def next_flight(
     poor = _needs_of_bands(frf)
     needs = _needs_of_parameters(fit, frf) if _is_usable(fit) else poor
     if not fit.identifiable and not needs and not fit.verdict.remedies:
-        low, high = float(frf.omega[0]) / 2, float(frf.omega[-1]) * 2
+        low, high = _beyond(frf)
         needs = [_Need(low, high, _LOUDER, "the band of this record does not determine the model")]
     if needs:
         return _sweep([*needs, *poor], frf, record)
@@ -251,7 +261,7 @@ def _needs_of_parameters(fit: Fit, frf: FrequencyResponse) -> list[_Need]:
 
 def _towards(peak: float, seen: Grid, frf: FrequencyResponse) -> tuple[float, float]:
     """The band of what is seen, which leaves the measured one on the side of the peak only."""
-    low, high = float(frf.omega[0]), float(frf.omega[-1])
+    low, high = _measured(frf)
     if peak > np.sqrt(low * high):
         return max(low, float(seen[0])), float(seen[-1])
     return float(seen[0]), min(high, float(seen[-1]))
@@ -268,7 +278,7 @@ def _apart(
 
     Zero where the others make the same.
     """
-    omega = np.geomspace(float(frf.omega[0]) / 2, float(frf.omega[-1]) * 2, 200)
+    omega = np.geomspace(*_beyond(frf), 200)
     places = fit.parameters.places[: len(fit.names)]
     values, size = _beside_zero(fit)
 
@@ -309,7 +319,7 @@ def _rests(columns: Float[np.ndarray, "points parameters"]) -> np.ndarray:
 
 
 def _sweep(needs: Sequence[_Need], frf: FrequencyResponse, record: Record | None) -> Flight:
-    measured = float(frf.omega[0]), float(frf.omega[-1])
+    measured = _measured(frf)
     low = min(each.low for each in needs)
     high = max(each.high for each in needs)
     low, high = min(low, measured[1] / 10), max(high, measured[0] * 10)  # at least a decade

@@ -18,6 +18,7 @@ from ._page import Headline, render_page
 from ._provenance import Provenance, provenance_section
 from ._record import check_section, GOOD_TIC, record_section
 from ._response import response_section
+from ._step import step_section
 
 
 if TYPE_CHECKING:
@@ -85,8 +86,10 @@ def write_report(
         gains = tuned_section(tuned)
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
+    flown = next(iter(records.values()), None)
     sections = {
-        "answers": answer_section(fit, first, next(iter(records.values()), None), found),
+        "answers": answer_section(fit, first, flown, found),
+        "step": None if flown is None else step_section(fit, first, flown),
         "tuned": gains,
         "response": response_section(frfs, models, others or {}),
         "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,

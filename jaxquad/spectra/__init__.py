@@ -20,3 +20,4 @@ from ._estimators import (
 )
 from ._frequency_response import Distortion as Distortion, FrequencyResponse as FrequencyResponse
 from ._remarks import Remark as Remark
+from ._step_response import estimate_step as estimate_step, StepResponse as StepResponse

@@ -1,0 +1,93 @@
+"""The step response of a flown loop, beside that of the loop that was simulated."""
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+import jaxquad as jq
+from jaxquad.spectra import estimate_step
+
+
+DT, NATURAL, DAMPING = 0.004, 15.0, 0.5  # s, rad/s, -
+CLOSED = cont2discrete(([NATURAL**2], [1, 2 * DAMPING * NATURAL, NATURAL**2]), DT, "zoh")
+EXACT = lfilter(CLOSED[0].ravel(), CLOSED[1], np.ones(2000))
+
+
+def stick(random, samples):
+    """Steps of random size and length, behind the lag of a hand."""
+    values, k = np.zeros(samples), 0
+    while k < samples:
+        longer = int(random.uniform(0.4, 3.0) / DT)
+        values[k : k + longer] = random.standard_normal()
+        k += longer
+    stay = np.exp(-DT / 0.02)
+    return lfilter([1 - stay], [1, -stay], values)
+
+
+def flown(seed=0, *, seconds=60.0, noise=0.02, reference=stick):
+    """A second-order loop in gusts and noise."""
+    random, samples = np.random.default_rng(seed), int(seconds / DT)
+    r = reference(random, samples)
+    y = lfilter(CLOSED[0].ravel(), CLOSED[1], r)
+    gusts = lfilter([np.sqrt(1 - 0.99**2)], [1, -0.99], random.standard_normal(samples))
+    y = y + noise * (gusts + random.standard_normal(samples))
+    return jq.Record(np.arange(samples) * DT, r, y, r, input_names="u", output_names="y")
+
+
+def exact_at(found):
+    return np.interp(found.time, np.arange(EXACT.size) * DT, EXACT, left=0.0)
+
+
+def test_the_step_of_a_known_loop_is_found_within_two_per_cent_of_a_quiet_log():
+    found = estimate_step(flown(noise=0.002))
+    assert found.is_told and found.is_resolved
+    assert np.max(np.abs(found.mean - exact_at(found))) < 0.02
+    truth = found._replace(mean=exact_at(found))
+    assert found.rise_time == pytest.approx(truth.rise_time, rel=0.05)
+    assert found.overshoot == pytest.approx(truth.overshoot, abs=0.02)
+    assert found.final == pytest.approx(1.0, abs=0.02)
+    assert found.settling_time == pytest.approx(truth.settling_time, rel=0.1)
+
+
+def test_its_standard_error_is_that_of_many_flights():
+    found = [estimate_step(flown(seed)) for seed in range(40)]
+    late = [np.searchsorted(found[0].time, t) for t in (0.2, 0.5, 1.0, 1.8)]
+    ratio = [((f.mean - exact_at(f)) / f.standard_error)[late] for f in found]
+    assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.6
+    assert abs(np.mean(ratio)) < 0.6
+
+
+def sweep(_, samples):
+    band = 2 * np.pi * 0.5, 2 * np.pi * 12
+    made = jq.sweep(*band, duration=samples * DT - 10, sample_rate=1 / DT, amplitude=1.0)
+    return np.pad(made.signal, (0, samples))[:samples]
+
+
+def one_step(_, samples):
+    values = np.zeros(samples)
+    values[samples // 2 : samples // 2 + 200] = 1.0
+    return values
+
+
+@pytest.mark.parametrize(
+    ("reference", "noise", "why"),
+    [
+        (sweep, 0.02, "too little power at low frequencies"),
+        (one_step, 0.02, "active in 2 of 11 windows"),
+        (stick, 2.0, "standard error"),
+    ],
+)
+def test_a_log_that_cannot_tell_the_step_says_so(reference, noise, why):
+    found = estimate_step(flown(reference=reference, noise=noise))
+    assert not found.is_told and any(why in text for text in found.doubts)
+    assert "this log cannot tell it" in str(found)
+
+
+def test_no_reference_and_no_room_are_refused():
+    record = flown(seconds=2.0)
+    with pytest.raises(ValueError, match="choose another length"):
+        estimate_step(record, length=1.0)
+    bare = jq.Record(record.time, record.inputs, record.outputs)
+    with pytest.raises(ValueError, match="no reference"):
+        estimate_step(bare)
+    assert estimate_step(bare, reference="u", length=0.1).names == ("u", "y")
