@@ -40,7 +40,7 @@ class Image(NamedTuple):
 
 
 def embed_figure(
-    draw: Callable[[], Panels],
+    draw: Callable[[], Panels | Figure],
     *,
     alt: str,
     caption: str = "",
@@ -52,7 +52,7 @@ def embed_figure(
     with headless(), silent, rc_context(settings):  # pyright: ignore[reportArgumentType]
         # A letter that the font does not have is drawn as a box: the caption holds it.
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
-        drawn = draw().figure
+        drawn = draw().figure  # a figure is its own
         _make_narrow(drawn)
         kind, data = _encoded(drawn)
     width, height = (f"{_WIDTH * inches:.0f}" for inches in drawn.get_size_inches())

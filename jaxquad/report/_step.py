@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.figure import Figure
 
-from jaxquad.identify import as_sampled, Fit, with_values
-from jaxquad.plot import Model, model_response, short_names, unit_label
+from jaxquad.identify import as_sampled, Fit, model_response, with_values
+from jaxquad.models import Model
+from jaxquad.plot import short_names, unit_label
 from jaxquad.records import Record
 from jaxquad.spectra import estimate_step, FrequencyResponse, StepResponse
 
