@@ -34,5 +34,30 @@ from ._flown import (
     px4_loop as px4_loop,
     replay_terms as replay_terms,
 )
+from ._gains import (
+    Cascade as Cascade,
+    cascade_of as cascade_of,
+    cascade_parameters as cascade_parameters,
+    find_inexpressible as find_inexpressible,
+    ladrc_as_pid as ladrc_as_pid,
+    LADRCAsPID as LADRCAsPID,
+    motor_share as motor_share,
+    pid_of as pid_of,
+    rate_gains as rate_gains,
+    rate_parameters as rate_parameters,
+    RateGains as RateGains,
+    torque_per_unit as torque_per_unit,
+)
 from ._law import FirmwareLoop as FirmwareLoop, LoopState as LoopState
+from ._parameters import (
+    check_ranges as check_ranges,
+    find_parameter as find_parameter,
+    Firmware as Firmware,
+    firmware_of as firmware_of,
+    list_parameters as list_parameters,
+    Parameter as Parameter,
+    PARAMETERS as PARAMETERS,
+    store_parameters as store_parameters,
+    with_parameters as with_parameters,
+)
 from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
