@@ -14,7 +14,7 @@ from ._curves import (
     model_response as model_response,
     ResponseBand as ResponseBand,
     step_response as step_response,
-    StepResponse as StepResponse,
+    StepBand as StepBand,
 )
 from ._discrepancy import Discrepancy as Discrepancy
 from ._explain import Candidate as Candidate, Explanation as Explanation

@@ -27,7 +27,7 @@ class ResponseBand(NamedTuple):
     degrees: Float[np.ndarray, "frequencies outputs inputs"]  # from the phase to either end
 
 
-class StepResponse(NamedTuple):
+class StepBand(NamedTuple):
     """The answer to a unit step of each input, with half of its 95 % band."""
 
     time: Float[np.ndarray, " samples"]  # s, from the step
@@ -97,13 +97,13 @@ def model_response(
 
 def fitted_step_response(
     fit: PyTree, time: Float[ArrayLike, " samples"], covariance: Matrix
-) -> StepResponse:
+) -> StepBand:
     """The step response of a fit, as `Fit.step_response` says; by a covariance of the parameters.
 
     The covariance is that of relative changes.
     """
     value, slopes = _slopes(fit, lambda model: step_response(model, time))
-    return StepResponse(np.asarray(time, float), value, _reach(fit, slopes, covariance))
+    return StepBand(np.asarray(time, float), value, _reach(fit, slopes, covariance))
 
 
 def fitted_response(
@@ -116,6 +116,20 @@ def fitted_response(
     reach = lambda part: _reach(fit, part(relative), covariance)
     decibels = 20 / np.log(10) * reach(np.real)
     return ResponseBand(grid, value, decibels, np.degrees(reach(np.imag)))
+
+
+def pole_reach(fit: PyTree, covariance: Matrix) -> Complex[np.ndarray, " poles"]:
+    """Half of the 95 % interval of each pole, as `Fit.pole_reach` says."""
+    start = linear_model(fit.model).poles
+
+    def poles(model: PyTree) -> Complex[np.ndarray, " poles"]:
+        left, found = list(linear_model(model).poles), []
+        for pole in start:  # in the order of the fit's own
+            found.append(left.pop(int(np.argmin(np.abs(np.array(left) - pole)))))
+        return np.array(found, complex)
+
+    slopes = _slopes(fit, poles)[1]
+    return _reach(fit, np.real(slopes), covariance) + 1j * _reach(fit, np.imag(slopes), covariance)
 
 
 def _slopes(

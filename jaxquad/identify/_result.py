@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Key, PyTree
 
 from jaxquad._core import plain_content
 from jaxquad._xla import run_shared
@@ -12,7 +12,13 @@ from jaxquad.records import Record
 
 from ._accuracy import Matrix
 from ._content import fit_content
-from ._curves import fitted_response, fitted_step_response, ResponseBand, StepResponse
+from ._curves import (
+    fitted_response,
+    fitted_step_response,
+    pole_reach,
+    ResponseBand,
+    StepBand,
+)
 from ._discrepancy import Discrepancy
 from ._explain import explain_misfit, Explanation
 from ._half_bands import Bands, fit_bands
@@ -232,14 +238,23 @@ class Fit(eqx.Module):
         """
         return linear_model(self.model).poles
 
-    def step_response(self, time: Float[ArrayLike, " samples"]) -> StepResponse:
+    @property
+    def pole_reach(self) -> Complex[np.ndarray, " poles"]:
+        """Half of the 95 % interval of each of the `poles`: of its real and of its imaginary part.
+
+        By first order, model error included; as the real and the imaginary part of the result.
+        """
+        self._require_model("an interval of the poles")
+        return pole_reach(self, self._covariance_of_curves())
+
+    def step_response(self, time: Float[ArrayLike, " samples"]) -> StepBand:
         """The answer to a unit step of each input, with its 95 % band, model error included.
 
         **Arguments:**
 
         - `time`: equally spaced, from 0, in s.
 
-        **Returns:** a `jq.identify.StepResponse`: `time`, `value`, `low`, `high`.
+        **Returns:** a `jq.identify.StepBand`: `time`, `value`, `low`, `high`.
 
         **Raises:** ValueError for other times, for a model that cannot be simulated, and where
         nothing was fitted.

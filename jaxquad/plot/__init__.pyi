@@ -1,5 +1,6 @@
 from ._bode import bode as bode, coherence as coherence, COHERENT as COHERENT
 from ._certificate import certificate_figure as certificate_figure
+from ._flight import flight as flight
 from ._histories import (
     channels_of as channels_of,
     extremes as extremes,
@@ -14,6 +15,8 @@ from ._labels import (
     visible as visible,
 )
 from ._panels import headless as headless, Panels as Panels
+from ._plane import nyquist as nyquist, pzmap as pzmap
 from ._predictions import compare as compare, step as step
 from ._residuals import resid as resid, Residuals as Residuals, residuals_of as residuals_of
+from ._spectrogram import spectrogram as spectrogram
 from ._tuning import convergence_figure as convergence_figure, front_figure as front_figure

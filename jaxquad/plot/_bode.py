@@ -157,7 +157,7 @@ def _model_curve(
     i: int,
 ) -> _Curve:
     phase = np.degrees(np.unwrap(np.angle(response)))
-    phase -= 360 * np.round(phase[0] / 360 + 0.01)  # -180 rather than 180 deg
+    phase -= 360 * np.ceil((phase[0] - 91) / 360)  # begins above -270 deg, and at 90 deg at most
     none, one = np.zeros_like(omega), np.ones_like(omega)
     decibels, degrees = none, none
     if each.fit is not None:

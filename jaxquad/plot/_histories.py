@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike, Float, Int
 
 from jaxquad.records import Record
 
-from ._labels import few_ticks, short_names, Style, unit_label, visible
+from ._labels import few_ticks, LINES, short_names, Style, unit_label, visible
 from ._panels import arrange, Given, legend_of, Panels, stacked
 
 
@@ -90,13 +90,6 @@ def record_figure(
     return arrange(panels, [1.0] * len(panels), above=0.2, gap=0.35, title=title)
 
 
-_LINES = [
-    {"color": "black", "ls": "-", "lw": 1.3},
-    {"color": "tab:blue", "ls": "--", "lw": 1.6},
-    {"color": "tab:red", "ls": "-.", "lw": 1.4},
-    {"color": "tab:green", "ls": (0, (1, 1.2)), "lw": 1.8},
-    {"color": "0.45", "ls": (0, (6, 1, 1, 1, 1, 1)), "lw": 1.4},
-]
 _TARGET = {"color": "0.75", "ls": "-", "lw": 4.0, "zorder": 1}
 
 
@@ -148,9 +141,9 @@ def _styles(
 ) -> dict[str, Style]:
     names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
     others = [name for name in names if name != target]
-    if len(others) > len(_LINES):
+    if len(others) > len(LINES):
         raise ValueError(
-            f"{len(others)} curves are too many to be distinguished, {len(_LINES)} is the most: "
+            f"{len(others)} curves are too many to be distinguished, {len(LINES)} is the most: "
             f"split {others} over several figures"
         )
-    return dict(zip(others, _LINES, strict=False)) | ({target: _TARGET} if target else {})
+    return dict(zip(others, LINES, strict=False)) | ({target: _TARGET} if target else {})

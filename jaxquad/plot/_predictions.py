@@ -17,12 +17,11 @@ from jaxquad.identify import (
 )
 from jaxquad.models import Model
 from jaxquad.records import Record
-from jaxquad.spectra import FrequencyResponse
 
 from ._histories import extremes
 from ._labels import few_ticks, look_of, Style, unit_label
 from ._panels import arrange, Given, legend_of, Panels, stacked, WIDTH
-from ._shown import analysed, Channels, channels_shown, Measured, named, Thing
+from ._shown import analysed, Channels, channels_shown, Measured, named_models, Thing
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -173,8 +172,7 @@ def step(
     **Raises:** ValueError for what has no step response, such as a measured response, and for an
     unknown `pair`.
     """
-    things = named(shown)
-    _require_models(things)
+    things = named_models(shown, "step")
     end = max(map(_duration, things.values())) if duration is None else float(duration)
     time = np.linspace(0.0, end, _SAMPLES)
     answers = {name: _answer(name, thing, time) for name, thing in things.items()}
@@ -200,17 +198,6 @@ def step(
 
 def _has_band(answers: Mapping[str, _Answer]) -> bool:
     return any(found.reach is not None for found in answers.values())
-
-
-def _require_models(things: Mapping[str, Thing]) -> None:
-    if not things:
-        raise ValueError("step has nothing to draw: give a model, a fit of jq.fit or a jq.Loop")
-    for name, thing in things.items():
-        if isinstance(thing, FrequencyResponse | Record):
-            raise ValueError(
-                f"{name} was measured, and has no step response of its own: fit a model to it with "
-                "jq.fit, and give the fit to step"
-            )
 
 
 def _duration(thing: Thing) -> float:

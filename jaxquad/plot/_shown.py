@@ -33,6 +33,23 @@ def named(shown: Iterable[Thing]) -> dict[str, Thing]:
     return {_distinct(k, flat, bases): thing for k, (_, thing) in enumerate(flat)}
 
 
+def named_models(shown: Iterable[Thing], what: str) -> dict[str, Thing]:
+    """Models, fits and loops by name, for `what` draws them.
+
+    Raises ValueError for nothing, and for what was measured.
+    """
+    things = named(shown)
+    if not things:
+        raise ValueError(f"{what} has nothing to draw: give a model, a fit of jq.fit or a jq.Loop")
+    for name, thing in things.items():
+        if _is_measured(thing):
+            raise ValueError(
+                f"{name} was measured, but {what} needs a model: fit one to it with jq.fit, and "
+                "give the fit"
+            )
+    return things
+
+
 def _distinct(k: int, flat: list[tuple[str, Thing]], bases: list[str]) -> str:
     unnamed = [bases[m] for m, (name, _) in enumerate(flat) if not name]
     if flat[k][0] or unnamed.count(bases[k]) == 1:
