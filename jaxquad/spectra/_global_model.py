@@ -131,12 +131,12 @@ def global_models(
     It asks for more than Akaike's, under which a pole and a zero settle where the noise of single
     bins happens to rise, and for less than a Bayesian one, which stops where what is left hides in
     that noise; in a local window that would be a bias. `None` where a model explains no more than
-    chance allows. The bins reach five times `highest` (rad/s). Above 20000 of them every n-th is
+    chance allows. The bins reach five times `highest` (rad/s). Above 20000 of them one of each n is
     taken: each is an equation of its own, so thinning costs precision, never resolution. The order
-    is chosen with every n-th of 4000.
+    is chosen with 4000 at most.
     """
     reach = int(np.searchsorted(bins.omega, _BEYOND * highest, "right"))
-    places = np.arange(0, reach, -(-reach // _MOST_BINS))
+    places = _thin(reach, _MOST_BINS)
     lag = np.exp(-1j * dt * bins.omega[places]) - 1
     scale = float(np.abs(lag[-1])) / 2
     u, own = bins.values[places, inputs], _own(bins.record[places], bins.records)
@@ -151,11 +151,22 @@ def global_models(
     ]
 
 
+def _thin(count: int, most: int) -> Int[np.ndarray, " places"]:
+    """At most so many of `count` bins, one of each n neighbours.
+
+    Not every n-th: of a periodic input's lines it would take all, or none.
+    """
+    step = -(-count // most)
+    first = np.arange(0, count, step)
+    shift = np.floor(step * (0.6180339887 * np.arange(first.size) % 1.0)).astype(int)
+    return np.minimum(first + shift, count - 1)
+
+
 def _identify(
     equations: Equations, omega: Float[np.ndarray, " bins"], most: int
 ) -> tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray] | None:
     """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
-    every = slice(None, None, -(-len(omega) // _TRIAL_BINS))
+    every = _thin(len(omega), _TRIAL_BINS)
     first = _choose(equations.pick(every), most)
     if first is None:
         return None

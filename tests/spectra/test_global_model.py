@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jaxquad.excitation import sweep
+from jaxquad.excitation import harmonics, multisine, sweep
 from jaxquad.records import Record
 from jaxquad.spectra import (
     frequency_response,
@@ -120,3 +120,13 @@ def test_the_joint_estimate_knows_the_errors_of_its_two_models():
         off.append(parts_over_error(found, exact(OMEGA)))
     worst = np.nanmax(np.abs(off), axis=(1, 2))
     assert np.median(worst) < 4 and 0.7 < np.sqrt(np.nanmean(np.square(off))) < 1.3
+
+
+def test_bins_are_thinned_without_losing_the_lines_of_a_periodic_input():
+    """Of 4500 bins every second one would hold no line of two periods: they are the odd ones."""
+    lines = harmonics(0.6, 60.0, period=90.0)
+    u = multisine(lines, period=90.0, periods=2, sample_rate=1 / DT, amplitude=1.0).signal
+    omega = np.geomspace(1.0, 55.0, 30)
+    found = frequency_response(Record(DT * np.arange(u.size), u, ringing(3, u)), omega)
+    errors = np.abs(np.asarray(found.response).ravel() / exact(omega) - 1)
+    assert np.all(errors < 5 * np.sqrt(2) * np.asarray(found.random_error).ravel() + 1e-3)
