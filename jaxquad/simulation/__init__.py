@@ -30,7 +30,11 @@ from ._hardware import (
 )
 from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
-from ._over_devices import loop_over_devices as loop_over_devices, over_devices as over_devices
+from ._over_devices import (
+    loop_over_devices as loop_over_devices,
+    over_devices as over_devices,
+    placed as placed,
+)
 from ._references import (
     Ramp as Ramp,
     ReferenceModel as ReferenceModel,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad.control import ObserverController
 
-from ._objective import Limit, Objective, soft
+from ._objective import Limit, Objective, soft, Worst
 from ._parameters import Coordinates
 from ._problem import Problem
 from ._quantities import QUANTITIES, split_quantities
@@ -120,7 +120,7 @@ def _cost(
     if in_flight:
         fly = lambda c: problem.in_time(c, in_flight)
         numbers |= jax.lax.cond(subproblem.fly, fly, lambda c: unknown, controller)
-    costs = objective.costs(numbers)
+    costs = objective.costs({name: x[:, : problem.counted] for name, x in numbers.items()})
     seen = {name: QUANTITIES[name].combine_axes(x, worst=True) for name, x in numbers.items()}
     limited = _limited(controller, problem, limits, seen)
     beyond = tuple(limit.beyond(x) for limit, x in zip(limits, limited, strict=True))
@@ -136,11 +136,18 @@ def _limited(
 ) -> tuple[Array, ...]:
     """The quantity of each limit: of the linear loop, which is cheap, on many more members."""
     names = {limit.quantity for limit in limits if QUANTITIES[limit.quantity].linear}
-    if problem.limited is None or not names:
-        return tuple(seen[limit.quantity] for limit in limits)
-    wide = problem.limited.numbers(controller, names, SMOOTHING)
-    found = seen | {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
-    return tuple(found[limit.quantity] for limit in limits)
+    found = dict(seen)
+    if problem.limited is not None and names:
+        wide = problem.limited.numbers(controller, names, SMOOTHING)
+        found |= {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
+    return tuple(found[limit.quantity][: count_members(problem, limit)] for limit in limits)
+
+
+def count_members(problem: Problem, limit: Limit) -> int:
+    """How many members a limit is kept on: a mean, as an objective, leaves out the added ones."""
+    if QUANTITIES[limit.quantity].linear and problem.limited is not None:
+        return problem.limited.members
+    return problem.members if isinstance(limit.over, Worst) else problem.counted
 
 
 def _lagrangian(beyond: Sequence[Array], multipliers: Multipliers) -> Float[Array, ""]:

@@ -220,9 +220,6 @@ def _p95(values: Numbers) -> float:
     return float(np.quantile(ordered, 0.95))
 
 
-TOLERATED = 0.0025  # share of all members that may be beyond a limit, where that is proven
-
-
 class Distance(NamedTuple):
     """How far a design is from one limit, in the SI unit of the limit."""
 
@@ -242,19 +239,11 @@ class Distance(NamedTuple):
 
     @property
     def met(self) -> bool:
-        """Whether the limit is met; an unknown number does not meet it.
+        """Whether the limit is met, by every member if it is one on the worst.
 
-        A limit on the worst member is, too, where members beyond it are proven to be so rare that
-        no more than 0.25 % of all are, and none of these is unstable: distributions without an end
-        have members beyond any limit.
+        An unknown number does not meet it.
         """
-        return bool(self.slack >= 0) or self.tolerated
-
-    @property
-    def tolerated(self) -> bool:
-        """Whether it is met although some members are beyond it."""
-        proven = self.beyond_at_most is not None and self.beyond_at_most <= TOLERATED
-        return bool(self.slack < 0) and not self.without and proven
+        return bool(self.slack >= 0)
 
     def __str__(self) -> str:
         shown = QUANTITIES[self.quantity]
@@ -269,8 +258,7 @@ class Distance(NamedTuple):
         if not np.isfinite(self.found):
             return f"{demand}: {shown.text(self.found)}, {'met' if self.met else 'missed'}{beyond}"
         difference = abs(shown.number(self.found) - shown.number(self.bound))
-        how = "exceeded" if self.tolerated else "met" if self.met else "missed"
-        by = f"{how} by {difference:.3g} {shown.unit}".rstrip()
+        by = f"{'met' if self.met else 'missed'} by {difference:.3g} {shown.unit}".rstrip()
         share = f" ({abs(self.percent):.2g} %)" if np.isfinite(self.percent) else ""
         return f"{demand}: {shown.text(self.found)}, {by}{share}{beyond}"
 
@@ -283,8 +271,7 @@ class Distance(NamedTuple):
         if self.beyond_at_most is None:
             return found
         most = 100 * self.beyond_at_most
-        may = f"; {100 * TOLERATED:g} % may be" if self.tolerated else ""
-        return f"{found} (proven: at most {most:.2g} % of all, 95 % confidence{may})"
+        return f"{found} (proven: at most {most:.2g} % of all, 95 % confidence)"
 
 
 def covers(distance: Distance) -> bool:

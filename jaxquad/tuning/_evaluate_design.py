@@ -1,8 +1,7 @@
 """One design on many members: their flights, and their linear loops."""
 
 import dataclasses
-import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +17,10 @@ from jaxquad.control import (
 )
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop, loop_numbers, LoopNumbers
-from jaxquad.simulation import AuthorityWarning, evaluate, Metrics, Scenario
+from jaxquad.simulation import Scenario
 
 from ._design_result import DesignResult, LinearMembers
+from ._flown import fly
 from ._problem import decouple, DeviceChoice, Plant, TimeSpan
 from ._quantities import LINEAR
 
@@ -38,29 +38,22 @@ def evaluate_design(
     is that of a controller with a method `linear`, a scheduled or adaptive one at the inertia that
     it is given.
     """
-    axes = flight.reference.shape[1]
-    loop = members.loop(controller)
-    loop = loop.with_controller(_widen(loop.controller, axes, members.size))
-
-    def run(start: float, stop: float | None, load_start: float | None = None) -> Metrics:
-        return evaluate(
-            loop, flight, start=start, stop=stop, load_start=load_start, devices=devices
-        )
-
-    with warnings.catch_warnings():  # the certificate says it
-        warnings.simplefilter("ignore", AuthorityWarning)
-        whole = run(span.start, span.stop, span.load_start)
-        single = len(span.parts) == 1 and span.load_start is None
-        parts = [whole] if single else [run(*part) for part in span.parts]
-    numbers = _join(whole, parts)
+    flown = fly(flying_loop(controller, members), flight, span, devices)
+    numbers = flown.numbers
     linear = _linear(controller, members, flight)
     if linear is not None:
         numbers |= {name: linear._asdict()[name] for name in LINEAR}
     unstable = None if linear is None else ~np.all(linear.stable, axis=0)
     observed = isinstance(controller, ObserverController)
     why = controller.observer_instability() if observed else ""
-    diverged = np.asarray(whole.diverged)
-    return DesignResult(numbers, unstable, diverged, diverged | _carried_off(parts, flight), why)
+    lost = flown.diverged | _carried_off(flown.greatest, flight)
+    return DesignResult(numbers, unstable, flown.diverged, lost, why)
+
+
+def flying_loop(controller: PyTree, members: Members) -> Loop:
+    """The loops of all members around a controller, its gains as wide as all of its kind have."""
+    loop = members.loop(controller)
+    return loop.with_controller(_widen(loop.controller, members.axes, members.size))
 
 
 _MULTIPLE, _MOST = 8, 2048  # of members that fly, and at most
@@ -79,19 +72,16 @@ def analyse_further(
 
     They come in slices of as many members as have `flown`, which compile nothing anew.
     """
-    count = min(_MULTIPLE * flown, _MOST) if count is None else count
-    if count == 0:
-        return None
-    keys = jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown))
     found, facts = [], []
-    for each in keys:
-        drawn = ensemble.fresh(loop, flown, each)
+    for drawn in _draw_further(loop, ensemble, key, flown, count):
         still = dataclasses.replace(drawn, noise=None, gust=None)
         linear = _linear(loop.controller, drawn, still.flight(scenario))
         if linear is None:
             return None
         found.append(linear)
         facts.append(member_facts(drawn))
+    if not found:
+        return None
     join = lambda parts: np.concatenate(parts, axis=-1)
     numbers = {name: join([x._asdict()[name] for x in found]) for name in LINEAR}
     unstable = ~np.all(join([x.stable for x in found]), axis=0)
@@ -101,6 +91,22 @@ def analyse_further(
 
 
 _FURTHER = 0xF0C5  # folded into the key of members that do not fly
+
+
+def _draw_further(
+    loop: Loop, ensemble: Ensemble, key: Key[Array, ""], flown: int, count: int | None
+) -> Iterator[Members]:
+    count = min(_MULTIPLE * flown, _MOST) if count is None else count
+    for each in jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown)):
+        yield ensemble.fresh(loop, flown, each)
+
+
+def certified_members(
+    loop: Loop, ensemble: Ensemble, key: Key[Array, ""], *, flown: int
+) -> list[Members]:
+    """The members of a certificate with that key: those that flew, and the further ones."""
+    further = _draw_further(loop, ensemble, key, flown, None)
+    return [ensemble.fresh(loop, flown, key), *further]
 
 
 def member_facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
@@ -117,11 +123,12 @@ def member_facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]
 _TILTED = np.pi / 2  # rad: a vehicle that is turned further pushes downwards
 
 
-def _carried_off(parts: Sequence[Metrics], flight: Scenario) -> Bool[np.ndarray, " members"]:
+def _carried_off(
+    greatest: Float[np.ndarray, " members"], flight: Scenario
+) -> Bool[np.ndarray, " members"]:
     """Members whose error exceeds all that the reference moves by more than a quarter turn."""
     reference = np.asarray(flight.reference)
     moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
-    greatest = np.max([np.asarray(part.peak) for part in parts], axis=(0, 1))
     return ~(greatest <= _TILTED + moved)
 
 
@@ -142,25 +149,6 @@ def _full(gain: Array, name: str, axes: int, members: int) -> Array:
     given = np.asarray(gain)
     aligned = given.reshape(given.shape + (1,) * (len(shape) - given.ndim)) if given.ndim else given
     return jnp.asarray(np.broadcast_to(aligned, shape))
-
-
-_INTEGRALS = ("itae", "iae", "ise")
-_WHOLE = ("activity", "energy", "saturation_share", "peak", "rms", "disturbance_rmse")
-
-
-def _join(whole: Metrics, parts: Sequence[Metrics]) -> dict[str, np.ndarray]:
-    stack = lambda name: np.stack([np.asarray(vars(one)[name], float) for one in parts])
-    numbers = {name: np.asarray(vars(whole)[name], float) for name in _WHOLE}
-    numbers["activity_rate"] = numbers["activity"] / (whole.stop - whole.start)
-    numbers["overshoot"] = _greatest(stack("overshoot"))
-    return numbers | {name: stack(name).sum(axis=0) for name in _INTEGRALS}
-
-
-def _greatest(values: Float[np.ndarray, "parts axes members"]) -> np.ndarray:
-    """NaN where no part has a step."""
-    known = ~np.isnan(values)
-    greatest = np.max(np.where(known, values, -np.inf), axis=0)
-    return np.where(known.any(axis=0), greatest, np.nan)
 
 
 def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:

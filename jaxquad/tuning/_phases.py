@@ -1,7 +1,6 @@
 """Stabilise, then optimise: all problems in lockstep, limits by an augmented Lagrangian."""
 
 import dataclasses
-import functools as ft
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -12,9 +11,11 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad.control import ObserverController
+from jaxquad.ensembles import Members
 
 from ._cost import (
     CostResult,
+    count_members,
     evaluate_cost,
     Evaluation,
     Multipliers,
@@ -26,12 +27,12 @@ from ._gauss_newton import GaussNewton, minimise_squares
 from ._lbfgs import Descent, Evaluate, LBFGS, minimise
 from ._objective import Limit, Objective
 from ._parameters import build_design, Coordinates
-from ._problem import LinearLoops, Problem
-from ._quantities import QUANTITIES
+from ._problem import Problem
 from ._tail import (
-    forget_multipliers,
+    Beyond,
     half_of_reserve,
-    least_critical,
+    put_flights,
+    put_loops,
     Search,
     search_tail,
     SEARCHES,
@@ -48,7 +49,7 @@ _AS_GOOD = 1.05  # of the least miss: of rounds that miss limits so nearly alike
 
 def initial_multipliers(problem: Problem, limits: Sequence[Limit], problems: int) -> Multipliers:
     """Before anything is known of the limits."""
-    sizes = [_count_constraints(problem, limit) for limit in limits]
+    sizes = [count_members(problem, limit) for limit in limits]
     values = tuple(jnp.asarray(np.zeros((problems, size))) for size in sizes)
     return Multipliers(values, jnp.asarray(np.full((problems, len(sizes)), _STIFFNESS)))
 
@@ -106,12 +107,6 @@ class Rounds:
         return np.stack([self.points[r][k] for k, r in enumerate(chosen)])
 
 
-def _count_constraints(problem: Problem, limit: Limit) -> int:
-    """One for each member that a limit is kept on."""
-    limited = problem.limited if QUANTITIES[limit.quantity].linear else None
-    return problem.members if limited is None else limited.members
-
-
 _ROUNDS = 8  # of multipliers
 _TIMES = 3  # evaluations of all rounds together, in those of one descent
 _BEYOND_KNEE = 0.25  # 1/s, below the abscissa that is enough: where the first phase aims
@@ -134,6 +129,7 @@ class Solution(NamedTuple):
     multipliers: Multipliers
     result: CostResult
     tail: Tail
+    state: "_State"  # to go on from
 
 
 def solve(
@@ -150,8 +146,7 @@ def solve(
 ) -> Solution:
     """Both phases of all problems: `objectives` and `limits` hold arrays [problems, ...].
 
-    Where limits are kept on `problem.limited`, a `search` finds members that are beyond them, and
-    the problems descend again with these.
+    A `search` finds members that are beyond limits, and the problems descend again with these.
 
     A problem whose members cannot all be made to decay at `rate` (1/s, negative) stays with the
     first phase's best if one of them is unstable. Otherwise no step is taken to where one is, and
@@ -165,17 +160,88 @@ def solve(
     slowest = runner.slowest(first.z)
     stable = slowest < 0
     multipliers = initial_multipliers(problem, limits, len(first.z))
-    found, tail = runner.optimise(first.z, stable, stable, multipliers), Tail()
-    if search is not None and problem.limited is not None:
-        found, tail = runner.keep_on_tail(found, stable, search)
-    second, multipliers, result, beyond, counts = found
+    found = runner.optimise(first.z, stable, stable, multipliers)
+    guards = None if search is None or search.flights is None else search.flights.guards
+    state = _State(runner, found, first.evaluations, stable, slowest < rate, Tail(), guards)
+    if search is not None:
+        state = _keep_on_tail(state, search)
+    return _solution(state)
+
+
+def go_on(solution: Solution, worst: Beyond, search: Search, index: int) -> Solution:
+    """The problem of that index descends again with members that its certificate found."""
+    state = solution.state
+    on = np.arange(len(solution.z)) == index
+    return _solution(_keep_on_tail(_with_worst(state, worst, search, on), search, on))
+
+
+class _State(NamedTuple):
+    """Where all problems are, and what they descend on."""
+
+    runner: "_Runner"
+    found: "_Optimised"
+    stabilising: Int[np.ndarray, " problems"]  # evaluations of the first phase
+    stable: Bool[np.ndarray, " problems"]
+    stabilised: Bool[np.ndarray, " problems"]
+    tail: Tail
+    guards: Members | None  # who fly for limits alone
+
+
+def _solution(state: _State) -> Solution:
+    second, multipliers, result, beyond, counts = state.found
     return Solution(
-        z=second.z, cost=np.where(stable, np.asarray(result.cost), np.nan),
-        gradient=second.gradient, stable=stable, stabilised=slowest < rate,
-        converged=second.converged & stable, reasons=second.reasons, refusal=memory.refusal,
-        evaluations=counts, stabilising=first.evaluations, beyond=beyond, multipliers=multipliers,
-        result=result, tail=tail,
+        z=second.z, cost=np.where(state.stable, np.asarray(result.cost), np.nan),
+        gradient=second.gradient, stable=state.stable, stabilised=state.stabilised,
+        converged=second.converged & state.stable, reasons=second.reasons,
+        refusal=state.runner.memory.refusal, evaluations=counts, stabilising=state.stabilising,
+        beyond=beyond, multipliers=multipliers, result=result, tail=state.tail, state=state,
     )  # fmt: skip
+
+
+def _keep_on_tail(
+    state: _State, search: Search, asked: Bool[np.ndarray, " problems"] | None = None
+) -> _State:
+    """Search for members that are beyond limits, and descend again with the worst of them.
+
+    Searched for are those of problems that are `asked` for (all, by default) and keep the limits on
+    the members known so far.
+    """
+    met = np.maximum(half_of_reserve(search.aimed, search.limits), MET)
+    asked = state.stable if asked is None else asked
+    for _ in range(SEARCHES):
+        on = asked & np.all(state.found.beyond <= met, axis=1)
+        if not on.any():
+            break
+        runner, tail = state.runner, state.tail
+        worst = search_tail(search, tail.searches, runner.coordinates, state.found.descent.z, on)
+        runner.progress.say(str(worst))
+        state = state._replace(tail=tail.with_search(worst))
+        if not worst.count:
+            break
+        state = _with_worst(state, worst, search, on)
+    return state
+
+
+def _with_worst(
+    state: _State, worst: Beyond, search: Search, on: Bool[np.ndarray, " problems"]
+) -> _State:
+    """The problems that are `on` descend again, with the worst among the members of limits."""
+    runner, found = state.runner, state.found
+    problem, multipliers, guards = runner.problem, found.multipliers, state.guards
+    known = found.result, runner.limits, on
+    if worst.loops is not None and worst.loops.found:
+        problem, multipliers = put_loops(worst.loops, problem, multipliers, *known)
+    if worst.members is not None and search.flights is not None and guards is not None:
+        given = search.flights, guards, problem, multipliers
+        guards, problem, multipliers = put_flights(worst.members, *given, *known)
+    runner = dataclasses.replace(runner, problem=problem, limits=search.aimed)
+    met = half_of_reserve(search.aimed, search.limits)
+    again = runner.optimise(found.descent.z, state.stable, on, multipliers, met)
+    found = again._replace(
+        descent=_merge(found.descent, again.descent, on), counts=found.counts + again.counts
+    )
+    tail = state.tail._replace(added=state.tail.added + worst.added)
+    return state._replace(runner=runner, found=found, tail=tail, guards=guards)
 
 
 class _Memory:
@@ -300,44 +366,6 @@ class _Runner(eqx.Module):
             descent = descent._replace(z=z, gradient=np.asarray(result.gradient))
         return _Optimised(descent, multipliers, result, beyond, counts)
 
-    def keep_on_tail(
-        self, found: "_Optimised", able: np.ndarray, search: Search
-    ) -> tuple["_Optimised", Tail]:
-        """Search for members that are beyond limits, and descend again with the worst of them."""
-        runner, tail, met = self, Tail(), half_of_reserve(self.limits, search.limits)
-        for number in range(SEARCHES):
-            on = able & np.all(found.beyond <= np.maximum(met, MET), axis=1)
-            if not on.any():
-                break
-            at = ft.partial(runner.on_linear_loops, found.descent.z)
-            worst = search_tail(search, number, at, on)
-            tail = Tail(tail.searched + worst.members, worst.beyond, tail.added)
-            self.progress.say(f"{worst.beyond} of {worst.members} members in the tail are beyond")
-            if not worst.beyond:
-                break
-            limited = runner.problem.limited
-            assert limited is not None
-            places = least_critical(found.result, self.limits, on, len(worst.found))
-            problem = dataclasses.replace(runner.problem, limited=worst.put_into(limited, places))
-            runner = dataclasses.replace(runner, problem=problem)
-            begun = forget_multipliers(found.multipliers, self.limits, places)
-            again = runner.optimise(found.descent.z, able, on, begun, met)
-            found = again._replace(
-                descent=_merge(found.descent, again.descent, on),
-                counts=found.counts + again.counts,
-            )
-            tail = tail._replace(added=tail.added + len(worst.found))
-        return found, tail
-
-    def on_linear_loops(
-        self, z: np.ndarray, loops: LinearLoops, limits: tuple[Limit, ...]
-    ) -> CostResult:
-        """Limits of the linear loop on other members, with what is compiled already."""
-        problem = dataclasses.replace(self.problem, limited=loops)
-        runner = dataclasses.replace(self, problem=problem, limits=limits)
-        multipliers = initial_multipliers(problem, limits, len(z))
-        return runner.evaluate(z, np.ones(len(z), bool), False, multipliers)
-
 
 class _Optimised(NamedTuple):
     descent: Descent
@@ -426,6 +454,9 @@ def _evaluation(
         gradient_norm=hide(np.linalg.norm(result.gradient, axis=1)),
         stable=hide(np.mean(abscissa < 0, axis=1)),
         worst=hide(np.argmax(worst, axis=1)),
-        means={name: hide(np.mean(x, axis=1)) for name, x in result.numbers.items()},
+        means={
+            name: hide(np.mean(x[:, : result.costs.shape[1]], axis=1))
+            for name, x in result.numbers.items()
+        },
         seconds=seconds,
     )

@@ -139,6 +139,7 @@ class Problem(eqx.Module):
     flight: Scenario
     window: Window = eqx.field(static=True)
     parts: tuple[tuple[int, int], ...] = eqx.field(static=True)  # samples from event to event
+    counted: int = eqx.field(static=True)  # members of the objective: others are for limits alone
 
     @property
     def members(self) -> int:
@@ -188,8 +189,11 @@ def make_problem(
     *,
     span: TimeSpan = _WHOLE,
     devices: DeviceChoice = None,
+    counted: int | None = None,
 ) -> Problem:
     """Of `members`, and of the linear loops of the `limited` ones on which limits are kept.
+
+    The first of the members are `counted` in the objective (all, by default).
 
     Raise ValueError for parts that do not fit together, as `jq.evaluate` does.
     """
@@ -213,6 +217,7 @@ def make_problem(
         flight=flight,
         window=Window(first, last, loaded, parts[-1][1]),
         parts=tuple(parts),
+        counted=members.size if counted is None else counted,
     )
 
 

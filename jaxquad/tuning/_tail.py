@@ -1,49 +1,79 @@
-"""The tail of an ensemble: thousands of linear loops are searched, and limits kept on the worst."""
+"""The tail of an ensemble: thousands of members are searched, and limits kept on the worst."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from ._cost import CostResult, Multipliers
-from ._objective import Limit
-from ._problem import LinearLoops
+from jaxquad._core import mark_members
+from jaxquad.ensembles import Members
+
+from ._certificate import Certificate
+from ._cost import CostResult, Multipliers, SMOOTHING, take_problem
+from ._design_result import covers, DesignResult, Distance, Numbers, with_further
+from ._objective import Limit, Worst
+from ._parameters import build_design, Coordinates
+from ._problem import linear_loops, LinearLoops, Problem
 from ._quantities import QUANTITIES
 
 
-SEARCHES = 2  # at most
-_SLICES = 8  # of a search, each as large as what limits are kept on
-_ADDED = 64  # members at most, after a search
+SEARCHES = 5  # at most, until one finds none
+SLICE = 2048  # linear loops that are evaluated at once
+GUARDS = 16  # members that fly for limits alone
+_LOOPS, _FLIGHTS = 8192, 2048  # of a search, unless it has enough members to go on with before
+_ENOUGH = 16  # members beyond a limit
+_ADDED = 64  # linear loops at most, after a search
+
+
+class FlightSearch(NamedTuple):
+    """What is searched of flights."""
+
+    draw: Callable[[int], Members]  # the slice of that number: members that no tuner has seen
+    fly: Callable[[PyTree, Members], dict[str, Float[np.ndarray, "axes members"]]]  # a controller
+    problem: Callable[[Members], Problem]  # in which these fly for limits alone
+    guards: Members  # who does so before anything is known
+    size: int  # of a slice
 
 
 class Search(NamedTuple):
-    """What is searched."""
+    """What is searched; limits have arrays [problems, ...]."""
 
-    draw: Callable[[int], LinearLoops]  # the slice of that number: members that no tuner has seen
-    limits: tuple[Limit, ...]  # as tight as those members have to keep them; [problems, ...]
+    linear: Callable[[int], LinearLoops] | None  # a slice, as of `FlightSearch`
+    flights: FlightSearch | None
+    limits: tuple[Limit, ...]  # that those members have to keep
+    aimed: tuple[Limit, ...]  # what is enforced once members of the tail are known
 
 
 class Tail(NamedTuple):
     """What was searched, and what came of it."""
 
-    searched: int = 0  # members
-    beyond: int = 0  # of these, in the last search
+    searches: int = 0
+    searched: int = 0  # linear loops, in all searches
+    flown: int = 0  # flights, in all searches
+    beyond: int = 0  # members of the last search beyond a limit
     added: int = 0  # to those that limits are kept on
+    certificates: int = 0  # each on other members; all but the last found members to tune on
+
+    def with_search(self, found: "Beyond") -> "Tail":
+        """After one more search."""
+        return self._replace(
+            searches=self.searches + 1,
+            searched=self.searched + found.searched,
+            flown=self.flown + found.flights,
+            beyond=found.count,
+        )
 
 
-class Worst(NamedTuple):
-    """Members to keep limits on: where they lie in their slices, the worst first."""
+class WorstLoops(NamedTuple):
+    """Linear loops to keep limits on: where they lie in their slices, the worst first."""
 
     slices: list[LinearLoops]
     found: list[tuple[int, int]]  # slice, and place in it
-    beyond: int  # how many there are in all
-
-    @property
-    def members(self) -> int:
-        """How many were searched."""
-        return sum(each.members for each in self.slices)
 
     def put_into(self, limited: LinearLoops, places: Int[np.ndarray, " some"]) -> LinearLoops:
         """They take the `places` of others."""
@@ -54,39 +84,151 @@ class Worst(NamedTuple):
         return limited
 
 
+class Beyond(NamedTuple):
+    """Members that are beyond a limit; the worst of them, to tune on."""
+
+    loops: WorstLoops | None
+    members: Members | None  # who fly
+    count: int  # how many there are in all
+    searched: int = 0  # linear loops
+    flights: int = 0
+
+    @property
+    def added(self) -> int:
+        """How many there are to tune on."""
+        loops = 0 if self.loops is None else len(self.loops.found)
+        return loops + (0 if self.members is None else self.members.size)
+
+    def __str__(self) -> str:
+        flights = f" and {self.flights} flights" * bool(self.flights)
+        return f"tail: {self.count} of {self.searched} linear loops{flights} are beyond limits"
+
+
 def search_tail(
     search: Search,
     number: int,
-    evaluate: Callable[[LinearLoops, tuple[Limit, ...]], CostResult],
+    coordinates: Coordinates,
+    z: Float[np.ndarray, "problems n"],
     able: Bool[np.ndarray, " problems"],
-) -> Worst:
-    """Search for members that are beyond a limit of the linear loop in one of the problems.
+) -> Beyond:
+    """Search for members that are beyond a limit in one of the problems.
 
     An unstable loop has no number that a limit could pull at: it is left to the certificate.
     """
-    slices = [search.draw(number * _SLICES + k) for k in range(_SLICES)]
-    levels = [greatest_levels(evaluate(x, search.limits), search.limits, able) for x in slices]
-    ranked = sorted(
-        (
-            (level[k], s, int(k))
-            for s, level in enumerate(levels)
-            for k in np.flatnonzero(level > 0)
-        ),
-        reverse=True,
-    )
-    return Worst(slices, [(s, k) for _, s, k in ranked[:_ADDED]], len(ranked))
+    designs = [(jnp.asarray(z[k]), take_problem(search.limits, int(k))) for k in able.nonzero()[0]]
+    found = Beyond(None, None, 0)
+    if search.linear is not None:
+        levels = lambda loops: [_levels(x, coordinates, loops, limits) for x, limits in designs]
+        slices, ranked = _search(search.linear, number, _LOOPS // SLICE, levels)
+        loops = WorstLoops(slices, [place for _, place in ranked[:_ADDED]])
+        found = Beyond(loops, None, len(ranked), len(slices) * SLICE)
+    if search.flights is not None:
+        fly, most = search.flights.fly, max(1, _FLIGHTS // search.flights.size)
+        controllers = [(build_design(coordinates, x), limits) for x, limits in designs]
+        levels = lambda flown: [flight_levels(fly(x, flown), limits) for x, limits in controllers]
+        slices, ranked = _search(search.flights.draw, number, most, levels)
+        members = take_members(slices, [place for _, place in ranked[:GUARDS]])
+        flights = len(slices) * search.flights.size
+        found = found._replace(members=members, count=found.count + len(ranked), flights=flights)
+    return found
+
+
+Slice = TypeVar("Slice")
+Ranked = list[tuple[float, tuple[int, int]]]  # levels, the worst first: slice, and place in it
+
+
+def _search(
+    draw: Callable[[int], Slice],
+    number: int,
+    most: int,
+    levels: Callable[[Slice], Sequence[Float[ArrayLike, " members"]]],
+) -> tuple[list[Slice], Ranked]:
+    """Slices, `most` of them unless there are members enough to go on, and who is beyond."""
+    slices: list[Slice] = []
+    ranked: Ranked = []
+    for s in range(most):
+        slices.append(draw(number * most + s))
+        level = np.max([np.asarray(x) for x in levels(slices[s])], axis=0)
+        ranked += [(float(level[k]), (s, int(k))) for k in np.flatnonzero(level > 0)]
+        if len(ranked) >= _ENOUGH:
+            break
+    return slices, sorted(ranked, reverse=True)
 
 
 _LOST = 5.0  # nepers beyond a limit: the peak of a loop that is unstable, or as good as that
 
 
-def greatest_levels(
-    result: CostResult, limits: Sequence[Limit], able: Bool[np.ndarray, " problems"]
+@eqx.filter_jit
+def _levels(
+    z: Float[Array, " n"],
+    coordinates: Coordinates,
+    loops: LinearLoops,
+    limits: tuple[Limit, ...],
+) -> Float[Array, " members"]:
+    """How far linear loops are beyond limits that every member has to keep, the greatest of all."""
+    kept = [limit for limit in limits if is_kept_by_loops(limit)]
+    names = {limit.quantity for limit in kept}
+    found = loops.numbers(coordinates.controller_at(z), names, SMOOTHING)
+    values = {name: QUANTITIES[name].combine_axes(found[name], worst=True) for name in names}
+    level = jnp.max(jnp.stack([limit.beyond(values[limit.quantity]) for limit in kept]), axis=0)
+    return jnp.where(level < _LOST, level, -jnp.inf)
+
+
+def flight_levels(
+    numbers: Mapping[str, Float[np.ndarray, "axes members"]], limits: Sequence[Limit]
 ) -> Float[np.ndarray, " members"]:
-    """How far each member is beyond the limits of the linear loop, the greatest of all problems."""
-    linear = [k for k, limit in enumerate(limits) if QUANTITIES[limit.quantity].linear]
-    levels = np.max([np.asarray(result.beyond[k])[able] for k in linear], axis=(0, 1))
-    return np.where(np.isfinite(levels) & (levels < _LOST), levels, -np.inf)
+    """How far flights are beyond limits that every member has to keep, the greatest of all."""
+    levels = []
+    for limit in filter(is_kept_by_flights, limits):
+        values, sign = numbers[limit.quantity], QUANTITIES[limit.quantity].sign
+        worst = sign * np.max(sign * values, axis=0)
+        levels.append(_level(limit.quantity, worst, limit.bound))
+    return np.max(levels, axis=0)
+
+
+def _level(quantity: str, values: Numbers, bound: Float[ArrayLike, ""]) -> Numbers:
+    """How far values are beyond a bound; minus infinity for those that are no number."""
+    shown = QUANTITIES[quantity]
+    level = np.asarray(shown.sign * (shown.level(values) - shown.level(bound)))
+    return np.where(np.isfinite(level), level, -np.inf)
+
+
+def is_kept_by_loops(limit: Limit) -> bool:
+    """Whether it is a limit of the linear loop that every member has to keep."""
+    return QUANTITIES[limit.quantity].linear and isinstance(limit.over, Worst)
+
+
+def is_kept_by_flights(limit: Limit) -> bool:
+    """Whether it is a limit of the flight that every member has to keep."""
+    return not QUANTITIES[limit.quantity].linear and isinstance(limit.over, Worst)
+
+
+def certified_beyond(certificate: Certificate, drawn: Sequence[Members]) -> Beyond:
+    """The members of a certificate that are beyond a limit.
+
+    `drawn` are those that flew, and the further ones.
+    """
+    missed = [x for x in certificate.distances if x.beyond and covers(x)]
+    linear = [x for x in missed if QUANTITIES[x.quantity].linear]
+    every = with_further(certificate.design, certificate.further)
+    loops = [divmod(k, drawn[0].size) for k in _rank(every, linear)]
+    flown = [(0, k) for k in _rank(certificate.design, [x for x in missed if x not in linear])]
+    slices = [linear_loops(x, None) for x in drawn] if loops else []
+    return Beyond(
+        WorstLoops(slices, loops[:_ADDED]),
+        take_members(drawn, flown[:GUARDS]),
+        len(loops) + len(flown),
+    )
+
+
+def _rank(design: DesignResult, missed: Sequence[Distance]) -> list[int]:
+    """The members that are beyond limits, the worst first; without those that have no number."""
+    if not missed:
+        return []
+    values = [design.of(x.quantity, worst_axis=True) for x in missed]
+    pairs = zip(missed, values, strict=True)
+    level = np.max([_level(x.quantity, found, x.bound) for x, found in pairs], axis=0)
+    return [int(k) for k in np.argsort(-level, kind="stable") if level[k] > 0]
 
 
 def half_of_reserve(
@@ -98,19 +240,84 @@ def half_of_reserve(
     return np.stack([0.5 * np.abs(level(a) - level(b)) for a, b in pairs], axis=1)
 
 
-def least_critical(
-    result: CostResult, limits: Sequence[Limit], able: Bool[np.ndarray, " problems"], count: int
-) -> Int[np.ndarray, " some"]:
-    """Which of the members that limits are kept on are furthest within them."""
-    return np.argsort(greatest_levels(result, limits, able), kind="stable")[:count]
+def _rank_places(
+    result: CostResult,
+    kept: Sequence[bool],
+    able: Bool[np.ndarray, " problems"],
+    first: int = 0,
+) -> Int[np.ndarray, " members"]:
+    """Members from the `first` on, those before that are furthest within the limits `kept`."""
+    levels = np.max(
+        [np.asarray(x)[able, first:] for x, mine in zip(result.beyond, kept, strict=True) if mine],
+        axis=(0, 1),
+    )
+    return np.argsort(np.where(np.isfinite(levels), levels, -np.inf), kind="stable")
 
 
-def forget_multipliers(
-    multipliers: Multipliers, limits: Sequence[Limit], places: Int[np.ndarray, " some"]
-) -> Multipliers:
-    """Those of the members at `places` begin at 0, where the limit is one of the linear loop."""
+def put_loops(
+    worst: WorstLoops,
+    problem: Problem,
+    multipliers: Multipliers,
+    result: CostResult,
+    limits: Sequence[Limit],
+    able: Bool[np.ndarray, " problems"],
+) -> tuple[Problem, Multipliers]:
+    """Limits are kept on the worst in place of the least critical; their multipliers begin at 0."""
+    assert problem.limited is not None
+    kept = [is_kept_by_loops(limit) for limit in limits]
+    places = _rank_places(result, kept, able)[: len(worst.found)]
     values = [np.array(x) for x in multipliers.values]
-    for value, limit in zip(values, limits, strict=True):
-        if QUANTITIES[limit.quantity].linear:
-            value[:, places] = 0.0
+    for value in (x for x, mine in zip(values, kept, strict=True) if mine):
+        value[:, places] = 0.0
+    limited = worst.put_into(problem.limited, places)
+    return dataclasses.replace(problem, limited=limited), _with_values(multipliers, values)
+
+
+def put_flights(
+    worst: Members,
+    search: FlightSearch,
+    guards: Members,
+    problem: Problem,
+    multipliers: Multipliers,
+    result: CostResult,
+    limits: Sequence[Limit],
+    able: Bool[np.ndarray, " problems"],
+) -> tuple[Members, Problem, Multipliers]:
+    """The worst fly in place of the least critical guards; their multipliers begin at 0."""
+    kept, first = [is_kept_by_flights(limit) for limit in limits], problem.counted
+    stay = np.sort(_rank_places(result, kept, able, first)[worst.size :])
+    places = [(0, int(k)) for k in stay] + [(1, k) for k in range(worst.size)]
+    guards = take_members([guards, worst], places) or guards
+    values = [np.array(x) for x in multipliers.values]
+    for k in np.flatnonzero(kept):
+        moved = [values[k][:, :first], values[k][:, first + stay]]
+        values[k] = np.concatenate([*moved, np.zeros((len(values[k]), worst.size))], axis=1)
+    flown = dataclasses.replace(search.problem(guards), limited=problem.limited)
+    return guards, flown, _with_values(multipliers, values)
+
+
+def _with_values(multipliers: Multipliers, values: Sequence[np.ndarray]) -> Multipliers:
     return multipliers._replace(values=tuple(map(jnp.asarray, values)))
+
+
+def take_members(slices: Sequence[Members], places: Sequence[tuple[int, int]]) -> Members | None:
+    """The members at these places, (slice, place in it); None without any. Compiles nothing."""
+    if not places:
+        return None
+    chosen = [[k for s, k in places if s == slice] for slice in range(len(slices))]
+    order = np.argsort([p for s in range(len(slices)) for p, at in enumerate(places) if at[0] == s])
+    used = [(x, np.array(k, int)) for x, k in zip(slices, chosen, strict=True)]
+    longest = max(x.longest_delay for x in slices)
+    alike = [dataclasses.replace(x, longest_delay=longest) for x in slices]
+
+    def pick(own: bool, *parts: Array) -> Array:
+        if not own:
+            return parts[0]
+        keys = jnp.issubdtype(parts[0].dtype, jax.dtypes.prng_key)
+        given = [np.asarray(jax.random.key_data(x)).T if keys else np.asarray(x) for x in parts]
+        taken = [x[..., k] for x, (_, k) in zip(given, used, strict=True)]
+        together = np.concatenate(taken, axis=-1)[..., order]
+        return jax.random.wrap_key_data(jnp.asarray(together.T)) if keys else jnp.asarray(together)
+
+    marks = mark_members(alike[0], (alike[0].size,))
+    return jax.tree.map(pick, marks, *alike)

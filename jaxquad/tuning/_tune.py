@@ -1,5 +1,7 @@
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import functools as ft
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +16,25 @@ from jaxquad.simulation import find_steps, Scenario
 from ._certificate import Certificate, lag_remark
 from ._certify import certify, require_same_rate
 from ._cost import Listener, Progress, stack_copies
+from ._evaluate_design import certified_members, flying_loop
+from ._flown import fly
 from ._gauss_newton import GaussNewton, require_squares
 from ._lbfgs import LBFGS
-from ._objective import Limit, Objective
+from ._objective import Limit, Objective, Worst
 from ._parameters import build_design, select_coordinates
-from ._phases import find_bounds, Solution, solve
-from ._problem import DeviceChoice, linear_loops, LinearLoops, make_problem, Problem, TimeSpan
+from ._phases import find_bounds, go_on, Solution, solve
+from ._problem import DeviceChoice, linear_loops, make_problem, Problem, TimeSpan
 from ._quantities import QUANTITIES
-from ._tail import Search
+from ._tail import (
+    certified_beyond,
+    FlightSearch,
+    GUARDS,
+    is_kept_by_flights,
+    is_kept_by_loops,
+    Search,
+    SLICE,
+    take_members,
+)
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
 from ._verdict import Bound, judge_convergence, Verdict
 
@@ -54,9 +67,12 @@ def tune(
     First the slowest pole of every member is moved to the left of the knee of the objective's
     penalty on the abscissa (-0.5 1/s without one), which needs no flights. Then the objective is
     minimised through their flights of the scenario. Limits are enforced by an augmented Lagrangian,
-    those of the linear loop on 512 further members. Then 4096 others are searched for such as are
-    beyond one of these limits; the worst join the 512, and the descent goes on from where it ended,
-    twice at most. A design whose certificate fails is returned, too, and says so first.
+    those of the linear loop on 512 further members. Then others are searched for such as are beyond
+    a limit that every member has to keep: 8192 linear loops, 2048 flights. The worst join those
+    that the limit is kept on, and the descent goes on from where it ended, until a search of other
+    members finds none, five times at most. Where the certificate still finds one, it is tuned on,
+    too, and another certificate is made on members of its own: three at most. A design whose
+    certificate fails is returned, too, and says so first.
     Source: docs/tuning.md.
 
     !!! example
@@ -79,7 +95,8 @@ def tune(
     - `objective`: what is minimised, see `jq.Objective`.
     - `limits`: bounds that the design has to keep.
     - `reserve`: by how much more limits are enforced than asked (0.03 is 3 %), because fresh
-        members reach further than those that were tuned on. Those that are searched may use it up.
+        members reach further than those that were tuned on. At most 1 % of it is left on limits
+        that every member has to keep once the worst of a search are tuned on.
     - `free`: the numbers to tune, as in `jq.fit`; by default those that `controller.tunable()`
         names: wc, wo and b0 or the knots of its map, of a PID all gains that are not 0. Gains keep
         their sign; the knots of a `jq.control.InertiaMap` stay falling.
@@ -112,26 +129,45 @@ def tune(
     coordinates = select_coordinates(loop.controller, free)
     drawn = draw_or_take(loop, ensemble, members, key)
     _require_fresh(fresh, drawn, peers)
+    search = _search(
+        loop, ensemble, drawn, scenario, limits, reserve=reserve, starts=starts, key=key, span=span,
+        size=fresh if isinstance(fresh, int) else _SIZE, devices=devices,
+    )  # fmt: skip
+    if search is None or search.flights is None:
+        problem = make_problem(loop.controller, drawn, scenario, span=span, devices=devices)
+    else:
+        problem = search.flights.problem(search.flights.guards)
     limited = _draw_limited(loop, ensemble, limits, key)
-    problem = make_problem(loop.controller, drawn, scenario, limited, span=span, devices=devices)
+    if limited is not None:
+        problem = dataclasses.replace(problem, limited=linear_loops(limited, devices))
     require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
     begun = scatter_starts(coordinates.start, starts, scatter, seed=0)
     tightened = tuple(tighten(limit, reserve) for limit in limits)
     solution = solve(
         coordinates, problem, begun, stack_copies(objective, starts),
         stack_copies(tightened, starts), method=method, rate=stabilising_rate(objective),
-        progress=watched, search=_search(loop, ensemble, limits, starts, key, devices),
+        progress=watched, search=search,
     )  # fmt: skip
-    seconds, best = watched.seconds, _best(solution)
-    tuned = build_design(coordinates, jnp.asarray(solution.z[best]))
-    certificate: Certificate | None = None
+    best, seconds, certificate, certificates = _best(solution), watched.seconds, None, 0
     if fresh is not None and not (isinstance(ensemble, Members) and isinstance(fresh, int)):
-        watched.say("certificate on fresh members ...")
         others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
-        certificate = certify(
-            loop.with_controller(tuned), others, scenario, limits=limits, peers=peers,
-            begun=loop.controller, members=count, key=key, devices=devices, **span._asdict(),
-        )  # fmt: skip
+
+        def judge(solution: Solution, key: Key[Array, ""]) -> Certificate:
+            watched.say("certificate on fresh members ...")
+            design = build_design(coordinates, jnp.asarray(solution.z[best]))
+            return certify(
+                loop.with_controller(design), others, scenario, limits=limits, peers=peers,
+                begun=loop.controller, members=count, key=key, devices=devices, **span._asdict(),
+            )  # fmt: skip
+
+        certificate, certificates = judge(solution, key), 1
+        if search is not None and isinstance(ensemble, Ensemble) and isinstance(fresh, int):
+            redraw = ft.partial(certified_members, loop, ensemble, flown=fresh)
+            solution, certificate, certificates, more = _certify_until_kept(
+                solution, certificate, judge, redraw, search, best, key
+            )
+            seconds += more
+    tuned = build_design(coordinates, jnp.asarray(solution.z[best]))
     found = _limit_results(limits, solution, best)
     bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
     convergence = judge_descent(solution, best, bounds, found)
@@ -150,7 +186,7 @@ def tune(
         minima=distinct_optima(solution, coordinates),
         evaluations=int(solution.evaluations[best]),
         stabilising=int(solution.stabilising[best]),
-        tail=solution.tail,
+        tail=solution.tail._replace(certificates=certificates),
         history=tuple(watched.history),
         seconds=seconds,
         remarks=tuple(_remarks(tuned, problem, solution, best, found)),
@@ -158,6 +194,36 @@ def tune(
 
 
 _WIDE = 512
+_CERTIFICATES = 3  # at most
+_AGAIN = 0xCE57  # folded into the key of certificates after the first
+
+
+def _certify_until_kept(
+    solution: Solution,
+    certificate: Certificate,
+    judge: Callable[[Solution, Key[Array, ""]], Certificate],
+    redraw: Callable[[Key[Array, ""]], list[Members]],
+    search: Search,
+    best: int,
+    key: Key[Array, ""],
+) -> tuple[Solution, Certificate, int, float]:
+    """Where certified members are beyond a limit, tune on these, too, and certify on others.
+
+    Also returns how many certificates there are, and how long that tuning took, in s.
+    """
+    seconds, number, own = 0.0, 1, key
+    for number in range(1, _CERTIFICATES + 1):
+        if number == _CERTIFICATES:
+            break
+        worst = certified_beyond(certificate, redraw(own))
+        if not worst.added:
+            break
+        began = time.perf_counter()
+        solution = go_on(solution, worst, search, best)
+        seconds += time.perf_counter() - began
+        own = jax.random.fold_in(key, _AGAIN + number)
+        certificate = judge(solution, own)
+    return solution, certificate, number, seconds
 
 
 def draw_or_take(
@@ -180,26 +246,57 @@ def _draw_limited(
     return ensemble.draw(loop, _WIDE, jax.random.fold_in(key, 1))
 
 
-_FIRST = 2  # folded into the key of the first slice that is searched
+_FIRST = 2  # folded into the key of the first slice of loops that is searched
+_FLOWN = 0xF17E  # and of the first slice of flights
+_GUARDING = 0x6A2D  # of those that fly for limits alone
+_SIZE = 256  # flights in a slice
+_MARGIN = 0.01  # of the reserve, what is left once the worst of a search are tuned on
 
 
 def _search(
     loop: Loop,
     ensemble: Ensemble | Members,
+    drawn: Members,
+    scenario: Scenario,
     limits: Sequence[Limit],
+    *,
+    reserve: float,
     starts: int,
     key: Key[Array, ""],
+    span: TimeSpan,
+    size: int,
     devices: DeviceChoice,
 ) -> Search | None:
-    """Members to search for those beyond limits; they may use up the reserve."""
-    if isinstance(ensemble, Members):
+    """Members to search for those beyond limits, and the limits that those found have to keep."""
+    if isinstance(ensemble, Members) or not any(isinstance(x.over, Worst) for x in limits):
         return None
+    fresh = lambda own, count: ensemble.fresh(loop, count, jax.random.fold_in(key, own))
 
-    def draw(number: int) -> LinearLoops:
-        own = jax.random.fold_in(key, _FIRST + number)
-        return linear_loops(ensemble.fresh(loop, _WIDE, own), devices)
+    def fly_around(controller: PyTree, members: Members) -> dict[str, np.ndarray]:
+        around = flying_loop(controller, members)
+        return fly(around, members.flight(scenario), span, devices).numbers
 
-    return Search(draw, stack_copies(tuple(limits), starts))
+    def problem(guards: Members) -> Problem:
+        flown = take_members([drawn, guards], [
+            *((0, k) for k in range(drawn.size)), *((1, k) for k in range(guards.size))
+        ])  # fmt: skip
+        assert flown is not None
+        return make_problem(
+            loop.controller, flown, scenario, span=span, devices=devices, counted=drawn.size
+        )
+
+    flights = FlightSearch(
+        lambda k: fresh(_FLOWN + k, size), fly_around, problem, fresh(_GUARDING, GUARDS), size
+    )
+    loops = lambda k: linear_loops(fresh(_FIRST + k, SLICE), devices)
+    aimed = [tighten(x, min(reserve, _MARGIN) if isinstance(x.over, Worst) else reserve)
+             for x in limits]  # fmt: skip
+    return Search(
+        loops if any(map(is_kept_by_loops, limits)) else None,
+        flights if any(map(is_kept_by_flights, limits)) else None,
+        stack_copies(tuple(limits), starts),
+        stack_copies(tuple(aimed), starts),
+    )
 
 
 def stabilising_rate(objective: Objective) -> float:

@@ -80,7 +80,7 @@ class Tuned(eqx.Module):
     is None if no fresh members were asked for. `limits` and `minima` are on the members that were
     tuned on. `evaluations` counts gradients through the flights of all members, `stabilising` those
     of the linear loops alone that came before. `tail` says how many members were searched for
-    those beyond a limit of the linear loop, and how many of these were tuned on, too.
+    those beyond a limit, how many of these were tuned on, too, and which certificate this one is.
     """
 
     controller: PyTree
@@ -98,7 +98,7 @@ class Tuned(eqx.Module):
     history: tuple[Evaluation, ...]
     seconds: float  # of the descent, compilation included, without the certificate
     remarks: tuple[str, ...]
-    tail: Tail = Tail()  # of the ensemble, searched for members beyond limits of the linear loop
+    tail: Tail = Tail()  # of the ensemble, searched for members beyond limits
 
     @property
     def active(self) -> tuple[Limit, ...]:
@@ -133,7 +133,7 @@ class Tuned(eqx.Module):
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
         lines = [first, *map(str, verdicts), f"tuned: {numbers}", f"  {_describe_effort(self)}"]
         lines += [f"  {_describe_limit(one)}" for one in self.limits]
-        lines += [f"  {_describe_tail(self.tail)}"] if self.tail.searched else []
+        lines += [f"  {_describe_tail(self.tail)}"] if self.tail.searches else []
         lines += _describe_optima(self.minima) if len(self.minima) > 1 else []
         lines += [f"  ! {remark}" for remark in self.remarks]
         return "\n".join([*lines, *map(str, rest)])
@@ -165,10 +165,16 @@ def _describe_limit(one: LimitResult) -> str:
 
 
 def _describe_tail(tail: Tail) -> str:
-    text = f"limits of the linear loop: {tail.searched} further members searched"
-    if not tail.added:
-        return f"{text}, none beyond"
-    return f"{text}, {tail.added} of the worst added to those tuned on"
+    flights = f" and {tail.flown} flights" if tail.flown else ""
+    loops = f"{tail.searched} further linear loops" if tail.searched else "further members"
+    text = f"limits: {loops}{flights} searched, "
+    text += f"{tail.added} of the worst added to those tuned on" if tail.added else "none beyond"
+    if tail.certificates < 2:
+        return text
+    return (
+        f"{text}; certificate {tail.certificates} follows, because members of the one before were "
+        "beyond a limit: these are tuned on, too, and it has others"
+    )
 
 
 def _describe_optima(minima: tuple[Optimum, ...]) -> list[str]:

@@ -6,9 +6,10 @@ import pytest
 from tuning_case import ensemble, equivalent, flight, loop, objective
 
 from jaxquad.loops import loop_numbers
+from jaxquad.simulation import scenario
 from jaxquad.tuning import LBFGS, Limit, tune
 from jaxquad.tuning._problem import linear_loops
-from jaxquad.tuning._tail import Worst
+from jaxquad.tuning._tail import take_members, WorstLoops
 
 
 def loops(seed, count=6):
@@ -17,12 +18,24 @@ def loops(seed, count=6):
 
 def test_the_worst_take_the_places_of_others():
     mine, first, second = loops(0), loops(1), loops(2)
-    worst = Worst([first, second], [(1, 4), (0, 0), (1, 2)], 3)
+    worst = WorstLoops([first, second], [(1, 4), (0, 0), (1, 2)])
     found = worst.put_into(mine, np.array([5, 1, 0]))
     for pick in (lambda x: x.assumed_inertia[0], lambda x: x.axes.lag[0], lambda x: x.delay):
         a, b, c = map(pick, (mine, first, second))
         np.testing.assert_array_equal(pick(found), [c[2], b[0], a[2], a[3], a[4], c[4]])
-    assert worst.members == 12
+
+
+def test_members_are_taken_from_several_draws_with_the_noise_that_is_theirs():
+    drawn = [ensemble().draw(loop(), 6, jax.random.key(seed)) for seed in range(3)]
+    places = [(2, 1), (0, 5), (2, 0), (0, 2)]
+    found = take_members(drawn, places)
+    assert found is not None and take_members(drawn, []) is None
+    still = scenario(duration=0.1, axes=1)
+    flown = found.flight(still).noise
+    for k, (s, place) in enumerate(places):
+        np.testing.assert_array_equal(found.plant.lag[0, k], drawn[s].plant.lag[0, place])
+        own = drawn[s].take([place]).flight(still).noise
+        np.testing.assert_array_equal(flown[..., k], own[..., 0])
 
 
 @pytest.mark.slow
@@ -35,8 +48,8 @@ def test_members_of_the_tail_are_tuned_on_where_they_are_beyond_a_limit():
     start = loop(equivalent(4.0, 50.0, 1.8))
     blind = tune(start, drawn, flight(), **brief)
     found = tune(start, ensemble(), flight(), members=16, **brief)
-    assert blind.tail.searched == 0 and found.tail.searched in (4096, 8192)
-    assert 0 < found.tail.added <= 128 and found.limits[0].met
+    assert blind.tail.searched == 0 and found.tail.searched >= 8192
+    assert 0 < found.tail.added <= 320 and found.limits[0].met
     assert f"{found.tail.added} of the worst added" in str(found)
     beyond = []
     for controller in (blind.controller, found.controller):
