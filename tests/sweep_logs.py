@@ -19,9 +19,9 @@ def swept(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return sweep.time, sweep.signal, rate + np.random.default_rng(seed).normal(0, 0.05, rate.size)
 
 
-def write_sweep(path: Path) -> Path:
+def write_sweep(path: Path, seed: int = 0) -> Path:
     """As CSV, driven by two motors: M = right - left."""
-    time, command, rate = swept(0)
+    time, command, rate = swept(seed)
     table = np.column_stack([time, -0.5 * command, 0.5 * command, rate])
     np.savetxt(path, table, delimiter=",", header="t,left,right,q", comments="")
     return path

@@ -9,6 +9,7 @@ from ._options import (
     add_config,
     add_json,
     add_out,
+    add_output,
     add_settings,
     Command,
     print_json,
@@ -24,13 +25,14 @@ SOME_FAILED = 4
 def _add(declared: argparse.ArgumentParser) -> None:
     declared.add_argument("folder", type=Path, help="the folder that contains the logs")
     add_config(declared)
-    add_out(declared, "results/NAME of the folder")
     declared.add_argument(
         "--again", action="store_true", help="identify logs again that failed before"
     )
-    add_json(declared, "the rows of the table")
-    add_quiet(declared)
     add_settings(declared, BatchSettings)
+    output = add_output(declared)
+    add_out(output, "results/NAME of the folder")
+    add_json(output, "the rows of the table")
+    add_quiet(output)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -2,7 +2,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ._options import add_json, Command, print_json
+from ._options import add_json, add_output, Command, print_json
 
 
 if TYPE_CHECKING:
@@ -12,9 +12,10 @@ BELOW_GUIDELINE = 4
 
 
 def _add(declared: argparse.ArgumentParser) -> None:
-    add = declared.add_argument
-    add("kind", choices=("sweep", "multisine"))
-    add("--band", type=float, nargs=2, required=True, metavar=("LOW", "HIGH"), help="in Hz")
+    declared.add_argument("kind", choices=("sweep", "multisine"))
+    add = declared.add_argument_group("the signal").add_argument
+    text = "in Hz; 1 Hz is 6.28 rad/s"
+    add("--band", type=float, nargs=2, required=True, metavar=("LOW", "HIGH"), help=text)
     add("--rate", type=float, required=True, metavar="HZ", help="samples per second")
     add("--amplitude", type=float, required=True, help="peak, in the unit of the command")
     text = (
@@ -27,8 +28,11 @@ def _add(declared: argparse.ArgumentParser) -> None:
     add("--bandwidth", type=float, metavar="HZ", help=text)
     text = "where the phase is expected to be -180 degrees, for the guideline on the upper end"
     add("--phase-crossover", type=float, metavar="HZ", help=text)
-    add("--out", type=Path, metavar="CSV", help="by default sweep.csv or multisine.csv")
-    add_json(declared, "the guidelines")
+    output = add_output(declared)
+    output.add_argument(
+        "--out", type=Path, metavar="CSV", help="by default sweep.csv or multisine.csv"
+    )
+    add_json(output, "the guidelines")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -51,7 +55,9 @@ def _run(options: argparse.Namespace) -> int:
         rules = [rule._asdict() for rule in found]
         print_json({"file": str(out), "samples": signal.time.size, "ok": found.ok, "rules": rules})
     else:
-        print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s\n{found}\n{out}")
+        low, high = options.band
+        band = f"{low:g} to {high:g} Hz ({2 * np.pi * low:.3g} to {2 * np.pi * high:.3g} rad/s)"
+        print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {band}\n{found}\n{out}")
     return 0 if found.ok else BELOW_GUIDELINE
 
 

@@ -3,19 +3,23 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxquad.records import require_file
-from jaxquad.workflows import IdentifySettings
+from jaxquad.workflows import default_folder, IdentifySettings, in_options
 
 from ._options import (
     add_config,
+    add_force,
     add_json,
     add_log,
     add_log_option,
     add_out,
+    add_output,
     add_result,
     add_settings,
     Command,
+    folder_to_write,
     given_settings,
     print_json,
     print_table,
@@ -24,13 +28,16 @@ from ._options import (
     stdout_for_json,
 )
 from ._progress import add_quiet
-from ._words import in_options, with_options
+
+
+if TYPE_CHECKING:
+    from jaxquad.workflows import Identification
 
 
 def _add_channels(declared: argparse.ArgumentParser) -> None:
     add_log(declared)
     add_settings(declared, IdentifySettings, only={"time": "", "time_unit": "", "dt": ""})
-    add_json(declared, "the list")
+    add_json(add_output(declared), "the list")
 
 
 def _channels(options: argparse.Namespace) -> int:
@@ -69,12 +76,16 @@ NOT_IDENTIFIABLE = 3
 _CODES = "exit codes: 0 done, 2 unusable input, 3 the record does not determine the parameters\n"
 
 
-def _finish(options: argparse.Namespace, found, folder: Path | None, note: str = "") -> int:
+def _finish(
+    options: argparse.Namespace, found: "Identification", folder: Path, note: str = ""
+) -> int:
     """Print an identification, write its folder, and tell whether it is identifiable."""
-    found = with_options(found)
+    verified = found.settings.verify
+    sources = [*found.paths, *([verified] if verified else [])]
+    same = {"settings": found.settings.content()}
     with stdout_for_json(options):
-        print(in_options(str(found)))
-        path = found.write(folder)
+        print(in_options(str(found)), flush=True)
+        path = found.write(folder_to_write(options, folder, "result.json", same, sources))
         names = ", ".join(["report.html", *found.figures()])
         print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
     if options.json:
@@ -86,26 +97,44 @@ def _finish(options: argparse.Namespace, found, folder: Path | None, note: str =
 
 
 def _add_identify(declared: argparse.ArgumentParser) -> None:
-    add_log(declared)
+    text = "a log of an autopilot, CSV, NPZ, MAT, HDF5, ...; several logs of one vehicle in one "
+    text += "condition are fitted together"
+    declared.add_argument("file", type=Path, nargs="+", help=text)
     add_config(declared)
-    add_out(declared, "results/NAME of the file")
-    add_json(declared, "result.json")
-    add_quiet(declared)
     add_settings(declared, IdentifySettings)
+    output = add_output(declared)
+    add_out(output, "results/NAME of the first file")
+    add_force(output)
+    add_json(output, "result.json")
+    add_quiet(output)
 
 
 def _identify(options: argparse.Namespace) -> int:
     given = settings_of(options, IdentifySettings)
-    for path in (options.file, *([given.verify] if given.verify else [])):
-        require_file(path)
+    for path in options.file:
+        _require_log(path)
+    if given.verify:
+        require_file(given.verify)
     start_computing()
     from jaxquad.workflows import identify, propose_settings
 
-    settings, proposal = propose_settings(options.file, given)
+    first, several = options.file[0], len(options.file) > 1
+    settings, proposal = propose_settings(first, given, several=several)
     if proposal is not None:
         with stdout_for_json(options):
             print(f"{proposal}\n", flush=True)
-    return _finish(options, identify(options.file, settings), options.out)
+    found = identify(options.file if several else first, settings)
+    return _finish(options, found, options.out or default_folder(first))
+
+
+def _require_log(path: Path) -> None:
+    """A ROS 2 bag is a folder; any other one is a batch."""
+    require_file(path)
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        raise ValueError(
+            f"{path} is a folder: jaxquad batch {path} identifies each log in it; for one log, "
+            "name the file"
+        )
 
 
 IDENTIFY = Command(
@@ -119,10 +148,13 @@ IDENTIFY = Command(
   jaxquad identify flight.csv --input p_cmd --output p --segment 22:30 --segment 41:49.5
   jaxquad identify log15 --input "roll=-motor.m1^2-motor.m2^2+motor.m3^2+motor.m4^2" --output gyro.x
   jaxquad identify a.npz --input "cmd[0]" --output "rate[0]" --verify b.npz --json > fit.json
+  jaxquad identify flight1.csv flight2.csv --input u --output p
 
 Without --input and --output, the log of a known autopilot proposes them, and the full command line
-is printed. Powers of a channel describe motors with a thrust curve. The keys of a file for --config
-are the names of the options, but units, segments, lag = false and delay = false.
+is printed. Several logs of one vehicle in one condition (mass, battery, speed) give one response;
+--start, --stop and --segment hold in each of them. Powers of a channel describe motors with a
+thrust curve. The keys of a file for --config are the names of the options, but units, segments,
+lag = false and delay = false.
 """
     + _CODES,
     _add_identify,
@@ -133,9 +165,11 @@ are the names of the options, but units, segments, lag = false and delay = false
 def _add_report(declared: argparse.ArgumentParser) -> None:
     add_result(declared)
     add_log_option(declared)
-    add_out(declared, "the folder of the result")
-    add_json(declared, "result.json")
-    add_quiet(declared)
+    output = add_output(declared)
+    add_out(output, "the folder of the result")
+    add_force(output)
+    add_json(output, "result.json")
+    add_quiet(output)
 
 
 def _report(options: argparse.Namespace) -> int:
@@ -176,6 +210,7 @@ _OF_A_RECORD = {
     "start": "",
     "stop": "",
     "band": "compare between these frequencies, in Hz; by default those that were fitted",
+    "band_rad": "",
 }
 
 
@@ -183,9 +218,10 @@ def _add_verify(declared: argparse.ArgumentParser) -> None:
     add_result(declared)
     add_log(declared)
     add_settings(declared, IdentifySettings, only=_OF_A_RECORD)
-    declared.add_argument("--out", type=Path, metavar="PNG", help="draw both outputs into a figure")
-    add_json(declared, "the measures of agreement")
-    add_quiet(declared)
+    output = add_output(declared)
+    output.add_argument("--out", type=Path, metavar="PNG", help="draw both outputs into a figure")
+    add_json(output, "the measures of agreement")
+    add_quiet(output)
 
 
 def _verify(options: argparse.Namespace) -> int:
@@ -200,7 +236,10 @@ def _verify(options: argparse.Namespace) -> int:
 
     check = verify_result(stored, options.file, given_settings(options, IdentifySettings))
     with stdout_for_json(options):
-        for doubt in stored.doubts:
+        if stored.doubts:
+            print(f"THE MODEL IS WEAK: {stored.doubts[0]}")
+            print("  a good agreement below does not make up for that")
+        for doubt in stored.doubts[1:]:
             print(f"! {doubt}")
         print(check)
         if options.out:
@@ -242,9 +281,11 @@ Then identify your own log:
 def _add_demo(declared: argparse.ArgumentParser) -> None:
     text = "identify a measured flight instead: a quadrotor on a pitch rig (JAXQUAD_DATA)"
     declared.add_argument("--flight", action="store_true", help=text)
-    add_out(declared, "results/demo")
-    add_json(declared, "result.json")
-    add_quiet(declared)
+    output = add_output(declared)
+    add_out(output, "results/demo")
+    add_force(output)
+    add_json(output, "result.json")
+    add_quiet(output)
 
 
 def _demo(options: argparse.Namespace) -> int:

@@ -9,16 +9,30 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from jaxquad.records import RecordWarning
+from jaxquad.workflows import in_options
 
 from ._batch import BATCH
 from ._design import DESIGN
 from ._identify import CHANNELS, DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
 from ._progress import shown_stages
 from ._tune import TUNE
-from ._words import in_options
 
 
-_COMMANDS = (DEMO, CHANNELS, IDENTIFY, VERIFY, REPORT, TUNE, DESIGN, BATCH)
+_COMMANDS = (DEMO, DESIGN, CHANNELS, IDENTIFY, VERIFY, TUNE, REPORT, BATCH)  # in order of use
+_WAY = """jaxquad demo                   a simulated flight, identified: results/demo/report.html
+jaxquad identify YOUR.LOG      a model of your own flight, with error bars
+jaxquad tune results/YOUR ...  gains from it, with a certificate; jaxquad --help lists all commands
+"""
+_PLACES = {  # what a command takes beside its options
+    "demo": "",
+    "design": "{sweep,multisine} --band LOW HIGH --rate HZ --amplitude AMPLITUDE ",
+    "channels": "FILE ",
+    "identify": "FILE [FILE ...] ",
+    "verify": "RESULT FILE ",
+    "tune": "RESULT --inertia J --limit NUMBER ",
+    "report": "RESULT ",
+    "batch": "FOLDER ",
+}
 _CODES = """exit codes:
   0  done
   2  the input or the options cannot be used
@@ -38,7 +52,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     **Returns:** the exit code, see `jaxquad --help`.
     """
-    options, unknown = make_parser().parse_known_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    if not words:
+        print(_WAY, end="")
+        return 0
+    options, unknown = make_parser().parse_known_args(words)
     if unknown:
         return _fail(_describe_unknown(options, unknown), _UNUSABLE)
     with warnings.catch_warnings(), shown_stages(options):
@@ -86,18 +104,23 @@ def _print_warning(message: Warning | str, *_: object) -> None:
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
+    listed = (f"  {each.name:<9} {each.help}\n  {'':<9} {each.example}" for each in _COMMANDS)
     parser = argparse.ArgumentParser(
         prog="jaxquad",
+        usage="jaxquad COMMAND ...",
         description="From a flight record to an identified model with honest error bars.",
-        epilog="\n".join((*(each.examples.split("\n\n")[0] for each in _COMMANDS), _CODES)),
+        epilog="\n".join(("commands, in order of use:", *listed, "", _CODES)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('jaxquad')}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    commands = parser.add_subparsers(
+        required=True, metavar="COMMAND", dest="command", help=argparse.SUPPRESS
+    )
     for each in _COMMANDS:
         each.declare(commands)
-    for each in commands.choices.values():
+    for name, each in commands.choices.items():
         each.set_defaults(usage=each.format_usage())
+        each.usage = f"jaxquad {name} {_PLACES[name]}[options]"
     return parser
 
 

@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jaxquad.workflows import BatchSettings, IdentifySettings, TuneSettings
+from jaxquad.workflows import BatchSettings, free_folder, GROUPS, IdentifySettings, TuneSettings
 
 
 Run = Callable[[argparse.Namespace], int]
 Settings = type[IdentifySettings] | type[TuneSettings] | type[BatchSettings]
 S = TypeVar("S", IdentifySettings, TuneSettings, BatchSettings)
+Group = argparse._ArgumentGroup
 Commands = Any  # argparse names the type of its subparsers nowhere public
 
 
@@ -23,14 +24,18 @@ class Command(NamedTuple):
 
     name: str
     help: str
-    examples: str
+    examples: str  # the first line of commands is the one that `jaxquad --help` shows
     add: Callable[[argparse.ArgumentParser], None]
     run: Run
+
+    @property
+    def example(self) -> str:
+        return self.examples.splitlines()[1].strip()
 
     def declare(self, commands: Commands) -> None:
         declared = commands.add_parser(
             self.name,
-            help=self.help,
+            prog=f"jaxquad {self.name}",
             description=self.help,
             epilog=self.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -52,12 +57,42 @@ def add_log_option(declared: argparse.ArgumentParser) -> None:
     declared.add_argument("--log", type=Path, metavar="FILE", help=text)
 
 
-def add_out(declared: argparse.ArgumentParser, default: str) -> None:
+def add_out(declared: Group, default: str) -> None:
     text = f"where to write; by default {default}"
     declared.add_argument("--out", type=Path, metavar="FOLDER", help=text)
 
 
-def add_json(declared: argparse.ArgumentParser, what: str) -> None:
+def add_force(declared: Group) -> None:
+    text = "overwrite the result of other settings; without it, that is kept, and FOLDER-2 written"
+    declared.add_argument("--force", action="store_true", help=text)
+
+
+def folder_to_write(
+    options: argparse.Namespace,
+    wanted: Path,
+    name: str,
+    same: Mapping[str, object],
+    sources: Sequence[Path | str],
+) -> Path:
+    """The folder that is wanted, or one beside it where that holds the result of other settings."""
+    if options.force:
+        return wanted
+    folder = free_folder(wanted, name, same, sources=sources)
+    if folder != wanted:
+        print(
+            f"! {wanted} holds the result of other settings or of another file, and is kept: this "
+            f"result is in {folder} (--force writes into {wanted})",
+            file=sys.stderr,
+        )
+    return folder
+
+
+def add_output(declared: argparse.ArgumentParser) -> Group:
+    """Where the options on output go, last in the help of a command."""
+    return declared.add_argument_group("output")
+
+
+def add_json(declared: Group, what: str) -> None:
     text = f"print {what} as JSON to stdout, everything else to stderr"
     declared.add_argument("--json", action="store_true", help=text)
 
@@ -74,13 +109,12 @@ def add_settings(
 
     `only` names the settings that are declared, each with its own help or "".
     """
-    groups = {}
-    for key, option in settings.options().items():
-        if only is not None and key not in only:
-            continue
-        group = groups.setdefault(option.group, declared.add_argument_group(option.group) if
-                                  option.group and only is None else declared)  # fmt: skip
-        kind = option.kind
+    chosen = {k: o for k, o in settings.options().items() if only is None or k in only}
+    used = list(dict.fromkeys(option.group for option in chosen.values()))
+    used.sort(key=lambda title: GROUPS.index(title) if title in GROUPS else len(GROUPS))
+    groups = {title: declared.add_argument_group(title) if title else declared for title in used}
+    for key, option in chosen.items():
+        group, kind = groups[option.group], option.kind
         how: dict[str, Any] = {
             "dest": key,
             "default": argparse.SUPPRESS,

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from jaxquad._core import STAGES
 
 
-def add_quiet(declared: argparse.ArgumentParser) -> None:
+def add_quiet(declared: argparse._ArgumentGroup) -> None:
     text = "do not show on stderr what is being done"
     declared.add_argument("--quiet", action="store_true", help=text)
 

@@ -1,15 +1,18 @@
 import argparse
 
-from jaxquad.workflows import TuneSettings
+from jaxquad.workflows import in_options, TuneSettings
 
 from ._options import (
     add_config,
+    add_force,
     add_json,
     add_log_option,
     add_out,
+    add_output,
     add_result,
     add_settings,
     Command,
+    folder_to_write,
     print_json,
     settings_of,
     start_computing,
@@ -25,10 +28,12 @@ def _add(declared: argparse.ArgumentParser) -> None:
     add_result(declared)
     add_log_option(declared)
     add_config(declared)
-    add_out(declared, "tuned/ in the folder of the result")
-    add_json(declared, "gains and certificate")
-    add_quiet(declared)
     add_settings(declared, TuneSettings)
+    output = add_output(declared)
+    add_out(output, "tuned/ in the folder of the result")
+    add_force(output)
+    add_json(output, "gains and certificate")
+    add_quiet(output)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -41,8 +46,11 @@ def _run(options: argparse.Namespace) -> int:
 
     found = tune(stored, settings, log=options.log, progress=False if options.quiet else None)
     with stdout_for_json(options):
-        print(found)
-        folder = options.out or stored.folder / "tuned"
+        print(in_options(str(found)))
+        content, logs = found.content(), found.identification.paths
+        same = {key: content[key] for key in ("settings", "identified_with")}
+        wanted = options.out or stored.folder / "tuned"
+        folder = folder_to_write(options, wanted, "tuned.json", same, logs)
         print(f"\n{folder}: {', '.join(path.name for path in found.write(folder))}")
     if options.json:
         print_json(found.content())

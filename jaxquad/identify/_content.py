@@ -46,6 +46,7 @@ def fit_content(fit: PyTree) -> dict[str, object]:
 def _parameter(fit: PyTree, k: int) -> dict[str, object]:
     return {
         "name": fit.names[k],
+        "unit": fit.parameter_units[k] if fit.parameter_units else None,
         "value": fit.values[k],
         "standard_error": fit.standard_errors[k],
         "determined": bool(fit.determined[k]),

@@ -44,7 +44,12 @@ class Bands(NamedTuple):
             rows.append((name, *cells, words[self.overlap(name)]))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = ["  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)) for row in rows]
-        return "\n".join([line.rstrip() for line in lines] + ["(95 % intervals, with model error)"])
+        return "\n".join([line.rstrip() for line in lines] + [self._footnote()])
+
+    def _footnote(self) -> str:
+        hertz = self.split / (2 * np.pi)
+        halves = f"the halves meet at {self.split:.3g} rad/s, {hertz:.3g} Hz"
+        return f"(95 % intervals, with model error; {halves})"
 
 
 def _determines(fit: PyTree, name: str) -> bool:

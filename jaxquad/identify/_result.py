@@ -49,7 +49,10 @@ def _parameters(fit: "Fit") -> list[str]:
     marks = np.where(fit.determined, "", _MARK)
     names = [f"{name}{mark}" for name, mark in zip(fit.names, marks, strict=True)]
     width = max(9, *map(len, names))
-    heads = (f"{'parameter':<{width}}", f"{'value':>11}", f"{'std. error':>10}")
+    units = fit.parameter_units or ("",) * len(names)
+    wide = max(map(len, units))
+    heads = (f"{'parameter':<{width}}", *([f"{'unit':<{max(4, wide)}}"] if wide else []))
+    heads = (*heads, f"{'value':>11}", f"{'std. error':>10}")
     apart = fit.discrepancy is not None
     heads = (*heads, f"{'95 % interval':>23}", *([_BESIDE] if apart else []))
     heads = (*heads, f"{'CR %':>7}", f"{'insens. %':>9}")
@@ -61,7 +64,8 @@ def _parameters(fit: "Fit") -> list[str]:
         stopped = "" if fit.determined[k] else value
         if stopped:
             value, interval = "-", "not determined"
-        cells = [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>23}"]
+        cells = [f"{units[k]:<{max(4, wide)}}"] if wide else []
+        cells += [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>23}"]
         cells += [_by_noise(fit, k)] if apart else []
         percent = f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:9.2f}"
         cells += percent if np.isfinite(fit.insensitivity[k]) else (f"{'-':>7}", f"{'-':>9}")
@@ -166,6 +170,7 @@ class Fit(eqx.Module):
     discrepancy: Discrepancy | None = None  # what the model leaves unexplained, if it was looked at
     noise_models: tuple[tuple[NoiseModel, ...], ...] = ()  # of each record's outputs, by jq.refine
     origin: Origin | None = None  # the responses and options of `jq.fit`
+    parameter_units: tuple[str, ...] = eqx.field(static=True, default=())  # for tables
 
     @property
     def identifiable(self) -> bool:

@@ -76,7 +76,9 @@ class Verification(eqx.Module):
     def __str__(self) -> str:
         where = "whole band"
         if self.band:
-            where = f"{self.band[0]:.4g}..{self.band[1]:.4g} rad/s"
+            low, high = self.band
+            hertz = f"{low / (2 * np.pi):.3g}..{high / (2 * np.pi):.3g} Hz"
+            where = f"{low:.4g}..{high:.4g} rad/s ({hertz})"
         numbers = (self.rms, self.tic, self.fit_percent, self.variance_percent)
         whole = Agreement(self.output_name, self.output_unit, *numbers)
         lines = [f"verification on {self.output_name}, {where}: {whole}"]

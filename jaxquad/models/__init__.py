@@ -44,3 +44,4 @@ from ._transfer_function import (
     LaggedIntegrator as LaggedIntegrator,
     TransferFunction as TransferFunction,
 )
+from ._units import parameter_units as parameter_units

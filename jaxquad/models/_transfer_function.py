@@ -21,6 +21,7 @@ from jaxquad._core import (
 
 from ._pade import check_order, pade_coefficients, require_package
 from ._protocols import as_frequencies, Frequencies
+from ._units import Scale, unit
 
 
 if TYPE_CHECKING:
@@ -76,6 +77,11 @@ def imaginary(omega: Frequencies) -> Complex[Array, "..."]:
     return jax.lax.complex(jnp.zeros_like(omega), omega)
 
 
+def _numerator_scale(model: "TransferFunction", k: int) -> Scale:
+    """With a denominator that starts with 1."""
+    return Scale(model.denominator.size - model.numerator.size + k)
+
+
 class TransferFunction(eqx.Module):
     """One input to one output: numerator(s) / denominator(s) exp(-delay s).
 
@@ -100,9 +106,13 @@ class TransferFunction(eqx.Module):
         negative, or the system that is given is sampled or has several inputs or outputs.
     """
 
-    numerator: Float[Array, " zeros"] = eqx.field(converter=as_float)
-    denominator: Float[Array, " poles"] = eqx.field(converter=as_float)
-    delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # s
+    numerator: Float[Array, " zeros"] = eqx.field(
+        converter=as_float, metadata=unit(_numerator_scale)
+    )
+    denominator: Float[Array, " poles"] = eqx.field(
+        converter=as_float, metadata=unit(lambda model, k: Scale(k, of_ratio=False))
+    )
+    delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0, metadata=unit("s"))
 
     def __init__(
         self,
@@ -235,9 +245,11 @@ class LaggedIntegrator(eqx.Module):
     - `ValueError`: lag or delay is negative.
     """
 
-    gain: Float[Array, ""] = eqx.field(converter=as_float)  # K, output unit / s^integrators
-    lag: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # T, s
-    delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # tau, s
+    gain: Float[Array, ""] = eqx.field(
+        converter=as_float, metadata=unit(lambda model, _: Scale(model.integrators))
+    )
+    lag: Float[Array, ""] = eqx.field(converter=as_float, default=0.0, metadata=unit("s"))
+    delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0, metadata=unit("s"))
     integrators: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
@@ -288,12 +300,14 @@ class AttitudeAxis(eqx.Module):
     - `ValueError`: a value is outside its physical range.
     """
 
-    L: Float[Array, ""] = eqx.field(converter=as_float)  # arm, m
-    K_t: Float[Array, ""] = eqx.field(converter=as_float)  # thrust, N/V
-    J_x: Float[Array, ""] = eqx.field(converter=as_float)  # inertia, kg m^2
-    lag: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # of motor and propeller, s
-    delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # s
-    K_af: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)  # damping, N m s/rad
+    L: Float[Array, ""] = eqx.field(converter=as_float, metadata=unit("m"))  # arm
+    K_t: Float[Array, ""] = eqx.field(converter=as_float, metadata=unit("N/V"))  # thrust
+    J_x: Float[Array, ""] = eqx.field(converter=as_float, metadata=unit("kg m^2"))
+    lag: Float[Array, ""] = eqx.field(converter=as_float, default=0.0, metadata=unit("s"))
+    delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0, metadata=unit("s"))
+    K_af: Float[Array, ""] = eqx.field(  # damping
+        converter=as_float, default=0.0, metadata=unit("N m s/rad")
+    )
 
     def __check_init__(self):
         for name, value in {"L": self.L, "K_t": self.K_t, "J_x": self.J_x}.items():

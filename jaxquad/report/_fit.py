@@ -21,12 +21,18 @@ def parameter_section(
     fit: Fit, derived: Sequence[Combination], beside: Mapping[str, str]
 ) -> dict[str, object]:
     """Every number with its standard error, and how good the fit is."""
-    heads = ("parameter", "value", "std. error", "95 % interval")
+    units = fit.parameter_units
+    heads = ("parameter", *(["unit"] if units else []), "value", "std. error", "95 % interval")
     heads += ("by noise alone", "width") if fit.discrepancy is not None else ()
     heads += ("CR, %", "insensitivity, %")
     heads += () if fit.identifiable else ("stopped at",)
     rows = [_parameter(fit, k) for k in range(len(fit.names))]
-    rows += [[*_estimate(each), *[_DASH] * (len(heads) - 4)] for each in derived]
+    rows += [[*_estimate(each), *[_DASH] * (len(heads) - 4 - bool(units))] for each in derived]
+    if units:
+        dashes = [_DASH] * len(derived)
+        rows = [
+            [name, each, *rest] for (name, *rest), each in zip(rows, [*units, *dashes], strict=True)
+        ]
     return {
         "table": Table("Identified parameters", heads, rows),
         "bounds": [f"{bound:g}" for bound in _BOUNDS],

@@ -13,10 +13,20 @@ from ._identify import (
     propose_settings as propose_settings,
 )
 from ._kinds import SettingsError as SettingsError
-from ._result_file import read_result as read_result, StoredResult as StoredResult
-from ._settings import IdentifySettings as IdentifySettings, TuneSettings as TuneSettings
+from ._result_file import (
+    default_folder as default_folder,
+    free_folder as free_folder,
+    read_result as read_result,
+    StoredResult as StoredResult,
+)
+from ._settings import (
+    GROUPS as GROUPS,
+    IdentifySettings as IdentifySettings,
+    TuneSettings as TuneSettings,
+)
 from ._stored import (
     identify_again as identify_again,
     verify_result as verify_result,
 )
 from ._tune import tune as tune, Tuning as Tuning
+from ._words import in_options as in_options

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools as ft
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +26,18 @@ from jaxquad.identify import (
     Verification,
     verify,
 )
-from jaxquad.models import LaggedIntegrator, TransferFunction
+from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.plot import bode, compare, headless, Panels, record_figure
-from jaxquad.records import Mix, parse_mix, Proposal, propose, read_segments, Record, Segment
+from jaxquad.records import (
+    Mix,
+    parse_mix,
+    Proposal,
+    propose,
+    read_segments,
+    Record,
+    RecordError,
+    Segment,
+)
 from jaxquad.report import compare_fits
 from jaxquad.spectra import (
     Composite,
@@ -40,8 +49,10 @@ from jaxquad.spectra import (
     Welch,
 )
 
-from ._kinds import mix_text
+from ._kinds import mix_text, SettingsError
+from ._result_file import default_folder
 from ._settings import IdentifySettings
+from ._words import in_options
 
 
 Model = LaggedIntegrator | TransferFunction
@@ -61,7 +72,7 @@ class Identification:
 
     - `path`: of the log.
     - `settings`: those that were used, a proposal included.
-    - `records`: one for each segment.
+    - `records`: one for each segment of each log.
     - `responses`: the frequency response by method, the one to trust first.
     - `fits`: the fit to each of them.
     - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
@@ -72,6 +83,7 @@ class Identification:
       the misfit exceeds 1.5 random errors.
     - `check`: the second record simulated, where `settings.verify` names one.
     - `proposal`: where the log itself said what is input and output.
+    - `more`: the logs that were taken together with the first.
     """
 
     path: Path
@@ -84,6 +96,18 @@ class Identification:
     proposal: Proposal | None
     bands: Bands | None = None
     explanation: Explanation | None = None
+    more: tuple[Path, ...] = ()
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All logs that were identified together."""
+        return self.path, *self.more
+
+    @property
+    def title(self) -> str:
+        """The name of the log, and how many others were taken with it."""
+        others = f" and {len(self.more)} more" if self.more else ""
+        return f"{self.path.name}{others}"
 
     @property
     def method(self) -> str:
@@ -143,7 +167,7 @@ class Identification:
                 f"record{'' if k == 1 else f'_{k}'}.png": record_figure(record)
                 for k, record in enumerate(self.records, start=1)
             }
-            figures["bode.png"] = bode(self.frf, others, models, title=self.path.name)
+            figures["bode.png"] = bode(self.frf, others, models, title=self.title)
             if self.check is not None:
                 title = Path(self.settings.verify or "").name
                 figures["verification.png"] = compare(self.check, title=title)
@@ -181,11 +205,6 @@ class Identification:
         return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
 
 
-def default_folder(path: Path) -> Path:
-    """Where the result of a log goes if nothing else is said."""
-    return Path("results") / path.stem
-
-
 def _text_or_reason(made: Callable[[], object]) -> str:
     try:
         return str(made())
@@ -193,8 +212,10 @@ def _text_or_reason(made: Callable[[], object]) -> str:
         return str(error)
 
 
-def identify(path: str | Path, settings: IdentifySettings | None = None) -> Identification:
-    """Identify one log, as `jaxquad identify` does.
+def identify(
+    path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None
+) -> Identification:
+    """Identify one log, or several together, as `jaxquad identify` does.
 
     The frequency response is estimated twice: the second time with the delay taken out that the
     first fit has found. With an external reference, the joint input-output estimate is fitted, and
@@ -202,7 +223,9 @@ def identify(path: str | Path, settings: IdentifySettings | None = None) -> Iden
 
     **Arguments:**
 
-    - `path`: a log of an autopilot, CSV, NPZ, MAT, HDF5, ...
+    - `path`: a log of an autopilot, CSV, NPZ, MAT, HDF5, ... Or several of one vehicle in one
+        condition: their records make one response, as the segments of one log do. They have the
+        same channels and units; their sample rates become the lowest of them.
     - `settings`: what to read from it and what to fit. By default the log proposes its input and
       output, and K e^(-delay s) / (s (lag s + 1)) is fitted.
 
@@ -221,19 +244,38 @@ def identify(path: str | Path, settings: IdentifySettings | None = None) -> Iden
         result.write("results/flight")
         ```
     """
-    path = Path(path)
-    settings, proposal = propose_settings(path, settings or IdentifySettings())
-    records = read_records(path, settings)
+    path, *more = [Path(path)] if isinstance(path, str | Path) else map(Path, path)
+    settings, proposal = propose_settings(path, settings or IdentifySettings(), several=bool(more))
+    records = _read_logs((path, *more), settings)
     methods = ("joint", "direct") if settings.reference else ("direct",)
     responses, fits, delay = {}, {}, 0.0
     for method in methods:
         responses[method], found, delay = _fit_twice(records, method, settings, delay)
-        fits[method] = _with_remedies(found, settings)
+        fits[method] = _with_units(_with_remedies(found, settings), records[0])
     announce("fits to parts of the band")
     best = methods[0]
     fits[best], parts = _fit_parts(fits[best], responses[best], settings)
-    found = Identification(path, settings, records, responses, fits, parts, None, proposal)
+    fits = {name: _in_option_words(each) for name, each in fits.items()}
+    found = Identification(
+        path, settings, records, responses, fits, parts, None, proposal, more=tuple(more)
+    )
     return dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
+
+
+def _in_option_words(fit: Fit) -> Fit:
+    return dataclasses.replace(fit, remarks=tuple(map(in_options, fit.remarks)))
+
+
+def _with_units(fit: Fit, record: Record) -> Fit:
+    """The units of the parameters; a channel without a unit stands for itself."""
+    if not fit.verdict.fitted:
+        return fit
+    [output], [source] = record.output_units, record.input_units
+    units = parameter_units(
+        fit.model, fit.names,
+        output=output or record.output_names[0], input=source or record.input_names[0],
+    )  # fmt: skip
+    return dataclasses.replace(fit, parameter_units=units)
 
 
 def _fitted_again(found: Identification) -> dict[str, Bands | Explanation | None]:
@@ -246,14 +288,20 @@ def _fitted_again(found: Identification) -> dict[str, Bands | Explanation | None
 
 
 def propose_settings(
-    path: Path, settings: IdentifySettings
+    path: Path, settings: IdentifySettings, *, several: bool = False
 ) -> tuple[IdentifySettings, Proposal | None]:
     """Settings with input and output, from the log's proposal where they are not given.
 
-    What the settings say stays. Raises what `jaxquad.propose` raises.
+    What the settings say stays. Raises what `jaxquad.propose` raises, and SettingsError where
+    `several` logs are to have one input and output.
     """
     if settings.input is not None:
         return settings, None
+    if several:
+        raise SettingsError(
+            f"several logs need `input` and `output`: run jaxquad identify {path} alone, and give "
+            "what it proposes"
+        )
     proposal = propose(path, axis=settings.axis)
     offered = proposal.options
     found = {"input": mix_text(offered["inputs"]), "output": offered["outputs"], "axis": None}
@@ -279,6 +327,29 @@ def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, 
     if len(spans) > 1:
         return {"segments": spans, "start": None, "stop": None}
     return dict(zip(("start", "stop"), spans[0], strict=True)) if spans else {}
+
+
+def _read_logs(paths: Sequence[Path], settings: IdentifySettings) -> tuple[Record, ...]:
+    """The records of all logs, with one sample rate. Raises RecordError where units differ."""
+    logs = {path: read_records(path, settings) for path in paths}
+    rates = [records[0].sample_rate for records in logs.values()]
+    if max(rates) > (1 + 1e-6) * min(rates):
+        common = dataclasses.replace(settings, rate=float(f"{min(rates):.3g}"))
+        logs = {path: read_records(path, common) for path in paths}
+    _check_units(logs)
+    return tuple(record for records in logs.values() for record in records)
+
+
+def _check_units(logs: Mapping[Path, tuple[Record, ...]]) -> None:
+    (first, [known, *_]), *others = logs.items()
+    for path, [record, *_] in others:
+        for name in (*known.input_names, *known.output_names):
+            if record.unit(name) != known.unit(name):
+                raise RecordError(
+                    f"the unit of {name} is {known.unit(name) or 'not known'} in {first}, but "
+                    f"{record.unit(name) or 'not known'} in {path}: logs that are identified "
+                    f"together need one unit. Leave one of them out."
+                )
 
 
 def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
@@ -424,13 +495,18 @@ def _fit_parts(
     used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
     low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
     bands = {
-        f"above {first:.3g} rad/s": (first, high),
-        f"below {second:.3g} rad/s": (low, second),
+        f"above {first:.3g} rad/s ({_hertz(first)})": (first, high),
+        f"below {second:.3g} rad/s ({_hertz(second)})": (low, second),
     }
     parts = {name: _refitted(found, frf, settings, band) for name, band in bands.items()}
     remarks = [_gain_change(name, part, found) for name, part in parts.items()]
     found = dataclasses.replace(found, remarks=(*found.remarks, *filter(None, remarks)))
-    return found, {f"{low:.3g} .. {high:.3g} rad/s": found} | parts
+    whole = f"{low:.3g} .. {high:.3g} rad/s ({low / (2 * np.pi):.3g} .. {_hertz(high)})"
+    return found, {whole: found} | parts
+
+
+def _hertz(omega: float) -> str:
+    return f"{omega / (2 * np.pi):.3g} Hz"
 
 
 def _refitted(

@@ -1,7 +1,8 @@
 """`result.json` as it is read again. Without JAX: a missing result is answered at once."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import chain, count
 from pathlib import Path
 from typing import NamedTuple, TYPE_CHECKING
 
@@ -21,6 +22,12 @@ class StoredResult(NamedTuple):
     log: Path
     hashes: tuple[str, ...]  # SHA-256 of the log, and of the record of a check
     band: tuple[float, float]  # rad/s, that was fitted
+    more: tuple[Path, ...] = ()  # logs that were taken together with the first
+
+    @property
+    def logs(self) -> list[Path]:
+        """All logs that were identified together."""
+        return [self.log, *self.more]
 
     @property
     def summary(self) -> str:
@@ -65,6 +72,45 @@ def _part(content: Mapping[str, object], key: str) -> Mapping[str, object]:
     return part if isinstance(part, dict) else {}
 
 
+def default_folder(log: Path) -> Path:
+    """Where the result of a log goes if nothing else is said."""
+    return Path("results") / log.stem
+
+
+def free_folder(
+    wanted: Path, name: str, same: Mapping[str, object], *, sources: Sequence[str | Path]
+) -> Path:
+    """The folder `wanted`, or `wanted-2`, `wanted-3`, ..., without a result of another origin.
+
+    **Arguments:**
+
+    - `wanted`: need not exist.
+    - `name`: of the JSON file that holds a result, such as `result.json`.
+    - `same`: what that file holds if the result is the same, made again, by key.
+    - `sources`: the files that it is made from, in the order of its provenance.
+    """
+    numbered = (wanted.with_name(f"{wanted.name}-{number}") for number in count(2))
+    return next(
+        folder for folder in chain([wanted], numbered) if _is_free(folder / name, same, sources)
+    )
+
+
+def _is_free(path: Path, same: Mapping[str, object], sources: Sequence[str | Path]) -> bool:
+    from jaxquad.report import plain_content, sha256_of
+
+    if not path.exists():
+        return True
+    try:
+        content = json.loads(path.read_text())
+        hashes = [file["sha256"] for file in content["provenance"]["files"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    wanted = {key: json.loads(json.dumps(plain_content(value))) for key, value in same.items()}
+    return all(content.get(key) == value for key, value in wanted.items()) and hashes == [
+        sha256_of(each) for each in sources
+    ]
+
+
 def read_result(path: str | Path) -> StoredResult:
     """Read the result in a folder, or a `result.json` itself.
 
@@ -89,6 +135,7 @@ def read_result(path: str | Path) -> StoredResult:
             log=Path(content["record"]["file"]),
             hashes=tuple(file["sha256"] for file in files),
             band=(float(content["band_rad_per_s"][0]), float(content["band_rad_per_s"][1])),
+            more=tuple(map(Path, content["record"].get("more_files", ()))),
         )
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(

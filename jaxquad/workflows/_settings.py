@@ -30,8 +30,9 @@ def option_field(
 
 
 _REQUIRED = dataclasses.MISSING
-_RUN, _PART, _MODEL = "signals", "part of the record", "model"
-_ESTIMATE, _CHECK = "estimate", "check on a second record"
+_RUN = _PART = "the record"
+_ESTIMATE, _MODEL, _CHECK = "the estimate", "the model", "a second record"
+GROUPS = (_RUN, _ESTIMATE, _MODEL, _CHECK)  # in the order in which help shows them
 REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the place of
     "segments": ("start", "stop"),
     "start": ("segments",),
@@ -285,10 +286,12 @@ class IdentifySettings(Settings):
     band: Pair | None = option_field(
         kinds.BAND,
         None,
-        "fit between these frequencies, in Hz; by default what the record resolves",
+        "fit between these frequencies, in Hz (6.28 rad/s); by default what the record resolves",
         group=_ESTIMATE,
     )
-    band_rad: Pair | None = option_field(kinds.BAND, None, "the same in rad/s", group=_ESTIMATE)
+    band_rad: Pair | None = option_field(
+        kinds.BAND, None, "the same in rad/s (0.159 Hz)", group=_ESTIMATE
+    )
     estimator: str = option_field(
         kinds.ESTIMATOR,
         "local",
@@ -365,76 +368,79 @@ class TuneSettings(Settings):
         kinds.INERTIA,
         _REQUIRED,
         "nominal inertia of the axis, in kg m^2; required",
-        group="vehicle",
+        group="the vehicle",
     )
     limit: float = option_field(
         kinds.POSITIVE,
         _REQUIRED,
         "largest command, to either side, in its unit; required",
-        group="vehicle",
+        group="the vehicle",
     )
     spread: Pair = option_field(
         kinds.BAND,
         (0.5, 3.0),
         "range of the true inertia, as factors of the nominal one; 0.5 3 by default",
-        group="vehicle",
+        group="the vehicle",
     )
     inertia_error: float = option_field(
         kinds.NOT_NEGATIVE,
         0.1,
         "relative standard error of the inertia that the controller's gains "
         "are scheduled with; 0.1 by default",
-        group="vehicle",
+        group="the vehicle",
     )
     noise: float = option_field(
         kinds.DEVIATION,
         0.02,
         "standard deviation of the measured angle; 0.02 by default",
-        group="vehicle",
+        group="the vehicle",
     )
     step: float = option_field(
-        kinds.DEGREES, 4.0, "step of the reference; 4 by default", group="simulated flight"
+        kinds.DEGREES, 4.0, "step of the reference; 4 by default", group="the simulated flight"
     )
     disturbance: float | None = option_field(
         kinds.TORQUE,
         None,
         "torque pulse; by default a tenth of the torque at the limit",
-        group="simulated flight",
+        group="the simulated flight",
     )
     duration: float = option_field(
-        kinds.DURATION, 4.0, "of one flight; 4 by default", group="simulated flight"
+        kinds.DURATION, 4.0, "of one flight; 4 by default", group="the simulated flight"
     )
     dt: float | None = option_field(
         kinds.DURATION,
         None,
         "sampling interval of the controller; by default that of the record",
-        group="controller",
+        group="the controller",
     )
     sensitivity: float = option_field(
-        kinds.POSITIVE, 3.6, "upper limit of the peak of |S|; 3.6 by default", group="controller"
+        kinds.POSITIVE,
+        3.6,
+        "upper limit of the peak of |S|; 3.6 by default",
+        group="the controller",
     )
     wo: float | None = option_field(
         kinds.POSITIVE,
         None,
         "hold the observer's bandwidth at this value in rad/s, for instance where the "
         "identified band ends; by default it is tuned",
-        group="controller",
+        group="the controller",
     )
     name: str = option_field(
         kinds.TEXT,
         "attitude",
         "prefix of the functions in the C header; attitude by default",
-        group="controller",
+        group="the controller",
     )
     members: int = option_field(
-        kinds.SIZE, 64, "number of plants to tune on; 64 by default", group="ensemble of plants"
+        kinds.SIZE, 64, "number of plants to tune on; 64 by default", group="the plants"
     )
     fresh: int = option_field(
         kinds.SIZE,
         256,
         "number of new plants to certify on; 256 by default",
-        group="ensemble of plants",
+        group="the plants",
     )
     seed: int = option_field(
-        kinds.COUNT, 0, "of the random draws; 0 by default", group="ensemble of plants"
+        kinds.COUNT, 0, "of the random draws; 0 by default", group="the plants"
     )

@@ -2,13 +2,14 @@
 
 import dataclasses
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jaxquad._core import announce
 from jaxquad.identify import Fit, Verification, verify
+from jaxquad.records import Record
 from jaxquad.report import provenance, sha256_of, write_report, write_results
 
 from ._identify import Identification, identify, read_records
@@ -20,12 +21,13 @@ def write_identification(found: Identification, folder: Path) -> Path:
     """Write `result.json`, `report.html` and the figures; returns the path of `result.json`."""
     announce("figures and report")
     spans = [[float(record.time[0]), float(record.time[-1])] for record in found.records]
-    command = identify_command(found.path, found.settings)
-    sources = [found.path, *([found.settings.verify] if found.settings.verify else [])]
+    command = identify_command(found.paths, found.settings)
+    sources = [*found.paths, *([found.settings.verify] if found.settings.verify else [])]
     origin = provenance(*sources, command=command)
     extra = {
         "record": {
             "file": str(found.path),
+            "more_files": [str(path) for path in found.more],
             "start_s": min(start for start, _ in spans),
             "stop_s": max(stop for _, stop in spans),
             "segments_s": spans,
@@ -47,10 +49,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         fit=found.fit,
         frf=found.frf,
         others=others,
-        record={
-            f"t = {record.time[0]:.6g} .. {record.time[-1]:.6g} s": record
-            for record in found.records
-        },
+        record={_record_title(found, record): record for record in found.records},
         checks={} if found.check is None else {Path(sources[-1]).name: found.check},
         derived=found.combinations,
         provenance=origin,
@@ -58,6 +57,11 @@ def write_identification(found: Identification, folder: Path) -> Path:
         beside=found.beside,
     )
     return path
+
+
+def _record_title(found: Identification, record: Record) -> str:
+    span = f"t = {record.time[0]:.6g} .. {record.time[-1]:.6g} s"
+    return f"{Path(record.source).name}, {span}" if found.more else span
 
 
 def _write_figures(found: Identification, folder: Path) -> None:
@@ -109,9 +113,9 @@ def _model_content(found: Identification) -> dict[str, object]:
     return {"model": {"kind": type(found.fit.model).__name__} | plain}
 
 
-def identify_command(path: Path, settings: IdentifySettings) -> str:
+def identify_command(paths: Sequence[Path], settings: IdentifySettings) -> str:
     """The command line that makes the result again, quoted for a shell."""
-    return shlex.join(["jaxquad", "identify", str(path), *settings.words()])
+    return shlex.join(["jaxquad", "identify", *map(str, paths), *settings.words()])
 
 
 def identify_again(
@@ -122,17 +126,19 @@ def identify_again(
     **Arguments:**
 
     - `result`: the folder of the result, its `result.json`, or what `read_result` returns.
-    - `log`: where the log lies, if it was moved.
+    - `log`: where the log lies, if it was moved; of several logs, the folder in which all lie.
 
-    **Raises:** ValueError where the log is gone, or is not the same file by its SHA-256.
+    **Raises:** ValueError where a log is gone, or is not the same file by its SHA-256.
     """
     stored = result if isinstance(result, StoredResult) else read_result(result)
-    path = Path(log) if log is not None else stored.log
+    paths = stored.logs
+    if log is not None:
+        paths = [Path(log) / path.name for path in paths] if len(paths) > 1 else [Path(log)]
     verified = stored.settings.verify
-    files = [path, *([Path(verified)] if verified else [])]
+    files = [*paths, *([Path(verified)] if verified else [])]
     for file, known in zip(files, stored.hashes, strict=True):
         _check_unchanged(file, known)
-    return identify(path, stored.settings)
+    return identify(paths, stored.settings)
 
 
 def _check_unchanged(path: Path, known: str) -> None:

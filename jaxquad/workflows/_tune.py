@@ -70,6 +70,7 @@ class Tuning:
             "remarks": tuned.remarks,
             "certificate": None if certificate is None else certificate.content(),
             "settings": self.settings.content(),
+            "identified_with": self.identification.settings.content(),
         }
         return {key: plain_content(value) for key, value in content.items()}
 
@@ -79,7 +80,7 @@ class Tuning:
         folder, found, tuned = Path(folder), self.identification, self.tuned
         name = self.settings.name
         known = {k: v for k, v in self.settings.content().items() if v is not None}
-        origin = provenance(found.path, settings=known)
+        origin = provenance(*found.paths, settings=known)
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         with headless():
@@ -144,8 +145,16 @@ def _check_unit(record: Record) -> None:
         name = record.output_names[0]
         raise ValueError(
             f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
-            f"identify with the output in rad/s or rad (--unit {name}=rad/s)"
+            f"identify with the output in rad/s or rad {_in_radians(unit, name)}"
         )
+
+
+def _in_radians(unit: str, name: str) -> str:
+    """The options that convert degrees, or that say what an unknown unit is."""
+    if unit in ("deg", "deg/s"):
+        radians = unit.replace("deg", "rad")
+        return f"(--output angle=0.017453293*{name} --unit angle={radians})"
+    return f"(--unit {name}=rad/s)"
 
 
 def _tuned(

@@ -26,6 +26,7 @@ def test_the_demo_finds_the_truth_of_its_log_within_its_error_bars(demo):
     for name, truth in {"gain": 280.0, "lag": 0.02, "delay": 0.008}.items():
         assert abs(rows[name]["value"] - truth) < 3 * rows[name]["standard_error"] < 0.09 * truth
         assert rows[name]["noise_standard_error"] < 0.02 * truth
+    assert [rows[name]["unit"] for name in rows] == ["rad/s^2 per M", "s", "s"]
     assert "identif" in (demo / "report.html").read_text().lower()
 
 
@@ -59,6 +60,19 @@ def test_a_stored_model_is_verified_on_another_record(demo, tmp_path, capsys):
     assert found["fit_percent"] == pytest.approx(check.fit_percent) and check.fit_percent > 70
     assert found["band_rad_per_s"] == pytest.approx([np.pi, 24 * np.pi], rel=0.01)
     assert found["unit"] == "rad/s" and picture.stat().st_size > 10_000
+
+
+def test_a_weak_model_is_called_so_before_its_agreement(demo, tmp_path, capsys):
+    content = result(demo)
+    content["fit"]["identifiable"] = False
+    content["fit"]["verdict"]["summary"] = "not identifiable from this record: lag"
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    words = ["verify", str(tmp_path), str(demo / "demo.csv"), "--start", "5", "--stop", "40"]
+    assert main([*words, "--band-rad", "4", "60"]) == 3
+    first, second, *_, last = capsys.readouterr().out.splitlines()
+    assert first == "THE MODEL IS WEAK: not identifiable from this record: lag"
+    assert "does not make up for that" in second
+    assert last.startswith("verification on q, 4..60 rad/s (0.637..9.55 Hz): fit")
 
 
 def test_what_holds_no_model_is_said(demo, tmp_path, capsys):
@@ -128,7 +142,8 @@ def test_all_chirps_of_a_log_are_used_together(tmp_path, capsys):
     assert np.allclose(result(out)["record"]["segments_s"], [(22, 42), (45, 65)], atol=0.02)
     assert result(out)["fit"]["parameters"][0]["value"] == pytest.approx(100.0, rel=0.02)
     # Of those, what lies where the user says to look.
-    assert main(["identify", str(path), "--out", str(out), "--no-lag", "--start", "43"]) == 0
+    words = ["identify", str(path), "--out", str(out), "--no-lag", "--start", "43", "--force"]
+    assert main(words) == 0
     assert np.allclose(result(out)["record"]["segments_s"], [(45, 65)], atol=0.02)
 
 

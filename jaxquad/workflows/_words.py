@@ -4,15 +4,10 @@ The library speaks Python: `max_gap=` is an argument, `jq.verify` a function. So
 `jaxquad identify` needs the option, `--max-gap`, or the command, `jaxquad verify`.
 """
 
-import dataclasses
 import re
-from typing import TYPE_CHECKING
 
-from jaxquad.workflows import BatchSettings, IdentifySettings, TuneSettings
-
-
-if TYPE_CHECKING:
-    from jaxquad.workflows import Identification
+from ._batch._settings import BatchSettings
+from ._settings import IdentifySettings, TuneSettings
 
 
 _FLAGS = {
@@ -42,6 +37,8 @@ _PHRASES = {
     r", or let its sign change with jq\.identify\.Real\([^)]*\)": " (--no-lag, --no-delay)",
     r"fit with a jq\.identify\.Prior or a second record, or ask for a determined combination":
         "fit without one of them (--no-lag, --no-delay), or fly again with more excitation",
+    r", or raise global_order": "",
+    r"try other starting values": "try another band (--band), or --no-lag",
     r"Fit\.explain\(\)": "--explain",
     r"jq\.verify\b": "jaxquad verify",
     r"jq\.propose\b": "jaxquad identify",
@@ -64,12 +61,3 @@ def in_options(text: str) -> str:
 def _with_value(found: re.Match[str]) -> str:
     flag = _ARGUMENTS.get(found[1])
     return f"({flag} " if flag else found[0]
-
-
-def with_options(found: "Identification") -> "Identification":
-    """An identification whose remarks are in the words of the command line."""
-    fits = {
-        name: dataclasses.replace(fit, remarks=tuple(map(in_options, fit.remarks)))
-        for name, fit in found.fits.items()
-    }
-    return dataclasses.replace(found, fits=fits)
