@@ -96,7 +96,8 @@ def free_folder(
 
 
 def _is_free(path: Path, same: Mapping[str, object], sources: Sequence[str | Path]) -> bool:
-    from jaxquad.report import plain_content, sha256_of
+    from jaxquad._core import plain_content
+    from jaxquad.report import sha256_of
 
     if not path.exists():
         return True

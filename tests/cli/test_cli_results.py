@@ -70,7 +70,8 @@ def test_a_result_of_other_settings_or_logs_keeps_its_folder(tmp_path, log):
     def written(content, source):
         folder = free_folder(wanted, "result.json", content, sources=[source])
         folder.mkdir(exist_ok=True)
-        from jaxquad.report import plain_content, provenance
+        from jaxquad._core import plain_content
+        from jaxquad.report import provenance
 
         origin = {"provenance": provenance(source).content()}
         (folder / "result.json").write_text(json.dumps(plain_content({**content, **origin})))
