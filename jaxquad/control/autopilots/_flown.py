@@ -22,6 +22,7 @@ from ._filters import (
     PT2,
     PT3,
 )
+from ._parameters import list_parameters
 from ._px4 import PX4Rate
 
 
@@ -36,6 +37,10 @@ class FlownLoop(eqx.Module):
 
     law: BetaflightPID | PX4Rate | ArduPilotRate
     unmodelled: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def parameters(self) -> dict[str, float]:
+        """The values that flew, by the names of `PARAMETERS`."""
+        return list_parameters(self.law)
 
 
 class FlownBetaflight(FlownLoop):
@@ -53,6 +58,14 @@ class FlownBetaflight(FlownLoop):
     dterm_dynamic: tuple[float, float, float] | None = eqx.field(static=True, default=None)
     tpa: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.35))
     tpa_on_p: bool = eqx.field(static=True, default=False)
+
+    def parameters(self) -> dict[str, float]:
+        """The values that flew, by the names of `PARAMETERS`, with the dynamic cutoffs."""
+        found = list_parameters(self.law)
+        for name, range in (("gyro", self.gyro_dynamic), ("dterm", self.dterm_dynamic)):
+            if range is not None:
+                found[f"{name}_lpf1_dyn_min_hz"], found[f"{name}_lpf1_dyn_max_hz"] = range[:2]
+        return found
 
     def at(self, throttle: Float[ArrayLike, "..."]) -> BetaflightPID:
         """The law at a throttle of 0 to 1: its dynamic cutoffs and TPA."""

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import as_float, Number, pick_gain, require_positive
+from jaxquad.records import AXES
 
 from .._adaptive_ladrc import AdaptiveLADRC
 from .._ladrc import LADRC
@@ -15,7 +16,7 @@ from .._pid import PID
 from .._scheduled import ScheduledLADRC
 from ._betaflight import D_SCALE, I_SCALE, P_SCALE
 from ._law import DEGREES
-from ._parameters import AXES, Firmware
+from ._parameters import Firmware
 
 
 class RateGains(NamedTuple):

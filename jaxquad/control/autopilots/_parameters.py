@@ -7,8 +7,10 @@ from typing import Literal, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxquad._core import Number
+from jaxquad.records import AXES
 
 from ._ardupilot import ArduPilotAttitude, ArduPilotRate
 from ._betaflight import BetaflightADRC, BetaflightAngle, BetaflightPID
@@ -20,7 +22,6 @@ from ._px4 import PX4Attitude, PX4Rate
 
 Firmware = Literal["betaflight", "px4", "ardupilot", "crazyflie"]
 Law = TypeVar("Law", bound=FirmwareLoop)
-AXES = ("roll", "pitch", "yaw")
 
 
 class Parameter(NamedTuple):
@@ -75,7 +76,7 @@ def _betaflight() -> list[Parameter]:
         *_rows(of("i"), "", (80, 84, 80), byte, "i", whole=True),
         *_rows(of("d"), "", (30, 34, 0), byte, "d", whole=True),
         *_rows(of("f"), "", (120, 125, 120), wide, "f", whole=True),
-        *_rows(of("d_max"), "", (40, 46, 0), byte, "", whole=True),
+        *_rows(of("d_max"), "", (40, 46, 0), byte, "d_max", whole=True),
         Parameter("angle_p_gain", "0.1/s", 50, 0, 200, True, "level"),
         Parameter("thrust_linear", "%", 0, 0, 150, True),
         *(Parameter(name, "Hz", default, *wide, True) for name, default in _BETAFLIGHT_FILTERS),
@@ -271,6 +272,9 @@ def _held(law: FirmwareLoop):
             low_passes = [x for x in owner.gyro.filters if isinstance(x, Butterworth)]
             if len(low_passes) == 1:
                 yield row, np.asarray(low_passes[0].cutoff_hz)
+        elif field == "d_max":
+            if owner.d_max is not None:
+                yield row, np.asarray(owner.d_max.ceiling)
         elif field:
             yield row, np.asarray(_fields(owner)[field])
 
@@ -297,10 +301,16 @@ def _set(law, row: Parameter, value: Number):
             for x in owner.gyro.filters
         )
         changed = {"gyro": dataclasses.replace(owner.gyro, filters=filters)}
+    elif field == "d_max":
+        ceiling = _with_axis(owner.d_max.ceiling, row.axis, value)
+        changed = {"d_max": dataclasses.replace(owner.d_max, ceiling=ceiling)}
     else:
-        now = jnp.asarray(_fields(owner)[field])
-        one = jnp.asarray(value, now.dtype)
-        wide = jnp.broadcast_to(now, (3,)) if row.axis >= 0 else now
-        changed = {field: wide.at[row.axis].set(one) if row.axis >= 0 else jnp.full_like(now, one)}
+        changed = {field: _with_axis(_fields(owner)[field], row.axis, value)}
     replaced = dataclasses.replace(owner, **changed)
     return replaced if owner is law else dataclasses.replace(law, rate=replaced)
+
+
+def _with_axis(now: Array, axis: int, value: Number) -> Array:
+    """One axis changed, or all of them."""
+    one = jnp.asarray(value, now.dtype)
+    return jnp.full_like(now, one) if axis < 0 else jnp.broadcast_to(now, (3,)).at[axis].set(one)
