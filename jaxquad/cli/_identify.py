@@ -279,7 +279,7 @@ Then identify your own log:
 
 
 def _add_demo(declared: argparse.ArgumentParser) -> None:
-    text = "identify a measured flight instead: a quadrotor on a pitch rig (JAXQUAD_DATA)"
+    text = "identify a measured flight instead: a quadrotor on a pitch test stand (JAXQUAD_DATA)"
     declared.add_argument("--flight", action="store_true", help=text)
     output = add_output(declared)
     add_out(output, "results/demo")
@@ -302,8 +302,8 @@ def _demo(options: argparse.Namespace) -> int:
 
 _NEXT_FLIGHT = """
 
-The flight is measured: an ANT-X quadrotor on a pitch rig in closed loop, with a binary sequence on
-the set-point x0 of its position.
+The flight is measured: an ANT-X quadrotor on a pitch test stand in closed loop, with a binary
+sequence on the set-point x0 of its position.
 Look at {report}"""
 
 

@@ -22,6 +22,8 @@ from ._progress import add_quiet
 
 
 NOT_TO_BE_FLOWN = 4
+_WORDS = """(A member is one plant that the record leaves possible; fresh ones were not tuned on. Linear loops are
+members without the limit of the command, of which more are analysed than flown.)"""
 
 
 def _add(declared: argparse.ArgumentParser) -> None:
@@ -47,6 +49,7 @@ def _run(options: argparse.Namespace) -> int:
     found = tune(stored, settings, log=options.log, progress=False if options.quiet else None)
     with stdout_for_json(options):
         print(in_options(str(found)))
+        print(_WORDS)
         content, logs = found.content(), found.identification.paths
         same = {key: content[key] for key in ("settings", "identified_with")}
         wanted = options.out or stored.folder / "tuned"

@@ -128,7 +128,7 @@ class Explanation(eqx.Module):
 
     @property
     def summary(self) -> str:
-        """What the responses want, in a sentence or two."""
+        """Which term the model lacks, in a sentence or two."""
         before = float(np.sqrt(self.whole.chi_squared))
         if self.best is None:
             return (
@@ -144,8 +144,8 @@ class Explanation(eqx.Module):
         named = _named_extra(first.formula, values)
         rest = "" if after < MISFIT else ", which is still more than noise"
         return (
-            f"The responses want {first.title}, {first.formula} with {named}: the misfit falls "
-            f"from {before:.1f} to {after:.1f} random errors{rest}"
+            f"The model lacks {first.title}, {first.formula} with {named}: with it the misfit "
+            f"falls from {before:.1f} to {after:.1f} random errors{rest}"
         )
 
     def __str__(self) -> str:

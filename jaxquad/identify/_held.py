@@ -127,11 +127,11 @@ def remarks_on_hold(
         k = np.unravel_index(np.argmax(over), over.shape)
         if over[k] > 1:
             return [
-                "nobody said how long the input keeps each value: held for a sample "
-                f"({1e3 * frf.dt:.3g} ms) it loses {100 * lost[k]:.2g} % at "
-                f"{np.asarray(frf.omega)[k[0]]:.3g} rad/s, {over[k]:.2g} times the error there, "
-                "and half a sample of the delay is its own; say hold= in s, the loop's period for "
-                "a command, 0 for a quantity that was measured (jq.Record, jq.read)"
+                "it is not known how long the input keeps each value: if it is held for a sample "
+                f"({1e3 * frf.dt:.3g} ms), the gain is {100 * lost[k]:.2g} % too low at "
+                f"{_frequency(np.asarray(frf.omega)[k[0]])}, {over[k]:.2g} times the random error, "
+                "and the delay half a sample too long; give hold= in s, the loop's period for a "
+                "command, 0 for a quantity that was measured (jq.Record, jq.read)"
             ]
     return []
 
@@ -251,3 +251,7 @@ def _step(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]
     with np.errstate(divide="ignore", over="ignore"):
         rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
     return fall / (rise + fall)
+
+
+def _frequency(omega: float) -> str:
+    return f"{omega:.3g} rad/s ({omega / (2 * np.pi):.3g} Hz)"

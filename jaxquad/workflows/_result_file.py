@@ -124,7 +124,9 @@ def read_result(path: str | Path) -> StoredResult:
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such result: run jaxquad identify first") from error
     except ValueError as error:
-        raise ValueError(f"{path}: no result of jaxquad identify: {error}") from error
+        raise ValueError(
+            f"{path}: this is no result of jaxquad identify ({error}): run it first"
+        ) from error
     try:
         content = dict(content)
         settings = IdentifySettings.from_mapping(content["settings"], f"{path}, settings")
@@ -140,5 +142,5 @@ def read_result(path: str | Path) -> StoredResult:
         )
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{path}: no result of this version of jaxquad identify: identify the log again"
+            f"{path}: this is no result of this version of jaxquad: run jaxquad identify again"
         ) from error

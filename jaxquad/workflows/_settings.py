@@ -315,7 +315,7 @@ class IdentifySettings(Settings):
         kinds.SWITCH,
         False,
         "where the misfit exceeds 1.5 random errors, fit again with one more pole, zero, pair, "
-        "or damping, and say which the response wants",
+        "or damping, and say which of them explains it",
         group=_ESTIMATE,
         flag="--explain",
     )

@@ -145,7 +145,9 @@ def _check_unchanged(path: Path, known: str) -> None:
     try:
         found = sha256_of(path)
     except FileNotFoundError as error:
-        raise ValueError(f"{path}: the log is gone: say where it is (--log)") from error
+        raise ValueError(
+            f"{path}: the log is gone: give the place that it was moved to (--log)"
+        ) from error
     if found != known:
         raise ValueError(
             f"{path}: this is not the log that was identified (SHA-256 {found[:12]}... instead of "

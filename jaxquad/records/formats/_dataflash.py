@@ -275,7 +275,9 @@ def _find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
         {**rate.units, **dict.fromkeys(named, unit)},
         {**rate.scales, **dict.fromkeys(named, scale)},
     )
-    why = "as ArduPilot 3.4 and later log it" if ratio is None else f"{ratio:.3g} times IMU's gyro"
+    why = "as ArduPilot 3.4 and later log it"
+    if ratio is not None:
+        why = f"because its rates are {ratio:.3g} times those of IMU's gyro in rad/s"
     hundredths = " (logged in hundredths)" if scale != 1.0 else ""
     return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
 
