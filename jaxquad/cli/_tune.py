@@ -22,8 +22,8 @@ from ._progress import add_quiet
 
 
 NOT_TO_BE_FLOWN = 4
-_WORDS = """(A member is one plant that the record leaves possible; fresh ones were not tuned on. Linear loops are
-members without the limit of the command, of which more are analysed than flown.)"""
+_WORDS = """(A member is one plant that the record leaves possible; fresh ones were not tuned on.
+Linear loops are members without the limit of the command: more of them are analysed than flown.)"""
 
 
 def _add(declared: argparse.ArgumentParser) -> None:

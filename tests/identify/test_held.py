@@ -48,12 +48,12 @@ def test_a_held_input_is_fitted_exactly_with_the_plants_own_delay(response):
     assert not any("keeps each value" in remark for remark in fit.remarks)
 
 
-def test_where_nobody_said_the_fit_says_what_to_say(response):
+def test_where_the_hold_is_unknown_the_fit_says_what_to_give(response):
     unsaid = dataclasses.replace(response, hold=None)
     fit = jq.fit(START, unsaid, free=FREE)
     assert fit.values[3] == pytest.approx(0.031 + DT / 2, rel=0.01)
     assert abs(fit.values[2] / 400 - 1) > 1e-4
-    assert sum("say hold=" in remark for remark in fit.remarks) == 1
+    assert sum("give hold=" in remark for remark in fit.remarks) == 1
 
 
 def test_a_measured_input_has_no_hold(response):
