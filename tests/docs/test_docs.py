@@ -10,11 +10,20 @@ from typing import NamedTuple
 import pytest
 from conftest import ROOT
 from flight_logs import ardupilot, px4
+from made_flights import write_flights
 from test_notebooks import words
 
 
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
-RUN = ("comparison.md", "first_steps.md", "how_to.md", "limits.md", "measured.md", "own_log.md")
+RUN = (
+    "comparison.md",
+    "first_steps.md",
+    "how_to.md",
+    "limits.md",
+    "measured.md",
+    "own_log.md",
+    "ten_tasks.md",
+)
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
 BLOCK = re.compile(r"(?:<!-- (.*?) -->\n)?```(\w*)\n(.*?)```", flags=re.S)
 MARK = "--- printed by the next block ---"
@@ -65,6 +74,7 @@ def lay_out(place, folder, request):
     made = {
         "a made ArduPilot log": lambda: ardupilot(folder, 10),
         "a made PX4 log": lambda: px4(folder, state=2),
+        "two made flights": lambda: write_flights(folder),
     }
     if place in made:
         made[place]()
@@ -100,3 +110,11 @@ def test_every_block_of_code_runs_or_is_called_a_fragment(page):
         remark == "fragment" or remark.startswith("reads ") for remark, *_ in found if remark
     )
     assert any(kind == "python" for _, kind, _ in found)
+
+
+def test_each_of_the_ten_tasks_takes_six_lines_at_most():
+    _, *tasks = re.split(r"^## ", (ROOT / "docs" / "ten_tasks.md").read_text(), flags=re.M)
+    assert [task.partition(".")[0] for task in tasks] == [str(k) for k in range(1, 11)]
+    for task in tasks:
+        ((_, kind, code),) = [found for found in BLOCK.findall(task) if found[1]]
+        assert kind == "python" and len([line for line in code.splitlines() if line.strip()]) <= 6
