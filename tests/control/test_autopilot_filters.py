@@ -1,5 +1,7 @@
 """The filters of the firmwares against scipy.signal, and chains of them."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,9 +34,9 @@ def prewarped(centre, quality, residual=0.0):
 
 
 def first_order(cutoff):
-    numerator, denominator, _ = signal.cont2discrete(
-        ([1.0], [1 / (2 * np.pi * cutoff), 1.0]), 1 / RATE, method="backward_diff"
-    )
+    analogue = [1.0], [1 / (2 * np.pi * cutoff), 1.0]
+    found: Any = signal.cont2discrete(analogue, 1 / RATE, method="backward_diff")
+    numerator, denominator, _ = found
     return np.ravel(numerator), np.ravel(denominator)
 
 
@@ -44,7 +46,7 @@ def repeated(pair, times):
 
 OCTAVES = 2 * np.log2(180 / (180 - 20))
 DEPTH = ardupilot_notch(180.0, 40.0, 30.0)
-CASES = {
+CASES: dict[str, Any] = {
     "pt1": (PT1(CUTOFF), first_order(CUTOFF)),
     "pt2": (PT2(CUTOFF), repeated(first_order(CUTOFF / np.sqrt(np.sqrt(2) - 1)), 2)),
     "pt3": (PT3(CUTOFF), repeated(first_order(CUTOFF / np.sqrt(np.cbrt(2) - 1)), 3)),
@@ -87,7 +89,7 @@ def test_pt2_and_pt3_are_chains_of_equal_first_order_filters(kind, order, factor
 
 
 CHAIN = FilterChain(tuple(filter for filter, _ in CASES.values()), RATE)
-FREQUENCIES = np.array([1.0, 40.0, 250.0, 900.0])
+FREQUENCIES: Any = np.array([1.0, 40.0, 250.0, 900.0])
 
 
 def test_shares_multiply_and_add_up_to_the_chain():
@@ -97,8 +99,8 @@ def test_shares_multiply_and_add_up_to_the_chain():
     np.testing.assert_allclose(sum(x.delay_ms for x in parts), whole.delay_ms, rtol=1e-12)
     expected = np.prod(
         [
-            signal.freqz(*map(np.asarray, pair), worN=FREQUENCIES, fs=RATE)[1]
-            for _, pair in CASES.values()
+            signal.freqz(np.asarray(above), np.asarray(below), worN=FREQUENCIES, fs=RATE)[1]
+            for _, (above, below) in CASES.values()
         ],
         axis=0,
     )
@@ -106,9 +108,9 @@ def test_shares_multiply_and_add_up_to_the_chain():
 
 
 def test_the_delay_of_slow_signals_is_the_group_delay():
-    numerator, denominator = signal.butter(2, 40.0, fs=RATE)
-    expected = signal.group_delay((numerator, denominator), w=[0.01], fs=RATE)[1] / RATE * 1e3
-    found = FilterChain((Butterworth(40.0),), RATE).delay_ms([0.01])
+    slow: Any = np.array([0.01])
+    expected = signal.group_delay(CASES["Butterworth"][1], w=slow, fs=RATE)[1] / RATE * 1e3
+    found = FilterChain((Butterworth(CUTOFF),), RATE).delay_ms([0.01])
     assert found[0] == pytest.approx(expected[0], rel=1e-6)
 
 

@@ -1,6 +1,7 @@
 """The firmwares' loops against a second writing of each law, their linear form, and differences."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -69,7 +70,7 @@ def gyro(y, chain, dt):
 
 def low_pass(x, cutoff, dt):
     alpha = dt / (dt + 1 / (2 * np.pi * cutoff))
-    return signal.lfilter([alpha], [1, alpha - 1], x)
+    return np.asarray(signal.lfilter([alpha], [1, alpha - 1], x))
 
 
 CHAIN8 = FilterChain((PT1(500.0),), 8000.0)
@@ -185,7 +186,9 @@ def crazyflie(r, y):
     dt = CRAZYFLIE.dt
     fine, count = gyro(DEGREES * y, CHAIN_CF, dt)
     y, r = fine[count - 1 :: count], DEGREES * r
-    slope = signal.lfilter(*signal.butter(2, 30.0, fs=500.0), -np.diff(y, prepend=0) / dt)
+    butterworth: Any = signal.butter(2, 30.0, fs=500.0)
+    above, below = butterworth
+    slope = np.asarray(signal.lfilter(above, below, -np.diff(y, prepend=0) / dt))
     i, total = np.zeros(len(r)), 0.0
     for n, e in enumerate(r - y):
         total = i[n] = np.clip(total + e * dt, -2, 2)

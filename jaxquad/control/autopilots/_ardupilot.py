@@ -72,8 +72,11 @@ class ArduPilotRate(FirmwareLoop):
             "integral_limit": self.integral_limit,
             "pd_limit": self.pd_limit,
         }
-        require_gains(self, {**self.gains(), "ff": self.ff, "d_ff": self.d_ff}, limits)
+        require_gains(self.dt, {**self.gains(), "ff": self.ff, "d_ff": self.d_ff}, limits)
         require_gyro_rate(self.gyro, self.dt)
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p, "i": self.i, "d": self.d}
@@ -153,6 +156,9 @@ class ArduPilotAttitude(FirmwareLoop):
     @property
     def dt(self) -> float:
         return self.rate.dt
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p} | {f"rate.{k}": x for k, x in self.rate.gains().items()}

@@ -160,13 +160,16 @@ class BetaflightPID(FirmwareLoop):
 
     def __check_init__(self):
         limits = {"limit": self.limit, "integral_limit": self.integral_limit}
-        require_gains(self, {**self.gains(), "f": self.f}, limits)
+        require_gains(self.dt, {**self.gains(), "f": self.f}, limits)
         require_gyro_rate(self.gyro, self.dt)
         self._chains()  # refuses what lies beyond half of the loop's rate
 
     def _chains(self) -> tuple[FilterChain, FilterChain]:
         """The filters of the rate and of its derivative, at the loop's rate."""
         return FilterChain(self.filters, 1 / self.dt), FilterChain(self.dterm, 1 / self.dt)
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p, "i": self.i, "d": self.d}
@@ -298,6 +301,9 @@ class BetaflightAngle(FirmwareLoop):
             relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
         return dataclasses.replace(self.rate, f=jnp.zeros_like(self.rate.f), relax=relax)
 
+    def interval(self) -> float:
+        return self.dt
+
     def gains(self) -> dict[str, Array]:
         return {"level": self.level} | {f"rate.{k}": x for k, x in self.rate.gains().items()}
 
@@ -364,7 +370,7 @@ class BetaflightADRC(FirmwareLoop):
     def __check_init__(self):
         for name, gain in self.gains().items():
             require_positive(name, gain)
-        require_gains(self, {**self.gains(), "f": self.f}, {"limit": self.limit})
+        require_gains(self.dt, {**self.gains(), "f": self.f}, {"limit": self.limit})
         require_gyro_rate(self.gyro, self.dt)
         self._chain()  # refuses what lies beyond half of the loop's rate
 
@@ -372,6 +378,9 @@ class BetaflightADRC(FirmwareLoop):
         """All filters of the rate at the loop's rate."""
         lowpass = (PT2(150.0),) if self.lowpass is None else self.lowpass
         return FilterChain((*self.filters, *lowpass), 1 / self.dt)
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"wc": self.wc, "wo": self.wo, "b0": self.b0}

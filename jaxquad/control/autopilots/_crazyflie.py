@@ -66,9 +66,12 @@ class CrazyflieRate(FirmwareLoop):
 
     def __check_init__(self):
         limits = {"integral_limit": self.integral_limit, "limit": self.limit}
-        require_gains(self, {**self.gains(), "kff": self.kff}, limits)
+        require_gains(self.dt, {**self.gains(), "kff": self.kff}, limits)
         require_gyro_rate(self.gyro, self.dt)
         self._slope()  # refuses what lies beyond half of the loop's rate
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
@@ -129,11 +132,14 @@ class CrazyflieAttitude(FirmwareLoop):
     def __check_init__(self):
         require_positive("kp", self.kp, "give 1/s")
         limits = {"integral_limit": self.integral_limit}
-        require_gains(self, {"ki": self.ki, "kd": self.kd}, limits)
+        require_gains(self.dt, {"ki": self.ki, "kd": self.kd}, limits)
 
     @property
     def dt(self) -> float:
         return self.rate.dt
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         own = {"kp": self.kp, "ki": self.ki, "kd": self.kd}

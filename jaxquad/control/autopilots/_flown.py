@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,7 +27,10 @@ from ._parameters import list_parameters
 from ._px4 import PX4Rate
 
 
-class FlownLoop(eqx.Module):
+RateLaw = TypeVar("RateLaw", BetaflightPID, PX4Rate, ArduPilotRate)
+
+
+class FlownLoop(eqx.Module, Generic[RateLaw]):
     """The rate loop of a log, for roll, pitch and yaw, and what of it is not modelled.
 
     **Arguments:**
@@ -35,7 +39,7 @@ class FlownLoop(eqx.Module):
     - `unmodelled`: sentences.
     """
 
-    law: BetaflightPID | PX4Rate | ArduPilotRate
+    law: RateLaw
     unmodelled: tuple[str, ...] = eqx.field(static=True, default=())
 
     def parameters(self) -> dict[str, float]:
@@ -43,7 +47,7 @@ class FlownLoop(eqx.Module):
         return list_parameters(self.law)
 
 
-class FlownBetaflight(FlownLoop):
+class FlownBetaflight(FlownLoop[BetaflightPID]):
     """Betaflight's rate loop of a log, with its dynamic cutoffs and TPA.
 
     **Arguments:** (those of `FlownLoop`, and)
@@ -70,19 +74,22 @@ class FlownBetaflight(FlownLoop):
     def at(self, throttle: Float[ArrayLike, "..."]) -> BetaflightPID:
         """The law at a throttle of 0 to 1: its dynamic cutoffs and TPA."""
         law, factor = self.law, tpa_factor(throttle, *self.tpa)
-        filters, dterm = law.filters, law.dterm
-        if self.gyro_dynamic is not None:
-            first = dataclasses.replace(
-                filters[0], cutoff_hz=dynamic_cutoff(throttle, *self.gyro_dynamic)
-            )
-            filters = (first, *filters[1:])
-        if self.dterm_dynamic is not None:
-            first = dataclasses.replace(
-                dterm[0], cutoff_hz=dynamic_cutoff(throttle, *self.dterm_dynamic)
-            )
-            dterm = (first, *dterm[1:])
+        filters = _retuned(law.filters, self.gyro_dynamic, throttle)
+        dterm = _retuned(law.dterm, self.dterm_dynamic, throttle)
         on_p = factor if self.tpa_on_p else jnp.ones_like(factor)
         return dataclasses.replace(law, filters=filters, dterm=dterm, tpa=factor, tpa_p=on_p)
+
+
+def _retuned(
+    filters: tuple[Filter, ...],
+    range: tuple[float, float, float] | None,
+    throttle: Float[ArrayLike, "..."],
+) -> tuple[Filter, ...]:
+    """The filters with the first one's cutoff at a throttle; None leaves it."""
+    if range is None or not isinstance(filters[0], PT1 | PT2 | PT3 | Butterworth):
+        return filters
+    cutoff = dynamic_cutoff(throttle, *range)
+    return (dataclasses.replace(filters[0], cutoff_hz=cutoff), *filters[1:])
 
 
 def betaflight_loop(
@@ -248,7 +255,7 @@ _UNUSUAL = {
 }
 
 
-def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> FlownLoop:
+def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> FlownLoop[PX4Rate]:
     """The rate loop of PX4's parameters.
 
     **Arguments:**
@@ -288,7 +295,7 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
     return FlownLoop(law, tuple(unmodelled))
 
 
-def ardupilot_loop(values: Mapping[str, str]) -> FlownLoop:
+def ardupilot_loop(values: Mapping[str, str]) -> FlownLoop[ArduPilotRate]:
     """The rate loop of ArduPilot's parameters (Copter).
 
     **Arguments:**

@@ -46,13 +46,12 @@ _SHORT = {"roll": "RLL", "pitch": "PIT", "yaw": "YAW"}
 
 
 def _names(firmware: Firmware, axis: str) -> tuple[str, str, str]:
-    if firmware == "px4":
-        return tuple(f"MC_{axis.upper()}RATE_{x}" for x in "PID")
-    if firmware == "ardupilot":
-        return tuple(f"ATC_RAT_{_SHORT[axis]}_{x}" for x in "PID")
-    if firmware == "betaflight":
-        return tuple(f"{x}_{axis}" for x in "pid")
-    return tuple(f"pid_rate.{axis}_k{x}" for x in "pid")
+    pattern = {
+        "px4": f"MC_{axis.upper()}RATE_{{}}", "ardupilot": f"ATC_RAT_{_SHORT[axis]}_{{}}",
+        "betaflight": f"{{}}_{axis}", "crazyflie": f"pid_rate.{axis}_k{{}}",
+    }[firmware]  # fmt: skip
+    p, i, d = "PID" if firmware in ("px4", "ardupilot") else "pid"
+    return pattern.format(p), pattern.format(i), pattern.format(d)
 
 
 def _scales(firmware: Firmware, axis: str) -> tuple[float, float, float]:

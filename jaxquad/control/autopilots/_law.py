@@ -47,7 +47,9 @@ class FirmwareLoop(eqx.Module):
     Subclasses are final: they say what the law remembers at rest, and how it advances.
     """
 
-    dt: eqx.AbstractVar[float]
+    @abc.abstractmethod
+    def interval(self) -> float:
+        """The interval of its samples in s."""
 
     @abc.abstractmethod
     def rest(self, zero: Signal) -> dict[str, PyTree]:
@@ -129,7 +131,7 @@ def _derivative(law: FirmwareLoop) -> LinearController:
         C=slopes[states, :states],
         reference_through=slopes[states, states],
         measurement_through=slopes[states, states + 1],
-        dt=law.dt,
+        dt=law.interval(),
     )
 
 
@@ -137,9 +139,9 @@ def _all_set(gain: Array) -> bool:
     return bool(np.all(np.asarray(gain) != 0))
 
 
-def require_gains(law: FirmwareLoop, gains: Mapping[str, Array], limits: Mapping[str, Array]):
+def require_gains(dt: float, gains: Mapping[str, Array], limits: Mapping[str, Array]) -> None:
     """Raises ValueError for gains that are not finite, limits below 0, shapes that do not fit."""
-    require_sample_interval(law.dt)
+    require_sample_interval(dt)
     for name, gain in gains.items():
         require_finite(name, gain)
     for name, limit in limits.items():

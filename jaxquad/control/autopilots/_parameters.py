@@ -1,7 +1,7 @@
 """The firmwares' parameters: unit, default, documented range, and what is stored."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeVar
 
@@ -16,12 +16,10 @@ from ._ardupilot import ArduPilotAttitude, ArduPilotRate
 from ._betaflight import BetaflightADRC, BetaflightAngle, BetaflightPID
 from ._crazyflie import CrazyflieAttitude, CrazyflieRate
 from ._filters import Butterworth
-from ._law import FirmwareLoop
 from ._px4 import PX4Attitude, PX4Rate
 
 
 Firmware = Literal["betaflight", "px4", "ardupilot", "crazyflie"]
-Law = TypeVar("Law", bound=FirmwareLoop)
 
 
 class Parameter(NamedTuple):
@@ -51,14 +49,18 @@ Range = tuple[Number, Number]
 
 
 def _rows(
-    names: Sequence[str], unit: str, defaults: Sequence[Number], ranges: Sequence[Range] | Range,
+    names: Sequence[str], unit: str, defaults: Sequence[Number], ranges: tuple[Range, ...] | Range,
     field: str, *, whole: bool = False,
 ) -> list[Parameter]:  # fmt: skip
     """A parameter of each axis."""
-    bounds = [ranges] * 3 if isinstance(ranges[0], int | float) else ranges
+    bounds = [(x, x) if isinstance(x, int | float) else x for x in ranges]
+    if len(bounds) == 2:
+        bounds = [(bounds[0][0], bounds[1][1])] * 3
     return [
-        Parameter(name, unit, default, *bound, whole, field, axis)
-        for axis, (name, default, bound) in enumerate(zip(names, defaults, bounds, strict=True))
+        Parameter(name, unit, default, low, high, whole, field, axis)
+        for axis, (name, default, (low, high)) in enumerate(
+            zip(names, defaults, bounds, strict=True)
+        )
     ]
 
 
@@ -158,17 +160,15 @@ def _crazyflie() -> list[Parameter]:
     ]
 
 
-PARAMETERS: Mapping[Firmware, Mapping[str, Parameter]] = MappingProxyType(
-    {
-        firmware: MappingProxyType({row.name: row for row in rows()})
-        for firmware, rows in (
-            ("betaflight", _betaflight),
-            ("px4", _px4),
-            ("ardupilot", _ardupilot),
-            ("crazyflie", _crazyflie),
-        )
-    }  # fmt: skip
-)
+def _frozen(rows: list[Parameter]) -> Mapping[str, Parameter]:
+    return MappingProxyType({row.name: row for row in rows})
+
+
+_TABLES: dict[Firmware, Mapping[str, Parameter]] = {
+    "betaflight": _frozen(_betaflight()), "px4": _frozen(_px4()),
+    "ardupilot": _frozen(_ardupilot()), "crazyflie": _frozen(_crazyflie()),
+}  # fmt: skip
+PARAMETERS: Mapping[Firmware, Mapping[str, Parameter]] = MappingProxyType(_TABLES)
 """The parameters of each firmware by name."""
 
 
@@ -218,21 +218,23 @@ def check_ranges(firmware: Firmware, values: Mapping[str, Number]) -> tuple[str,
     return tuple(found)
 
 
+RateLaw = BetaflightPID | BetaflightADRC | PX4Rate | ArduPilotRate | CrazyflieRate
+AngleLaw = BetaflightAngle | PX4Attitude | ArduPilotAttitude | CrazyflieAttitude
+AnyLaw = RateLaw | AngleLaw
+Law = TypeVar("Law", bound=AnyLaw)
 _RATES: Mapping[type, Firmware] = {
     BetaflightPID: "betaflight", BetaflightADRC: "betaflight", PX4Rate: "px4",
     ArduPilotRate: "ardupilot", CrazyflieRate: "crazyflie",
 }  # fmt: skip
-_OUTER = (BetaflightAngle, PX4Attitude, ArduPilotAttitude, CrazyflieAttitude)
 _OUTER_FIELDS = {"attitude_ki": "ki", "attitude_kd": "kd", "level": "level"}
 
 
-def firmware_of(law: FirmwareLoop) -> Firmware:
+def firmware_of(law: AnyLaw) -> Firmware:
     """Which firmware a law is of."""
-    inner = law.rate if isinstance(law, _OUTER) else law
-    return _RATES[type(inner)]
+    return _RATES[type(_parts(law)[0])]
 
 
-def list_parameters(law: FirmwareLoop) -> dict[str, float]:
+def list_parameters(law: AnyLaw) -> dict[str, float]:
     """The parameters that a law of roll, pitch and yaw amounts to, not rounded.
 
     Gains and filters of a law, and the angle loop's where it has one. Not listed: Betaflight's
@@ -264,50 +266,68 @@ def with_parameters(law: Law, values: Mapping[str, Number]) -> Law:
     return law
 
 
-def _held(law: FirmwareLoop):
+def _parts(law: AnyLaw) -> tuple[RateLaw, AngleLaw | None]:
+    """The rate loop, and the angle loop around it."""
+    return (law.rate, law) if isinstance(law, AngleLaw) else (law, None)
+
+
+def _held(law: AnyLaw) -> Iterator[tuple[Parameter, np.ndarray]]:
     """The rows that have a place in a law, with what is there."""
-    for row in PARAMETERS[firmware_of(law)].values():
-        owner, field = _place(law, row.field)
-        if field == "gyro":
-            low_passes = [x for x in owner.gyro.filters if isinstance(x, Butterworth)]
+    inner, outer = _parts(law)
+    for row in PARAMETERS[_RATES[type(inner)]].values():
+        if row.field == "gyro":
+            low_passes = [x for x in inner.gyro.filters if isinstance(x, Butterworth)]
             if len(low_passes) == 1:
                 yield row, np.asarray(low_passes[0].cutoff_hz)
-        elif field == "d_max":
-            if owner.d_max is not None:
-                yield row, np.asarray(owner.d_max.ceiling)
-        elif field:
-            yield row, np.asarray(_fields(owner)[field])
+        elif row.field == "d_max":
+            if isinstance(inner, BetaflightPID) and inner.d_max is not None:
+                yield row, np.asarray(inner.d_max.ceiling)
+        elif _is_outer(row):
+            name = _outer_field(row, outer)
+            if outer is not None and name in _arrays(outer):
+                yield row, np.asarray(_arrays(outer)[name])
+        elif row.field in _arrays(inner):
+            yield row, np.asarray(_arrays(inner)[row.field])
 
 
-def _place(law: FirmwareLoop, field: str) -> tuple[FirmwareLoop, str]:
-    """The part of a law that has what a parameter sets, and its name there; or no name."""
-    outer = law if isinstance(law, _OUTER) else None
-    inner = law.rate if isinstance(law, _OUTER) else law
-    if field.startswith("attitude") or field == "level":
-        name = _OUTER_FIELDS.get(field, "kp" if isinstance(law, CrazyflieAttitude) else "p")
-        return (outer, name) if outer is not None and name in _fields(outer) else (inner, "")
-    return inner, field if field in _fields(inner) else ""
+def _is_outer(row: Parameter) -> bool:
+    return row.field.startswith("attitude") or row.field == "level"
 
 
-def _fields(law: FirmwareLoop) -> dict[str, object]:
-    return {x.name: law.__dict__[x.name] for x in dataclasses.fields(law)}
+def _outer_field(row: Parameter, outer: AngleLaw | None) -> str:
+    """What an angle loop calls it."""
+    return _OUTER_FIELDS.get(row.field, "kp" if isinstance(outer, CrazyflieAttitude) else "p")
 
 
-def _set(law, row: Parameter, value: Number):
-    owner, field = _place(law, row.field)
-    if field == "gyro":
+def _arrays(law: AnyLaw) -> dict[str, Array]:
+    values = {x.name: law.__dict__[x.name] for x in dataclasses.fields(law)}
+    return {name: x for name, x in values.items() if isinstance(x, Array)}
+
+
+def _set(law: Law, row: Parameter, value: Number) -> Law:
+    inner, outer = _parts(law)
+    if _is_outer(row):
+        field = _outer_field(row, outer)
+        return dataclasses.replace(law, **{field: _with_axis(_arrays(law)[field], row.axis, value)})
+    changed = _set_rate(inner, row, value)
+    whole = changed if outer is None else dataclasses.replace(law, rate=changed)
+    assert isinstance(whole, type(law))
+    return whole
+
+
+def _set_rate(law: RateLaw, row: Parameter, value: Number):
+    if row.field == "gyro":
         filters = tuple(
             dataclasses.replace(x, cutoff_hz=value) if isinstance(x, Butterworth) else x
-            for x in owner.gyro.filters
+            for x in law.gyro.filters
         )
-        changed = {"gyro": dataclasses.replace(owner.gyro, filters=filters)}
-    elif field == "d_max":
-        ceiling = _with_axis(owner.d_max.ceiling, row.axis, value)
-        changed = {"d_max": dataclasses.replace(owner.d_max, ceiling=ceiling)}
-    else:
-        changed = {field: _with_axis(_fields(owner)[field], row.axis, value)}
-    replaced = dataclasses.replace(owner, **changed)
-    return replaced if owner is law else dataclasses.replace(law, rate=replaced)
+        return dataclasses.replace(law, gyro=dataclasses.replace(law.gyro, filters=filters))
+    if isinstance(law, BetaflightPID) and law.d_max is not None and row.field == "d_max":
+        ceiling = _with_axis(law.d_max.ceiling, row.axis, value)
+        return dataclasses.replace(law, d_max=dataclasses.replace(law.d_max, ceiling=ceiling))
+    return dataclasses.replace(
+        law, **{row.field: _with_axis(_arrays(law)[row.field], row.axis, value)}
+    )
 
 
 def _with_axis(now: Array, axis: int, value: Number) -> Array:

@@ -74,8 +74,11 @@ class PX4Rate(FirmwareLoop):
             "derivative_hz": self.derivative_hz,
             "torque_hz": self.torque_hz,
         }
-        require_gains(self, {**self.gains(), "k": self.k, "ff": self.ff}, limits)
+        require_gains(self.dt, {**self.gains(), "k": self.k, "ff": self.ff}, limits)
         require_gyro_rate(self.gyro, self.dt)
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p, "i": self.i, "d": self.d}
@@ -162,6 +165,9 @@ class PX4Attitude(FirmwareLoop):
     @property
     def dt(self) -> float:
         return self.rate.dt
+
+    def interval(self) -> float:
+        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p} | {f"rate.{k}": x for k, x in self.rate.gains().items()}
