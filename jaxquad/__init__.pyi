@@ -61,3 +61,4 @@ from .tuning import (
     Objective as Objective,
     tune as tune,
 )
+from .workflows import load_result as load_result

@@ -173,9 +173,9 @@ def _add_report(declared: argparse.ArgumentParser) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import read_result
+    from jaxquad.workflows import load_result
 
-    stored = read_result(options.result)
+    stored = load_result(options.result)
     start_computing()
     from jaxquad.workflows import identify_again
 
@@ -225,9 +225,9 @@ def _add_verify(declared: argparse.ArgumentParser) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import read_result
+    from jaxquad.workflows import load_result
 
-    stored = read_result(options.result)
+    stored = load_result(options.result)
     require_file(options.file)
     start_computing()
     from jaxquad.plot import compare, headless

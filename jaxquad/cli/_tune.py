@@ -39,10 +39,10 @@ def _add(declared: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import read_result
+    from jaxquad.workflows import load_result
 
     settings = settings_of(options, TuneSettings)
-    stored = read_result(options.result)
+    stored = load_result(options.result)
     start_computing()
     from jaxquad.workflows import tune
 

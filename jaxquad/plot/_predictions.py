@@ -17,11 +17,12 @@ from jaxquad.identify import (
 )
 from jaxquad.models import Model
 from jaxquad.records import Record
+from jaxquad.spectra import estimate_step, StepResponse
 
 from ._histories import extremes
 from ._labels import few_ticks, look_of, Style, unit_label
 from ._panels import arrange, Given, legend_of, Panels, stacked, WIDTH
-from ._shown import analysed, Channels, channels_shown, Measured, named_models, Thing
+from ._shown import analysed, Channels, channels_shown, Measured, named, named_models, Thing
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -145,10 +146,12 @@ def step(
     ax: Given = None,
     title: str = "",
 ) -> Panels:
-    """Draw the answers of models, fits and closed loops to a unit step.
+    """Draw the answers of models, fits, closed loops and flown loops to a unit step.
 
     A fit has its 95 % band, model error included. Of a loop its first axis is simulated: the angle,
-    per step of 1 deg of the reference.
+    per step of 1 deg of the reference. Of a record with a reference it is what was flown, from its
+    reference to its first output, with the 95 % band by the scatter between windows, see
+    `jq.spectra.estimate_step`.
 
     !!! example
 
@@ -159,8 +162,8 @@ def step(
 
     **Arguments:**
 
-    - `shown`: models that `jq.verify` takes, fits, `jq.Loop`s; one by one, in lists, or in mappings
-        from the texts of the legend.
+    - `shown`: models that `jq.verify` takes, fits, `jq.Loop`s, records, measured step responses;
+        one by one, in lists, or in mappings from the texts of the legend.
     - `duration`: in s; by default six times the slowest time constant.
     - `pair`: names of output and input of a fit (`y1`, `u1` of a model); by default all, an input
         for each column.
@@ -169,23 +172,28 @@ def step(
 
     **Returns:** `jq.plot.Panels`.
 
-    **Raises:** ValueError for what has no step response, such as a measured response, and for an
-    unknown `pair`.
+    **Raises:** ValueError for what has no step response, such as a frequency response or a record
+    without a reference, and for an unknown `pair`.
     """
-    things = named_models(shown, "step")
+    given = named(shown)
+    records = [each for each in given.values() if isinstance(each, Record)]
+    things = {
+        name: estimate_step(thing, length=duration) if isinstance(thing, Record) else thing
+        for name, thing in given.items()
+    }
+    named_models(things, "step")
     end = max(map(_duration, things.values())) if duration is None else float(duration)
     time = np.linspace(0.0, end, _SAMPLES)
     answers = {name: _answer(name, thing, time) for name, thing in things.items()}
-    channels = _channels(things, answers)
+    channels = _channels(things, answers, records)
     places = channels.places(pair)
     columns = len({i for _, i in places})
     panels = stacked(len(places), ax, columns=columns)
     for panel, (o, i) in zip(panels, places, strict=True):
-        scale, unit = unit_label(channels.output_units[o])
+        scale, unit = _unit_of_ratio(channels.output_units[o], channels.input_units[i])
         for k, (name, found) in enumerate(answers.items()):
             _draw_answer(panel, found, (o, i), scale, look_of(k, name))
-        per = f" per {channels.input_units[i]}" if unit and channels.input_units[i] else ""
-        panel.set_ylabel(f"{channels.ratio(o, i) or 'answer to a unit step'}{unit}{per}")
+        panel.set_ylabel(f"{channels.ratio(o, i) or 'answer to a unit step'}{unit}")
         panel.grid(True, color="0.92", lw=0.5)
         panel.margins(x=0)
     for panel in panels[-columns:]:
@@ -196,11 +204,22 @@ def step(
                    title=title, legend=legend, handle_length=3.0)  # fmt: skip
 
 
+def _unit_of_ratio(output: str, source: str) -> tuple[float, str]:
+    """Factor and label of an output per input, with angles in degrees."""
+    (above, one), (below, other) = unit_label(output), unit_label(source)
+    if one == other:
+        return above / below, ""
+    per = f" per {other.removeprefix(', ')}" if one and other else ""
+    return above / below, f"{one}{per}"
+
+
 def _has_band(answers: Mapping[str, _Answer]) -> bool:
     return any(found.reach is not None for found in answers.values())
 
 
 def _duration(thing: Thing) -> float:
+    if isinstance(thing, StepResponse):
+        return float(thing.time[-1])
     if not isinstance(thing, Fit | Model):
         poles = analysed("the loop", thing, "step").poles
     else:
@@ -211,6 +230,9 @@ def _duration(thing: Thing) -> float:
 
 
 def _answer(name: str, thing: Thing, time: Samples) -> _Answer:
+    if isinstance(thing, StepResponse):
+        reach = 1.96 * thing.standard_error
+        return _Answer(thing.time, thing.mean[:, None, None], reach[:, None, None])
     if isinstance(thing, Fit):
         found = thing.step_response(time)
         return _Answer(found.time, found.value, found.reach)
@@ -236,8 +258,10 @@ def _closed_loop(name: str, loop: Thing, duration: float) -> _Answer:
     return _Answer(np.asarray(flown.time), angle[:, None, None])
 
 
-def _channels(things: Mapping[str, Thing], answers: Mapping[str, _Answer]) -> Channels:
-    """Names and units of the first fit that has them; else numbers."""
+def _channels(
+    things: Mapping[str, Thing], answers: Mapping[str, _Answer], records: Sequence[Record]
+) -> Channels:
+    """Names and units of the first fit or record that has them; else numbers."""
     shapes = {name: found.value.shape[1:] for name, found in answers.items()}
     if len(set(shapes.values())) > 1:
         raise ValueError(
@@ -246,6 +270,11 @@ def _channels(things: Mapping[str, Thing], answers: Mapping[str, _Answer]) -> Ch
     origins = [x.origin for x in things.values() if isinstance(x, Fit) and x.origin is not None]
     if origins:
         return channels_shown([Measured("", origins[0].frfs[0])], [])
+    flown = [thing.names for thing in things.values() if isinstance(thing, StepResponse)]
+    if flown:
+        reference, output = flown[0]
+        units = [records[0].unit(name) for name in (output, reference)] if records else ["", ""]
+        return Channels((output,), (reference,), (units[0],), (units[1],), True)
     outputs, inputs = next(iter(shapes.values()))
     return Channels.numbered(outputs, inputs)
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, PyTree
 from jaxquad.identify import as_sampled, Fit, linear_model, model_response
 from jaxquad.models import Model
 from jaxquad.records import Record
-from jaxquad.spectra import frequency_response, FrequencyResponse
+from jaxquad.spectra import frequency_response, FrequencyResponse, StepResponse
 
 
 Thing = PyTree  # model, fit, loop, measured response or record; or several, by name or in a list
@@ -33,12 +33,12 @@ def named(shown: Iterable[Thing]) -> dict[str, Thing]:
     return {_distinct(k, flat, bases): thing for k, (_, thing) in enumerate(flat)}
 
 
-def named_models(shown: Iterable[Thing], what: str) -> dict[str, Thing]:
+def named_models(shown: Iterable[Thing] | Mapping[str, Thing], what: str) -> dict[str, Thing]:
     """Models, fits and loops by name, for `what` draws them.
 
     Raises ValueError for nothing, and for what was measured.
     """
-    things = named(shown)
+    things = dict(shown) if isinstance(shown, Mapping) else named(shown)
     if not things:
         raise ValueError(f"{what} has nothing to draw: give a model, a fit of jq.fit or a jq.Loop")
     for name, thing in things.items():
@@ -61,7 +61,7 @@ def _distinct(k: int, flat: list[tuple[str, Thing]], bases: list[str]) -> str:
 def _kind(thing: Thing) -> str:
     if isinstance(thing, FrequencyResponse):
         return f"{thing.method} estimate"
-    kinds = {"record": Record, "fit": Fit, "model": Model}
+    kinds = {"flown": Record | StepResponse, "fit": Fit, "model": Model}
     return next((name for name, kind in kinds.items() if isinstance(thing, kind)), "loop")
 
 

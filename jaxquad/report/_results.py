@@ -50,6 +50,8 @@ def _response(frf: FrequencyResponse) -> dict[str, object]:
         "method": frf.method,
         "inputs": frf.input_names,
         "outputs": frf.output_names,
+        "input_units": frf.input_units,
+        "output_units": frf.output_units,
         "omega_rad_per_s": frf.omega,
         "magnitude_db": frf.magnitude_db,
         "phase_deg": frf.phase_deg,

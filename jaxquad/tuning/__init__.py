@@ -1,7 +1,7 @@
 """Tuning over an ensemble: objectives, limits, the optimiser, certificates, Pareto fronts."""
 
 from ._certificate import Certificate as Certificate
-from ._certify import certify as certify
+from ._certify import certify as certify, describe_controller as describe_controller
 from ._cost import Evaluation as Evaluation
 from ._design_result import (
     DesignResult as DesignResult,

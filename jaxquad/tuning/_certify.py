@@ -103,7 +103,7 @@ def certify(
         )
     known = _provenance(ensemble, drawn, key)
     known["linear_members"] = 0 if further is None else further.design.members
-    known["controller"] = _describe_controller(loop.controller)
+    known["controller"] = describe_controller(loop.controller)
     found = Certificate(
         designs=results,
         distances=measure_distances(results[name], limits, independent=not given, further=further),
@@ -217,7 +217,7 @@ def _provenance(given: Ensemble | Members, drawn: Members, key: Key[Array, ""]) 
     }
 
 
-def _describe_controller(controller: PyTree) -> dict[str, object]:
+def describe_controller(controller: PyTree) -> dict[str, object]:
     """The controller's class and numbers, by their places in it."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(controller, eqx.is_array))
     numbers = {jax.tree_util.keystr(path)[1:]: np.asarray(x).tolist() for path, x in leaves}

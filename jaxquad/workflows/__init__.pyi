@@ -16,8 +16,10 @@ from ._kinds import SettingsError as SettingsError
 from ._result_file import (
     default_folder as default_folder,
     free_folder as free_folder,
-    read_result as read_result,
+    load_result as load_result,
+    load_tuning as load_tuning,
     StoredResult as StoredResult,
+    StoredTuning as StoredTuning,
 )
 from ._settings import (
     GROUPS as GROUPS,

@@ -1,20 +1,27 @@
-"""`result.json` as it is read again. Without JAX: a missing result is answered at once."""
+"""Stored results as they are read again. Without JAX: a missing result is answered at once."""
 
 import json
 from collections.abc import Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
-from ._settings import IdentifySettings
+import numpy as np
+
+from ._settings import IdentifySettings, TuneSettings
 
 
 if TYPE_CHECKING:
+    from jaxquad.control import ScheduledLADRC
     from jaxquad.models import LaggedIntegrator, TransferFunction
+    from jaxquad.spectra import FrequencyResponse
 
 
 class StoredResult(NamedTuple):
-    """A `result.json` as `read_result` reads it."""
+    """What `jaxquad identify` has stored, as `jq.load_result` reads it.
+
+    `content` is all of `result.json`.
+    """
 
     folder: Path
     content: Mapping[str, object]
@@ -38,6 +45,48 @@ class StoredResult(NamedTuple):
     def identifiable(self) -> bool:
         """Whether the record determines every parameter."""
         return _part(self.content, "fit").get("identifiable") is True
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters by name, also of those that the record does not determine."""
+        return {name: _number(one["value"]) for name, one in self._parameters.items()}
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Of the parameters, by name; infinite where the record determines nothing."""
+        errors = {name: one["standard_error"] for name, one in self._parameters.items()}
+        return {name: np.inf if x is None else float(x) for name, x in errors.items()}
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """The 95 % intervals of the parameters, by name."""
+        pairs = {name: one["interval_95"] for name, one in self._parameters.items()}
+        return {name: (_number(low), _number(high)) for name, (low, high) in pairs.items()}
+
+    @property
+    def _parameters(self) -> dict[str, dict[str, Any]]:
+        found = _part(self.content, "fit").get("parameters")
+        return {one["name"]: one for one in found} if isinstance(found, list) else {}
+
+    @property
+    def frf(self) -> "FrequencyResponse":
+        """The response that was fitted; its errors count as independent between frequencies."""
+        return _response(_part(self.content, "response"))
+
+    @property
+    def tuned(self) -> "StoredTuning | None":
+        """What `jaxquad tune` has stored for this result, in its folder or in `tuned/` there."""
+        folders = (self.folder / "tuned", self.folder)
+        found = [folder for folder in folders if (folder / "tuned.json").exists()]
+        return load_tuning(found[0]) if found else None
+
+    def __str__(self) -> str:
+        lines = [f"{self.log.name}: {self.summary}"]
+        lines += [
+            f"  {name} = {value:.5g} +- {self.standard_errors[name]:.2g}"
+            for name, value in self.values.items()
+        ]
+        return "\n".join([*lines, "  (+- one standard error)"] if lines[1:] else lines)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -65,6 +114,107 @@ class StoredResult(NamedTuple):
             return known[str(kind)](**numbers)  # pyright: ignore[reportArgumentType]
         except TypeError as error:
             raise ValueError(f"the result's model is incomplete: {error}") from error
+
+
+class StoredTuning(NamedTuple):
+    """What `jaxquad tune` has stored, as `jq.workflows.load_tuning` reads it.
+
+    `content` is all of `tuned.json`.
+    """
+
+    folder: Path
+    content: Mapping[str, object]
+    settings: TuneSettings
+
+    @property
+    def holds(self) -> bool:
+        """Whether all three verdicts hold: only then the gains may be flown."""
+        return self.content["holds"] is True
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The tuned numbers by name."""
+        return {name: _number(value) for name, value in _part(self.content, "values").items()}
+
+    @property
+    def controller(self) -> "ScheduledLADRC":
+        """The tuned controller, as it was certified."""
+        return _controller(_part(self.content, "controller"))
+
+    def __str__(self) -> str:
+        verdicts = self.content["verdicts"]
+        assert isinstance(verdicts, list)
+        words = {True: "OK  ", False: "FAIL", None: "--  "}
+        lines = [f"{words[each['holds']]} {each['name']}: {each['text']}" for each in verdicts]
+        gains = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
+        return "\n".join([*lines, f"tuned: {gains}"])
+
+
+def _controller(content: Mapping[str, Any]) -> "ScheduledLADRC":
+    """A controller of the kind that `jaxquad tune` tunes, with the stored numbers."""
+    import jax
+    import jax.numpy as jnp
+
+    from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
+
+    numbers, dt = content["numbers"], float(content["dt"])
+    like = ScheduledLADRC(LADRC(1.0, 3.0, 1.0, limit=1.0, dt=dt), certainty_equivalence(1.0, 1.0))
+    stored = lambda path, x: jnp.asarray(numbers[jax.tree_util.keystr(path)[1:]], x.dtype)
+    return jax.tree_util.tree_map_with_path(stored, like)
+
+
+def _response(content: Mapping[str, Any]) -> "FrequencyResponse":
+    import jax.numpy as jnp
+
+    from jaxquad.spectra import FrequencyResponse, independent_errors
+
+    array = lambda name: np.array(content[name], float)  # null becomes nan
+    omega, error, coherence = (array(n) for n in ("omega_rad_per_s", "random_error", "coherence"))
+    size = 10 ** (array("magnitude_db") / 20)
+    response = size * np.exp(1j * np.radians(array("phase_deg")))
+    error = np.where(np.isfinite(error), error, np.inf)
+    return FrequencyResponse(
+        omega=jnp.asarray(omega),
+        response=jnp.asarray(response),
+        coherence=jnp.asarray(coherence),
+        random_error=jnp.asarray(error),
+        errors=independent_errors(omega, 2 * (error * size) ** 2),
+        direct_coherence=jnp.asarray(coherence),
+        multiple_coherence=jnp.asarray(np.max(coherence, axis=2)),
+        method=content["method"],
+        input_names=tuple(content["inputs"]),
+        output_names=tuple(content["outputs"]),
+        input_units=tuple(content.get("input_units", ())),
+        output_units=tuple(content.get("output_units", ())),
+    )
+
+
+def _number(value: object) -> float:
+    """JSON has no nan: it is null there."""
+    return float(value) if isinstance(value, int | float) else np.nan
+
+
+def load_tuning(path: str | Path) -> StoredTuning:
+    """Read gains that `jaxquad tune` has stored, from their folder or `tuned.json` itself.
+
+    `jq.load_result(folder).tuned` has those of a result.
+
+    **Raises:** ValueError for a file that `jaxquad tune` did not write.
+    """
+    path = Path(path)
+    path = path / "tuned.json" if path.is_dir() else path
+    try:
+        content = dict(json.loads(path.read_text()))
+        settings = TuneSettings.from_mapping(content["settings"], f"{path}, settings")
+        if not {"holds", "verdicts", "values", "controller"} <= content.keys():
+            raise KeyError("gains or verdicts")
+        return StoredTuning(path.parent, content, settings)
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such result: run jaxquad tune first") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path}: no result of this version of jaxquad tune: tune again"
+        ) from error
 
 
 def _part(content: Mapping[str, object], key: str) -> Mapping[str, object]:
@@ -112,13 +262,31 @@ def _is_free(path: Path, same: Mapping[str, object], sources: Sequence[str | Pat
     ]
 
 
-def read_result(path: str | Path) -> StoredResult:
-    """Read the result in a folder, or a `result.json` itself.
+def load_result(path: str | Path) -> StoredResult:
+    """Read what `jaxquad identify`, and `jaxquad tune` after it, have stored, back as objects.
+
+    !!! example
+
+        ```python
+        result = jq.load_result("results/flight")
+        print(result, result.settings.band, result.tuned)
+        jq.plot.bode(result.frf, {"identified": result.model})
+        ```
+
+    **Arguments:**
+
+    - `path`: the folder of a result, or its `result.json`; also the folder of its gains, `tuned/`.
+
+    **Returns:** a `jq.workflows.StoredResult`: `model`, `values`, `standard_errors`, `intervals`,
+    `frf`, `settings`, and `tuned`, whose `controller` has the gains.
 
     **Raises:** ValueError for a file that `jaxquad identify` did not write.
     """
     path = Path(path)
-    path = path / "result.json" if path.is_dir() else path
+    if path.is_dir():
+        inside = path / "result.json"
+        beside = path.parent / "result.json"
+        path = beside if path.name == "tuned" and not inside.exists() else inside
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError as error:

@@ -13,7 +13,7 @@ from jaxquad.records import Record
 from jaxquad.report import provenance, sha256_of, write_report, write_results
 
 from ._identify import Identification, identify, read_records
-from ._result_file import read_result, StoredResult
+from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
 
@@ -125,12 +125,12 @@ def identify_again(
 
     **Arguments:**
 
-    - `result`: the folder of the result, its `result.json`, or what `read_result` returns.
+    - `result`: the folder of the result, its `result.json`, or what `load_result` returns.
     - `log`: where the log lies, if it was moved; of several logs, the folder in which all lie.
 
     **Raises:** ValueError where a log is gone, or is not the same file by its SHA-256.
     """
-    stored = result if isinstance(result, StoredResult) else read_result(result)
+    stored = result if isinstance(result, StoredResult) else load_result(result)
     paths = stored.logs
     if log is not None:
         paths = [Path(log) / path.name for path in paths] if len(paths) > 1 else [Path(log)]
@@ -164,7 +164,7 @@ def verify_result(
 
     **Arguments:**
 
-    - `result`: the folder of the result, its `result.json`, or what `read_result` returns.
+    - `result`: the folder of the result, its `result.json`, or what `load_result` returns.
     - `path`: the other log.
     - `changes`: settings that differ for this log (keys of `IdentifySettings`): another channel's
       name, another part, another band. Otherwise its whole time is used, with the channels, the
@@ -173,7 +173,7 @@ def verify_result(
     **Raises:** `UndeterminedError` (a ValueError) for a result without a model, `RecordError` for a
     log that cannot be used.
     """
-    stored = result if isinstance(result, StoredResult) else read_result(result)
+    stored = result if isinstance(result, StoredResult) else load_result(result)
     whole = {"start": None, "stop": None, "segments": (), "reference": None}
     settings = dataclasses.replace(stored.settings, **whole, band=None, band_rad=stored.band)
     changed = settings.changed(changes or {})

@@ -17,6 +17,7 @@ from jaxquad.records import Record
 from jaxquad.report import provenance, write_json, write_report
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
 from jaxquad.tuning import (
+    describe_controller,
     KNOWN_INERTIA,
     Limit,
     Objective,
@@ -47,11 +48,13 @@ class Tuning:
     - `identification`: the axis.
     - `settings`: those that were used.
     - `tuned`: controller, gains and certificate.
+    - `dt`: the sample interval of the controller in s.
     """
 
     identification: Identification
     settings: TuneSettings
     tuned: Tuned
+    dt: float
 
     def content(self) -> dict[str, object]:
         """Gains, certificate and settings, for JSON."""
@@ -61,6 +64,7 @@ class Tuning:
             "holds": tuned.holds,
             "verdicts": [each._asdict() for each in tuned.verdicts],
             "values": tuned.values,
+            "controller": describe_controller(tuned.controller) | {"dt": self.dt},
             "cost": tuned.cost,
             "converged": tuned.converged,
             "bounds": [each._asdict() for each in tuned.bounds],
@@ -136,7 +140,7 @@ def tune(
     record = found.records[0]
     _check_unit(record)
     dt = record.dt if settings.dt is None else settings.dt
-    return Tuning(found, settings, _tuned(found, dt, settings, progress))
+    return Tuning(found, settings, _tuned(found, dt, settings, progress), dt)
 
 
 def _check_unit(record: Record) -> None:

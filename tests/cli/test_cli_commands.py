@@ -242,6 +242,9 @@ def test_a_result_becomes_gains_with_a_certificate(demo, tmp_path, capsys):
     assert {"ladrc.wc", "ladrc.wo"} <= {name.partition("[")[0] for name in printed["values"]}
     assert printed["settings"]["inertia"] == 0.01
     assert json.loads((tmp_path / "tuned.json").read_text())["values"] == printed["values"]
+    stored = jq.workflows.load_tuning(tmp_path)
+    assert stored.values == printed["values"]
+    assert float(stored.controller.ladrc.wc) == pytest.approx(printed["values"]["ladrc.wc"])
     assert "attitude" in (tmp_path / "attitude.h").read_text()
     page = (tmp_path / "report.html").read_text()
     assert "Tuned gains" in page and "SHA-256" in page

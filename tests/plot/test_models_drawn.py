@@ -132,7 +132,8 @@ def test_white_residuals_stay_within_the_bound_of_their_autocorrelation(fit, rec
 
 def test_a_comparison_says_the_fit_of_each_model(record):
     half = jq.LaggedIntegrator(140.0, 0.016, 0.011)
-    top, bottom = jq.plot.compare({"truth": TRUTH, "half": half}, record)
+    panels: Any = jq.plot.compare({"truth": TRUTH, "half": half}, record)
+    top, bottom = panels
     texts = [text.get_text() for text in top.get_legend().get_texts()]
     found = jq.compare({"truth": TRUTH, "half": half}, record).fit_percent
     assert texts == ["measured", *(f"{name}: {value:.1f} %" for name, value in found.items())]
@@ -181,7 +182,7 @@ def test_what_cannot_be_drawn_is_refused_with_what_to_give(record):
         (jq.plot.bode, 3.0, "bode cannot draw loop, a float: give a model with frequency_response"),
         (jq.plot.nyquist, "log.csv", "nyquist cannot draw loop, a str"),
         (jq.plot.step, frf, "joint estimate was measured, but step needs a model"),
-        (jq.plot.pzmap, record, "record was measured, but pzmap needs a model"),
+        (jq.plot.pzmap, record, "flown was measured, but pzmap needs a model"),
         (jq.plot.coherence, TRUTH, "model: a model has no coherence"),
         (jq.plot.bode, [], "bode has nothing to draw"),
     ):
@@ -203,3 +204,23 @@ def test_the_worst_members_of_a_certificate_fly_again_as_they_flew():
     name = next(text for text in lines(angle) if f"member {worst}" in text)
     drawn = np.asarray(lines(angle)[name].get_ydata())
     np.testing.assert_allclose(drawn, np.degrees(np.asarray(exact.angle)[:, 0, 0]), atol=1e-9)
+
+
+def test_a_flown_loop_is_drawn_by_its_record_as_what_flew():
+    """A closed loop of first order under a square wave, without noise."""
+    time = np.arange(6000) * 0.01
+    wave = np.sign(np.sin(0.9 * time))
+    closed_loop = jq.TransferFunction([1.0], [0.2, 1.0])
+    answer = np.asarray(jq.models.simulate_linear(closed_loop, wave, 0.01))
+    flown = jq.Record(
+        time, wave - answer, answer, wave, output_names="roll", reference_names="stick",
+        output_units="rad/s",
+    )  # fmt: skip
+    [panel] = jq.plot.step(flown, {"designed": closed_loop})
+    assert panel.get_ylabel() == "roll / stick, deg/s" and {"flown", "designed"} <= set(
+        lines(panel)
+    )
+    measured, model = lines(panel)["flown"], lines(panel)["designed"]
+    at = np.asarray(measured.get_xdata())
+    exact = np.interp(at[at > 0.4], model.get_xdata(), model.get_ydata())
+    np.testing.assert_allclose(np.asarray(measured.get_ydata())[at > 0.4], exact, rtol=0.02)

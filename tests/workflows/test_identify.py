@@ -12,7 +12,7 @@ from jaxquad.workflows import (
     identify,
     identify_again,
     IdentifySettings,
-    read_result,
+    load_result,
     verify_result,
 )
 
@@ -60,7 +60,7 @@ def test_numbers_and_figures_are_at_hand_without_a_folder(found):
 
 def test_a_result_is_made_again_from_its_settings(found, folder, log, tmp_path):
     again = identify_again(folder)
-    assert again.settings == found.settings == read_result(folder).settings
+    assert again.settings == found.settings == load_result(folder).settings
     np.testing.assert_array_equal(again.fit.values, found.fit.values)
     moved = tmp_path / "moved.csv"
     moved.write_bytes(log.read_bytes())
@@ -71,7 +71,7 @@ def test_a_result_is_made_again_from_its_settings(found, folder, log, tmp_path):
 
 
 def test_a_stored_model_is_that_of_the_fit(found, folder):
-    stored = read_result(folder / "result.json")
+    stored = load_result(folder / "result.json")
     assert stored.band == pytest.approx(found.band) and stored.doubts == ()
     assert stored.model == found.fit.model
 
@@ -94,7 +94,7 @@ def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
     assert not found.fit.verdict.identifiable and found.combinations == ()
     assert any("jaxquad design sweep" in remedy for remedy in found.fit.verdict.remedies)
     found.write(tmp_path)
-    stored = read_result(tmp_path)
+    stored = load_result(tmp_path)
     assert "not identifiable from this record" in stored.doubts[0]
     with pytest.raises(ValueError, match="the result holds no model: not identifiable"):
         verify_result(stored, noise)
@@ -104,4 +104,4 @@ def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
 def test_a_file_that_is_no_result_is_refused(tmp_path, text):
     (tmp_path / "result.json").write_text(text)
     with pytest.raises(ValueError, match="no result of"):
-        read_result(tmp_path)
+        load_result(tmp_path)
