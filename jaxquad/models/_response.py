@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad._xla import no_fuse, sincos
 
@@ -42,6 +42,21 @@ def inverse(matrix: Split, scales: Scales) -> Split:
     rows, columns = scales
     scaled = Split(*(rows[:, None] * part * columns[None] for part in matrix))
     return Split(*(columns[:, None] * part * rows[None] for part in _invert_in_place(scaled)))
+
+
+def invert(matrix: Complex[Array, "frequencies n n"]) -> Complex[Array, "frequencies n n"]:
+    """The inverse at each frequency, in any units.
+
+    Without LAPACK: two such calls for many matrices that run side by side, which a program's
+    threads share, wait for each other for ever on a machine with two cores.
+    """
+    return no_fuse(_invert, matrix)
+
+
+def _invert(matrix: Complex[Array, "frequencies n n"]) -> Complex[Array, "frequencies n n"]:
+    parts = Split(*(jnp.moveaxis(part(matrix), 0, -1) for part in (jnp.real, jnp.imag)))
+    found = inverse(parts, equilibrium(_size(parts)))
+    return jnp.moveaxis(jax.lax.complex(*found), -1, 0)
 
 
 @inverse.defjvp

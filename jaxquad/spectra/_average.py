@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
+from jaxquad.models import invert
+
 from ._leakage import Rest, Slopes, without_leakage
 
 
@@ -81,7 +83,7 @@ def _inverse(
     matrix: Complex[Array, "frequencies inputs inputs"],
 ) -> Complex[Array, "frequencies inputs inputs"]:
     # One input needs no factorisation, which would double the time to compile.
-    return 1 / matrix if matrix.shape[1] == 1 else jnp.linalg.inv(matrix)
+    return 1 / matrix if matrix.shape[1] == 1 else invert(matrix)
 
 
 def _diagonal(

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jaxquad.models import invert
+
 
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
 _WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well adds nothing
@@ -80,7 +82,7 @@ def _least_squares(
     size = jnp.maximum(jnp.sqrt(jnp.sum(jnp.abs(columns) ** 2, axis=1, keepdims=True)), 1e-300)
     unit = columns / size.astype(columns.dtype)
     ridge = _RIDGE * jnp.eye(unit.shape[2], dtype=unit.dtype)[None]
-    pseudo = jnp.linalg.inv(_adjoint(unit) @ unit + ridge) @ _adjoint(unit)
+    pseudo = invert(_adjoint(unit) @ unit + ridge) @ _adjoint(unit)
     rest, q = left, own
     for _ in range(2):  # the second time for the rounding of nearly dependent columns
         rest, q = rest - unit @ (pseudo @ rest), q - unit @ (pseudo @ q)
