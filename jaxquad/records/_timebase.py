@@ -294,8 +294,9 @@ def _clock_in(arrays: Mapping[str, Signal], name: str) -> tuple[str, int, str]:
     """The struct that a name gives the time of, how good a name it is, and the time base."""
     if found := _CLOCK.fullmatch(name):
         return found[1], _KNOWN.index(found[2]), name
-    found = _SECONDS.fullmatch(name)
-    for partner in _PARTNERS.get(found[2], ()) if found else ():
+    if not (found := _SECONDS.fullmatch(name)):
+        return "", 0, ""
+    for partner in _PARTNERS.get(found[2], ()):
         other = f"{name.removesuffix(found[2])}{partner}"
         if other in arrays:
             return found[1], len(_KNOWN), f"{name}+{other}"

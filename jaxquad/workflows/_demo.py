@@ -44,13 +44,10 @@ def find_demo_flight() -> tuple[Path, IdentifySettings]:
     """
     path = locate(FILES["antx_pitch prbs"])
     field = ".value" if path.suffix == ".mat" else ""  # its publisher's file has structs
-    named = {role: f"{name}{field}" for role, name in _FLIGHT_CHANNELS.items()}
     return path, IdentifySettings(
-        **named, units={f"q{field}": "rad/s"}, rate=250.0, start=50.0, stop=76.0, band=(0.7, 12.0)
-    )
-
-
-_FLIGHT_CHANNELS = {"input": "M", "output": "q", "reference": "x0"}
+        input=f"M{field}", output=f"q{field}", reference=f"x0{field}",
+        units={f"q{field}": "rad/s"}, rate=250.0, start=50.0, stop=76.0, band=(0.7, 12.0),
+    )  # fmt: skip
 
 
 def _simulated(swept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

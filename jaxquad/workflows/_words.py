@@ -38,6 +38,11 @@ _PHRASES = {
     r"fit with a jq\.identify\.Prior or a second record, or ask for a determined combination":
         "fit without one of them (--no-lag, --no-delay), or fly again with more excitation",
     r", or raise global_order": "",
+    r"; or use a larger width: [^;.]*": "",
+    r"start from other values, or leave solver= at its default":
+        "choose another band (--band) or a simpler model (--no-lag, --no-delay)",
+    r"start from other values": "choose another band (--band)",
+    r"as valid=\{[^}]*\}": "as --valid NAME=-20:20",
     r"try other starting values": "try another band (--band), or --no-lag",
     r"Fit\.explain\(\)": "--explain",
     r"jq\.verify\b": "jaxquad verify",

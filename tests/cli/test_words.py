@@ -1,10 +1,21 @@
 """Messages of the library, said in options where the command line shows them."""
 
+import re
+
 import numpy as np
 import pytest
+from package_messages import messages
 
 import jaxquad as jq
 from jaxquad.cli import main
+from jaxquad.workflows import in_options
+
+
+SEEN = re.compile(r"jaxquad/(records|spectra|identify|workflows)/")  # rooms below `identify`
+ARGUMENTS = (
+    "inputs", "outputs", "references", "sample_rate", "units", "time", "time_unit", "dt", "hold",
+    "valid", "max_gap", "start", "stop", "window_length", "cost", "window", "integrators",
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -37,3 +48,35 @@ def test_advice_names_the_option_that_was_typed_for_the_argument(
     assert main(["identify", str(log), "--input", "u", "--output", "y", *words]) == 2
     said = capsys.readouterr().err
     assert option in said and python not in said and "jq." not in said
+
+
+def test_an_argument_that_has_an_option_is_said_as_the_option():
+    texts = [in_options(text) for place, text in messages() if SEEN.match(place)]
+    argument = re.compile(rf"\b({'|'.join(ARGUMENTS)})=(?=[\s),;.:{{]|$)")
+    assert len(texts) > 300 and not [text for text in texts if argument.search(text)]
+
+
+@pytest.mark.parametrize(
+    ("python", "options"),
+    [
+        ("read them with the same sample rate (sample_rate=)", "(--rate)"),
+        ("fit the part of the band where it holds (band=)", "(--band-rad)"),
+        ("give hold= in s, 0 for a quantity (jq.Record, jq.read)", "give --hold in s, 0 for"),
+        ("use a longer window (window_length=), or give the frequencies (omega=)", "(--window)"),
+        ("Use jq.spectra.LocalPolynomial(), or integrators= where", "--integrators where"),
+        ("check the model by jq.verify on another record", "by jaxquad verify on"),
+        ("excite the axis (jq.sweep)", "(jaxquad design sweep)"),
+        ("a model that explains more (Fit.explain() names terms)", "(--explain names terms)"),
+        ("`band` (Hz) and `band_rad` (rad/s)", "--band (Hz) and --band-rad (rad/s)"),
+        ("lag ran to zero: leave it out, or let its sign change with jq.identify.Real('lag')",
+         "leave it out (--no-lag, --no-delay)"),
+    ],
+)  # fmt: skip
+def test_common_advice_in_options(python, options):
+    said = in_options(python)
+    assert options in said and "jq." not in said
+
+
+def test_what_is_no_argument_stays():
+    text = "gain = 3.1, q=rad/s, F[1][1]=2 and a stick=up; `unknown` stays"
+    assert in_options(text) == text

@@ -1,0 +1,39 @@
+"""Every text that the package can show, collected from its source by AST."""
+
+import ast
+from collections.abc import Iterator
+
+from conftest import ROOT
+
+
+PACKAGE = ROOT / "jaxquad"
+
+
+def messages() -> Iterator[tuple[str, str]]:
+    """Every text of four words or more that is neither a docstring nor an annotation."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        silent = {id(node) for each in ast.walk(tree) for node in _silent(each)}
+        for node in ast.walk(tree):
+            text = "" if id(node) in silent else _text(node)
+            if isinstance(node, ast.expr) and len(text.split()) >= 4:
+                yield f"{path.relative_to(ROOT)}:{node.lineno}", text
+
+
+def _silent(node: ast.AST) -> Iterator[ast.AST]:
+    """What is not shown: docstrings, annotations (shapes), and the pieces of an f-string."""
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        yield node.value
+    if isinstance(node, ast.Subscript):
+        yield from ast.walk(node.slice)
+    if isinstance(node, ast.JoinedStr):
+        yield from (each for value in node.values for each in ast.walk(value))
+
+
+def _text(node: ast.AST) -> str:
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        parts = [v.value if isinstance(v, ast.Constant) else "X" for v in node.values]
+        return "".join(map(str, parts))
+    return ""
