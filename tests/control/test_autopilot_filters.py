@@ -97,9 +97,10 @@ def test_shares_multiply_and_add_up_to_the_chain():
     product = np.prod([x.response for x in parts], axis=0)
     np.testing.assert_allclose(product, whole.response, rtol=1e-12)
     np.testing.assert_allclose(sum(x.delay_ms for x in parts), whole.delay_ms, rtol=1e-12)
+    freqz: Any = signal.freqz
     expected = np.prod(
         [
-            signal.freqz(np.asarray(above), np.asarray(below), worN=FREQUENCIES, fs=RATE)[1]
+            freqz(np.asarray(above), np.asarray(below), worN=FREQUENCIES, fs=RATE)[1]
             for _, (above, below) in CASES.values()
         ],
         axis=0,

@@ -61,3 +61,11 @@ from ._parameters import (
     with_parameters as with_parameters,
 )
 from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
+from ._thrust_curve import (
+    adrc_b0_law as adrc_b0_law,
+    B0Law as B0Law,
+    motor_command as motor_command,
+    pool_gains as pool_gains,
+    thrust_linear as thrust_linear,
+    ThrustCurve as ThrustCurve,
+)
