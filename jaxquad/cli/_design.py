@@ -1,4 +1,5 @@
 import argparse
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,8 @@ def _add(declared: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--out", type=Path, metavar="CSV", help="by default sweep.csv or multisine.csv"
     )
+    text = "overwrite another signal; without it, that is kept, and CSV-2 written"
+    output.add_argument("--force", action="store_true", help=text)
     add_json(output, "the guidelines")
 
 
@@ -48,9 +51,10 @@ def _run(options: argparse.Namespace) -> int:
         omega_bandwidth=radian(options.bandwidth),
         omega_180=radian(options.phase_crossover),
     )
-    out = options.out or Path(f"{options.kind}.csv")
     rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
-    write_file(out, f"time,signal\n{''.join(rows)}")
+    content = f"time,signal\n{''.join(rows)}"
+    out = _free_file(options, options.out or Path(f"{options.kind}.csv"), content)
+    write_file(out, content)
     if options.json:
         rules = [rule._asdict() for rule in found]
         print_json({"file": str(out), "samples": signal.time.size, "ok": found.ok, "rules": rules})
@@ -59,6 +63,17 @@ def _run(options: argparse.Namespace) -> int:
         band = f"{low:g} to {high:g} Hz ({2 * np.pi * low:.3g} to {2 * np.pi * high:.3g} rad/s)"
         print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {band}\n{found}\n{out}")
     return 0 if found.ok else BELOW_GUIDELINE
+
+
+def _free_file(options: argparse.Namespace, wanted: Path, content: str) -> Path:
+    """The file that is wanted, or one beside it where that holds something else."""
+    numbered = (wanted.with_stem(f"{wanted.stem}-{number}") for number in count(2))
+    files = (
+        path
+        for path in chain([wanted], numbered)
+        if options.force or not path.exists() or path.read_bytes() == content.encode()
+    )
+    return next(files)
 
 
 def _sweep(options: argparse.Namespace) -> "Excitation":

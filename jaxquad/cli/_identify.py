@@ -1,6 +1,7 @@
 """Commands around one log: channels, identify, report, verify and demo."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,6 +55,8 @@ def _channels(options: argparse.Namespace) -> int:
         numbers = (f"{c.rate:.5g}", f"{c.start:.6g}", f"{c.stop:.6g}", f"{c.minimum:.4g}")
         rows.append((c.name, f"{c.samples}", *numbers, f"{c.maximum:.4g}", c.unit))
     print_table(rows)
+    if any(math.isnan(c.rate) for c in found):
+        print("\nnan: no time of that length is known. Name it (--time), or give --dt.")
     return 0
 
 
@@ -63,8 +66,10 @@ CHANNELS = Command(
     """examples:
   jaxquad channels flight.npz
   jaxquad channels table.npy --time "data[0]"
+  jaxquad channels table.csv --dt 0.004
 
-A channel without a known time has no rate: name the channel that holds the time (--time).
+A channel without a known time has no rate: name the channel that holds the time (--time), or give
+the distance of its rows (--dt).
 exit codes: 0 done, 2 unusable input
 """,
     _add_channels,

@@ -172,10 +172,11 @@ def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[s
     if band is None or ladrc is None:
         return []
     rates = {name: float(np.max(np.asarray(vars(ladrc)[name]))) for name in ("wc", "wo")}
+    hertz = f"{band[0] / (2 * np.pi):.3g} to {band[1] / (2 * np.pi):.3g} Hz"
     return [
         f"{name} = {value:.4g} rad/s lies beyond the identified band of {band[0]:.3g} to "
-        f"{band[1]:.3g} rad/s: the design relies on a model that no data support there. Hold "
-        f"{name} at {band[1]:.2g} rad/s or below, or record to higher frequencies"
+        f"{band[1]:.3g} rad/s ({hertz}): the design relies on a model that no data support "
+        f"there. Hold {name} at {band[1]:.2g} rad/s or below, or record to higher frequencies"
         for name, value in rates.items()
         if value > _ROUNDED * band[1]
     ]

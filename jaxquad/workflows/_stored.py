@@ -36,6 +36,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         },
         "settings": found.settings.content(),
         "band_rad_per_s": found.band,
+        "band_hz": [omega / (2 * np.pi) for omega in found.band],
         "derived": [each._asdict() for each in found.combinations],
         "provenance": origin.content(),
         **_content_beside(found),

@@ -26,6 +26,7 @@ _ARGUMENTS = _FLAGS | {  # those of `read`, `frequency_response` and `fit`, whos
 _PHRASES = {
     r",? or build a jq\.Record from its arrays": "",
     r", jq\.records\.channels\b": "",
+    r"name inputs, outputs and references yourself": "name them (--input, --output, --reference)",
     r" \(jq\.Record, jq\.read\)": "",
     r"jq\.read\(\.\.\., sample_rate=\) or jq\.records\.resample": "--rate",
     r" \(estimator=jq\.spectra\.LocalPolynomial\(\)\)": " (without --reference)",

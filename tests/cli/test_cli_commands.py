@@ -106,6 +106,18 @@ def test_an_excitation_is_designed_within_its_band(kind, tmp_path, capsys):
     assert power[inside].sum() > 0.95 * power.sum()
 
 
+def test_another_signal_keeps_its_file(tmp_path, capsys):
+    def written(*more):
+        words = ["design", "sweep", "--band", "0.5", "10", "--rate", "500", "--json", *more]
+        assert main([*words, "--out", str(tmp_path / "s.csv")]) == 0
+        return json.loads(capsys.readouterr().out)["file"]
+
+    one, two = str(tmp_path / "s.csv"), str(tmp_path / "s-2.csv")
+    amplitudes = ["0.2", "0.2", "0.3", "0.3"]
+    assert [written("--amplitude", each) for each in amplitudes] == [one, one, two, two]
+    assert written("--amplitude", "0.3", "--force") == one
+
+
 @pytest.mark.parametrize(
     ("words", "code", "complaint"),
     [
@@ -265,10 +277,17 @@ def test_what_cannot_be_tuned_is_one_line(demo, capsys, more, complaint):
 
 
 @pytest.mark.slow
-def test_an_output_of_unknown_unit_is_refused(demo, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("units", "said"),
+    [
+        ({}, "the unit of q is not known, but gains are for an angle in rad: identify with the"),
+        ({"q": "deg/s"}, "(--output angle=0.017453293*q --unit angle=rad/s)"),
+    ],
+)
+def test_an_output_that_is_not_in_radians_is_refused(demo, tmp_path, capsys, units, said):
     """Gains in the wrong unit would be 57 times too large or too small."""
     content = json.loads((demo / "result.json").read_text())
-    content["settings"]["units"] = {}
+    content["settings"]["units"] = units
     (tmp_path / "result.json").write_text(json.dumps(content))
     assert main(["tune", str(tmp_path), *PLANT]) == 2
-    assert "the unit of q is not known" in capsys.readouterr().err
+    assert said in capsys.readouterr().err

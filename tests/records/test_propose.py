@@ -48,7 +48,7 @@ def test_an_integral_term_that_works_against_the_sweep_is_told(tmp_path):
 
 def test_all_chirps_into_one_place_are_segments_of_the_printed_line(tmp_path):
     proposal = propose(ardupilot(tmp_path, 10, runs=((21, 24, 6.0), (25.5, 30, 8.0))))
-    assert "2 times: 0.5 .. 8 Hz, 2.997 + 4.497 s" in str(proposal)
+    assert "2 times: 0.5 .. 8 Hz (3.14 .. 50.3 rad/s), 2.997 + 4.497 s" in str(proposal)
     assert np.allclose(proposal.segments, [(21, 24), (25.5, 30)], atol=0.01)
     # One record is that of the longest.
     assert proposal.options["start"] == pytest.approx(25.5)

@@ -134,7 +134,10 @@ def with_injections(setup: Setup, runs: Sequence[Injection], what: str) -> Setup
     band = (min(r.low for r in known), max(r.high for r in known)) if known else None
     lasted = " + ".join(f"{run.stop - run.start:.4g}" for run in runs)
     times = f"{len(runs)} times: " if len(runs) > 1 else ""
-    swept = f"{band[0]:.4g} .. {band[1]:.4g} Hz, " if band else ""
+    swept = ""
+    if band:
+        low, high = (2 * np.pi * end for end in band)
+        swept = f"{band[0]:.4g} .. {band[1]:.4g} Hz ({low:.3g} .. {high:.3g} rad/s), "
     return setup._replace(
         start=best.start,
         stop=best.stop,
