@@ -122,7 +122,9 @@ def _with_next_step(state: Descent, tolerance: float) -> Descent:
     size = _relative(change, state.z)
     # Near a minimum each step shrinks as the one before: what is left after the next is known.
     left = size * jnp.clip(size / state.size, _SHRINKING, 1.0)
-    enough = (left <= tolerance) | (predicted <= tolerance**2 * state.normal.cost)
+    # Steps along weak directions start short, because of their damping, and grow with less of it.
+    shrinks = jnp.isfinite(state.size) & (size < state.size)
+    enough = ((left <= tolerance) & shrinks) | (predicted <= tolerance**2 * state.normal.cost)
     # A step that damping has shortened says nothing about the distance to the minimum.
     last = (state.status == RUNNING) & definite & (state.damping <= DAMPING) & enough
     return state._replace(

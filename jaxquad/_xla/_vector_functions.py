@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
+Numbers = Array | np.ndarray  # constants of a traced function are NumPy's
+
 # sin x = x + x^3 (c0 + c1 x^2 + ...) on -pi/2 to pi/2, minimax in the relative error: 3e-19, and
 # 6e-9 in single precision. pi as a sum of terms of so few bits that whole multiples are exact.
 _DOUBLE = (
@@ -33,8 +35,8 @@ _PER_PI = 0.3183098861837907
 
 @jax.custom_jvp
 def sincos(
-    x: Float[Array, "*shape"],
-) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    x: Float[Numbers, "*shape"],
+) -> tuple[Float[Numbers, "*shape"], Float[Numbers, "*shape"]]:
     """Sine and cosine of angles in rad, by short polynomials that a CPU computes 8 at a time.
 
     For loops of many small steps, where the library functions cost several times as much. Within
@@ -53,7 +55,7 @@ def _sincos_jvp(primals, tangents):
     return (sine, cosine), (cosine * dx, -sine * dx)
 
 
-def _near(x: Float[Array, "*shape"], turns: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def _near(x: Float[Numbers, "*shape"], turns: Float[Numbers, "*shape"]) -> Float[Numbers, "*shape"]:
     """The sine of x - turns pi, which is a quarter turn at most."""
     single = x.dtype == jnp.float32
     terms, coefficients = (_PI_SINGLE, _SINGLE) if single else (_PI_DOUBLE, _DOUBLE)
@@ -66,7 +68,7 @@ def _near(x: Float[Array, "*shape"], turns: Float[Array, "*shape"]) -> Float[Arr
     return x + x * series
 
 
-def _sign(turns: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def _sign(turns: Float[Numbers, "*shape"]) -> Float[Numbers, "*shape"]:
     """1 for even numbers, -1 for odd ones."""
     half = 0.5 * turns
     return 1 - 4 * (half - jnp.floor(half))
@@ -92,7 +94,7 @@ _BELOW = (
 _EIGHTH = 0.4142135623730951  # tan(pi / 8)
 
 
-def arctan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def arctan2(y: Float[Numbers, "*shape"], x: Float[Numbers, "*shape"]) -> Float[Numbers, "*shape"]:
     """The angle of (x, y) in rad, within 4e-16 of `jnp.arctan2` in double precision.
 
     0 at the origin and nan where both are infinite; the sign of a zero does not count.
@@ -112,7 +114,7 @@ def arctan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array
     return jnp.where(y < 0, -angle, angle)
 
 
-def _polynomial(coefficients: tuple[float, ...], x: Float[Array, "*s"]) -> Float[Array, "*s"]:
+def _polynomial(coefficients: tuple[float, ...], x: Float[Numbers, "*s"]) -> Float[Numbers, "*s"]:
     value = jnp.full_like(x, coefficients[0])
     for coefficient in coefficients[1:]:
         value = value * x + coefficient

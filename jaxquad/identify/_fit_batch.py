@@ -344,7 +344,7 @@ def fit_batch(
     ones = [np.ones(each.used.shape) for each in data.points]
     weights, mixed = _weights(cost, data, ones), isinstance(cost, MaximumLikelihood)
     # Without a floor on the errors, they do not depend on the weights.
-    mixings = mixings_of(data.points, weights) if mixed else ()
+    mixings = mixings_of(data.points, list(weights)) if mixed else ()
     arrays, options = (data.omega, data.measured), {"hold": data.hold, "max_steps": max_steps}
     found = solve_batch(model, parameters, *arrays, weights, mixings=mixings, **options)
     again = _weights(cost, data, _ratios(model, parameters, data, found))

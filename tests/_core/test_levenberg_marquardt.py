@@ -58,3 +58,19 @@ def test_a_definite_matrix_is_told_from_others():
     solution, definite = solve_definite(jnp.asarray(matrix), jnp.ones((2, 2)))
     np.testing.assert_array_equal(definite, [True, False])
     np.testing.assert_allclose(solution[:, 0], np.linalg.solve(matrix[..., 0], np.ones(2)))
+
+
+def test_a_start_close_to_the_minimum_along_a_weak_direction_is_not_taken_for_it():
+    """The first step is damped: there it is shorter than 1e-8, and the minimum 1e-6 away."""
+    slopes = np.diag([1.0, 1e-3])
+
+    def misfit(z, _):
+        return slopes @ z - 1.0
+
+    def normal(z):
+        return jax.vmap(lambda z: normal_equations(misfit, z, None), in_axes=1, out_axes=-1)(z)
+
+    least = np.linalg.solve(slopes, np.ones(2))
+    found = jax.jit(lambda z: minimise(normal, z, 50))((least + [0.0, 1e-6 * least[1]])[:, None])
+    assert found.status == CONVERGED
+    np.testing.assert_allclose(found.z[:, 0], least, rtol=1e-8)
