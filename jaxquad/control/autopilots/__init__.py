@@ -61,6 +61,13 @@ from ._parameters import (
     with_parameters as with_parameters,
 )
 from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
+from ._reproduce import (
+    check_loop as check_loop,
+    hold_response as hold_response,
+    LoopCheck as LoopCheck,
+    predict_loop as predict_loop,
+    without_gyro_filters as without_gyro_filters,
+)
 from ._thrust_curve import (
     adrc_b0_law as adrc_b0_law,
     B0Law as B0Law,
