@@ -144,8 +144,10 @@ def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -
             f"{np.degrees(error):.2g} deg of phase (median standard error)."
         )
     if fit.verdict.fitted:
+        known = fit.parameter_units or ("",) * len(fit.names)
+        units = [f" {unit}" if unit else "" for unit in known]
         answers += [
-            f"{name}: {fit.values[k]:.4g} \u00b1 {100 * _reach(fit, k):.2g} % (95 %)."
+            f"{name}: {fit.values[k]:.4g}{units[k]} \u00b1 {100 * _reach(fit, k):.2g} % (95 %)."
             for k, name in enumerate(fit.names)
             if fit.determined[k] and _reach(fit, k) <= _LOOSE
         ]

@@ -139,9 +139,11 @@ def fit_headline(fit: Fit, remarks: int) -> Headline:
 
 
 def _numbers(fit: Fit) -> str:
+    units = fit.parameter_units or ("",) * len(fit.names)
+    rows = zip(fit.names, fit.values, fit.standard_errors, units, strict=True)
     shown = [
-        f"{name} = {value:.4g} \u00b1 {1.96 * error:.2g}"
-        for name, value, error in zip(fit.names, fit.values, fit.standard_errors, strict=True)
+        f"{name} = {value:.4g} \u00b1 {1.96 * error:.2g} {unit}".rstrip()
+        for name, value, error, unit in rows
     ]
     more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
     return f"{', '.join(shown[:6])}{more} (95 % intervals)"
