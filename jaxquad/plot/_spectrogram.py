@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from jaxquad.records import Record
 
-from ._labels import few_ticks, raise_powers, unit_label
+from ._labels import few_ticks, raise_powers, short_names, unit_label, visible
 from ._panels import arrange, Given, Panels, stacked
 
 
@@ -62,18 +62,19 @@ def spectrogram(
     longer than the record or shorter than 16 samples.
     """
     name = record.output_names[0] if channel is None else channel
-    scale, unit = unit_label(record.unit(name))
+    scale, unit = unit_label(visible(record.unit(name))[:12])
     samples = _window(record, window)
     found = _over_time(record, scale * record.channel(name), samples)
     label = "time, s"
     if over != "time":
         found = _over_channel(record, found, record.channel(over), samples)
-        other, text = unit_label(record.unit(over))
-        found, label = found._replace(across=other * found.across), f"{over}{text}"
+        other, text = unit_label(visible(record.unit(over))[:12])
+        found = found._replace(across=other * found.across)
+        label = f"{short_names([over])[0]}{text}"
     panels = stacked(1, ax)
     _draw(panels, found, f"dB of ({unit.removeprefix(', ') or 'unit'})^2/Hz")
     panels[0].set_xlabel(label)
-    panels[0].set_title(name, loc="left", fontsize=9, pad=3)
+    panels[0].set_title(short_names([name])[0], loc="left", fontsize=9, pad=3)
     return panels if ax is not None else _with_room(panels, title)
 
 

@@ -14,10 +14,12 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._answers import answer_section
 from ._fit import identifiability_section, parameter_section
+from ._loop import loop_section
 from ._page import Headline, render_page
 from ._provenance import Provenance, provenance_section
 from ._record import check_section, GOOD_TIC, record_section
 from ._response import response_section
+from ._spectrum import spectrum_section
 from ._step import step_section
 
 
@@ -86,15 +88,18 @@ def write_report(
         gains = tuned_section(tuned)
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
-    flown = next(iter(records.values()), None)
+    channels = {*first.input_names, *first.output_names}
+    flown = next((each for each in records.values() if channels <= {*each.names}), None)
     sections = {
-        "answers": answer_section(fit, first, flown, found),
+        "answers": answer_section(fit, first, next(iter(records.values()), None), found),
         "step": None if flown is None else step_section(fit, first, flown),
+        "loop": None if flown is None else loop_section(first, flown),
         "tuned": gains,
         "response": response_section(frfs, models, others or {}),
         "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
         "identifiability": identifiability_section(fit),
         "verification": check_section(found) if found else None,
+        "spectrum": None if flown is None else spectrum_section(first, flown),
         "record": record_section(records) if records else None,
         "provenance": provenance_section(provenance) if provenance is not None else None,
     }

@@ -23,7 +23,8 @@ _ROOM = 2  # times the flight, behind which its transients have ended
 _BEFORE = 0.05  # share of a response's energy before its cause, from which the model is unstable
 _GRID = 512  # frequencies at which a model is evaluated, the number of one program
 _SMALL = 0.1  # of a standard error: a step of a derivative
-_GREY = 40  # windows that are drawn
+_GREY = 20  # windows that are drawn
+_POINTS = 300  # of a curve: as many as its figure has pixels
 
 
 class Prediction(NamedTuple):
@@ -94,7 +95,8 @@ def _driven(
     As many integrators as the response has at low frequencies are taken out of the spectrum, where
     they are infinite, and are done in time.
     """
-    count, size = len(inputs), _ROOM * len(inputs)
+    count = len(inputs)
+    size = 2 ** int(np.ceil(np.log2(_ROOM * count)))  # quick to transform
     omega = 2 * np.pi * np.fft.rfftfreq(size, dt)
     omega[0], omega[-1] = 1e-3 * omega[1], 0.999 * omega[-1]
     grid = np.geomspace(omega[0], omega[-1], _GRID)
@@ -137,13 +139,15 @@ def _figure(record: Record, found: StepResponse, predicted: Prediction | None) -
     figure = Figure(figsize=(5.0, 3.4))
     panel = figure.add_axes((0.14, 0.14, 0.82, 0.72))
     scale, unit = _unit(record, found.names)
+    every = slice(None, None, -(-found.time.size // _POINTS))
+    time = found.time[every]
     for window in found.windows[:_GREY]:
-        panel.plot(found.time, scale * window, color="0.82", lw=0.6, label="_nolegend_")
-    _curve(panel, found.time, scale * found.mean, scale * found.standard_error,
-           ("measured", "0.15", "-"))  # fmt: skip
+        panel.plot(time, scale * window[every], color="0.82", lw=0.6, label="_nolegend_")
+    error = scale * found.standard_error[every]
+    _curve(panel, time, scale * found.mean[every], error, ("measured", "0.15", "-"))
     if predicted is not None:
-        error = None if predicted.error is None else scale * predicted.error
-        _curve(panel, found.time, scale * predicted.mean, error, ("model", "tab:blue", "--"))
+        error = None if predicted.error is None else scale * predicted.error[every]
+        _curve(panel, time, scale * predicted.mean[every], error, ("model", "tab:blue", "--"))
     level = scale * found.final
     panel.axhline(level, color="0.5", lw=0.7, ls=":", label="_nolegend_")
     low, high = np.min(scale * found.mean), np.max(scale * found.mean)

@@ -1,5 +1,10 @@
 """Frequency responses of records, and their random error."""
 
+from ._broken_loop import (
+    BrokenLoop as BrokenLoop,
+    Entry as Entry,
+    estimate_broken_loop as estimate_broken_loop,
+)
 from ._closed_loop import (
     deembed as deembed,
     feedback_bias as feedback_bias,
@@ -19,5 +24,6 @@ from ._estimators import (
     Welch as Welch,
 )
 from ._frequency_response import Distortion as Distortion, FrequencyResponse as FrequencyResponse
+from ._lines import find_line as find_line, SpectralLine as SpectralLine
 from ._remarks import Remark as Remark
 from ._step_response import estimate_step as estimate_step, StepResponse as StepResponse

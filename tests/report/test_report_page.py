@@ -167,7 +167,7 @@ def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
     page, known = read_page(path), read_page(whole)
     assert page.errors == []
     assert {name for name, _ in page.elements} <= {name for name, _ in known.elements}
-    assert len(page.of("img")) == 4 and all(is_image(*each) for each in page.figures())
+    assert len(page.of("img")) == 5 and all(is_image(*each) for each in page.figures())
     assert not re.search(UNSEEN, path.read_bytes().decode())
     shown = page.text("section")
     assert all(name in shown for name in (u, y, unit))
