@@ -1,5 +1,6 @@
 """Numbers and arrays that a user gives: refused at once, by name and with the remedy."""
 
+import functools as ft
 from collections.abc import Callable
 
 import numpy as np
@@ -15,9 +16,14 @@ def is_concrete(x: Value) -> bool:
     """Whether `x` has values to check, which a tracer under jit, vmap or grad has not."""
     if isinstance(x, _PLAIN):
         return True
+    return not isinstance(x, _tracer())
+
+
+@ft.cache
+def _tracer() -> type:
     from jax.core import Tracer  # Designs and lists of channels need no JAX, nor its 0.3 s.
 
-    return not isinstance(x, Tracer)
+    return Tracer
 
 
 def require_vector(name: str, value: Value, length: int) -> None:

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 from jaxtyping import PyTree
 
 from jaxquad._core import is_concrete
@@ -138,8 +140,16 @@ def _known() -> tuple[tuple[str, int], ...]:
 
 def _is_outermost(args: PyTree) -> bool:
     # Within another jit even a constant is traced.
-    arrays = filter(eqx.is_array, (jnp.zeros(()), *jax.tree.leaves(args)))
-    return all(map(is_concrete, arrays))
+    arrays = filter(eqx.is_array, jax.tree.leaves(args))
+    return is_concrete(_probe.bind(_CONSTANT)) and all(map(is_concrete, arrays))
+
+
+_CONSTANT = np.zeros(())
+_probe = Primitive("probe")  # a tenth of the price of the cheapest operation of `jax.numpy`
+_probe.def_impl(lambda x: x)
+_probe.def_abstract_eval(lambda x: x)
+batching.defvectorized(_probe)
+mlir.register_lowering(_probe, lambda ctx, x: [x])
 
 
 def _shapes(args: PyTree) -> tuple:

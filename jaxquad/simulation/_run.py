@@ -53,6 +53,8 @@ def _check_payload(plant: Plant, payload: Float[Array, "samples axes ..."]) -> N
 
 def _check_numbers(name: str, part: Float[Array, "samples axes ..."]) -> None:
     finite = np.isfinite(np.asarray(part))
+    if finite.all():
+        return
     bad = np.flatnonzero(~finite.all(axis=tuple(range(1, part.ndim))))
     if bad.size:
         raise ValueError(

@@ -1,3 +1,4 @@
+import functools as ft
 import math
 
 import equinox as eqx
@@ -134,7 +135,7 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     run, places = placed(loop, scenario, devices)
     ((angle, *others), diverged), authority = gathered(_run(*run, places))
     warn_beyond_authority(authority, scenario)
-    time = jax.device_put((loop.dt * np.arange(angle.shape[0])).astype(angle.dtype))
+    time = _times(loop.dt, angle.shape[0], angle.dtype)
     measurement, command, saturated, signals = others
     return Simulation(
         time=time,
@@ -148,6 +149,12 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
         dt=loop.dt,
         authority=authority,
     )
+
+
+@ft.lru_cache(maxsize=8)
+def _times(dt: float, samples: int, dtype: np.dtype) -> Float[Array, " samples"]:
+    with jax.ensure_compile_time_eval():  # a traced array would not outlive its trace
+        return jax.device_put((dt * np.arange(samples)).astype(dtype))
 
 
 @Jit
