@@ -22,11 +22,20 @@ _INDEPENDENT = 1e-8  # smallest singular value of the columns of B, beside the l
 class HasMatrices(Protocol):
     """A state space of python-control or scipy.signal."""
 
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
-    dt: float | int | bool | None
+    @property
+    def A(self) -> np.ndarray: ...
+
+    @property
+    def B(self) -> np.ndarray: ...
+
+    @property
+    def C(self) -> np.ndarray: ...
+
+    @property
+    def D(self) -> np.ndarray: ...
+
+    @property
+    def dt(self) -> float | int | bool | None: ...  # s; None or 0 where it is continuous
 
 
 def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | StateSpace:
@@ -88,7 +97,7 @@ def _pairs(
             )
     from scipy.linalg import block_diag
 
-    A = block_diag(*(part[0] for part in parts))
+    A = np.asarray(block_diag(*(part[0] for part in parts)))
     B = np.concatenate([part[1] for part in parts])
     return _with_passage(A, B, np.concatenate([part[2] for part in parts], axis=1), D)
 

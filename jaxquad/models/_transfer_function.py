@@ -33,9 +33,14 @@ if TYPE_CHECKING:
 class HasCoefficients(Protocol):
     """A transfer function of python-control (outputs per inputs) or of scipy.signal (one pair)."""
 
-    num: Sequence | np.ndarray
-    den: Sequence | np.ndarray
-    dt: float | int | bool | None  # s; None or 0 where it is continuous
+    @property
+    def num(self) -> Sequence | np.ndarray: ...
+
+    @property
+    def den(self) -> Sequence | np.ndarray: ...
+
+    @property
+    def dt(self) -> float | int | bool | None: ...  # s; None or 0 where it is continuous
 
 
 def coefficients_of(
@@ -120,9 +125,9 @@ class TransferFunction(eqx.Module):
         denominator: ArrayLike | Sequence | None = None,
         delay: ArrayLike = 0.0,
     ):
-        if denominator is None:
-            numerator, denominator = _one_pair(numerator)
-        self.numerator, self.denominator, self.delay = numerator, denominator, delay
+        above, below = _coefficients(numerator, denominator)
+        self.numerator, self.denominator = as_float(above), as_float(below)
+        self.delay = as_float(delay)
 
     def __check_init__(self):
         above, below = self.numerator.size, self.denominator.size
@@ -197,14 +202,23 @@ class TransferFunction(eqx.Module):
         return np.roots(np.asarray(self.numerator))
 
 
-def _one_pair(
-    system: ArrayLike | Sequence | HasCoefficients,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of a system that stands in the place of a numerator."""
+Coefficients = ArrayLike | Sequence
+
+
+def _coefficients(
+    system: Coefficients | HasCoefficients, denominator: Coefficients | None
+) -> tuple[Coefficients, Coefficients]:
+    """Numerator and denominator, also of a system in the place of a numerator."""
     if not isinstance(system, HasCoefficients):
+        if denominator is not None:
+            return system, denominator
         raise ValueError(
             "TransferFunction has a numerator and no denominator: give both, or a transfer "
             "function of python-control or scipy.signal."
+        )
+    if denominator is not None:
+        raise ValueError(
+            f"TransferFunction has a {type(system).__name__} and a denominator: leave one out."
         )
     require_continuous(system.dt)
     above, below = coefficients_of(system)

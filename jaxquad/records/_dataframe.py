@@ -95,7 +95,8 @@ def _stamps(
         )
     if found and found[0] not in frame.columns:
         raise RecordError(f"time: {unknown_name(found[0], map(str, frame.columns))}")
-    label, series = (found[0], frame[found[0]]) if found else ("the index", frame.index.to_series())
+    label = found[0] if found else "the index"
+    series = _column(frame, label) if found else frame.index.to_series()
     seconds = _dates(series, unit)
     if seconds is not None:
         return seconds
@@ -123,7 +124,16 @@ def _dates(series: "pandas.Series", unit: TimeUnit | None) -> np.ndarray | None:
 def _values(frame: "pandas.DataFrame", name: str) -> Float[np.ndarray, " samples"]:
     if name not in frame.columns:
         raise ReadError(unknown_name(name, map(str, frame.columns)))
-    return _numbers(name, frame[name])
+    return _numbers(name, _column(frame, name))
+
+
+def _column(frame: "pandas.DataFrame", name: str) -> "pandas.Series":
+    from pandas import Series
+
+    column = frame[name]
+    if not isinstance(column, Series):
+        raise RecordError(f"the table has several columns {name!r}: give each its own name.")
+    return column
 
 
 def _numbers(label: str, series: "pandas.Series") -> Float[np.ndarray, " samples"]:

@@ -74,7 +74,8 @@ def test_a_model_with_mass_accelerations_and_scipy_in_between():
     )
     system = model.to_scipy()
     assert_equal_responses(response(system), model.frequency_response(OMEGA), 1e-12)
-    assert_equal_responses(from_control(system).frequency_response(OMEGA), response(system), 1e-12)
+    back = from_control(system)  # pyright: ignore[reportArgumentType]
+    assert_equal_responses(back.frequency_response(OMEGA), response(system), 1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 3, 6])
@@ -85,8 +86,7 @@ def test_a_delay_becomes_the_approximation_of_python_control(order):
 
 
 def test_each_delay_of_a_state_space_is_approximated_on_its_channel():
-    delays = {"input_delay": [0.02, 0.0], "output_delay": [0.0, 0.05]}
-    model = jq.StateSpace(A, B, C, **delays)
+    model = jq.StateSpace(A, B, C, input_delay=[0.02, 0.0], output_delay=[0.0, 0.05])
     late = np.add.outer([0.0, 0.05], [0.02, 0.0])
     slow = OMEGA < 2.9 / 0.07
     wanted = np.asarray(model.frequency_response(OMEGA))
@@ -119,6 +119,11 @@ def test_the_refusal_of_a_delay_says_up_to_where_an_approximation_holds():
 def test_what_is_no_transfer_function_of_one_pair_is_refused(system, message):
     with pytest.raises(ValueError, match=message):
         jq.TransferFunction(system)
+
+
+def test_a_system_and_a_denominator_at_once_are_refused():
+    with pytest.raises(ValueError, match="leave one out"):
+        jq.TransferFunction(control.tf([1.0], [1.0, 2.0]), [1.0, 2.0])
 
 
 def test_a_sampled_state_space_is_refused():

@@ -1,5 +1,7 @@
 """Records from and to pandas and MATLAB's iddata: what goes out comes back, bit by bit."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
@@ -50,7 +52,7 @@ def test_a_record_goes_to_a_table_and_back(pandas):
 def test_time_stamps_are_found_in_a_column_or_the_index(pandas, kind):
     frame = pandas.DataFrame({"M": U[:, 0], "q": Y[:, 1]})
     dates = pandas.to_datetime(np.round(TIME * 1e9).astype(np.int64), unit="ns")
-    options = {}
+    options: dict[str, Any] = {}
     if kind == "index":
         frame.index = pandas.Index(TIME)
     elif kind == "column":
@@ -97,6 +99,12 @@ def test_tables_that_do_not_say_enough_are_refused(pandas, change, options, mess
     frame = pandas.DataFrame({"M": U[:, 0], "q": Y[:, 1]}).assign(**change)
     with pytest.raises(RecordError, match=message):
         jq.Record.from_dataframe(frame, **options)
+
+
+def test_columns_of_one_name_are_refused(pandas):
+    frame = pandas.DataFrame(np.column_stack([TIME, U[:, 0], Y]), columns=["t", "M", "q", "q"])
+    with pytest.raises(RecordError, match="several columns 'q'"):
+        jq.Record.from_dataframe(frame, inputs="M", outputs="q")
 
 
 def test_a_record_goes_to_the_fields_of_iddata_and_back(tmp_path):
