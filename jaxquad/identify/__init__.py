@@ -22,6 +22,11 @@ from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from ._fit_remarks import MISFIT as MISFIT
+from ._gain_over_throttle import (
+    gain_over_throttle as gain_over_throttle,
+    KnownFilter as KnownFilter,
+    ThrottledIntegrator as ThrottledIntegrator,
+)
 from ._half_bands import Bands as Bands
 from ._held import as_sampled as as_sampled
 from ._known_loop import (
@@ -64,6 +69,12 @@ from ._starts import (
     Minimum as Minimum,
     solve_from_many as solve_from_many,
     spread_starts as spread_starts,
+)
+from ._thrust_curve import (
+    FirmwareValue as FirmwareValue,
+    GainBand as GainBand,
+    GainOverThrottle as GainOverThrottle,
+    ScaledB0 as ScaledB0,
 )
 from ._transfer_function_fit import fit_transfer_function as fit_transfer_function
 from ._transfer_function_guess import guess_transfer_function as guess_transfer_function

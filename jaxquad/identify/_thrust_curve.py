@@ -1,0 +1,426 @@
+"""The thrust curve t = f x^2 + (1 - f) x: gain, firmware parameters and b0 that follow from it."""
+
+from collections.abc import Callable, Mapping
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from jaxquad._core import plain_content
+
+from ._result import Fit
+from ._verdict import Combination, reach_of_interval, UndeterminedError
+
+
+Levels = Float[np.ndarray, " levels"]
+Firmware = Literal["px4", "ardupilot", "betaflight", "betaflight 2025.12"]
+_PARAMETERS: Mapping[str, tuple[str, float, float, float]] = {  # name, factor on f, least, most
+    "px4": ("THR_MDL_FAC", 1.0, 0.0, 1.0),
+    "ardupilot": ("MOT_THST_EXPO", 1.0, -1.0, 1.0),
+    "betaflight": ("thrust_linear", 100.0, 0.0, 150.0),
+    "betaflight 2025.12": ("thrust_linear", 100.0, 0.0, 150.0),
+}
+_LAWS: Mapping[str, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
+_SHARP = 0.2  # half of the 95 % interval of f below which a firmware's parameter is given
+_DEGREES = {"deg/s": 1.0, "rad/s": 180 / np.pi}
+
+
+def actuator(throttle: Float[ArrayLike, "..."], curve: float) -> Float[np.ndarray, "..."]:
+    """The motor's command x, 0 to 1, of a firmware that inverts t = curve x^2 + (1 - curve) x."""
+    t = np.asarray(throttle, float)
+    if curve == 0:
+        return t
+    half = (1 - curve) / (2 * curve)
+    return np.asarray(-half + np.sign(curve) * np.sqrt(half**2 + t / curve))
+
+
+def relative_slope(
+    throttle: Float[ArrayLike, "..."], curve: float, flown: float
+) -> Float[np.ndarray, "..."]:
+    """The gain over the throttle, relative to that of the `flown` curve being right."""
+    x = actuator(throttle, flown)
+    return np.asarray((1 - curve + 2 * curve * x) / (1 - flown + 2 * flown * x))
+
+
+class FirmwareValue(NamedTuple):
+    """A parameter of a firmware that straightens the thrust curve, with its 95 % interval."""
+
+    name: str
+    value: float  # within the documented range
+    standard_error: float
+    interval: tuple[float, float]  # not cut to the range
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.name} {self.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
+
+
+class ScaledB0(NamedTuple):
+    """b0 at hover for Betaflight's proposed ADRC, and the law by which it follows the throttle.
+
+    `deviations` says how far each law is from the measured b0 over the throttles that were flown,
+    at most and relative; `law` is the nearest.
+    """
+
+    hover: float  # throttle, 0 to 1
+    b0: Combination  # at hover, deg/s^3 per unit of command
+    law: str
+    deviations: Mapping[str, float]
+    extrapolated: bool  # hover lies outside of what was flown
+
+    def __str__(self) -> str:
+        low, high = self.b0.interval
+        others = ", ".join(f"{law} {100 * far:.0f} %" for law, far in self.deviations.items())
+        where = ", outside of what was flown" if self.extrapolated else ""
+        return (
+            f"b0 {self.b0.value:.0f} deg/s^3 (95 %: {low:.0f} .. {high:.0f}) at {self.hover:.2f} "
+            f"throttle{where}; law {self.law} (off by at most: {others})"
+        )
+
+
+class GainBand(NamedTuple):
+    """A quantity over the throttle with its 95 % band, for figures."""
+
+    throttle: Float[np.ndarray, " points"]  # 0 to 1
+    value: Float[np.ndarray, " points"]
+    low: Float[np.ndarray, " points"]
+    high: Float[np.ndarray, " points"]
+
+
+class _Line(NamedTuple):
+    """The gain at a compensated throttle, a + b x by generalised least squares."""
+
+    ends: Float[np.ndarray, "2"]  # a, b
+    weights: Float[np.ndarray, "2 levels"]  # (a, b) is this times the gains
+    misfit: float  # chi^2
+    probability: float  # that the family has a larger one
+
+
+class GainOverThrottle(eqx.Module):
+    """K of K e^(-delay s) / (s (lag s + 1)) at each level of throttle, and the curve through them.
+
+    `str()` is a table with the firmwares' parameters; where the record holds too little of the
+    curve it says what to fly. The numbers are those of `fit`, a `jq.identify.Fit` of all levels
+    together: parameters `gain[0]`, ..., `lag` and `delay`. Gains are in the output's unit per s,
+    per unit of input.
+    """
+
+    throttle: Levels  # mean of each level, 0 to 1
+    low: Levels  # of the throttle within the level
+    high: Levels
+    seconds: Levels  # flown at each level
+    fit: Fit
+    flown: float = eqx.field(static=True)  # curve that the firmware inverted during the flight
+    input_unit: str = eqx.field(static=True)
+    output_unit: str = eqx.field(static=True)
+    remarks: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def gain(self) -> Levels:
+        """At each level."""
+        return np.asarray(self.fit.values)[: self.throttle.size]
+
+    @property
+    def gain_errors(self) -> Levels:
+        """Standard errors of `gain`."""
+        return np.asarray(self.fit.standard_errors)[: self.throttle.size]
+
+    def b0(self, level: int) -> Combination:
+        """gain / lag at one level, in the output's unit per s^2 and unit of input.
+
+        **Raises:**
+
+        - `UndeterminedError`: the record does not tell the lag from the delay.
+        """
+        self._require_lag()
+        name = f"b0 at {self.throttle[level]:.2f}"
+        return self.fit.derived(lambda model: model.gain[level] / model.lag, name)
+
+    @property
+    def curve(self) -> Combination | None:
+        """f of the thrust curve t = f x^2 + (1 - f) x; None with fewer than two levels."""
+        line = self._line()
+        if line is None:
+            return None
+        (a, b), total = line.ends, line.ends[0] + line.ends[1] / 2
+        slope = np.array([-b / 2, a / 2]) / total**2
+        return self._by_law("f", float(b / 2 / total), slope @ line.weights, 0.0)
+
+    def over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
+        """The gain by the thrust curve, at any throttle.
+
+        **Raises:**
+
+        - `UndeterminedError`: fewer than two levels were flown.
+        """
+        return self._band(throttle, self._gain_at)
+
+    def b0_over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
+        """gain / lag by the thrust curve, at any throttle; as `b0`.
+
+        **Raises:**
+
+        - `UndeterminedError`: as `over`, and as `b0`.
+        """
+        self._require_lag()
+        return self._band(throttle, self._b0_at)
+
+    def firmware_value(self, firmware: Firmware) -> FirmwareValue:
+        """The parameter with which a firmware makes the gain the same at every throttle.
+
+        **Arguments:**
+
+        - `firmware`: `"px4"` (THR_MDL_FAC), `"ardupilot"` (MOT_THST_EXPO), `"betaflight"`
+            (thrust_linear from 2026.6 on) or `"betaflight 2025.12"`, whose thrust_linear
+            t (1 + e (1 - t)^2) is fitted to the inverse curve by least squares over 0 to 1.
+
+        **Raises:**
+
+        - `UndeterminedError`: the record holds too little of the curve; says what to fly.
+        - `ValueError`: for another firmware.
+        """
+        if firmware not in _PARAMETERS:
+            raise ValueError(f"firmware is {firmware!r}: use one of {', '.join(_PARAMETERS)}")
+        name, factor, least, most = _PARAMETERS[firmware]
+        curve = self.curve
+        if curve is None or _reach(curve) > _SHARP:
+            raise UndeterminedError(f"{name}: {self.what_to_fly()}")
+        convert = _cubic if firmware == "betaflight 2025.12" else _same
+        slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
+        value, error = factor * convert(curve.value), factor * abs(slope) * curve.standard_error
+        reach = reach_of_interval(curve.degrees_of_freedom) * error
+        kept = float(np.clip(value, least, most))
+        return FirmwareValue(name, kept, error, (value - reach, value + reach))
+
+    def adrc_b0(self, hover: float, *, largest: float = 3.0) -> ScaledB0:
+        """adrc_b0 and the law over the throttle of Betaflight's proposed ADRC.
+
+        **Arguments:**
+
+        - `hover`: adrc_hover_throttle, 0 to 1.
+        - `largest`: adrc_b0_scale_max; the least is 1, as adrc_b0_scale_min is by default.
+
+        **Raises:**
+
+        - `UndeterminedError`: as `b0_over`.
+        - `ValueError`: the output's unit is neither deg/s nor rad/s, or `hover` not within 0 to 1.
+        """
+        if self.output_unit not in _DEGREES:
+            raise ValueError(
+                f"the output's unit is {self.output_unit or 'unknown'}: adrc_b0 needs deg/s or "
+                "rad/s; give the record output_units="
+            )
+        if not 0 < hover <= 1:
+            raise ValueError(f"hover is {hover}: give the throttle at hover, above 0 and up to 1")
+        self._require_lag()
+        factor = _DEGREES[self.output_unit]
+        value, error, freedom = self._b0_at(hover)[1:]
+        b0 = Combination("b0", factor * value, factor * error, freedom)
+        grid = np.linspace(self.low.min(), self.high.max(), 41)
+        measured = self.b0_over(grid).value / value
+        scales = {law: np.clip((grid / hover) ** p, 1.0, largest) for law, p in _LAWS.items()}
+        far = {law: float(np.max(np.abs(each / measured - 1))) for law, each in scales.items()}
+        outside = not self.low.min() <= hover <= self.high.max()
+        return ScaledB0(hover, b0, min(far, key=lambda law: far[law]), far, outside)
+
+    def what_to_fly(self) -> str:
+        """In words: whether the record holds enough of the thrust curve, and what to fly if not."""
+        seconds = float(np.median(self.seconds))
+        first, last = float(self.throttle[0]), float(self.throttle[-1])
+        fly = f"with the same excitation for {seconds:.0f} s at each"
+        curve = self.curve
+        if curve is None:
+            lower, upper = _around(first, 0.3)
+            return (
+                f"the log holds one level of throttle ({first:.2f}), which shows no curve: fly "
+                f"{lower:.2f} and {upper:.2f} as well, {fly}"
+            )
+        reach = _reach(curve)
+        if reach <= _SHARP:
+            return f"the log holds enough of the thrust curve ({first:.2f} .. {last:.2f} throttle)"
+        wanted = (last - first) * reach / _SHARP
+        if wanted <= 0.6:
+            lower, upper = _around((first + last) / 2, wanted)
+            advice = f"fly from {lower:.2f} to {upper:.2f}, {fly} level"
+        else:
+            advice = (
+                f"fly from 0.20 to 0.80, with {wanted / 0.6:.1f} times the amplitude or "
+                f"{(wanted / 0.6) ** 2:.1f} times as long"
+            )
+        return (
+            f"the log holds too little of the thrust curve: {first:.2f} .. {last:.2f} throttle give"
+            f" f = {curve.value:.2f} +- {reach:.2f} (95 %); {advice}"
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """All numbers as JSON holds them: None for what is not finite or not determined."""
+        curve, line = self.curve, self._line()
+        levels = [
+            {
+                "throttle": self.throttle[k],
+                "range": [self.low[k], self.high[k]],
+                "seconds": self.seconds[k],
+                "gain": self.gain[k],
+                "gain_standard_error": self.gain_errors[k],
+                "gain_interval_95": self.fit.interval(f"gain[{k}]"),
+                "b0": _content(self.b0(k)) if self._knows_lag else None,
+            }
+            for k in range(self.throttle.size)
+        ]
+        found = {
+            "input_unit": self.input_unit,
+            "output_unit": self.output_unit,
+            "levels": levels,
+            "curve": None if curve is None else _content(curve),
+            "curve_flown": self.flown,
+            "probability_of_curve": None if line is None else line.probability,
+            "firmware": [_content_of(each) for each in self._firmware_values()],
+            "advice": self.what_to_fly(),
+            "fit": self.fit.to_dict(),
+            "remarks": self.remarks,
+        }
+        return plain_content(found)
+
+    def __str__(self) -> str:
+        parts = [f"gain over throttle: {self.throttle.size} levels, {self._times()}"]
+        per = f"{self.output_unit or 'output'} per s, per {self.input_unit or 'unit of input'}"
+        parts.append(f"{'throttle':>8} {'from':>5} {'to':>5} {'s':>6} {'K':>10} {'+- 95 %':>9}"
+                     f" {'K/lag':>10} {'+- 95 %':>9}   [K in {per}]")  # fmt: skip
+        for k, row in enumerate(zip(self.throttle, self.low, self.high, self.seconds, strict=True)):
+            middle, low, high, seconds = row
+            reach = self.fit.interval(f"gain[{k}]")[1] - self.gain[k]
+            cells = f"{middle:8.3f} {low:5.2f} {high:5.2f} {seconds:6.1f} {self.gain[k]:10.5g} "
+            b0 = self.b0(k) if self._knows_lag else None
+            end = f"{'-':>10} {'-':>9}" if b0 is None else f"{b0.value:10.5g} {_reach(b0):9.2g}"
+            parts.append(f"{cells}{reach:9.2g} {end}")
+        return "\n".join(parts + self._curve_in_words() + [f"! {each}" for each in self.remarks])
+
+    def _times(self) -> str:
+        if not self._knows_lag:
+            both = [str(each) for each in self.fit.combinations]
+            return "lag and delay not told apart" + (f" ({both[0]})" if both else "")
+        lag, delay = (_half(*self.fit.interval(name)) for name in ("lag", "delay"))
+        return (
+            f"lag {1e3 * self.fit['lag']:.2f} +- {1e3 * lag:.2g} ms, "
+            f"delay {1e3 * self.fit['delay']:.2f} +- {1e3 * delay:.2g} ms (95 %)"
+        )
+
+    def _curve_in_words(self) -> list[str]:
+        curve, line = self.curve, self._line()
+        values = [str(each) for each in self._firmware_values()]
+        words = []
+        if curve is not None:
+            words.append(f"thrust curve t = f x^2 + (1 - f) x: {curve}")
+        if line is not None and line.probability < 0.05:
+            words.append(
+                f"! the curve does not pass through the gains within their errors (probability "
+                f"{100 * line.probability:.2g} %): its errors are widened by the misfit"
+            )
+        return words + [self.what_to_fly(), *values]
+
+    def _firmware_values(self) -> list[FirmwareValue]:
+        curve = self.curve
+        if curve is None or _reach(curve) > _SHARP:
+            return []
+        return [self.firmware_value(each) for each in ("px4", "ardupilot", "betaflight")]
+
+    def _line(self) -> _Line | None:
+        n = self.throttle.size
+        if n < 2 or np.ptp(self.throttle) < 0.02 or not np.all(self.fit.determined[:n]):
+            return None
+        from scipy.special import chdtrc
+
+        x = actuator(self.throttle, self.flown)
+        scale = 1 - self.flown + 2 * self.flown * x
+        gains = self.gain * scale
+        covariance = np.asarray(self.fit.covariance)[:n, :n] * np.outer(scale, scale)
+        columns = np.stack([np.ones(n), x], axis=1)
+        known = np.linalg.solve(covariance, columns)
+        gather = np.linalg.solve(columns.T @ known, known.T)
+        ends = gather @ gains
+        rest = gains - columns @ ends
+        misfit = float(rest @ np.linalg.solve(covariance, rest))
+        probability = float(chdtrc(n - 2, misfit)) if n > 2 else 1.0
+        return _Line(ends, gather * scale, misfit, probability)
+
+    def _by_law(self, name: str, value: float, by_gain: Levels, by_lag: float) -> Combination:
+        """By the covariance of all parameters, widened where the law itself does not fit."""
+        line, n = self._line(), self.throttle.size
+        slope = np.concatenate([by_gain, [by_lag, 0.0]]) * self.fit.units
+        error = float(np.sqrt(slope @ self.fit.relative_covariance @ slope))
+        if line is not None and line.probability < 0.05:
+            error *= float(np.sqrt(line.misfit / (n - 2)))
+        return Combination(name, value, error, self.fit.freedom_of(slope))
+
+    def _gain_at(self, throttle: float) -> Combination:
+        line = self._line()
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
+        x = float(actuator(throttle, self.flown))
+        row = np.array([1.0, x]) / (1 - self.flown + 2 * self.flown * x)
+        return self._by_law("gain", float(row @ line.ends), row @ line.weights, 0.0)
+
+    def _b0_at(self, throttle: float) -> Combination:
+        line, lag = self._line(), self.fit["lag"]
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
+        x = float(actuator(throttle, self.flown))
+        row = np.array([1.0, x]) / (1 - self.flown + 2 * self.flown * x)
+        gain = float(row @ line.ends)
+        return self._by_law("b0", gain / lag, row @ line.weights / lag, -gain / lag**2)
+
+    def _band(
+        self, throttle: Float[ArrayLike, " points"], at: Callable[[float], Combination]
+    ) -> GainBand:
+        grid = np.atleast_1d(np.asarray(throttle, float))
+        found = [at(float(each)) for each in grid]
+        low, high = np.array([each.interval for each in found]).T
+        return GainBand(grid, np.array([each.value for each in found]), low, high)
+
+    @property
+    def _knows_lag(self) -> bool:
+        return "lag" not in self.fit.verdict.undetermined and self.fit["lag"] > 0
+
+    def _require_lag(self) -> None:
+        if not self._knows_lag:
+            raise UndeterminedError(
+                "b0 = gain / lag: the record does not tell the motors' lag from the delay. Excite "
+                "up to three times the motors' corner 1/lag, usually to 30 Hz"
+            )
+
+
+def _around(middle: float, span: float) -> tuple[float, float]:
+    """A range of throttle of this span that can be flown."""
+    lower = float(np.clip(middle - span / 2, 0.15, 0.85 - min(span, 0.7)))
+    return lower, min(lower + span, 0.85)
+
+
+def _half(low: float, high: float) -> float:
+    return (high - low) / 2
+
+
+def _reach(found: Combination) -> float:
+    """Half of the 95 % interval."""
+    return _half(*found.interval)
+
+
+def _same(curve: float) -> float:
+    return curve
+
+
+def _cubic(curve: float) -> float:
+    """e of t (1 + e (1 - t)^2) nearest to the inverse of the thrust curve."""
+    t = (np.arange(1000) + 0.5) / 1000
+    shape = t * (1 - t) ** 2
+    return float(shape @ (actuator(t, curve) - t) / (shape @ shape))
+
+
+def _content(found: Combination) -> dict[str, object]:
+    return {**found._asdict(), "interval_95": found.interval}
+
+
+def _content_of(value: FirmwareValue) -> dict[str, object]:
+    kept: dict[str, object] = dict(value._asdict())
+    kept["interval_95"] = kept.pop("interval")
+    return kept
