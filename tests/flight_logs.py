@@ -1,5 +1,6 @@
 """Whole logs of flights that were made, for the tests: a chirp or autotune from 22 to 30 s."""
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,11 @@ IN_RUN = (TIME >= 22) & (TIME < 30)
 WAVE = np.sin(5 * TIME)
 
 
-def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),)):
-    """A log with chirps of 0.5 Hz up to so many, from and to so many seconds."""
+def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),), changes=()):
+    """A log with chirps of 0.5 Hz up to so many, from and to so many seconds.
+
+    `changes` are pairs of a time in s and a value of ATC_RAT_RLL_P, which begins at 0.135.
+    """
     log = DataFlash()
     log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
     log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
@@ -24,12 +28,17 @@ def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),)):
     )  # fmt: skip
     log.write("PARM", 0, b"SID_AXIS", float(place))
     log.write("PARM", 0, b"ATC_RAT_PIT_I", float(gain))
+    log.write("PARM", 0, b"ATC_RAT_RLL_P", 0.135)
     for k, t in enumerate(np.round(TIME * 1e6).astype(int).tolist()):
         run = next((run for run in runs if run[0] <= TIME[k] < run[1]), None)
         if sidd and run:
             if TIME[k - 1] < run[0]:
                 log.write("SIDS", t - 10, place, 0.2, 0.5, run[2])
             log.write("SIDD", t, CHIRP[k], 1.0)
+        for when, value in changes:
+            if TIME[k - 1] < when <= TIME[k]:
+                log.write("PARM", t, b"ATC_RAT_RLL_P", value)
+                log.write("PARM", t, b"LOG_BITMASK", 1e3 * value)
         w = float(WAVE[k])
         log.write("RATE", t + 30, w, 2 * w, 0.1 * w, w, 3 * w, 0.2 * w, w, w, w)
     path = folder / "log.bin"
@@ -37,8 +46,10 @@ def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),)):
     return path
 
 
-def px4(folder, *, state: Any = 0, nav_state=15):
+def px4(folder, *, state: Any = 0, nav_state=15, change: float | None = None):
+    """A log of 12 s; MC_ROLLRATE_P goes from 0.15 to 0.2 at the time `change`."""
     log = ULog()
+    log.info("float MC_ROLLRATE_P", struct.pack("<f", 0.15), kind="P")
     log.define("vehicle_angular_velocity:uint64_t timestamp;float[3] xyz;")
     log.define("vehicle_torque_setpoint:uint64_t timestamp;float[3] xyz;")
     log.define("vehicle_rates_setpoint:uint64_t timestamp;float roll;float pitch;float yaw;")
@@ -61,6 +72,11 @@ def px4(folder, *, state: Any = 0, nav_state=15):
     ]
     for number, (name, table) in enumerate(zip(names, tables, strict=True)):
         log.subscribe(number, name)
-        log.write_rows(number, structured(table))
+        rows = structured(table)
+        late = rows.size if change is None else int(np.searchsorted(TIME, change))
+        log.write_rows(number, rows[:late])
+        if change is not None and name == names[-1]:
+            log.info("float MC_ROLLRATE_P", struct.pack("<f", 0.2), kind="P")
+        log.write_rows(number, rows[late:])
     (folder / "log.ulg").write_bytes(log.content)
     return folder / "log.ulg"

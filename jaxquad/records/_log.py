@@ -1,7 +1,8 @@
 """What every reader returns: tables of signals, each on one clock, and remarks on damage."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,6 +28,18 @@ class Table:
     rows: Mapping[str, Bool[np.ndarray, " rows"]] = dataclasses.field(default_factory=dict)
 
 
+class SettingChange(NamedTuple):
+    """A parameter that got another value while the log was written."""
+
+    time: float  # s, on the clock of the log
+    name: str
+    before: str
+    after: str
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.before} -> {self.after} at t = {self.time:.6g} s"
+
+
 @dataclasses.dataclass(frozen=True)
 class Log:
     """The tables of a file by name; the channels of the table `""` have no prefix.
@@ -38,6 +51,7 @@ class Log:
     remarks: tuple[str, ...] = ()
     vehicle: str = ""  # ardupilot, px4, betaflight, crazyflie, or unknown
     settings: Mapping[str, str] = dataclasses.field(default_factory=dict)  # header, parameters
+    changes: tuple[SettingChange, ...] = ()  # of settings in flight, in the order of time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +71,29 @@ class Signals:
 
     arrays: Mapping[str, Signal]
     clocks: Mapping[str, Float[np.ndarray, " samples"]]
+
+
+_MOST_CHANGES = 1000
+Stamp = TypeVar("Stamp")
+
+
+def changes_of(
+    logged: Iterable[tuple[Stamp, str, str]], time_of: Callable[[Stamp], float | None]
+) -> tuple[SettingChange, ...]:
+    """The changes among settings as they were logged: a stamp, name, value.
+
+    `time_of` a stamp is in s, None where it has none.
+    """
+    values: dict[str, str] = {}
+    found: list[SettingChange] = []
+    for stamp, name, value in logged:
+        before = values.get(name, value)
+        values[name] = value
+        if before != value and len(found) < _MOST_CHANGES:
+            time = time_of(stamp)
+            if time is not None and np.isfinite(time):
+                found.append(SettingChange(time, name, before, value))
+    return tuple(sorted(found, key=lambda change: change.time))
 
 
 def flattened(log: Log) -> Signals:

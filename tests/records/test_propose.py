@@ -58,6 +58,42 @@ def test_all_chirps_into_one_place_are_segments_of_the_printed_line(tmp_path):
     assert typed.start is None and typed.stop is None
 
 
+def test_a_change_of_the_loops_parameters_splits_the_log_there(tmp_path):
+    proposal = propose(ardupilot(tmp_path, 10, changes=((25.0, 0.2), (27.0, 0.2))))
+    assert (proposal.setup.start, proposal.setup.stop) == (
+        pytest.approx(25.0, abs=0.01),
+        pytest.approx(30.0, abs=0.01),
+    )
+    assert "ATC_RAT_RLL_P 0.135000005 -> 0.200000003 at t = 25" in str(proposal)
+    assert "others: 22" in str(proposal) and "LOG_BITMASK" not in str(proposal)
+    [change] = proposal.changes
+    assert (change.name, change.time) == ("ATC_RAT_RLL_P", pytest.approx(25.0, abs=0.01))
+
+
+def test_injections_with_other_parameters_are_no_segments_of_the_same_record(tmp_path):
+    runs = ((21, 23.5, 6.0), (24.6, 27, 8.0), (28.5, 31, 8.0))
+    proposal = propose(ardupilot(tmp_path, 10, runs=runs, changes=((24.0, 0.2),)))
+    assert np.allclose(proposal.segments, [(24.6, 27), (28.5, 31)], atol=0.01)
+    whole = propose(ardupilot(tmp_path, 10, runs=runs))
+    assert len(whole.segments) == 3 and not whole.changes
+
+
+def test_px4s_parameter_updates_split_a_log_without_injections(tmp_path):
+    proposal = propose(px4(tmp_path, nav_state=10, change=28.0), axis="roll")
+    assert proposal.setup.stop == pytest.approx(28.0, abs=0.01)
+    assert proposal.options["start"] == pytest.approx(20.0, abs=0.01)
+    assert "MC_ROLLRATE_P 0.15" in str(proposal)
+
+
+def test_the_collective_is_proposed_as_a_second_input(data, tmp_path):
+    proposal = propose(data / "betaflight_ar8/LOG00037.BFL", axis="roll")
+    record = read(proposal.path, **proposal.options_with_throttle)
+    throttle = record.channel("throttle")
+    assert throttle.min() > -0.01 and 0.2 < throttle.max() <= 1.0
+    with pytest.raises(RecordError, match="holds no collective"):
+        propose(ardupilot(tmp_path, 10)).options_with_throttle  # noqa: B018
+
+
 def settings_typed(words):
     """The settings of `jaxquad identify ...`."""
     options = vars(make_parser().parse_args(words[1:]))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from .._errors import ReadError
-from .._log import describe_skips, Log, Table
+from .._log import changes_of, describe_skips, Log, Table
 
 
 FORMAT_TYPE = 128
@@ -92,7 +92,11 @@ def load(path: Path) -> Log:
             columns = {name: rows[each.name][name] for name in each.columns}
             tables |= tables_of(each, columns, scaled)
     remarks += _find_rate_unit(tables, scaled)
-    return Log(tables, tuple(remarks), "ardupilot", _parameters(rows.get("PARM")))
+    stamped = _parameters(rows.get("PARM"))
+    settings = {name: value for _, name, value in stamped}
+    return Log(
+        tables, tuple(remarks), "ardupilot", settings, changes_of(stamped, lambda time: time)
+    )
 
 
 def _all_rows(
@@ -163,13 +167,18 @@ def _next_message(data: bytes, place: int, lengths: list[int]) -> int:
     return len(data)
 
 
-def _parameters(rows: np.ndarray | None) -> Mapping[str, str]:
-    if rows is None or not {"Name", "Value"} <= set(rows.dtype.names or ()):
-        return {}
+def _parameters(rows: np.ndarray | None) -> list[tuple[float | None, str, str]]:
+    """Time in s where the messages have one, name and value of each."""
+    columns = set() if rows is None else set(rows.dtype.names or ())
+    if rows is None or not {"Name", "Value"} <= columns:
+        return []
     if rows["Name"].dtype.kind != "S" or rows["Value"].dtype.kind != "f":
-        return {}
+        return []
+    timed = "TimeUS" in columns and rows["TimeUS"].dtype.kind in "iuf"
+    times = (1e-6 * rows["TimeUS"]).tolist() if timed else [None] * len(rows)
     names = (name.decode("latin-1") for name in rows["Name"].tolist())
-    return {name: f"{value:.9g}" for name, value in zip(names, rows["Value"].tolist(), strict=True)}
+    values = (f"{value:.9g}" for value in rows["Value"].tolist())
+    return list(zip(times, names, values, strict=True))
 
 
 _MOST_INSTANCES = 64
@@ -322,8 +331,27 @@ def load_text(path: Path) -> Log:
             tables |= tables_of(each, columns, scaled, applied=True)
     remarks = [f"{skipped} lines that match no format were left out"] if skipped else []
     remarks += _find_rate_unit(tables, scaled)
-    settings = {cells[-2]: cells[-1] for cells in _split(lines.get("PARM", [])) if len(cells) >= 2}
-    return Log(tables, tuple(remarks), "ardupilot", settings)
+    stamped = _text_parameters(lines, formats)
+    settings = {name: value for _, name, value in stamped}
+    return Log(
+        tables, tuple(remarks), "ardupilot", settings, changes_of(stamped, lambda time: time)
+    )
+
+
+def _text_parameters(
+    lines: Mapping[str, list[bytes]], formats: Sequence[Format]
+) -> list[tuple[float | None, str, str]]:
+    """As `_parameters`. Later versions log a parameter's default behind its value."""
+    columns = next((each.columns for each in formats if each.name == "PARM"), ())
+    at = columns.index("Name") if {"Name", "Value"} <= set(columns) else -2
+    beside = columns.index("Value") if at >= 0 else -1
+    timed = columns[:1] == ("TimeUS",)
+    least = max(2, at + 1, beside + 1)
+    return [
+        (1e-6 * _number(cells[0]) if timed else None, cells[at], cells[beside])
+        for cells in _split(lines.get("PARM", []))
+        if len(cells) >= least
+    ]
 
 
 def _by_name(content: bytes) -> tuple[dict[str, list[bytes]], int]:

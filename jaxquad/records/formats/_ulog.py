@@ -1,5 +1,6 @@
 """PX4 ULog (.ulg), after the description at docs.px4.io, "ULog File Format"."""
 
+import bisect
 import dataclasses
 import re
 import struct
@@ -10,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._errors import ReadError
-from .._log import describe_skips, Log, Table
+from .._log import changes_of, describe_skips, Log, Table
 
 
 LARGEST = 65_535  # bytes of a message: its length is a 16-bit number
@@ -55,6 +56,7 @@ class Messages:
     appended: list[int] = dataclasses.field(default_factory=list)  # offsets of further parts
     dropouts: list[int] = dataclasses.field(default_factory=list)  # ms
     settings: dict[str, str] = dataclasses.field(default_factory=dict)
+    stamped: list[tuple[int, str, str]] = dataclasses.field(default_factory=list)  # by place
     notes: list[str] = dataclasses.field(default_factory=list)
     stray: int = 0  # messages without a subscription
     columns_left: int = _MOST_COLUMNS
@@ -68,6 +70,7 @@ MAGIC = b"ULog\x01\x12\x35"
 _BEGIN = 16  # bytes of file header
 _KINDS = frozenset(b"BFIMPQARDLCSO")
 _DATA = ord("D")
+_MOST_PARAMETERS = 100_000
 _SPARE = 64  # bytes that a message may be longer than its fields
 
 
@@ -85,7 +88,21 @@ def load(path: Path) -> Log:
         raise ReadError("the file logs no topic: it is cut off or damaged", offset=place)
     remarks = describe_skips(skipped, place, len(data)) + _remarks(messages)
     tables = {name: _table(data, each) for name, each in messages.topics.items() if each.offsets}
-    return Log(tables, tuple(remarks), "px4", messages.settings)
+    changes = changes_of(messages.stamped, lambda place: _time_before(data, messages, place))
+    return Log(tables, tuple(remarks), "px4", messages.settings, changes)
+
+
+def _time_before(data: bytes, messages: Messages, place: int) -> float | None:
+    """The time of the last data message before a byte of the file; None before the first."""
+    found, last = None, -1
+    for topic in messages.topics.values():
+        k = bisect.bisect_left(topic.offsets, place)
+        if k and topic.offsets[k - 1] > last:
+            found, last = topic, topic.offsets[k - 1]
+    if found is None:
+        return None
+    stamp = last + (found.dtype.fields or {})["timestamp"][1]
+    return 1e-6 * int.from_bytes(data[stamp : stamp + 8], "little")
 
 
 def _scan(data: bytes) -> tuple[Messages, list[tuple[int, int]], int]:
@@ -266,7 +283,7 @@ def interpret(kind: int, body: bytes, place: int, messages: Messages) -> None:
         elif letter == "R":
             messages.current.pop(*struct.unpack_from("<H", body), None)
         elif letter in "IP":
-            _setting(body, messages)
+            _setting(letter, body, place, messages)
         elif letter == "O":
             messages.dropouts += struct.unpack_from("<H", body)
         elif letter == "D":
@@ -318,10 +335,12 @@ def _subscribe(body: bytes, place: int, messages: Messages) -> None:
     messages.current[number] = topic
 
 
-def _setting(body: bytes, messages: Messages) -> None:
+def _setting(letter: str, body: bytes, place: int, messages: Messages) -> None:
     kind, _, name = body[1 : 1 + body[0]].decode().partition(" ")
     value = body[1 + body[0] :]
     if kind.startswith("char["):
         messages.settings[name] = value.decode("utf-8", "replace")
     elif kind in _NUMBERS:
         messages.settings[name] = f"{struct.unpack_from(_NUMBERS[kind], value)[0]:.9g}"
+        if letter == "P" and len(messages.stamped) < _MOST_PARAMETERS:
+            messages.stamped.append((place, name, messages.settings[name]))

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._clock import FEWEST, native_rate
 from .._errors import RecordError
-from .._log import flattened, Log, Signals
+from .._log import flattened, Log, SettingChange, Signals
 
 
 AXES: tuple[str, ...] = ("roll", "pitch", "yaw")
@@ -41,6 +41,7 @@ class Setup(NamedTuple):
     remarks: tuple[str, ...] = ()
     segments: tuple[tuple[float, float], ...] = ()  # s
     hold: float | None = None  # s; of the command, where the log says it
+    throttle: Mix = {}  # the collective, 0 to 1 but for PX4's sign; empty if it is not logged
 
 
 class Proposal(NamedTuple):
@@ -56,6 +57,7 @@ class Proposal(NamedTuple):
     setup: Setup
     sample_rate: float  # Hz, the lowest of the channels' own
     units: Mapping[str, str]
+    changes: tuple[SettingChange, ...] = ()  # of the loop's parameters, in flight
 
     @property
     def options(self) -> dict[str, Any]:
@@ -70,6 +72,20 @@ class Proposal(NamedTuple):
             "stop": setup.stop,
             "hold": setup.hold,
         }
+
+    @property
+    def options_with_throttle(self) -> dict[str, Any]:
+        """`options` with a second input "throttle", as `jq.identify.gain_over_throttle` wants it.
+
+        Raises RecordError where the log has no collective.
+        """
+        if not self.setup.throttle:
+            raise RecordError(
+                f"{self.path} holds no collective: log the throttle, or name a channel yourself."
+            )
+        options = self.options
+        both = {**options["inputs"], "throttle": dict(self.setup.throttle)}
+        return {**options, "inputs": both}
 
     @property
     def segments(self) -> tuple[tuple[float, float], ...]:
@@ -165,8 +181,88 @@ def complete(path: str, log: Log, setup: Setup) -> Proposal:
         )
     units = {name: array_of(signals, name)[1] for name in names}
     rate = float(f"{min(rates.values()):.3g}")
-    setup = setup._replace(remarks=remarks, hold=_loop_period(log))
-    return Proposal(path, log.vehicle, setup, rate, units)
+    setup = setup._replace(
+        remarks=remarks, hold=_loop_period(log), throttle=_throttle(log, signals)
+    )
+    changes = tuple(change for change in log.changes if change.name.startswith(_OF_LOOP))
+    return Proposal(path, log.vehicle, _split(setup, changes, signals), rate, units, changes)
+
+
+_OF_LOOP = (
+    "ATC_", "INS_GYRO_", "INS_HNTC", "MOT_", "SCHED_LOOP_RATE", "PSC_", "FSTRATE_",
+    "MC_", "IMU_GYRO_", "IMU_DGYRO_", "THR_MDL_FAC", "CA_", "PWM_", "DSHOT_",
+)  # fmt: skip
+_SHOWN = 4  # changes in a remark
+_SHORTEST = 2.0  # s of a part worth a record
+
+
+def _split(setup: Setup, changes: Sequence[SettingChange], signals: Signals) -> Setup:
+    """The set-up of what was flown longest without a change of the loop's parameters."""
+    clock = signals.clocks[signals.arrays[array_of(signals, setup.rate)[0]].clock]
+    begin, end = float(np.min(clock)), float(np.max(clock))
+    spans = [
+        (begin if start is None else start, end if stop is None else stop)
+        for start, stop in setup.segments or ((setup.start, setup.stop),)
+    ]
+    first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
+    inside = [change for change in changes if first < change.time < last]
+    if not inside:
+        return setup
+    parts = _parts(spans, sorted({change.time for change in inside}))
+    said = f"parameters of the loop changed in flight: {_in_words(inside)}"
+    if not parts:
+        remark = f"{said}; no part of {_SHORTEST:g} s has the same ones"
+        return setup._replace(remarks=(*setup.remarks, remark))
+    lasting: dict[int, float] = {}
+    for number, (a, b) in parts:
+        lasting[number] = lasting.get(number, 0.0) + b - a
+    regime = max(lasting, key=lambda number: lasting[number])
+    alike = tuple(each for number, each in parts if number == regime)
+    start, stop = max(alike, key=lambda each: each[1] - each[0])
+    others = ", ".join(f"{a:.6g} .. {b:.6g} s" for number, (a, b) in parts if number != regime)
+    rest = f" (others: {others})" if others else ""
+    remark = f"{said}; split there, what lasted longest with the same ones is taken{rest}"
+    return setup._replace(
+        start=start,
+        stop=stop,
+        segments=alike if len(alike) > 1 else (),
+        remarks=(*setup.remarks, remark),
+    )
+
+
+def _parts(
+    spans: Sequence[tuple[float, float]], cuts: Sequence[float]
+) -> list[tuple[int, tuple[float, float]]]:
+    """What the cuts leave of the spans, each with the number of cuts before it."""
+    limits = zip([-np.inf, *cuts], [*cuts, np.inf], strict=True)
+    found = [
+        (number, (max(start, low), min(stop, high)))
+        for number, (low, high) in enumerate(limits)
+        for start, stop in spans
+    ]
+    return [(number, (a, b)) for number, (a, b) in found if b - a >= _SHORTEST]
+
+
+def _in_words(changes: Sequence[SettingChange]) -> str:
+    more = f" and {len(changes) - _SHOWN} more" if len(changes) > _SHOWN else ""
+    return f"{', '.join(map(str, changes[:_SHOWN]))}{more}"
+
+
+_THROTTLES: Mapping[str, tuple[tuple[str, float], ...]] = {  # channel, its factor to 0 .. 1
+    "ardupilot": (("RATE.AOut", 1.0), ("CTUN.ThO", 1.0)),
+    "px4": (("vehicle_thrust_setpoint.xyz[2]", -1.0), ("actuator_controls_0.control[3]", 1.0)),
+    "betaflight": (("setpoint[3]", 1e-3),),
+    "crazyflie": (("controller.cmd_thrust", 1 / 65535), ("stabilizer.thrust", 1 / 65535)),
+}
+
+
+def _throttle(log: Log, signals: Signals) -> Mix:
+    """The collective of the vehicle, where the log has it."""
+    for name, factor in _THROTTLES.get(log.vehicle, ()):
+        found = next((each for each in signals.arrays if each.endswith(name)), "") or name
+        if first_logged(signals, [found]):
+            return {found: factor}
+    return {}
 
 
 _RATES = ("SCHED_LOOP_RATE", "IMU_GYRO_RATEMAX")  # Hz, of ArduPilot's and of PX4's rate loop
