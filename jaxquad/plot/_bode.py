@@ -123,7 +123,7 @@ def _draw_pair(
             _draw_other(axes, _beside(curve, first), each.name, k - 1)
     for k, (each, curve) in enumerate(modelled):
         _draw_model(axes, _beside(curve, first), each, k)
-    _scale(axes, first, bool(measured))
+    _scale(axes, first, [_beside(curve, first) for _, curve in modelled])
 
 
 def _measured_curve(each: Measured, o: int, i: int) -> _Curve:
@@ -213,13 +213,21 @@ def _draw_model(axes: Sequence[Axes], curve: _Curve, each: Modelled, k: int) -> 
         axis.plot(curve.omega, level, **style)
 
 
-def _scale(axes: Sequence[Axes], first: _Curve, measured: bool) -> None:
+_WIDEST = 6.0, 45.0  # dB and deg of a band that sets the limits of an axis
+
+
+def _scale(axes: Sequence[Axes], first: _Curve, models: Sequence[_Curve]) -> None:
     """Axes that show every good point and the models, whatever the other points do."""
     if not first.good.any():
         return
-    for axis, level in ((axes[0], first.magnitude), (axes[1], first.phase)):
-        lines = [line.get_ydata() for line in axis.get_lines() if line.get_linestyle() != "None"]
-        shown = np.concatenate([level[first.good], *(np.asarray(y, float) for y in lines)])
+    magnitudes = [(each.magnitude, each.decibels) for each in models]
+    phases = [(each.phase, each.degrees) for each in models]
+    for axis, level, curves, widest in (
+        (axes[0], first.magnitude, magnitudes, _WIDEST[0]),
+        (axes[1], first.phase, phases, _WIDEST[1]),
+    ):
+        ends = [y + sign * np.minimum(reach, widest) for y, reach in curves for sign in (-1, 1)]
+        shown = np.concatenate([level[first.good], *ends])
         shown = shown[np.isfinite(shown)]
         margin = 0.06 * np.ptp(shown) + 1
         axis.set_ylim(shown.min() - margin, shown.max() + margin)

@@ -2,17 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad.control import schedule_for_flight
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop
 from jaxquad.records import AXES
-from jaxquad.simulation import Scenario, simulate, Simulation
-from jaxquad.tuning import Certificate, QUANTITIES, Tuned
+from jaxquad.simulation import Scenario, Simulation
+from jaxquad.tuning import Certificate, Tuned, worst_flights
 
 from ._histories import histories
 from ._panels import Given, Panels
@@ -66,94 +63,18 @@ def flight(
     if isinstance(flown, Simulation):
         flown = {"flown": flown}
     if isinstance(flown, Tuned | Certificate):
-        flown = _fly_again(flown, loop, ensemble, scenario, quantities)
+        if loop is None or ensemble is None or scenario is None:
+            raise ValueError(
+                "flight flies the members again: give flight(tuned, loop, ensemble, scenario), as "
+                "they were given to jq.tune"
+            )
+        flown = worst_flights(flown, loop, ensemble, scenario, quantities=quantities)
     if not isinstance(flown, Mapping) or not flown:
         raise ValueError(
             f"flight cannot draw a {type(flown).__name__}: give what jq.tune or jq.certify "
             "returned with its loop, ensemble and scenario, or what jq.simulate returned"
         )
     return _draw(flown, axis, command_unit, ax, title)
-
-
-def _fly_again(
-    design: Tuned | Certificate,
-    loop: Loop | None,
-    ensemble: Ensemble | Members | None,
-    scenario: Scenario | None,
-    quantities: Sequence[str],
-) -> dict[str, Simulation]:
-    certificate = design.certificate if isinstance(design, Tuned) else design
-    if loop is None or ensemble is None or scenario is None:
-        raise ValueError(
-            "flight flies the members again: give flight(tuned, loop, ensemble, scenario), as they "
-            "were given to jq.tune"
-        )
-    if certificate is None:
-        raise ValueError(
-            "the design has no certificate, so that its worst members are not known: tune with "
-            "fresh=256, or draw jq.simulate(...) of some members"
-        )
-    controller = design.controller if isinstance(design, Tuned) else loop.controller
-    worst = _worst(certificate, quantities)
-    members = _members(certificate, loop, ensemble).take(list(worst))
-    found = simulate(members.loop(controller), members.flight(scenario))
-    named = {text: _member(found, k) for k, text in enumerate(worst.values())}
-    return {"nominal": _nominal(certificate, loop, controller, scenario)} | named
-
-
-def _worst(certificate: Certificate, quantities: Sequence[str]) -> dict[int, str]:
-    """The worst members, with the quantities in which they are."""
-    unknown = [name for name in quantities if name not in certificate.design.by_axis]
-    if unknown or not quantities:
-        known = ", ".join(certificate.design.by_axis)
-        raise ValueError(f"no quantities {unknown} in the certificate: choose from {known}")
-    found: dict[int, list[str]] = {}
-    for name in quantities:
-        index = certificate.design.worst_member(name)
-        if index is not None:
-            found.setdefault(index, []).append(QUANTITIES[name].title)
-    return {k: f"worst {' and '.join(names)} (member {k})" for k, names in found.items()}
-
-
-def _members(certificate: Certificate, loop: Loop, ensemble: Ensemble | Members) -> Members:
-    if isinstance(ensemble, Members):
-        members = ensemble
-    else:
-        data = certificate.provenance["key"]
-        if data is None:
-            raise ValueError(
-                "the certificate was made on members that were given: give these as the ensemble"
-            )
-        key = jax.random.wrap_key_data(jnp.asarray(data, jnp.uint32))
-        members = ensemble.fresh(loop, certificate.members, key)
-    known = certificate.facts["assumed_inertia"].shape
-    if members.assumed_inertia.shape != known:
-        raise ValueError(
-            f"the members have the shape {members.assumed_inertia.shape}, but the certificate was "
-            f"made on {known}: give the loop and ensemble that it was made with"
-        )
-    return members
-
-
-def _member(found: Simulation, k: int) -> Simulation:
-    """One of an ensemble of simulations."""
-    count = found.diverged.shape
-    pick = lambda x: x[..., k] if x.shape[-1:] == count and x.ndim > 2 else x
-    parts = {name: pick(part) for name, part in found.scenario.parts.items()}
-    return Simulation(
-        found.time, found.angle[..., k], found.measurement[..., k], found.command[..., k],
-        found.saturated[..., k], {}, found.diverged[k], Scenario(**parts, dt=found.scenario.dt),
-        found.dt,
-    )  # fmt: skip
-
-
-def _nominal(
-    certificate: Certificate, loop: Loop, controller: PyTree, scenario: Scenario
-) -> Simulation:
-    inertia = certificate.nominal
-    if inertia is None:
-        inertia = np.exp(np.mean(np.log(certificate.facts["inertia"]), axis=1))
-    return simulate(loop.with_controller(schedule_for_flight(controller, inertia)), scenario)
 
 
 def _draw(

@@ -24,6 +24,7 @@ from ._step import step_section
 
 
 if TYPE_CHECKING:
+    from jaxquad.simulation import Simulation
     from jaxquad.tuning import Certificate, Tuned
 
 
@@ -39,6 +40,7 @@ def write_report(
     derived: Sequence[Combination] = (),
     beside: Mapping[str, str] | None = None,
     tuned: "Tuned | Certificate | None" = None,
+    flights: "Mapping[str, Simulation] | None" = None,
     provenance: Provenance | None = None,
     title: str = "",
     formula: str = "",
@@ -63,6 +65,7 @@ def write_report(
     - `derived`: rows below the parameters, see `Fit.derived`.
     - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
+    - `flights`: of these gains, by name, see `jaxquad.tuning.worst_flights`.
     - `provenance`: where the result comes from, see `jaxquad.report.provenance`.
     - `title`: by default "output / input" of the first response.
     - `formula`: the model in words.
@@ -85,7 +88,7 @@ def write_report(
         from ._tuned import tuned_section, verdict_headlines  # the room of tuning takes 0.2 s
 
         headlines += verdict_headlines(tuned)
-        gains = tuned_section(tuned)
+        gains = tuned_section(tuned, flights or {})
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
     channels = {*first.input_names, *first.output_names}

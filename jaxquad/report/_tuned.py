@@ -1,11 +1,14 @@
 """Tuned gains, and their certificate on fresh members."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from jaxquad.plot import certificate_figure, convergence_figure
+from jaxquad.plot import certificate_figure, convergence_figure, flight
+from jaxquad.simulation import Simulation
 from jaxquad.tuning import Certificate, KNOWN_INERTIA, QUANTITIES, Tuned
 
-from ._figure import embed_figure
+from ._figure import embed_figure, Image
 from ._fit import count_starts
 from ._page import Cell, Headline, Table
 
@@ -27,15 +30,28 @@ def verdict_headlines(tuned: Tuned | Certificate) -> list[Headline]:
     return headlines
 
 
-def tuned_section(tuned: Tuned | Certificate) -> dict[str, object]:
-    """The verdicts, the gains, how the tune went, and the certificate."""
+def tuned_section(
+    tuned: Tuned | Certificate, flights: Mapping[str, Simulation]
+) -> dict[str, object]:
+    """The verdicts, the gains, how the tune went, how they fly, and the certificate."""
     certificate = tuned.certificate if isinstance(tuned, Tuned) else tuned
     return {
         "verdicts": [str(verdict) for verdict in tuned.verdicts],
         "gains": _gains(tuned) if isinstance(tuned, Tuned) else None,
+        "flight": _flight(flights) if flights else None,
         "certificate": None if certificate is None else _certificate(certificate),
         "text": str(tuned),
     }
+
+
+def _flight(flights: Mapping[str, Simulation]) -> Image:
+    """Closed-loop step, command and disturbance."""
+    names = ", ".join(flights)
+    return embed_figure(
+        lambda: flight(flights),
+        alt=f"Angle with its set-point, command and disturbing torque over time: {names}.",
+        caption="The tuned gains in flight, with the members of the certificate that do worst.",
+    )
 
 
 def _gains(tuned: Tuned) -> dict[str, object]:

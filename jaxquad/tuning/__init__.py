@@ -34,3 +34,4 @@ from ._tail import Tail as Tail
 from ._tune import tune as tune
 from ._tuned import LimitResult as LimitResult, Optimum as Optimum, Tuned as Tuned
 from ._verdict import Bound as Bound, Verdict as Verdict
+from ._worst_flights import worst_flights as worst_flights

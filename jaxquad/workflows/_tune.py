@@ -12,7 +12,7 @@ from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
 from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
-from jaxquad.plot import certificate_figure, convergence_figure, headless
+from jaxquad.plot import certificate_figure, convergence_figure, flight, headless
 from jaxquad.records import Record
 from jaxquad.report import provenance, write_json, write_report
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
@@ -25,6 +25,7 @@ from jaxquad.tuning import (
     Penalty,
     tune as tune_controller,
     Tuned,
+    worst_flights,
 )
 
 from ._identify import Identification
@@ -48,13 +49,15 @@ class Tuning:
     - `identification`: the axis.
     - `settings`: those that were used.
     - `tuned`: controller, gains and certificate.
-    - `dt`: the sample interval of the controller in s.
+    - `loop`, `ensemble`, `flight`: what it was tuned on.
     """
 
     identification: Identification
     settings: TuneSettings
     tuned: Tuned
-    dt: float
+    loop: Loop
+    ensemble: Ensemble
+    flight: Scenario
 
     def content(self) -> dict[str, object]:
         """Gains, certificate and settings, for JSON."""
@@ -64,7 +67,7 @@ class Tuning:
             "holds": tuned.holds,
             "verdicts": [each._asdict() for each in tuned.verdicts],
             "values": tuned.values,
-            "controller": describe_controller(tuned.controller) | {"dt": self.dt},
+            "controller": describe_controller(tuned.controller) | {"dt": self.loop.dt},
             "cost": tuned.cost,
             "converged": tuned.converged,
             "bounds": [each._asdict() for each in tuned.bounds],
@@ -87,10 +90,12 @@ class Tuning:
         origin = provenance(*found.paths, settings=known)
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
+        flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
         with headless():
             figures = {"convergence.png": convergence_figure(tuned.history)}
             if tuned.certificate is not None:
                 figures["certificate.png"] = certificate_figure(tuned.certificate)
+            figures["flight.png"] = flight(flights)
         for file, panels in figures.items():
             panels.figure.savefig(folder / file, dpi=130)
         write_report(
@@ -99,6 +104,7 @@ class Tuning:
             frf=found.frf,
             record=found.records[0],
             tuned=tuned,
+            flights=flights,
             provenance=origin,
             formula=found.formula,
         )
@@ -140,7 +146,7 @@ def tune(
     record = found.records[0]
     _check_unit(record)
     dt = record.dt if settings.dt is None else settings.dt
-    return Tuning(found, settings, _tuned(found, dt, settings, progress), dt)
+    return _tuned(found, dt, settings, progress)
 
 
 def _check_unit(record: Record) -> None:
@@ -163,7 +169,7 @@ def _in_radians(unit: str, name: str) -> str:
 
 def _tuned(
     found: Identification, dt: float, settings: TuneSettings, progress: bool | None
-) -> Tuned:
+) -> Tuning:
     record = found.records[0]
     recorded_dt = record.dt if record.hold is None else "as fitted"  # commands are held
     posterior = Posterior(
@@ -187,10 +193,11 @@ def _tuned(
         delay=posterior.delay,
     )  # fmt: skip
     announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
-    return tune_controller(
+    flown = _flight(gain, dt, settings)
+    tuned = tune_controller(
         loop,
         ensemble,
-        _flight(gain, dt, settings),
+        flown,
         objective=_objective(settings),
         limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
         free=["ladrc.wc", "map.values"] if held else None,
@@ -200,6 +207,7 @@ def _tuned(
         key=jax.random.key(settings.seed),
         progress=progress,
     )
+    return Tuning(found, settings, tuned, loop, ensemble, flown)
 
 
 def _ensemble(posterior: Posterior, settings: TuneSettings) -> Ensemble:
