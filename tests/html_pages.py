@@ -4,6 +4,7 @@ import base64
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 
+import jax.numpy as jnp
 import numpy as np
 from certificates_by_hand import certificate, judged, missed
 
@@ -90,6 +91,19 @@ def record_of(names, units, source="flight.csv"):
         time, u, y, u, input_names=names[0], output_names=names[1], reference_names=names[2],
         input_units=units[0], output_units=units[1], reference_units=units[2], source=source,
     )  # fmt: skip
+
+
+def flown_by_hand():
+    """A flight that follows a step at once."""
+    count = 50
+    zero = np.zeros((count, 1))
+    step = zero + np.radians(4.0)
+    flight = jq.simulation.Scenario(*map(jnp.asarray, (step, zero, zero, zero)), dt=0.01)
+    time, angle, still = (jnp.asarray(x) for x in (0.01 * np.arange(count), step, zero))
+    never = jnp.zeros((count, 1), bool)
+    return jq.simulation.Simulation(
+        time, angle, angle, still, never, {}, jnp.zeros((), bool), flight, 0.01
+    )
 
 
 def tuned_by_hand():

@@ -8,6 +8,7 @@ found through `JAXQUAD_DATA`, or downloaded. It takes about three minutes.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -51,7 +52,8 @@ def draw(
 ) -> Figure:
     """Three pictures side by side, 12 by 4 inches."""
     figure = Figure(figsize=(12.0, 4.0), layout="constrained")
-    log, response, flown = figure.subfigures(1, 3, width_ratios=(1, 1.05, 1))
+    parts: Any = figure.subfigures(1, 3, width_ratios=(1, 1.05, 1))
+    log, response, flown = parts
     axes = log.subplots(2, sharex=True)
     jq.plot.record_figure(jq.records.select(record, inputs="M", outputs="q"), ax=axes)
     _finish(log, axes, "1   flight log")
@@ -92,9 +94,9 @@ def _finish(part: SubFigure, axes: np.ndarray, title: str) -> None:
     """A title above, and the legend below instead of on the curves."""
     part.suptitle(title, fontsize=10.5, fontweight="bold")
     panels: list[Axes] = list(axes)
-    if panels[0].get_legend():
+    if (legend := panels[0].get_legend()) is not None:
         handles, labels = panels[0].get_legend_handles_labels()
-        panels[0].get_legend().remove()
+        legend.remove()
         part.legend(handles, labels, loc="outside lower center", ncols=2, handlelength=2.6,
                     frameon=False)  # fmt: skip
     part.align_ylabels(panels)

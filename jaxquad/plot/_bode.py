@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Complex, Float
 from matplotlib.axes import Axes
 
-from ._labels import few_ticks, look_of, plain_ticks, Style
+from ._labels import add_hertz, few_ticks, look_of, plain_ticks, Style
 from ._panels import arrange, Given, legend_of, Panels, stacked, WIDTH
 from ._shown import (
     Channels,
@@ -260,15 +260,6 @@ def _coherence_axis(axis: Axes) -> None:
     axis.axhline(COHERENT, color="0.4", lw=0.8, ls="--")
     axis.text(0.995, COHERENT + 0.02, f"{COHERENT}", ha="right", va="bottom", fontsize=8,
               color="0.3", transform=axis.get_yaxis_transform())  # fmt: skip
-
-
-def add_hertz(axis: Axes) -> None:
-    """A second horizontal axis above, in Hz, of one in rad/s."""
-    turn = 2 * np.pi
-    functions = (lambda omega: omega / turn, lambda hertz: hertz * turn)
-    hertz = axis.secondary_xaxis("top", functions=functions)
-    hertz.set_xlabel("frequency, Hz")
-    plain_ticks(hertz.xaxis)
 
 
 def coherence(

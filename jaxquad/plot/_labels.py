@@ -132,3 +132,15 @@ def draw_limit(panel: Axes, bound: float, text: str) -> None:
         text, (1.0, bound), xycoords=("axes fraction", "data"), xytext=(-3, 2),
         textcoords="offset points", ha="right", va="bottom", fontsize=8, bbox=box, zorder=5,
     )  # fmt: skip
+
+
+def add_hertz(panel: Axes, side: str = "top", text: str = "frequency, Hz") -> None:
+    """A second axis in Hz of one in rad/s: above ("top") the horizontal one, or on the "right"."""
+    turn = 2 * np.pi
+    functions = (lambda omega: omega / turn, lambda hertz: hertz * turn)
+    if side == "top":
+        hertz = panel.secondary_xaxis("top", functions=functions)
+        hertz.set_xlabel(text)
+        plain_ticks(hertz.xaxis)
+    else:
+        panel.secondary_yaxis("right", functions=functions).set_ylabel(text)

@@ -8,7 +8,7 @@ from matplotlib.collections import EllipseCollection
 from jaxquad.identify import Fit, linear_model
 from jaxquad.models import Model
 
-from ._labels import few_ticks, look_of, Style
+from ._labels import add_hertz, few_ticks, look_of, Style
 from ._panels import arrange, Given, legend_of, Panels, stacked
 from ._shown import (
     analysed,
@@ -54,9 +54,7 @@ def pzmap(*shown: Thing, ax: Given = None, title: str = "") -> Panels:
     panel.margins(0.12)
     _damping_lines(panel)
     panel.set(xlabel="real part, rad/s", ylabel="imaginary part, rad/s")
-    turn = 2 * np.pi
-    hertz = panel.secondary_yaxis("right", functions=(lambda w: w / turn, lambda f: f * turn))
-    hertz.set_ylabel("imaginary part, Hz")
+    add_hertz(panel, "right", "imaginary part, Hz")
     few_ticks(panel.xaxis, 6)
     return arrange(panels, [4.0], right=0.75, title=title, legend=legend_of(panels))
 

@@ -4,11 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 
 from jaxquad.records import Record
 
-from ._labels import few_ticks, raise_powers, short_names, unit_label, visible
+from ._labels import add_hertz, few_ticks, raise_powers, short_names, unit_label, visible
 from ._panels import arrange, Given, Panels, stacked
 
 
@@ -133,18 +132,12 @@ def _draw(panels: Panels, found: _Spectrum, unit: str) -> None:
     panel.set_facecolor("0.9")  # nothing flew there
     panel.set_ylabel("frequency, rad/s")
     few_ticks(panel.yaxis, 6)
-    _hertz_on_the_right(panel)
+    add_hertz(panel, "right")
     if panels.own:
         bar = panels.figure.add_axes((0, 0, 1, 1), label="scale")
         panels.figure.colorbar(drawn, cax=bar, label=raise_powers(unit))
     else:
         panels.figure.colorbar(drawn, ax=panel, label=raise_powers(unit), pad=0.13)
-
-
-def _hertz_on_the_right(panel: Axes) -> None:
-    turn = 2 * np.pi
-    hertz = panel.secondary_yaxis("right", functions=(lambda w: w / turn, lambda f: f * turn))
-    hertz.set_ylabel("frequency, Hz")
 
 
 def _with_room(panels: Panels, title: str) -> Panels:

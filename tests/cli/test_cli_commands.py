@@ -261,6 +261,7 @@ def test_a_result_becomes_gains_with_a_certificate(demo, tmp_path, capsys):
     page = (tmp_path / "report.html").read_text()
     assert "Tuned gains" in page and "SHA-256" in page
     assert (tmp_path / "certificate.png").stat().st_size > 10_000
+    assert (tmp_path / "flight.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

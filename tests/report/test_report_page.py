@@ -11,7 +11,17 @@ from importlib.metadata import version
 import equinox as eqx
 import numpy as np
 import pytest
-from html_pages import ERROR, HOSTILE, is_image, read_page, record_of, TRUTH, tuned_by_hand, UNSEEN
+from html_pages import (
+    ERROR,
+    flown_by_hand,
+    HOSTILE,
+    is_image,
+    read_page,
+    record_of,
+    TRUTH,
+    tuned_by_hand,
+    UNSEEN,
+)
 from synthetic import response_of
 
 import jaxquad as jq
@@ -53,6 +63,7 @@ def whole(tmp_path_factory, frf, fit, record, log):
         checks={"other.csv": jq.verify(TRUTH, record)},
         derived=[fit.derived(lambda m: m.lag + m.delay, "lag + delay")],
         tuned=tuned_by_hand(),
+        flights={"nominal": flown_by_hand()},
         provenance=provenance(log, command="jaxquad identify 'a & b.csv' --input M"),
         formula="q / M = K e^(-delay s) / (s (lag s + 1))",
     )
@@ -80,6 +91,11 @@ def test_the_verdict_is_the_first_that_is_read(whole, fit):
     assert f"gain = {fit.values[0]:.4g}" in first and "VERIFIED other.csv" in first
     assert "STABILITY FAILS Ms, worst, at most 1.5: 2, missed" in first
     assert "PERFORMANCE 12 of 12 members" in first and "CONVERGENCE 2 gradients" in first
+
+
+def test_the_tuned_gains_are_shown_in_flight(whole):
+    texts = [attributes["alt"] for attributes in read_page(whole).of("img")]
+    assert "Angle with its set-point, command and disturbing torque over time: nominal." in texts
 
 
 def test_nothing_is_fetched_and_no_script_runs_but_the_one_of_the_page(whole):
@@ -111,7 +127,7 @@ def test_a_pointer_reads_the_numbers_that_are_drawn(whole, frf):
 
 def test_figures_are_images_with_a_text_for_those_who_cannot_see_them(whole):
     page = read_page(whole)
-    assert len(page.of("img")) == 6
+    assert len(page.of("img")) == 7
     assert all(is_image(*each) for each in page.figures())
     assert all(len(attributes["alt"]) > 30 for attributes in page.of("img"))
     assert any("reference r, input M, output q" in each["alt"] for each in page.of("img"))

@@ -1,0 +1,10 @@
+"""The picture of the README."""
+
+from conftest import ROOT
+from matplotlib.image import imread
+
+
+def test_the_picture_is_wide_small_and_made_by_a_script_of_the_repository():
+    picture = ROOT / "docs" / "images" / "log_to_gains.png"
+    assert picture.stat().st_size < 120_000 and imread(picture).shape[:2] == (400, 1200)
+    assert picture.name in (ROOT / "docs" / "site" / "figures.py").read_text()
