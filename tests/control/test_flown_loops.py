@@ -6,11 +6,14 @@ import pytest
 from jaxquad.control.autopilots import (
     ardupilot_loop,
     betaflight_loop,
+    predict_loop,
     px4_loop,
     replay_terms,
+    without_gyro_filters,
 )
-from jaxquad.records import read_settings
+from jaxquad.records import read, read_settings
 from jaxquad.records.formats import load_log
+from jaxquad.spectra import frequency_response
 
 
 HEADER = {
@@ -97,3 +100,23 @@ def test_the_terms_of_a_measured_log_follow_from_its_set_point_and_gyro(data):
     d = columns("axisD", 2)
     for k in (0, 1):
         assert np.corrcoef(np.asarray(found["D"])[after, k], d[after, k])[0, 1] > 0.9
+
+
+@pytest.mark.slow
+def test_the_laws_of_a_measured_log_reproduce_its_closed_loops(data):
+    path = data / "betaflight_ar8" / "LOG00037.BFL"
+    settings = read_settings(path)
+    flown = betaflight_loop(settings.values, settings.version, throttle=0.34)
+    assert any(x.startswith("feedforward_transition") for x in flown.unmodelled)
+    law, omega = without_gyro_filters(flown.law), 2 * np.pi * np.geomspace(5.0, 15.0, 12)
+    for axis in (0, 1):
+        names = f"setpoint[{axis}]", f"axisSum[{axis}]", f"gyroADC[{axis}]"
+        parts = {"outputs": [names[2]], "start": 453.5, "stop": 469.0}
+        plant = frequency_response(
+            read(path, inputs=[names[1]], references=[names[0]], **parts), omega
+        )
+        loop = frequency_response(read(path, inputs=[names[0]], **parts), omega)
+        per_radian = np.asarray(plant.response)[:, 0, 0] * np.pi / 180
+        predicted = np.asarray(predict_loop(law.linear(axis), per_radian, omega))
+        away = np.abs(predicted / np.asarray(loop.response)[:, 0, 0] - 1)
+        assert np.isfinite(away).sum() >= 8 and np.nanmedian(away) < 0.12

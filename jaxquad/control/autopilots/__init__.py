@@ -68,11 +68,3 @@ from ._reproduce import (
     predict_loop as predict_loop,
     without_gyro_filters as without_gyro_filters,
 )
-from ._thrust_curve import (
-    adrc_b0_law as adrc_b0_law,
-    B0Law as B0Law,
-    motor_command as motor_command,
-    pool_gains as pool_gains,
-    thrust_linear as thrust_linear,
-    ThrustCurve as ThrustCurve,
-)

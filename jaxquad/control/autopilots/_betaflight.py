@@ -132,6 +132,7 @@ class BetaflightPID(FirmwareLoop):
     - `p_lowpass_hz`: of the P term; the firmware has yaw_lowpass_hz on yaw, 0 is off.
     - `relax`: an `ItermRelax`; `d_max`: a `DMax`; None is off.
     - `tpa`: factor of the D term by the throttle, see `tpa_factor`; `tpa_p`: of the P term.
+    - `f_share`: factor of F; 0 for centred sticks where feedforward_transition is above 0.
     - `limit`: pidsum_limit; `integral_limit`: of the I term.
     - `dt`: of the PID loop in s.
 
@@ -154,6 +155,7 @@ class BetaflightPID(FirmwareLoop):
     d_max: DMax | None = None
     tpa: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
     tpa_p: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
+    f_share: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
     limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=500.0)
     integral_limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=400.0)
     dt: float = eqx.field(static=True, default=1 / 4000)  # s
@@ -211,7 +213,7 @@ class BetaflightPID(FirmwareLoop):
         terms = {
             "P": next["p"], "I": next["integral"],
             "D": D_SCALE * at(self.d) * at(self.tpa) * factor * delta,
-            "F": F_SCALE * at(self.f) * DEGREES * speed,
+            "F": F_SCALE * at(self.f) * at(self.f_share) * DEGREES * speed,
         }  # fmt: skip
         return {**next, **relaxed, **raised}, bounded(sum_of(terms), self.limit), terms
 

@@ -130,6 +130,7 @@ def betaflight_loop(
         ),
         integral_factor=[1.0, 1.0, 2.5],
         p_lowpass_hz=[0.0, 0.0, read.number("yaw_lowpass_hz", default=0.0)],
+        f_share=1.0 if read.number("feedforward_transition", default=0.0) == 0 else 0.0,
         relax=read.relax(), d_max=read.d_max(base, ceiling), limit=limits,
         integral_limit=0.8 * limits if read.version >= (2025,) else 400.0, dt=dt,
     )  # fmt: skip
@@ -241,6 +242,11 @@ class _Header:
             found.append(f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors")
         if self.number("dyn_notch_count", "dyn_notch_q", default=0.0) > 0:
             found.append("dynamic notches on the gyro: they follow its spectrum")
+        if (transition := self.number("feedforward_transition", default=0.0)) > 0:
+            found.append(
+                f"feedforward_transition {transition:g}: F grows with the sticks' deflection; the "
+                "law is that of centred sticks, without F"
+            )
         for name, words in _UNUSUAL.items():
             if self.number(name, default=0.0) > 0:
                 found.append(f"{name}: {words}")
@@ -367,8 +373,9 @@ def replay_terms(
 
     Between the samples of the log both are taken as straight. A log rounds them to 1 deg/s, and
     the integral of what is lost drifts away: with `integral`, the I term of the log, it starts anew
-    from the log every `restart` seconds. Filters start at rest. F is that of the logged set-point:
-    the firmware takes it from the sticks between their samples, which no log holds.
+    from the log every `restart` seconds. Filters start at rest. F is that of the logged set-point
+    times the law's `f_share`: the firmware takes it from the sticks between their samples, which no
+    log holds.
 
     **Arguments:**
 
