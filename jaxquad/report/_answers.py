@@ -338,7 +338,7 @@ def _sweep(needs: Sequence[_Need], frf: FrequencyResponse, record: Record | None
         "seconds": f"{_rounded(seconds):g}" + (f" (now {now:.3g})" if now else ""),
     }
     what = (
-        f"A sweep of {source} from {low / (2 * np.pi):.2g} to {high / (2 * np.pi):.2g} Hz, "
+        f"Sweep the channel {source} from {low / (2 * np.pi):.2g} to {high / (2 * np.pi):.2g} Hz, "
         f"{text.split(' (')[0]}, for {_rounded(seconds):g} s."
     )
     return Flight(what, facts, [_sentence(each.why) for each in needs])
@@ -377,7 +377,7 @@ def _verification(frf: FrequencyResponse, record: Record | None) -> Flight:
         "seconds": f"{7 * width + 4:.2g}, rest before and after included",
     }
     what = (
-        f"A 3-2-1-1 on {source} with a shortest pulse of {width:.2g} s, to verify the model on a "
-        "flight that it was not fitted to."
+        f"A 3-2-1-1 on the channel {source} with a shortest pulse of {width:.2g} s, to verify the "
+        "model on a flight that it was not fitted to."
     )
     return Flight(what, facts, ["The log determines this model: what is missing is a check."])
