@@ -299,7 +299,7 @@ class GainOverThrottle(eqx.Module):
     def _times(self) -> str:
         if not self._knows_lag:
             both = [str(each) for each in self.fit.combinations]
-            return "lag and delay not told apart" + (f" ({both[0]})" if both else "")
+            return "lag and delay not determined separately" + (f" ({both[0]})" if both else "")
         lag, delay = (_half(*self.fit.interval(name)) for name in ("lag", "delay"))
         return (
             f"lag {1e3 * self.fit['lag']:.2f} +- {1e3 * lag:.2g} ms, "
