@@ -105,7 +105,9 @@ def estimate_broken_loop(
     **Raises:** ValueError for a record without a reference.
     """
     if reference is None and not record.reference_names:
-        raise ValueError("the record has no reference, so its loop is not known: name one (reference=)")
+        raise ValueError(
+            "the record has no reference, so its loop is not known: name one (reference=)"
+        )
     source = reference or record.reference_names[0]
     answer = output or record.output_names[0]
     answer = answer if entry == "set-point" else input or record.input_names[0]
