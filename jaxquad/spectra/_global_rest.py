@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from ._global_model import global_models, GlobalModel
-from ._local_fit import Bins, local_fit, LocalFit
+from ._local_fit import Bins, local_fit, LocalFit, window_slices
 from ._local_noise import Noise, SharedErrors
 
 
@@ -53,12 +53,17 @@ class Rest(NamedTuple):
     def _followed(self, model: GlobalModel, omega: Grid, half_width: Grid, order: int) -> Grid:
         """Complex degrees of freedom of local residuals that the model has taken."""
         inputs = self.sources.stop - self.sources.start
-        values = np.zeros((len(self.bins.omega), inputs + model.follow.shape[1]), complex)
-        values[:, :inputs] = self.bins.values[:, self.sources]
-        values[model.places, inputs:] = model.follow
-        bins = self.bins._replace(values=values)
+        # A long record has many times the bins that the windows reach.
+        reached = slice(0, int(np.max(window_slices(omega, half_width, self.bins)[1])))
+        own = self.bins.values[:, self.sources]
+        values = np.zeros((reached.stop, inputs + model.follow.shape[1]), complex)
+        values[:, :inputs] = own[reached]
+        inside = model.places < reached.stop
+        values[model.places[inside], inputs:] = model.follow[inside]
+        bins = Bins(self.bins.omega[reached], self.bins.record[reached], values, self.bins.records)
         columns = slice(0, inputs), slice(inputs, values.shape[1])
-        fit = local_fit(omega, half_width, bins, *columns, order, "polynomial")
+        largest = np.max(np.abs(own), axis=0)
+        fit = local_fit(omega, half_width, bins, *columns, order, "polynomial", largest=largest)
         left = np.real(np.trace(np.nan_to_num(fit.scatter), axis1=1, axis2=2))
         return 0.5 * left * np.maximum(fit.freedom, 1.0)
 
@@ -151,12 +156,14 @@ def shared_errors(
     places = used[0].places
     roots = noise.root_at(bins.omega[places])
     lines = roots / np.maximum(np.linalg.norm(roots, axis=2, keepdims=True), 1e-300)
-    drive = [
-        model.drive[:, :, None] * (np.sqrt(model.noise)[:, None] * lines[:, c])
-        for c, model in enumerate(rest.models)
-        if model is not None
-    ]
-    return SharedErrors(slopes, np.concatenate(drive), places)
+    counts = [0 if model is None else len(model.drive) for model in rest.models]
+    drive, first = np.empty((sum(counts), *lines[:, 0].shape), complex), 0
+    for c, model in enumerate(rest.models):
+        if model is not None:
+            level = np.sqrt(model.noise)[:, None] * lines[:, c]
+            np.multiply(model.drive[:, :, None], level, out=drive[first : first + counts[c]])
+            first += counts[c]
+    return SharedErrors(slopes, drive, places)
 
 
 _END, _FEWEST = 0.05, 20  # share of a record, and samples, that count as its end
@@ -164,19 +171,19 @@ _MOVING, _LARGE = 4.0, 10.0  # ratios of powers to the noise's: of the end, and 
 
 
 def left_moving(
-    rest: Rest, columns: Sequence[Float[np.ndarray, "_samples channels"]], grid: Grid, noise: Noise
+    rest: Rest, ends: Sequence[Float[np.ndarray, "_samples channels"]], grid: Grid, noise: Noise
 ) -> Bool[np.ndarray, " grid"]:
     """Where models leave a peak, far above the noise, of a channel that moves when a record ends.
 
     There the local fits alone have to tell the response from what still rings, which they cannot do
-    of a mode narrower than their windows. `columns` are the records' channels as transformed, and
-    `noise` is that of the moved channels on the `grid`.
+    of a mode narrower than their windows. `ends` are those of the records' channels as transformed,
+    and `noise` is that of the moved channels on the `grid`.
     """
     found = np.zeros(grid.size, bool)
     for c in range(len(rest.models)):
         power = noise.power_at(rest.bins.omega)[:, c]
         level = float(np.mean(power))
-        if not any(_end_power(each[:, rest.moved.start + c]) > _MOVING * level for each in columns):
+        if not any(np.var(end[:, rest.moved.start + c]) > _MOVING * level for end in ends):
             continue
         values = np.abs(rest.bins.values[:, rest.moved.start + c]) ** 2 / power
         found |= _peaks(np.log(rest.bins.omega), values, np.log(grid))
@@ -200,6 +207,6 @@ def _peaks(
     return found
 
 
-def _end_power(values: Float[np.ndarray, " samples"]) -> float:
-    """Mean square at the end, without the mean."""
-    return float(np.var(values[-max(int(_END * len(values)), _FEWEST) :]))
+def end_of(columns: Float[np.ndarray, "samples channels"]) -> Float[np.ndarray, "last channels"]:
+    """The last samples of a record, by which `left_moving` judges it; a copy of them alone."""
+    return columns[-max(int(_END * len(columns)), _FEWEST) :].copy()

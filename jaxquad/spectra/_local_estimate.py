@@ -9,7 +9,7 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance
 from ._estimators import LocalPolynomial
 from ._feedback import COHERENT
-from ._global_rest import left_moving, Rest, shared_errors, subtract_models
+from ._global_rest import end_of, left_moving, Rest, shared_errors, subtract_models
 from ._local_fit import (
     Bins,
     check_bins,
@@ -193,8 +193,8 @@ def estimate_local_polynomial(
     moved = _fit_chosen(omega, width, rational, _responder(rest, inputs, order, "direct"))
     ringing = np.zeros(omega.size, bool)
     if options.global_order:
-        columns = [transformed_columns(record, options.integrators) for record in records]
-        ringing = left_moving(rest, columns, grid, sources)[at]
+        columns = (transformed_columns(record, options.integrators) for record in records)
+        ringing = left_moving(rest, [end_of(each) for each in columns], grid, sources)[at]
     doubtful = unresolved(omega, moved, sources, at, bins, rest.moved) & (options.width is None)
     lost = doubtful
     if method == "joint":

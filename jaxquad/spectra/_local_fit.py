@@ -295,14 +295,17 @@ def local_fit(
     outputs: slice,
     order: int,
     shape: Literal["polynomial", "rational"],
+    *,
+    largest: Float[np.ndarray, " inputs"] | None = None,
 ) -> LocalFit:
     """Fit the response and each record's transient around every frequency.
 
     `shape` says whether both are polynomials of `order`, or such polynomials over a common
-    denominator of the first degree.
+    denominator of the first degree; `largest` are the inputs' largest values at any bin, where
+    `bins` are not all of them.
     """
     first, last = window_slices(omega, half_width, bins)
-    largest = np.max(np.abs(bins.values[:, inputs]), axis=0)
+    largest = np.max(np.abs(bins.values[:, inputs]), axis=0) if largest is None else largest
     longest = max(int(np.max(last - first)), 1)
     fields, places = [], np.argsort(last - first, kind="stable")
     size = min(_CHUNK, max(_BINS // longest, 1))

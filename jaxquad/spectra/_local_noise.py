@@ -316,17 +316,36 @@ def _on_common_atoms(
     Bins that no local fit uses are one more atom for each parameter, with the same covariance.
     """
     parameters, _, roots = models.drive.shape
-    size = np.sqrt(0.5 * np.sum(np.abs(models.drive) ** 2, axis=(1, 2)))
+    size = np.sqrt(0.5 * np.array([_power(row) for row in models.drive]))
     size = np.where(size > 0, size, 1.0)
-    unit = models.drive / size[:, None, None]
     column = np.searchsorted(atoms, models.places)
     mine = np.isin(models.places, atoms)
-    rest = unit[:, ~mine].reshape(parameters, -1)
-    values, vectors = np.linalg.eigh(np.real(rest @ np.conj(rest).T))
+    values, vectors = np.linalg.eigh(_gram(models.drive, ~mine) / np.outer(size, size))
     drive = np.zeros((_padded(parameters, _PARAMETERS), count, roots), complex)
-    drive[:parameters, column[mine]] = unit[:, mine]
+    for row, whole, unit in zip(drive, models.drive, size, strict=False):
+        row[column[mine]] = whole[mine] / unit
     spare = slice(atoms.size, atoms.size + parameters)
     drive[:parameters, spare, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
     known = np.zeros((*slopes.shape[:3], len(drive)), complex)
     known[..., :parameters] = slopes * size
     return known, drive
+
+
+_TOGETHER = 4096  # bins whose drives are taken at a time: those of a long record are many
+
+
+def _power(drive: Complex[np.ndarray, "places roots"]) -> float:
+    return float(np.vdot(drive, drive).real)
+
+
+def _gram(
+    drive: Complex[np.ndarray, "parameters places roots"], taken: Bool[np.ndarray, " places"]
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Real part of the products of all pairs of rows over the bins that are `taken`."""
+    total = np.zeros((len(drive), len(drive)))
+    places = np.flatnonzero(taken)
+    for first in range(0, places.size, _TOGETHER):
+        part = drive[:, places[first : first + _TOGETHER]].reshape(len(drive), -1)
+        rows = np.ascontiguousarray(part).view(float)  # real and imaginary parts in turn
+        total += rows @ rows.T
+    return total
