@@ -102,7 +102,8 @@ def _draw_output(top: Axes, bottom: Axes, checks: Mapping[str, Verification], k:
     one, shape = first.outputs[k], (first.time.size, len(first.outputs))
     scale, unit = unit_label(one.unit)
     measured = scale * first.measured.reshape(shape)[:, k]
-    _plot(top, first.time, measured, {"color": "0.15", "lw": 1.0, "label": "measured"})
+    ink = {"color": "0.15", "lw": 1.0} if len(checks) == 1 else {"color": "0.7", "lw": 3.0}
+    _plot(top, first.time, measured, ink | {"label": "measured"})
     for m, (name, check) in enumerate(checks.items()):
         simulated = scale * check.simulated.reshape(shape)[:, k]
         text = name if len(checks) == 1 else f"{name}: {check.outputs[k].fit_percent:.1f} %"
