@@ -67,7 +67,7 @@ def tune(
     First the slowest pole of every member is moved to the left of the knee of the objective's
     penalty on the abscissa (-0.5 1/s without one), which needs no flights. Then the objective is
     minimised through their flights of the scenario. Limits are enforced by an augmented Lagrangian,
-    those of the linear loop on 512 further members. Then others are searched for such as are beyond
+    those of the linear loop on 256 further members. Then others are searched for such as are beyond
     a limit that every member has to keep: 8192 linear loops, 2048 flights. The worst join those
     that the limit is kept on, and the descent goes on from where it ended, until a search of other
     members finds none, five times at most. Where the certificate still finds one, it is tuned on,
@@ -193,7 +193,7 @@ def tune(
     )
 
 
-_WIDE = 512
+_WIDE = 256
 _CERTIFICATES = 3  # at most
 _AGAIN = 0xCE57  # folded into the key of certificates after the first
 

@@ -133,7 +133,7 @@ class Tuned(eqx.Module):
         numbers = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
         lines = [first, *map(str, verdicts), f"tuned: {numbers}", f"  {_describe_effort(self)}"]
         lines += [f"  {_describe_limit(one)}" for one in self.limits]
-        lines += [f"  {_describe_tail(self.tail)}"] if self.tail.searches else []
+        lines += [f"  {describe_tail(self.tail)}"] if self.tail.searches else []
         lines += _describe_optima(self.minima) if len(self.minima) > 1 else []
         lines += [f"  ! {remark}" for remark in self.remarks]
         return "\n".join([*lines, *map(str, rest)])
@@ -164,7 +164,7 @@ def _describe_limit(one: LimitResult) -> str:
     return f"limit on {one.limit}: {one.found:.4g} on the members tuned on, {state}"
 
 
-def _describe_tail(tail: Tail) -> str:
+def describe_tail(tail: Tail) -> str:
     flights = f" and {tail.flown} flights" if tail.flown else ""
     loops = f"{tail.searched} further linear loops" if tail.searched else "further members"
     text = f"limits: {loops}{flights} searched, "
@@ -172,8 +172,9 @@ def _describe_tail(tail: Tail) -> str:
     if tail.certificates < 2:
         return text
     return (
-        f"{text}; certificate {tail.certificates} follows, because members of the one before were "
-        "beyond a limit: these are tuned on, too, and it has others"
+        f"{text}; this is certificate {tail.certificates}, on members of its own, because the one "
+        "before found some beyond a limit, which are tuned on, too: read its 95 % as "
+        f"{100 - 5 * tail.certificates} %"
     )
 
 

@@ -16,7 +16,7 @@ DATA = Path(os.environ.get("JAXQUAD_DATA", ROOT / ".." / "shared" / "data"))
 LOG = DATA / "antx_pitch" / "antx_log3_prbs.npz"
 COMMAND = (str(Path(sys.executable).with_name("jaxquad")),)
 IDENTIFY = (*COMMAND, "identify", str(LOG), "--input", "M", "--output", "q", "--reference", "x0")
-IDENTIFY = (*IDENTIFY, "--rate", "250", "--quiet", "--out", "antx")
+IDENTIFY = (*IDENTIFY, "--rate", "250", "--unit", "q=rad/s", "--quiet", "--out", "antx")
 
 
 class Job(NamedTuple):
@@ -40,7 +40,7 @@ JOBS = (
     Job("`jaxquad identify`, report and figures", IDENTIFY),
     Job(
         "`jaxquad tune` on its result",
-        (*COMMAND, "tune", "antx", "--inertia", "0.0552", "--quiet"),
+        (*COMMAND, "tune", "antx", "--inertia", "0.0552", "--limit", "1", "--quiet"),
         IDENTIFY,
     ),
     Job("the README's main job", (sys.executable, str(ROOT / "fits" / "hover_roll.py"))),

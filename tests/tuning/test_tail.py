@@ -9,7 +9,8 @@ from jaxquad.loops import loop_numbers
 from jaxquad.simulation import scenario
 from jaxquad.tuning import LBFGS, Limit, tune
 from jaxquad.tuning._problem import linear_loops
-from jaxquad.tuning._tail import take_members, WorstLoops
+from jaxquad.tuning._tail import Tail, take_members, WorstLoops
+from jaxquad.tuning._tuned import describe_tail
 
 
 def loops(seed, count=6):
@@ -36,6 +37,14 @@ def test_members_are_taken_from_several_draws_with_the_noise_that_is_theirs():
         np.testing.assert_array_equal(found.plant.lag[0, k], drawn[s].plant.lag[0, place])
         own = drawn[s].take([place]).flight(still).noise
         np.testing.assert_array_equal(flown[..., k], own[..., 0])
+
+
+def test_one_certificate_of_several_claims_less():
+    """By Bonferroni: the claims of n certificates hold together with 1 - 0.05 n at least."""
+    found = describe_tail(Tail(searches=3, searched=24576, added=4, certificates=2))
+    assert "24576 further linear loops searched, 4 of the worst added" in found
+    assert "this is certificate 2" in found and "read its 95 % as 90 %" in found
+    assert "certificate" not in describe_tail(Tail(searches=1, searched=8192, certificates=1))
 
 
 @pytest.mark.slow
