@@ -176,3 +176,15 @@ def test_a_laws_parameters_make_the_same_law(name):
     assert back == values and len(values) > 5
     with pytest.raises(ValueError, match="has no place"):
         with_parameters(law, {"THR_MDL_FAC": 0.3})
+
+
+def test_a_law_of_one_axis_has_the_parameters_of_the_axis_that_it_is_said_to_be():
+    law = PX4Attitude(PX4Rate([0.15], [0.2], [0.003], gyro=GYRO), [4.0])
+    with pytest.raises(ValueError, match="one axis"):
+        list_parameters(law)
+    found = list_parameters(law, axes=["pitch"])
+    assert found["MC_PITCH_P"] == 4 and found["IMU_GYRO_CUTOFF"] == 40
+    assert not any("ROLL" in name or "YAW" in name for name in found)
+    changed = with_parameters(law, {"MC_PITCH_P": 5.0})
+    assert list_parameters(changed, axes=["pitch"])["MC_PITCH_P"] == 5
+    assert changed.p.shape == (1,)

@@ -234,23 +234,36 @@ def firmware_of(law: AnyLaw) -> Firmware:
     return _RATES[type(_parts(law)[0])]
 
 
-def list_parameters(law: AnyLaw) -> dict[str, float]:
-    """The parameters that a law of roll, pitch and yaw amounts to, not rounded.
+def list_parameters(law: AnyLaw, *, axes: Sequence[str] = AXES) -> dict[str, float]:
+    """The parameters that a law amounts to, not rounded.
 
-    Gains and filters of a law, and the angle loop's where it has one. Not listed: Betaflight's
-    filters, because their parameters are ranges over the throttle.
+    Gains and filters of a law, and the angle loop's where it has one; parameters of all axes, such
+    as a gyro filter, too. Not listed: Betaflight's filters, because their parameters are ranges
+    over the throttle.
+
+    **Arguments:**
+
+    - `axes`: which of roll, pitch and yaw; of a law of one axis, which that is.
 
     **Raises:**
 
-    - `ValueError`: the law is for other than 1 or 3 axes.
+    - `ValueError`: an axis is unknown, or the law is of one axis and several are named.
     """
-    return {
-        row.name: float(np.broadcast_to(value, (3,))[max(row.axis, 0)]) for row, value in _held(law)
-    }
+    if unknown := set(axes) - set(AXES):
+        raise ValueError(f"axes has {', '.join(sorted(unknown))}: give some of {', '.join(AXES)}.")
+    found = {}
+    for row, value in _held(law):
+        if row.axis >= 0 and AXES[row.axis] not in axes:
+            continue
+        if value.shape == (1,) and len(axes) != 1:
+            raise ValueError("the law is of one axis: say which, as axes=['roll'].")
+        wide = np.broadcast_to(value, (3,))
+        found[row.name] = float(wide[max(row.axis, 0)])
+    return found
 
 
 def with_parameters(law: Law, values: Mapping[str, Number]) -> Law:
-    """The law with these parameters, by name; others stay.
+    """The law with these parameters, by name; others stay. A law of one axis takes any axis'.
 
     **Raises:**
 
@@ -331,6 +344,8 @@ def _set_rate(law: RateLaw, row: Parameter, value: Number):
 
 
 def _with_axis(now: Array, axis: int, value: Number) -> Array:
-    """One axis changed, or all of them."""
+    """One axis changed, or all of them; the only one of a law of one axis."""
     one = jnp.asarray(value, now.dtype)
-    return jnp.full_like(now, one) if axis < 0 else jnp.broadcast_to(now, (3,)).at[axis].set(one)
+    if axis < 0 or now.shape == (1,):
+        return jnp.full_like(now, one)
+    return jnp.broadcast_to(now, (3,)).at[axis].set(one)
