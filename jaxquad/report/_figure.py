@@ -37,6 +37,7 @@ class Image(NamedTuple):
     caption: str = ""
     ratio: tuple[str, str] | None = None  # output and input, in front of the caption
     curves: str = "[]"  # JSON: what a pointer reads on each panel
+    is_map: bool = False  # its colours are a scale, which a dark page must not invert
 
 
 def embed_figure(
@@ -45,6 +46,7 @@ def embed_figure(
     alt: str,
     caption: str = "",
     ratio: tuple[str, str] | None = None,
+    is_map: bool = False,
 ) -> Image:
     """What `draw()` returns as an image. Texts in it are drawn as they are, dollar signs too."""
     settings = {"svg.hashsalt": "jaxquad", "svg.fonttype": "path", "text.parse_math": False}
@@ -57,7 +59,7 @@ def embed_figure(
         kind, data = _encoded(drawn)
     width, height = (f"{_WIDTH * inches:.0f}" for inches in drawn.get_size_inches())
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-    return Image(alt, width, height, source, caption, ratio, _curves(drawn))
+    return Image(alt, width, height, source, caption, ratio, _curves(drawn), is_map)
 
 
 _NARROW = 5.0  # inches: letters of 10 points are 10 pixels high on a screen of 390

@@ -39,7 +39,8 @@ def entry_of(record: Record, frf: FrequencyResponse) -> Entry | None:
     output, source = record.unit(frf.output_names[0]), record.unit(frf.input_names[0])
     if output == source:
         return None
-    return {output: "set-point", source: "plant input"}.get(unit)
+    entries: dict[str, Entry] = {output: "set-point", source: "plant input"}
+    return entries.get(unit)
 
 
 def _facts(found: BrokenLoop) -> dict[str, str]:

@@ -43,6 +43,7 @@ def _image(record: Record, output: str, over: str) -> Image:
         lambda: spectrogram(record, output, over=over),
         alt=f"Power spectral density of {output} over {over}.",
         caption=f"Spectrum of {output} over {over}.",
+        is_map=True,
     )
 
 

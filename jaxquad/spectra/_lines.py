@@ -117,4 +117,4 @@ def _rank_correlation(a: Float[np.ndarray, " many"], b: Float[np.ndarray, " many
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return 0.0
     ranks = [np.argsort(np.argsort(each, kind="stable"), kind="stable") for each in (a, b)]
-    return float(np.corrcoef(ranks)[0, 1])
+    return float(np.asarray(np.corrcoef(ranks)).flat[1])

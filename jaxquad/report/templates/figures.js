@@ -45,27 +45,31 @@ for (const figure of document.querySelectorAll("figure[data-curves]")) {
   frame.addEventListener("pointerdown", read);
   frame.addEventListener("pointerleave", () => { line.hidden = note.hidden = true; });
 
-  let size = 0; // 0: in the page; else a share of the window
+  let size = 0; // 0: in the page; else a share of the window's width
+  const image = frame.querySelector("img");
+  const whole = () => innerWidth < 700 ? 1.8 : // a phone scrolls
+    Math.min(1, Math.max(0.75, 0.9 * innerHeight * image.width / image.height / innerWidth));
   const zoom = (next) => {
-    size = next < 0.7 ? 0 : Math.min(next, 6);
+    size = next < 0.7 * whole() ? 0 : Math.min(next, 6);
+    button.textContent = size ? "Close" : "Enlarge";
     figure.classList.toggle("zoomed", size > 0);
     frame.style.width = size ? `${100 * size}%` : "";
   };
   const button = document.createElement("button");
   button.type = "button";
   button.textContent = "Enlarge";
-  button.addEventListener("click", () => zoom(size ? 0 : 1));
+  button.addEventListener("click", () => zoom(size ? 0 : whole()));
   figure.append(button);
-  figure.addEventListener("dblclick", () => zoom(size ? 0 : 1));
+  figure.addEventListener("dblclick", () => zoom(size ? 0 : whole()));
   figure.addEventListener("wheel", (event) => {
     if (!size) return;
     event.preventDefault();
-    zoom(Math.max(0.7, size * (event.deltaY < 0 ? 1.2 : 1 / 1.2)));
+    zoom(Math.max(0.7 * whole(), size * (event.deltaY < 0 ? 1.2 : 1 / 1.2)));
   }, {passive: false});
   document.addEventListener("keydown", (event) => {
     if (!size) return;
     if (event.key === "Escape") zoom(0);
     if (event.key === "+") zoom(size * 1.2);
-    if (event.key === "-") zoom(Math.max(0.7, size / 1.2));
+    if (event.key === "-") zoom(Math.max(0.7 * whole(), size / 1.2));
   });
 }
