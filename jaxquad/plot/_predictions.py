@@ -185,7 +185,7 @@ def step(
     named_models(things, "step")
     end = max(map(_duration, things.values())) if duration is None else float(duration)
     time = np.linspace(0.0, end, _SAMPLES)
-    answers = {name: _answer(name, thing, time) for name, thing in things.items()}
+    answers = {name: _answer(thing, time) for name, thing in things.items()}
     channels = _channels(things, answers, records)
     places = channels.places(pair)
     columns = len({i for _, i in places})
@@ -230,7 +230,7 @@ def _duration(thing: Thing) -> float:
     return float(_TIME_CONSTANTS / rates.min()) if rates.size else _LONGEST
 
 
-def _answer(name: str, thing: Thing, time: Samples) -> _Answer:
+def _answer(thing: Thing, time: Samples) -> _Answer:
     if isinstance(thing, StepResponse):
         reach = 1.96 * thing.standard_error
         return _Answer(thing.time, thing.mean[:, None, None], reach[:, None, None])
@@ -239,16 +239,16 @@ def _answer(name: str, thing: Thing, time: Samples) -> _Answer:
         return _Answer(found.time, found.value, found.reach)
     if isinstance(thing, Model):
         return _Answer(time, step_response(thing, time))
-    return _closed_loop(name, thing, float(time[-1]))
+    return _closed_loop(thing, float(time[-1]))
 
 
-def _closed_loop(name: str, loop: Thing, duration: float) -> _Answer:
+def _closed_loop(loop: Thing, duration: float) -> _Answer:
     """A step of 1 deg of the first axis, per deg. Raises ValueError for what is no single loop."""
     from jaxquad.loops import Loop
     from jaxquad.simulation import scenario, simulate, Step  # here: most figures show no loop
 
     if not isinstance(loop, Loop):
-        raise ValueError(f"step cannot draw {name}, a {type(loop).__name__}: give its jq.Loop")
+        raise ValueError(f"step cannot draw a {type(loop).__name__}: give its jq.Loop")
     axes = np.shape(loop.plant.measure(loop.plant.init()))[0]
     size = float(np.radians(1.0))
     whole = loop.dt * max(round(duration / loop.dt), 2)

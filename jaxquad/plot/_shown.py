@@ -135,7 +135,7 @@ def analysed(name: str, thing: Thing, what: str) -> PyTree:
 
     found = analyse(thing, 0) if isinstance(thing, Loop) else thing
     if not isinstance(found, LoopAnalysis):
-        raise ValueError(f"{what} cannot draw {name}, a {type(thing).__name__}: give {_KINDS}")
+        raise ValueError(f"{what} cannot draw a {type(thing).__name__}: give {_KINDS}")
     if found.abscissa.ndim:
         raise ValueError(
             f"{name} is an ensemble of {found.abscissa.size} loops: give one of them to {what}, "

@@ -179,8 +179,8 @@ def test_flights_by_name_share_their_set_point():
 def test_what_cannot_be_drawn_is_refused_with_what_to_give(record):
     frf = response_of(TRUTH)
     for draw, thing, message in (
-        (jq.plot.bode, 3.0, "bode cannot draw loop, a float: give a model with frequency_response"),
-        (jq.plot.nyquist, "log.csv", "nyquist cannot draw loop, a str"),
+        (jq.plot.bode, 3.0, "bode cannot draw a float: give a model with frequency_response"),
+        (jq.plot.nyquist, "log.csv", "nyquist cannot draw a str"),
         (jq.plot.step, frf, "joint estimate was measured, but step needs a model"),
         (jq.plot.pzmap, record, "flown was measured, but pzmap needs a model"),
         (jq.plot.coherence, TRUTH, "model: a model has no coherence"),
