@@ -1,6 +1,7 @@
 """The gain over the throttle, from outputs that scipy calculates of a known plant and curve."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,8 +30,8 @@ def flight(levels=LEVELS, *, seed=1, wander=0.01, noise=1.0):
     phase = 2 * np.pi * (1.0 * local + 34.0 * local**2 / (2 * (SECONDS - 1)))
     u = np.where((local > 0.3) & (local < SECONDS - 0.7), 100 * np.sin(phase), 0.0)
     throttle = np.repeat(levels, count) + wander * np.sin(2 * np.pi * 0.23 * time)
-    plant = [1.0], [LAG, 1.0, 0.0]
-    numerator, denominator, _ = cont2discrete(plant, DT, "zoh")
+    found: Any = cont2discrete(([1.0], [LAG, 1.0, 0.0]), DT, "zoh")
+    numerator, denominator = found[:2]
     driven = np.concatenate([[0.0], gain(throttle) * u])[: time.size]  # one sample of delay
     y = lfilter(np.ravel(numerator), denominator, driven) + noise * rng.standard_normal(time.size)
     return jq.Record(
@@ -128,7 +129,8 @@ def test_a_curve_that_the_firmware_inverts_already_is_found_again():
     names = {"input_names": ("sum", "throttle"), "output_units": "deg/s", "hold": "dt"}
     found = identify(jq.Record(record.time, inputs, record.outputs, **names), flown_curve=CURVE)
     np.testing.assert_allclose(found.gain, SLOPE, rtol=0.02)
-    assert abs(found.curve.value - CURVE) < 3.5 * found.curve.standard_error
+    curve = found.curve
+    assert curve is not None and abs(curve.value - CURVE) < 3.5 * curve.standard_error
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ def direct_ratios(truth, flights, k: int) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="b0 over the throttle from simulated flights")
     parser.add_argument("--flights", type=int, default=40)
     count = parser.parse_args().flights
     jq.enable_x64()

@@ -106,7 +106,7 @@ def fly(truth: Truth, rng: np.random.Generator, log_rate: int = 1000) -> Flights
             logged[:, k // every] = np.round(r), np.round(x2), np.round(command)
     stamps = np.arange(steps // every) / log_rate
     gas = np.repeat(throttle, 400 // every, axis=0)[: stamps.size]
-    return Flights(stamps, *logged, np.round(gas, 3))
+    return Flights(stamps, logged[0], logged[1], logged[2], np.round(gas, 3))
 
 
 def _throttle(rng, n) -> np.ndarray:
