@@ -27,16 +27,17 @@ class Settings(NamedTuple):
 _REVISION = re.compile(r"(\d+)\.(\d+)(?:\.(\d+))?")
 
 
-def read_settings(path: str | Path, *, log: str = "") -> Settings:
+def read_settings(path: str | Path, *, log: str = "", at: float | int | None = None) -> Settings:
     """Read the parameters that a log begins with.
 
-    A parameter that was changed in flight has its last value in ArduPilot's and PX4's logs, and its
-    first one in Betaflight's.
+    A parameter that was changed in flight has its value of the time `at`; by default its last one
+    in ArduPilot's and PX4's logs, and its first one in Betaflight's, which say no more.
 
     **Arguments:**
 
     - `path`: a log of Betaflight, ArduPilot or PX4.
     - `log`: of a Betaflight file with several logs, which one: "log2".
+    - `at`: in s of the log's own time, for logs of ArduPilot and PX4.
 
     **Returns:** the `Settings`.
 
@@ -45,7 +46,8 @@ def read_settings(path: str | Path, *, log: str = "") -> Settings:
     - `ReadError`: the file cannot be read, is of no autopilot, or holds no parameters.
     """
     found = load_log(path)
-    values = found.settings
+    later = [change for change in found.changes if at is not None and change.time > at]
+    values = {**found.settings, **{each.name: each.before for each in reversed(later)}}
     if log:
         values = {
             k.removeprefix(f"{log} "): x for k, x in values.items() if k.startswith(f"{log} ")

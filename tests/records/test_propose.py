@@ -6,7 +6,7 @@ from flight_logs import ardupilot, CHIRP, IN_RUN, px4, TIME, WAVE
 from log_writers import DataFlash
 
 from jaxquad.cli import make_parser
-from jaxquad.records import parse_mix, propose, read, ReadError, RecordError
+from jaxquad.records import parse_mix, propose, read, read_settings, ReadError, RecordError
 from jaxquad.workflows import IdentifySettings
 
 
@@ -83,6 +83,13 @@ def test_px4s_parameter_updates_split_a_log_without_injections(tmp_path):
     assert proposal.setup.stop == pytest.approx(28.0, abs=0.01)
     assert proposal.options["start"] == pytest.approx(20.0, abs=0.01)
     assert "MC_ROLLRATE_P 0.15" in str(proposal)
+
+
+def test_the_settings_of_a_time_are_those_before_later_changes(tmp_path):
+    path = ardupilot(tmp_path, 10, changes=((25.0, 0.2), (27.0, 0.3)))
+    name = "ATC_RAT_RLL_P"
+    found = [float(read_settings(path, at=at).values[name]) for at in (24.0, 26.0, 28.0, None)]
+    np.testing.assert_allclose(found, [0.135, 0.2, 0.3, 0.3], rtol=1e-6)
 
 
 def test_the_collective_is_proposed_as_a_second_input(data, tmp_path):
