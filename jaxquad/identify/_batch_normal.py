@@ -23,7 +23,7 @@ from jaxquad.models import evaluate_response, StateSpace
 
 from ._held import held
 from ._mixing import Mixing
-from ._parameters import Parameters, Place
+from ._parameters import Numbers, Parameters, Place
 from ._problem import Problem, unchanged
 from ._solve import problem_normal
 
@@ -34,9 +34,9 @@ class Member(NamedTuple):
     Frequencies are filled up to a length that many records share; only `count` of them count.
     """
 
-    inverse: tuple[Array, Array]  # frequencies outputs inputs: 1 / measured, real and imaginary
-    weights: Array  # frequencies outputs inputs 2
-    factor: tuple[Array, Array] | None  # frequencies frequencies outputs inputs, a `Mixing`'s
+    inverse: tuple[Numbers, Numbers]  # frequencies outputs inputs: 1 / measured, real, imaginary
+    weights: Numbers  # frequencies outputs inputs 2
+    factor: tuple[Numbers, Numbers] | None  # frequencies frequencies outputs inputs, a `Mixing`'s
 
 
 class Batch(NamedTuple):
@@ -45,8 +45,8 @@ class Batch(NamedTuple):
     model: PyTree
     parameters: Parameters
     hold: float  # s
-    omega: Float[Array, " frequencies"]
-    count: Int[Array, ""]  # of the frequencies
+    omega: Float[Numbers, " frequencies"]
+    count: Int[Numbers, ""]  # of the frequencies
 
 
 Column = tuple[Array, Array]  # of slopes or misfits: magnitudes and phases, weighted
@@ -102,7 +102,8 @@ def _problem_of_one(batch: Batch, member: Member) -> Problem:
     mixing = None
     if member.factor is not None:
         factor = jnp.moveaxis(jax.lax.complex(*member.factor), (0, 1), (2, 3))
-        mixing = Mixing(factor, factor)  # correlations matter to nothing here
+        # Traced, in the place of NumPy's arrays; correlations matter to nothing here.
+        mixing = Mixing(factor, factor)  # pyright: ignore[reportArgumentType]
     return Problem(
         model=batch.model,
         parameters=batch.parameters,
@@ -164,7 +165,7 @@ def _mix(
     columns_at: Callable[[Array], list[Column]],
     omega: Array,
     count: Int[Array, ""],
-    factor: tuple[Array, Array],
+    factor: tuple[Numbers, Numbers],
     columns: int,
 ) -> Callable[[Array], list[Column]]:
     """The same columns with points that share noise taken together, by a triangular factor."""
@@ -191,7 +192,7 @@ def _mix(
     return mixed_at
 
 
-def _two_indices(array: Array, k: Array, g: Array) -> Array:
+def _two_indices(array: Numbers, k: Array, g: Array) -> Array:
     first, rest = (1, 1), array.shape[2:]
     start = (k, g, *(jnp.zeros_like(k) for _ in rest))
     return jax.lax.dynamic_slice(array, start, (*first, *rest))[0]

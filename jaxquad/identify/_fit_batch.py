@@ -114,7 +114,7 @@ def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Mem
     weights[:, measured.shape[1] :] = 0
     shared = any(each is not None for each in mixings)
     factor = _factors(mixings, measured.shape, inverse.shape[1]) if shared else None
-    return Member((inverse.real, inverse.imag), weights, factor)
+    return Member((np.real(inverse), np.imag(inverse)), weights, factor)
 
 
 def _factors(
@@ -127,7 +127,7 @@ def _factors(
     for k, mixing in enumerate(mixings):
         factor = np.eye(count)[:, :, None, None]
         factor = factor if mixing is None else np.moveaxis(mixing.factor, (0, 1), (2, 3))
-        real[k, :count, :count], imag[k, :count, :count] = factor.real, factor.imag
+        real[k, :count, :count], imag[k, :count, :count] = np.real(factor), np.imag(factor)
     return real, imag
 
 
@@ -354,9 +354,9 @@ def fit_batch(
             model, parameters, *arrays, weights, mixings=mixings, start=start, **options
         )
     return BatchFit(
-        parameters.names, found.values, found.cost, found.decrement, found.steps, found.converged,
+        parameters.names, *(np.asarray(part) for part in found[1:]),
         model=model, parameters=parameters, points=tuple(data.points), weights=weights,
-        mixed=mixed, z=found.z,
+        mixed=mixed, z=np.asarray(found.z),
     )  # fmt: skip
 
 

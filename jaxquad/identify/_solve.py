@@ -85,7 +85,7 @@ def _logarithm(value: Split, measured: Complex[Array, "frequencies outputs input
     b = value.imag * real - value.real * imag
     power = real * real + imag * imag
     size = (value.real * value.real + value.imag * value.imag) / power
-    return Split(0.5 * jnp.log(size), arctan2(b, a))
+    return Split(0.5 * jnp.log(size), jnp.asarray(arctan2(b, a)))
 
 
 def _entry(name: str) -> Entry:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jaxquad.models import invert
+from jaxquad.models import invert_definite
 
 
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
@@ -82,7 +82,7 @@ def _least_squares(
     size = jnp.maximum(jnp.sqrt(jnp.sum(jnp.abs(columns) ** 2, axis=1, keepdims=True)), 1e-300)
     unit = columns / size.astype(columns.dtype)
     ridge = _RIDGE * jnp.eye(unit.shape[2], dtype=unit.dtype)[None]
-    pseudo = invert(_adjoint(unit) @ unit + ridge) @ _adjoint(unit)
+    pseudo = invert_definite(_adjoint(unit) @ unit + ridge) @ _adjoint(unit)
     rest, q = left, own
     for _ in range(2):  # the second time for the rounding of nearly dependent columns
         rest, q = rest - unit @ (pseudo @ rest), q - unit @ (pseudo @ q)

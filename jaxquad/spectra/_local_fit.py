@@ -305,7 +305,8 @@ def local_fit(
     `bins` are not all of them.
     """
     first, last = window_slices(omega, half_width, bins)
-    largest = np.max(np.abs(bins.values[:, inputs]), axis=0) if largest is None else largest
+    peak = np.max(np.abs(bins.values[:, inputs]), axis=0) if largest is None else largest
+    threshold = _UNEXCITED * np.asarray(peak)
     longest = max(int(np.max(last - first)), 1)
     fields, places = [], np.argsort(last - first, kind="stable")
     size = min(_CHUNK, max(_BINS // longest, 1))
@@ -316,7 +317,7 @@ def local_fit(
         u, y = (values[:, :, each] * used[:, :, None] for each in (inputs, outputs))
         solve = solve_polynomial if shape == "polynomial" else solve_rational
         solution = solve(window.place, u, y, own, order)
-        excited = np.all(np.max(np.abs(u), axis=1) > _UNEXCITED * largest, axis=1)
+        excited = np.all(np.max(np.abs(u), axis=1) > threshold, axis=1)
         excited &= np.all(_leaked(solution, u) < _LEAKED, axis=1)
         count = np.maximum(np.sum(used, axis=1), 1)[:, None, None]
         part = (*_padded(solution, excited, longest), products(u) / count)
