@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
-from ._result import Fit
+from ._result import counted, Fit
 from ._verdict import Combination, reach_of_interval, UndeterminedError
 
 
@@ -283,7 +283,7 @@ class GainOverThrottle(eqx.Module):
         return plain_content(found)
 
     def __str__(self) -> str:
-        parts = [f"gain over throttle: {self.throttle.size} levels, {self._times()}"]
+        parts = [f"gain over throttle: {counted(self.throttle.size, 'level')}, {self._times()}"]
         per = f"{self.output_unit or 'output'} per s, per {self.input_unit or 'unit of input'}"
         parts.append(f"{'throttle':>8} {'from':>5} {'to':>5} {'s':>6} {'K':>10} {'+- 95 %':>9}"
                      f" {'K/lag':>10} {'+- 95 %':>9}   [K in {per}]")  # fmt: skip
