@@ -126,6 +126,7 @@ def test_a_cutoff_of_zero_lets_everything_pass():
     np.testing.assert_array_equal(run(FilterChain((PT1(0.0),), RATE), jnp.asarray(NOISE)), NOISE)
 
 
+@pytest.mark.slow
 def test_the_response_is_differentiable_by_cutoff_and_quality():
     def gain(x):
         chain = FilterChain((Butterworth(x[0]), Notch(x[1], x[2]), PT3(x[0]), PT1(x[1])), RATE)

@@ -234,7 +234,7 @@ SLOW = pytest.mark.slow
 LAWS = {name: law for name, (law, *_) in RATES.items()} | ANGLES
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=SLOW if x in ANGLES else ()) for x in LAWS])
+@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x == "ADRC" else SLOW) for x in LAWS])
 def test_small_signals_pass_as_the_linear_form_says(name):
     law, (r, y) = LAWS[name], broken_lines(1e-7)
     if name == "Betaflight, angle":
@@ -312,6 +312,7 @@ def test_the_integral_stops_where_the_mixer_gave_less(law):
     assert integrals[0] == state.memory["integral"] and integrals[1] > integrals[0]
 
 
+@pytest.mark.slow
 def test_a_setpoint_feeds_its_own_rate_forward():
     law = PX4Attitude(PX4, [4.0])
     zero = jnp.zeros(1)
@@ -320,6 +321,7 @@ def test_a_setpoint_feeds_its_own_rate_forward():
     np.testing.assert_allclose(ahead, as_angle, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_axes_and_members_have_their_own_gains():
     law = dataclasses.replace(
         CRAZYFLIE, kp=[[250.0, 200.0], [250.0, 200.0]], ki=[500.0, 400.0], kd=[2.5, 2.0],

@@ -85,6 +85,7 @@ def draws_of(gain, spread, count=40):
     return predict_loop(LAW.linear(0), factors[:, None] * sampled(gain)[2], OMEGA)
 
 
+@pytest.mark.slow
 def test_a_flight_is_reproduced_within_its_errors_and_by_the_right_plant_alone():
     seen = measured(GAIN, 1e-5)
     others = np.stack([measured(GAIN, 1e-5, seed) for seed in range(1, 13)])
@@ -95,11 +96,13 @@ def test_a_flight_is_reproduced_within_its_errors_and_by_the_right_plant_alone()
     assert wrong.inside < 0.5 and "do not reproduce" in wrong.verdict
 
 
+@pytest.mark.slow
 def test_a_flight_without_excitation_cannot_tell():
     found = check_loop(OMEGA, draws_of(GAIN, 0.02), measured(GAIN, 0.0), np.full(len(OMEGA), 0.9))
     assert "cannot tell" in found.verdict and "sweep" in found.verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency", [1.0, 5.0, 20.0])
 def test_the_filters_belong_either_to_the_law_or_to_the_plant(frequency):
     """Up to the derivative, which is taken at the gyro's rate or at the loop's."""

@@ -19,13 +19,13 @@ def test_px4s_parameters_and_version_are_those_that_were_logged(tmp_path):
     path = flight_logs.px4(tmp_path)
     log = ULog()
     log.info("uint32_t ver_sw_release", struct.pack("<I", 1 << 24 | 15 << 16 | 4 << 8 | 255))
-    log.info("float MC_ROLLRATE_P", struct.pack("<f", 0.16), kind="P")
+    log.info("float MC_YAWRATE_K", struct.pack("<f", 0.16), kind="P")
     head = len(ULog().content)
     content = path.read_bytes()
     path.write_bytes(bytes(log.content) + content[head:])
     found = read_settings(path)
     assert found.vehicle == "px4" and found.version == (1, 15, 4)
-    assert float(found.values["MC_ROLLRATE_P"]) == pytest.approx(0.16, rel=1e-7)
+    assert float(found.values["MC_YAWRATE_K"]) == pytest.approx(0.16, rel=1e-7)
 
 
 def test_betaflights_header_tells_gains_and_version(data):
