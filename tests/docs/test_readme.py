@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -10,39 +11,53 @@ from test_notebooks import words
 
 
 README = (ROOT / "README.md").read_text()
+BLOCK = re.compile(r"```(\w*)\n(.*?)```", flags=re.S)
 
 
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+def blocks(text, kind=""):
+    return [code for found, code in BLOCK.findall(text) if found == kind]
+
+
+def page(name):
+    return (ROOT / "docs" / name).read_text()
+
+
+def run(*command, folder):
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("example", "words"),
-    [
-        (EXAMPLES[0], ("gain", "lag + delay = 0.05")),
-        (
-            EXAMPLES[1],
-            ("stable loop", "stable for gains of 0.1104 to 2.148", "256 members", "CVaR20"),
-        ),
-    ],
-    ids=["identify", "control"],
-)
-def test_the_python_examples_print_what_they_promise(example, words):
-    assert len(example.splitlines()) <= 12
+def test_the_demo_prints_what_the_readme_shows_and_its_log_serves_the_eight_lines(tmp_path):
+    command = str(Path(sys.executable).with_name("jaxquad"))
+    printed = " ".join(words(run(command, "demo", folder=tmp_path)))
+    shown = blocks(README.partition("<!-- demo -->")[2])[1]
+    assert len(shown.splitlines()) == 8
+    for line in shown.splitlines():
+        assert " ".join(words(line)) in printed, line
+    (example,) = blocks(README, "python")
+    assert len(example.splitlines()) == 8
     # jnp's strict promotion, which the tests switch on, is not what a user has.
-    run = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    assert all(word in run.stdout for word in words), run.stdout
+    printed = run(sys.executable, "-c", example, folder=tmp_path)
+    assert all(word in printed for word in ("gain", "lag + delay = 0.02", "verification"))
 
 
 @pytest.mark.slow
-def test_the_main_job_prints_what_the_readme_shows(tmp_path):
-    part = README.partition("## What the main job prints")[2]
-    shown = words(re.findall(r"```\n(.*?)```", part, flags=re.S)[0])
-    command = [sys.executable, str(ROOT / "fits" / "hover_roll.py"), "--out", str(tmp_path)]
-    run = subprocess.run(command, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    printed = words(run.stdout[run.stdout.index("One record, asked") :])
+def test_the_loop_in_twelve_lines_prints_what_its_page_promises(tmp_path):
+    example = blocks(page("control.md"), "python")[0]
+    assert len(example.splitlines()) <= 12
+    printed = run(sys.executable, "-c", example, folder=tmp_path)
+    promised = ("stable loop", "stable for gains of 0.1104 to 2.148", "256 members", "CVaR20")
+    assert all(word in printed for word in promised)
+
+
+@pytest.mark.slow
+def test_the_main_job_prints_what_its_page_shows(tmp_path):
+    shown = words(blocks(page("main_job.md"))[0])
+    job = str(ROOT / "fits" / "hover_roll.py")
+    stdout = run(sys.executable, job, "--out", str(tmp_path), folder=ROOT)
+    printed = words(stdout[stdout.index("One record, asked") :])
     assert printed[: len(shown)] == shown
     files = {"result.json", "report.html", "bode.png", "verification.png"}
     assert files <= {path.name for path in tmp_path.iterdir()}
