@@ -15,7 +15,8 @@ class Faces(griffe.Extension):
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
         """`from ._file import X as X` makes X public, as if `__all__` named it."""
         for room in pkg.modules.values():
-            room.exports = [n for n, m in room.members.items() if m.is_alias and n[0] != "_"]
+            for face in (room, *room.modules.values()):
+                face.exports = [n for n, m in face.members.items() if m.is_alias and n[0] != "_"]
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, agent: Any, **_: Any) -> None:
         """The comment behind a field or a constant becomes its docstring."""
