@@ -164,8 +164,8 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
     lowest = min(float(np.min(np.asarray(frf.random_error))) for frf in frfs)
     return (
         f"coherence reaches {least:g}, with a random error below {100 * _LARGEST:.0f} %, at "
-        f"{points} of {total} frequencies; the largest coherence is {best:.2f}, the smallest error "
-        f"{100 * lowest:.2g} %"
+        f"{points} of {total} frequencies (means over a third of an octave; the largest coherence "
+        f"of one frequency is {best:.2f}, the smallest error {100 * lowest:.2g} %)"
     )
 
 

@@ -60,7 +60,8 @@ def _of(name: str) -> list[dict]:
 
 def _section(table: dict) -> str:
     rows = [table["columns"], ["---"] * len(table["columns"])]
-    rows += [[shown(cell) for cell in row] for row in table["rows"]]
+    # [0][1] would be a link.
+    rows += [[shown(cell).replace("[", "\\[") for cell in row] for row in table["rows"]]
     parts = [f"## {table['title']}", f"`{table['command']}`", fill(table.get("text", ""), 110)]
     parts += ["\n".join(f"| {' | '.join(row)} |" for row in rows)]
     notes = [fill(f"- {note}", 110, subsequent_indent="  ") for note in table.get("notes", ())]
