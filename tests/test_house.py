@@ -10,8 +10,9 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "jaxquad"
 ORDER = (
-    "_core", "_xla", "records", "datasets", "excitation", "models", "spectra", "identify", "design", "control",
-    "loops", "simulation", "ensembles", "tuning", "export", "plot", "report", "workflows", "cli",
+    "_core", "_xla", "records", "datasets", "excitation", "models", "spectra", "identify",
+    "design", "control", "loops", "simulation", "ensembles", "tuning",
+    "export", "plot", "report", "workflows", "cli",
 )  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
 
