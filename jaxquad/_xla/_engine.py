@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
@@ -141,15 +142,25 @@ def _known() -> tuple[tuple[str, int], ...]:
 def _is_outermost(args: PyTree) -> bool:
     # Within another jit even a constant is traced.
     arrays = filter(eqx.is_array, jax.tree.leaves(args))
-    return is_concrete(_probe.bind(_CONSTANT)) and all(map(is_concrete, arrays))
+    constant = jnp.negative(_CONSTANT) if _probe is None else _probe.bind(_CONSTANT)
+    return is_concrete(constant) and all(map(is_concrete, arrays))
+
+
+def _make_probe() -> Primitive | None:
+    """A tenth of the price of the cheapest operation of `jax.numpy`; None where it cannot be."""
+    probe = Primitive("probe")
+    probe.def_impl(lambda x: x)
+    probe.def_abstract_eval(lambda x: x)
+    try:
+        batching.defvectorized(probe)
+        mlir.register_lowering(probe, lambda ctx, x: [x])
+    except AttributeError:  # a JAX without these rules, in which no loop is a kernel either
+        return None
+    return probe
 
 
 _CONSTANT = np.zeros(())
-_probe = Primitive("probe")  # a tenth of the price of the cheapest operation of `jax.numpy`
-_probe.def_impl(lambda x: x)
-_probe.def_abstract_eval(lambda x: x)
-batching.defvectorized(_probe)
-mlir.register_lowering(_probe, lambda ctx, x: [x])
+_probe = _make_probe()
 
 
 def _shapes(args: PyTree) -> tuple:

@@ -19,6 +19,8 @@ from jaxquad.plot import COHERENT
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
+from ._figure import Section
+
 
 Grid = Float[np.ndarray, " frequencies"]
 _LOOSE = 0.2  # half of a 95 % interval over the value: CIFER's Cramer-Rao guideline of 20 %
@@ -54,7 +56,7 @@ def answer_section(
     frf: FrequencyResponse,
     record: Record | None,
     checks: Mapping[str, Verification],
-) -> dict[str, object]:
+) -> Section:
     """Verdict in plain words, lists of what is answered and what not, and the next flight."""
     return {
         "plain": _plain(fit, frf),

@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from math import ceil
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -18,6 +18,8 @@ from matplotlib.lines import Line2D
 
 from jaxquad.plot import headless, Panels, visible
 
+
+Section = dict[str, Any]  # what a template of the page shows
 
 _LARGEST = 220_000  # bytes of an SVG; a PNG of the figures here has about half of that
 _OF_TEXTS, _OF_A_MARK, _OF_A_CORNER = 45_000, 145, 14  # bytes

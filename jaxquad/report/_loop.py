@@ -7,7 +7,7 @@ from jaxquad.plot import plain_ticks
 from jaxquad.records import Record
 from jaxquad.spectra import BrokenLoop, Entry, estimate_broken_loop, FrequencyResponse
 
-from ._figure import embed_figure, Image
+from ._figure import embed_figure, Image, Section
 
 
 _FEWEST = 8  # frequencies of a loop that is shown
@@ -18,7 +18,7 @@ _ASSUMED = {
 }
 
 
-def loop_section(frf: FrequencyResponse, record: Record) -> dict[str, object] | None:
+def loop_section(frf: FrequencyResponse, record: Record) -> Section | None:
     """Bode diagram, crossover and margins; None where the units do not tell where r enters."""
     entry = entry_of(record, frf)
     if entry is None:

@@ -8,7 +8,7 @@ from jaxquad.plot import spectrogram
 from jaxquad.records import Record
 from jaxquad.spectra import find_line, FrequencyResponse, SpectralLine
 
-from ._figure import embed_figure, Image
+from ._figure import embed_figure, Image, Section
 
 
 _SHORTEST = 5.0  # s, of a record whose spectrum over time says something
@@ -18,7 +18,7 @@ _THROTTLE = re.compile(
 _FOLLOWS, _STAYS = 0.7, 0.3  # rank correlation
 
 
-def spectrum_section(frf: FrequencyResponse, record: Record) -> dict[str, object] | None:
+def spectrum_section(frf: FrequencyResponse, record: Record) -> Section | None:
     """Spectrograms of the first output, and its strongest line; None for a short record."""
     if record.duration < _SHORTEST:
         return None

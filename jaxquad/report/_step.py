@@ -13,7 +13,7 @@ from jaxquad.plot import short_names, unit_label
 from jaxquad.records import Record
 from jaxquad.spectra import estimate_step, FrequencyResponse, StepResponse
 
-from ._figure import embed_figure, Image
+from ._figure import embed_figure, Image, Section
 from ._page import Table
 
 
@@ -34,7 +34,7 @@ class Prediction(NamedTuple):
     error: Samples | None
 
 
-def step_section(fit: Fit, frf: FrequencyResponse, record: Record) -> dict[str, object] | None:
+def step_section(fit: Fit, frf: FrequencyResponse, record: Record) -> Section | None:
     """Measured and predicted step response; None without a reference or room for one."""
     if not record.reference_names:
         return None
@@ -42,7 +42,7 @@ def step_section(fit: Fit, frf: FrequencyResponse, record: Record) -> dict[str, 
         found = estimate_step(record, output=frf.output_names[0])
     except ValueError:
         return None
-    head: dict[str, object] = {"names": found.names, "doubts": found.doubts}
+    head: Section = {"names": found.names, "doubts": found.doubts}
     if not found.is_told:
         return head | {"image": None, "table": None, "notes": []}
     predicted = predict_step(fit, frf, record) if fit.verdict.fitted else None

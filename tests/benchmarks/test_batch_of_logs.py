@@ -33,7 +33,7 @@ def write_log(path, number: int, samples: int) -> None:
 def test_logs_after_the_first(tmp_path):
     compiled, used = [], []
 
-    def listen(event, _, **facts):
+    def listen(event: str, duration_secs: float, **facts: str | int):
         if "backend_compile" in event:
             compiled.append(facts.get("fun_name"))
 

@@ -29,9 +29,9 @@ def written(model, name, value):
     leaf, *index = name.replace("]", "").split("[")
     array = np.array(getattr(model, leaf))
     array[tuple(int(i) for i in index)] = value
-    parts = {key: getattr(model, key) for key in ("F", "G", "H0", "H1", "M")}
+    parts: dict[str, np.ndarray] = {key: getattr(model, key) for key in ("F", "G", "H0", "H1", "M")}
     parts |= {key: getattr(model, key) for key in ("input_delay", "output_delay")}
-    return jq.StateSpace(**(parts | {leaf: array}))
+    return jq.StateSpace(**(parts | {leaf: array}))  # pyright: ignore
 
 
 @pytest.mark.slow

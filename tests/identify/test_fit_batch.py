@@ -123,7 +123,7 @@ def test_other_numbers_of_members_and_frequencies_compile_nothing():
     compiled, responses, weights = [], np.asarray(responses), np.asarray(WEIGHTS)
     parameters, omega = select_parameters(START, FREE), np.asarray(OMEGA)
 
-    def listen(event, _, **facts):
+    def listen(event: str, duration_secs: float, **facts: str | int):
         if "backend_compile" in event:
             compiled.append(facts.get("fun_name"))
 

@@ -42,6 +42,7 @@ def test_the_unit_of_the_reference_says_where_it_enters(frf):
 def test_the_loop_has_the_crossover_of_the_one_that_was_simulated(frf):
     """y = 0.04 r + 0.96 y before is an integrator of its error, of 10.4 rad/s."""
     section = loop_section(frf, flown(("V", "rad/s", "rad/s"), motor=90.0))
+    assert section is not None
     crossover = float(section["facts"]["crossover"].split("(")[1].split()[0])
     assert crossover == pytest.approx(10.4, rel=0.05)
     assert section["facts"]["phase margin"].startswith(("8", "9"))
@@ -52,7 +53,9 @@ def test_a_motor_is_called_one_where_it_follows_the_throttle(frf):
     record = flown()
     assert throttle_of(record) == "throttle"
     section = spectrum_section(frf, record)
+    assert section is not None
     assert len(section["images"]) == 2 and "throttle" in section["images"][1].caption
     assert section["text"].endswith("motors.")
     quiet = jq.records.select(record, inputs=["u0"], outputs=["y0"])
-    assert "Record the throttle as well" in spectrum_section(frf, quiet)["text"]
+    poor = spectrum_section(frf, quiet)
+    assert poor is not None and "Record the throttle as well" in poor["text"]

@@ -44,6 +44,8 @@ def test_the_right_model_predicts_the_measured_step_and_a_wrong_one_does_not(rec
     for gain in (GAIN, 0.6 * GAIN):
         fit, frf = fit_of(gain)
         predicted = predict_step(fit, frf, record)
+        assert predicted is not None
+        assert predicted.error is not None
         error = np.hypot(predicted.error, found.standard_error)
         early = (found.time > 0.05) & (found.time < 0.5)
         inside[gain] = np.abs(predicted.mean - found.mean)[early] < 3 * error[early] + 0.02
@@ -53,6 +55,7 @@ def test_the_right_model_predicts_the_measured_step_and_a_wrong_one_does_not(rec
 def test_the_section_says_that_the_data_suffice_and_shows_both(record):
     fit, frf = fit_of(GAIN)
     section = step_section(fit, frf, record)
+    assert section is not None
     assert not section["doubts"] and "The data suffice" in section["notes"][0]
     assert section["table"].heads == ("", "measured", "model")
     assert "prediction of the model" in section["image"].alt
@@ -68,4 +71,4 @@ def test_no_reference_gives_no_section_and_a_poor_one_no_figure(record):
         record.time, record.inputs, record.outputs, quiet, input_names="u0", output_names="y0"
     )
     section = step_section(fit, frf, poor)
-    assert section["doubts"] and section["image"] is None
+    assert section is not None and section["doubts"] and section["image"] is None

@@ -9,22 +9,22 @@ from jaxquad.spectra import estimate_broken_loop
 
 
 DT, NATURAL, DAMPING, SAMPLES = 0.004, 15.0, 0.5, 30000
-CLOSED = cont2discrete(([NATURAL**2], [1, 2 * DAMPING * NATURAL, NATURAL**2]), DT, "zoh")
+SYSTEM = [NATURAL**2], [1, 2 * DAMPING * NATURAL, NATURAL**2]
+ABOVE, BELOW = map(np.ravel, cont2discrete(SYSTEM, DT, "zoh")[:2])  # pyright: ignore
 
 
 def flown(*, noise=0.02, entry="set-point"):
     """A loop flown by random steps; with its error as the input where the entry is that."""
     random = np.random.default_rng(1)
     r = np.repeat(random.standard_normal(SAMPLES // 100), 100)
-    y = lfilter(CLOSED[0].ravel(), CLOSED[1], r)
+    y = lfilter(ABOVE, BELOW, r)
     noisy = y + noise * random.standard_normal(SAMPLES)
     return jq.Record(DT * np.arange(SAMPLES), r - noisy, noisy, r)
 
 
 def exact(omega):
-    b, a = CLOSED[0].ravel(), CLOSED[1]
     z = np.exp(1j * omega * DT)
-    closed = np.polyval(b, z) / np.polyval(a, z)
+    closed = np.polyval(ABOVE, z) / np.polyval(BELOW, z)
     return closed / (1 - closed)
 
 

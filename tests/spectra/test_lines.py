@@ -23,6 +23,7 @@ def record_with(frequency, *, harmonics=(1.0,), noise=1.0):
 def test_a_motor_is_found_with_its_harmonics_and_follows_the_throttle():
     record = record_with(40 + 80 * THROTTLE, harmonics=(1.0, 0.5))
     line = find_line(record, "gyro", above=2 * np.pi * 20, over="throttle")
+    assert line is not None
     assert line.omega == pytest.approx(2 * np.pi * 80, rel=0.05)
     assert line.low == pytest.approx(2 * np.pi * 64, rel=0.05)
     assert line.high == pytest.approx(2 * np.pi * 96, rel=0.05)
@@ -31,6 +32,7 @@ def test_a_motor_is_found_with_its_harmonics_and_follows_the_throttle():
 
 def test_a_resonance_stays_where_it_is():
     line = find_line(record_with(120.0), "gyro", over="throttle")
+    assert line is not None
     assert line.omega == pytest.approx(2 * np.pi * 120, rel=0.02)
     assert abs(line.follows) < 0.3 and line.harmonics == ()
 

@@ -9,8 +9,9 @@ from jaxquad.spectra import estimate_step
 
 
 DT, NATURAL, DAMPING = 0.004, 15.0, 0.5  # s, rad/s, -
-CLOSED = cont2discrete(([NATURAL**2], [1, 2 * DAMPING * NATURAL, NATURAL**2]), DT, "zoh")
-EXACT = lfilter(CLOSED[0].ravel(), CLOSED[1], np.ones(2000))
+SYSTEM = [NATURAL**2], [1, 2 * DAMPING * NATURAL, NATURAL**2]
+ABOVE, BELOW = map(np.ravel, cont2discrete(SYSTEM, DT, "zoh")[:2])  # pyright: ignore
+EXACT = np.asarray(lfilter(ABOVE, BELOW, np.ones(2000)))
 
 
 def stick(random, samples):
@@ -28,7 +29,7 @@ def flown(seed=0, *, seconds=60.0, noise=0.02, reference=stick):
     """A second-order loop in gusts and noise."""
     random, samples = np.random.default_rng(seed), int(seconds / DT)
     r = reference(random, samples)
-    y = lfilter(CLOSED[0].ravel(), CLOSED[1], r)
+    y = lfilter(ABOVE, BELOW, r)
     gusts = lfilter([np.sqrt(1 - 0.99**2)], [1, -0.99], random.standard_normal(samples))
     y = y + noise * (gusts + random.standard_normal(samples))
     return jq.Record(np.arange(samples) * DT, r, y, r, input_names="u", output_names="y")

@@ -33,12 +33,12 @@ def test_an_interval_ends_where_so_many_or_so_few_are_seen_once_in_forty(count, 
     )
 
 
-def test_the_shares_that_the_readme_prints_are_those_of_the_study():
+def test_the_shares_that_the_documents_print_are_those_of_the_study():
     study = json.loads((ROOT / "tests" / "studies" / "results" / "tuned.json").read_text())
     shares = {row[0]: row[1] for row in study["rows"]}
-    read_me = " ".join((ROOT / "README.md").read_text().split())
+    page = " ".join((ROOT / "docs" / "tuning.md").read_text().split())
     for name in ("paper, b0 = 3", "paper, b0 = 1.6", "10/30, CE"):
-        assert f"{shares[name]} %" in read_me
+        assert f"{shares[name]} %" in page
 
 
 @pytest.mark.slow
