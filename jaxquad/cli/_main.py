@@ -11,6 +11,7 @@ from importlib.metadata import version
 from jaxquad.records import RecordWarning
 from jaxquad.workflows import in_options
 
+from ._autopilot import AUTOPILOT
 from ._batch import BATCH
 from ._design import DESIGN
 from ._identify import CHANNELS, DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
@@ -18,7 +19,8 @@ from ._progress import shown_stages
 from ._tune import TUNE
 
 
-_COMMANDS = (DEMO, DESIGN, CHANNELS, IDENTIFY, VERIFY, TUNE, REPORT, BATCH)  # in order of use
+# In order of use.
+_COMMANDS = (DEMO, DESIGN, CHANNELS, IDENTIFY, VERIFY, TUNE, AUTOPILOT, REPORT, BATCH)
 _WAY = """jaxquad demo                   a simulated flight, identified: results/demo/report.html
 jaxquad identify YOUR.LOG      a model of your own flight, with error bars
 jaxquad tune results/YOUR ...  gains from it, with a certificate; jaxquad --help lists all commands
@@ -30,6 +32,7 @@ _PLACES = {  # what a command takes beside its options
     "identify": "FILE [FILE ...] ",
     "verify": "RESULT FILE ",
     "tune": "RESULT --inertia J --limit NUMBER ",
+    "autopilot": "FILE ",
     "report": "RESULT ",
     "batch": "FOLDER ",
 }

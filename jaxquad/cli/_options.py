@@ -9,12 +9,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jaxquad.workflows import BatchSettings, free_folder, GROUPS, IdentifySettings, TuneSettings
+from jaxquad.workflows import (
+    AutopilotSettings,
+    BatchSettings,
+    free_folder,
+    GROUPS,
+    IdentifySettings,
+    TuneSettings,
+)
 
 
 Run = Callable[[argparse.Namespace], int]
-Settings = type[IdentifySettings] | type[TuneSettings] | type[BatchSettings]
-S = TypeVar("S", IdentifySettings, TuneSettings, BatchSettings)
+Settings = (
+    type[AutopilotSettings] | type[IdentifySettings] | type[TuneSettings] | type[BatchSettings]
+)
+S = TypeVar("S", AutopilotSettings, IdentifySettings, TuneSettings, BatchSettings)
 Group = argparse._ArgumentGroup
 Commands = Any  # argparse names the type of its subparsers nowhere public
 

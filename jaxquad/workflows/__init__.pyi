@@ -1,3 +1,4 @@
+from ._autopilot import autopilot as autopilot, AutopilotProposal as AutopilotProposal
 from ._batch._jobs import Job as Job
 from ._batch._run import batch as batch, find_logs as find_logs
 from ._batch._settings import BatchSettings as BatchSettings, Override as Override
@@ -22,6 +23,7 @@ from ._result_file import (
     StoredTuning as StoredTuning,
 )
 from ._settings import (
+    AutopilotSettings as AutopilotSettings,
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,
     TuneSettings as TuneSettings,

@@ -444,3 +444,69 @@ class TuneSettings(Settings):
     seed: int = option_field(
         kinds.COUNT, 0, "of the random draws; 0 by default", group="the plants"
     )
+
+
+_PLANTS, _KEPT = "the plants", "what is kept"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AutopilotSettings(Settings):
+    """How the gains of the autopilot that flew a log are tuned.
+
+    The keyword arguments are the keys of the TOML file; `jaxquad autopilot --help` lists them as
+    options. Input, output and reference are those that the log proposes.
+
+    **Raises:** `SettingsError` (a ValueError) for values that cannot be.
+    """
+
+    axis: str | None = option_field(
+        kinds.AXIS, None, "the axis to tune; by default the one that was excited", group=_RUN
+    )
+    start: float | None = option_field(
+        kinds.TIME, None, "first time to use, in the file's time", group=_RUN
+    )
+    stop: float | None = option_field(kinds.TIME, None, "last time to use", group=_RUN)
+    band: Pair | None = option_field(
+        kinds.BAND,
+        None,
+        "fit between these frequencies, in Hz; by default what the record resolves",
+        group=_RUN,
+    )
+    throttle: float = option_field(
+        kinds.POSITIVE,
+        0.3,
+        "of 1, at which Betaflight's dynamic filters and TPA are taken; 0.3 by default",
+        group=_RUN,
+    )
+    sensitivity: float = option_field(
+        kinds.POSITIVE, 1.8, "upper limit of the peak of |S|; 1.8 by default", group=_KEPT
+    )
+    noise: float = option_field(
+        kinds.POSITIVE,
+        1.5,
+        "the most that the command's noise may grow, as a factor; 1.5 by default",
+        group=_KEPT,
+    )
+    change: float = option_field(
+        kinds.POSITIVE,
+        3.0,
+        "factor within which each gain stays of what flew; 3 by default",
+        group=_KEPT,
+    )
+    members: int = option_field(
+        kinds.SIZE, 32, "number of plants to tune on; 32 by default", group=_PLANTS
+    )
+    fresh: int = option_field(
+        kinds.SIZE, 256, "number of new plants to certify on; 256 by default", group=_PLANTS
+    )
+    seed: int = option_field(kinds.COUNT, 0, "of the random draws; 0 by default", group=_PLANTS)
+
+    def _check_together(self) -> None:
+        if self.throttle > 1:
+            raise SettingsError(f"`throttle` is {self.throttle:g}: give a share, above 0 to 1")
+        if self.sensitivity <= 1:
+            raise SettingsError(
+                f"`sensitivity` is {self.sensitivity:g}: no loop has a peak of |S| of 1 or below"
+            )
+        if self.change <= 1:
+            raise SettingsError(f"`change` is {self.change:g}: give a factor above 1")

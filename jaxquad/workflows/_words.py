@@ -7,12 +7,12 @@ The library speaks Python: `max_gap=` is an argument, `jq.verify` a function. So
 import re
 
 from ._batch._settings import BatchSettings
-from ._settings import IdentifySettings, TuneSettings
+from ._settings import AutopilotSettings, IdentifySettings, TuneSettings
 
 
 _FLAGS = {
     key: option.flag
-    for settings in (BatchSettings, TuneSettings, IdentifySettings)
+    for settings in (BatchSettings, AutopilotSettings, TuneSettings, IdentifySettings)
     for key, option in settings.options().items()
 }
 _ARGUMENTS = _FLAGS | {  # those of `read`, `frequency_response` and `fit`, whose names differ

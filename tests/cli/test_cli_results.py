@@ -11,7 +11,7 @@ from jaxquad.cli import main
 from jaxquad.workflows import free_folder, IdentifySettings
 
 
-ORDER = ["demo", "design", "channels", "identify", "verify", "tune", "report", "batch"]
+ORDER = ["demo", "design", "channels", "identify", "verify", "tune", "autopilot", "report", "batch"]
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,7 @@ LIGHT = {
     "identify log.csv --input u --output y --band 3 1": 2,
     "identify log.csv --input u --output y --verify missing.csv": 2,
     "tune missing --inertia 1 --limit 1": 2,
+    "autopilot missing": 2,
     "report missing": 2,
     "verify missing log.csv": 2,
     "channels log.csv": 0,

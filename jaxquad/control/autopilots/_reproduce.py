@@ -13,11 +13,13 @@ from .._protocols import LinearController
 from ._ardupilot import ArduPilotRate
 from ._betaflight import BetaflightADRC, BetaflightPID
 from ._crazyflie import CrazyflieRate
-from ._filters import FilterChain
+from ._filters import FilterChain, PT1
 from ._px4 import PX4Rate
 
 
-Rate = TypeVar("Rate", BetaflightPID, BetaflightADRC, PX4Rate, ArduPilotRate, CrazyflieRate)
+Rate = TypeVar(
+    "Rate", bound=BetaflightPID | BetaflightADRC | PX4Rate | ArduPilotRate | CrazyflieRate
+)
 
 
 def without_gyro_filters(law: Rate) -> Rate:
@@ -27,6 +29,9 @@ def without_gyro_filters(law: Rate) -> Rate:
     """
     if isinstance(law, BetaflightPID | BetaflightADRC):
         return dataclasses.replace(law, gyro=FilterChain(), filters=())
+    if isinstance(law, PX4Rate) and law.gyro.filters:
+        open = FilterChain((PT1(0.0),), law.gyro.rate_hz)  # the derivative is at the gyro's rate
+        return dataclasses.replace(law, gyro=open)
     return dataclasses.replace(law, gyro=FilterChain())
 
 
