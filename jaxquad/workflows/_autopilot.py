@@ -23,10 +23,16 @@ from jaxquad.export import (
     propose_changes,
     write_parameter_files,
 )
+from jaxquad.identify import usable
 from jaxquad.loops import FlownLoop as Reproduction, reproduce_flight
 from jaxquad.records import AXES, Proposal, read_settings
 from jaxquad.report import provenance, write_json
-from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
+from jaxquad.spectra import (
+    frequency_response,
+    FrequencyResponse,
+    JointInputOutput,
+    LocalPolynomial,
+)
 
 from ._identify import Identification, identify, propose_settings, read_records
 from ._kinds import SettingsError
@@ -35,6 +41,7 @@ from ._rate_gains import (
     certify_gains,
     gains_in,
     gains_of,
+    law_responses,
     make_loops,
     parameters_of,
     RateLaw,
@@ -49,6 +56,7 @@ Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
 _THIRD, _ALL = 1 / 3, 1.0
 _WORTH = 0.95  # of the flown effect of torque, above which gains are not worth a change
 _STEM = "proposal"
+_INJECTED = "SIDD.Targ"  # ArduPilot's chirp
 _CERTIFICATES = 3  # at most: the worst plants of one that fails are tuned on, too
 _WORST = 16
 
@@ -250,10 +258,10 @@ def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> Au
         why = f"this log cannot tell: {found.fit.verdict.summary}; {_FLY}"
         return AutopilotProposal("cannot tell", why, *known, None)
     announce("the flown loop again")
-    again, missing = _reproduce(found, flown)
-    if again is None or again.kind != "flown":
-        why = missing if again is None else again.verdict
-        text = f"this log cannot tell: {why}" if not why.startswith("this log") else why
+    again = _reproduce(found, flown)
+    if again.kind != "flown":
+        why = again.verdict
+        text = why if again.kind == "unknown" else f"this log cannot tell: {why}"
         return AutopilotProposal("cannot tell", text, *known, again)
     return _designed(settings, found, flown, again)
 
@@ -296,26 +304,53 @@ def read_flown(path: Path, proposal: Proposal, settings: AutopilotSettings) -> F
     )
 
 
-def _reproduce(found: Identification, flown: FlownAutopilot) -> tuple[Reproduction | None, str]:
-    """The flown loop compared with the log, or why it cannot be."""
-    settings = found.settings
-    if "SIDD.Targ" in (settings.input or ""):
-        return None, (
-            "the chirp enters at the mixer, so the response from set-point to rate is not excited; "
-            "fly the SystemID mode with SID_AXIS 7 to 9, the rate set-point"
-        )
-    output = found.records[0].output_names[0]
-    setpoint = _setpoint_of(output, flown)
-    joint = settings.reference not in (None, "", setpoint)
-    changed = {"input": setpoint, "reference": settings.reference if joint else None}
-    closed = read_records(found.path, dataclasses.replace(settings, **changed))
-    estimator = JointInputOutput() if joint else LocalPolynomial()
-    response = frequency_response(list(closed), found.frf.omega, estimator=estimator)
-    unit = found.records[0].output_units[0]
+def _reproduce(found: Identification, flown: FlownAutopilot) -> Reproduction:
+    """The flown loop compared with the log."""
+    settings, [unit] = found.settings, found.records[0].output_units
+    if _INJECTED in (settings.input or ""):
+        return _reproduce_law(found, flown)
+    setpoint = _setpoint_of(found.records[0].output_names[0], flown)
+    try:
+        reference = None if settings.reference == setpoint else settings.reference
+        response = _response_of(found, input=setpoint, reference=reference)
+    except ValueError:  # the stick is the set-point in another unit: that one is external
+        response = _response_of(found, input=setpoint, reference=None)
     return reproduce_flight(
         found.fit, without_gyro_filters(flown.law), response,
         unit="deg/s" if unit == "deg/s" else "rad/s", axis=flown.axis,
-    ), ""  # fmt: skip
+    )  # fmt: skip
+
+
+def _response_of(found: Identification, **changed: str | None) -> FrequencyResponse:
+    """The response between other channels of the log, joint where there is a reference."""
+    records = read_records(found.path, dataclasses.replace(found.settings, **changed))
+    estimator = JointInputOutput() if changed["reference"] else LocalPolynomial()
+    return frequency_response(list(records), found.frf.omega, estimator=estimator)
+
+
+def _reproduce_law(found: Identification, flown: FlownAutopilot) -> Reproduction:
+    """Where ArduPilot's chirp enters at the mixer: the law's output, of set-point and rate.
+
+    From the chirp to all three. The noise of the rate is in the output, too, so that the error of
+    the latter counts alone.
+    """
+    letter, [unit] = AXES[flown.axis][0].upper(), found.records[0].output_units
+    of = lambda name: _response_of(found, input=_INJECTED, output=name, reference=None)
+    output, rate, setpoint = map(of, (f"RATE.{letter}Out", f"RATE.{letter}", f"RATE.{letter}Des"))
+    omega, only = np.asarray(output.omega), lambda x: np.asarray(x)[:, 0, 0]
+    ahead, back = law_responses(without_gyro_filters(flown.law), flown.axis, omega)
+    factor = np.pi / 180 if unit == "deg/s" else 1.0
+    predicted = factor * (ahead * only(setpoint.response) + back * only(rate.response))
+    measured, error = only(output.response), only(output.random_error)
+    used = only(usable(output, None, 0.6))
+    weight, off = 1 / error[used] ** 2, (measured / predicted - 1)[used]
+    total = max(float(np.sum(weight)), 1e-12)
+    scale = float(np.sum(weight * off.real)) / total
+    left = float(np.sum(weight * np.abs(off - scale) ** 2)) / max(2 * off.size, 1)
+    doubt = float(np.sqrt(max(left, 1.0) / total))
+    return Reproduction(
+        omega, measured, error, predicted, np.zeros_like(error), used, 1 + scale, doubt
+    )
 
 
 def _setpoint_of(rate: str, flown: FlownAutopilot) -> str:

@@ -20,6 +20,7 @@ from jaxquad.control.autopilots import (
     BetaflightPID,
     Firmware,
     firmware_of,
+    Parameter,
     PARAMETERS,
     PX4Rate,
     store_parameters,
@@ -46,7 +47,7 @@ class LoopQualities(NamedTuple):
     - `stable`: by Nyquist's criterion on the sampled loop.
     - `peak`: Ms; `crossover`: the highest frequency with |L| = 1, in rad/s.
     - `rejection`: root of the integrated square of the rate after a step of torque, relative.
-    - `noise`: rms of the command of white noise of the rate, relative.
+    - `noise`: rms of the command of white noise before the gyro's filters, relative.
     """
 
     stable: Bool[np.ndarray, "designs plants"]
@@ -64,13 +65,15 @@ class RateLoops:
 
     - `omega`: rad/s.
     - `feedback`: of the law, from the rate to minus the command, per unit of P, I and D.
-    - `plants`: from the command to the rate in rad/s, the hold included.
+    - `plants`: from the command to the logged rate in rad/s, the hold included.
+    - `noise`: magnitude of the gyro's filters, which the logged noise has passed.
     - `ceiling`: by which factor D can rise in flight (D_MAX); 1 where it cannot.
     """
 
     omega: Float[np.ndarray, " frequencies"]
     feedback: Complex[np.ndarray, "gains frequencies"]
     plants: Complex[np.ndarray, "plants frequencies"]
+    noise: Float[np.ndarray, " frequencies"]
     ceiling: float = 1.0
 
     def joined(self, others: "RateLoops", gains: Gains, count: int) -> "RateLoops":
@@ -101,7 +104,7 @@ class RateLoops:
         begun = phase[..., 0] - 2 * np.pi * np.round(phase[..., -1] / (2 * np.pi))
         above = np.where(np.abs(through) > 1, self.omega, 0.0)
         torque = np.abs(self.plants[None] / distance / self.omega) ** 2
-        command = np.abs(feedback / distance) ** 2
+        command = np.abs(feedback * self.noise / distance) ** 2
         return LoopQualities(
             begun < 0,
             1 / np.min(np.abs(distance), axis=-1),
@@ -122,7 +125,8 @@ def make_loops(law: RateLaw, axis: int, fit: Fit, unit: str, plants: int, seed: 
     feedback = np.stack([_feedback(one, axis, omega) for one in each])
     per_radian = np.pi / 180 if unit == "deg/s" else 1.0
     responses = per_radian * _sampled_plants(fit, omega, law.dt, plants, seed)
-    return RateLoops(omega, feedback, responses, _ceiling(law, axis))
+    passed = np.abs(_feedback(_alone(law, "p"), axis, omega) / feedback[0])
+    return RateLoops(omega, feedback, responses, passed, _ceiling(law, axis))
 
 
 def _alone(law: RateLaw, name: str) -> RateLaw:
@@ -134,13 +138,20 @@ def _alone(law: RateLaw, name: str) -> RateLaw:
 def _feedback(
     law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, " frequencies"]:
+    return -law_responses(law, axis, omega)[1]
+
+
+def law_responses(
+    law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, "inputs frequencies"]:
+    """From the set-point and from the rate, both in rad/s, to the command."""
     linear = law.linear(axis)
-    A, b, c = (np.asarray(x) for x in (linear.A, linear.measurement_in, linear.C))
+    A, c = np.asarray(linear.A), np.asarray(linear.C)
+    into = np.stack([linear.reference_in, linear.measurement_in], axis=1)
+    through = np.array([linear.reference_through, linear.measurement_through])
     z = np.exp(1j * omega * linear.dt)[:, None, None]
-    inner = np.linalg.solve(
-        z * np.eye(len(A)) - A, np.broadcast_to(b[:, None], (len(z), len(b), 1))
-    )
-    return -(inner[..., 0] @ c + float(linear.measurement_through))
+    inner = np.linalg.solve(z * np.eye(len(A)) - A, np.broadcast_to(into, (len(z), *into.shape)))
+    return (c @ inner + through).T
 
 
 def _sampled_plants(
@@ -221,7 +232,7 @@ def search_gains(
         ]
         points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
         middle, half = points[np.argmin(score(np.exp(points)))], _NARROWED * half
-    stored = _stored_near(np.exp(middle), rows)
+    stored = _stored_near(np.exp(middle), rows, low, high)
     gains = flown.copy()
     gains[free] = stored[np.argmin(score(stored))]
     return gains
@@ -252,18 +263,21 @@ class _Score:
         return np.where(beyond <= 1, rejection, 1e9 * beyond)
 
 
-def _row(firmware: Firmware, axis: int, field: str):
+def _row(firmware: Firmware, axis: int, field: str) -> Parameter:
     rows = PARAMETERS[firmware].values()
     return next(row for row in rows if row.field == field and row.axis == axis)
 
 
-def _stored_near(gains: np.ndarray, rows: Sequence) -> Gains:
-    """The whole numbers, or numbers of three digits, around some gains, within their ranges."""
+def _stored_near(
+    gains: np.ndarray, rows: Sequence[Parameter], low: np.ndarray, high: np.ndarray
+) -> Gains:
+    """The whole numbers, or numbers of three digits, around some gains, from `low` to `high`."""
     around = []
-    for value, row in zip(gains, rows, strict=True):
+    for value, row, least, most in zip(gains, rows, low, high, strict=True):
         step = 1.0 if row.whole else 10 ** (np.floor(np.log10(value)) - 2)
-        pair = np.array([np.floor(value / step), np.ceil(value / step)]) * step
-        around.append(np.unique(np.clip(np.round(pair, 12), max(row.low, step), row.high)))
+        pair = np.round(np.array([np.floor(value / step), np.ceil(value / step)]) * step, 12)
+        inside = (pair >= least * (1 - 1e-9)) & (pair <= most * (1 + 1e-9))
+        around.append(np.unique(pair[inside] if inside.any() else pair))
     return np.array(list(itertools.product(*around)))
 
 

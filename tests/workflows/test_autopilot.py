@@ -1,122 +1,28 @@
 """From a log of a simulated PX4 to its parameters: what is tuned, refused, and written."""
 
 import json
-import struct
-from pathlib import Path
 
+import blackbox_rows
+import blackbox_writer
 import flight_logs
 import numpy as np
 import pytest
-from log_writers import structured, ULog
+from log_writers import DataFlash
+from px4_flights import Vehicle, write_log
 
 from jaxquad.cli import main
-from jaxquad.control.autopilots import px4_loop
+from jaxquad.control.autopilots import betaflight_loop, px4_loop
 from jaxquad.workflows import AutopilotSettings, SettingsError
 
 
-GYRO_HZ, EACH = 8000, 20  # samples of the gyro for one of the loop, at 400 Hz
-GAIN, LAG, LATE = 60.0, 0.03, 32  # rad/s^2 per unit of torque, s, samples of the gyro
-P, I, D, CUTOFF, SLOPE_HZ = 0.15, 0.2, 0.003, 40.0, 30.0
-PARAMETERS = {
-    **{f"MC_{axis}RATE_{k}": x for axis in ("ROLL", "PITCH", "YAW") for k, x in
-       (("P", P), ("I", I), ("D", D))},
-    "IMU_GYRO_RATEMAX": 400.0, "IMU_GYRO_CUTOFF": CUTOFF, "IMU_DGYRO_CUTOFF": SLOPE_HZ,
-}  # fmt: skip
-
-
-def low_pass():
-    """LowPassFilter2p: bilinear Butterworth, as its coefficients."""
-    k = np.tan(np.pi * CUTOFF / GYRO_HZ)
-    c = 1 + np.sqrt(2) * k + k * k
-    return k * k / c, 2 * (k * k - 1) / c, (1 - np.sqrt(2) * k + k * k) / c
-
-
-def fly(seconds=30.0, amplitude=1.5, noise=0.05, gains=(P, I, D), seed=3):
-    """Set-point, torque and filtered rate at 400 Hz: PX4's equations in plain numbers."""
-    p, i, d = gains
-    rng = np.random.default_rng(seed)
-    steps = int(seconds * GYRO_HZ)
-    time = np.arange(steps) / GYRO_HZ
-    rise = np.log(60.0) / seconds
-    sweep = np.sin(2 * np.pi * 0.5 * (np.exp(rise * time) - 1) / rise)
-    r = (amplitude * sweep[::EACH]).tolist()
-    jitter = (noise * rng.standard_normal(steps)).tolist()
-    gusts = np.repeat(0.02 * rng.standard_normal(steps // 160 + 1), 160).tolist()
-    decay = float(np.exp(-1 / (GYRO_HZ * LAG)))
-    b, a1, a2 = map(float, low_pass())
-    share = 2 * np.pi * SLOPE_HZ / GYRO_HZ / (1 + 2 * np.pi * SLOPE_HZ / GYRO_HZ)
-    sent, push, rate, u, integral = [0.0] * (steps + LATE), 0.0, 0.0, 0.0, 0.0
-    s1 = s2 = y = slope = 0.0
-    rates, torques = [], []
-    for k in range(steps):
-        before = y
-        now = rate + jitter[k]
-        y = b * now + s1
-        s1, s2 = 2 * b * now - a1 * y + s2, b * now - a2 * y
-        slope += share * ((y - before) * GYRO_HZ - slope)
-        if k % EACH == 0:
-            error = r[k // EACH] - y
-            u = p * error + integral - d * slope
-            integral += max(0.0, 1 - (error / np.deg2rad(400.0)) ** 2) * i * error * EACH / GYRO_HZ
-            rates.append(y)
-            torques.append(u)
-        sent[k + LATE] = u
-        wanted = GAIN * (sent[k] + gusts[k])
-        rate += (wanted + (push - wanted) * LAG * GYRO_HZ * (1 - decay)) / GYRO_HZ
-        push = wanted + (push - wanted) * decay
-    return np.array(r), np.array(torques), np.array(rates)
-
-
-def write_log(path: Path, flown, parameters=PARAMETERS) -> Path:
-    """A ULog of a flight in acro."""
-    r, u, y = flown
-    log = ULog()
-    for name, value in parameters.items():
-        log.info(f"float {name}", struct.pack("<f", value), kind="P")
-    log.define("vehicle_angular_velocity:uint64_t timestamp;float[3] xyz;")
-    log.define("vehicle_torque_setpoint:uint64_t timestamp;float[3] xyz;")
-    log.define("vehicle_rates_setpoint:uint64_t timestamp;float roll;float pitch;float yaw;")
-    log.define("vehicle_status:uint64_t timestamp;uint8_t nav_state;")
-    stamps = np.round(1e6 * (10 + np.arange(len(r)) / 400)).astype("<u8")
-    clock, three = {"timestamp": ("<u8", stamps)}, np.array([[1.0, 0.0, 0.0]])
-    tables = {
-        "vehicle_angular_velocity": {"xyz": ("(3,)<f4", (y[:, None] * three).astype("<f4"))},
-        "vehicle_torque_setpoint": {"xyz": ("(3,)<f4", (u[:, None] * three).astype("<f4"))},
-        "vehicle_rates_setpoint": {
-            name: ("<f4", r if name == "roll" else 0 * r) for name in ("roll", "pitch", "yaw")
-        },
-        "vehicle_status": {"nav_state": ("u1", np.full(len(r), 10))},
-    }
-    for number, (name, columns) in enumerate(tables.items()):
-        log.subscribe(number, name)
-        log.write_rows(number, structured(clock | columns))
-    path.write_bytes(log.content)
-    return path
-
-
-def true_loop(gains, omega):
-    """L of the simulated loop, from the same equations in the frequency domain."""
-    p, i, d = gains
-    z = np.exp(1j * omega * EACH / GYRO_HZ)
-    s, gyro = 1j * omega, np.exp(1j * omega / GYRO_HZ)
-    hold = (1 - 1 / z) / (s * EACH / GYRO_HZ)
-    plant = GAIN / (s * (LAG * s + 1)) * np.exp(-s * LATE / GYRO_HZ) * hold
-    b, a1, a2 = low_pass()
-    smooth = b * (1 + 1 / gyro) ** 2 / (1 + a1 / gyro + a2 / gyro**2)
-    share = 2 * np.pi * SLOPE_HZ / GYRO_HZ / (1 + 2 * np.pi * SLOPE_HZ / GYRO_HZ)
-    slope = (1 - 1 / gyro) * GYRO_HZ * share / (1 - (1 - share) / gyro)
-    return plant * smooth * (p + i * EACH / GYRO_HZ / (z - 1) + d * slope)
+VEHICLE = Vehicle()
+PARAMETERS = VEHICLE.parameters
 
 
 def read_params(text: str) -> dict[str, float]:
     """QGroundControl's tab-separated file."""
     rows = [row.split("\t") for row in text.splitlines() if not row.startswith("#")]
     return {name: float(value) for _, _, name, value, _ in rows}
-
-
-def fly_again(gains) -> float:
-    """Root mean square of the rate in gusts alone: it grows without bound where unstable."""
-    return float(np.sqrt(np.mean(fly(seconds=5.0, amplitude=0.0, noise=0.0, gains=gains)[2] ** 2)))
 
 
 @pytest.mark.parametrize(
@@ -145,7 +51,7 @@ def test_a_log_without_gains_is_refused_in_one_line(tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    return write_log(tmp_path_factory.mktemp("px4") / "flight.ulg", fly())
+    return write_log(tmp_path_factory.mktemp("px4") / "flight.ulg", VEHICLE.fly(), PARAMETERS)
 
 
 @pytest.mark.slow
@@ -165,18 +71,167 @@ def test_the_written_parameters_hold_on_the_true_plant(log, tmp_path, capsys):
     before, _, after = content["stages"]
     assert after["gains"] == pytest.approx([float(x[0]) for x in (law.p, law.i, law.d)])
     omega = np.geomspace(0.1, 400 * np.pi * 0.99, 2000)
-    peaks = [1 / np.min(np.abs(1 + true_loop(x["gains"], omega))) for x in (before, after)]
+    peaks = [1 / np.min(np.abs(1 + VEHICLE.loop(x["gains"], omega))) for x in (before, after)]
     assert peaks[0] <= before["peak"] and peaks[1] <= after["peak"] <= 1.8
     # The certificate is of the truth's size, and torque moves the rate less.
     assert after["peak"] < 1.25 * peaks[1]
-    assert after["rejection"] < 0.7 and fly_again(after["gains"]) < 0.8 * fly_again((P, I, D))
+    moved = [VEHICLE.effect(x["gains"]) for x in (before, after)]
+    assert after["rejection"] < 0.7 and moved[1] < 0.8 * moved[0]
     assert "searching gains on" in printed.err
 
 
 @pytest.mark.slow
 def test_other_gains_than_those_of_the_log_are_noticed(tmp_path, capsys):
-    path = write_log(tmp_path / "other.ulg", fly(gains=(1.6 * P, I, D)))
+    p, i, d = VEHICLE.gains
+    flown = VEHICLE._replace(gains=(1.6 * p, i, d)).fly()
+    path = write_log(tmp_path / "other.ulg", flown, PARAMETERS)
     assert main(["autopilot", str(path), "--axis", "roll", "--out", str(tmp_path / "out")]) == 3
     written = sorted(each.name for each in (tmp_path / "out").iterdir())
     assert written == ["autopilot.json", "proposal_revert.params"]
     assert "this log cannot tell" in capsys.readouterr().out
+
+
+RATE, LAG, GAIN, LATE = 1000, 0.025, 60.0, 3  # Hz, s, deg/s^2 per pidsum, samples
+PID, RAISED, SLOPE_HZ = (28, 40, 18), 26, 105.0  # D_MAX above D, which steady moves do not reach
+BETAFLIGHT = {
+    "Firmware type": "Betaflight", "Firmware revision": "Betaflight 4.5.1 (abc) STM32F7X2",
+    "looptime": "1000", "pid_process_denom": "1", "rollPID": f"28,40,{RAISED}",
+    "pitchPID": "47,84,46", "yawPID": "45,80,0", "d_min": "18,30,0", "d_max_gain": "0",
+    "d_max_advance": "0", "dterm_lpf1_static_hz": "105", "tpa_rate": "0",
+}  # fmt: skip
+
+
+def fly_betaflight(seconds=24.0, noise=2.0):
+    """Set-point, pidsum and rate in deg/s at 1 kHz, by Betaflight's equations."""
+    rng, samples = np.random.default_rng(5), int(seconds * RATE)
+    time, rise = np.arange(samples) / RATE, np.log(50.0) / seconds
+    r = np.round(150 * np.sin(2 * np.pi * (np.exp(rise * time) - 1) / rise)).tolist()
+    jitter, decay = (noise * rng.standard_normal(samples)).tolist(), float(np.exp(-1 / RATE / LAG))
+    p, i, d = 0.032029 * PID[0], 0.244381 * PID[1], 0.000529 * PID[2]
+    share = 1 - 1 / (1 + 2 * np.pi * SLOPE_HZ / RATE)
+    push = rate = smooth = integral = 0.0
+    sent, rates = [0.0] * LATE, []
+    for k in range(samples):
+        y = rate + jitter[k]
+        integral += i * (r[k] - y) / RATE
+        before, smooth = smooth, smooth + share * (y - smooth)
+        sent.append(p * (r[k] - y) + integral - d * (smooth - before) * RATE)
+        rates.append(y)
+        wanted = GAIN * sent[k]
+        rate += (wanted + (push - wanted) * LAG * RATE * (1 - decay)) / RATE
+        push = wanted + (push - wanted) * decay
+    return r, sent[LATE:], rates
+
+
+def betaflight_loop_of(gains, omega):
+    """L of these gains of the CLI, in the frequency domain."""
+    s, z = 1j * omega, np.exp(1j * omega / RATE)
+    p, i, d = 0.032029 * gains[0], 0.244381 * gains[1], 0.000529 * gains[2]
+    share = 1 - 1 / (1 + 2 * np.pi * SLOPE_HZ / RATE)
+    slope = RATE * (1 - 1 / z) * share / (1 - (1 - share) / z)
+    # The lag of 25 ms lets no alias through.
+    plant = GAIN / (s * (LAG * s + 1)) * (1 - 1 / z) / (s / RATE) * z**-LATE
+    return plant * (p + i / RATE / (1 - 1 / z) + d * slope)
+
+
+@pytest.mark.slow
+def test_betaflights_file_holds_whole_numbers_that_keep_the_limit_with_d_raised(tmp_path):
+    level = {name: blackbox_rows.LEVEL.get(name, 0) for name in blackbox_writer.NAMES}
+    rows = [
+        level | {
+            "loopIteration": k, "time": 5_000_000 + 1000 * k, "axisP[0]": round(u),
+            "rcCommand[0]": round(r), "setpoint[0]": round(r), "gyroADC[0]": round(y),
+        }
+        for k, (r, u, y) in enumerate(zip(*fly_betaflight(), strict=True))
+    ]  # fmt: skip
+    path = tmp_path / "flight.bbl"
+    path.write_bytes(blackbox_rows.log(rows, changed=BETAFLIGHT))
+    assert main(["autopilot", str(path), "--axis", "roll", "--out", str(tmp_path)]) == 0
+    lines = (tmp_path / "proposal_100.txt").read_text().splitlines()
+    words = [line.split() for line in lines if line.startswith("set ") and "OFF" not in line]
+    old = {"p_roll": 28, "i_roll": 40, "d_min_roll": 18, "d_roll": 26}
+    new = old | {name: int(value) for _, name, _, value in words}
+    assert new != old and set(new) == set(old)
+    omega = np.geomspace(0.1, 0.99 * np.pi * RATE, 2000)
+    for d in (new["d_min_roll"], new["d_roll"]):
+        gains = new["p_roll"], new["i_roll"], d
+        assert 1 / np.min(np.abs(1 + betaflight_loop_of(gains, omega))) < 1.8
+    changed = {"rollPID": f"{new['p_roll']},{new['i_roll']},{new['d_roll']}",
+               "d_min": f"{new['d_min_roll']},30,0"}  # fmt: skip
+    law = betaflight_loop(BETAFLIGHT | changed, (4, 5, 1)).law
+    after = json.loads((tmp_path / "autopilot.json").read_text())["stages"][-1]
+    assert after["gains"] == [float(x[0]) for x in (law.p, law.i, law.d)]
+
+
+def fly_ardupilot(gains, seconds=30.0, noise=0.01):
+    """Chirp, set-point, rate in rad/s and output at 400 Hz: a loop that holds the level.
+
+    The gyro is filtered at 2 kHz; the chirp of 0.5 to 30 Hz enters at the mixer.
+    """
+    rng, parts, dt = np.random.default_rng(7), 5, 1 / 400
+    count = int(seconds / dt)
+    time, rise = np.arange(count) * dt, np.log(60.0) / seconds
+    chirp = (0.1 * np.sin(2 * np.pi * 0.5 * (np.exp(rise * time) - 1) / rise)).tolist()
+    jitter = (noise * rng.standard_normal(parts * count)).tolist()
+    k = float(np.tan(np.pi * 40.0 / 2000))
+    c = 1 + 2**0.5 * k + k * k
+    b, a1, a2 = k * k / c, 2 * (k * k - 1) / c, (1 - 2**0.5 * k + k * k) / c
+    p, i, d = gains
+    share, fine, late = 1 - 1 / (1 + 2 * np.pi * 20.0 * dt), dt / parts, 10
+    decay = float(np.exp(-fine / 0.03))
+    s1 = s2 = y = push = rate = angle = target = error = slope = integral = 0.0
+    sent, rows = [0.0] * late, []
+    for n in range(count):
+        wanted = -4.5 * angle
+        target += share * (wanted - target)
+        before, error = error, target - y
+        slope += share * ((error - before) / dt - slope)
+        integral += i * error * dt
+        u = p * error + integral + d * slope
+        rows.append((chirp[n], wanted, y, u))
+        for m in range(parts):
+            sent.append(u + chirp[n])
+            moved = 80.0 * sent[parts * n + m]
+            step = moved * fine + (push - moved) * 0.03 * (1 - decay)
+            push, rate, angle = moved + (push - moved) * decay, rate + step, angle + rate * fine
+            now = rate + jitter[parts * n + m]
+            y = b * now + s1
+            s1, s2 = 2 * b * now - a1 * y + s2, b * now - a2 * y
+    return np.array(rows).T
+
+
+def write_dataflash(path, flown, gains):
+    """ArduPilot's log of a SystemID flight with SID_AXIS 10."""
+    log = DataFlash()
+    log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
+    log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
+    log.define(
+        "RATE", "Qffffff", "TimeUS,RDes,R,ROut,PDes,P,POut", units="skk-kk-", mults="F------"
+    )
+    kept = {f"ATC_RAT_{axis}_{k}": x for axis in ("RLL", "PIT", "YAW")
+            for k, x in zip("PID", gains, strict=True)}  # fmt: skip
+    kept |= {"INS_GYRO_RATE": 1.0, "INS_GYRO_FILTER": 40.0, "SCHED_LOOP_RATE": 400.0}
+    for name, value in kept.items():
+        log.write("PARM", 0, name.encode(), value)
+    log.write("SIDS", 9_999_000, 10, 0.1, 0.5, 30.0)
+    for n, (chirp, wanted, y, u) in enumerate(flown.T.tolist()):
+        stamp = 10_000_000 + 2500 * n
+        log.write("SIDD", stamp, chirp, 1.0)
+        log.write("RATE", stamp, np.degrees(wanted), np.degrees(y), u, 0.0, 0.0, 0.0)
+    path.write_bytes(log.content)
+    return path
+
+
+@pytest.mark.slow
+def test_ardupilots_chirp_at_the_mixer_shows_its_law(tmp_path, capsys):
+    gains = (0.135, 0.135, 0.0036)
+    path = write_dataflash(tmp_path / "flight.bin", fly_ardupilot(gains), gains)
+    assert main(["autopilot", str(path), "--out", str(tmp_path)]) == 0, capsys.readouterr()
+    content = json.loads((tmp_path / "autopilot.json").read_text())
+    assert content["axis"] == "roll" and content["reproduction"]["misfit"] < 0.05
+    assert content["reproduction"]["gain_scale"] == pytest.approx(1, abs=0.05)
+    assert (tmp_path / "proposal_100.param").read_text().count("ATC_RAT_RLL_") >= 4
+    # The log of other gains.
+    path = write_dataflash(tmp_path / "other.bin", fly_ardupilot((0.2, 0.2, 0.0036)), gains)
+    assert main(["autopilot", str(path), "--out", str(tmp_path / "other")]) == 3
+    assert "not the one that flew" in capsys.readouterr().out
