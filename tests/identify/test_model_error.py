@@ -135,5 +135,5 @@ def test_the_missing_term_is_found_and_a_right_model_is_left_alone(right, wrong)
     found = wrong[0].explain()
     assert found.candidates[0].title == "rate damping" and found.best is not None
     assert abs(found.best.values[-1] - 0.3) < 3 * found.best.standard_errors[-1]
-    assert "d = 0." in found.summary and "want rate damping" in str(found)
+    assert "d = 0." in found.summary and "lacks rate damping" in str(found)
     assert right[0].explain().best is None
