@@ -209,11 +209,11 @@ class AutopilotProposal:
 
 def _stage_table(stages: tuple[Stage, ...]) -> str:
     names = ("what flew", "a third of the way", "all of it")
-    rows = [f"{'on fresh plants':<20} stable   worst Ms   crossover   torque   noise"]
+    rows = [f"{'on fresh plants':<20} stable   worst Ms   resonance   crossover   torque   noise"]
     for name, stage in zip(names, stages, strict=False):
         rows.append(
-            f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} "
-            f"{stage.crossover / (2 * np.pi):8.1f} Hz {stage.rejection:8.2f} {stage.noise:7.2f}"
+            f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
+            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {stage.rejection:8.2f} {stage.noise:7.2f}"
         )
     return "\n".join(rows)
 
@@ -373,7 +373,9 @@ def _designed(
     law, axis, unit = flown.law, flown.axis, found.records[0].output_units[0]
     draw = lambda count, seed: make_loops(law, axis, found.fit, unit, count, settings.seed + seed)
     loops, before = draw(settings.members, 0), gains_of(law, axis)
-    targets = Targets(settings.sensitivity, settings.noise, settings.change, found.band[1])
+    targets = Targets(
+        settings.sensitivity, settings.resonance, settings.noise, settings.change, found.band[1]
+    )
     new, stages = flown.old, ()
     for attempt in range(1, _CERTIFICATES + 1):
         announce(f"searching gains on {len(loops.plants)} plants")
@@ -383,7 +385,7 @@ def _designed(
         fresh = dataclasses.replace(fresh, ceiling=ceiling_in(law, axis, ways))
         designs = [before, *(gains_in(law, axis, each) for each in ways)]
         stages = tuple(certify_gains(fresh, designs))
-        if stages[-1].stable == 1 and stages[-1].peak <= settings.sensitivity:
+        if _judge(stages, settings, found.band[1])[0] != "not to be flown":
             break
         loops = loops.joined(fresh, designs[-1][None], _WORST)
     kind, verdict = _judge(stages, settings, found.band[1])
@@ -406,6 +408,11 @@ def _judge(stages: tuple[Stage, ...], settings: AutopilotSettings, edge: float) 
         beyond.append(f"only {100 * min(third.stable, whole.stable):.1f} % of the loops are stable")
     if whole.peak > limit:
         beyond.append(f"the worst Ms is {whole.peak:.2f}, above {limit:g}")
+    if whole.resonance > settings.resonance:
+        beyond.append(
+            f"the worst peak from set-point to rate is {whole.resonance:.2f}, above "
+            f"{settings.resonance:g}"
+        )
     if third.peak > max(limit, flown.peak):
         beyond.append(f"a third of the way the worst Ms is {third.peak:.2f}, above {limit:g}")
     if whole.crossover > edge:
@@ -415,11 +422,12 @@ def _judge(stages: tuple[Stage, ...], settings: AutopilotSettings, edge: float) 
         )
     if beyond:
         return "not to be flown", (
-            f"no gains are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, `noise`, "
-            "`change`), or fly more excitation"
+            f"no gains are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, `resonance`, "
+            "`noise`, `change`), or fly more excitation"
         )
     better = f"{whole.rejection:.2f} of the flown effect of torque"
-    if flown.stable == 1 and flown.peak <= limit and whole.rejection > _WORTH:
+    within = flown.peak <= limit and flown.resonance <= settings.resonance
+    if flown.stable == 1 and within and whole.rejection > _WORTH:
         return "kept", (
             f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
             f"{count} fresh plants is {flown.peak:.2f}"

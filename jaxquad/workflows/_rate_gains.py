@@ -45,13 +45,15 @@ class LoopQualities(NamedTuple):
     **Attributes:**
 
     - `stable`: by Nyquist's criterion on the sampled loop.
-    - `peak`: Ms; `crossover`: the highest frequency with |L| = 1, in rad/s.
+    - `peak`: Ms; `resonance`: of the response from set-point to rate, without feed-forward.
+    - `crossover`: the highest frequency with |L| = 1, in rad/s.
     - `rejection`: root of the integrated square of the rate after a step of torque, relative.
     - `noise`: rms of the command of white noise before the gyro's filters, relative.
     """
 
     stable: Bool[np.ndarray, "designs plants"]
     peak: Float[np.ndarray, "designs plants"]
+    resonance: Float[np.ndarray, "designs plants"]
     crossover: Float[np.ndarray, "designs plants"]
     rejection: Float[np.ndarray, "designs plants"]
     noise: Float[np.ndarray, "designs plants"]
@@ -65,6 +67,7 @@ class RateLoops:
 
     - `omega`: rad/s.
     - `feedback`: of the law, from the rate to minus the command, per unit of P, I and D.
+    - `ahead`: likewise from the set-point to the command.
     - `plants`: from the command to the logged rate in rad/s, the hold included.
     - `noise`: magnitude of the gyro's filters, which the logged noise has passed.
     - `ceiling`: by which factor D can rise in flight (D_MAX); 1 where it cannot.
@@ -72,15 +75,16 @@ class RateLoops:
 
     omega: Float[np.ndarray, " frequencies"]
     feedback: Complex[np.ndarray, "gains frequencies"]
+    ahead: Complex[np.ndarray, "gains frequencies"]
     plants: Complex[np.ndarray, "plants frequencies"]
     noise: Float[np.ndarray, " frequencies"]
     ceiling: float = 1.0
 
     def joined(self, others: "RateLoops", gains: Gains, count: int) -> "RateLoops":
-        """With the plants of `others` that have the greatest Ms under these gains."""
+        """With the plants of `others` that have the greatest peaks under these gains."""
         found = others.qualities(gains)
-        peak = np.where(found.stable, found.peak, np.inf).max(axis=0)
-        worst = others.plants[np.argsort(peak)[-count:]]
+        peak = np.where(found.stable, np.maximum(found.peak, found.resonance), np.inf)
+        worst = others.plants[np.argsort(peak.max(axis=0))[-count:]]
         return dataclasses.replace(self, plants=np.concatenate([self.plants, worst]))
 
     def qualities(self, gains: Gains) -> LoopQualities:
@@ -92,6 +96,7 @@ class RateLoops:
         return base._replace(
             stable=base.stable & raised.stable,
             peak=np.maximum(base.peak, raised.peak),
+            resonance=np.maximum(base.resonance, raised.resonance),
             crossover=np.maximum(base.crossover, raised.crossover),
         )
 
@@ -108,6 +113,7 @@ class RateLoops:
         return LoopQualities(
             begun < 0,
             1 / np.min(np.abs(distance), axis=-1),
+            np.max(np.abs((gains @ self.ahead)[:, None] * self.plants / distance), axis=-1),
             np.max(above, axis=-1),
             np.sqrt(np.trapezoid(torque, self.omega, axis=-1)),
             np.sqrt(np.trapezoid(command, self.omega, axis=-1)),
@@ -122,23 +128,21 @@ def make_loops(law: RateLaw, axis: int, fit: Fit, unit: str, plants: int, seed: 
     omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
     seen = without_gyro_filters(law)  # the logged rate is behind them: they are in the plant
     each = [_alone(seen, name) for name in FIELDS]
-    feedback = np.stack([_feedback(one, axis, omega) for one in each])
+    ahead, back = np.stack([law_responses(one, axis, omega) for one in each], axis=1)
     per_radian = np.pi / 180 if unit == "deg/s" else 1.0
     responses = per_radian * _sampled_plants(fit, omega, law.dt, plants, seed)
-    passed = np.abs(_feedback(_alone(law, "p"), axis, omega) / feedback[0])
-    return RateLoops(omega, feedback, responses, passed, _ceiling(law, axis))
+    passed = np.abs(law_responses(_alone(law, "p"), axis, omega)[1] / back[0])
+    return RateLoops(omega, -back, ahead, responses, passed, _ceiling(law, axis))
 
 
 def _alone(law: RateLaw, name: str) -> RateLaw:
-    """The law with a gain of 1 and none of the other two."""
+    """The law with a gain of 1, none of the other two and no feed-forward."""
     gains = {other: jnp.full_like(law.p, float(other == name)) for other in FIELDS}
-    return dataclasses.replace(law, **gains)
-
-
-def _feedback(
-    law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
-) -> Complex[np.ndarray, " frequencies"]:
-    return -law_responses(law, axis, omega)[1]
+    if isinstance(law, ArduPilotRate):
+        none = jnp.zeros_like(law.p)
+        return dataclasses.replace(law, ff=none, d_ff=none, **gains)
+    ahead = "f" if isinstance(law, BetaflightPID) else "ff"
+    return dataclasses.replace(law, **gains, **{ahead: jnp.zeros_like(law.p)})
 
 
 def law_responses(
@@ -194,13 +198,14 @@ class Targets(NamedTuple):
 
     **Attributes:**
 
-    - `peak`: Ms at most.
+    - `peak`: Ms at most; `resonance`: the peak from set-point to rate at most.
     - `noise`: of the flown gains' noise, at most.
     - `change`: factor by which a gain may rise or fall.
     - `crossover`: rad/s at most, where the identified band ends.
     """
 
     peak: float
+    resonance: float
     noise: float
     change: float
     crossover: float
@@ -255,6 +260,7 @@ class _Score:
         found, targets = self.loops.qualities(gains), self.targets
         beyond = np.stack([
             np.max(found.peak, axis=1) / (_RESERVE * targets.peak),
+            np.max(found.resonance, axis=1) / (_RESERVE * targets.resonance),
             np.mean(found.noise / self.noise, axis=1) / targets.noise,
             np.max(found.crossover, axis=1) / targets.crossover,
         ]).max(axis=0)  # fmt: skip
@@ -318,7 +324,7 @@ class Stage(NamedTuple):
     **Attributes:**
 
     - `gains`: P, I and D.
-    - `stable`: share of the plants; `peak`: their greatest Ms.
+    - `stable`: share of the plants; `peak`, `resonance`: the greatest of them.
     - `crossover`: their median in rad/s.
     - `rejection`, `noise`: relative to what flew.
     """
@@ -326,6 +332,7 @@ class Stage(NamedTuple):
     gains: tuple[float, ...]
     stable: float
     peak: float
+    resonance: float
     crossover: float
     rejection: float
     noise: float
@@ -341,6 +348,7 @@ def certify_gains(loops: RateLoops, designs: Sequence[np.ndarray]) -> list[Stage
             tuple(map(float, gains)),
             float(np.mean(found.stable[k])),
             float(np.max(found.peak[k])),
+            float(np.max(found.resonance[k])),
             float(np.median(found.crossover[k])),
             float(rejection[k] / rejection[0]),
             float(noise[k] / noise[0]),

@@ -481,6 +481,12 @@ class AutopilotSettings(Settings):
     sensitivity: float = option_field(
         kinds.POSITIVE, 1.8, "upper limit of the peak of |S|; 1.8 by default", group=_KEPT
     )
+    resonance: float = option_field(
+        kinds.POSITIVE,
+        1.4,
+        "upper limit of the peak of the response from set-point to rate; 1.4 by default",
+        group=_KEPT,
+    )
     noise: float = option_field(
         kinds.POSITIVE,
         1.5,
@@ -507,6 +513,10 @@ class AutopilotSettings(Settings):
         if self.sensitivity <= 1:
             raise SettingsError(
                 f"`sensitivity` is {self.sensitivity:g}: no loop has a peak of |S| of 1 or below"
+            )
+        if self.resonance <= 1:
+            raise SettingsError(
+                f"`resonance` is {self.resonance:g}: a loop with an integral has a peak above 1"
             )
         if self.change <= 1:
             raise SettingsError(f"`change` is {self.change:g}: give a factor above 1")

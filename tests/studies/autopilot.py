@@ -40,7 +40,9 @@ def draw(rng) -> simulated.Vehicle:
 def main() -> None:
     parser = argparse.ArgumentParser(description="proposed gains on the true plants")
     parser.add_argument("--flights", type=int, default=40)
-    count = parser.parse_args().flights
+    parser.add_argument("--amplitude", type=float, default=1.5, help="of the chirp, rad/s")
+    options = parser.parse_args()
+    count = options.flights
     jq.enable_x64()
     rng = np.random.default_rng(SEED)
     kinds, peaks, certified, gusts = Counter(), [], [], []
@@ -49,7 +51,7 @@ def main() -> None:
         for k in range(count):
             vehicle = draw(rng)
             noise, gust = rng.uniform(0.01, 0.1), rng.uniform(0.002, 0.03)
-            flown = vehicle.fly(noise=noise, gust=gust, seed=k)
+            flown = vehicle.fly(amplitude=options.amplitude, noise=noise, gust=gust, seed=k)
             log = simulated.write_log(Path(folder) / "log.ulg", flown, vehicle.parameters)
             found = autopilot(log, SETTINGS)
             kinds[found.kind] += 1
@@ -63,6 +65,8 @@ def main() -> None:
                 line += f" Ms {peaks[-1]:.2f}, certified {after.peak:.2f}, gusts {gusts[-1]:.2f}"
             print(line, flush=True)
     print(f"{count} flights, seed {SEED}: {dict(kinds)}")
+    if not peaks:
+        return
     limit, true = SETTINGS.sensitivity, np.array(peaks)
     kept, middle, most = np.sum(true <= limit), np.median(gusts), max(gusts)
     print(f"true Ms at most {limit}: {kept} of {true.size}, greatest {true.max():.2f}")

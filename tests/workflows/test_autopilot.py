@@ -27,7 +27,7 @@ def read_params(text: str) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     ("wrong", "words"),
-    [({"sensitivity": 1.0}, "no loop"), ({"change": 0.5}, "above 1"), ({"throttle": 30}, "share"),
+    [({"sensitivity": 1.0}, "no loop"), ({"resonance": 0.9}, "above 1"), ({"change": 0.5}, "above 1"), ({"throttle": 30}, "share"),
      ({"axis": "rol"}, "roll")],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(wrong, words):
