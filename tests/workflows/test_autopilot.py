@@ -27,8 +27,8 @@ def read_params(text: str) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     ("wrong", "words"),
-    [({"sensitivity": 1.0}, "no loop"), ({"resonance": 0.9}, "above 1"), ({"change": 0.5}, "above 1"), ({"throttle": 30}, "share"),
-     ({"axis": "rol"}, "roll")],
+    [({"sensitivity": 1.0}, "no loop"), ({"resonance": 0.9}, "above 1"),
+     ({"change": 0.5}, "above 1"), ({"throttle": 30}, "share"), ({"axis": "rol"}, "roll")],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(wrong, words):
     with pytest.raises(SettingsError, match=words):
