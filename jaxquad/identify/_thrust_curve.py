@@ -9,7 +9,8 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
-from ._result import counted, Fit
+from ._fit_table import counted
+from ._result import Fit
 from ._verdict import Combination, reach_of_interval, UndeterminedError
 
 

@@ -1,0 +1,110 @@
+"""A fit in words: its verdict, its table of parameters, and how good it is."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+
+if TYPE_CHECKING:
+    from ._result import Fit
+
+
+_SHOWN = 6  # optima of several starts
+
+
+def fit_table(fit: "Fit") -> str:
+    """The verdict where it is a refusal, the table of parameters, and how good the fit is."""
+    lines = [] if fit.identifiable else [str(fit.verdict)]
+    if fit.verdict.fitted:
+        lines += [*_parameters(fit), _quality(fit), *_minima(fit)]
+    return "\n".join(lines + [f"! {remark}" for remark in fit.remarks])
+
+
+_MARK = " *"  # behind the name of a parameter that is not determined
+
+
+def _parameters(fit: "Fit") -> list[str]:
+    marks = np.where(fit.determined, "", _MARK)
+    names = [f"{name}{mark}" for name, mark in zip(fit.names, marks, strict=True)]
+    width = max(9, *map(len, names))
+    units = fit.parameter_units or ("",) * len(names)
+    wide = max(map(len, units))
+    heads = (f"{'parameter':<{width}}", *([f"{'unit':<{max(4, wide)}}"] if wide else []))
+    heads = (*heads, f"{'value':>11}", f"{'std. error':>10}")
+    apart = fit.discrepancy is not None
+    heads = (*heads, f"{'95 % interval':>23}", *([_BESIDE] if apart else []))
+    heads = (*heads, f"{'CR %':>7}", f"{'insens. %':>9}")
+    heads += () if fit.identifiable else (f"{'stopped at':>11}",)
+    lines = [" ".join(heads)]
+    for k, name in enumerate(names):
+        low, high = fit.interval(fit.names[k])
+        value, interval = f"{fit.values[k]:.5g}", f"{low:.5g} .. {high:.5g}"
+        stopped = "" if fit.determined[k] else value
+        if stopped:
+            value, interval = "-", "not determined"
+        cells = [f"{units[k]:<{max(4, wide)}}"] if wide else []
+        cells += [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>23}"]
+        cells += [_by_noise(fit, k)] if apart else []
+        percent = f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:9.2f}"
+        cells += percent if np.isfinite(fit.insensitivity[k]) else (f"{'-':>7}", f"{'-':>9}")
+        lines.append(" ".join([f"{name:<{width}}", *cells, f"{stopped:>11}"]).rstrip())
+    if apart:
+        lines.append(_how_wide(fit))
+    if not fit.identifiable:
+        lines.append(
+            "* this record does not determine it individually: where the solver stopped is for "
+            "comparison alone"
+        )
+    return lines
+
+
+_BESIDE = f"{'by noise alone':>23} {'width':>6}"
+
+
+def _by_noise(fit: "Fit", k: int) -> str:
+    """The interval by the noise alone, and what makes the other one as wide as it is."""
+    if fit.discrepancy is None or not fit.determined[k]:
+        return " " * len(_BESIDE)
+    low, high = fit.interval(fit.names[k], model_error=False)
+    return f"{f'{low:.5g} .. {high:.5g}':>23} {fit.discrepancy.widths[k]:>6}"
+
+
+def _how_wide(fit: "Fit") -> str:
+    """What the model leaves unexplained, and what the words under "width" mean."""
+    found = fit.discrepancy
+    if found is None:
+        return ""
+    size, degrees = 100 * 0.6 * found.amplitude, np.degrees(found.amplitude)
+    text = f"95 % intervals count model error: {size:.2g} % of magnitude, {degrees:.2g} deg"
+    text += " of phase"
+    text += f" (probability of none: {100 * found.none:.0f} %)" if found.none > 0.05 else ""
+    if "prior" in found.widths:
+        text += "\nwidth prior: the record cannot show this error; it is that of usual models"
+    return text
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    """`1 start`, `2 starts`."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def _minima(fit: "Fit") -> list[str]:
+    """The optima at which the starts ended, if there were several."""
+    if not fit.minima:
+        return []
+    starts = sum(len(point.starts) for point in fit.minima)
+    lines = [f"{counted(starts, 'start')}, {counted(len(fit.minima), 'optimum', 'optima')}:"]
+    for point in fit.minima[:_SHOWN]:
+        values = ", ".join(f"{value:.4g}" for value in point.values)
+        lines.append(f"  cost {point.cost:9.4g} from {len(point.starts)}: {point.kind}; {values}")
+    rest = len(fit.minima) - _SHOWN
+    return lines + ([f"  and {rest} more of higher cost"] if rest > 0 else [])
+
+
+def _quality(fit: "Fit") -> str:
+    condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
+    return (
+        f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
+        f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} points, condition {condition}, "
+        f"Newton decrement {fit.newton_decrement:.1e}, {counted(fit.steps, 'step')}"
+    )
