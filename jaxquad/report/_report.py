@@ -36,6 +36,7 @@ def write_report(
     models: Mapping[str, Model] | None = None,
     others: Mapping[str, FrequencyResponse] | None = None,
     record: Record | Mapping[str, Record] | None = None,
+    spectrum: Record | None = None,
     checks: Verification | Mapping[str, Verification] | None = None,
     derived: Sequence[Combination] = (),
     beside: Mapping[str, str] | None = None,
@@ -62,6 +63,8 @@ def write_report(
       by the same names; by default the fit's own.
     - `others`: further estimates of the same response, by name.
     - `record`, `checks`: the records, and the model simulated on records; one, or several by name.
+    - `spectrum`: the record whose spectrum is shown, such as one with the throttle beside its
+        channels; by default the first record.
     - `derived`: rows below the parameters, see `Fit.derived`.
     - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
@@ -93,6 +96,7 @@ def write_report(
     names = (first.output_names[0], first.input_names[0])
     channels = {*first.input_names, *first.output_names}
     flown = next((each for each in records.values() if channels <= {*each.names}), None)
+    shown = flown if spectrum is None else spectrum
     sections = {
         "answers": answer_section(fit, first, next(iter(records.values()), None), found),
         "step": None if flown is None else step_section(fit, first, flown),
@@ -102,7 +106,7 @@ def write_report(
         "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
         "identifiability": identifiability_section(fit),
         "verification": check_section(found) if found else None,
-        "spectrum": None if flown is None else spectrum_section(first, flown),
+        "spectrum": None if shown is None else spectrum_section(first, shown),
         "record": record_section(records) if records else None,
         "provenance": provenance_section(provenance) if provenance is not None else None,
     }

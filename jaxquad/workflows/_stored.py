@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxquad._core import announce
 from jaxquad.identify import Fit, Verification, verify
-from jaxquad.records import Record
+from jaxquad.records import read, Record, RecordError
 from jaxquad.report import provenance, sha256_of, write_report, write_results
 
 from ._identify import Identification, identify, read_records
@@ -51,6 +51,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         frf=found.frf,
         others=others,
         record={_record_title(found, record): record for record in found.records},
+        spectrum=_with_throttle(found),
         checks={} if found.check is None else {Path(sources[-1]).name: found.check},
         derived=found.combinations,
         provenance=origin,
@@ -58,6 +59,19 @@ def write_identification(found: Identification, folder: Path) -> Path:
         beside=found.beside,
     )
     return path
+
+
+def _with_throttle(found: Identification) -> Record | None:
+    """The first record with the throttle that the log's proposal names; None without one."""
+    proposal, first = found.proposal, found.records[0]
+    if proposal is None or not proposal.setup.throttle:
+        return None
+    span = {"start": float(first.time[0]), "stop": float(first.time[-1])}
+    options = proposal.options_with_throttle | span | {"sample_rate": first.sample_rate}
+    try:
+        return read(found.path, **options)
+    except RecordError:  # such as a throttle with gaps: the page is then without it
+        return None
 
 
 def _record_title(found: Identification, record: Record) -> str:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from textwrap import fill, wrap
 from typing import NamedTuple
 
 import first_answer
@@ -124,6 +125,11 @@ Whole processes, the median of {rounds}: without compiled programs on disk (`JAX
 and the second time, with those that the first has left (the command line's default).
 
 """
+TAIL = """
+An ensemble of more than 512 members is one kernel on an NVIDIA GPU, forward and in reverse. No GPU
+was there to measure it on: interpreters test these kernels.
+"""
+_OF_PYTEST = re.compile(r"benchmark: |Outliers: |OPS: ")  # lines that a plugin prints
 
 
 def main() -> None:
@@ -138,7 +144,8 @@ def main() -> None:
     text += _table(heads, [row for pair in PAIRS if (row := _compared(pair))])
     text += "\n## Ensembles, devices, the tuner's own steps\n\n```text\n"
     text += "\n".join(line for file in PRINTED for line in _printed(file))
-    text += f"\nan hour at 1 kHz, 4 inputs, 6 outputs: {_run_script('long_record.py')}\n```\n"
+    hour = f"an hour at 1 kHz, 4 inputs, 6 outputs: {_run_script('long_record.py')}"
+    text += f"\n{fill(hour, 110, subsequent_indent='    ')}\n```\n{TAIL}"
     PAGE.write_text(text)
     print(text)
 
@@ -181,9 +188,11 @@ def _seconds(value: float) -> str:
 
 
 def _printed(file: str) -> list[str]:
-    """The lines with figures that a benchmark prints."""
+    """The lines with figures that a benchmark prints, as wide as the page."""
     lines = _pytest(file, "-s").splitlines()
-    return [line.lstrip(".") for line in lines if ": " in line and re.search(r"\d", line)]
+    kept = [line.lstrip(".") for line in lines if ": " in line and re.search(r"\d", line)]
+    own = [line for line in kept if not _OF_PYTEST.search(line)]
+    return [part for line in own for part in wrap(line, 110, subsequent_indent="    ")]
 
 
 def _run_script(file: str) -> str:

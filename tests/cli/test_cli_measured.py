@@ -71,9 +71,11 @@ def test_a_band_that_the_model_does_not_hold_over_is_told(identified):
     assert float(row.split("+-")[3].split()[1]) == pytest.approx(0.07, rel=0.15)
 
 
-def test_feedback_without_an_outside_reference_is_no_plant(identified):
+def test_feedback_without_an_outside_reference_is_no_plant(identified, tmp_path):
+    """Its page shows the spectrum over the throttle, which the log's proposal names."""
     code, printed, result = identified("LOG00037.BFL")
     assert code == 3 and "! feedback-dominated: " in printed
+    assert "Spectrum of gyroADC[0] over throttle" in (tmp_path / "report.html").read_text()
     assert not result["fit"]["identifiable"]
     assert not any(row["determined"] for row in result["fit"].get("parameters", []))
 
