@@ -75,7 +75,7 @@ def test_feedback_without_an_outside_reference_is_no_plant(identified, tmp_path)
     """Its page shows the spectrum over the throttle, which the log's proposal names."""
     code, printed, result = identified("LOG00037.BFL")
     assert code == 3 and "! feedback-dominated: " in printed
-    assert "Spectrum of gyroADC[0] over throttle" in (tmp_path / "report.html").read_text()
+    assert "Spectrum of gyroADC[1] over throttle" in (tmp_path / "report.html").read_text()
     assert not result["fit"]["identifiable"]
     assert not any(row["determined"] for row in result["fit"].get("parameters", []))
 
