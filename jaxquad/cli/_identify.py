@@ -1,6 +1,7 @@
 """Commands around one log: channels, identify, report, verify and demo."""
 
 import argparse
+import dataclasses
 import math
 import sys
 from pathlib import Path
@@ -129,6 +130,7 @@ def _identify(options: argparse.Namespace) -> int:
         with stdout_for_json(options):
             print(f"{proposal}\n", flush=True)
     found = identify(options.file if several else first, settings)
+    found = dataclasses.replace(found, proposal=proposal)
     return _finish(options, found, options.out or default_folder(first))
 
 

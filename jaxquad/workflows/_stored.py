@@ -66,8 +66,9 @@ def _with_throttle(found: Identification) -> Record | None:
     proposal, first = found.proposal, found.records[0]
     if proposal is None or not proposal.setup.throttle:
         return None
-    span = {"start": float(first.time[0]), "stop": float(first.time[-1])}
-    options = proposal.options_with_throttle | span | {"sample_rate": first.sample_rate}
+    options = proposal.options_with_throttle
+    options |= {"start": float(first.time[0]), "stop": float(first.time[-1])}
+    options["sample_rate"] = first.sample_rate
     try:
         return read(found.path, **options)
     except RecordError:  # such as a throttle with gaps: the page is then without it
