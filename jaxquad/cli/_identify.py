@@ -1,7 +1,6 @@
 """Commands around one log: channels, identify, report, verify and demo."""
 
 import argparse
-import dataclasses
 import math
 import sys
 from pathlib import Path
@@ -129,8 +128,7 @@ def _identify(options: argparse.Namespace) -> int:
     if proposal is not None:
         with stdout_for_json(options):
             print(f"{proposal}\n", flush=True)
-    found = identify(options.file if several else first, settings)
-    found = dataclasses.replace(found, proposal=proposal)
+    found = identify(options.file if several else first, settings, proposal=proposal)
     return _finish(options, found, options.out or default_folder(first))
 
 

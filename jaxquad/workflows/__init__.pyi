@@ -11,9 +11,9 @@ from ._demo import (
 from ._identify import (
     Identification as Identification,
     identify as identify,
-    propose_settings as propose_settings,
 )
 from ._kinds import SettingsError as SettingsError
+from ._log import propose_settings as propose_settings
 from ._result_file import (
     default_folder as default_folder,
     free_folder as free_folder,
@@ -23,14 +23,16 @@ from ._result_file import (
     StoredTuning as StoredTuning,
 )
 from ._settings import (
-    AutopilotSettings as AutopilotSettings,
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,
-    TuneSettings as TuneSettings,
 )
 from ._stored import (
     identify_again as identify_again,
     verify_result as verify_result,
 )
 from ._tune import tune as tune, Tuning as Tuning
+from ._tune_settings import (
+    AutopilotSettings as AutopilotSettings,
+    TuneSettings as TuneSettings,
+)
 from ._words import in_options as in_options

@@ -34,8 +34,9 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
-from ._identify import Identification, identify, propose_settings, read_records
+from ._identify import Identification, identify
 from ._kinds import SettingsError
+from ._log import propose_settings, read_records
 from ._rate_gains import (
     ceiling_in,
     certify_gains,
@@ -49,7 +50,8 @@ from ._rate_gains import (
     Stage,
     Targets,
 )
-from ._settings import AutopilotSettings, IdentifySettings
+from ._settings import IdentifySettings
+from ._tune_settings import AutopilotSettings
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]

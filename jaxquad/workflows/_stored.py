@@ -12,7 +12,8 @@ from jaxquad.identify import Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError
 from jaxquad.report import provenance, sha256_of, write_report, write_results
 
-from ._identify import Identification, identify, read_records
+from ._identify import Identification, identify
+from ._log import read_records
 from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
@@ -71,7 +72,8 @@ def _with_throttle(found: Identification) -> Record | None:
     options["sample_rate"] = first.sample_rate
     try:
         return read(found.path, **options)
-    except RecordError:  # such as a throttle with gaps: the page is then without it
+    except RecordError as error:
+        announce(f"no spectrum over the throttle: {error}")
         return None
 
 

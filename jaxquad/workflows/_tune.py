@@ -30,8 +30,8 @@ from jaxquad.tuning import (
 
 from ._identify import Identification
 from ._result_file import StoredResult
-from ._settings import TuneSettings
 from ._stored import identify_again
+from ._tune_settings import TuneSettings
 
 
 _PULSE, _BACK = 0.375, 0.625  # of the flight: when the torque comes, and the step back

@@ -7,7 +7,8 @@ The library speaks Python: `max_gap=` is an argument, `jq.verify` a function. So
 import re
 
 from ._batch._settings import BatchSettings
-from ._settings import AutopilotSettings, IdentifySettings, TuneSettings
+from ._settings import IdentifySettings
+from ._tune_settings import AutopilotSettings, TuneSettings
 
 
 _FLAGS = {

@@ -228,7 +228,7 @@ def test_channels_are_listed_as_json(demo, capsys):
 
 @pytest.mark.parametrize(("more", "said"), [([], "long ...\n"), (["--quiet"], "")])
 def test_a_stage_that_takes_longer_than_a_second_is_a_line(more, said, demo, capsys, monkeypatch):
-    def identify_slowly(*_):
+    def identify_slowly(*_, **__):
         for stage, seconds in (("short", 0.0), ("long", 1.5), ("last", 0.0)):
             logging.getLogger("jaxquad.stages").info(stage)
             time.sleep(seconds)

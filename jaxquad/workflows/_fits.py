@@ -1,0 +1,212 @@
+"""Responses and fits of an identification, over the whole band and over parts of it."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad._core import announce
+from jaxquad.identify import (
+    CoherenceWeighted,
+    Fit,
+    fit,
+    fit_transfer_function,
+    guess_lagged_integrator,
+    MaximumLikelihood,
+    usable,
+)
+from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
+from jaxquad.records import Record
+from jaxquad.spectra import (
+    Composite,
+    Estimator,
+    frequency_response,
+    FrequencyResponse,
+    JointInputOutput,
+    LocalPolynomial,
+    Welch,
+)
+
+from ._settings import IdentifySettings
+from ._words import in_options
+
+
+Model = LaggedIntegrator | TransferFunction
+_COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
+_POINTS = 100  # frequencies, log-spaced over the band
+_LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
+_MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
+_CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
+_DOMINATED = "feedback-dominated"
+
+
+def fit_twice(
+    records: tuple[Record, ...], method: str, settings: IdentifySettings, delay: float
+) -> tuple[FrequencyResponse, Fit, float]:
+    """The second response is estimated with the delay (s) that the first fit found taken out.
+
+    Once is enough where a delay is known. Returns the delay, too.
+    """
+    band = _band(settings)
+    dt, duration = records[0].dt, max(record.duration for record in records)
+    omega = np.geomspace(*band, _POINTS) if band else None
+    while True:
+        announce(f"{method} response{f', {delay:.4g} s of delay taken out' if delay else ''}")
+        estimator = _estimator(settings, method, delay)
+        frf = frequency_response(list(records), omega, estimator=estimator)
+        announce(f"fit to the {method} response")
+        found = _fitted(frf, settings)
+        if not found.verdict.fitted:
+            return frf, found, delay
+        total = dt * round(float(total_delay(found.model)) / dt)
+        if delay or not 0 < total < _LONGEST * duration:
+            return frf, found, delay
+        delay = total
+
+
+def _band(settings: IdentifySettings) -> tuple[float, float] | None:
+    """In rad/s."""
+    if settings.band is not None:
+        return 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
+    return settings.band_rad
+
+
+def _estimator(settings: IdentifySettings, method: str, delay: float) -> Estimator:
+    shape = {"integrators": settings.integrators, "delay": delay}
+    if settings.window is not None or settings.estimator == "welch":
+        estimator = Welch(settings.window, **shape)
+    elif settings.estimator == "composite":
+        estimator = Composite(**shape)
+    else:
+        estimator = LocalPolynomial(**shape)
+    return JointInputOutput(estimator) if method == "joint" else estimator
+
+
+def _fitted(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
+    cost, n = _COSTS[settings.cost], settings.integrators
+    if settings.poles is not None:
+        return fit_transfer_function(
+            frf,
+            zeros=settings.zeros,
+            poles=settings.poles + n,
+            integrators=n,
+            delay="free" if settings.delay else 0.0,
+            cost=cost,
+        )
+    free = ["gain", *(["lag"] if settings.lag else []), *(["delay"] if settings.delay else [])]
+    return fit(_start(frf, settings), frf, free=free, cost=cost)
+
+
+def _start(frf: FrequencyResponse, settings: IdentifySettings) -> LaggedIntegrator:
+    """What is fixed at zero is added to what is free."""
+    guess = guess_lagged_integrator(frf, settings.integrators)
+    total = np.asarray(guess.lag) + np.asarray(guess.delay)
+    lag = 0.0 if not settings.lag else guess.lag if settings.delay else total
+    delay = 0.0 if not settings.delay else guess.delay if settings.lag else total
+    return LaggedIntegrator(guess.gain, lag, delay, settings.integrators)
+
+
+def total_delay(model: Model) -> Float[Array, ""]:
+    """The sum of lag and delay, which a record determines better than either of them."""
+    return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
+
+
+def sums_of(settings: IdentifySettings) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:
+    """The quantities that are shown beside the parameters."""
+    both = settings.poles is None and settings.lag and settings.delay
+    return {"lag + delay": total_delay} if both else {}
+
+
+def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
+    """The same fit, whose remedies are options of `jaxquad identify`."""
+    kind, lost = found.verdict.kind, found.verdict.undetermined
+    if kind == "identifiable":
+        return found
+    excite = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
+    remedies = [excite]
+    if kind == "too few points":
+        remedies += ["use longer windows (--estimator welch --window S)"]
+    elif kind == "no model":
+        remedies = [
+            "fit the part of the band where it holds (--band, --band-rad)",
+            "fit a model of higher order (--poles), or ask which term is missing (--explain)",
+        ]
+    elif settings.poles is not None:
+        remedies = ["fit fewer poles and zeros (--poles, --zeros)", excite]
+    elif {"lag", "delay"} & set(lost) and settings.lag and settings.delay:
+        remedies = ["fit without the lag (--no-lag) or without the delay (--no-delay)", excite]
+    verdict = dataclasses.replace(found.verdict, remedies=tuple(remedies))
+    return dataclasses.replace(found, verdict=verdict)
+
+
+def fit_parts(
+    found: Fit, frf: FrequencyResponse, settings: IdentifySettings
+) -> tuple[Fit, dict[str, Fit | None]]:
+    """Fits to the upper and the lower two thirds of the frequencies, where the misfit is large.
+
+    Returns the fit too, with a remark where the gain differs between them. There are no parts for
+    a misfit below three times the noise, for other models than the lagged integrator, and for a
+    response that feedback dominates: no part of it would be better.
+    """
+    small = not found.chi_squared >= _MISFIT**2 or not isinstance(found.model, LaggedIntegrator)
+    dominated = any(_DOMINATED in remark for remark in frf.remarks)
+    if not found.verdict.fitted or small or dominated:
+        return found, {}
+    used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
+    low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
+    bands = {
+        f"above {first:.3g} rad/s ({_hertz(first)})": (first, high),
+        f"below {second:.3g} rad/s ({_hertz(second)})": (low, second),
+    }
+    parts = {name: _refitted(found, frf, settings, band) for name, band in bands.items()}
+    remarks = [_gain_change(name, part, found) for name, part in parts.items()]
+    found = dataclasses.replace(found, remarks=(*found.remarks, *filter(None, remarks)))
+    whole = f"{low:.3g} .. {high:.3g} rad/s ({low / (2 * np.pi):.3g} .. {_hertz(high)})"
+    return found, {whole: found} | parts
+
+
+def _hertz(omega: float) -> str:
+    return f"{omega / (2 * np.pi):.3g} Hz"
+
+
+def _refitted(
+    found: Fit, frf: FrequencyResponse, settings: IdentifySettings, band: tuple[float, float]
+) -> Fit | None:
+    """From where the fit stopped; None where the solver diverged."""
+    try:
+        return fit(found.model, frf, free=found.names, cost=_COSTS[settings.cost], band=band)
+    except ValueError:
+        return None
+
+
+def _gain_change(where: str, part: Fit | None, found: Fit) -> str:
+    known = found.determined[0] or found.verdict.kind == "no model"
+    if part is None or not (part.determined[0] and known):
+        return ""
+    before, after = found.values[0], part.values[0]
+    change = abs(after - before)
+    if not change > max(_CHANGE * abs(before), 2 * part.standard_errors[0]):
+        return ""
+    ratio, ratio_before = part.chi_squared**0.5, found.chi_squared**0.5
+    return (
+        f"{where} the gain is {after:.4g} instead of {before:.4g}, with a misfit of {ratio:.1f} "
+        f"instead of {ratio_before:.1f}: the model does not hold over the whole band. Fit the part "
+        "where it does (--band, --band-rad), or a model of higher order (--poles)"
+    )
+
+
+def in_option_words(fit: Fit) -> Fit:
+    return dataclasses.replace(fit, remarks=tuple(map(in_options, fit.remarks)))
+
+
+def with_units(fit: Fit, record: Record) -> Fit:
+    """The units of the parameters; a channel without a unit stands for itself."""
+    if not fit.verdict.fitted:
+        return fit
+    [output], [source] = record.output_units, record.input_units
+    units = parameter_units(
+        fit.model, fit.names,
+        output=output or record.output_names[0], input=source or record.input_names[0],
+    )  # fmt: skip
+    return dataclasses.replace(fit, parameter_units=units)

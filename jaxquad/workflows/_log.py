@@ -1,0 +1,115 @@
+"""What an identification reads: the channels that a log proposes, and its records."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxquad._core import announce
+from jaxquad.records import (
+    Mix,
+    parse_mix,
+    Proposal,
+    propose,
+    read_segments,
+    Record,
+    RecordError,
+    Segment,
+)
+
+from ._kinds import mix_text, SettingsError
+from ._settings import IdentifySettings
+
+
+def propose_settings(
+    path: Path, settings: IdentifySettings, *, several: bool = False
+) -> tuple[IdentifySettings, Proposal | None]:
+    """Settings with input and output, from the log's proposal where they are not given.
+
+    What the settings say stays. Raises what `jaxquad.propose` raises, and SettingsError where
+    `several` logs are to have one input and output.
+    """
+    if settings.input is not None:
+        return settings, None
+    if several:
+        raise SettingsError(
+            f"several logs need `input` and `output`: run jaxquad identify {path} alone, and give "
+            "what it proposes"
+        )
+    proposal = propose(path, axis=settings.axis)
+    offered = proposal.options
+    found = {"input": mix_text(offered["inputs"]), "output": offered["outputs"], "axis": None}
+    if settings.reference is None:
+        found["reference"] = offered["references"]
+    if settings.rate is None:
+        found["rate"] = offered["sample_rate"]
+    if settings.hold is None:
+        found["hold"] = offered["hold"]
+    if proposal.setup.band and settings.band is settings.band_rad is None:
+        found["band"] = proposal.setup.band
+    return dataclasses.replace(settings, **found | _proposed_span(settings, proposal)), proposal
+
+
+def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, object]:
+    """All injections that were found, or those within `start` and `stop`."""
+    if settings.segments:
+        return {}
+    low = -np.inf if settings.start is None else settings.start
+    high = np.inf if settings.stop is None else settings.stop
+    inside = [(max(start, low), min(stop, high)) for start, stop in proposal.segments]
+    spans = [(start, stop) for start, stop in inside if start < stop]
+    if len(spans) > 1:
+        return {"segments": spans, "start": None, "stop": None}
+    return dict(zip(("start", "stop"), spans[0], strict=True)) if spans else {}
+
+
+def read_logs(paths: Sequence[Path], settings: IdentifySettings) -> tuple[Record, ...]:
+    """The records of all logs, with one sample rate. Raises RecordError where units differ."""
+    logs = {path: read_records(path, settings) for path in paths}
+    rates = [records[0].sample_rate for records in logs.values()]
+    if max(rates) > (1 + 1e-6) * min(rates):
+        common = dataclasses.replace(settings, rate=float(f"{min(rates):.3g}"))
+        logs = {path: read_records(path, common) for path in paths}
+    _check_units(logs)
+    return tuple(record for records in logs.values() for record in records)
+
+
+def _check_units(logs: Mapping[Path, tuple[Record, ...]]) -> None:
+    (first, [known, *_]), *others = logs.items()
+    for path, [record, *_] in others:
+        for name in (*known.input_names, *known.output_names):
+            if record.unit(name) != known.unit(name):
+                raise RecordError(
+                    f"the unit of {name} is {known.unit(name) or 'not known'} in {first}, but "
+                    f"{record.unit(name) or 'not known'} in {path}: logs that are identified "
+                    f"together need one unit. Leave one of them out."
+                )
+
+
+def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
+    """One record for each segment. Raises RecordError, ReadError."""
+    announce(f"reading {path.name}")
+    inputs, outputs, references = map(mix_of, (settings.input, settings.output, settings.reference))
+    asked = {*inputs, *outputs, *references}
+    segments: list[Segment] = list(settings.segments) or [(settings.start, settings.stop)]
+    records = read_segments(
+        path,
+        segments,
+        inputs=inputs,
+        outputs=outputs,
+        references=references,
+        sample_rate=settings.rate,
+        time=settings.time,
+        time_unit=settings.time_unit,
+        dt=settings.dt,
+        units={name: unit for name, unit in settings.units.items() if name in asked},
+        max_gap=settings.max_gap,
+        valid=settings.valid,
+        hold=settings.hold,
+    )
+    return tuple(records)
+
+
+def mix_of(text: str | None) -> Mix:
+    return {} if text is None else parse_mix(text)
