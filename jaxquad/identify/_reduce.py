@@ -10,7 +10,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._cost import Band, Cost, MaximumLikelihood
 from ._fit import check_options, fit_with, require_responses
-from ._fit_table import counted
+from ._fit_content import counted
 from ._half_bands import model_to_start_from
 from ._origin import free_again, Options
 from ._parameters import Free, Parameters, Positive, Real, select_parameters, Tie

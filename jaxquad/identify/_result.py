@@ -11,7 +11,6 @@ from jaxquad._xla import run_shared
 from jaxquad.records import Record
 
 from ._accuracy import Matrix
-from ._content import fit_content
 from ._curves import (
     fitted_response,
     fitted_step_response,
@@ -21,7 +20,7 @@ from ._curves import (
 )
 from ._discrepancy import Discrepancy
 from ._explain import explain_misfit, Explanation
-from ._fit_table import fit_table
+from ._fit_content import fit_content, fit_table
 from ._half_bands import Bands, fit_bands
 from ._noise_model import NoiseModel
 from ._origin import Origin

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
-from ._fit_table import counted
+from ._fit_content import counted
 from ._result import Fit
 from ._verdict import Combination, reach_of_interval, UndeterminedError
 

@@ -1,5 +1,4 @@
 from ._fit import compare_fits as compare_fits
-from ._json import write_json as write_json
 from ._page import (
     Cell as Cell,
     render_page as render_page,
@@ -14,5 +13,6 @@ from ._provenance import (
 from ._report import write_report as write_report
 from ._results import (
     verification_content as verification_content,
+    write_json as write_json,
     write_results as write_results,
 )

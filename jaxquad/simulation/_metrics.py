@@ -175,9 +175,7 @@ class Metrics(eqx.Module):
 
         Each variable has its unit in `attrs`, the dataset the window in s.
         """
-        from ._labelled import to_xarray
-
-        return to_xarray(self, axis_names(self.itae.shape[0]))
+        return _labelled(self, axis_names(self.itae.shape[0]))
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -337,3 +335,29 @@ def _torque(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
 def _flat(values: ArrayLike) -> np.ndarray:
     array = np.asarray(values)
     return array.reshape(array.shape[0], -1)
+
+
+_UNITS = {
+    "itae": "rad s^2", "iae": "rad s", "ise": "rad^2 s", "overshoot": "%", "rise_time": "s",
+    "settling_time": "s", "settling_time_5": "s", "peak": "rad", "rms": "rad",
+    "disturbance_rmse": "N m", "activity": "", "energy": "", "saturation_share": "1",
+    "step": "rad", "stepped": "", "diverged": "", "beyond_authority": "1", "reversing": "1",
+}  # fmt: skip
+_OF_A_UNIT_STEP = {"itae": "s^2", "iae": "s", "ise": "s"}
+
+
+def _labelled(metrics: "Metrics", axes: tuple[str, ...]) -> "xarray.Dataset":
+    """`Metrics.to_xarray`, with names for the axes."""
+    import xarray
+
+    depth = metrics.diverged.ndim
+    members = ("member",) if depth == 1 else tuple(f"member_{k}" for k in range(depth))
+    units = _UNITS | (_OF_A_UNIT_STEP if metrics.per_step else {})
+    variables = {}
+    for name, unit in units.items():
+        values = np.asarray(vars(metrics)[name])
+        dims = members if name == "diverged" else ("axis", *members)
+        variables[name] = (dims, values, {"units": unit} if unit else {})
+    counts = {name: np.arange(n) for name, n in zip(members, metrics.diverged.shape, strict=True)}
+    window = {name: vars(metrics)[name] for name in ("start", "stop", "load_start")}  # s
+    return xarray.Dataset(variables, coords={"axis": list(axes), **counts}, attrs=window)
