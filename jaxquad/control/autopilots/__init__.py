@@ -48,7 +48,7 @@ from ._gains import (
     RateGains as RateGains,
     torque_per_unit as torque_per_unit,
 )
-from ._law import FirmwareLoop as FirmwareLoop, LoopState as LoopState
+from ._law import AngleLoop as AngleLoop, FirmwareLoop as FirmwareLoop, LoopState as LoopState
 from ._parameters import (
     check_ranges as check_ranges,
     find_parameter as find_parameter,
@@ -62,9 +62,7 @@ from ._parameters import (
 )
 from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
 from ._reproduce import (
-    check_loop as check_loop,
     hold_response as hold_response,
-    LoopCheck as LoopCheck,
     predict_loop as predict_loop,
     without_gyro_filters as without_gyro_filters,
 )

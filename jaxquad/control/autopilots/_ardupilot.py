@@ -10,6 +10,7 @@ from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
 from .._protocols import Reference, Setpoint
 from ._filters import FilterChain
 from ._law import (
+    AngleLoop,
     bounded,
     filter_gyro,
     FirmwareLoop,
@@ -122,7 +123,7 @@ class ArduPilotRate(FirmwareLoop):
         return p * scale, d * scale
 
 
-class ArduPilotAttitude(FirmwareLoop):
+class ArduPilotAttitude(AngleLoop):
     """ArduPilot's angle loop around a rate loop: angles in rad in, ROut out.
 
     The rate's target is `p` times the error of the angle, beyond a_max/p^2 the root of it that a
@@ -153,35 +154,23 @@ class ArduPilotAttitude(FirmwareLoop):
         require_positive("p", self.p, "give 1/s")
         require_positive("acceleration_limit", self.acceleration_limit, "give rad/s^2")
 
-    @property
-    def dt(self) -> float:
-        return self.rate.dt
+    def outer_gains(self) -> dict[str, Array]:
+        return {"p": self.p}
 
-    def interval(self) -> float:
-        return self.dt
+    def inner(self) -> FirmwareLoop:
+        return self.rate
 
-    def gains(self) -> dict[str, Array]:
-        return {"p": self.p} | {f"rate.{k}": x for k, x in self.rate.gains().items()}
+    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {"wanted": zero}
 
-    def rest(self, zero: Signal) -> dict[str, PyTree]:
-        return {"rate": self.rate.rest(zero), "angle": zero, "wanted": zero}
-
-    def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
-        angle = reference.angle if isinstance(reference, Setpoint) else reference
-        measured = (measurement - memory["angle"]) / self.dt
-        inner, command, terms = self.rate.advance(
-            memory["rate"], excess, memory["wanted"], measured
-        )
-        wanted = bounded(self._rate_of(angle - measurement), self.rate_limit)
+    def wanted_rate(
+        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        aim = reference.angle if isinstance(reference, Setpoint) else reference
+        wanted = bounded(self._rate_of(aim - angle), self.rate_limit)
         if isinstance(reference, Setpoint):
             wanted = wanted + reference.rate
-        return {"rate": inner, "angle": measurement, "wanted": wanted}, command, terms
+        return {"wanted": wanted}, memory["wanted"]
 
     def _rate_of(self, error: Signal) -> Signal:
         """The square-root controller: linear for small errors, then the braking parabola."""

@@ -11,6 +11,7 @@ from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
 from .._protocols import Reference
 from ._filters import Filter, FilterChain, PT2, PT3
 from ._law import (
+    AngleLoop,
     bounded,
     DEGREES,
     filter_gyro,
@@ -262,7 +263,7 @@ def dynamic_cutoff(
     return low_hz + (high_hz - low_hz) * (throttle * (1 - throttle) * expo / 10 + throttle)
 
 
-class BetaflightAngle(FirmwareLoop):
+class BetaflightAngle(AngleLoop):
     """Betaflight's angle mode around a rate loop: angles in rad in, pidsum units out.
 
     The rate's set-point is level/10 times the error of the angle, through a pt3 at 50 Hz. Feed-
@@ -288,44 +289,28 @@ class BetaflightAngle(FirmwareLoop):
         require_positive("level", self.level, "give angle_p_gain, 50 by default")
 
     @property
-    def dt(self) -> float:
-        return self.rate.dt
-
-    @property
     def _smooth(self) -> FilterChain:
         return FilterChain((PT3(50.0),) if self.smooth is None else self.smooth, 1 / self.dt)
 
-    @property
-    def _inner(self) -> BetaflightPID:
-        """The rate loop as it is in angle mode."""
+    def inner(self) -> BetaflightPID:
         relax = self.rate.relax
         if relax is not None:
             relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
         return dataclasses.replace(self.rate, f=jnp.zeros_like(self.rate.f), relax=relax)
 
-    def interval(self) -> float:
-        return self.dt
+    def outer_gains(self) -> dict[str, Array]:
+        return {"level": self.level}
 
-    def gains(self) -> dict[str, Array]:
-        return {"level": self.level} | {f"rate.{k}": x for k, x in self.rate.gains().items()}
+    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {"smooth": self._smooth.init(zero)}
 
-    def rest(self, zero: Signal) -> dict[str, PyTree]:
-        smooth = self._smooth.init(zero)
-        return {"rate": self._inner.rest(zero), "smooth": smooth, "angle": zero}
-
-    def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
-        angle, _ = split_reference(reference, measurement, self.dt)
-        level = broadcast_gain(self.level, measurement) / 10
-        smooth, wanted = self._smooth.step(memory["smooth"], level * (angle - measurement))
-        measured = (measurement - memory["angle"]) / self.dt
-        inner, command, terms = self._inner.advance(memory["rate"], excess, wanted, measured)
-        return {"rate": inner, "smooth": smooth, "angle": measurement}, command, terms
+    def wanted_rate(
+        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        aim, _ = split_reference(reference, angle, self.dt)
+        level = broadcast_gain(self.level, angle) / 10
+        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim - angle))
+        return {"smooth": smooth}, wanted
 
 
 class BetaflightADRC(FirmwareLoop):

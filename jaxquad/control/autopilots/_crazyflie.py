@@ -8,6 +8,7 @@ from jaxquad._core import as_float, as_float_or_none, broadcast_gain, per_member
 from .._protocols import Reference
 from ._filters import Butterworth, FilterChain
 from ._law import (
+    AngleLoop,
     bounded,
     DEGREES,
     filter_gyro,
@@ -106,7 +107,7 @@ class CrazyflieRate(FirmwareLoop):
         return next, bounded(sum_of(terms), self.limit), terms
 
 
-class CrazyflieAttitude(FirmwareLoop):
+class CrazyflieAttitude(AngleLoop):
     """The Crazyflie's angle PID around its rate loop: angles in rad in, the int16 command out.
 
     The rate that the inner loop sees is the difference of the measured angles over a sample.
@@ -134,34 +135,21 @@ class CrazyflieAttitude(FirmwareLoop):
         limits = {"integral_limit": self.integral_limit}
         require_gains(self.dt, {"ki": self.ki, "kd": self.kd}, limits)
 
-    @property
-    def dt(self) -> float:
-        return self.rate.dt
+    def outer_gains(self) -> dict[str, Array]:
+        return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
 
-    def interval(self) -> float:
-        return self.dt
+    def inner(self) -> FirmwareLoop:
+        return self.rate
 
-    def gains(self) -> dict[str, Array]:
-        own = {"kp": self.kp, "ki": self.ki, "kd": self.kd}
-        return own | {f"rate.{k}": x for k, x in self.rate.gains().items()}
+    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {"integral": zero}
 
-    def rest(self, zero: Signal) -> dict[str, PyTree]:
-        return {"rate": self.rate.rest(zero), "angle": zero, "integral": zero}
-
-    def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
-        at = lambda gain: broadcast_gain(gain, measurement)
-        angle, _ = split_reference(reference, measurement, self.dt)
-        measured = (measurement - memory["angle"]) / self.dt
-        error = DEGREES * (angle - measurement)
+    def wanted_rate(
+        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        at = lambda gain: broadcast_gain(gain, angle)
+        aim, _ = split_reference(reference, angle, self.dt)
+        error = DEGREES * (aim - angle)
         integral = bounded(memory["integral"] + error * self.dt, self.integral_limit)
-        wanted = at(self.kp) * error + at(self.ki) * integral - at(self.kd) * DEGREES * measured
-        inner, command, terms = self.rate.advance(
-            memory["rate"], excess, wanted / DEGREES, measured
-        )
-        return {"rate": inner, "angle": measurement, "integral": integral}, command, terms
+        wanted = at(self.kp) * error + at(self.ki) * integral - at(self.kd) * DEGREES * rate
+        return {"integral": integral}, wanted / DEGREES

@@ -105,6 +105,59 @@ class FirmwareLoop(eqx.Module):
         """What `tunable` names unless it is 0."""
 
 
+class AngleLoop(FirmwareLoop):
+    """An angle loop of a firmware around its rate loop: angles in rad in.
+
+    The rate that the inner loop sees is the difference of the measured angles over a sample.
+    Subclasses are final: they say what rate they ask for.
+    """
+
+    rate: eqx.AbstractVar[FirmwareLoop]
+
+    @property
+    def dt(self) -> float:
+        return self.rate.interval()
+
+    def interval(self) -> float:
+        return self.dt
+
+    def gains(self) -> dict[str, Array]:
+        return self.outer_gains() | {f"rate.{name}": x for name, x in self.rate.gains().items()}
+
+    def rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {"rate": self.inner().rest(zero), "angle": zero, **self.outer_rest(zero)}
+
+    def advance(
+        self,
+        memory: Mapping[str, PyTree],
+        excess: Signal,
+        reference: Reference,
+        measurement: Signal,
+    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        rate = (measurement - memory["angle"]) / self.dt
+        outer, wanted = self.wanted_rate(memory, reference, measurement, rate)
+        inner, command, terms = self.inner().advance(memory["rate"], excess, wanted, rate)
+        return {"rate": inner, "angle": measurement, **outer}, command, terms
+
+    @abc.abstractmethod
+    def outer_gains(self) -> dict[str, Array]:
+        """The gains of the angle alone."""
+
+    @abc.abstractmethod
+    def inner(self) -> FirmwareLoop:
+        """The rate loop as it is inside this one."""
+
+    @abc.abstractmethod
+    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
+        """What the angle loop remembers at rest besides the last angle."""
+
+    @abc.abstractmethod
+    def wanted_rate(
+        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        """What the angle loop remembers, and the set-point of the rate in rad/s."""
+
+
 Law = TypeVar("Law", bound=eqx.Module)
 
 

@@ -10,6 +10,7 @@ from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
 from .._protocols import Reference, Setpoint
 from ._filters import FilterChain, PT1, Section
 from ._law import (
+    AngleLoop,
     bounded,
     filter_gyro,
     FirmwareLoop,
@@ -134,7 +135,7 @@ class PX4Rate(FirmwareLoop):
 _UNALLOCATED = 1e-6  # of the normalised torque, above which the axis counts as saturated
 
 
-class PX4Attitude(FirmwareLoop):
+class PX4Attitude(AngleLoop):
     """PX4's attitude loop around a rate loop: angles in rad in, normalised torque out.
 
     The rate's set-point is `p` times the error of the angle, plus a `Setpoint`'s rate, within
@@ -162,31 +163,20 @@ class PX4Attitude(FirmwareLoop):
         require_positive("p", self.p, "give 1/s")
         require_positive("rate_limit", self.rate_limit, "give rad/s")
 
-    @property
-    def dt(self) -> float:
-        return self.rate.dt
+    def outer_gains(self) -> dict[str, Array]:
+        return {"p": self.p}
 
-    def interval(self) -> float:
-        return self.dt
+    def inner(self) -> FirmwareLoop:
+        return self.rate
 
-    def gains(self) -> dict[str, Array]:
-        return {"p": self.p} | {f"rate.{k}": x for k, x in self.rate.gains().items()}
+    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {}
 
-    def rest(self, zero: Signal) -> dict[str, PyTree]:
-        return {"rate": self.rate.rest(zero), "angle": zero}
-
-    def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
-        angle = reference.angle if isinstance(reference, Setpoint) else reference
-        wanted = broadcast_gain(self.p, measurement) * (angle - measurement)
+    def wanted_rate(
+        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        aim = reference.angle if isinstance(reference, Setpoint) else reference
+        wanted = broadcast_gain(self.p, angle) * (aim - angle)
         if isinstance(reference, Setpoint):
             wanted = wanted + reference.rate
-        wanted = bounded(wanted, self.rate_limit)
-        measured = (measurement - memory["angle"]) / self.dt
-        inner, command, terms = self.rate.advance(memory["rate"], excess, wanted, measured)
-        return {"rate": inner, "angle": measurement}, command, terms
+        return {}, bounded(wanted, self.rate_limit)
