@@ -58,4 +58,5 @@ from ._process import (
     require_float64 as require_float64,
     require_x64 as require_x64,
 )
+from ._pytree_node import pytree_node as pytree_node
 from ._stages import announce as announce, STAGES as STAGES

@@ -74,7 +74,7 @@ class ResponseTerm(NamedTuple):
     @property
     def error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Random error relative to the model."""
-        off = np.abs(self.ratio) ** self.frf.error_exponent()
+        off = np.abs(self.ratio) ** self.frf.error_exponent
         return np.asarray(self.frf.random_error) * off
 
 
@@ -109,7 +109,7 @@ def _through_fit(record: ResponseTerm, count: int) -> Matrix:
     weighted = record.pulls(count)
     used = record.weights[..., :1] > 0
     model = np.where(used[..., 0], np.asarray(record.frf.response) / record.ratio, 1.0)
-    off = np.where(used[..., 0], np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent())
+    off = np.where(used[..., 0], np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent)
     # Magnitude and phase of the misfit are the parts of dT over T.
     columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / (model.conj() * off)[..., None]
     return record.frf.errors.project(np.where(used, columns, 0.0))

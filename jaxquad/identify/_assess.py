@@ -122,7 +122,7 @@ def assess(
             *_remarks_on_used(problem, frfs),
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
             *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
-            *remarks_on_minima(problem, solution, bread, minima),
+            *remarks_on_minima(problem, solution, _cost(blocks, prior), bread, minima),
             *remarks_on_priors(prior.misfit, verdict, by_data),
             *remarks_on_discrepancy(discrepancy),
             *further,
@@ -238,12 +238,18 @@ def _look(records: list[ResponseTerm], prior: PriorRows, count: int) -> _Look:
 
 def _costs(blocks: list[Block], prior: PriorRows, bread: Matrix, noise: Noise) -> Costs:
     """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
-    data = sum(float(np.sum(block.residual**2)) for block in blocks)
-    cost, misfit = data + float(np.sum(prior.misfit**2)), misfit_ratio(data, bread, noise)
+    cost = _cost(blocks, prior)
+    misfit = misfit_ratio(_cost(blocks), bread, noise)
     # A misfit beyond the noise is in no covariance of the noise.
     inflation = misfit if misfit > MISFIT**2 else 1.0
     information = cost + 2 * inflation * fitted_noise(bread, noise)
     return Costs(cost, cost / len(blocks), information, misfit)
+
+
+def _cost(blocks: list[Block], prior: PriorRows | None = None) -> float:
+    """The sum of squares of the data, and of the priors."""
+    data = sum(float(np.sum(block.residual**2)) for block in blocks)
+    return data if prior is None else data + float(np.sum(prior.misfit**2))
 
 
 def discrepancy_at(

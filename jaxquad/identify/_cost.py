@@ -1,5 +1,7 @@
 """Costs: weights on the logarithm of the ratio of model to measurement."""
 
+import dataclasses
+import functools as ft
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -7,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from jaxquad._core import pytree_node
 from jaxquad.spectra import ErrorCovariance, FrequencyResponse
 
 
@@ -46,7 +49,9 @@ def paper_cost(
     return float(20 / T.size * np.sum(coherence_weight(gamma_squared) * squares))
 
 
-class Points(eqx.Module):
+@pytree_node
+@dataclasses.dataclass(frozen=True, eq=False)
+class Points:
     """The points of one measured response as a fit counts them.
 
     Neighbouring frequencies share part of their noise: `shared` is the sum of |rho|^2 of a point's
@@ -109,7 +114,7 @@ class MaximumLikelihood(eqx.Module):
     def weights(self, points: Points, ratio: Ratio) -> Weights:
         # 1e-7 keeps noise-free records from weights that overflow.
         # Where the model is off by far, as at the start, the measurement is the better guide.
-        off = np.clip(ratio, 1 / 3, 3) ** -points.frf.error_exponent()
+        off = np.clip(ratio, 1 / 3, 3) ** -points.frf.error_exponent
         error = np.maximum(np.asarray(points.frf.random_error), 1e-7) * off
         with np.errstate(invalid="ignore"):  # an unknown response has an infinite error
             deviation = np.hypot(error * np.sqrt(points.shared), points.floor)
@@ -203,7 +208,7 @@ def _shared_noise(
         size = np.sqrt(np.maximum(np.real(np.diagonal(covariance)), 1e-300))
         turn = np.exp(-1j * np.angle(np.asarray(frf.response)[mine, o, i])) / size
         correlation = turn[:, None] * covariance * turn.conj()
-        sums = np.sum(np.abs(correlation) ** 2, axis=1)
+        sums = np.sum(correlation.real**2 + correlation.imag**2, axis=1)
         shared[mine, o, i] = np.maximum(sums, 1.0)
         if np.any(sums > _ALONE):
             correlations[o, i] = correlation
@@ -251,6 +256,13 @@ def _local_mean(
 
     Choosing single points whose own coherence came out high by chance would bias the fit.
     """
-    distance = np.log(omega[:, None] / omega[None, :])
-    kernel = np.exp(-0.5 * (distance / 0.2) ** 2)
-    return np.einsum("fg,goi->foi", kernel / kernel.sum(axis=1, keepdims=True), values)
+    kernel = _third_of_an_octave(omega.tobytes())
+    return (kernel @ values.reshape(len(values), -1)).reshape(values.shape)
+
+
+@ft.lru_cache(maxsize=16)
+def _third_of_an_octave(omega: bytes) -> Float[np.ndarray, "frequencies frequencies"]:
+    """Weights of a mean around each frequency (the bytes of their array, rad/s)."""
+    place = np.log(np.frombuffer(omega))
+    kernel = np.exp(-0.5 * ((place[:, None] - place[None, :]) / 0.2) ** 2)
+    return kernel / kernel.sum(axis=1, keepdims=True)

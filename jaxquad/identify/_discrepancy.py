@@ -8,6 +8,7 @@ Source: Kennedy & O'Hagan (2001), Bayesian calibration of computer models; Rasmu
 (2006), Gaussian Processes for Machine Learning, eq. 2.45.
 """
 
+import dataclasses
 import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,6 +16,8 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+
+from jaxquad._core import pytree_node
 
 from ._accuracy import Matrix, PriorRows, ResponseTerm, scaled_inverse
 from ._cost import Points
@@ -30,12 +33,13 @@ _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
 _FOLLOWS = 1.25  # factor by which such a width grows
 
 _PAIR = ["einsum_path", (0, 1)]  # to search for a path takes longer than the products
-_TRIPLE = [*_PAIR, (0, 1)]
 
 Widths = Float[np.ndarray, " parameters"]
 
 
-class Discrepancy(eqx.Module):
+@pytree_node
+@dataclasses.dataclass(frozen=True, eq=False)
+class Discrepancy:
     """How far a model is off beyond the noise, in rad of phase; 0.6 of it in neper of magnitude.
 
     **Attributes:**
@@ -97,7 +101,8 @@ def _look(
         inverse = np.where(used, error**-2 / counted.shared, 0.0)
         columns = np.concatenate([record.slopes[..., :count], record.misfit[..., None]], axis=-1)
         columns = np.where(used[..., None, None], columns, 0.0)
-        whole += np.einsum("foimx,foi,foimy->xy", columns, inverse, columns, optimize=_TRIPLE)
+        weighted = (inverse[..., None, None] * columns).reshape(-1, len(whole))
+        whole += weighted.T @ columns.reshape(-1, len(whole))
         parts = _components(np.asarray(record.frf.omega), used, inverse, columns)
         gains.append(parts[0])
         along.append(parts[1])
@@ -109,14 +114,14 @@ def _look(
 def _components(omega, used, inverse, columns) -> tuple[np.ndarray, np.ndarray]:
     """Components of the kernels in which noise and discrepancy are both diagonal."""
     pairs = np.any(used, axis=0)
-    inverse, columns = inverse[:, pairs], columns[:, pairs]
-    basis = kernel_basis(omega.tobytes())
-    weighted = basis[:, :, :, None] * inverse[None, :, None, :]  # length frequency rank pair
-    gram = np.einsum("lfrp,lfs->lprs", weighted, basis, optimize=_PAIR)
-    seen = np.einsum("lfrp,fpmx->lprmx", weighted, columns, optimize=_PAIR)
-    gains, turned = np.linalg.eigh(gram)
-    seen = np.einsum("lprk,lprmx->lpkmx", turned, seen, optimize=_PAIR) * SHARES[:, None]
-    products = np.einsum("lpkmx,lpkmy->lpkmxy", seen, seen, optimize=_PAIR)
+    inverse, columns = inverse[:, pairs].T, np.moveaxis(columns[:, pairs], 0, 1)
+    basis = kernel_basis(omega.tobytes())[:, None]  # length pair frequency rank
+    weighted = np.swapaxes(basis * inverse[:, :, None], 2, 3)
+    gains, turned = np.linalg.eigh(weighted @ basis)
+    seen = weighted @ columns.reshape(*columns.shape[:2], -1)
+    seen = (np.swapaxes(turned, 2, 3) @ seen).reshape(*gains.shape, *columns.shape[2:])
+    seen = seen * SHARES[:, None]
+    products = seen[..., :, None] * seen[..., None, :]
     gains = np.maximum(gains, 0.0)[..., None] * SHARES**2
     lengths, width = len(basis), columns.shape[-1]
     return gains.reshape(lengths, -1), products.reshape(lengths, -1, width**2)

@@ -84,23 +84,37 @@ class _Same:
         return isinstance(other, _Same) and all(mine is its for mine, its in pairs)
 
 
+class Frame(NamedTuple):
+    """A problem without its arrays: what a program is compiled for."""
+
+    structure: PyTree
+    rest: tuple[PyTree, ...]
+
+    def filled(self, arrays: Sequence[Numbers]) -> Problem:
+        """The problem with these arrays."""
+        given = iter(arrays)
+        leaves = [next(given) if leaf is None else leaf for leaf in self.rest]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def take_apart(problem: Problem) -> tuple[Frame, list[Numbers]]:
+    """What a program is compiled for, and the arrays that it is run with."""
+    leaves, structure = jax.tree.flatten(problem)
+    arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+    rest = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+    return Frame(structure, rest), arrays
+
+
 @ft.lru_cache(maxsize=8)
 def _programs(same: _Same) -> list[tuple[Program, list[Numbers]]]:
-    programs = []
-    for part in same.problem.parts():
-        leaves, structure = jax.tree.flatten(part)
-        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        rest = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
-        programs.append((_program(structure, rest), arrays))
-    return programs
+    pairs = [take_apart(part) for part in same.problem.parts()]
+    return [(_program(frame), arrays) for frame, arrays in pairs]
 
 
 @ft.lru_cache(maxsize=128)
-def _program(structure: PyTree, rest: tuple[PyTree, ...]) -> Program:
+def _program(frame: Frame) -> Program:
     def run(z: Float[Array, " all"], arrays: Sequence[Array]):
-        given = iter(arrays)
-        leaves = [next(given) if leaf is None else leaf for leaf in rest]
-        problem = jax.tree.unflatten(structure, leaves)
+        problem = frame.filled(arrays)
 
         def along(change):
             return jax.jvp(lambda z: misfits(z, problem), (z,), (change,))

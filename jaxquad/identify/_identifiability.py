@@ -203,7 +203,9 @@ def assess_identifiability(information: Information, bounds: tuple[Bound, ...] =
 
 def _assess(information: Information) -> Verdict:
     count = len(information.covariance)
-    _, singular, right = np.linalg.svd(information.root[:, :count], full_matrices=True)
+    root = information.root[:, :count]
+    # All rows of `right` are wanted, and of the other factor none.
+    _, singular, right = np.linalg.svd(root, full_matrices=len(root) < count)
     singular = np.pad(singular, (0, count - len(singular)))
     exact = singular <= _FLOOR * singular[0]
     null = right[exact | (singular * LIMIT < 1)]

@@ -1,5 +1,7 @@
 """Which numbers of a model are free, under which names, and how each is scaled."""
 
+import dataclasses
+import functools as ft
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -9,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._core import is_concrete, require_float64
+from jaxquad._core import is_concrete, pytree_node, require_float64
 from jaxquad.models import StateSpace
 
 
@@ -43,7 +45,9 @@ class Place(NamedTuple):
 Tie = Callable[[PyTree], Float[Array, ""]]
 
 
-class Parameters(eqx.Module):
+@pytree_node
+@dataclasses.dataclass(frozen=True, eq=False)
+class Parameters:
     """Free numbers first, then the fixed nonzero ones; `z` is the vector that a solver moves.
 
     Tied numbers follow the others: each is a function of the model. With a NumPy `z` all is done
@@ -115,16 +119,27 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
 
 def name_places(model: PyTree) -> list[Place]:
     """Every floating-point number of a model: `lag`, `numerator[0]`, `axis.inertia[2]`."""
-    arrays = eqx.filter(model, eqx.is_inexact_array)
-    places, given = [], _given_names(model)
-    for leaf, (path, array) in enumerate(jax.tree_util.tree_flatten_with_path(arrays)[0]):
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
+    arrays, structure = jax.tree.flatten(eqx.filter(model, eqx.is_inexact_array))
+    places, names = _places(structure, tuple(array.shape for array in arrays))
+    for name, array in zip(names, arrays, strict=True):
         require_float64(f"parameter {name}", array)
+    return list(places)
+
+
+@ft.lru_cache(maxsize=64)
+def _places(
+    structure: PyTree, shapes: tuple[tuple[int, ...], ...]
+) -> tuple[tuple[Place, ...], tuple[str, ...]]:
+    """Of all numbers in arrays of these shapes; and the arrays' own names."""
+    hollow = jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])
+    places, names, given = [], [], _given_names(hollow)
+    for leaf, (path, array) in enumerate(jax.tree_util.tree_flatten_with_path(hollow)[0]):
+        names.append(jax.tree_util.keystr(path, simple=True, separator="."))
         for index in range(array.size):
             place = np.unravel_index(index, array.shape)
-            entry = name + "".join(f"[{i}]" for i in place)
+            entry = names[-1] + "".join(f"[{i}]" for i in place)
             places.append(Place(given.get(entry, entry), leaf, index, entry))
-    return places
+    return tuple(places), tuple(names)
 
 
 def _given_names(model: PyTree) -> dict[str, str]:
@@ -231,8 +246,9 @@ def _marked(
 
 
 def _numbers(model: PyTree, places: list[Place]) -> dict[str, float]:
-    leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
-    return {p.name: float(np.asarray(leaves[p.leaf]).reshape(-1)[p.index]) for p in places}
+    arrays = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+    leaves = [np.asarray(array).reshape(-1) for array in arrays]
+    return {p.name: float(leaves[p.leaf][p.index]) for p in places}
 
 
 def _choose(

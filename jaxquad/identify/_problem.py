@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
+from jaxquad._core import pytree_node
 from jaxquad._xla import no_fuse
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
@@ -51,7 +52,9 @@ class Prior(eqx.Module):
             )
 
 
-class Problem(eqx.Module):
+@pytree_node
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
     """One least-squares problem: residuals as a function of `z`, with all that they depend on."""
 
     model: PyTree
@@ -173,8 +176,7 @@ def on_host(model: PyTree) -> PyTree:
 
 def on_device(model: PyTree) -> PyTree:
     """The model with JAX's arrays in the place of NumPy's."""
-    arrays, rest = eqx.partition(model, eqx.is_array)
-    return eqx.combine(jax.device_put(arrays), rest)
+    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, model)
 
 
 def _silent_pairs(

@@ -237,11 +237,11 @@ _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
 def remarks_on_minima(
-    problem: Problem, solution: Solution, bread: Matrix, minima: tuple[Minimum, ...]
+    problem: Problem, solution: Solution, here: float, bread: Matrix, minima: tuple[Minimum, ...]
 ) -> list[str]:
-    """Remarks on a saddle instead of a minimum, and on other minima of nearly the same cost."""
+    """Remarks on a saddle instead of a minimum, and on other minima of nearly the cost `here`."""
     remarks = []
-    if solution.converged and _falls_aside(problem, solution, bread):
+    if solution.converged and _falls_aside(problem, solution, here, bread):
         remarks.append(
             "stationary, but no minimum: the cost falls to one side; start from other values, or "
             "give starts=20"
@@ -258,12 +258,11 @@ def remarks_on_minima(
     return remarks
 
 
-def _falls_aside(problem: Problem, solution: Solution, bread: Matrix) -> bool:
+def _falls_aside(problem: Problem, solution: Solution, here: float, bread: Matrix) -> bool:
     """Whether the cost is lower a small step to either side along the weakest direction."""
     size = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
     values, vectors = np.linalg.eigh(bread / np.outer(size, size))
     weakest = vectors[:, 0] / size
-    here = cost_at(problem, solution.z)
     step = np.sqrt(1e-2 * max(here, 1e-12) / max(values[0], 1e-12))
     step = min(step, _ASIDE / max(np.max(np.abs(weakest)), 1e-300))
     sides = [cost_at(problem, solution.z + sign * step * weakest) for sign in (1, -1)]

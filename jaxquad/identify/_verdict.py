@@ -1,10 +1,13 @@
 """What a record determines of a model's parameters, in numbers and in words."""
 
+import dataclasses
 from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+
+from jaxquad._core import pytree_node
 
 
 Kind = Literal["identifiable", "not identifiable", "no minimum", "no model", "too few points"]
@@ -73,7 +76,9 @@ class Bound(NamedTuple):
         return f"{self.name}: {self.value:.3g}, {side} {self.limit:.3g} (95 %)"
 
 
-class Verdict(eqx.Module):
+@pytree_node
+@dataclasses.dataclass(frozen=True, eq=False)
+class Verdict:
     """Which free parameters a record determines; true if it determines each of them individually.
 
     `kind` is "identifiable", "not identifiable" (the numbers are those of the best fit, but some

@@ -125,6 +125,7 @@ class FrequencyResponse(eqx.Module):
         covariance = self.errors.between((output, input), (output, input))
         return covariance / np.outer(response, response.conj())
 
+    @property
     def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """The power p of |measurement / model| in the random error relative to a model.
 
