@@ -1,7 +1,7 @@
 """Functions that are written anew each time, a lambda in a loop, compiled once."""
 
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
@@ -11,19 +11,22 @@ from jaxtyping import PyTree
 _KEPT = 256  # programs
 
 
-def run_shared(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
-    """`function(*args)` by a program that all functions share which trace to the same operations.
+def run_shared(
+    function: Callable[..., PyTree], calls: Sequence[tuple[PyTree, ...]]
+) -> list[PyTree]:
+    """`function(*call)` of each call, by a program that all functions of the same operations share.
 
     `jax.jit` compiles each function object anew, and keeps what a global or a closure held when it
-    was traced. Here every call traces, which takes some milliseconds.
+    was traced. Here a function is traced each time, once for all calls, which takes some
+    milliseconds. The calls have equal shapes.
     """
-    closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*calls[0])
     structure = jax.tree.structure(shape)
-    leaves = jax.tree.leaves(args)
     if _holds_constants(closed.jaxpr):
-        return jax.tree.unflatten(structure, jax.jit(jaxpr_as_fun(closed))(*leaves))
-    run = _program(_Text(closed.jaxpr))
-    return jax.tree.unflatten(structure, run(closed.consts, *leaves))
+        run, first = jax.jit(jaxpr_as_fun(closed)), ()
+    else:
+        run, first = _program(_Text(closed.jaxpr)), (closed.consts,)
+    return [jax.tree.unflatten(structure, run(*first, *jax.tree.leaves(call))) for call in calls]
 
 
 class _Text:

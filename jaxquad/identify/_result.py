@@ -1,4 +1,4 @@
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -231,9 +231,11 @@ class Fit(eqx.Module):
         """
         if not self.verdict.fitted:
             raise UndeterminedError(f"{name} has no value: {self.verdict.summary}")
-        value, gradient = self._value_and_gradient(quantity, self.values)
+        others = self.verdict.alternatives
+        (value, gradient), *there = self._values_and_gradients(quantity, (self.values, *others))
         slope = gradient * self.units
-        if self._depends_on_undetermined(quantity, slope, value):
+        differs = any(abs(other - value) > 1e-6 * abs(value) for other, _ in there)
+        if differs or self._changes_undetermined(slope):
             lost = ", ".join(self.verdict.undetermined)
             raise UndeterminedError(
                 f"{name} depends on what this record does not determine ({lost}): fit with a "
@@ -305,24 +307,19 @@ class Fit(eqx.Module):
         scores = jax.random.normal(key, (len(self.names), n))
         return draw_models(self, scores, hold_undetermined=hold_undetermined)
 
-    def _depends_on_undetermined(
-        self,
-        quantity: Callable[[PyTree], Float[Array, ""]],
-        slope: Float[np.ndarray, " parameters"],
-        here: float,
-    ) -> bool:
-        """Whether a quantity changes where the responses do not."""
+    def _changes_undetermined(self, slope: Float[np.ndarray, " parameters"]) -> bool:
+        """Whether a quantity of this `slope` changes where the responses do not."""
         verdict = self.verdict
         along_null = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
         on_curved = [slope[self.names.index(name)] != 0 for name in verdict.curved]
-        others = [self._value_and_gradient(quantity, each)[0] for each in verdict.alternatives]
-        differs = [abs(other - here) > 1e-6 * abs(here) for other in others]
-        return bool(np.any(along_null) or any(on_curved) or any(differs))
+        return bool(np.any(along_null) or any(on_curved))
 
-    def _value_and_gradient(
-        self, quantity: Callable[[PyTree], Float[Array, ""]], values: Float[np.ndarray, " n"]
-    ) -> tuple[float, Float[np.ndarray, " n"]]:
-        """Of a quantity at physical values of the free parameters."""
+    def _values_and_gradients(
+        self,
+        quantity: Callable[[PyTree], Float[Array, ""]],
+        places: Sequence[Float[np.ndarray, " n"]],
+    ) -> list[tuple[float, Float[np.ndarray, " n"]]]:
+        """Of a quantity at several physical values of the free parameters."""
         arrays, rest = eqx.partition(self.model, eqx.is_inexact_array)
 
         def of_values(x, arrays):
@@ -330,10 +327,10 @@ class Fit(eqx.Module):
 
         function = jax.value_and_grad(of_values)
         try:
-            found = run_shared(function, values, arrays)
+            found = run_shared(function, [(values, arrays) for values in places])
         except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
-            found = function(jnp.asarray(values), arrays)
-        return float(found[0]), np.asarray(found[1])
+            found = [function(jnp.asarray(values), arrays) for values in places]
+        return [(float(value), np.asarray(gradient)) for value, gradient in found]
 
     def __str__(self) -> str:
         return fit_table(self)

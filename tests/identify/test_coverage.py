@@ -15,31 +15,19 @@ pytestmark = pytest.mark.slow
 NAMES = ("open loop", "closed loop", "two inputs")
 
 
-@pytest.fixture(scope="module", params=NAMES, ids=lambda name: name.replace(" ", "-"))
-def drawn(request):
-    study = studies()[request.param]
-    return study, *draw(study, omega_of(request.param, frequencies=25), 100)
-
-
-def test_intervals_cover_the_truth(drawn):
+@pytest.mark.parametrize("name", NAMES)
+def test_intervals_cover_errors_are_the_scatter_and_bias_is_small(name):
     """By noise alone as they are, without the degrees of freedom of the noise estimate."""
-    study, values, errors, halves = drawn
+    study = studies()[name]
+    values, errors, halves = draw(study, omega_of(name, frequencies=25), 100)
     covered = np.abs(values - study.truth) < 1.96 * errors
     # 100 draws know a coverage of 95 % to 2.2 %; all parameters together to about 1 %.
     assert np.all(np.mean(covered, axis=0) > 0.88)
     assert 0.92 < np.mean(covered) < 0.98
     assert 0.93 < np.mean(np.abs(values - study.truth) < halves) < 0.99
-
-
-def test_the_predicted_error_is_the_scatter(drawn):
-    study, values, errors, _ = drawn
     ratio = np.sqrt(np.mean(errors**2, axis=0)) / np.std(values, axis=0)
     # 100 draws know a scatter to 7 %.
     assert 0.8 < ratio.min() and ratio.max() < 1.25
     assert np.mean(ratio) == pytest.approx(1, abs=0.1)
-
-
-def test_the_bias_is_small_beside_the_error(drawn):
-    study, values, errors, _ = drawn
     bias = values.mean(axis=0) - study.truth
     assert np.all(np.abs(bias) < 0.4 * errors.mean(axis=0))
