@@ -177,7 +177,7 @@ def fit_transfer_function(
     points = usable_points(pair, band, least)
     too_few = too_few_points(points, structure, least)
     if too_few is not None:
-        return _unfitted(structure, too_few, pair.remarks)
+        return _unfitted(structure, too_few, tuple(pair.remarks))
     samples = usable_samples(points, structure, cost)
     best = search(samples, structure)
     result = _refined(

@@ -76,7 +76,7 @@ def _response(frf: FrequencyResponse) -> dict[str, object]:
         "phase_deg": frf.phase_deg,
         "coherence": frf.coherence,
         "random_error": frf.random_error,
-        "remarks": frf.remarks,
+        "remarks": tuple(frf.remarks),
     }
 
 

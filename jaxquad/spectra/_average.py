@@ -1,8 +1,8 @@
 """Responses, coherence and errors from windowed transforms of one or several window lengths."""
 
+import functools as ft
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -276,7 +276,7 @@ class Averaged(NamedTuple):
     leakage: Float[Array, "2 frequencies outputs inputs"]  # relative bias, and its error
 
 
-@eqx.filter_jit
+@ft.partial(jax.jit, static_argnames="channels")
 def average(
     transforms: tuple[Complex[Array, "_ frequencies channels"], ...],
     slopes: tuple[Slopes, ...],

@@ -69,7 +69,7 @@ def deembed(
         response=jnp.asarray(plant),
         random_error=closed.random_error * jnp.asarray(amplified),
         errors=errors,
-        remarks=closed.remarks + _remark_on_errors(np.asarray(closed.omega), amplified[:, 0, 0]),
+        remarks=(*closed.remarks, *_remark_on_errors(np.asarray(closed.omega), amplified[:, 0, 0])),
     )
 
 

@@ -10,7 +10,7 @@ from jaxquad.records import Record
 from ._checks import check_compatible
 from ._estimators import Welch
 from ._welch import frequencies_for, transform_records
-from ._window import window
+from ._window import coefficients
 
 
 class SpectralDensity(eqx.Module):
@@ -74,7 +74,8 @@ def spectral_density(
     omega = frequencies_for(omega, records, welch)
     segments = transform_records(records, omega, [welch])
     [transforms], [(length, _)] = segments.transforms, segments.groups
-    energy = np.sum(window(welch.shape, length) ** 2)
+    level, cosine = coefficients(welch.shape)
+    energy = length * (level**2 + cosine**2 / 2)
     density = _averaged(transforms, np.asarray(2 * records[0].dt / energy))
     return SpectralDensity(jnp.asarray(omega), density, records[0].names)
 

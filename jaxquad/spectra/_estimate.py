@@ -21,6 +21,7 @@ from ._frequency_response import FrequencyResponse
 from ._local_estimate import estimate_local_polynomial, LocalEstimate
 from ._nonlinearity import remarks_on_nonlinearity
 from ._periodic import estimate_periodic, PeriodicEstimate
+from ._remarks import Remark, Remarks
 from ._welch import average_windows
 
 
@@ -65,9 +66,13 @@ def _result(
         error = np.where(np.isfinite(response), spread / np.abs(response), np.inf)
     names = records[0].output_names, records[0].input_names
     measured = omega, response, error, coherence, direct
-    remarks = remarks_on_feedback(method, *measured, names, found.errors)
-    if isinstance(found, LocalEstimate):  # periods show their own distortion
-        remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
+
+    def remarks() -> tuple[Remark, ...]:
+        noted = remarks_on_feedback(method, *measured, names, found.errors)
+        if isinstance(found, LocalEstimate):  # periods show their own distortion
+            noted += remarks_on_nonlinearity(records, omega, response, coherence, method)
+        return noted + found.remarks
+
     # Not jnp.asarray: it compiles a program for each new shape.
     put = jax.device_put
     return FrequencyResponse(
@@ -81,7 +86,7 @@ def _result(
         method=method,
         input_names=records[0].input_names,
         output_names=records[0].output_names,
-        remarks=remarks + found.remarks,
+        remarks=Remarks(remarks),
         integrators=integrators,
         log_noise_covariance=found.log_noise_covariance,
         divided=found.divided if isinstance(found, LocalEstimate) else None,

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -80,7 +81,7 @@ class FrequencyResponse(eqx.Module):
     method: Literal["direct", "joint"] = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
-    remarks: tuple[Remark, ...] = eqx.field(static=True, default=())
+    remarks: Sequence[Remark] = eqx.field(static=True, default=())
     integrators: int = eqx.field(static=True, default=0)  # removed before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation

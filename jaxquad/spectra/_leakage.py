@@ -24,8 +24,8 @@ _WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well add
 class Slopes(NamedTuple):
     """Transforms behind the derivatives of the windows of one length."""
 
-    inputs: Complex[Array, "_ frequencies slopes"]  # the first derivative, then the second
-    outputs: Complex[Array, "_ frequencies outputs"]  # the first derivative
+    first: Complex[Array, "_ frequencies channels"]  # derivative: inputs, then outputs
+    second: Complex[Array, "_ frequencies inputs"]
 
 
 class Rest(NamedTuple):
@@ -58,7 +58,9 @@ def without_leakage(
     for k, (left, inputs) in enumerate(zip(*parts, strict=True)):
         first = int(np.sum(counts[:k]))
         mine = overlap[first : first + counts[k], first : first + counts[k]]
-        leaked, own = (jnp.swapaxes(part, 0, 1) for part in slopes[k])
+        once, twice = (jnp.swapaxes(part, 0, 1) for part in slopes[k])
+        steep, own = once[:, :, : twice.shape[2]], once[:, :, twice.shape[2] :]
+        leaked = jnp.concatenate([steep, twice], axis=2)
         if counts[k] < inputs.shape[2] + leaked.shape[2] + 3:
             leaked, own = leaked[:, :, :0], jnp.zeros_like(own)
         found.append(_least_squares(left, inputs, leaked, own, mine.astype(left.dtype)))

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from jaxquad.records import Record
 
@@ -100,15 +100,21 @@ def _tone_of(record: Record, i: int, method: Literal["direct", "joint"]) -> Tone
     """The input's part at the frequency of a sweep, with its phase; `None` without a sweep."""
     count = _fast_length(record.samples)
     source = record.inputs[:count, i] if method == "direct" else record.references[:count, i]
-    phase = phase_of_sweep(source)
-    return None if phase is None else _at_phase(record.inputs[:count, i], phase)
+    swept = phase_of_sweep(source)
+    if swept is None:
+        return None
+    return swept.tone if method == "direct" else _at_phase(record.inputs[:count, i], swept.phase)
 
 
-def phase_of_sweep(signal: Signal) -> Signal | None:
-    """Phase in rad, rising, of a signal that is a tone of slowly changing frequency.
+class Swept(NamedTuple):
+    """A signal that is a tone of slowly changing frequency, and its phase in rad, rising."""
 
-    `None` for any other signal: noise, multisines and steps have much power beside such a tone.
-    """
+    phase: Signal
+    tone: Tone
+
+
+def phase_of_sweep(signal: Signal) -> Swept | None:
+    """`None` for other signals: noise, multisines and steps have much power beside such a tone."""
     centred = signal - np.mean(signal)
     analytic = _analytic(centred)
     size = np.abs(analytic)
@@ -119,9 +125,10 @@ def phase_of_sweep(signal: Signal) -> Signal | None:
     if turned[-1] - turned[0] < 2 * np.pi * _FEWEST:
         return None
     phase = np.pad(_smooth_phase(turned), (first, signal.size - last), mode="edge")
-    left = (centred - np.real(_at_phase(centred, phase)))[first:last]
+    tone = _at_phase(centred, phase)
+    left = (centred - np.real(tone))[first:last]
     power = np.sum(centred[first:last] ** 2)
-    return phase if np.sum(left**2) < (1 - _CONCENTRATED) * power else None
+    return Swept(phase, tone) if np.sum(left**2) < (1 - _CONCENTRATED) * power else None
 
 
 def _analytic(signal: Signal) -> Tone:
@@ -137,7 +144,7 @@ def _analytic(signal: Signal) -> Tone:
 def _smooth_phase(phase: Signal) -> Signal:
     """A phase in which the time at each value is the mean over a cycle around it."""
     time = np.arange(float(phase.size))
-    mean = _over_a_cycle(time, phase)
+    mean = _Cycles.around(phase).mean(time)
     inner = (phase > phase[0] + np.pi) & (phase < phase[-1] - np.pi)
     return np.interp(time, np.where(inner, mean, time), phase)
 
@@ -148,15 +155,42 @@ def _at_phase(signal: Signal, phase: Signal) -> Tone:
     Averages over whole cycles have no response to its harmonics.
     """
     rising = phase + 1e-9 * np.arange(phase.size)
-    turned = 2 * (signal - np.mean(signal)) * np.exp(-1j * rising)
-    return _over_a_cycle(_over_a_cycle(turned, rising), rising) * np.exp(1j * rising)
+    wave, cycles = np.cos(rising) + 1j * np.sin(rising), _Cycles.around(rising)
+    turned = 2 * (signal - np.mean(signal)) * np.conj(wave)
+    return cycles.mean(cycles.mean(turned)) * wave
 
 
-def _over_a_cycle(values: Tone | Signal, phase: Signal) -> Tone | Signal:
-    step = np.diff(phase)
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * step)])
-    low, high = np.maximum(phase - np.pi, phase[0]), np.minimum(phase + np.pi, phase[-1])
-    return (np.interp(high, phase, total) - np.interp(low, phase, total)) / (high - low)
+class _Cycles(NamedTuple):
+    """The cycle around each sample of a rising phase: where it begins and ends, linearly between.
+
+    `low` and `high` are samples, `rest_low` and `rest_high` the shares of a step beyond them.
+    """
+
+    step: Signal  # rad
+    width: Signal  # rad; less than a cycle at the ends
+    low: Int[np.ndarray, " samples"]
+    rest_low: Signal
+    high: Int[np.ndarray, " samples"]
+    rest_high: Signal
+
+    @classmethod
+    def around(cls, phase: Signal) -> "_Cycles":
+        step = np.diff(phase)
+        low, high = np.maximum(phase - np.pi, phase[0]), np.minimum(phase + np.pi, phase[-1])
+        samples = np.arange(float(phase.size))
+        places = []
+        for edge in (low, high):
+            place = np.interp(edge, phase, samples)
+            whole = np.minimum(place.astype(int), step.size - 1)
+            places += [whole, (edge - phase[whole]) / step[whole]]
+        return cls(step, high - low, *places)
+
+    def mean(self, values: Tone | Signal) -> Tone | Signal:
+        area = 0.5 * (values[1:] + values[:-1]) * self.step
+        total = np.concatenate([[0.0], np.cumsum(area)])
+        end = total[self.high] + self.rest_high * area[self.high]
+        begin = total[self.low] + self.rest_low * area[self.low]
+        return (end - begin) / self.width
 
 
 _TRANSIENT = 21  # bins over which a transient of the record's ends is smooth
@@ -191,8 +225,8 @@ def _harmonics(
     u, y = (
         np.fft.rfft(x[:count], axis=0)[band] for x in (record.inputs, record.outputs[:, output])
     )
-    size, angle = np.abs(tone), np.angle(tone)
-    waves = [np.fft.fft(size * np.exp(1j * k * angle))[band] / 2 for k in _HARMONICS]
+    turn = tone / np.maximum(np.abs(tone), 1e-300)
+    waves = [np.fft.fft(tone * turn ** (k - 1))[band] / 2 for k in _HARMONICS]
     columns = np.stack([y - np.sum(plant * u, axis=1), *(plant[:, source] * w for w in waves)])
     sharp = columns - _smooth(columns)
     left, seen = sharp[0], sharp[1:]

@@ -1,6 +1,7 @@
 """What a user of a response should know, with the frequencies and the pair that it is about."""
 
-from collections.abc import Sequence
+import functools as ft
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -47,6 +48,40 @@ class Remark(str):
             return self
         kept = [x for x in self.omega if np.any(np.abs(omega - x) <= 1e-9 * x)]
         return Remark(self.text, kept, self.pair) if kept else None
+
+
+class Remarks(Sequence[Remark]):
+    """Remarks that are found when they are first looked at: tests take longer than an estimate."""
+
+    def __init__(self, find: Callable[[], tuple[Remark, ...]]):
+        self._find = find
+
+    @ft.cached_property
+    def _found(self) -> tuple[Remark, ...]:
+        found = self._find()
+        del self._find  # and with it the records
+        return found
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def __getitem__(self, place):
+        return self._found[place]
+
+    def __iter__(self) -> Iterator[Remark]:
+        return iter(self._found)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, tuple | Remarks) and self._found == tuple(other)
+
+    def __hash__(self) -> int:
+        return hash(self._found)
+
+    def __repr__(self) -> str:
+        return repr(self._found)
+
+    def __reduce__(self) -> tuple[type[tuple], tuple[tuple[Remark, ...]]]:
+        return tuple, (self._found,)
 
 
 def _place(omega: tuple[float, ...]) -> str:

@@ -152,22 +152,53 @@ def transform_windows(
     frequencies can distinguish; each length is then a small matrix product. Accurate to about 2e-13
     of the largest sum. Fast where lengths are multiples of a block: see `lattice_windows`.
     """
+    tapers = ((shape, signals.shape[1]),)
+    return transform_tapers(signals, angle, windows, tapers, detrend=detrend, origin=origin)[0]
+
+
+def transform_tapers(
+    signals: Float[np.ndarray, "samples channels"],
+    angle: Float[np.ndarray, " frequencies"],
+    windows: tuple[tuple[int, tuple[int, ...]], ...],
+    tapers: tuple[tuple[str, int], ...],
+    *,
+    detrend: str,
+    origin: float,
+) -> list[list[Complex[Array, "segments frequencies _"]]]:
+    """`transform_windows` for several tapers, each with how many of the channels it acts on."""
     require_x64("a transform")
-    plan = plan_transform(
-        len(signals), tuple(np.asarray(angle, float).tolist()), windows, shape, detrend
-    )
-    return _transform(plan, np.asarray(signals, float), np.asarray(origin, float))
+    angles, most = tuple(np.asarray(angle, float).tolist()), len(signals)
+    plans = tuple(plan_transform(most, angles, windows, name, detrend) for name, _ in tapers)
+    channels = tuple(count for _, count in tapers)
+    return _transform(plans, channels, np.asarray(signals, float), np.asarray(origin, float))
 
 
-def apply_plan(
-    plan: Plan, signals: Float[Array, "samples channels"], origin: Float[Array, ""]
-) -> list[Complex[Array, "segments frequencies channels"]]:
-    """`transform_windows` with tables at hand, to be called inside a compiled function."""
+@ft.partial(jax.jit, static_argnums=1)
+def _transform(
+    plans: tuple[Plan, ...],
+    channels: tuple[int, ...],
+    signals: Float[Array, "samples channels"],
+    origin: Float[Array, ""],
+) -> list[list[Complex[Array, "segments frequencies _"]]]:
+    """All plans are of one layout: the compressed blocks serve each of them."""
+    plan = plans[0]
     if plan.detrend != "none":  # No trend is left of a constant, but its rounding errors would be.
         signals = signals - jnp.mean(signals, axis=0)[None, :]
     lattice, rows = plan.lattice, signals.T
     used = rows[:, lattice.offset : lattice.offset + lattice.count * lattice.block]
     blocks = used.reshape(rows.shape[0], lattice.count, lattice.block) @ plan.basis
+    return [
+        _apply_plan(each, rows[:count], blocks[:count], origin)
+        for each, count in zip(plans, channels, strict=True)
+    ]
+
+
+def _apply_plan(
+    plan: Plan,
+    rows: Float[Array, "channels samples"],
+    blocks: Float[Array, "channels blocks rank"],
+    origin: Float[Array, ""],
+) -> list[Complex[Array, "segments frequencies channels"]]:
     sums = [_window_sums(plan, each, rows, blocks) for each in plan.windows]
     phase = turn(origin * plan.angle)
     turned = [
@@ -177,9 +208,6 @@ def apply_plan(
     if plan.order is None:
         return turned
     return [each[:, np.array(plan.order)] for each in turned]
-
-
-_transform = jax.jit(apply_plan)
 
 
 def _window_sums(

@@ -1,5 +1,6 @@
 """Responses by averages over windows: one length (Welch) or several (Composite)."""
 
+import functools as ft
 import itertools
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -21,9 +22,9 @@ from ._frequency_response import FrequencyResponse
 from ._leakage import Slopes
 from ._noise_freedom import smoothed
 from ._nonlinearity import remarks_on_nonlinearity
-from ._remarks import Remark
-from ._transform import transform_windows
-from ._window import coefficients, leaked_power, segment_starts, window
+from ._remarks import Remark, Remarks
+from ._transform import transform_tapers
+from ._window import coefficients, leaked_power, segment_starts
 
 
 Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
@@ -38,30 +39,36 @@ class Segments(NamedTuple):
     """
 
     transforms: tuple[Complex[Array, "windows frequencies channels"], ...]
-    slopes: tuple[Slopes, ...]
+    slopes: tuple[Slopes, ...]  # none where they were not asked for
     groups: Layout
 
 
 def transform_records(
-    records: Sequence[Record], omega: Float[np.ndarray, " frequencies"], members: Sequence[Welch]
+    records: Sequence[Record],
+    omega: Float[np.ndarray, " frequencies"],
+    members: Sequence[Welch],
+    *,
+    derivatives: int = 0,
 ) -> Segments:
-    """Transform all channels of all records; no window spans two records."""
+    """Transform all channels of all records; no window spans two records.
+
+    With two `derivatives`, behind those of the windows too.
+    """
     require_x64("a frequency response")
     layouts = _layouts(records, omega, members)
-    parts, slopes, starts, origin = [], [], [[] for _ in members], 0
+    parts, starts, origin = [], [[] for _ in members], 0
     for record, layout in zip(records, layouts, strict=True):
-        parts.append(_transform_record(record, omega, members[0], layout, origin))
-        slopes.append(_transform_slopes(record, omega, members[0], layout, origin))
+        parts.append(_transform_record(record, omega, members[0], layout, origin, derivatives))
         for mine, (_, local) in zip(starts, layout, strict=True):
             mine += [origin + start for start in local]
         origin += record.samples + max(length for length, _ in layout)
-    joined = tuple(_joined(each) for each in zip(*parts, strict=True))
-    leaked = tuple(
-        Slopes(_joined([one.inputs for one in each]), _joined([one.outputs for one in each]))
-        for each in zip(*slopes, strict=True)
-    )
     lengths = [length for length, _ in layouts[0]]
-    return Segments(joined, leaked, tuple(zip(lengths, map(tuple, starts), strict=True)))
+    groups = tuple(zip(lengths, map(tuple, starts), strict=True))
+    joined, *slopes = (
+        tuple(_joined(part) for part in zip(*each, strict=True))
+        for each in zip(*parts, strict=True)
+    )
+    return Segments(joined, tuple(map(Slopes, *slopes)) if derivatives else (), groups)
 
 
 def _joined(
@@ -94,18 +101,24 @@ def _transform_record(
     welch: Welch,
     layout: Layout,
     origin: int,
-) -> list[Complex[Array, "_ frequencies channels"]]:
-    columns = _columns(record, welch)
-    found = _transform(columns, omega * record.dt, welch, layout, origin, order=0)
+    derivatives: int,
+) -> list[list[Complex[Array, "_ frequencies _"]]]:
+    """By derivative of the window, which act on all channels, all but references, and inputs."""
+    columns, inputs = _columns(record, welch), record.inputs.shape[1]
+    counts = columns.shape[1], inputs + record.outputs.shape[1], inputs
+    tapers = tuple((welch.shape + k * "'", counts[k]) for k in range(1 + derivatives))
+    found, *slopes = transform_tapers(
+        columns, omega * record.dt, layout, tapers, detrend=welch.detrend, origin=float(origin)
+    )
     n, late = welch.integrators, welch.delay_samples(record)
     if not (n or late):
-        return found
+        return [found, *slopes]
     angle = omega * record.dt
     factor = np.ones((omega.size, columns.shape[1]), complex)
     first = len(record.input_names)
     recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
     factor[:, first : first + record.outputs.shape[1]] = recolour[:, None]
-    return [part * factor[None] for part in found]
+    return [[part * factor[None] for part in found], *slopes]
 
 
 def _columns(record: Record, welch: Welch) -> Float[np.ndarray, "samples channels"]:
@@ -116,39 +129,6 @@ def _columns(record: Record, welch: Welch) -> Float[np.ndarray, "samples channel
     # A difference delays by n/2 samples, and the window would act on it like on any delay.
     centre = slice(n - n // 2, record.samples - n // 2)
     return np.hstack([record.inputs[centre], outputs, record.references[centre]])
-
-
-def _transform(
-    columns: Float[np.ndarray, "samples channels"],
-    angle: Float[np.ndarray, " frequencies"],
-    welch: Welch,
-    layout: Layout,
-    origin: int,
-    *,
-    order: int,
-) -> list[Complex[Array, "_ frequencies channels"]]:
-    """Behind the windows, or their derivative of that `order`."""
-    shape = welch.shape + order * "'"
-    return transform_windows(
-        columns, angle, layout, shape=shape, detrend=welch.detrend, origin=float(origin)
-    )
-
-
-def _transform_slopes(
-    record: Record,
-    omega: Float[np.ndarray, " frequencies"],
-    welch: Welch,
-    layout: Layout,
-    origin: int,
-) -> list[Slopes]:
-    inputs, angle = record.inputs.shape[1], omega * record.dt
-    columns = _columns(record, welch)[:, : inputs + record.outputs.shape[1]]
-    first = _transform(columns, angle, welch, layout, origin, order=1)
-    second = _transform(columns[:, :inputs], angle, welch, layout, origin, order=2)
-    return [
-        Slopes(jnp.concatenate([one[:, :, :inputs], other], axis=2), one[:, :, inputs:])
-        for one, other in zip(first, second, strict=True)
-    ]
 
 
 _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
@@ -175,7 +155,7 @@ def check_spectrum(
     first = records[0]
     names = first.input_names + (first.reference_names if method == "joint" else ())
     largest = check_excitation(records, method)
-    gain = np.sum(window(welch.shape, welch.length(records)))
+    gain = coefficients(welch.shape)[0] * welch.length(records)
     for name, level in zip(names, np.sqrt(power), strict=False):
         lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[first.names.index(name)]))
         if lost.size:
@@ -282,9 +262,9 @@ def average_windows(
     """Response by averages over tapered windows of one or several lengths."""
     members = (spectra,) if isinstance(spectra, Welch) else spectra.windowed(records, omega)
     omega = frequencies_for(omega, records, members[0])
-    segments = transform_records(records, omega, members)
+    segments = transform_records(records, omega, members, derivatives=2)
     channels = _channels(records[0], method)
-    independent = _independent(records, segments)
+    independent = _independent(records, segments.groups)
     check_windows(independent, segments, channels)
     overlap = window_products(segments.groups, members[0].shape)
     found = average(
@@ -301,9 +281,9 @@ def _channels(record: Record, method: Method) -> Channels:
     return Channels(len(record.input_names), len(record.output_names), instruments)
 
 
-def _independent(records: Sequence[Record], segments: Segments) -> list[float]:
+def _independent(records: Sequence[Record], groups: Layout) -> list[float]:
     """Windows that do not overlap, for each length (n_d)."""
-    return [sum(record.samples for record in records) / length for length, _ in segments.groups]
+    return [sum(record.samples for record in records) / length for length, _ in groups]
 
 
 def _scales(segments: Segments, welch: Welch, dt: float) -> Float[np.ndarray, " groups"]:
@@ -331,16 +311,6 @@ def _result(
     method: Method,
 ) -> FrequencyResponse:
     first, dt = records[0], records[0].dt
-    independent = _independent(records, segments)
-    response, coherence = np.asarray(found.response), np.asarray(found.coherence)
-    error, direct = np.asarray(found.random_error), np.asarray(found.direct_coherence)
-    names = first.output_names, first.input_names
-    remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
-    remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
-    remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
-    remarks += remarks_on_leakage(omega, np.asarray(found.leakage), error, names)
-    if max(independent) < 3:
-        remarks += (Remark(_FEW.format(count=max(independent))),)
     counts = tuple(len(starts) for _, starts in segments.groups)
     windows = place_windows(segments.groups, members[0].shape, dt, omega[-1] - omega[0])
     grid = jnp.asarray(omega)
@@ -355,7 +325,7 @@ def _result(
         method=method,
         input_names=first.input_names,
         output_names=first.output_names,
-        remarks=remarks,
+        remarks=Remarks(ft.partial(_remarks, records, omega, segments.groups, found, method)),
         integrators=members[0].integrators,
         log_noise_covariance=_log_noise_covariance(records, omega, members, segments, found),
         resolution=2 * np.pi / (segments.groups[0][0] * dt),
@@ -365,6 +335,25 @@ def _result(
         input_units=first.input_units,
         output_units=first.output_units,
     )
+
+
+def _remarks(
+    records: Sequence[Record],
+    omega: Float[np.ndarray, " frequencies"],
+    groups: Layout,
+    found: Averaged,
+    method: Method,
+) -> tuple[Remark, ...]:
+    first, independent = records[0], _independent(records, groups)
+    response, coherence = np.asarray(found.response), np.asarray(found.coherence)
+    error, direct = np.asarray(found.random_error), np.asarray(found.direct_coherence)
+    names = first.output_names, first.input_names
+    remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
+    remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
+    remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
+    remarks += remarks_on_leakage(omega, np.asarray(found.leakage), error, names)
+    few = max(independent) < 3
+    return remarks + ((Remark(_FEW.format(count=max(independent))),) if few else ())
 
 
 def _log_noise_covariance(
@@ -377,9 +366,17 @@ def _log_noise_covariance(
     """All window lengths see the same noise, each with its own resolution."""
     weights = np.mean(np.asarray(found.share), axis=(1, 2))
     freedom = np.mean(np.asarray(found.freedom), axis=1)
-    apart = (omega[:, None] - omega) * records[0].dt
-    single = np.zeros_like(apart)
+    single, angle = np.zeros((omega.size, omega.size)), tuple((omega * records[0].dt).tolist())
     for share, left, (length, _) in zip(weights.T, freedom.T, segments.groups, strict=True):
         level = share / np.sqrt(left)
-        single += np.outer(level, level) * leaked_power(members[0].shape, length, apart)
+        single += np.outer(level, level) * _shared_power(members[0].shape, length, angle)
     return smoothed(omega, single, np.sum(weights * freedom, axis=1), BANDWIDTH)
+
+
+@ft.lru_cache(maxsize=12)
+def _shared_power(
+    shape: str, length: int, angle: tuple[float, ...]
+) -> Float[np.ndarray, "frequencies frequencies"]:
+    """What windows of this length have in common at two frequencies, in rad per sample."""
+    places = np.array(angle)
+    return leaked_power(shape, length, places[:, None] - places)

@@ -95,5 +95,5 @@ def test_a_signal_that_is_no_sweep_has_no_phase():
     steps = np.sign(rng.standard_normal(30)).repeat(100)
     for other in (np.fft.irfft(lines), rng.standard_normal(SAMPLES), steps):
         assert phase_of_sweep(other) is None
-    phase = phase_of_sweep(sweep())
-    assert phase is not None and np.all(np.diff(phase) >= 0)
+    swept = phase_of_sweep(sweep())
+    assert swept is not None and np.all(np.diff(swept.phase) >= 0)

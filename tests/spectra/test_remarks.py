@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 
 from jaxquad.spectra import Remark
-from jaxquad.spectra._remarks import remarks_on_used
+from jaxquad.spectra._remarks import Remarks, remarks_on_used
 
 
 OMEGA = np.array([1.0, 2.0, 3.0, 4.0])
@@ -42,3 +42,11 @@ def test_a_remark_on_the_whole_response_is_kept_once_and_survives_a_pickle():
     assert remarks_on_used([remark, remark], OMEGA, used((0, 0)), *NAMES) == (remark,)
     part = pickle.loads(pickle.dumps(Remark("{where}", OMEGA)))
     assert part.omega == tuple(OMEGA) and part.within(OMEGA[:1]) == "near 1 rad/s (0.159 Hz)"
+
+
+def test_remarks_are_found_once_when_they_are_looked_at():
+    asked = []
+    remarks = Remarks(lambda: tuple(Remark(text) for text in asked.append(0) or ("a", "b")))
+    assert not asked
+    assert remarks == ("a", "b") and [*remarks, remarks[0]] == ["a", "b", "a"]
+    assert len(asked) == 1 and pickle.loads(pickle.dumps(remarks)) == ("a", "b")
