@@ -62,7 +62,7 @@ def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
     of what evaluates the rest: at all frequencies at once.
     """
 
-    if _is_plain_state_space(batch):
+    if evaluates_singly(batch):
         return _one_by_one(batch, member)
 
     def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
@@ -77,7 +77,8 @@ def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
     return evaluate
 
 
-def _is_plain_state_space(batch: Batch) -> bool:
+def evaluates_singly(batch: Batch) -> bool:
+    """Whether members are evaluated one after the other, by a plain `jq.StateSpace`'s slopes."""
     return type(batch.model) is StateSpace and not batch.parameters.ties and not batch.hold
 
 

@@ -27,7 +27,7 @@ from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
 from ._assess import assess, Counted, discrepancy_at
-from ._batch_normal import Batch, Evaluate, Member, normal_equations_of
+from ._batch_normal import Batch, Evaluate, evaluates_singly, Member, normal_equations_of
 from ._cost import (
     Cost,
     least_coherence,
@@ -47,6 +47,7 @@ from ._solve import solution_at, stopped_early
 
 
 _CHUNK = 64  # fits side by side
+_CHUNK_OF_SINGLES = 16  # fits of which each is evaluated by itself
 _CHUNKS = 8  # of one call
 
 
@@ -163,11 +164,15 @@ def _both_ways(model, omega):
     return evaluate_response(model, omega), single
 
 
-def _calls(batch: int, chunks: int) -> list[Int[np.ndarray, "chunks chunk"]]:
+def _calls(batch: int, chunk: int, chunks: int) -> list[Int[np.ndarray, "chunks chunk"]]:
     """The members that each call solves, by chunks; the last are filled up with the last member."""
-    places = np.minimum(np.arange(batch + -batch % _CHUNK), batch - 1).reshape(-1, _CHUNK)
+    places = _places(batch, chunk)
     calls = max(-(-len(places) // chunks), min(len(places), os.cpu_count() or 1))
     return np.array_split(places, calls)
+
+
+def _places(batch: int, chunk: int) -> Int[np.ndarray, "chunks chunk"]:
+    return np.minimum(np.arange(batch + -batch % chunk), batch - 1).reshape(-1, chunk)
 
 
 def _solve_calls(
@@ -182,11 +187,12 @@ def _solve_calls(
         found = _solve_call(where, mine, z0, *options)
         return BatchSolution(*(np.asarray(part)[: places.size] for part in found))
 
-    first, *others = _calls(batch, chunks)
-    found = [solve(first)]  # it compiles; a program runs on one core
-    if others:
-        with ThreadPoolExecutor(max_workers=min(len(others), os.cpu_count() or 1)) as pool:
-            found += pool.map(solve, others)
+    calls = _calls(batch, _CHUNK_OF_SINGLES if evaluates_singly(where) else _CHUNK, chunks)
+    if len(calls) > 1:
+        solve(calls[0][:0])  # of no chunk: compiled here, once for all threads
+    # A program runs on one core.
+    with ThreadPoolExecutor(max_workers=min(len(calls), os.cpu_count() or 1)) as pool:
+        found = list(pool.map(solve, calls))
     return BatchSolution(*(np.concatenate(each)[:batch] for each in zip(*found, strict=True)))
 
 
@@ -409,8 +415,8 @@ def _ratios(
     """|model / measurement| of every member; 1 where a fit ran away."""
     batch, count = len(found.z), data.omega.size
     where = Batch(model, parameters, data.hold, _pad(data.omega), np.asarray(count))
-    places = np.minimum(np.arange(batch + -batch % _CHUNK), batch - 1).reshape(-1, _CHUNK)
-    sizes = np.concatenate([np.asarray(_sizes(where, found.z[each])) for each in places])
+    parts = [_sizes(where, found.z[each]) for each in _places(batch, _CHUNK)]
+    sizes = np.concatenate([np.asarray(part) for part in parts])
     with np.errstate(invalid="ignore"):
         ratios = sizes[:batch, :count] / np.abs(data.measured)
     return np.where(np.isfinite(ratios) & (ratios > 0), ratios, 1.0)

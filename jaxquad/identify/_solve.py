@@ -15,7 +15,7 @@ from jaxquad._core import (
     STALLED,
     TOLERANCE,
 )
-from jaxquad._xla import arctan2, no_fuse
+from jaxquad._xla import arctan2
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
 from ._evaluate import as_residuals, evaluate, Evaluation, Frame, take_apart
@@ -55,12 +55,10 @@ def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[No
     parameters, omega = problem.parameters, jnp.asarray(problem.omega[k])
     matrices = matrices_of(parameters.insert(problem.model, z))
     entries = [_entry(place.path) for place in parameters.places[: z.size]]
-    value, slopes = logarithmic_slopes(matrices, omega, entries)
-    misfit, scale = _logarithm(value, jnp.asarray(problem.measured[k])), parameters.slopes(z)
-    weights = jnp.moveaxis(problem.weights[k], (0, 3), (3, 0))
+    weights = Split(*jnp.moveaxis(jnp.asarray(problem.weights[k]), (0, 3), (3, 0)))
+    value, rows = logarithmic_slopes(matrices, omega, entries, parameters.slopes(z), weights)
+    misfit = _logarithm(value, jnp.asarray(problem.measured[k]))
     residual = [part * weight for part, weight in zip(misfit, weights, strict=True)]
-    pairs = zip(slopes, weights, strict=True)
-    rows = [no_fuse(_weighted, part, weight, scale) for part, weight in pairs]
     mixing = problem.mixings[k]
     mixed = mix_parts(mixing, *residual), mix_parts(mixing, *rows)
     return [_products(*each) for each in zip(*mixed, strict=True)]
@@ -72,10 +70,6 @@ def _products(
 ) -> Normal:
     r, rows = residual.reshape(-1), slopes.reshape(len(slopes), -1)
     return Normal(0.5 * jnp.sum(r**2), rows @ r, rows @ rows.T)
-
-
-def _weighted(slopes: Array, weights: Array, scale: Array) -> Array:
-    return slopes * weights[None] * scale[:, None, None, None]
 
 
 def _logarithm(value: Split, measured: Complex[Array, "frequencies outputs inputs"]) -> Split:

@@ -4,6 +4,7 @@ With the resolvent R, the states X = R G and L = (H0 + s H1) R, the response L G
 F[p][q] by L[:, p] X[q, :], one column times one row; and so with all the others.
 """
 
+import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,27 +25,86 @@ class Entry(NamedTuple):
     column: int
 
 
-class Slopes(NamedTuple):
-    """One column, one row and one pattern of delays for each entry."""
+class _Factors(NamedTuple):
+    """What slopes are products of, each vector once."""
 
-    left: Split  # (entries, outputs, frequencies)
-    right: Split  # (entries, inputs, frequencies)
-    late: Float[np.ndarray, "entries outputs inputs"]  # 1 where the entry is a delay of the pair
+    left: Split  # (columns, outputs, inputs, frequencies), relative to the response
+    right: Split  # (rows, inputs, frequencies)
+    scale: Float[Array, " entries"]  # 0 for a delay
+    late: Float[Array, "entries outputs inputs"]  # scale where the entry is a delay of the pair
+
+
+class _Places(NamedTuple):
+    """Which column and which row belong to each entry: hashed, to be known when compiling."""
+
+    column: tuple[int, ...]
+    row: tuple[int, ...]
 
 
 def logarithmic_slopes(
-    matrices: Matrices, omega: Float[Array, " frequencies"], entries: Sequence[Entry]
+    matrices: Matrices,
+    omega: Float[Array, " frequencies"],
+    entries: Sequence[Entry],
+    scale: Float[Array, " entries"],
+    weights: Split,
 ) -> tuple[Split, Split]:
-    """The response T, and d ln T by each entry: (entries, outputs, inputs, frequencies).
+    """The response T, and the slopes of ln T: (entries, outputs, inputs, frequencies).
 
+    They are those by each entry times its `scale`, the real and the imaginary part times `weights`.
     Both without a look at rounding near a pole; the slope of a response of 0 is not finite.
     """
     found = solve_states(matrices, omega)
     seen, undelayed = (output_of(matrices, omega, x) for x in (found.resolvent, found.states))
-    picked = _pick_vectors(entries, seen, found.states, omega)
-    delays = picked.late[..., None] * omega[None, None, None]
-    over = no_fuse(_reciprocal, undelayed)
-    return found.value, no_fuse(_relative_slopes, picked.left, picked.right, over, delays)
+    factors, places = _make_factors(entries, scale, seen, found.states, undelayed, omega)
+    real = no_fuse(ft.partial(_real_slopes, places), factors, weights.real)
+    return found.value, Split(
+        real, no_fuse(ft.partial(_imag_slopes, places), factors, omega, weights.imag)
+    )
+
+
+def _real_slopes(places: _Places, factors: _Factors, weights: Array) -> Array:
+    a, b = _pick_factors(places, factors)
+    scale = factors.scale[:, None, None, None]
+    return (a.real * b.real - a.imag * b.imag) * scale * weights[None]
+
+
+def _imag_slopes(places: _Places, factors: _Factors, omega: Array, weights: Array) -> Array:
+    a, b = _pick_factors(places, factors)
+    scale, delays = factors.scale[:, None, None, None], factors.late[..., None] * omega
+    return ((a.real * b.imag + a.imag * b.real) * scale - delays) * weights[None]
+
+
+def _pick_factors(places: _Places, factors: _Factors) -> tuple[Split, Split]:
+    column, row = np.array(places.column), np.array(places.row)
+    left = Split(*(part[column] for part in factors.left))
+    return left, Split(*(part[row][:, None] for part in factors.right))
+
+
+def _make_factors(
+    entries: Sequence[Entry],
+    scale: Float[Array, " entries"],
+    seen: Split,
+    states: Split,
+    undelayed: Split,
+    omega: Float[Array, " frequencies"],
+) -> tuple[_Factors, _Places]:
+    """Columns from L and unit vectors, rows from X, s X and unit vectors."""
+    (outputs, count, _), inputs = seen.real.shape, states.real.shape[1]
+    rate = Split(-omega[None, None] * states.imag, omega[None, None] * states.real)
+    left = _append_units(Split(*(jnp.moveaxis(part, 1, 0) for part in seen)))
+    right = _append_units(Split(*map(jnp.concatenate, zip(states, rate, strict=True))))
+    columns, rows, signs = np.array([_find_vectors(entry, count) for entry in entries]).T
+    late = np.zeros((len(entries), outputs, inputs))
+    for k, (field, which, _) in enumerate(entries):
+        if field == "input_delay":
+            late[k, :, which] = 1
+        elif field == "output_delay":
+            late[k, which] = 1
+    (used, column), (pushed, row) = (np.unique(x, return_inverse=True) for x in (columns, rows))
+    left, right = (Split(*(x[at] for x in y)) for at, y in ((used, left), (pushed, right)))
+    relative = no_fuse(_divide, left, no_fuse(_reciprocal, undelayed))
+    places = _Places(tuple(column.tolist()), tuple(row.tolist()))
+    return _Factors(relative, right, signs * scale, late * scale[:, None, None]), places
 
 
 def _reciprocal(response: Split) -> Split:
@@ -52,34 +112,9 @@ def _reciprocal(response: Split) -> Split:
     return Split(response.real / power, -response.imag / power)
 
 
-def _relative_slopes(left: Split, right: Split, over: Split, delays: Array) -> Split:
-    a, b = Split(*(x[:, :, None] for x in left)), Split(*(x[:, None] for x in right))
-    change = Split(a.real * b.real - a.imag * b.imag, a.real * b.imag + a.imag * b.real)
-    over = Split(*(x[None] for x in over))
-    return Split(
-        change.real * over.real - change.imag * over.imag,
-        change.real * over.imag + change.imag * over.real - delays,
-    )
-
-
-def _pick_vectors(
-    entries: Sequence[Entry], seen: Split, states: Split, omega: Float[Array, " frequencies"]
-) -> Slopes:
-    """Columns from L and unit vectors, rows from X, s X and unit vectors."""
-    (outputs, count, _), inputs = seen.real.shape, states.real.shape[1]
-    rate = Split(-omega[None, None] * states.imag, omega[None, None] * states.real)
-    left = _append_units(Split(*(jnp.moveaxis(part, 1, 0) for part in seen)))
-    right = _append_units(Split(*map(jnp.concatenate, zip(states, rate, strict=True))))
-    column, row, sign = np.array([_find_vectors(entry, count) for entry in entries]).T
-    sign = jnp.asarray(sign, omega.dtype)[:, None, None]
-    late = np.zeros((len(entries), outputs, inputs))
-    for k, (field, which, _) in enumerate(entries):
-        if field == "input_delay":
-            late[k, :, which] = 1
-        elif field == "output_delay":
-            late[k, which] = 1
-    columns, rows = (Split(*(x[at] for x in y)) for at, y in ((column, left), (row, right)))
-    return Slopes(Split(*(sign * x for x in columns)), rows, late)
+def _divide(left: Split, over: Split) -> Split:
+    a, b = Split(*(x[:, :, None] for x in left)), Split(*(x[None] for x in over))
+    return Split(a.real * b.real - a.imag * b.imag, a.real * b.imag + a.imag * b.real)
 
 
 def _find_vectors(entry: Entry, count: int) -> tuple[int, int, int]:
