@@ -46,5 +46,8 @@ def one_blas_thread() -> Iterator[None]:
 
     The environment's OPENBLAS_NUM_THREADS and its kin count only before NumPy is imported.
     """
+    import scipy.linalg.lapack  # SciPy has a BLAS of its own, and only loaded ones are limited
+
+    del scipy
     with threadpoolctl.threadpool_limits(limits=1, user_api="blas"):
         yield
