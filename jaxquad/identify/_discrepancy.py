@@ -24,9 +24,10 @@ from ._cost import Points
 
 
 LENGTHS = (0.5, 1.0, 2.0)  # in ln(omega); 0.69 is an octave
-MEAN = 0.035  # of the prior of the amplitude, neper
+MEAN = 0.05  # of the prior of the amplitude, neper
+_SHAPE = 1.5  # of that prior, a gamma distribution: errors far below its mean are few
 SHARES = np.array([0.6, 1.0])  # of the amplitude, in magnitude and in phase
-_NONE = 0.72  # the prior's mass at a discrepancy of zero
+_NONE = 0.82  # the prior's mass at a discrepancy of zero
 _AMPLITUDES = 16
 _RANK = 16  # of a kernel over a band of two decades: what is left of its variance is below 1 %
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
@@ -164,9 +165,9 @@ def _restricted_likelihoods(
 
 
 def _mix(likelihoods: np.ndarray, amplitudes: np.ndarray, mean: float) -> Mixture:
-    """The posterior under half the mass at zero, and an exponential distribution above it."""
+    """The posterior under a mass at zero, and a gamma distribution above it."""
     cell = amplitudes * np.log(amplitudes[1] / amplitudes[0])
-    density = cell / mean * np.exp(-amplitudes / mean)
+    density = cell * amplitudes ** (_SHAPE - 1) * np.exp(-_SHAPE * amplitudes / mean)
     density *= (1 - _NONE) / max(float(np.sum(density)), 1e-300) / len(likelihoods)
     relative = np.exp(likelihoods - np.max(likelihoods))
     none, some = _NONE * relative[0, 0], relative[:, 1:] * density

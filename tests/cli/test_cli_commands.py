@@ -24,8 +24,9 @@ def test_the_demo_finds_the_truth_of_its_log_within_its_error_bars(demo):
     """The lag's mean over a sample and the hold of the command are exact: no bias is allowed."""
     rows = {row["name"]: row for row in result(demo)["fit"]["parameters"]}
     for name, truth in {"gain": 280.0, "lag": 0.02, "delay": 0.008}.items():
-        assert abs(rows[name]["value"] - truth) < 3 * rows[name]["standard_error"] < 0.09 * truth
-        assert rows[name]["noise_standard_error"] < 0.02 * truth
+        # 2 % by the noise; this log's misfit of 1.07 leaves room for a model error of 0.01 rad.
+        assert abs(rows[name]["value"] - truth) < 3 * rows[name]["standard_error"] < 0.075 * truth
+        assert 3 * rows[name]["noise_standard_error"] < 0.06 * truth
     assert [rows[name]["unit"] for name in rows] == ["rad/s^2 per M", "s", "s"]
     assert "identif" in (demo / "report.html").read_text().lower()
 

@@ -33,6 +33,20 @@ def test_the_readme_and_the_site_lead_to_the_page():
     assert "validation.md" in (ROOT / "mkdocs.yml").read_text()
 
 
+@pytest.mark.parametrize("name", ["short-20", "trends", "jitter"])
+def test_the_efficient_estimate_scatters_as_the_bound_says(name):
+    """Without the library: the records' noise, through the weights of the bound alone."""
+    from bounds import efficient  # pyright: ignore
+    from plants import make  # pyright: ignore
+
+    plant, count = make(name), 200
+    best = efficient(plant)
+    errors = np.array([best.errors(flown) for flown in plant.fly(np.arange(count))]) / best.bound
+    # A scatter of 200 is known to 5 %, a mean to 7 % of the scatter.
+    assert np.all(np.abs(np.std(errors, axis=0) - 1) < 0.2)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 0.3)
+
+
 @pytest.mark.slow
 def test_a_study_continues_where_it_stopped_and_makes_its_tables(tmp_path):
     from bounds import cramer_rao  # pyright: ignore
@@ -52,5 +66,8 @@ def test_a_study_continues_where_it_stopped_and_makes_its_tables(tmp_path):
     )
     assert by_plant["rows"][0][0] == plant.title
     errors = np.array([row["values"] for row in rows]) - plant.truth
+    best = np.array([row["efficient"] for row in rows])
     assert np.all(np.abs(errors) < 6 * bound)
+    # Most of an error is the records' own noise.
+    assert np.all(np.abs(errors - best) < 3 * bound)
     assert len(by_parameter["rows"]) == plant.truth.size

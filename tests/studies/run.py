@@ -14,7 +14,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 STEPS = (
-    ["healthy.py", "--draws", "400", "--workers", "2"],
+    ["healthy.py", "--draws", "1200", "--workers", "2"],
     ["tuned.py"],
     ["page.py"],
 )
