@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from jaxquad.models import invert
 
-from ._leakage import Rest, Slopes, without_leakage
+from ._leakage import power_of, Rest, Slopes, without_leakage
 
 
 _TINY = 1e-300
@@ -64,7 +64,7 @@ def condition(
     explained = jnp.real(jnp.sum(jnp.conj(response) * (response @ jnp.swapaxes(moving, 1, 2)), 2))
     whole = _diagonal(products)
     total = whole[:, y]
-    own = jnp.abs(response) ** 2 * power[:, None, :]
+    own = power_of(response) * power[:, None, :]
     rest = jnp.maximum(total - explained, 0.0)
     answer = rest[:, :, None] + own
     return Conditioned(
@@ -114,7 +114,7 @@ def noise_root(
     much it counts.
     """
     place = jnp.log(omega)
-    energy, floor = (jnp.swapaxes(jnp.abs(x) ** 2, 1, 2) @ member for x in (residuals, outputs))
+    energy, floor = (jnp.swapaxes(power_of(x), 1, 2) @ member for x in (residuals, outputs))
     # The logarithm of a chi-squared variable is biased by digamma(f) - ln(f).
     low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
     levels = jnp.log(jnp.maximum(energy, _FLOOR * floor + 1e-280) / trace) - low
@@ -316,7 +316,7 @@ def average(
         jnp.asarray(omega), rest.residuals, outputs, member, rest.trace, rest.freedom,
         weights * trust,
     )  # fmt: skip
-    power = jnp.sum(jnp.abs(noise) ** 2, axis=2)
+    power = jnp.sum(power_of(noise), axis=2)
     error = jnp.sqrt(power[:, :, None] * gain / 2) / jnp.abs(combined.response)
     gone = lost[:, None, :]
     return Averaged(

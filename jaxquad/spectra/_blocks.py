@@ -1,5 +1,6 @@
 """Tables of a two-level Fourier transform, made once on the host in NumPy."""
 
+import functools as ft
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
 from typing import NamedTuple
@@ -200,12 +201,13 @@ def lattice_windows(
                 f"a window of {length} samples does not fit a record of {samples}: give lengths "
                 f"of 2 to {samples} samples"
             )
-    long = [length for length in lengths if length >= 16 * _BLOCKS[0]]
+    long = tuple(length for length in lengths if length >= 16 * _BLOCKS[0])
     block = _common_block(long, float(np.max(np.abs(angle)))) if long else 1
     return tuple(_spread(samples, n, overlap, block if n in long else 1) for n in lengths)
 
 
-def _common_block(lengths: Sequence[int], angle: float) -> int:
+@ft.lru_cache(maxsize=64)
+def _common_block(lengths: tuple[int, ...], angle: float) -> int:
     """A block of about 50 rad that divides all lengths, or else changes them by least."""
     ideal = min(50 / max(angle, 1e-9), min(lengths) / 8, _BLOCKS[1])
     sizes = np.arange(max(int(ideal / 2), _BLOCKS[0]), max(int(1.5 * ideal), _BLOCKS[0]) + 1)

@@ -1,6 +1,7 @@
 import functools as ft
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,8 +48,12 @@ def plan_transform(
     windows: tuple[tuple[int, tuple[int, ...]], ...],
     shape: str,
     detrend: str,
+    first: int = 0,
 ) -> Plan:
-    """The tables of a transform, cached: they depend on the layout of a record, not on samples."""
+    """The tables of a transform, cached: they depend on the layout of a record, not on samples.
+
+    Those of the windows from number `first` on, on the blocks of all of them.
+    """
     _check(samples, angle, windows, detrend)
     forward = np.argsort(np.abs(angle), kind="stable")
     omega = np.asarray(angle, float)[forward]
@@ -59,7 +64,7 @@ def plan_transform(
     with jax.ensure_compile_time_eval():
         made = tuple(
             _window(n, starts, shape, detrend, omega, bands if n >= _SHORT else [], basis, ranks)
-            for n, starts in windows
+            for n, starts in windows[first:]
         )
         straight = np.array_equal(forward, np.arange(omega.size))
         order = None if straight else tuple(int(i) for i in np.argsort(forward))
@@ -152,24 +157,34 @@ def transform_windows(
     frequencies can distinguish; each length is then a small matrix product. Accurate to about 2e-13
     of the largest sum. Fast where lengths are multiples of a block: see `lattice_windows`.
     """
-    tapers = ((shape, signals.shape[1]),)
+    tapers = (Taper(shape, signals.shape[1]),)
     return transform_tapers(signals, angle, windows, tapers, detrend=detrend, origin=origin)[0]
+
+
+class Taper(NamedTuple):
+    """A window's shape and what it acts on: so many of the channels, windows from `first` on."""
+
+    shape: str
+    channels: int
+    first: int = 0
 
 
 def transform_tapers(
     signals: Float[np.ndarray, "samples channels"],
     angle: Float[np.ndarray, " frequencies"],
     windows: tuple[tuple[int, tuple[int, ...]], ...],
-    tapers: tuple[tuple[str, int], ...],
+    tapers: tuple[Taper, ...],
     *,
     detrend: str,
     origin: float,
 ) -> list[list[Complex[Array, "segments frequencies _"]]]:
-    """`transform_windows` for several tapers, each with how many of the channels it acts on."""
+    """`transform_windows` for several tapers."""
     require_x64("a transform")
     angles, most = tuple(np.asarray(angle, float).tolist()), len(signals)
-    plans = tuple(plan_transform(most, angles, windows, name, detrend) for name, _ in tapers)
-    channels = tuple(count for _, count in tapers)
+    plans = tuple(
+        plan_transform(most, angles, windows, each.shape, detrend, each.first) for each in tapers
+    )
+    channels = tuple(each.channels for each in tapers)
     return _transform(plans, channels, np.asarray(signals, float), np.asarray(origin, float))
 
 

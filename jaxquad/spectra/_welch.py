@@ -19,11 +19,11 @@ from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._leakage import Slopes
+from ._leakage import shows_leakage, Slopes
 from ._noise_freedom import smoothed
 from ._nonlinearity import remarks_on_nonlinearity
 from ._remarks import Remark, Remarks
-from ._transform import transform_tapers
+from ._transform import Taper, transform_tapers
 from ._window import coefficients, leaked_power, segment_starts
 
 
@@ -39,7 +39,7 @@ class Segments(NamedTuple):
     """
 
     transforms: tuple[Complex[Array, "windows frequencies channels"], ...]
-    slopes: tuple[Slopes, ...]  # none where they were not asked for
+    slopes: tuple[Slopes, ...]  # empty where nothing can be made of them, or nobody asked
     groups: Layout
 
 
@@ -57,8 +57,9 @@ def transform_records(
     require_x64("a frequency response")
     layouts = _layouts(records, omega, members)
     parts, starts, origin = [], [[] for _ in members], 0
+    tapers = _tapers(records[0], members[0], layouts, derivatives)
     for record, layout in zip(records, layouts, strict=True):
-        parts.append(_transform_record(record, omega, members[0], layout, origin, derivatives))
+        parts.append(_transform_record(record, omega, members[0], layout, origin, tapers))
         for mine, (_, local) in zip(starts, layout, strict=True):
             mine += [origin + start for start in local]
         origin += record.samples + max(length for length, _ in layout)
@@ -68,7 +69,27 @@ def transform_records(
         tuple(_joined(part) for part in zip(*each, strict=True))
         for each in zip(*parts, strict=True)
     )
-    return Segments(joined, tuple(map(Slopes, *slopes)) if derivatives else (), groups)
+    none = Slopes(jnp.zeros((0, 0, 0), complex), jnp.zeros((0, 0, 0), complex))
+    known = tuple(map(Slopes, *slopes)) if derivatives else ()
+    return Segments(joined, (none,) * (len(joined) - len(known)) + known, groups)
+
+
+def _tapers(
+    record: Record, welch: Welch, layouts: Sequence[Layout], derivatives: int
+) -> tuple[Taper, ...]:
+    """The window on all channels, its derivatives on all but references, and on inputs.
+
+    Derivatives from the first length on whose windows can tell leakage from noise.
+    """
+    inputs, outputs = len(record.input_names), len(record.output_names)
+    counts = [sum(len(mine) for _, mine in each) for each in zip(*layouts, strict=True)]
+    enough = [shows_leakage(count, inputs) for count in counts]
+    first = enough.index(True) if any(enough) else len(counts)
+    slopes = (
+        Taper(f"{welch.shape}'", inputs + outputs, first),
+        Taper(f"{welch.shape}''", inputs, first),
+    )
+    return Taper(welch.shape, len(record.names)), *slopes[:derivatives]
 
 
 def _joined(
@@ -101,12 +122,10 @@ def _transform_record(
     welch: Welch,
     layout: Layout,
     origin: int,
-    derivatives: int,
+    tapers: tuple[Taper, ...],
 ) -> list[list[Complex[Array, "_ frequencies _"]]]:
-    """By derivative of the window, which act on all channels, all but references, and inputs."""
-    columns, inputs = _columns(record, welch), record.inputs.shape[1]
-    counts = columns.shape[1], inputs + record.outputs.shape[1], inputs
-    tapers = tuple((welch.shape + k * "'", counts[k]) for k in range(1 + derivatives))
+    """By taper and then by length."""
+    columns = _columns(record, welch)
     found, *slopes = transform_tapers(
         columns, omega * record.dt, layout, tapers, detrend=welch.detrend, origin=float(origin)
     )

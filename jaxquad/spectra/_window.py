@@ -50,7 +50,25 @@ def leaked_power(
     level, cosine = coefficients(shape)
     cycles = angle * samples / (2 * np.pi)
     terms = level**2 + cosine**2 / 2, level * cosine, cosine**2 / 4  # of the squared window
+    # sinc(c - k) + sinc(c + k) for k = 0, 1, 2 have one sine in common, but poles at whole cycles.
+    square = cycles**2
+    poles = square * (square - 1) * (square - 4)
+    near = np.abs(poles) < _NEAR
+    poles = np.where(near, 1.0, poles)
+    ratio = terms[0] * (square - 1) * (square - 4)
+    ratio += 2 * square * (terms[2] * (square - 1) - terms[1] * (square - 4))
+    found = np.sin(np.pi * cycles) * cycles * ratio / (np.pi * poles)
+    found[near] = _correlation(terms, cycles[near])
+    return (found / terms[0]) ** 2
+
+
+_NEAR = 1e-2  # of a pole: its neighbourhood's rounding is below 1e-13
+
+
+def _correlation(
+    terms: tuple[float, float, float], cycles: Float[np.ndarray, " places"]
+) -> Float[np.ndarray, " places"]:
     found = terms[0] * np.sinc(cycles)
     for k in (1, 2):
         found = found + terms[k] * (np.sinc(cycles - k) + np.sinc(cycles + k))
-    return (found / terms[0]) ** 2
+    return found
