@@ -1,6 +1,7 @@
 """From the derivatives at the solution to covariances, bounds and conditioning (host side)."""
 
 import functools as ft
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -209,31 +210,55 @@ _FLOOR = 0.05  # of a frequency that the fit leaves to the noise, at least
 def projected_noise(
     columns: Float[np.ndarray, "samples outputs columns"],
     residual: Float[np.ndarray, "samples outputs"],
-    basis: Float[np.ndarray, "samples outputs fitted"],
+    nuisance: Float[np.ndarray, "samples outputs unknowns"],
+    count: int,
 ) -> Float[np.ndarray, "columns columns"]:
     """Covariance of `columns`' v, for noise v with the spectrum of the residual.
 
     The spectrum is the residual's periodogram, averaged over neighbouring frequencies, with what
-    the orthonormal `basis` of everything fitted took out of it put back.
+    the fit took out of it put back: orthonormal are the first `count` columns and the `nuisance`.
     Source: Klein & Morelli, Aircraft System Identification, sec. 6.3, with the residual's
     spectrum in place of its autocorrelation.
     """
-    from scipy.fft import next_fast_len
+    from scipy.fft import next_fast_len, rfft
 
     samples, outputs = residual.shape
     length = int(next_fast_len(2 * samples, real=True) or 2 * samples)
-    taken = np.sum(np.abs(np.fft.rfft(basis, length, axis=0)) ** 2, axis=2) / samples
-    turned = np.fft.rfft(residual, length, axis=0)
-    reach = _reach(len(turned), length / samples)
-    left = np.sqrt(np.maximum(1 - _averaged(taken, reach), _FLOOR))
-    seen = np.fft.rfft(columns, length, axis=0)
-    twice = np.where(np.arange(len(seen)) * 2 % length == 0, 1.0, 2.0) / length
+    # One series after the other: fresh memory for all of them would take longer than they do.
+    turn = lambda series: np.asarray(rfft(series, length))
+    power = lambda rows: (rows.real**2 + rows.imag**2) / samples
+    rest = [turn(residual[:, o]) for o in range(outputs)]
+    seen = np.empty((outputs, columns.shape[2], length // 2 + 1), complex)
+    smooth, left = [], []
+    reach = _reach(length // 2 + 1, length / samples)
+    for o in range(outputs):
+        for k in range(columns.shape[2]):
+            seen[o, k] = turn(columns[:, o, k])
+        taken = sum(power(each) for each in seen[o, :count])
+        taken += sum(power(turn(each)) for each in nuisance[:, o].T)
+        smooth.append(_averaged(power(rest[o]), reach))
+        left.append(np.sqrt(np.maximum(1 - _averaged(taken, reach), _FLOOR)))
+    twice = np.full(len(reach), 2.0 / length)
+    twice[0] = 1.0 / length
+    twice[-1] /= 2.0 if length % 2 == 0 else 1.0
     total = np.zeros((columns.shape[2],) * 2)
-    for i, j in np.ndindex(outputs, outputs):
-        cross = _averaged(turned[:, i].conj() * turned[:, j] / samples, reach)
-        weight = np.reshape(twice * cross / (left[:, i] * left[:, j]), (-1, 1))
-        total += np.real((np.conj(seen[:, i]) * np.conj(weight)).T @ seen[:, j])
+    for o in range(outputs):
+        total += _product(seen[o], twice * smooth[o] / left[o] ** 2, seen[o])
+    for i, j in itertools.permutations(range(outputs), 2):
+        cross = _averaged(rest[i].conj() * rest[j] / samples, reach)
+        total += _product(seen[i], twice * cross / (left[i] * left[j]), seen[j])
     return 0.5 * (total + total.T)
+
+
+def _product(
+    one: Complex[np.ndarray, "columns bins"],
+    weight: Float[np.ndarray, " bins"] | Complex[np.ndarray, " bins"],
+    other: Complex[np.ndarray, "columns bins"],
+) -> Float[np.ndarray, "columns columns"]:
+    """The real part of the sum of conj(weight one) other over the bins."""
+    if np.iscomplexobj(weight):
+        return np.real(np.conj(weight * one) @ other.T)
+    return (np.repeat(weight, 2) * one.view(float)) @ other.view(float).T
 
 
 def orthonormal(

@@ -90,14 +90,14 @@ class Frame(NamedTuple):
     structure: PyTree
     rest: tuple[PyTree, ...]
 
-    def filled(self, arrays: Sequence[Numbers]) -> Problem:
+    def filled(self, arrays: Sequence[Numbers]) -> PyTree:
         """The problem with these arrays."""
         given = iter(arrays)
         leaves = [next(given) if leaf is None else leaf for leaf in self.rest]
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def take_apart(problem: Problem) -> tuple[Frame, list[Numbers]]:
+def take_apart(problem: PyTree) -> tuple[Frame, list[Numbers]]:
     """What a program is compiled for, and the arrays that it is run with."""
     leaves, structure = jax.tree.flatten(problem)
     arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]

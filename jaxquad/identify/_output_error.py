@@ -14,8 +14,9 @@ from jaxquad.records import Record
 from ._fit import check_priors
 from ._known_loop import feedback_response, KnownController
 from ._noise_model import ARMA, AutoRegressive, Noise
+from ._output_error_descent import descend_by_turns
 from ._output_error_noise import descend_with_noise
-from ._output_error_problem import descend_by_turns, evaluate_misfits, OutputError, RecordTerm
+from ._output_error_problem import evaluate_misfits, OutputError, RecordTerm
 from ._output_error_result import assess_output_error
 from ._parameters import find_place, Free, Parameters, Positive, Real, select_parameters, Tie
 from ._problem import Prior, Problem, quantity_of

@@ -16,19 +16,17 @@ from ._noise_model import (
     shock_slopes,
     shocks_of,
 )
-from ._output_error_problem import (
+from ._output_error_descent import (
     descend,
     descend_by_turns,
     Descent,
     describe_stop,
-    evaluate_misfits,
-    Evaluation,
     message_of,
-    OutputError,
     Point,
     RecordNoise,
     sizes_of,
 )
+from ._output_error_problem import evaluate_misfits, Evaluation, OutputError
 from ._whitening import make_whitener, white
 
 

@@ -29,15 +29,8 @@ from ._assess import (
 from ._fit_remarks import no_minimum, remarks_on_priors, runaways
 from ._identifiability import Information
 from ._make_fit import Costs, Estimate, make_fit
-from ._output_error_problem import (
-    Descent,
-    evaluate_misfits,
-    Evaluation,
-    OutputError,
-    RecordNoise,
-    RecordTerm,
-    with_fixed_slopes,
-)
+from ._output_error_descent import Descent, RecordNoise, with_fixed_slopes
+from ._output_error_problem import evaluate_misfits, Evaluation, OutputError, RecordTerm
 from ._result import Fit
 from ._verdict import Verdict
 
@@ -141,8 +134,9 @@ def project_records(
         own = np.concatenate(own if noise is None else [*own, noise], axis=2)
         basis = orthonormal(own)
         mine = slopes[:, :, : rescale.size] * rescale
-        share = np.einsum("tok,toa->ka", basis, mine)
-        projected.append(Projected(np.asarray(misfit), mine - basis @ share, basis))
+        rows, flat = mine.reshape(-1, rescale.size), basis.reshape(-1, basis.shape[2])
+        left = np.reshape(rows - flat @ (flat.T @ rows), mine.shape)
+        projected.append(Projected(np.asarray(misfit), left, basis))
         at += states
     return projected
 
@@ -160,8 +154,7 @@ def reduced_rows(
         measured = np.asarray(term.measured)
         aim += np.einsum("tok,to->k", mine, one.misfit)
         output += np.einsum("tok,to->k", mine, measured)
-        fitted = np.concatenate([mine[:, :, :count], one.nuisance], axis=2)
-        noise += projected_noise(mine, one.misfit, fitted)
+        noise += projected_noise(mine, one.misfit, one.nuisance, count)
         at += one.misfit.size
     return Reduced(root, aim, noise, output)
 

@@ -269,7 +269,7 @@ def _stands_out(columns: np.ndarray, left: np.ndarray, found: np.ndarray, last: 
     scale = np.where(scale > 1e-12 * scale.max(), scale, np.inf)
     inverse = np.linalg.pinv(flat / scale, rcond=1e-9)[-last:]
     ways = inverse.T.reshape(*left.shape, last)
-    covariance = projected_noise(ways, left, orthonormal(columns))
+    covariance = projected_noise(ways, left, orthonormal(columns), 0)
     tested = found[-last:] * np.where(np.isfinite(scale[-last:]), scale[-last:], 0.0)
     size = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
     scaled = np.linalg.pinv(covariance / np.outer(size, size)) @ (tested / size)

@@ -38,6 +38,8 @@ from ._rotation import (
 )
 from ._simulate_linear import (
     free_responses as free_responses,
+    sample_rational as sample_rational,
+    SampledRational as SampledRational,
     simulate_linear as simulate_linear,
     split_delay as split_delay,
 )

@@ -202,6 +202,66 @@ def free_responses(
     return start, bias
 
 
+class SampledRational(NamedTuple):
+    """A model at its samples: y = B(q) u / A(q), `shift` samples late, and its free motions."""
+
+    above: Float[Array, " zeros"]  # B, of u[k], u[k-1], ...
+    below: Float[Array, " poles"]  # A without its leading 1, of y[k-1], y[k-2], ...
+    shift: Int[Array, ""]
+    step: Float[Array, "both both"]  # of state and constant bias over one sample
+    rows: Float[Array, "1 both"]  # from these to the output
+
+
+def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRational:
+    """The difference equation that `simulate_linear` solves, and what `free_responses` shows.
+
+    **Arguments:**
+
+    - `model`: with a numerator of no higher degree than its denominator.
+    - `dt`: the sample interval in s.
+    - `hold`: as in `simulate_linear`.
+
+    **Returns:**
+
+    A `SampledRational`, differentiable by all of the model but whole samples of its delay.
+
+    Source: Faddeev and LeVerrier's recursion for C adj(qI - A); Astrom & Wittenmark,
+    Computer-Controlled Systems, sec. 2.3.
+    """
+    plant = _plant(model)
+    states, one = len(plant.A), jnp.ones((), plant.A.dtype)
+    shift, late = split_delay(plant.input_delay, dt)
+    step, drive = propagation(plant.A, plant.B, late, one, dt)
+    old, old_change, new, new_change = drive
+    if hold == "first":  # by samples of u itself, the next one first
+        drive = jnp.stack([new_change, old_change + new - new_change, old - old_change])
+    else:
+        drive = jnp.stack([jnp.zeros_like(new), new, old])
+    below, row, above = [], plant.C[0], jnp.zeros(states + 2, plant.A.dtype)
+    power = jnp.eye(states, dtype=plant.A.dtype)
+    for k in range(states):
+        above = above.at[k : k + 3].add(_dot(drive, _dot(row, power)))
+        power = _dot(step, power)
+        below.append(-jnp.trace(power) / (k + 1))
+        power = power + below[-1] * jnp.eye(states, dtype=plant.A.dtype)
+    poles = jnp.stack(below) if below else jnp.zeros(0, plant.A.dtype)
+    if plant.D is not None:
+        now, before = plant.D[0, 0] * _direct(late[0], hold)
+        whole = jnp.concatenate([jnp.ones(1, poles.dtype), poles])
+        above = above.at[:-1].add(now * whole).at[1:].add(before * whole)
+    block = _with_bias(plant.A)
+    rows = jnp.concatenate([plant.C, jnp.zeros_like(plant.C)], axis=1)
+    return SampledRational(above, poles, shift[0], matrix_exponential(block * dt), rows)
+
+
+def _direct(late: Float[Array, ""], hold: str) -> Float[Array, "2"]:
+    """What `delay_input` makes of u[k] and u[k-1]."""
+    one, now = jnp.ones_like(late), late <= _WHOLE
+    share = 1 - late if hold == "first" else jnp.zeros_like(late)
+    share = jnp.where(now, one, share)
+    return jnp.stack([share, 1 - share])
+
+
 class _Plant(NamedTuple):
     A: Float[Array, "states states"]
     B: Float[Array, "states inputs"]
@@ -285,9 +345,7 @@ def _direct_outputs(
 def _free_outputs(
     plant: _Plant, samples: int, dt: Number
 ) -> tuple[Float[Array, "samples outputs states"], Float[Array, "samples outputs states"]]:
-    A, states = plant.A, len(plant.A)
-    block = jnp.zeros((2 * states, 2 * states), A.dtype)
-    block = block.at[:states].set(jnp.concatenate([A, jnp.eye(states, dtype=A.dtype)], axis=1))
+    states, block = len(plant.A), _with_bias(plant.A)
     bias = jnp.zeros_like(plant.C) if plant.bias is None else plant.bias
     rows = jnp.concatenate([plant.C, bias], axis=1)
     if plant.output_delay is not None:
@@ -295,3 +353,9 @@ def _free_outputs(
         rows = jnp.einsum("oi,oij->oj", rows, back, precision="highest")
     found = free_motion(rows, matrix_exponential(block * dt), samples)
     return found[:, :, :states], found[:, :, states:]
+
+
+def _with_bias(A: Float[Array, "states states"]) -> Float[Array, "both both"]:
+    """Of x' = A x + bias, for state and bias."""
+    both = jnp.concatenate([A, jnp.eye(len(A), dtype=A.dtype)], axis=1)
+    return jnp.concatenate([both, jnp.zeros_like(both)])

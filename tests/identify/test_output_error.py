@@ -114,6 +114,25 @@ def test_a_loop_that_may_be_closed_is_spoken_of():
     assert any("is 1 for any model" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("hold", ["zero", "first"])
+def test_a_transfer_function_and_its_state_space_give_one_estimate(hold):
+    # The one is fitted by filters, the other by differentiating its simulation.
+    y = late_by_scipy([*VALUES, 0.1, -0.5, 0.3], U) + 0.05 * noise(2, 0.8)
+    record = jq.Record(TIME, U, y)
+    fit = refine(START, record, free=FREE, hold=hold)
+    plant = StateSpace(
+        F=[[0.0, 1.0], [-26.0, -2.0]], G=[[0.0], [10.0]], H0=[[1.0, 0.0]], input_delay=[0.02]
+    )
+    free = ("G[1][0]", "F[1][1]", "F[1][0]", "input_delay[0]")
+    other = refine(plant, record, free=free, hold=hold)
+    signs = np.array([1.0, -1.0, -1.0, 1.0])
+    np.testing.assert_allclose(fit.values, signs * other.values, rtol=1e-8)
+    rest = signs[:, None] * other.covariance * signs
+    np.testing.assert_allclose(fit.covariance, rest, rtol=1e-5, atol=1e-12)
+    assert fit.cost == pytest.approx(other.cost, rel=1e-9)
+
+
 def test_an_exact_record_gives_exact_values():
     fit = refined(CLEAN)
     np.testing.assert_allclose(fit.values, VALUES, rtol=1e-6)

@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jaxquad.models import AttitudeAxis, free_responses, simulate_linear, TransferFunction
+from jaxquad.models import (
+    AttitudeAxis,
+    free_responses,
+    sample_rational,
+    simulate_linear,
+    TransferFunction,
+)
 
 
 OMEGA = jnp.asarray(np.geomspace(0.1, 300.0, 60))
@@ -205,3 +211,17 @@ def test_models_build_under_jit_from_constants_and_from_traced_values():
 def test_an_unknown_hold_is_refused_with_those_that_exist():
     with pytest.raises(ValueError, match="'second'.*zero.*first"):
         simulate_linear(model("double integrator"), NOISE, DT, hold="second")
+
+
+@pytest.mark.parametrize("hold", ["zero", "first"])
+@pytest.mark.parametrize("delay", [0.0, 0.033, 0.04])
+@pytest.mark.parametrize("name", ["lightly damped mode", "feedthrough and an integrator"])
+def test_the_difference_equation_gives_the_simulated_samples(name, delay, hold):
+    plant, u = model(name, delay), np.asarray(NOISE)
+    sampled = sample_rational(plant, DT, hold)
+    u = u - u[0]  # a straight input would begin before the record
+    late = np.concatenate([np.zeros(int(sampled.shift)), u])[:SAMPLES]
+    denominator = np.concatenate([[1.0], np.asarray(sampled.below)])
+    found = signal.lfilter(np.asarray(sampled.above), denominator, late)
+    expected = np.asarray(simulate_linear(plant, u, DT, hold=hold))
+    np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())

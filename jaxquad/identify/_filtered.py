@@ -1,0 +1,309 @@
+"""Output error of one output behind one input by filters, where the general way differentiates.
+
+At its samples a rational model is y = B(q) u / A(q), and all slopes of y lie in two signals:
+
+    dy = dB(q) w - dA(q) v,  with  w = u / A  and  v = y / A.
+
+So an evaluation takes two passes over the record, whatever the number of parameters is. Start and
+trim leave the slopes as far as they are orthogonal to what start and trim do, which is all that
+counts of them (variable projection).
+Source: Ljung, System Identification, sec. 10.3; Kaufman (1975), A variable projection method for
+solving separable nonlinear least squares problems, BIT 15.
+"""
+
+import dataclasses
+import functools as ft
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jaxquad._core import Normal
+from jaxquad.models import sample_rational, SampledRational, TransferFunction
+
+from ._evaluate import evaluate, Frame, take_apart
+from ._output_error_problem import Evaluation, insert_parameters, OutputError, RecordTerm
+from ._parameters import Numbers
+from ._simulated import band_filter, linear_model
+
+
+_MOST = 4  # poles, beyond which the coefficients of A may say too little of them
+_DIGITS = 1e6  # rounding of the output, in units of the last bit of its largest value
+_RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
+_REFINEMENTS = 3
+_SETTLED = 1e-7  # change of an unknown, whose square is left to the next refinement
+_GONE = 1e-30  # of a free motion, relative to its start
+
+Rows = Float[np.ndarray, "rows samples"]
+
+
+class Sampled(NamedTuple):
+    """A model at its samples, and what the parameters do to the coefficients."""
+
+    model: SampledRational  # of NumPy's arrays
+    slopes: Float[np.ndarray, "coefficients parameters"]  # of B and then of A
+
+
+class Columns(NamedTuple):
+    """What start and trim do to a record."""
+
+    free: Rows  # unit shift, biases and initial values
+    seen: Rows  # these as they count
+    scale: Float[np.ndarray, " rows"]  # that brings them to unit length
+    normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
+
+
+class Simulated(NamedTuple):
+    """One record: what is left of it, and what its slopes are made of."""
+
+    sampled: Sampled
+    driven: Float[np.ndarray, " samples"]  # u / A
+    output: Float[np.ndarray, " samples"]  # with the free motions
+    columns: Columns
+    misfit: Float[np.ndarray, " samples"]  # weighted, and orthogonal to the columns
+
+
+Program = Callable[[Float[np.ndarray, " parameters"]], Sampled]
+
+
+def is_filtered(problem: OutputError) -> bool:
+    """Whether all records are of one output and one input of a rational model, in white noise."""
+    base = problem.base
+    if problem.unknown or any(term.motions is None for term in problem.terms):
+        return False
+    plant = linear_model(base.model)
+    rational = isinstance(plant, TransferFunction) and 2 <= plant.denominator.size <= _MOST + 1
+    return rational and all(
+        term.whitener is None and term.feedback is None for term in problem.terms
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FilteredPoint:
+    """Where a descent by filters stands."""
+
+    problem: OutputError
+    programs: list[Program]  # of each record
+    z: Float[np.ndarray, " parameters"]
+    records: list[Simulated]
+    prior_misfits: Float[np.ndarray, " priors"]
+    prior_slopes: Float[np.ndarray, "priors parameters"]
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squares; infinite where something is not finite."""
+        parts = [self.prior_misfits, *(one.misfit for one in self.records)]
+        cost = 0.5 * sum(float(part @ part) for part in parts)
+        return cost if np.isfinite(cost) else np.inf
+
+    @ft.cached_property
+    def behind(self) -> list[Float[np.ndarray, " samples"]]:
+        """y / A of each record."""
+        return [_over(one.sampled.model.below, one.output) for one in self.records]
+
+    @ft.cached_property
+    def rows(self) -> list[Rows]:
+        """The slopes of each record's misfit, up to what start and trim can do."""
+        parts = zip(self.problem.terms, self.records, self.behind, strict=True)
+        return [_slope_rows(*each) for each in parts]
+
+    @ft.cached_property
+    def normal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient and Gauss-Newton Hessian."""
+        gradient = self.prior_slopes.T @ self.prior_misfits
+        hessian = self.prior_slopes.T @ self.prior_slopes
+        for one, rows in zip(self.records, self.rows, strict=True):
+            gradient = gradient + rows @ one.misfit
+            hessian = hessian + _without_columns(rows, one.columns)
+        return gradient, hessian
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.normal
+
+    def moved(self, change: Float[np.ndarray, " parameters"]) -> "FilteredPoint":
+        return _point(self.problem, self.programs, self.z + change)
+
+    @property
+    def is_precise(self) -> bool:
+        """Whether rounding of the coefficients leaves the digits that a fit needs."""
+        return all(map(_is_precise, self.records, self.behind))
+
+    @property
+    def found(self) -> Evaluation:
+        """As the general way gives it."""
+        misfits = [one.misfit[:, None] for one in self.records]
+        slopes = [rows.T[:, None] for rows in self.rows]
+        columns = [one.columns.seen.T[:, None] for one in self.records]
+        return Evaluation(misfits, slopes, columns, Normal(self.cost, *self.normal))
+
+
+def filtered_point(problem: OutputError, z: Float[np.ndarray, " parameters"]) -> FilteredPoint:
+    """Where a descent begins."""
+    frame, arrays = take_apart(OutputError(problem.base, (), problem.zeros))
+    programs = [_sampler(frame, arrays, term.hold, term.dt) for term in problem.terms]
+    return _point(problem, programs, np.asarray(z))
+
+
+def _point(problem: OutputError, programs: list[Program], z: np.ndarray) -> FilteredPoint:
+    parts = zip(problem.terms, programs, strict=True)
+    records = [_simulated(term, sample(z)) for term, sample in parts]
+    misfits, slopes = np.zeros(0), np.zeros((0, z.size))
+    if problem.base.quantities:
+        priors = evaluate(problem.base, z)
+        misfits, slopes = priors.misfits, priors.slopes.T[:, : z.size]
+    return FilteredPoint(problem, programs, z, records, misfits, slopes)
+
+
+def _sampler(frame: Frame, arrays: list[Numbers], hold: str, dt: float) -> Program:
+    run = _program(frame, hold)
+
+    def sample(z: Float[np.ndarray, " parameters"]) -> Sampled:
+        coefficients, motion, shift = map(np.asarray, run(z, dt, arrays))
+        both = motion.shape[1]
+        above, below = np.split(coefficients[:, 0], [both // 2 + 2])
+        model = SampledRational(above, below, shift, motion[:both], motion[both:])
+        return Sampled(model, coefficients[:, 1:])
+
+    return sample
+
+
+@ft.lru_cache(maxsize=64)
+def _program(frame: Frame, hold: str) -> Callable[[np.ndarray, float, list[Numbers]], PyTree]:
+    """Few arrays come back: each takes longer than its numbers."""
+
+    def run(z: Float[Array, " parameters"], dt: Float[Array, ""], arrays: list[Array]) -> PyTree:
+        problem = frame.filled(arrays)
+
+        def coefficients(z):
+            plant = linear_model(insert_parameters(z, problem))
+            assert isinstance(plant, TransferFunction)
+            model = sample_rational(plant, dt, hold)
+            both = jnp.concatenate([model.above, model.below])
+            return both, (both, jnp.concatenate([model.step, model.rows]), model.shift)
+
+        slopes, (both, motion, shift) = jax.jacfwd(coefficients, has_aux=True)(z)
+        return jnp.concatenate([both[:, None], slopes], axis=1), motion, shift
+
+    return jax.jit(run)
+
+
+def _simulated(term: RecordTerm, sampled: Sampled) -> Simulated:
+    model, samples = sampled.model, len(term.y)
+    late = _shifted(np.asarray(term.u)[:, 0], int(model.shift))
+    with np.errstate(all="ignore"):  # an unstable model is a failed step
+        driven = _over(model.below, late)
+        forced = np.convolve(driven, model.above)[:samples]
+        columns = _columns(term, _free_motions(term, model, samples))
+        measured = np.asarray(term.y)[:, 0] * term.weights[0]
+        misfit, unknowns = _project_out(measured - _weighted(term, forced), columns)
+        # A shift stays what it is, whatever A does.
+        output = forced + unknowns[1:] @ columns.free[1:]
+    return Simulated(sampled, driven, output, columns, misfit)
+
+
+def _shifted(u: Float[np.ndarray, " samples"], shift: int) -> Float[np.ndarray, " samples"]:
+    """From its first value, so many samples later; after the record it stays as it is."""
+    late, kept = np.zeros(len(u)), max(len(u) - abs(shift), 0)
+    if shift < 0:
+        late[:kept], late[kept:] = u[len(u) - kept :], u[-1]
+        return late - u[0]
+    late[len(u) - kept :] = u[:kept] - u[0]
+    return late
+
+
+def _slope_rows(term: RecordTerm, one: Simulated, behind: Float[np.ndarray, " samples"]) -> Rows:
+    model, samples = one.sampled.model, len(behind)
+    parts = np.zeros((model.above.size + model.below.size, samples))
+    for k in range(model.above.size):
+        parts[k, k:] = one.driven[: samples - k]
+    for k in range(model.below.size):
+        parts[model.above.size + k, k + 1 :] = behind[: samples - k - 1]
+    signs = np.repeat([-1.0, 1.0], [model.above.size, model.below.size])
+    return _weighted(term, (signs[:, None] * one.sampled.slopes).T @ parts)
+
+
+def _over(below: Float[np.ndarray, " poles"], x: Float[np.ndarray, " samples"]) -> np.ndarray:
+    """`x` / A, from rest."""
+    from scipy.signal import lfilter
+
+    with np.errstate(all="ignore"):
+        return np.asarray(lfilter(np.ones(1), np.concatenate([[1.0], below]), x))
+
+
+def _weighted(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndarray:
+    seen = x if term.gain is None else np.asarray(band_filter(x.T, np.asarray(term.gain))).T
+    return seen * term.weights[0]
+
+
+def _free_motions(term: RecordTerm, model: SampledRational, samples: int) -> Rows:
+    """A shift, biases on the slow motions and initial values of the fast ones, as rows."""
+    assert term.motions is not None
+    slow, fast = (np.asarray(each) for each in term.motions)
+    states = len(slow)
+    if not slow.shape[1]:  # the biases are those of no one
+        step, rows, ways = model.step[:states, :states], model.rows[:, :states], fast.T
+    else:
+        step, rows = model.step, model.rows
+        ways = np.zeros((slow.shape[1] + fast.shape[1], 2 * states))
+        ways[: slow.shape[1], states:], ways[slow.shape[1] :, :states] = slow.T, fast.T
+    found = np.ones((1 + len(ways), samples))
+    found[1:] = ways @ _motion(rows[0], step, samples)
+    return found
+
+
+def _motion(
+    row: Float[np.ndarray, " both"], step: Float[np.ndarray, "both both"], samples: int
+) -> Float[np.ndarray, "both samples"]:
+    """`row` step^k for each sample k, as far as anything is left of it."""
+    found = np.zeros((len(row), samples))
+    found[:, 0], done = row, 1
+    largest = np.max(np.abs(row), initial=0.0)
+    power = step.T
+    while done < samples:
+        more = min(done, samples - done)
+        found[:, done : done + more] = power @ found[:, :more]
+        if np.max(np.abs(found[:, done : done + more])) < _GONE * largest:
+            break
+        power, done = power @ power, done + more
+    return found
+
+
+def _columns(term: RecordTerm, free: Rows) -> Columns:
+    seen = _weighted(term, free)
+    normal = seen @ seen.T
+    square = np.diagonal(normal)
+    scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
+    ridged = normal * np.outer(scale, scale) + _RIDGE * np.eye(len(normal))
+    return Columns(free, seen, scale, ridged)
+
+
+def _project_out(
+    misfit: Float[np.ndarray, " samples"], columns: Columns
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " rows"]]:
+    """The misfit that no start, trim or shift explains, and how much of each does explain."""
+    unknowns, rest = np.zeros(len(columns.scale)), misfit
+    for _ in range(_REFINEMENTS):
+        aim = columns.scale * (columns.seen @ rest)
+        if not np.all(np.isfinite(aim)):
+            return np.full_like(misfit, np.nan), unknowns
+        step = np.linalg.solve(columns.normal, aim) * columns.scale
+        unknowns = unknowns + step
+        rest = misfit - unknowns @ columns.seen
+        if np.all(np.abs(step) <= _SETTLED * np.abs(unknowns)):
+            break
+    return rest, unknowns
+
+
+def _without_columns(rows: Rows, columns: Columns) -> Float[np.ndarray, "parameters parameters"]:
+    """Products of the rows' parts orthogonal to the columns."""
+    shared = columns.scale[:, None] * (columns.seen @ rows.T)
+    return rows @ rows.T - shared.T @ np.linalg.solve(columns.normal, shared)
+
+
+def _is_precise(one: Simulated, behind: Float[np.ndarray, " samples"]) -> bool:
+    above, size = np.sum(np.abs(one.sampled.model.above)), float(np.max(np.abs(one.output)))
+    needed = max(float(np.max(np.abs(behind))), float(above * np.max(np.abs(one.driven))))
+    return np.isfinite(needed) and needed <= _DIGITS * size
