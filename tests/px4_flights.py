@@ -12,12 +12,11 @@ from log_writers import structured, ULog
 GYRO_HZ, EACH = 8000, 20  # samples of the gyro for one of the loop, at 400 Hz
 DT = EACH / GYRO_HZ
 CUTOFF, SLOPE_HZ = 40.0, 30.0
-_SHARE = 2 * np.pi * SLOPE_HZ / GYRO_HZ / (1 + 2 * np.pi * SLOPE_HZ / GYRO_HZ)
 
 
-def low_pass() -> tuple[float, float, float]:
+def low_pass(cutoff: float) -> tuple[float, float, float]:
     """LowPassFilter2p: bilinear Butterworth, as its coefficients."""
-    k = float(np.tan(np.pi * CUTOFF / GYRO_HZ))
+    k = float(np.tan(np.pi * cutoff / GYRO_HZ))
     c = 1 + 2**0.5 * k + k * k
     return k * k / c, 2 * (k * k - 1) / c, (1 - 2**0.5 * k + k * k) / c
 
@@ -29,6 +28,8 @@ class Vehicle(NamedTuple):
     lag: float = 0.03  # s
     late: int = 32  # samples of the gyro
     gains: tuple[float, float, float] = (0.15, 0.2, 0.003)
+    cutoff: float = CUTOFF  # Hz, of the gyro
+    slope: float = SLOPE_HZ  # Hz, of the D term
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -36,8 +37,24 @@ class Vehicle(NamedTuple):
         return {
             **{f"MC_{axis}RATE_{k}": x for axis in ("ROLL", "PITCH", "YAW")
                for k, x in zip("PID", self.gains, strict=True)},
-            "IMU_GYRO_RATEMAX": 400.0, "IMU_GYRO_CUTOFF": CUTOFF, "IMU_DGYRO_CUTOFF": SLOPE_HZ,
+            "IMU_GYRO_RATEMAX": 400.0, "IMU_GYRO_CUTOFF": self.cutoff,
+            "IMU_DGYRO_CUTOFF": self.slope,
         }  # fmt: skip
+
+    def proposed(self, new: Mapping[str, float]) -> "Vehicle":
+        """With what a proposal changes of roll."""
+        gains = [new.get(f"MC_ROLLRATE_{k}", x) for k, x in zip("PID", self.gains, strict=True)]
+        return self._replace(
+            gains=tuple(gains),
+            cutoff=new.get("IMU_GYRO_CUTOFF", self.cutoff),
+            slope=new.get("IMU_DGYRO_CUTOFF", self.slope),
+        )
+
+    @property
+    def share(self) -> float:
+        """Of the D term's low-pass."""
+        turn = 2 * np.pi * self.slope / GYRO_HZ
+        return turn / (1 + turn)
 
     def fly(
         self, seconds=30.0, amplitude=1.5, noise=0.05, gust=0.02, seed=3
@@ -52,8 +69,8 @@ class Vehicle(NamedTuple):
         r = (amplitude * sweep[::EACH]).tolist()
         jitter = (noise * rng.standard_normal(steps)).tolist()
         gusts = np.repeat(gust * rng.standard_normal(steps // 160 + 1), 160).tolist()
-        decay = float(np.exp(-1 / (GYRO_HZ * self.lag)))
-        b, a1, a2 = low_pass()
+        decay, share = float(np.exp(-1 / (GYRO_HZ * self.lag))), self.share
+        b, a1, a2 = low_pass(self.cutoff)
         sent, push, rate, u, integral = [0.0] * (steps + self.late), 0.0, 0.0, 0.0, 0.0
         s1 = s2 = y = slope = 0.0
         rates, torques = [], []
@@ -61,7 +78,7 @@ class Vehicle(NamedTuple):
             before, now = y, rate + jitter[k]
             y = b * now + s1
             s1, s2 = 2 * b * now - a1 * y + s2, b * now - a2 * y
-            slope += _SHARE * ((y - before) * GYRO_HZ - slope)
+            slope += share * ((y - before) * GYRO_HZ - slope)
             if k % EACH == 0:
                 error = r[k // EACH] - y
                 u = p * error + integral - d * slope
@@ -74,21 +91,20 @@ class Vehicle(NamedTuple):
             push = wanted + (push - wanted) * decay
         return np.array(r), np.array(torques), np.array(rates)
 
-    def effect(self, gains) -> float:
+    def effect(self) -> float:
         """Root mean square of the rate in gusts alone: without bound where the loop is unstable."""
-        flown = self._replace(gains=tuple(gains))
-        rates = flown.fly(seconds=5.0, amplitude=0.0, noise=0.0)[2]
+        rates = self.fly(seconds=5.0, amplitude=0.0, noise=0.0)[2]
         return float(np.sqrt(np.mean(rates**2)))
 
-    def loop(self, gains, omega: np.ndarray) -> np.ndarray:
-        """L of these gains, from the same equations in the frequency domain."""
-        p, i, d = gains
+    def loop(self, omega: np.ndarray) -> np.ndarray:
+        """L, from the same equations in the frequency domain."""
+        p, i, d = self.gains
         s, z, gyro = 1j * omega, np.exp(1j * omega * DT), np.exp(1j * omega / GYRO_HZ)
         hold = (1 - 1 / z) / (s * DT)
         plant = self.gain / (s * (self.lag * s + 1)) * np.exp(-s * self.late / GYRO_HZ) * hold
-        b, a1, a2 = low_pass()
+        b, a1, a2 = low_pass(self.cutoff)
         smooth = b * (1 + 1 / gyro) ** 2 / (1 + a1 / gyro + a2 / gyro**2)
-        slope = (1 - 1 / gyro) * GYRO_HZ * _SHARE / (1 - (1 - _SHARE) / gyro)
+        slope = (1 - 1 / gyro) * GYRO_HZ * self.share / (1 - (1 - self.share) / gyro)
         return plant * smooth * (p + i * DT / (z - 1) + d * slope)
 
 

@@ -64,9 +64,10 @@ AUTOPILOT = Command(
 
 A log of Betaflight, PX4 or ArduPilot. The gains and filters that flew are read from it, the plant
 is identified in the firmware's own units, and the loop of both is compared with the flight. P, I
-and D of the rate loop are tuned on the plants that the log leaves possible, rounded to what the
-firmware stores, and certified on new plants. The folder gets a parameter file for a third of the
-way, one for all of it, one that reverts them, and a table of what changes.
+and D of the rate loop, and cutoffs where the log shows the gyro's noise, are tuned on the plants
+that the log leaves possible, rounded to what the firmware stores, and certified on new plants. The
+folder gets a parameter file for a third of the way, one for all of it, one that reverts them, and a
+table of what changes.
 exit codes: 0 done, or what flew is kept, 2 unusable input, 3 this log cannot tell, 4 the design is
 not to be flown (with 3 and 4 only the file with what flew is written)
 """,

@@ -40,6 +40,7 @@ def propose_changes(
     share: Number = 1.0,
     reasons: Mapping[str, str] | None = None,
     beyond: Sequence[str] = (),
+    at_once: Sequence[str] = (),
 ) -> tuple[ParameterChange, ...]:
     """What changes between two sets of parameters once both are stored by the firmware.
 
@@ -50,6 +51,7 @@ def propose_changes(
     - `share`: how much of the way to go, above 0 and at most 1: 1/3 for a first flight.
     - `reasons`: by name.
     - `beyond`: names that may lie beyond their documented range.
+    - `at_once`: names that go all of the way at any share, such as a notch that is switched on.
 
     **Returns:**
 
@@ -67,7 +69,8 @@ def propose_changes(
             f"{', '.join(unknown)} would change, but what flew is not known: give it in `old`, so "
             "that the change can be reverted."
         )
-    wanted = {name: old[name] + share * (value - old[name]) for name, value in new.items()}
+    part = lambda name: 1.0 if name in at_once else share
+    wanted = {name: old[name] + part(name) * (value - old[name]) for name, value in new.items()}
     stored = store_parameters(firmware, wanted)
     outside = {name: value for name, value in stored.items() if name not in beyond}
     if said := check_ranges(firmware, outside):
@@ -89,7 +92,7 @@ def parameter_file(
     *,
     revert: bool = False,
     version: tuple[int, ...] = (2025, 12),
-    profile: int = 0,
+    profile: int | None = 0,
     raised: Sequence[str] = ("roll", "pitch", "yaw"),
     title: str = "",
 ) -> str:
@@ -101,7 +104,7 @@ def parameter_file(
     - `revert`: whether to write the old values, to go back to what flew.
     - `version`: of Betaflight, whose names differ: until 4.5 d is d_min, and the maximum d.
     - `raised`: of Betaflight until 4.5, the axes on which d_min is in use; on others d is d.
-    - `profile`: of Betaflight, the PID profile that is changed.
+    - `profile`: of Betaflight, the PID profile that is changed; None is the one in use.
     - `title`: a line of comment.
 
     **Returns:**
@@ -166,10 +169,14 @@ _FORMATS: Mapping[str, Callable[[Values, str], str]] = {
 
 
 def _betaflight(
-    values: Values, names: Sequence[str], version: tuple[int, ...], profile: int, title: str
-) -> str:
+    values: Values, names: Sequence[str], version: tuple[int, ...], profile: int | None,
+    title: str,
+) -> str:  # fmt: skip
     rows = [f"# {title}"] if title else []
-    rows.append(f"profile {profile}")
+    if profile is None:
+        rows.append("# select the PID profile that flew first: the log does not name it")
+    else:
+        rows.append(f"profile {profile}")
     if version >= (4, 3):
         # Sliders that stay on would rewrite what is set here.
         rows.append("set simplified_pids_mode = OFF")
@@ -200,6 +207,7 @@ def _betaflight_names(
         for part in ("gyro", "dterm"):
             older[f"{part}_lpf1_dyn_min_hz"] = f"dyn_lpf_{part}_min_hz"
             older[f"{part}_lpf1_dyn_max_hz"] = f"dyn_lpf_{part}_max_hz"
+            older[f"{part}_lpf1_static_hz"] = f"{part}_lowpass_hz"
             older[f"{part}_lpf2_static_hz"] = f"{part}_lowpass2_hz"
     return [older.get(name, name) for name in names]
 
@@ -250,8 +258,9 @@ def write_parameter_files(
     shares: Sequence[Number] = (1 / 3, 1.0),
     reasons: Mapping[str, str] | None = None,
     beyond: Sequence[str] = (),
+    at_once: Sequence[str] = (),
     version: tuple[int, ...] = (2025, 12),
-    profile: int = 0,
+    profile: int | None = 0,
 ) -> ParameterFiles:
     """Write a staged proposal, a file that reverts it, and a table of what changes.
 
@@ -275,7 +284,9 @@ def write_parameter_files(
     )
     stages, table, whole = [], [], ()
     for share in sorted(shares):
-        whole = propose_changes(firmware, old, new, share=share, reasons=reasons, beyond=beyond)
+        whole = propose_changes(
+            firmware, old, new, share=share, reasons=reasons, beyond=beyond, at_once=at_once
+        )
         percent = round(100 * share)
         title = f"{percent} % of the way from what flew to the proposal"
         stages.append((folder / f"{stem}_{percent:03d}.{suffix}", text(whole, title)))

@@ -3,17 +3,12 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from jaxquad._core import announce, plain_content, write_file
 from jaxquad.control.autopilots import (
-    ardupilot_loop,
-    betaflight_loop,
     find_parameter,
-    Firmware,
-    px4_loop,
     without_gyro_filters,
 )
 from jaxquad.export import (
@@ -25,7 +20,12 @@ from jaxquad.export import (
 )
 from jaxquad.identify import usable
 from jaxquad.loops import FlownLoop as Reproduction, reproduce_flight
-from jaxquad.records import AXES, Proposal, read_settings
+from jaxquad.records import (
+    AXES,
+    Proposal,
+    ReadError,
+    RecordError,
+)
 from jaxquad.report import provenance, write_json
 from jaxquad.spectra import (
     frequency_response,
@@ -34,50 +34,21 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
+from ._flight_channels import FlightChannels, read_channels
+from ._flown_autopilot import FlownAutopilot, read_flown, settings_of
+from ._gyro_noise import GyroNoise
 from ._identify import Identification, identify
 from ._kinds import SettingsError
 from ._log import propose_settings, read_records
-from ._rate_gains import (
-    ceiling_in,
-    certify_gains,
-    gains_in,
-    gains_of,
-    law_responses,
-    make_loops,
-    parameters_of,
-    RateLaw,
-    search_gains,
-    Stage,
-    Targets,
-)
+from ._rate_design import design_gains, FilterVerdict, Kind
+from ._rate_gains import law_responses, Stage
 from ._settings import IdentifySettings
 from ._tune_settings import AutopilotSettings
 
 
-Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
 _THIRD, _ALL = 1 / 3, 1.0
-_WORTH = 0.95  # of the flown effect of torque, above which gains are not worth a change
 _STEM = "proposal"
 _INJECTED = "SIDD.Targ"  # ArduPilot's chirp
-_CERTIFICATES = 3  # at most: the worst plants of one that fails are tuned on, too
-_WORST = 16
-
-
-@dataclasses.dataclass(frozen=True)
-class FlownAutopilot:
-    """The rate loop of a log: firmware, version, law and what of it is not modelled."""
-
-    firmware: Firmware
-    version: tuple[int, ...]
-    axis: int
-    law: RateLaw
-    parameters: Mapping[str, float]
-    unmodelled: tuple[str, ...]
-
-    @property
-    def old(self) -> dict[str, float]:
-        """P, I and D of the axis by the firmware's names."""
-        return parameters_of(self.law, self.axis, gains_of(self.law, self.axis))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +66,9 @@ class AutopilotProposal:
     - `stages`: on fresh plants what flew, then a third of the way and all of it; empty where the
       log cannot tell.
     - `old`, `new`: the parameters by name; `new` is empty where nothing is proposed.
+    - `filters`: what freeing the filters brings, or why they stay as they flew; None without a
+      search.
+    - `noise`: of the gyros, where the log shows it; `flight`: the channels that were read.
     """
 
     kind: Kind
@@ -105,11 +79,14 @@ class AutopilotProposal:
     reproduction: Reproduction | None
     stages: tuple[Stage, ...] = ()
     new: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    filters: FilterVerdict | None = None
+    noise: GyroNoise | None = None
+    flight: FlightChannels | None = None
 
     @property
     def old(self) -> dict[str, float]:
-        """What flew."""
-        return self.flown.old
+        """What flew, of the gains and of filters that change."""
+        return self.flown.old | ({} if self.filters is None else dict(self.filters.flown))
 
     @property
     def changes(self) -> tuple[ParameterChange, ...]:
@@ -127,7 +104,10 @@ class AutopilotProposal:
             f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of what "
             f"flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
         )
-        return dict.fromkeys(self.new, why)
+        reasons = dict.fromkeys(self.new, why)
+        if self.filters is not None:
+            reasons |= dict.fromkeys(self.filters.flown, self.filters.reason)
+        return {name: reason for name, reason in reasons.items() if name in self.new}
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
@@ -142,6 +122,8 @@ class AutopilotProposal:
             "old": self.old,
             "new": dict(self.new),
             "stages": [stage._asdict() for stage in self.stages],
+            "filters": None if self.filters is None else self.filters.content(),
+            "noise": None if self.noise is None else self.noise.content(),
             "reproduction": None if self.reproduction is None else self.reproduction.to_dict(),
             "plant": self._plant,
             "settings": self.settings.content(),
@@ -176,6 +158,7 @@ class AutopilotProposal:
         files = write_parameter_files(
             folder, flown.firmware, self.old, self.new, stem=_STEM, shares=(_THIRD, _ALL),
             reasons=self._reasons, beyond=list(self.new), version=flown.version or (2025, 12),
+            at_once=() if self.filters is None else self.filters.at_once, profile=None,
         )  # fmt: skip
         return [stored, *files.stages, files.revert, files.table]
 
@@ -188,7 +171,7 @@ class AutopilotProposal:
         raised = [AXES[flown.axis]] if f"d_max_{AXES[flown.axis]}" in self.old else []
         text = parameter_file(
             flown.firmware, same, revert=True, version=flown.version or (2025, 12), raised=raised,
-            title="what flew",
+            title="what flew", profile=None,
         )  # fmt: skip
         suffix = {"betaflight": "txt", "px4": "params", "ardupilot": "param"}[flown.firmware]
         return write_file(folder / f"{_STEM}_revert.{suffix}", text)
@@ -204,6 +187,8 @@ class AutopilotProposal:
             lines += ["", f"flown loop: {self.reproduction.verdict}"]
         if self.stages:
             lines += ["", _stage_table(self.stages)]
+        if self.filters is not None:
+            lines += ["", f"filters: {self.filters.text}"]
         if self.kind == "proposed":
             lines += ["", change_table(self.changes).rstrip()]
         return "\n".join([*lines, "", self.verdict])
@@ -227,8 +212,9 @@ def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> Au
     to the logged rate, and the loop of both has to reproduce the flight. P, I and D of the rate
     loop are searched over the plants that the fit leaves uncertain: least rate after a step of
     torque, with limits on the peak of |S|, on the command's noise and on the crossover, which stays
-    in the identified band. The rounded numbers are certified on fresh plants, as is a third of the
-    way. Filters, feed-forward and the angle loop stay as they are. Loops are taken as linear: no
+    in the identified band. Where the log shows the gyro's noise, cutoffs and notches are searched
+    with them. The rounded numbers are certified on fresh plants, as is a third of the way.
+    Feed-forward and the angle loop stay as they are. Loops are taken as linear: no
     limit of the motors is simulated. Source: docs/autopilots.md.
 
     **Arguments:**
@@ -253,19 +239,22 @@ def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> Au
     path, settings = Path(path), settings or AutopilotSettings()
     asked, proposal = _channels_of(path, settings)
     announce("gains and filters that flew")
-    flown = read_flown(path, proposal, settings)
+    flown, flight = _read_flight(path, asked, proposal, settings)
     found = identify(path, asked)
     known = (settings, found, flown)
+    unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
     if not found.fit.identifiable:
-        why = f"this log cannot tell: {found.fit.verdict.summary}; {_FLY}"
-        return AutopilotProposal("cannot tell", why, *known, None)
+        return unsure(f"this log cannot tell: {found.fit.verdict.summary}; {_FLY}", None)
     announce("the flown loop again")
     again = _reproduce(found, flown)
     if again.kind != "flown":
         why = again.verdict
-        text = why if again.kind == "unknown" else f"this log cannot tell: {why}"
-        return AutopilotProposal("cannot tell", text, *known, again)
-    return _designed(settings, found, flown, again)
+        return unsure(why if again.kind == "unknown" else f"this log cannot tell: {why}", again)
+    made = design_gains(settings, found, flown, flight)
+    return AutopilotProposal(
+        made.kind, made.verdict, *known, again, made.stages,
+        made.new if made.kind == "proposed" else {}, made.filters, made.noise, flight,
+    )  # fmt: skip
 
 
 _FLY = "fly a chirp of the rate set-point, or strong and quick stick on this axis, for 20 s or more"
@@ -282,28 +271,19 @@ def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySetti
     return found, proposal
 
 
-def read_flown(path: Path, proposal: Proposal, settings: AutopilotSettings) -> FlownAutopilot:
-    """The loop that flew. Raises ValueError where the log does not hold its gains."""
-    setup = proposal.setup
-    prefix = setup.rate.rpartition("gyroADC")[0].rstrip(".")
-    at = None if proposal.vehicle == "betaflight" else setup.start
-    given = read_settings(path, log=prefix, at=at)
-    axis = AXES.index(setup.axis)
-    if proposal.vehicle == "betaflight":
-        loop = betaflight_loop(given.values, given.version, throttle=settings.throttle)
-        firmware: Firmware = "betaflight"
-    elif proposal.vehicle == "px4":
-        loop, firmware = px4_loop(given.values), "px4"
-    else:
-        loop, firmware = ardupilot_loop(given.values), "ardupilot"
-    law = loop.law
-    if not np.any(gains_of(law, axis) > 0):
-        raise ValueError(
-            f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
-        )
-    return FlownAutopilot(
-        firmware, tuple(given.version), axis, law, loop.parameters(), loop.unmodelled
-    )
+def _read_flight(
+    path: Path, asked: IdentifySettings, proposal: Proposal, settings: AutopilotSettings
+) -> tuple[FlownAutopilot, FlightChannels | None]:
+    """The loop that flew, at the throttle of the log, and the channels beside the record's."""
+    values = settings_of(path, proposal).values
+    try:
+        flight = read_channels(path, proposal, asked, values)
+    except (ReadError, RecordError):  # the record has what identification needs, and says so
+        flight = None
+    if settings.throttle is None and flight is not None and flight.throttle is not None:
+        middle = float(np.clip(np.median(flight.throttle), 0.01, 1.0))
+        settings = dataclasses.replace(settings, throttle=middle)
+    return read_flown(path, proposal, settings), flight
 
 
 def _reproduce(found: Identification, flown: FlownAutopilot) -> Reproduction:
@@ -363,78 +343,3 @@ def _setpoint_of(rate: str, flown: FlownAutopilot) -> str:
     if flown.firmware == "ardupilot":
         return f"RATE.{name[0].upper()}Des"
     return rate.replace("gyroADC", "setpoint")
-
-
-def _designed(
-    settings: AutopilotSettings,
-    found: Identification,
-    flown: FlownAutopilot,
-    again: Reproduction,
-) -> AutopilotProposal:
-    """The search, and its rounded numbers on fresh plants."""
-    law, axis, unit = flown.law, flown.axis, found.records[0].output_units[0]
-    draw = lambda count, seed: make_loops(law, axis, found.fit, unit, count, settings.seed + seed)
-    loops, before = draw(settings.members, 0), gains_of(law, axis)
-    targets = Targets(
-        settings.sensitivity, settings.resonance, settings.noise, settings.change, found.band[1]
-    )
-    new, stages = flown.old, ()
-    for attempt in range(1, _CERTIFICATES + 1):
-        announce(f"searching gains on {len(loops.plants)} plants")
-        new = parameters_of(law, axis, search_gains(loops, before, targets, flown.firmware, axis))
-        announce(f"certifying the rounded gains on {settings.fresh} new plants")
-        fresh, ways = draw(settings.fresh, attempt), (_third_of(flown, new), new)
-        fresh = dataclasses.replace(fresh, ceiling=ceiling_in(law, axis, ways))
-        designs = [before, *(gains_in(law, axis, each) for each in ways)]
-        stages = tuple(certify_gains(fresh, designs))
-        if _judge(stages, settings, found.band[1])[0] != "not to be flown":
-            break
-        loops = loops.joined(fresh, designs[-1][None], _WORST)
-    kind, verdict = _judge(stages, settings, found.band[1])
-    return AutopilotProposal(
-        kind, verdict, settings, found, flown, again, stages, new if kind == "proposed" else {}
-    )
-
-
-def _third_of(flown: FlownAutopilot, new: Mapping[str, float]) -> dict[str, float]:
-    """A third of the way, as the firmware stores it."""
-    changes = propose_changes(flown.firmware, flown.old, new, share=_THIRD, beyond=list(new))
-    return flown.old | {change.parameter.name: change.new for change in changes}
-
-
-def _judge(stages: tuple[Stage, ...], settings: AutopilotSettings, edge: float) -> tuple[Kind, str]:
-    flown, third, whole = stages
-    limit, count = settings.sensitivity, settings.fresh
-    beyond = []
-    if min(third.stable, whole.stable) < 1:
-        beyond.append(f"only {100 * min(third.stable, whole.stable):.1f} % of the loops are stable")
-    if whole.peak > limit:
-        beyond.append(f"the worst Ms is {whole.peak:.2f}, above {limit:g}")
-    if whole.resonance > settings.resonance:
-        beyond.append(
-            f"the worst peak from set-point to rate is {whole.resonance:.2f}, above "
-            f"{settings.resonance:g}"
-        )
-    if third.peak > max(limit, flown.peak):
-        beyond.append(f"a third of the way the worst Ms is {third.peak:.2f}, above {limit:g}")
-    if whole.crossover > edge:
-        beyond.append(
-            f"the crossover of {whole.crossover / (2 * np.pi):.1f} Hz is beyond the identified "
-            f"{edge / (2 * np.pi):.1f} Hz"
-        )
-    if beyond:
-        return "not to be flown", (
-            f"no gains are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, `resonance`, "
-            "`noise`, `change`), or fly more excitation"
-        )
-    better = f"{whole.rejection:.2f} of the flown effect of torque"
-    within = flown.peak <= limit and flown.resonance <= settings.resonance
-    if flown.stable == 1 and within and whole.rejection > _WORTH:
-        return "kept", (
-            f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
-            f"{count} fresh plants is {flown.peak:.2f}"
-        )
-    return "proposed", (
-        f"proposed: stable on all {count} fresh plants, worst Ms {whole.peak:.2f} of at most "
-        f"{limit:g}, {better}. Load the file for a third of the way first"
-    )

@@ -6,7 +6,6 @@ Source: docs/autopilots.md.
 """
 
 import dataclasses
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from jaxquad._core import Number
 from jaxquad.control.autopilots import (
     ArduPilotRate,
     BetaflightPID,
+    FilterChain,
     Firmware,
     firmware_of,
     Parameter,
@@ -32,11 +32,10 @@ from jaxquad.records import AXES
 
 RateLaw = BetaflightPID | PX4Rate | ArduPilotRate
 Gains = Float[np.ndarray, "designs gains"]
+Paths = Complex[np.ndarray, "designs frequencies"]
 FIELDS = ("p", "i", "d")
 _LOWEST = 0.05  # rad/s, below which only the integrals count
 _FREQUENCIES = 300
-_POINTS, _LEVELS, _NARROWED = 7, 6, 0.4  # of the search, along each gain and one after the other
-_RESERVE = 0.97  # of the limit, because fresh plants reach further than those that were tuned on
 
 
 class LoopQualities(NamedTuple):
@@ -59,6 +58,13 @@ class LoopQualities(NamedTuple):
     noise: Float[np.ndarray, "designs plants"]
 
 
+class Filters(NamedTuple):
+    """Responses of other filters of each design over those that flew."""
+
+    gyro: Paths
+    derivative: Paths
+
+
 @dataclasses.dataclass(frozen=True)
 class RateLoops:
     """The open rate loops of one axis for all plants, on a grid of frequencies.
@@ -66,10 +72,11 @@ class RateLoops:
     **Attributes:**
 
     - `omega`: rad/s.
-    - `feedback`: of the law, from the rate to minus the command, per unit of P, I and D.
+    - `feedback`: of the law, from the logged rate to minus the command, per unit of P, I and D.
     - `ahead`: likewise from the set-point to the command.
     - `plants`: from the command to the logged rate in rad/s, the hold included.
-    - `noise`: magnitude of the gyro's filters, which the logged noise has passed.
+    - `noise`: power of the logged rate's noise around each frequency, behind the flown filters.
+    - `passed`: response of the gyro's filters that flew.
     - `ceiling`: by which factor D can rise in flight (D_MAX); 1 where it cannot.
     """
 
@@ -78,21 +85,35 @@ class RateLoops:
     ahead: Complex[np.ndarray, "gains frequencies"]
     plants: Complex[np.ndarray, "plants frequencies"]
     noise: Float[np.ndarray, " frequencies"]
+    passed: Complex[np.ndarray, " frequencies"]
     ceiling: float = 1.0
 
-    def joined(self, others: "RateLoops", gains: Gains, count: int) -> "RateLoops":
-        """With the plants of `others` that have the greatest peaks under these gains."""
-        found = others.qualities(gains)
-        peak = np.where(found.stable, np.maximum(found.peak, found.resonance), np.inf)
-        worst = others.plants[np.argsort(peak.max(axis=0))[-count:]]
-        return dataclasses.replace(self, plants=np.concatenate([self.plants, worst]))
+    def of_law(self, law: RateLaw, axis: int) -> "RateLoops":
+        """The same plants under a law with other filters, as exactly as those of the flown one."""
+        back, ahead = law_paths(law, axis, self.omega)
+        changed = gyro_chain_response(law, self.omega) / self.passed
+        return dataclasses.replace(self, feedback=back * changed, ahead=ahead)
 
-    def qualities(self, gains: Gains) -> LoopQualities:
-        """What each row of P, I and D gives; stability and Ms with D at its ceiling, too."""
-        base = self._qualities(gains)
+    def worst(self, gains: Gains, count: int) -> "RateLoops":
+        """With those plants alone that have the greatest peaks under these gains."""
+        found = self.qualities(gains)
+        peak = np.where(found.stable, np.maximum(found.peak, found.resonance), np.inf)
+        order = np.argsort(peak.max(axis=0), kind="stable")
+        return dataclasses.replace(self, plants=self.plants[order[-count:]])
+
+    def joined(self, others: "RateLoops") -> "RateLoops":
+        """With the plants of `others`."""
+        return dataclasses.replace(self, plants=np.concatenate([self.plants, others.plants]))
+
+    def qualities(self, gains: Gains, filters: Filters | None = None) -> LoopQualities:
+        """What each row of P, I and D gives; stability and Ms with D at its ceiling, too.
+
+        `filters` are the responses of other filters over those that flew.
+        """
+        base = self._qualities(*self.paths(gains, filters))
         if self.ceiling == 1:
             return base
-        raised = self._qualities(gains * np.array([[1.0, 1.0, self.ceiling]]))
+        raised = self._qualities(*self.paths(gains * np.array([[1, 1, self.ceiling]]), filters))
         return base._replace(
             stable=base.stable & raised.stable,
             peak=np.maximum(base.peak, raised.peak),
@@ -100,24 +121,59 @@ class RateLoops:
             crossover=np.maximum(base.crossover, raised.crossover),
         )
 
-    def _qualities(self, gains: Gains) -> LoopQualities:
-        feedback = (gains @ self.feedback)[:, None]
-        through = feedback * self.plants[None]
-        distance = 1 + through
-        phase = np.unwrap(np.angle(distance), axis=-1)
-        # From -pi at the double integrator to 0; 2 pi higher for each pair of unstable poles.
-        begun = phase[..., 0] - 2 * np.pi * np.round(phase[..., -1] / (2 * np.pi))
-        above = np.where(np.abs(through) > 1, self.omega, 0.0)
-        torque = np.abs(self.plants[None] / distance / self.omega) ** 2
-        command = np.abs(feedback * self.noise / distance) ** 2
+    def paths(self, gains: Gains, filters: Filters | None = None) -> tuple[Paths, Paths]:
+        """The law from the logged rate to minus the command, and from the set-point to it."""
+        if filters is None:
+            return gains @ self.feedback, gains @ self.ahead
+        both, slow, quick = filters.gyro, gains[:, :2], gains[:, 2:]
+        back = slow @ self.feedback[:2] + (quick @ self.feedback[2:]) * filters.derivative
+        return back * both, slow @ self.ahead[:2] + (quick @ self.ahead[2:]) * filters.derivative
+
+    def _qualities(self, feedback: Paths, ahead: Paths) -> LoopQualities:
+        through = feedback[:, None] * self.plants[None]
+        real, imaginary = 1 + through.real, through.imag
+        distance = real**2 + imaginary**2
+        inverse = 1 / distance
+        plants, cells = _power(self.plants), cells_of(self.omega)
+        asked = (inverse * _power(ahead)[:, None] * plants).max(axis=-1)
+        above = distance - 2 * real + 1 > 1  # |L|
+        last = above.shape[-1] - 1 - np.argmax(above[..., ::-1], axis=-1)
         return LoopQualities(
-            begun < 0,
-            1 / np.min(np.abs(distance), axis=-1),
-            np.max(np.abs((gains @ self.ahead)[:, None] * self.plants / distance), axis=-1),
-            np.max(above, axis=-1),
-            np.sqrt(np.trapezoid(torque, self.omega, axis=-1)),
-            np.sqrt(np.trapezoid(command, self.omega, axis=-1)),
+            _is_stable(real, imaginary),
+            1 / np.sqrt(distance.min(axis=-1)),
+            np.sqrt(asked),
+            np.where(above.any(axis=-1), self.omega[last], 0.0),
+            np.sqrt(np.einsum("dpf,pf->dp", inverse, plants / self.omega**2 * cells)),
+            np.sqrt(np.einsum("dpf,df->dp", inverse, _power(feedback) * self.noise)),
         )
+
+
+def _power(response: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    return response.real**2 + response.imag**2
+
+
+def cells_of(omega: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " frequencies"]:
+    """The width around each frequency, by the trapezoidal rule."""
+    edges = np.concatenate([omega[:1], (omega[1:] + omega[:-1]) / 2, omega[-1:]])
+    return np.diff(edges)
+
+
+def _is_stable(
+    real: Float[np.ndarray, "designs plants frequencies"],
+    imaginary: Float[np.ndarray, "designs plants frequencies"],
+) -> Bool[np.ndarray, "designs plants"]:
+    """Whether 1 + L turns from -pi, of the double integrator, to 0; 2 pi for each unstable pair."""
+    upper = imaginary >= 0
+    design, plant, k = np.nonzero(upper[..., 1:] != upper[..., :-1])
+    at = lambda x, k: x[design, plant, k]
+    cross = at(real, k) * at(imaginary, k + 1) - at(real, k + 1) * at(imaginary, k)
+    falls = at(upper, k)  # through the real axis; left of 0 where the cross product says so
+    turns = np.where(falls & (cross > 0), 1, 0) - np.where(~falls & (cross < 0), 1, 0)
+    whole = np.zeros(real.shape[:2])
+    np.add.at(whole, (design, plant), turns)
+    ends = [np.arctan2(imaginary[..., end], real[..., end]) for end in (0, -1)]
+    rounds = np.round((ends[1] + 2 * np.pi * whole) / (2 * np.pi))
+    return ends[0] - 2 * np.pi * rounds < 0
 
 
 def make_loops(law: RateLaw, axis: int, fit: Fit, unit: str, plants: int, seed: int) -> RateLoops:
@@ -126,13 +182,33 @@ def make_loops(law: RateLaw, axis: int, fit: Fit, unit: str, plants: int, seed: 
     Raises ValueError where a drawn gain is not above 0.
     """
     omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
-    seen = without_gyro_filters(law)  # the logged rate is behind them: they are in the plant
-    each = [_alone(seen, name) for name in FIELDS]
-    ahead, back = np.stack([law_responses(one, axis, omega) for one in each], axis=1)
+    back, ahead = law_paths(law, axis, omega)
     per_radian = np.pi / 180 if unit == "deg/s" else 1.0
     responses = per_radian * _sampled_plants(fit, omega, law.dt, plants, seed)
-    passed = np.abs(law_responses(_alone(law, "p"), axis, omega)[1] / back[0])
-    return RateLoops(omega, -back, ahead, responses, passed, _ceiling(law, axis))
+    passed = gyro_chain_response(law, omega)
+    white = cells_of(omega) * _power(passed)
+    return RateLoops(omega, back, ahead, responses, white, passed, _ceiling(law, axis))
+
+
+def law_paths(
+    law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
+) -> tuple[Complex[np.ndarray, "gains frequencies"], Complex[np.ndarray, "gains frequencies"]]:
+    """Per unit of P, I and D: from the filtered rate to minus the command, from the set-point."""
+    seen = without_gyro_filters(law)  # the logged rate is behind them: they are in the plant
+    each = [law_responses(_alone(seen, name), axis, omega) for name in FIELDS]
+    ahead, back = np.stack(each, axis=1)
+    return -back, ahead
+
+
+def gyro_chain_response(
+    law: RateLaw, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, " frequencies"]:
+    """Of all filters of the gyro, at their own rates."""
+    hertz = omega / (2 * np.pi)
+    passed = np.asarray(law.gyro.response(hertz))
+    if isinstance(law, BetaflightPID) and law.filters:
+        passed = passed * np.asarray(FilterChain(law.filters, 1 / law.dt).response(hertz))
+    return passed
 
 
 def _alone(law: RateLaw, name: str) -> RateLaw:
@@ -193,98 +269,10 @@ def gains_of(law: RateLaw, axis: int) -> Float[np.ndarray, " gains"]:
     return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in FIELDS])
 
 
-class Targets(NamedTuple):
-    """What a search keeps.
-
-    **Attributes:**
-
-    - `peak`: Ms at most; `resonance`: the peak from set-point to rate at most.
-    - `noise`: of the flown gains' noise, at most.
-    - `change`: factor by which a gain may rise or fall.
-    - `crossover`: rad/s at most, where the identified band ends.
-    """
-
-    peak: float
-    resonance: float
-    noise: float
-    change: float
-    crossover: float
-
-
-def search_gains(
-    loops: RateLoops,
-    flown: Float[np.ndarray, " gains"],
-    targets: Targets,
-    firmware: Firmware,
-    axis: int,
-) -> Float[np.ndarray, " gains"]:
-    """The stored gains that reject torque best within the targets, on all plants of `loops`.
-
-    Gains of 0 stay. Where nothing keeps the targets, the gains that come nearest.
-    """
-    free = np.flatnonzero(flown > 0)
-    rows = [_row(firmware, axis, FIELDS[k]) for k in free]
-    least = np.array([max(row.low, 1e-9) for row in rows])
-    most = np.array([row.high for row in rows])
-    low = np.clip(flown[free] / targets.change, least, most)
-    high = np.clip(flown[free] * targets.change, least, most)
-    score = _Score(loops, flown, free, targets)
-    middle, half = np.log(low * high) / 2, np.log(high / low) / 2
-    for _ in range(_LEVELS):
-        axes = [
-            np.clip(np.linspace(m - h, m + h, _POINTS), np.log(a), np.log(b))
-            for m, h, a, b in zip(middle, half, low, high, strict=True)
-        ]
-        points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
-        middle, half = points[np.argmin(score(np.exp(points)))], _NARROWED * half
-    stored = _stored_near(np.exp(middle), rows, low, high)
-    gains = flown.copy()
-    gains[free] = stored[np.argmin(score(stored))]
-    return gains
-
-
-class _Score:
-    """What is least for the best design; designs beyond a target come after all that keep them."""
-
-    def __init__(self, loops: RateLoops, flown: np.ndarray, free: np.ndarray, targets: Targets):
-        self.loops, self.flown, self.free, self.targets = loops, flown, free, targets
-        self.noise = loops.qualities(flown[None]).noise
-
-    def __call__(self, points: Gains) -> Float[np.ndarray, " designs"]:
-        gains = np.tile(self.flown, (len(points), 1))
-        gains[:, self.free] = points
-        parts = np.array_split(gains, max(1, len(gains) // 64))
-        return np.concatenate([self._of(part) for part in parts])
-
-    def _of(self, gains: Gains) -> Float[np.ndarray, " designs"]:
-        found, targets = self.loops.qualities(gains), self.targets
-        beyond = np.stack([
-            np.max(found.peak, axis=1) / (_RESERVE * targets.peak),
-            np.max(found.resonance, axis=1) / (_RESERVE * targets.resonance),
-            np.mean(found.noise / self.noise, axis=1) / targets.noise,
-            np.max(found.crossover, axis=1) / targets.crossover,
-        ]).max(axis=0)  # fmt: skip
-        beyond = np.where(np.all(found.stable, axis=1), beyond, 1e6 * beyond)
-        rejection = np.sqrt(np.mean(found.rejection**2, axis=1))
-        return np.where(beyond <= 1, rejection, 1e9 * beyond)
-
-
-def _row(firmware: Firmware, axis: int, field: str) -> Parameter:
+def gain_row(firmware: Firmware, axis: int, field: str) -> Parameter:
+    """The parameter of a gain of one axis."""
     rows = PARAMETERS[firmware].values()
     return next(row for row in rows if row.field == field and row.axis == axis)
-
-
-def _stored_near(
-    gains: np.ndarray, rows: Sequence[Parameter], low: np.ndarray, high: np.ndarray
-) -> Gains:
-    """The whole numbers, or numbers of three digits, around some gains, from `low` to `high`."""
-    around = []
-    for value, row, least, most in zip(gains, rows, low, high, strict=True):
-        step = 1.0 if row.whole else 10 ** (np.floor(np.log10(value)) - 2)
-        pair = np.round(np.array([np.floor(value / step), np.ceil(value / step)]) * step, 12)
-        inside = (pair >= least * (1 - 1e-9)) & (pair <= most * (1 + 1e-9))
-        around.append(np.unique(pair[inside] if inside.any() else pair))
-    return np.array(list(itertools.product(*around)))
 
 
 def parameters_of(law: RateLaw, axis: int, gains: Float[np.ndarray, " gains"]) -> dict[str, float]:
@@ -292,7 +280,7 @@ def parameters_of(law: RateLaw, axis: int, gains: Float[np.ndarray, " gains"]) -
     firmware = firmware_of(law)
     flown = gains_of(law, axis)
     found = {
-        _row(firmware, axis, name).name: float(gain)
+        gain_row(firmware, axis, name).name: float(gain)
         for name, gain, old in zip(FIELDS, gains, flown, strict=True)
         if old > 0
     }
@@ -314,7 +302,7 @@ def gains_in(
     """P, I and D of parameters; those that are not named stay."""
     firmware, gains = firmware_of(law), gains_of(law, axis)
     for k, name in enumerate(FIELDS):
-        gains[k] = parameters.get(_row(firmware, axis, name).name, gains[k])
+        gains[k] = parameters.get(gain_row(firmware, axis, name).name, gains[k])
     return gains
 
 
@@ -338,20 +326,22 @@ class Stage(NamedTuple):
     noise: float
 
 
-def certify_gains(loops: RateLoops, designs: Sequence[np.ndarray]) -> list[Stage]:
-    """What each of the designs gives, the first of which is what flew."""
-    found = loops.qualities(np.array(designs))
-    rms = lambda x: np.sqrt(np.mean(x**2, axis=1))
-    rejection, noise = rms(found.rejection), rms(found.noise)
+def certify_gains(
+    loops: Sequence[RateLoops], designs: Sequence[Float[np.ndarray, " gains"]]
+) -> list[Stage]:
+    """What each of the designs gives under its own law, the first of which is what flew."""
+    found = [one.qualities(gains[None]) for one, gains in zip(loops, designs, strict=True)]
+    rms = lambda x: float(np.sqrt(np.mean(x**2)))
+    first = found[0]
     return [
         Stage(
             tuple(map(float, gains)),
-            float(np.mean(found.stable[k])),
-            float(np.max(found.peak[k])),
-            float(np.max(found.resonance[k])),
-            float(np.median(found.crossover[k])),
-            float(rejection[k] / rejection[0]),
-            float(noise[k] / noise[0]),
+            float(np.mean(each.stable)),
+            float(np.max(each.peak)),
+            float(np.max(each.resonance)),
+            float(np.median(each.crossover)),
+            rms(each.rejection) / rms(first.rejection),
+            rms(each.noise) / rms(first.noise),
         )
-        for k, gains in enumerate(designs)
+        for each, gains in zip(found, designs, strict=True)
     ]

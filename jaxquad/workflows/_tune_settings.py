@@ -125,10 +125,11 @@ class AutopilotSettings(Settings):
         "fit between these frequencies, in Hz; by default what the record resolves",
         group=THE_RECORD,
     )
-    throttle: float = option_field(
+    throttle: float | None = option_field(
         kinds.POSITIVE,
-        0.3,
-        "of 1, at which Betaflight's dynamic filters and TPA are taken; 0.3 by default",
+        None,
+        "of 1, at which Betaflight's dynamic filters and TPA are taken; by default the log's "
+        "median, 0.3 where it does not hold the throttle",
         group=THE_RECORD,
     )
     sensitivity: float = option_field(
@@ -149,8 +150,11 @@ class AutopilotSettings(Settings):
     change: float = option_field(
         kinds.POSITIVE,
         3.0,
-        "factor within which each gain stays of what flew; 3 by default",
+        "factor within which each gain and cutoff stays of what flew; 3 by default",
         group=_KEPT,
+    )
+    keep_filters: bool = option_field(
+        kinds.SWITCH, False, "leave the filters as they flew, and tune gains alone", group=_KEPT
     )
     members: int = option_field(
         kinds.SIZE, 32, "number of plants to tune on; 32 by default", group=_PLANTS
@@ -161,7 +165,7 @@ class AutopilotSettings(Settings):
     seed: int = option_field(kinds.COUNT, 0, "of the random draws; 0 by default", group=_PLANTS)
 
     def _check_together(self) -> None:
-        if self.throttle > 1:
+        if self.throttle is not None and self.throttle > 1:
             raise SettingsError(f"`throttle` is {self.throttle:g}: give a share, above 0 to 1")
         if self.sensitivity <= 1:
             raise SettingsError(

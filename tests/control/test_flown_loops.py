@@ -6,6 +6,12 @@ import pytest
 from jaxquad.control.autopilots import (
     ardupilot_loop,
     betaflight_loop,
+    BetaflightPID,
+    change_filters,
+    filter_choices,
+    FilterChain,
+    find_parameter,
+    flown_loop,
     predict_loop,
     px4_loop,
     replay_terms,
@@ -50,6 +56,64 @@ def test_from_2025_on_d_is_the_base():
     assert law.d_max is not None
     assert float(law.d[0]) == 30 and float(law.d_max.ceiling[0]) == 40
     np.testing.assert_allclose(law.integral_limit, [400, 400, 320])
+
+
+PX4_VALUES = {
+    **{f"MC_{axis}RATE_{k}": x for axis in ("ROLL", "PITCH", "YAW")
+       for k, x in (("P", "0.15"), ("I", "0.2"), ("D", "0.003"))},
+    "IMU_GYRO_CUTOFF": "40", "IMU_DGYRO_CUTOFF": "30",
+}  # fmt: skip
+ARDUPILOT_VALUES = {
+    **{f"ATC_RAT_{axis}_{k}": x for axis in ("RLL", "PIT", "YAW")
+       for k, x in (("P", "0.135"), ("I", "0.135"), ("D", "0.0036"))},
+    "INS_GYRO_FILTER": "20", "ATC_RAT_PIT_FLTD": "30",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("firmware", "values", "names"),
+    [
+        ("betaflight", HEADER, [
+            ("gyro_lpf1_dyn_min_hz", "gyro_lpf1_dyn_max_hz"), ("gyro_lpf2_static_hz",),
+            ("dterm_lpf1_dyn_min_hz", "dterm_lpf1_dyn_max_hz"), ("dterm_lpf2_static_hz",),
+            ("gyro_notch2_hz", "gyro_notch2_cutoff"),  # the first one is on
+        ]),
+        ("px4", PX4_VALUES, [
+            ("IMU_GYRO_CUTOFF",), ("IMU_DGYRO_CUTOFF",), ("IMU_GYRO_NF0_FRQ", "IMU_GYRO_NF0_BW"),
+        ]),
+        ("ardupilot", ARDUPILOT_VALUES, [("INS_GYRO_FILTER",), ("ATC_RAT_PIT_FLTD",)]),
+    ],
+)  # fmt: skip
+def test_every_option_of_a_filter_can_be_stored_and_gives_the_loop_it_describes(
+    firmware, values, names
+):
+    version = (4, 5, 0)
+    choices = filter_choices(firmware, values, version, axis=1, change=2.0, line_hz=110.0)
+    assert [choice.names for choice in choices] == names
+    before = flown_loop(firmware, values, version).law
+    f = np.array([3.0, 40.0, 140.0])
+    for choice in choices:
+        for option in (choice.options[0], choice.options[choice.flown], choice.options[-1]):
+            for name, value in option.parameters.items():
+                row = find_parameter(firmware, name)
+                assert row.low <= value <= row.high and (not row.whole or value == round(value))
+            changed = change_filters(firmware, values, option.parameters)
+            after = flown_loop(firmware, changed, version).law
+            if choice.stage == "derivative" or option.filter is None:
+                continue
+            # The chain changes by the option's response over that of the filter that flew.
+            flown = choice.options[choice.flown].filter
+            ratio = _alone(option.filter, choice.rate_hz, f) / _alone(flown, choice.rate_hz, f)
+            np.testing.assert_allclose(_gyro(after, f) / _gyro(before, f), ratio, rtol=0.01)
+
+
+def _alone(filter, rate_hz, hertz):
+    return 1.0 if filter is None else np.asarray(FilterChain((filter,), rate_hz).response(hertz))
+
+
+def _gyro(law, hertz):
+    own = FilterChain(law.filters, 1 / law.dt) if isinstance(law, BetaflightPID) else FilterChain()
+    return np.asarray(law.gyro.response(hertz)) * np.asarray(own.response(hertz))
 
 
 def test_a_header_without_gains_is_refused():

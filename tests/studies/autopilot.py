@@ -57,12 +57,12 @@ def main() -> None:
             kinds[found.kind] += 1
             line = f"{k:3d} {found.kind}"
             if found.kind == "proposed":
-                before, _, after = found.stages
-                peaks.append(1 / np.min(np.abs(1 + vehicle.loop(after.gains, omega))))
+                after, changed = found.stages[-1], vehicle.proposed(found.new)
+                peaks.append(1 / np.min(np.abs(1 + changed.loop(omega))))
                 certified.append(after.peak)
-                moved = [vehicle.effect(each.gains) for each in (before, after)]
-                gusts.append(moved[1] / moved[0])
+                gusts.append(changed.effect() / vehicle.effect())
                 line += f" Ms {peaks[-1]:.2f}, certified {after.peak:.2f}, gusts {gusts[-1]:.2f}"
+                line += f", filters {changed.cutoff:.0f} and {changed.slope:.0f} Hz"
             print(line, flush=True)
     print(f"{count} flights, seed {SEED}: {dict(kinds)}")
     if not peaks:

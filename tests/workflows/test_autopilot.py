@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from log_writers import DataFlash
 from px4_flights import Vehicle, write_log
+from scipy import signal
 
 from jaxquad.cli import main
 from jaxquad.control.autopilots import betaflight_loop, px4_loop
@@ -64,6 +65,8 @@ def test_the_written_parameters_hold_on_the_true_plant(log, tmp_path, capsys):
     whole = read_params((tmp_path / "proposal_100.params").read_text())
     back = read_params((tmp_path / "proposal_revert.params").read_text())
     assert set(whole) == set(back) <= {"MC_ROLLRATE_P", "MC_ROLLRATE_I", "MC_ROLLRATE_D"}
+    assert content["filters"]["text"].startswith("as they flew: ")  # the noise's limit is reached
+    assert 100 < content["noise"]["known_hz"] < 200  # behind a low-pass of 40 Hz, in a log of 400
     for name, value in back.items():
         assert value == pytest.approx(PARAMETERS[name], rel=1e-6)
     # The file gives the loop that was certified.
@@ -71,11 +74,12 @@ def test_the_written_parameters_hold_on_the_true_plant(log, tmp_path, capsys):
     before, _, after = content["stages"]
     assert after["gains"] == pytest.approx([float(x[0]) for x in (law.p, law.i, law.d)])
     omega = np.geomspace(0.1, 400 * np.pi * 0.99, 2000)
-    peaks = [1 / np.min(np.abs(1 + VEHICLE.loop(x["gains"], omega))) for x in (before, after)]
+    both = VEHICLE, VEHICLE.proposed(whole)
+    peaks = [1 / np.min(np.abs(1 + vehicle.loop(omega))) for vehicle in both]
     assert peaks[0] <= before["peak"] and peaks[1] <= after["peak"] <= 1.8
     # The certificate is of the truth's size, and torque moves the rate less.
     assert after["peak"] < 1.25 * peaks[1]
-    moved = [VEHICLE.effect(x["gains"]) for x in (before, after)]
+    moved = [vehicle.effect() for vehicle in both]
     assert after["rejection"] < 0.7 and moved[1] < 0.8 * moved[0]
     assert "searching gains on" in printed.err
 
@@ -101,18 +105,25 @@ BETAFLIGHT = {
 }  # fmt: skip
 
 
-def fly_betaflight(seconds=24.0, noise=2.0):
-    """Set-point, pidsum and rate in deg/s at 1 kHz, by Betaflight's equations."""
+def fly_betaflight(seconds=24.0, noise=2.0, gyro_hz=0.0, line=(0.0, 0.0)):
+    """Set-point, pidsum, filtered and unfiltered rate in deg/s at 1 kHz, by its equations.
+
+    The gyro has a pt1 at `gyro_hz` (0: none), and a line of so many Hz and deg/s.
+    """
     rng, samples = np.random.default_rng(5), int(seconds * RATE)
     time, rise = np.arange(samples) / RATE, np.log(50.0) / seconds
     r = np.round(150 * np.sin(2 * np.pi * (np.exp(rise * time) - 1) / rise)).tolist()
-    jitter, decay = (noise * rng.standard_normal(samples)).tolist(), float(np.exp(-1 / RATE / LAG))
+    hum = line[1] * np.sin(2 * np.pi * line[0] * time)
+    jitter = (noise * rng.standard_normal(samples) + hum).tolist()
+    decay = float(np.exp(-1 / RATE / LAG))
+    passed = 1 - 1 / (1 + 2 * np.pi * gyro_hz / RATE) if gyro_hz else 1.0
     p, i, d = 0.032029 * PID[0], 0.244381 * PID[1], 0.000529 * PID[2]
     share = 1 - 1 / (1 + 2 * np.pi * SLOPE_HZ / RATE)
-    push = rate = smooth = integral = 0.0
-    sent, rates = [0.0] * LATE, []
+    push = rate = smooth = integral = y = 0.0
+    sent, rates, unfiltered = [0.0] * LATE, [], []
     for k in range(samples):
-        y = rate + jitter[k]
+        unfiltered.append(rate + jitter[k])
+        y += passed * (rate + jitter[k] - y)
         integral += i * (r[k] - y) / RATE
         before, smooth = smooth, smooth + share * (y - smooth)
         sent.append(p * (r[k] - y) + integral - d * (smooth - before) * RATE)
@@ -120,37 +131,51 @@ def fly_betaflight(seconds=24.0, noise=2.0):
         wanted = GAIN * sent[k]
         rate += (wanted + (push - wanted) * LAG * RATE * (1 - decay)) / RATE
         push = wanted + (push - wanted) * decay
-    return r, sent[LATE:], rates
+    return r, sent[LATE:], rates, unfiltered
 
 
-def betaflight_loop_of(gains, omega):
-    """L of these gains of the CLI, in the frequency domain."""
+def betaflight_loop_of(gains, omega, slope_hz=SLOPE_HZ):
+    """L of these gains of the CLI, in the frequency domain, without the gyro's filters."""
     s, z = 1j * omega, np.exp(1j * omega / RATE)
     p, i, d = 0.032029 * gains[0], 0.244381 * gains[1], 0.000529 * gains[2]
-    share = 1 - 1 / (1 + 2 * np.pi * SLOPE_HZ / RATE)
+    share = 1 - 1 / (1 + 2 * np.pi * slope_hz / RATE)
     slope = RATE * (1 - 1 / z) * share / (1 - (1 - share) / z)
     # The lag of 25 ms lets no alias through.
     plant = GAIN / (s * (LAG * s + 1)) * (1 - 1 / z) / (s / RATE) * z**-LATE
     return plant * (p + i / RATE / (1 - 1 / z) + d * slope)
 
 
-@pytest.mark.slow
-def test_betaflights_file_holds_whole_numbers_that_keep_the_limit_with_d_raised(tmp_path):
+def write_blackbox(path, flown, changed, every=1):
+    """A log of roll; axisI is put aside for the unfiltered gyro, with as many bits."""
+    names = [name.replace("axisI", "gyroUnfilt") for name in blackbox_writer.NAMES]
     level = {name: blackbox_rows.LEVEL.get(name, 0) for name in blackbox_writer.NAMES}
     rows = [
         level | {
-            "loopIteration": k, "time": 5_000_000 + 1000 * k, "axisP[0]": round(u),
+            "loopIteration": every * k, "time": 5_000_000 + 1000 * every * k, "axisP[0]": round(u),
             "rcCommand[0]": round(r), "setpoint[0]": round(r), "gyroADC[0]": round(y),
+            "axisI[0]": round(x),
         }
-        for k, (r, u, y) in enumerate(zip(*fly_betaflight(), strict=True))
+        for k, (r, u, y, x) in enumerate(list(zip(*flown, strict=True))[::every])
     ]  # fmt: skip
-    path = tmp_path / "flight.bbl"
-    path.write_bytes(blackbox_rows.log(rows, changed=BETAFLIGHT))
-    assert main(["autopilot", str(path), "--axis", "roll", "--out", str(tmp_path)]) == 0
-    lines = (tmp_path / "proposal_100.txt").read_text().splitlines()
-    words = [line.split() for line in lines if line.startswith("set ") and "OFF" not in line]
+    named = BETAFLIGHT | {"Field I name": ",".join(names)} | changed
+    path.write_bytes(blackbox_rows.log(rows, logged=f"1/{every}", changed=named))
+    return path
+
+
+def read_cli(path):
+    """What a file for the CLI sets to a number."""
+    words = [line.split() for line in path.read_text().splitlines() if line.startswith("set ")]
+    return {name: int(value) for _, name, _, value in words if value != "OFF"}
+
+
+@pytest.mark.slow
+def test_betaflights_file_holds_whole_numbers_that_keep_the_limit_with_d_raised(tmp_path):
+    path = write_blackbox(tmp_path / "flight.bbl", fly_betaflight(), {})
+    options = ["--axis", "roll", "--keep-filters", "--out", str(tmp_path)]
+    assert main(["autopilot", str(path), *options]) == 0
     old = {"p_roll": 28, "i_roll": 40, "d_min_roll": 18, "d_roll": 26}
-    new = old | {name: int(value) for _, name, _, value in words}
+    changed = read_cli(tmp_path / "proposal_100.txt")
+    new = old | changed
     assert new != old and set(new) == set(old)
     omega = np.geomspace(0.1, 0.99 * np.pi * RATE, 2000)
     for d in (new["d_min_roll"], new["d_roll"]):
@@ -159,8 +184,63 @@ def test_betaflights_file_holds_whole_numbers_that_keep_the_limit_with_d_raised(
     changed = {"rollPID": f"{new['p_roll']},{new['i_roll']},{new['d_roll']}",
                "d_min": f"{new['d_min_roll']},30,0"}  # fmt: skip
     law = betaflight_loop(BETAFLIGHT | changed, (4, 5, 1)).law
-    after = json.loads((tmp_path / "autopilot.json").read_text())["stages"][-1]
-    assert after["gains"] == [float(x[0]) for x in (law.p, law.i, law.d)]
+    content = json.loads((tmp_path / "autopilot.json").read_text())
+    assert content["stages"][-1]["gains"] == [float(x[0]) for x in (law.p, law.i, law.d)]
+    assert "keep_filters" in content["filters"]["text"]
+
+
+GYRO_HZ, LINE = 80.0, (160.0, 30.0)  # Hz; of a frame that rings, Hz and deg/s
+
+
+def gyro_of(parameters, omega):
+    """The gyro's pt1 and the static notch of these parameters, written once more."""
+    z = np.exp(1j * omega / RATE)
+    share = 1 - 1 / (1 + 2 * np.pi * parameters.get("gyro_lpf1_static_hz", GYRO_HZ) / RATE)
+    passed = share / (1 - (1 - share) / z)
+    centre, low = (parameters.get(f"gyro_notch1_{end}", 0.0) for end in ("hz", "cutoff"))
+    if centre:
+        b, a = signal.iirnotch(centre, centre * low / (centre**2 - low**2), fs=RATE)
+        passed = passed * signal.freqz(b, a, worN=omega / RATE)[1]
+    return passed
+
+
+@pytest.mark.slow
+def test_a_line_of_the_gyro_gets_a_notch_and_the_low_passes_open(tmp_path, capsys):
+    filters = {
+        "gyro_lpf1_static_hz": "80", "gyro_notch_hz": "0,0", "gyro_notch_cutoff": "0,0",
+    }  # fmt: skip
+    flown = fly_betaflight(gyro_hz=GYRO_HZ, line=LINE)
+    path = write_blackbox(tmp_path / "flight.bbl", flown, filters)
+    assert main(["autopilot", str(path), "--axis", "roll", "--out", str(tmp_path)]) == 0
+    new, third, back = (
+        read_cli(tmp_path / f"proposal_{end}.txt") for end in ("100", "033", "revert")
+    )
+    # The notch is where the line is, at once; the low-pass opens, in two steps.
+    assert abs(new["gyro_notch1_hz"] - LINE[0]) <= 2 and third["gyro_notch1_hz"] == LINE[0]
+    assert GYRO_HZ < third["gyro_lpf1_static_hz"] < new["gyro_lpf1_static_hz"]
+    assert (back["gyro_notch1_hz"], back["gyro_lpf1_static_hz"]) == (0, GYRO_HZ)
+    before, _, after = json.loads((tmp_path / "autopilot.json").read_text())["stages"]
+    # Ms of the true plant with the written filters, which turn the plant of the log.
+    omega = np.geomspace(0.1, 0.99 * np.pi * RATE, 4000)
+    slope = new.get("dterm_lpf1_static_hz", SLOPE_HZ)
+    loop = betaflight_loop_of(after["gains"], omega, slope) * gyro_of(new, omega)
+    assert 1 / np.min(np.abs(1 + loop)) <= after["peak"] <= 1.8
+    # The command's noise, flown again: the line is gone, and the lag has not grown.
+    said = capsys.readouterr().out
+    assert after["noise"] < 1 and "with filters it is" in said
+    at = np.array([2 * np.pi * 5.0])
+    late = [-np.angle(gyro_of(x, at))[0] for x in ({}, new)]
+    assert late[1] <= late[0]
+
+
+@pytest.mark.slow
+def test_a_log_that_is_too_slow_for_the_noise_keeps_its_filters_and_says_why(tmp_path, capsys):
+    flown = fly_betaflight(gyro_hz=GYRO_HZ)
+    path = write_blackbox(tmp_path / "slow.bbl", flown, {"gyro_lpf1_static_hz": "80"}, every=4)
+    assert main(["autopilot", str(path), "--axis", "roll", "--out", str(tmp_path)]) in (0, 3)
+    said = capsys.readouterr().out
+    assert "as they flew: the gyro of the log shows its noise up to 112 Hz" in said
+    assert not any("lpf" in name for name in read_cli(tmp_path / "proposal_revert.txt"))
 
 
 def fly_ardupilot(gains, seconds=30.0, noise=0.01):

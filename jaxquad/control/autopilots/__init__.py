@@ -11,6 +11,13 @@ from ._betaflight import (
     ItermRelax as ItermRelax,
     tpa_factor as tpa_factor,
 )
+from ._choices import (
+    change_filters as change_filters,
+    filter_choices as filter_choices,
+    FilterChoice as FilterChoice,
+    FilterOption as FilterOption,
+    flown_loop as flown_loop,
+)
 from ._crazyflie import CrazyflieAttitude as CrazyflieAttitude, CrazyflieRate as CrazyflieRate
 from ._filters import (
     ardupilot_notch as ardupilot_notch,

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Generic, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -141,6 +141,44 @@ def betaflight_loop(
         read.number("tpa_mode", default=1.0) == 0,
     )  # fmt: skip
     return dataclasses.replace(flown, law=flown.at(throttle))
+
+
+class FlownLowPass(NamedTuple):
+    """A low-pass of Betaflight's gyro or D term that is on, with what sets its cutoff, in Hz."""
+
+    stage: Literal["gyro", "derivative"]
+    parameters: Mapping[str, float]  # lowest and highest cutoff of a dynamic one
+    filter: Filter
+    rate_hz: float
+
+
+def betaflight_low_passes(
+    values: Mapping[str, str], version: Sequence[int], *, throttle: float = 0.3
+) -> tuple[FlownLowPass, ...]:
+    """The low-passes of a Betaflight header that are on, at a throttle of 0 to 1."""
+    read = _Header(values, tuple(version))
+    looptime, denominator = read.number("looptime"), read.number("pid_process_denom", default=1.0)
+    gyro_hz, loop_hz = 1e6 / looptime, 1e6 / looptime / denominator
+    found: list[FlownLowPass] = []
+    stages: tuple[tuple[Literal["gyro", "derivative"], str, tuple, tuple, float], ...] = (
+        ("gyro", "gyro", _GYRO_LOW_PASS, _GYRO_SECOND, gyro_hz),
+        ("derivative", "dterm", _DTERM_LOW_PASS, _DTERM_SECOND, loop_hz),
+    )
+    for stage, name, first, second, rate in stages:
+        filters, dynamic = read.low_pass(first, loop_hz)
+        for each in _retuned(filters, dynamic, throttle):
+            ends = (
+                {f"{name}_lpf1_static_hz": _cutoff(each)} if dynamic is None
+                else {f"{name}_lpf1_dyn_min_hz": dynamic[0], f"{name}_lpf1_dyn_max_hz": dynamic[1]}
+            )  # fmt: skip
+            found.append(FlownLowPass(stage, ends, each, loop_hz))
+        for each in read.second_low_pass(second):
+            found.append(FlownLowPass(stage, {f"{name}_lpf2_static_hz": _cutoff(each)}, each, rate))
+    return tuple(found)
+
+
+def _cutoff(low_pass: Filter) -> float:
+    return float(np.ravel(vars(low_pass)["cutoff_hz"])[0])
 
 
 _GYRO_LOW_PASS = (

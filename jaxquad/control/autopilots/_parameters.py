@@ -92,6 +92,9 @@ def _betaflight() -> list[Parameter]:
 _BETAFLIGHT_FILTERS = (
     ("gyro_lpf1_dyn_min_hz", 250), ("gyro_lpf1_dyn_max_hz", 500), ("gyro_lpf2_static_hz", 500),
     ("dterm_lpf1_dyn_min_hz", 75), ("dterm_lpf1_dyn_max_hz", 150), ("dterm_lpf2_static_hz", 150),
+    ("gyro_lpf1_static_hz", 250), ("dterm_lpf1_static_hz", 75),
+    ("gyro_notch1_hz", 0), ("gyro_notch1_cutoff", 0), ("gyro_notch2_hz", 0),
+    ("gyro_notch2_cutoff", 0),
 )  # fmt: skip
 
 
@@ -115,8 +118,8 @@ def _px4() -> list[Parameter]:
         Parameter("MC_YAW_TQ_CUTOFF", "Hz", 2, 0, _INF, False, "torque_hz", 2),
         Parameter("IMU_GYRO_CUTOFF", "Hz", 40, 0, 1000, False, "gyro"),
         Parameter("IMU_DGYRO_CUTOFF", "Hz", 20, 0, 1000, False, "derivative_hz"),
-        Parameter("IMU_GYRO_NF0_FRQ", "Hz", 0, 0, _INF),
-        Parameter("IMU_GYRO_NF0_BW", "Hz", 20, 0, _INF),
+        *(Parameter(f"IMU_GYRO_NF{k}_FRQ", "Hz", 0, 0, _INF) for k in (0, 1)),
+        *(Parameter(f"IMU_GYRO_NF{k}_BW", "Hz", 20, 0, _INF) for k in (0, 1)),
         Parameter("IMU_GYRO_RATEMAX", "Hz", 400, 100, 2000, True),
         Parameter("THR_MDL_FAC", "", 0, 0, 1),
         Parameter("MC_AIRMODE", "", 0, 0, 2, True),

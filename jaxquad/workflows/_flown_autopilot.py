@@ -1,0 +1,71 @@
+"""The rate loop of a log: its law, its parameters, and the same with other filters."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxquad._core import Number
+from jaxquad.control.autopilots import change_filters, Firmware, flown_loop
+from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
+
+from ._rate_gains import gains_of, parameters_of, RateLaw
+from ._tune_settings import AutopilotSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class FlownAutopilot:
+    """The rate loop of a log: firmware, version, law and what of it is not modelled.
+
+    `values` are the log's own parameters, and `throttle` is where Betaflight's dynamic filters and
+    TPA are taken.
+    """
+
+    firmware: Firmware
+    version: tuple[int, ...]
+    axis: int
+    law: RateLaw
+    parameters: Mapping[str, float]
+    unmodelled: tuple[str, ...]
+    values: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    throttle: float = 0.3
+
+    def with_filters(self, parameters: Mapping[str, Number]) -> RateLaw:
+        """The law as it is read from a log with these cutoffs and notches."""
+        values = change_filters(self.firmware, self.values, parameters)
+        return flown_loop(self.firmware, values, self.version, throttle=self.throttle).law
+
+    @property
+    def old(self) -> dict[str, float]:
+        """P, I and D of the axis by the firmware's names."""
+        return parameters_of(self.law, self.axis, gains_of(self.law, self.axis))
+
+
+def settings_of(path: Path, proposal: Proposal) -> LogSettings:
+    """The log's own parameters, of the part that is proposed."""
+    setup = proposal.setup
+    prefix = setup.rate.rpartition("gyroADC")[0].rstrip(".")
+    at = None if proposal.vehicle == "betaflight" else setup.start
+    return read_settings(path, log=prefix, at=at)
+
+
+_HOVER = 0.3  # of the throttle, where a log does not hold it
+
+
+def read_flown(path: Path, proposal: Proposal, settings: AutopilotSettings) -> FlownAutopilot:
+    """The loop that flew. Raises ValueError where the log does not hold its gains."""
+    setup, given = proposal.setup, settings_of(path, proposal)
+    axis = AXES.index(setup.axis)
+    known: dict[str, Firmware] = {"betaflight": "betaflight", "px4": "px4"}
+    firmware = known.get(proposal.vehicle, "ardupilot")
+    throttle = _HOVER if settings.throttle is None else settings.throttle
+    loop = flown_loop(firmware, given.values, given.version, throttle=throttle)
+    if not np.any(gains_of(loop.law, axis) > 0):
+        raise ValueError(
+            f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
+        )
+    return FlownAutopilot(
+        firmware, tuple(given.version), axis, loop.law, loop.parameters(), loop.unmodelled,
+        given.values, throttle,
+    )  # fmt: skip

@@ -1,0 +1,313 @@
+"""The design of a rate loop: searched, rounded, and certified on fresh plants."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from jaxquad._core import announce
+from jaxquad.control.autopilots import filter_choices
+from jaxquad.export import propose_changes
+
+from ._flight_channels import FlightChannels
+from ._flown_autopilot import FlownAutopilot
+from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
+from ._identify import Identification
+from ._rate_gains import (
+    ceiling_in,
+    certify_gains,
+    gains_in,
+    gains_of,
+    make_loops,
+    parameters_of,
+    RateLoops,
+    Stage,
+)
+from ._rate_search import filter_values, FilterBank, Search, shared_change, SharedChange, Targets
+from ._tune_settings import AutopilotSettings
+
+
+Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
+_THIRD = 1 / 3
+_WORTH = 0.95  # of the flown effect of torque, above which gains are not worth a change
+_FILTERS_WORTH = 0.97  # of that with gains alone, above which filters are not worth one
+_ALLOWED = 1.03  # of a limit that the search kept on the ratio of filters, for the law itself
+_CERTIFICATES = 3  # at most: the worst plants of one that fails are tuned on, too
+_WORST = 16
+_HARD = 14  # plants of a search with filters
+
+
+@dataclasses.dataclass(frozen=True)
+class FilterVerdict:
+    """What the search made of the filters.
+
+    **Attributes:**
+
+    - `text`: which freedom brought what, or why the filters stay.
+    - `flown`: of the filters that change, what flew.
+    - `reason`: why they change.
+    - `at_once`: parameters of a notch that is switched on, which has no third of the way.
+    - `gains_alone`: the best gains with the filters that flew, on fresh plants.
+    - `shared`: what the changed filters do to the other axes.
+    """
+
+    text: str
+    flown: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    reason: str = ""
+    at_once: tuple[str, ...] = ()
+    gains_alone: Stage | None = None
+    shared: SharedChange | None = None
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        return {
+            "text": self.text,
+            "flown": dict(self.flown),
+            "gains_alone": None if self.gains_alone is None else self.gains_alone._asdict(),
+            "shared": None if self.shared is None else self.shared._asdict(),
+        }
+
+
+class Design(NamedTuple):
+    """What is proposed, and what it gives on fresh plants: what flew, a third, and all of it."""
+
+    kind: Kind
+    verdict: str
+    stages: tuple[Stage, ...]
+    new: dict[str, float]
+    filters: FilterVerdict
+    noise: GyroNoise | None
+
+
+def design_gains(
+    settings: AutopilotSettings,
+    found: Identification,
+    flown: FlownAutopilot,
+    flight: FlightChannels | None,
+) -> Design:
+    """Search gains, and filters where the log shows the gyro's noise; certify the rounded ones."""
+    work = _Work(settings, found, flown)
+    noise, why = _noise_of(settings, flown, flight, work)
+    work = dataclasses.replace(work, noise=noise)
+    loops, targets = work.loops(settings.members, 0), work.targets
+    bank = work.bank(loops)
+    if noise is not None and bank is None:
+        why = "the firmware's filters are off, so there is none to change"
+    for attempt in range(1, _CERTIFICATES + 1):
+        fresh = work.loops(settings.fresh, attempt)
+        announce(f"searching gains on {len(loops.plants)} plants")
+        search = Search(loops, work.before, targets, flown.firmware, flown.axis, bank)
+        gains = search.gains()
+        plain = work.certified(fresh, parameters_of(flown.law, flown.axis, gains), {})
+        design, verdict = plain, FilterVerdict(f"as they flew: {why}")
+        if bank is not None and noise is not None:
+            announce("searching gains and filters together")
+            hard = loops.worst(gains[None], _HARD)
+            search = Search(hard, work.before, targets, flown.firmware, flown.axis, bank)
+            both, picks = search.gains_and_filters(gains, settings.seed)
+            filters = bank.parameters(picks)
+            if filters:
+                design = work.certified(fresh, parameters_of(flown.law, flown.axis, both), filters)
+            design, verdict = _compared(work, plain, design, bank, noise)
+        kind, text = _judge(design.stages, settings, found.band[1], verdict.shared)
+        if kind != "not to be flown":
+            break
+        loops = loops.joined(design.loops[-1].worst(design.gains[-1][None], _WORST))
+    return Design(kind, text, design.stages, design.new, verdict, noise)
+
+
+class _Certified(NamedTuple):
+    stages: tuple[Stage, ...]
+    new: dict[str, float]
+    filters: dict[str, float]
+    gains: list[np.ndarray]
+    loops: list[RateLoops]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Work:
+    settings: AutopilotSettings
+    found: Identification
+    flown: FlownAutopilot
+    noise: GyroNoise | None = None
+
+    @property
+    def before(self) -> np.ndarray:
+        """The gains that flew."""
+        return gains_of(self.flown.law, self.flown.axis)
+
+    @property
+    def targets(self) -> Targets:
+        kept = self.settings
+        return Targets(
+            kept.sensitivity, kept.resonance, kept.noise, kept.change, self.found.band[1]
+        )
+
+    def loops(self, count: int, seed: int) -> RateLoops:
+        """Of what flew, with the noise of the log where it shows it."""
+        found, flown = self.found, self.flown
+        unit = found.records[0].output_units[0]
+        loops = make_loops(flown.law, flown.axis, found.fit, unit, count, self.settings.seed + seed)
+        if self.noise is None:
+            return loops
+        # What was measured has passed the flown loop.
+        opened = np.abs(1 + (self.before @ loops.feedback) * loops.plants) ** 2
+        power = self.noise.powers(self.noise.behind, loops.omega)
+        return dataclasses.replace(loops, noise=power * np.median(opened, axis=0))
+
+    def bank(self, loops: RateLoops) -> FilterBank | None:
+        if self.noise is None:
+            return None
+        flown, line = self.flown, self.noise.line
+        choices = filter_choices(
+            flown.firmware, flown.values, flown.version, axis=flown.axis, throttle=flown.throttle,
+            change=self.settings.change,
+            line_hz=None if line is None else line.omega / (2 * np.pi),
+        )  # fmt: skip
+        return FilterBank(choices, flown.law, self.noise, loops.omega) if choices else None
+
+    def certified(
+        self, fresh: RateLoops, gains: Mapping[str, float], filters: Mapping[str, float]
+    ) -> _Certified:
+        """What flew, a third of the way and all of it, with their filters, as stored."""
+        announce(f"certifying the rounded numbers on {self.settings.fresh} new plants")
+        law, axis, whole = self.flown.law, self.flown.axis, dict(gains) | dict(filters)
+        third = self._third(whole, filters)
+        ways = (third, whole)
+        ceiling = ceiling_in(law, axis, ways)
+        loops = [dataclasses.replace(fresh, ceiling=ceiling)]
+        for way in ways:
+            parts = {name: way[name] for name in filters}
+            changed = self.flown.with_filters(parts) if filters else law
+            loops.append(loops[0].of_law(changed, axis) if filters else loops[0])
+        designs = [self.before, *(gains_in(law, axis, way) for way in ways)]
+        stages = tuple(certify_gains(loops, designs))
+        return _Certified(stages, whole, dict(filters), designs, loops)
+
+    def _third(self, new: Mapping[str, float], filters: Mapping[str, float]) -> dict[str, float]:
+        """A third of the way, as the firmware stores it."""
+        flown = self.flown
+        bank = {} if not filters else self.flown_filters(filters)
+        old = flown.old | bank
+        changes = propose_changes(
+            flown.firmware, old, new, share=_THIRD, beyond=list(new), at_once=switched(bank)
+        )
+        return old | {change.parameter.name: change.new for change in changes}
+
+    def flown_filters(self, names: Mapping[str, float]) -> dict[str, float]:
+        """What flew of these filters."""
+        flown, line = self.flown, None if self.noise is None else self.noise.line
+        choices = filter_choices(
+            flown.firmware, flown.values, flown.version, axis=flown.axis, throttle=flown.throttle,
+            line_hz=None if line is None else line.omega / (2 * np.pi),
+        )  # fmt: skip
+        return dict(filter_values(list(names), choices))
+
+
+def switched(flown: Mapping[str, float]) -> tuple[str, ...]:
+    """Of filters that flew, the parameters of notches that were off."""
+    notch = [name for name in flown if "notch" in name or "_NF" in name]
+    off = any(flown[name] == 0 for name in notch)
+    return tuple(notch) if off else ()
+
+
+def _noise_of(
+    settings: AutopilotSettings, flown: FlownAutopilot, flight: FlightChannels | None, work: _Work
+) -> tuple[GyroNoise | None, str]:
+    """The noise, or why filters stay."""
+    if settings.keep_filters:
+        return None, "asked for by `keep_filters`"
+    if flight is None:
+        return None, "the channels of gyro and set-point could not be read from the log"
+    announce("the gyro's noise")
+    loops = work.loops(1, 0)
+    crossover = float(loops.qualities(work.before[None]).crossover[0, 0])
+    found = gyro_noise(flight, flown.law, flown.axis, 2 * crossover / (2 * np.pi))
+    return (None, found.reason) if isinstance(found, NoNoise) else (found, "")
+
+
+def _compared(
+    work: _Work, plain: _Certified, both: _Certified, bank: FilterBank, noise: GyroNoise
+) -> tuple[_Certified, FilterVerdict]:
+    """Gains alone beside gains and filters, on the same fresh plants."""
+    alone, freed = plain.stages[-1], both.stages[-1]
+    names = ", ".join(name for choice in bank.choices for name in choice.names)
+    heard = f"the noise is of {noise.source}"
+    if not both.filters or freed.rejection > _FILTERS_WORTH * alone.rejection:
+        text = (
+            f"as they flew: with gains alone the effect of torque is {alone.rejection:.2f} of what "
+            f"flew, and freeing {names} brings less than {100 * (1 - _FILTERS_WORTH):.0f} % more; "
+            f"{heard}"
+        )
+        return plain, FilterVerdict(text, gains_alone=alone)
+    shared = shared_change(
+        work.flown.law, work.flown.with_filters(both.filters), noise, plain.loops[0].omega,
+        work.flown.axis,
+    )  # fmt: skip
+    flown = work.flown_filters(both.filters)
+    gyro, slope = shared.delay_ms
+    text = (
+        f"gains alone leave {alone.rejection:.2f} of the flown effect of torque, with filters it "
+        f"is {freed.rejection:.2f}; command noise {alone.noise:.2f} and {freed.noise:.2f} of what "
+        f"flew. Delay of the gyro's filters {gyro:+.2f} ms, with those of the D term {slope:+.2f} "
+        f"ms; on the other axes, which have the same filters, the command's noise grows by at most "
+        f"{max(shared.noise, 0):.2f}. {heard[0].upper()}{heard[1:]}"
+    )
+    reason = (
+        f"delay of gyro {gyro:+.2f} ms, of D {slope:+.2f} ms, at command noise {freed.noise:.2f}"
+    )
+    return both, FilterVerdict(text, flown, reason, switched(flown), alone, shared)
+
+
+def _judge(
+    stages: Sequence[Stage], settings: AutopilotSettings, edge: float, shared: SharedChange | None
+) -> tuple[Kind, str]:
+    flown, third, whole = stages
+    beyond = _beyond(third, whole, flown, settings, edge)
+    if shared is not None and shared.noise > _ALLOWED * settings.noise:
+        beyond.append(
+            f"the command's noise on another axis grows by {shared.noise:.2f}, above "
+            f"{settings.noise:g}"
+        )
+    if beyond:
+        return "not to be flown", (
+            f"no gains are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, `resonance`, "
+            "`noise`, `change`), or fly more excitation"
+        )
+    limit, count = settings.sensitivity, settings.fresh
+    better = f"{whole.rejection:.2f} of the flown effect of torque"
+    within = flown.peak <= limit and flown.resonance <= settings.resonance
+    if flown.stable == 1 and within and whole.rejection > _WORTH:
+        return "kept", (
+            f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
+            f"{count} fresh plants is {flown.peak:.2f}"
+        )
+    return "proposed", (
+        f"proposed: stable on all {count} fresh plants, worst Ms {whole.peak:.2f} of at most "
+        f"{limit:g}, {better}. Load the file for a third of the way first"
+    )
+
+
+def _beyond(
+    third: Stage, whole: Stage, flown: Stage, settings: AutopilotSettings, edge: float
+) -> list[str]:
+    """What is beyond a limit."""
+    limit, beyond = settings.sensitivity, []
+    if min(third.stable, whole.stable) < 1:
+        beyond.append(f"only {100 * min(third.stable, whole.stable):.1f} % of the loops are stable")
+    if whole.peak > limit:
+        beyond.append(f"the worst Ms is {whole.peak:.2f}, above {limit:g}")
+    if whole.resonance > settings.resonance:
+        beyond.append(
+            f"the worst peak from set-point to rate is {whole.resonance:.2f}, above "
+            f"{settings.resonance:g}"
+        )
+    if third.peak > max(limit, flown.peak):
+        beyond.append(f"a third of the way the worst Ms is {third.peak:.2f}, above {limit:g}")
+    if whole.crossover > edge:
+        beyond.append(
+            f"the crossover of {whole.crossover / (2 * np.pi):.1f} Hz is beyond the identified "
+            f"{edge / (2 * np.pi):.1f} Hz"
+        )
+    return beyond
