@@ -1,6 +1,6 @@
 """L-BFGS for many problems at once: each evaluation serves all of them."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 
 Vector = Float[np.ndarray, " n"]
+Pairs = list[tuple[Vector, Vector]]  # steps, and by how much the gradient changed along each
 Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 # values [problems] and gradients [problems, n] at points [problems, n] of problems that are on
 
@@ -61,6 +62,7 @@ class Descent(NamedTuple):
     evaluations: Int[np.ndarray, " problems"]
     converged: Bool[np.ndarray, " problems"]
     reasons: tuple[str, ...]
+    pairs: tuple[Pairs, ...]  # of each problem: what is known of the curvature
 
 
 class _Point(NamedTuple):
@@ -70,7 +72,7 @@ class _Point(NamedTuple):
 
 
 _TRIALS = 7  # of a line search
-_End = tuple[_Point, bool, str]
+_End = tuple[_Point, bool, str, Pairs]
 _Descending = Generator[Vector, tuple[float, Vector], _End]
 _Searching = Generator[Vector, tuple[float, Vector], tuple[_Point | None, int]]
 
@@ -82,17 +84,20 @@ def minimise(
     *,
     on: Bool[np.ndarray, " problems"] | None = None,
     enough: Callable[[int, float], bool] | None = None,
+    pairs: Sequence[Pairs] | None = None,
 ) -> Descent:
     """Run all problems in lockstep: `evaluate(z, on)` gives values and gradients of those `on`.
 
     Problems that are not `on` from the start stay there. `enough(problem, value)` ends a problem
-    early. One that is done stays where it is best.
+    early. One that is done stays where it is best. `pairs` are those of a descent before, of a cost
+    with nearly the same curvature.
     """
     z = np.array(start, float)
     on = np.ones(len(z), bool) if on is None else np.array(on)
-    searches = [_lbfgs(x, method, _bound(enough, k)) for k, x in enumerate(z)]
+    known = [Pairs() for _ in z] if pairs is None else pairs
+    searches = [_lbfgs(x, method, _bound(enough, k), known[k]) for k, x in enumerate(z)]
     still = [_Point(x, np.nan, np.full_like(x, np.nan)) for x in z]
-    ends: list[_End] = [(point, False, "not started") for point in still]
+    ends: list[_End] = [(point, False, "not started", known[k]) for k, point in enumerate(still)]
     counts = np.zeros(len(z), int)
     z = np.stack([next(search) for search in searches])
     while on.any():
@@ -104,7 +109,7 @@ def minimise(
             except StopIteration as stop:
                 ends[k], on[k] = stop.value, False
                 z[k] = stop.value[0].z
-    points, converged, reasons = zip(*ends, strict=True)  # type: ignore[misc]
+    points, converged, reasons, learnt = zip(*ends, strict=True)  # type: ignore[misc]
     return Descent(
         z=np.stack([p.z for p in points]),
         value=np.array([p.value for p in points]),
@@ -112,6 +117,7 @@ def minimise(
         evaluations=counts,
         converged=np.array(converged),
         reasons=tuple(reasons),
+        pairs=tuple(learnt),
     )
 
 
@@ -119,18 +125,20 @@ def _bound(enough: Callable[[int, float], bool] | None, problem: int) -> Callabl
     return (lambda value: False) if enough is None else (lambda value: enough(problem, value))
 
 
-def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool]) -> _Descending:
+def _lbfgs(
+    z: Vector, method: LBFGS, enough: Callable[[float], bool], pairs: Pairs
+) -> _Descending:
     point = _Point(z, *(yield z))
-    left, pairs, idle = method.evaluations - 1, [], 0
+    left, idle = method.evaluations - 1, 0
     if not _finite(point):
-        return point, False, "the cost is not finite at the start"
+        return point, False, "the cost is not finite at the start", pairs
     while True:
         if enough(point.value):
-            return point, True, "good enough"
+            return point, True, "good enough", pairs
         if np.max(np.abs(point.gradient)) <= method.gradient_tolerance:
-            return point, True, "the gradient vanishes"
+            return point, True, "the gradient vanishes", pairs
         if left <= 0:
-            return point, False, f"stopped after {method.evaluations} evaluations"
+            return point, False, f"stopped after {method.evaluations} evaluations", pairs
         direction = _direction(point.gradient, pairs)
         if direction @ point.gradient >= 0:  # rounding has spoilt the pairs
             pairs, direction = [], -point.gradient
@@ -140,17 +148,17 @@ def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool]) -> _Descen
             pairs = []  # once more, downhill
             continue
         if found is None:
-            return point, idle > 0, "no step lowers the cost any further"
+            return point, idle > 0, "no step lowers the cost any further", pairs
         s, y = found.z - point.z, found.gradient - point.gradient
         if s @ y > 1e-10 * (y @ y):
             pairs = [*pairs, (s, y)][-method.memory :]
         idle = idle + 1 if point.value - found.value < method.tolerance else 0
         point = found
         if idle == 2:
-            return point, True, "the cost no longer falls"
+            return point, True, "the cost no longer falls", pairs
 
 
-def _direction(gradient: Vector, pairs: list[tuple[Vector, Vector]]) -> Vector:
+def _direction(gradient: Vector, pairs: Pairs) -> Vector:
     """Minus the inverse Hessian of the pairs times the gradient, by the two-loop recursion."""
     q, shares = gradient.copy(), []
     for s, y in reversed(pairs):
@@ -164,7 +172,7 @@ def _direction(gradient: Vector, pairs: list[tuple[Vector, Vector]]) -> Vector:
     return -q
 
 
-def _first(direction: Vector, pairs: list[tuple[Vector, Vector]], method: LBFGS) -> float:
+def _first(direction: Vector, pairs: Pairs, method: LBFGS) -> float:
     longest = np.max(np.abs(direction))
     if pairs:
         return min(1.0, method.longest_step / longest)

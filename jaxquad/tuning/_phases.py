@@ -24,7 +24,7 @@ from ._cost import (
     take_problem,
 )
 from ._gauss_newton import GaussNewton, minimise_squares
-from ._lbfgs import Descent, Evaluate, LBFGS, minimise
+from ._lbfgs import Descent, Evaluate, LBFGS, minimise, Pairs
 from ._objective import Limit, Objective
 from ._parameters import build_design, Coordinates
 from ._problem import Problem
@@ -236,7 +236,8 @@ def _with_worst(
         guards, problem, multipliers = put_flights(worst.members, *given, *known)
     runner = dataclasses.replace(runner, problem=problem, limits=search.aimed)
     met = half_of_reserve(search.aimed, search.limits)
-    again = runner.optimise(found.descent.z, state.stable, on, multipliers, met)
+    known = found.descent.z, state.stable, on, multipliers, met, found.descent.pairs
+    again = runner.optimise(*known)
     found = again._replace(
         descent=_merge(found.descent, again.descent, on), counts=found.counts + again.counts
     )
@@ -309,18 +310,28 @@ class _Runner(eqx.Module):
         result = self.evaluate(z, np.ones(len(z), bool), False, multipliers)
         return np.asarray(result.numbers["abscissa"]).max(axis=1)
 
-    def descend(self, z: np.ndarray, on: np.ndarray, given: Multipliers, left: int) -> Descent:
+    def descend(
+        self,
+        z: np.ndarray,
+        on: np.ndarray,
+        given: Multipliers,
+        left: int,
+        pairs: Sequence[Pairs] | None,
+    ) -> Descent:
         """One round of the second phase, of at most `left` evaluations."""
         if isinstance(self.method, LBFGS):
             method = dataclasses.replace(self.method, evaluations=left)
-            return minimise(self.evaluator(True, given), z, method, on=on)
+            return minimise(self.evaluator(True, given), z, method, on=on, pairs=pairs)
         ends = [self._squares(k, x) if on[k] else (x, 0, False) for k, x in enumerate(z)]
         points, steps, done = zip(*ends, strict=True)
         value, gradient = self.evaluator(True, given)(np.stack(points), on)
         reasons = tuple(
             "" if d else f"stopped after {s} steps" for s, d in zip(steps, done, strict=True)
         )
-        return Descent(np.stack(points), value, gradient, np.array(steps), np.array(done), reasons)
+        known = tuple(Pairs() for _ in z)
+        return Descent(
+            np.stack(points), value, gradient, np.array(steps), np.array(done), reasons, known
+        )
 
     def _squares(self, k: int, z: np.ndarray) -> tuple[np.ndarray, int, bool]:
         assert isinstance(self.method, GaussNewton)
@@ -334,10 +345,12 @@ class _Runner(eqx.Module):
         on: np.ndarray,
         multipliers: Multipliers,
         met: ArrayLike = MET,
+        pairs: Sequence[Pairs] | None = None,
     ) -> "_Optimised":
         """The second phase: rounds of multipliers until limits are `met`, to these levels.
 
-        Problems that are `able` fly, even those that are not `on`.
+        Problems that are `able` fly, even those that are not `on`. Each round begins with the
+        curvature that those before it found, the first one with `pairs`.
         """
         on, everyone, rounds = on.copy(), np.ones_like(able), Rounds()
         counts, beyond = np.zeros(len(z), int), np.full((len(z), len(self.limits)), np.inf)
@@ -347,9 +360,9 @@ class _Runner(eqx.Module):
         most = self.method.evaluations if isinstance(self.method, LBFGS) else 0
         for _ in range(_ROUNDS if self.limits else 1):
             left = min(most, int(_TIMES * most - counts.max()))
-            found = self.descend(z, on, multipliers, left)
+            found = self.descend(z, on, multipliers, left, pairs)
             descent = found if descent is None else _merge(descent, found, on)
-            z, counts = descent.z, counts + found.evaluations
+            z, counts, pairs = descent.z, counts + found.evaluations, descent.pairs
             result = self.evaluate(z, everyone, able, multipliers)
             if not self.limits:
                 return _Optimised(descent, multipliers, result, beyond, counts)
@@ -434,11 +447,12 @@ def _require_finite(result: CostResult, able: np.ndarray) -> None:
 
 def _merge(old: Descent, new: Descent, on: np.ndarray) -> Descent:
     pick = lambda a, b: np.where(on.reshape((-1,) + (1,) * (a.ndim - 1)), b, a)
-    reasons = tuple(b if o else a for a, b, o in zip(old.reasons, new.reasons, on, strict=True))
-    fields = Descent._fields[:-1]
+    choose = lambda a, b: tuple(y if o else x for x, y, o in zip(a, b, on, strict=True))
+    fields = Descent._fields[:-2]
     both = old._asdict(), new._asdict()
     arrays = {name: pick(*(x[name] for x in both)) for name in fields}
-    return Descent(**arrays, reasons=reasons)
+    reasons, pairs = choose(old.reasons, new.reasons), choose(old.pairs, new.pairs)
+    return Descent(**arrays, reasons=reasons, pairs=pairs)
 
 
 def _evaluation(
