@@ -1,5 +1,4 @@
 import dataclasses
-import functools as ft
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
@@ -9,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from jaxquad.control import Reference
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop
 from jaxquad.simulation import Authority, beyond_authority, find_authority, Scenario
 
+from ._beside import Beside, evaluate_beside
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
 from ._design_result import measure_distances
 from ._evaluate_design import analyse_further, evaluate_design, member_facts
@@ -87,32 +86,51 @@ def certify(
             f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
             "jq.ensembles.Members of it"
         )
-    given = isinstance(ensemble, Members)
-    # Independent draws, as the bound of a share needs.
-    drawn = ensemble if given else ensemble.fresh(loop, members, key)
-    require_same_rate(loop, drawn)
-    flight = drawn.flight(scenario)
-    designs = {name: loop.controller} | _named(peers or {}, name)
     span = TimeSpan(tuple(events), start, stop, load_start)
-    run = ft.partial(evaluate_design, members=drawn, flight=flight, span=span, devices=devices)
-    results = {n: run(x) for n, x in designs.items()}
+    beside = evaluate_beside(
+        loop, ensemble, scenario, key, peers=_named(peers or {}, name), begun=begun,
+        members=members, span=span, devices=devices,
+    )  # fmt: skip
+    return certify_beside(
+        loop, ensemble, scenario, beside, limits=limits, linear_members=linear_members, key=key,
+        span=span, name=name, devices=devices,
+    )  # fmt: skip
+
+
+def certify_beside(
+    loop: Loop,
+    ensemble: Ensemble | Members,
+    scenario: Scenario,
+    beside: Beside,
+    *,
+    limits: Sequence[Limit],
+    linear_members: int | None,
+    key: Key[Array, ""],
+    span: TimeSpan,
+    name: str,
+    devices: DeviceChoice,
+) -> Certificate:
+    """The certificate of `loop.controller`, on the members that other designs were evaluated on."""
+    given, drawn, flight = isinstance(ensemble, Members), beside.drawn, beside.flight
+    design = evaluate_design(loop.controller, drawn, flight, span, devices)
+    results = {name: design} | beside.peers
     further = None
     if isinstance(ensemble, Ensemble):
         further = analyse_further(
-            loop, ensemble, scenario, key, flown=members, count=linear_members
+            loop, ensemble, scenario, key, flown=drawn.size, count=linear_members
         )
     known = _provenance(ensemble, drawn, key)
     known["linear_members"] = 0 if further is None else further.design.members
     known["controller"] = describe_controller(loop.controller)
     found = Certificate(
         designs=results,
-        distances=measure_distances(results[name], limits, independent=not given, further=further),
+        distances=measure_distances(design, limits, independent=not given, further=further),
         facts=member_facts(drawn),
         nominal=_nominal_inertia(loop) if isinstance(ensemble, Ensemble) else None,
         provenance=known,
         remarks=(),
-        idle=run(_Idle()),
-        start=None if begun is None else run(begun),
+        idle=beside.idle,
+        start=beside.start,
         error="itae" if _moves(flight) else "rms",
         further=further,
     )
@@ -122,20 +140,6 @@ def certify(
         remarks += _beyond_band(loop.controller, ensemble.plants.band)
         remarks += _beyond_record(limits_of, ensemble.plants.largest_command)
     return dataclasses.replace(found, remarks=tuple(remarks))
-
-
-class _Idle(eqx.Module):
-    """The controller that does nothing."""
-
-    def init(self, like: Float[Array, " axes *ensemble"]) -> None:
-        """It remembers nothing."""
-        return None
-
-    def step(
-        self, state: None, reference: Reference, measurement: Float[Array, " axes *ensemble"]
-    ) -> tuple[None, Float[Array, " axes *ensemble"]]:
-        """The command 0."""
-        return None, jnp.zeros_like(measurement)
 
 
 def _moves(flight: Scenario) -> bool:
@@ -180,15 +184,6 @@ def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[s
         for name, value in rates.items()
         if value > _ROUNDED * band[1]
     ]
-
-
-def require_same_rate(loop: Loop, members: Members) -> None:
-    """Raise ValueError for members that were drawn around a loop of another sample interval."""
-    if not np.isclose(loop.dt, members.dt, rtol=1e-6):
-        raise ValueError(
-            f"the members were drawn around a loop with dt = {members.dt} s, but this one has "
-            f"{loop.dt} s: draw them again, ensemble.draw(loop, n, key)"
-        )
 
 
 def _named(peers: Mapping[str, PyTree], name: str) -> dict[str, PyTree]:

@@ -125,9 +125,7 @@ def _bound(enough: Callable[[int, float], bool] | None, problem: int) -> Callabl
     return (lambda value: False) if enough is None else (lambda value: enough(problem, value))
 
 
-def _lbfgs(
-    z: Vector, method: LBFGS, enough: Callable[[float], bool], pairs: Pairs
-) -> _Descending:
+def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool], pairs: Pairs) -> _Descending:
     point = _Point(z, *(yield z))
     left, idle = method.evaluations - 1, 0
     if not _finite(point):

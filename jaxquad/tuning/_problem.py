@@ -233,3 +233,12 @@ def decouple(plant: object) -> DecoupledAxes:
     axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
     assert isinstance(axes, DecoupledAxes)
     return axes
+
+
+def require_same_rate(loop: Loop, members: Members) -> None:
+    """Raise ValueError for members that were drawn around a loop of another sample interval."""
+    if not np.isclose(loop.dt, members.dt, rtol=1e-6):
+        raise ValueError(
+            f"the members were drawn around a loop with dt = {members.dt} s, but this one has "
+            f"{loop.dt} s: draw them again, ensemble.draw(loop, n, key)"
+        )

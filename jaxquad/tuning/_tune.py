@@ -13,8 +13,9 @@ from jaxquad.identify import Free
 from jaxquad.loops import Loop
 from jaxquad.simulation import find_steps, Scenario
 
+from ._beside import begin_evaluating, Beside, evaluate_beside
 from ._certificate import Certificate, lag_remark
-from ._certify import certify, require_same_rate
+from ._certify import certify_beside
 from ._cost import Listener, Progress, stack_copies
 from ._evaluate_design import certified_members, flying_loop
 from ._flown import fly
@@ -23,7 +24,14 @@ from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Worst
 from ._parameters import build_design, select_coordinates
 from ._phases import find_bounds, go_on, Solution, solve
-from ._problem import DeviceChoice, linear_loops, make_problem, Problem, TimeSpan
+from ._problem import (
+    DeviceChoice,
+    linear_loops,
+    make_problem,
+    Problem,
+    require_same_rate,
+    TimeSpan,
+)
 from ._quantities import QUANTITIES
 from ._tail import (
     certified_beyond,
@@ -143,28 +151,35 @@ def tune(
     require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
     begun = scatter_starts(coordinates.start, starts, scatter, seed=0)
     tightened = tuple(tighten(limit, reserve) for limit in limits)
+    certified = fresh is not None and not (isinstance(ensemble, Members) and isinstance(fresh, int))
+    others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh or 0)
+    beside = ft.partial(
+        evaluate_beside, loop, others, scenario, peers=peers or {}, begun=loop.controller,
+        members=count, span=span, devices=devices,
+    )  # fmt: skip
+    first = begin_evaluating(lambda: beside(key), devices) if certified else None
     solution = solve(
         coordinates, problem, begun, stack_copies(objective, starts),
         stack_copies(tightened, starts), method=method, rate=stabilising_rate(objective),
         progress=watched, search=search,
     )  # fmt: skip
     best, seconds, certificate, certificates = _best(solution), watched.seconds, None, 0
-    if fresh is not None and not (isinstance(ensemble, Members) and isinstance(fresh, int)):
-        others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
+    if first is not None:
 
-        def judge(solution: Solution, key: Key[Array, ""]) -> Certificate:
+        def judge(solution: Solution, key: Key[Array, ""], found: Beside) -> Certificate:
             watched.say("certificate on fresh members ...")
             design = build_design(coordinates, jnp.asarray(solution.z[best]))
-            return certify(
-                loop.with_controller(design), others, scenario, limits=limits, peers=peers,
-                begun=loop.controller, members=count, key=key, devices=devices, **span._asdict(),
+            return certify_beside(
+                loop.with_controller(design), others, scenario, found, limits=limits,
+                linear_members=None, key=key, span=span, name="tuned", devices=devices,
             )  # fmt: skip
 
-        certificate, certificates = judge(solution, key), 1
+        certificate, certificates = judge(solution, key, first()), 1
         if search is not None and isinstance(ensemble, Ensemble) and isinstance(fresh, int):
             redraw = ft.partial(certified_members, loop, ensemble, flown=fresh)
+            again = lambda solution, key: judge(solution, key, beside(key))
             solution, certificate, certificates, more = _certify_until_kept(
-                solution, certificate, judge, redraw, search, best, key
+                solution, certificate, again, redraw, search, best, key
             )
             seconds += more
     tuned = build_design(coordinates, jnp.asarray(solution.z[best]))
