@@ -74,6 +74,7 @@ from ._thrust_curve import (
     FirmwareValue as FirmwareValue,
     GainBand as GainBand,
     GainOverThrottle as GainOverThrottle,
+    PlantsOverThrottle as PlantsOverThrottle,
     ScaledB0 as ScaledB0,
 )
 from ._transfer_function_fit import fit_transfer_function as fit_transfer_function

@@ -4,13 +4,14 @@ from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
 from ._fit_content import counted
-from ._result import Fit
+from ._result import draw_models, Fit
 from ._verdict import Combination, reach_of_interval, UndeterminedError
 
 
@@ -87,6 +88,14 @@ class GainBand(NamedTuple):
     value: Float[np.ndarray, " points"]
     low: Float[np.ndarray, " points"]
     high: Float[np.ndarray, " points"]
+
+
+class PlantsOverThrottle(NamedTuple):
+    """Plants K e^(-delay s) / (s (lag s + 1)) that a record leaves possible, at some throttles."""
+
+    gain: Float[np.ndarray, "throttles plants"]  # output's unit per s, per unit of input
+    lag: Float[np.ndarray, " plants"]  # s
+    delay: Float[np.ndarray, " plants"]  # s
 
 
 class _Line(NamedTuple):
@@ -166,6 +175,38 @@ class GainOverThrottle(eqx.Module):
         """
         self._require_lag()
         return self._band(throttle, self._b0_at)
+
+    def draw(
+        self, throttle: Float[ArrayLike, " throttles"], plants: int, *, seed: int = 0
+    ) -> PlantsOverThrottle:
+        """Draw plants from what the record leaves uncertain; each follows a thrust curve.
+
+        **Arguments:**
+
+        - `throttle`: 0 to 1.
+        - `plants`: how many.
+
+        **Returns:**
+
+        A `PlantsOverThrottle`.
+
+        **Raises:**
+
+        - `UndeterminedError`: as `over`, and as `b0`.
+        """
+        line = self._line()
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
+        self._require_lag()
+        scores = np.random.default_rng(seed).standard_normal((len(self.fit.names), plants))
+        models = draw_models(self.fit, jnp.asarray(scores))
+        wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
+        away = line.weights @ (np.asarray(models.gain) - self.gain[:, None])
+        x = actuator(np.atleast_1d(throttle), self.flown)
+        rows = np.stack([np.ones_like(x), x], axis=1)
+        rows /= (1 - self.flown + 2 * self.flown * x)[:, None]
+        gain = rows @ (line.ends[:, None] + self._widening(line) * away)
+        return PlantsOverThrottle(gain, wide(models.lag), wide(models.delay))
 
     def firmware_value(self, firmware: Firmware) -> FirmwareValue:
         """The parameter with which a firmware makes the gain the same at every throttle.
@@ -347,12 +388,17 @@ class GainOverThrottle(eqx.Module):
 
     def _by_law(self, name: str, value: float, by_gain: Levels, by_lag: float) -> Combination:
         """By the covariance of all parameters, widened where the law itself does not fit."""
-        line, n = self._line(), self.throttle.size
+        line = self._line()
         slope = np.concatenate([by_gain, [by_lag, 0.0]]) * self.fit.units
         error = float(np.sqrt(slope @ self.fit.relative_covariance @ slope))
-        if line is not None and line.probability < 0.05:
-            error *= float(np.sqrt(line.misfit / (n - 2)))
+        error *= 1.0 if line is None else self._widening(line)
         return Combination(name, value, error, self.fit.freedom_of(slope))
+
+    def _widening(self, line: _Line) -> float:
+        """Of errors by the curve, where the curve itself does not fit."""
+        if line.probability >= 0.05:
+            return 1.0
+        return float(np.sqrt(line.misfit / (self.throttle.size - 2)))
 
     def _gain_at(self, throttle: float) -> Combination:
         line = self._line()

@@ -1,3 +1,9 @@
+from ._adrc import (
+    ADRCProposal as ADRCProposal,
+    ADRCStage as ADRCStage,
+    ADRCTargets as ADRCTargets,
+    propose_adrc as propose_adrc,
+)
 from ._autopilot import autopilot as autopilot, AutopilotProposal as AutopilotProposal
 from ._batch._jobs import Job as Job
 from ._batch._run import batch as batch, find_logs as find_logs

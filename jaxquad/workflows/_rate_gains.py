@@ -237,7 +237,7 @@ def law_responses(
 def _sampled_plants(
     fit: Fit, omega: Float[np.ndarray, " frequencies"], dt: float, count: int, seed: int
 ) -> Complex[np.ndarray, "plants frequencies"]:
-    """K e^(-delay s) / (s (lag s + 1)) behind a hold, exactly: its modified z-transform."""
+    """Plants drawn from a fit, behind a hold."""
     scores = np.random.default_rng(seed).standard_normal((len(fit.names), count))
     models = draw_models(fit, jnp.asarray(scores))
     wide = lambda x: np.broadcast_to(np.asarray(x, float), (count,))[:, None]
@@ -248,6 +248,17 @@ def _sampled_plants(
             f"{count} plants drawn from the fit: check the sign of the input, or fly more "
             "excitation"
         )
+    return hold_plants(gain, lag, delay, omega, dt)
+
+
+def hold_plants(
+    gain: Float[np.ndarray, "plants 1"],
+    lag: Float[np.ndarray, "plants 1"],
+    delay: Float[np.ndarray, "plants 1"],
+    omega: Float[np.ndarray, " frequencies"],
+    dt: float,
+) -> Complex[np.ndarray, "plants frequencies"]:
+    """K e^(-delay s) / (s (lag s + 1)) behind a hold, exactly: its modified z-transform."""
     lag, delay = np.maximum(lag, 1e-6), np.maximum(delay, 0.0)
     whole = np.floor(delay / dt)
     ahead = dt * (whole + 1) - delay  # from the command's arrival to the next sample

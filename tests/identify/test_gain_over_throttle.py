@@ -73,6 +73,19 @@ def test_the_gain_between_the_levels_follows_the_curve_with_its_band(found):
     assert middle.value[0] == pytest.approx(found.b0(1).value, rel=0.02)
 
 
+def test_drawn_plants_scatter_as_the_band_says_and_follow_a_curve(found):
+    grid = np.array([0.3, 0.45, 0.6])
+    plants, band = found.draw(grid, 4000, seed=3), found.over(grid)
+    sigma = (band.high - band.low) / 2 / 1.96
+    np.testing.assert_allclose(plants.gain.std(axis=1), sigma, rtol=0.1)
+    assert np.all(np.abs(plants.gain.mean(axis=1) - band.value) < 0.1 * sigma)
+    straight = plants.gain[1] - (plants.gain[0] + plants.gain[2]) / 2
+    assert np.max(np.abs(straight)) < 1e-9 * band.value[1]
+    b0 = plants.gain[0] / plants.lag
+    reach = found.b0_over(grid[:1])
+    assert b0.std() == pytest.approx(float(reach.high[0] - reach.low[0]) / 2 / 1.96, rel=0.1)
+
+
 def test_b0_at_hover_is_that_of_gain_and_lag(found):
     law = found.adrc_b0(0.4)
     rad = found.over(np.array([0.4])).value[0] * np.pi / 180

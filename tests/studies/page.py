@@ -19,6 +19,7 @@ ORDER = (
     "coverage_short",
     "model_error",
     "tuned",
+    "adrc",
 )
 HEAD = """\
 # Validation

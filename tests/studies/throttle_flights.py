@@ -60,7 +60,7 @@ def fly(truth: Truth, rng: np.random.Generator, log_rate: int = 1000) -> Flights
     setpoint = _chirps(rng, n)
     pt1 = lambda hertz, rate: 1 - 1 / (1 + 2 * np.pi * hertz / rate)
     k_gyro, k_slow, k_d = pt1(500, RATE), pt1(350, RATE / 2), (pt1(105, 4000), pt1(150, 4000))
-    notch = _notch(190.0, 3.0, RATE / 2)
+    section = notch(190.0, 3.0, RATE / 2)
     share = 1 - np.exp(-dt / truth.lag)
     rate, spin, x1, x2, integral, d1, d2, before = (np.zeros(n) for _ in range(8))
     state = np.zeros((2, n))
@@ -90,9 +90,9 @@ def fly(truth: Truth, rng: np.random.Generator, log_rate: int = 1000) -> Flights
         x1 += k_gyro * (_DEGREES * rate + noise[k % 16] + shake - x1)
         if k % 2:
             continue
-        y = notch[0] * x1 + state[0]
-        state[0] = notch[1] * x1 - notch[4] * y + state[1]
-        state[1] = notch[2] * x1 - notch[5] * y
+        y = section[0] * x1 + state[0]
+        state[0] = section[1] * x1 - section[4] * y + state[1]
+        state[1] = section[2] * x1 - section[5] * y
         x2 += k_slow * (y - x2)
         d1 += k_d[0] * (x2 - d1)
         d2 += k_d[1] * (d1 - d2)
@@ -131,7 +131,7 @@ def _chirps(rng, n) -> np.ndarray:
     return np.concatenate([one * each for each in amplitude]).astype(np.float32)
 
 
-def _notch(centre, quality, rate) -> np.ndarray:
+def notch(centre, quality, rate) -> np.ndarray:
     """b0, b1, b2, a0, a1, a2 of the cookbook's notch, a0 = 1."""
     w = 2 * np.pi * centre / rate
     alpha, c = np.sin(w) / (2 * quality), np.cos(w)
