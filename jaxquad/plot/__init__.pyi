@@ -15,6 +15,14 @@ from ._labels import (
     visible as visible,
 )
 from ._panels import headless as headless, Panels as Panels
+from ._pilot import (
+    balance_figure as balance_figure,
+    filters_figure as filters_figure,
+    spectra_figure as spectra_figure,
+    Spectrum as Spectrum,
+    StepBand as StepBand,
+    steps_figure as steps_figure,
+)
 from ._plane import nyquist as nyquist, pzmap as pzmap
 from ._predictions import compare as compare, step as step
 from ._residuals import resid as resid, Residuals as Residuals, residuals_of as residuals_of

@@ -1,9 +1,11 @@
 from ._fit import compare_fits as compare_fits
 from ._page import (
     Cell as Cell,
+    Headline as Headline,
     render_page as render_page,
     Table as Table,
 )
+from ._pilot import PilotPage as PilotPage, write_pilot_page as write_pilot_page
 from ._provenance import (
     Provenance as Provenance,
     provenance as provenance,

@@ -1,6 +1,7 @@
 """From the log of an autopilot to parameters for it: read, identify, reproduce, tune, write."""
 
 import dataclasses
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from jaxquad.records import (
     ReadError,
     RecordError,
 )
-from jaxquad.report import provenance, write_json
+from jaxquad.report import provenance, write_json, write_pilot_page
 from jaxquad.spectra import (
     frequency_response,
     FrequencyResponse,
@@ -40,6 +41,7 @@ from ._gyro_noise import GyroNoise
 from ._identify import Identification, identify
 from ._kinds import SettingsError
 from ._log import propose_settings, read_records
+from ._pilot_page import pilot_page
 from ._rate_design import design_gains, FilterVerdict, Kind
 from ._rate_gains import law_responses, Stage
 from ._settings import IdentifySettings
@@ -142,25 +144,29 @@ class AutopilotProposal:
         }
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write `autopilot.json` and the parameter files; without a proposal only what flew.
+        """Write the page, `autopilot.json`, and parameter files: without a proposal what flew.
 
         **Returns:** their paths.
         """
         announce("parameter files")
         folder, flown = Path(folder), self.flown
         known = {k: v for k, v in self.settings.content().items() if v is not None}
-        origin = provenance(*self.identification.paths, settings=known)
+        log = self.identification.path
+        words = ["jaxquad", "autopilot", str(log), *self.settings.words()]
+        origin = provenance(log, command=shlex.join(words), settings=known)
         stored = write_json(
             folder / "autopilot.json", self.content() | {"provenance": origin.content()}
         )
+        announce("the page")
+        page = write_pilot_page(folder / "autopilot.html", pilot_page(self, origin))
         if self.kind != "proposed":
-            return [stored, self._write_flown(folder)]
+            return [page, stored, self._write_flown(folder)]
         files = write_parameter_files(
             folder, flown.firmware, self.old, self.new, stem=_STEM, shares=(_THIRD, _ALL),
             reasons=self._reasons, beyond=list(self.new), version=flown.version or (2025, 12),
             at_once=() if self.filters is None else self.filters.at_once, profile=None,
         )  # fmt: skip
-        return [stored, *files.stages, files.revert, files.table]
+        return [page, stored, *files.stages, files.revert, files.table]
 
     def _write_flown(self, folder: Path) -> Path:
         flown = self.flown

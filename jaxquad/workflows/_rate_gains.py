@@ -176,12 +176,16 @@ def _is_stable(
     return ends[0] - 2 * np.pi * rounds < 0
 
 
-def make_loops(law: RateLaw, axis: int, fit: Fit, unit: str, plants: int, seed: int) -> RateLoops:
+def make_loops(
+    law: RateLaw, axis: int, fit: Fit, unit: str, plants: int, seed: int,
+    omega: Float[np.ndarray, " frequencies"] | None = None,
+) -> RateLoops:  # fmt: skip
     """The loops of a flown law with so many plants drawn from a fit up to the logged rate.
 
     Raises ValueError where a drawn gain is not above 0.
     """
-    omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
+    if omega is None:
+        omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
     back, ahead = law_paths(law, axis, omega)
     per_radian = np.pi / 180 if unit == "deg/s" else 1.0
     responses = per_radian * _sampled_plants(fit, omega, law.dt, plants, seed)

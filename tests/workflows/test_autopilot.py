@@ -91,7 +91,7 @@ def test_other_gains_than_those_of_the_log_are_noticed(tmp_path, capsys):
     path = write_log(tmp_path / "other.ulg", flown, PARAMETERS)
     assert main(["autopilot", str(path), "--axis", "roll", "--out", str(tmp_path / "out")]) == 3
     written = sorted(each.name for each in (tmp_path / "out").iterdir())
-    assert written == ["autopilot.json", "proposal_revert.params"]
+    assert written == ["autopilot.html", "autopilot.json", "proposal_revert.params"]
     assert "this log cannot tell" in capsys.readouterr().out
 
 

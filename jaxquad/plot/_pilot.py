@@ -1,0 +1,171 @@
+"""What a pilot looks at: filters and their delay, spectra before and after them, steps, terms."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxquad.control.autopilots import FilterChain
+
+from ._labels import few_ticks, look_of, plain_ticks
+from ._panels import arrange, Given, legend_of, Panels, stacked
+
+
+Frequencies = Float[np.ndarray, " frequencies"]
+_POINTS = 200
+_LOWEST = 2.0  # Hz
+_HATCHES = (None, "....", "////", "xxxx", "----")  # of bands, for those who see no colours
+_SPAN = 70.0  # dB that a figure shows below the highest level
+
+
+def filters_figure(
+    chains: Mapping[str, Sequence[FilterChain]], *, ax: Given = None, title: str = ""
+) -> Panels:
+    """Draw magnitude and delay of filters over the frequency.
+
+    **Arguments:**
+
+    - `chains`: by the text of the legend, those that a signal passes one after the other.
+    - `ax`: two axes to draw into.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
+    """
+    panels = stacked(2, ax)
+    level, delay = panels
+    highest = min(each.rate_hz for group in chains.values() for each in group) / 2
+    hertz = np.geomspace(_LOWEST, 0.98 * highest, _POINTS)
+    for k, (name, group) in enumerate(chains.items()):
+        response, late = np.ones(hertz.size, complex), np.zeros(hertz.size)
+        for each in group:
+            response = response * np.asarray(each.response(hertz))
+            late = late + np.asarray(each.delay_ms(hertz))
+        level.plot(hertz, 20 * np.log10(np.abs(response)), **look_of(k, name))
+        delay.plot(hertz, late, **look_of(k, name))
+    low, high = level.get_ylim()
+    level.set(xscale="log", ylabel="magnitude, dB", ylim=(max(low, high - _SPAN), high))
+    delay.set(xscale="log", ylabel="delay, ms", xlabel="frequency, Hz")
+    delay.set_ylim(min(0.0, delay.get_ylim()[0]), None)
+    return _finished(panels, (1.9, 1.6), title)
+
+
+class Spectrum(NamedTuple):
+    """A power spectral density, one-sided, per Hz."""
+
+    hertz: Frequencies
+    power: Frequencies
+
+
+def spectra_figure(
+    gyro: Mapping[str, Spectrum], derivative: Mapping[str, Spectrum], *, unit: str = "",
+    ax: Given = None, title: str = "",
+) -> Panels:  # fmt: skip
+    """Draw the gyro's noise and the D term's, before and behind filters.
+
+    **Arguments:**
+
+    - `gyro`: in (rad/s)^2/Hz, drawn in deg/s; `derivative`: in the command's unit squared per Hz.
+      By the text of the legend; the same text has the same line in both.
+    - `unit`: of the command.
+    - `ax`: two axes to draw into.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
+    """
+    panels = stacked(2, ax)
+    per = f", dB re 1 {unit}" if unit else ", dB"
+    labels = ("gyro, dB re 1 deg/s /√Hz", f"D term{per} /√Hz")
+    places = {name: k for k, name in enumerate(dict.fromkeys([*gyro, *derivative]))}
+    for panel, spectra, label in zip(panels, (gyro, derivative), labels, strict=True):
+        factor = np.degrees(1.0) ** 2 if panel is panels[0] else 1.0
+        top = -np.inf
+        for name, each in spectra.items():
+            seen = (each.hertz >= _LOWEST) & (each.power > 0)
+            level = 10 * np.log10(factor * each.power[seen])
+            panel.plot(each.hertz[seen], level, **look_of(places[name], name) | {"lw": 1.2})
+            top = max(top, float(level.max(initial=-np.inf)))
+        if np.isfinite(top):
+            panel.set_ylim(max(panel.get_ylim()[0], top - _SPAN), top + 4)
+        panel.set_ylabel(label)
+    panels[1].set_xlabel("frequency, Hz")
+    for panel in panels:
+        panel.margins(x=0.01)
+    return _finished(panels, (2.0, 2.0), title)
+
+
+class StepBand(NamedTuple):
+    """Step responses of many plants: their median, and between which 95 % of them lie."""
+
+    time: Float[np.ndarray, " samples"]
+    middle: Float[np.ndarray, " samples"]
+    low: Float[np.ndarray, " samples"]
+    high: Float[np.ndarray, " samples"]
+
+
+def steps_figure(
+    steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: Given = None,
+    title: str = "",
+) -> Panels:  # fmt: skip
+    """Draw step responses with the band of the plants that are possible.
+
+    **Arguments:**
+
+    - `steps`: by the text of the legend.
+    - `label`: of the vertical axis.
+    - `ax`: axes to draw into.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
+    """
+    panels = stacked(1, ax)
+    [panel] = panels
+    for k, (name, each) in enumerate(steps.items()):
+        look = look_of(k, name)
+        panel.fill_between(
+            each.time, each.low, each.high, facecolor=look["color"], alpha=0.22, lw=0,
+            hatch=_HATCHES[k], edgecolor=look["color"], label=f"{name}, 95 % of plants",
+        )  # fmt: skip
+        panel.plot(each.time, each.middle, **look)
+    panel.axhline(1.0, color="0.4", lw=0.8, ls=":")
+    panel.set(xlabel="time, s", ylabel=label)
+    panel.margins(x=0)
+    return _finished(panels, (2.8,), title)
+
+
+def balance_figure(
+    terms: Mapping[str, float], *, unit: str = "", ax: Given = None, title: str = ""
+) -> Panels:
+    """Draw how large P, I, D and F were, as bars of their root mean squares.
+
+    **Arguments:**
+
+    - `terms`: root mean squares by name.
+    - `unit`: of the command.
+    - `ax`: axes to draw into.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
+    """
+    panels = stacked(1, ax)
+    [panel] = panels
+    names, total = list(terms), sum(terms.values()) or 1.0
+    places = np.arange(len(names))[::-1]
+    panel.barh(places, [terms[name] for name in names], color="0.55", edgecolor="black", height=0.6)
+    most = max(terms.values(), default=0.0) or 1.0
+    for place, name in zip(places, names, strict=True):
+        text = f"{terms[name]:.3g} ({100 * terms[name] / total:.0f} %)"
+        panel.annotate(text, (terms[name], place), xytext=(5, 0), textcoords="offset points",
+                       va="center", fontsize=9)  # fmt: skip
+    panel.set_yticks(places, names)
+    panel.set(xlim=(0, 1.3 * most), xlabel=f"root mean square{f', {unit}' if unit else ''}")
+    few_ticks(panel.xaxis, 5)
+    return arrange(panels, (0.38 * len(names) + 0.2,), title=title)
+
+
+def _finished(panels: Panels, heights: tuple[float, ...], title: str) -> Panels:
+    for panel in panels:
+        panel.grid(True, color="0.9", lw=0.5)
+        if panel.get_xscale() == "log":
+            plain_ticks(panel.xaxis)
+    return arrange(panels, heights, title=title, legend=legend_of(panels), handle_length=3.0)

@@ -1,0 +1,182 @@
+"""A proposal for an autopilot as one page: filters, noise, steps, terms, and what changes."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from jaxquad._core import write_file
+from jaxquad.control.autopilots import FilterChain
+from jaxquad.plot import (
+    balance_figure,
+    filters_figure,
+    spectra_figure,
+    Spectrum,
+    StepBand,
+    steps_figure,
+)
+
+from ._figure import embed_figure, Section
+from ._page import Cell, Headline, render_page, Table
+from ._provenance import Provenance, provenance_section
+
+
+_SHOWN = (10.0, 50.0)  # Hz, of a table of delays
+Chains = Mapping[str, Sequence[FilterChain]]  # by the signal that they filter
+
+
+@dataclasses.dataclass(frozen=True)
+class PilotPage:
+    """What the page of a proposal shows; what is None or empty is left out.
+
+    **Attributes:**
+
+    - `title`: of the page; `headlines`: the verdict first.
+    - `remarks`: what of the firmware is not modelled, and other doubts.
+    - `filters`: the chains of "flown", and of "proposed" where they change, each by the signal that
+      they filter: "gyro", "D term".
+    - `gyro`, `derivative`: spectra by what they are, for `jaxquad.plot.spectra_figure`.
+    - `noise`: what the spectra are of, in words.
+    - `steps`: for `jaxquad.plot.steps_figure`, with `step_facts`.
+    - `terms`: root mean squares of P, I, D and F; `terms_are`: logged, or computed.
+    - `motors`: rows of name and shares of samples at the lowest and the highest command.
+    - `stages`, `changes`: tables.
+    - `unit`: of the command.
+    """
+
+    title: str
+    headlines: Sequence[Headline]
+    filters: Mapping[str, Chains]
+    remarks: Sequence[str] = ()
+    gyro: Mapping[str, Spectrum] = dataclasses.field(default_factory=dict)
+    derivative: Mapping[str, Spectrum] = dataclasses.field(default_factory=dict)
+    noise: str = ""
+    steps: Mapping[str, StepBand] = dataclasses.field(default_factory=dict)
+    terms: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    terms_are: str = ""
+    motors: Sequence[tuple[str, float, float]] = ()
+    stages: Table | None = None
+    changes: Table | None = None
+    text: str = ""
+    unit: str = ""
+    provenance: Provenance | None = None
+
+
+def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
+    """Write one self-contained HTML page on a proposal for an autopilot, whole or not at all.
+
+    It is made as `jaxquad.report.write_report` makes its page: figures inside it, nothing fetched,
+    texts from a log escaped.
+
+    **Arguments:**
+
+    - `path`: of the page.
+    - `page`: what it shows.
+
+    **Returns:** the path.
+    """
+    sections = {
+        "changes": _changes(page),
+        "filters": _filters(page.filters),
+        "noise": _noise(page) if page.gyro else None,
+        "steps": _steps(page) if page.steps else None,
+        "balance": _balance(page) if page.terms or page.motors else None,
+        "text": {"text": page.text} if page.text else None,
+        "provenance": None if page.provenance is None else provenance_section(page.provenance),
+    }
+    text = render_page(
+        "pilot.html",
+        title=f"{page.headlines[0].word}: {page.title}",
+        title_text=page.title,
+        headlines=list(page.headlines),
+        remarks=list(page.remarks),
+        sections={name: section for name, section in sections.items() if section is not None},
+    )
+    return write_file(path, text)
+
+
+def _changes(page: PilotPage) -> Section:
+    return {"changes": page.changes, "stages": page.stages}
+
+
+def _filters(filters: Mapping[str, Chains]) -> Section:
+    drawn = {
+        f"{signal}, {design}": _passed(chains, signal)
+        for design, chains in filters.items()
+        for signal in chains
+    }
+    drawn = {name: chains for name, chains in drawn.items() if chains}
+    if not drawn:
+        return {"image": None, "tables": []}
+    image = embed_figure(
+        lambda: filters_figure(drawn),
+        alt=f"Magnitude and delay over the frequency of {', '.join(drawn)}.",
+        caption="Magnitude and phase delay; what filters the gyro filters the D term, too.",
+    )
+    tables = [_delays(design, chains) for design, chains in filters.items()]
+    return {"image": image, "tables": tables}
+
+
+def _passed(chains: Chains, signal: str) -> list[FilterChain]:
+    """All filters that a signal has passed: those of the gyro, too."""
+    names = list(chains)[: list(chains).index(signal) + 1]
+    return [each for name in names for each in chains[name] if each.filters]
+
+
+def _delays(design: str, chains: Chains) -> Table:
+    rows: list[list[str | Cell]] = []
+    for signal, group in chains.items():
+        total = [0.0] * len(_SHOWN)
+        for chain in group:
+            *shares, _ = chain.shares(_SHOWN)
+            for share in shares:
+                late = [float(x) for x in share.delay_ms]
+                total = [a + b for a, b in zip(total, late, strict=True)]
+                rows.append([Cell(share.name), signal, *(f"{x:.2f}" for x in late)])
+        rows.append([f"all of the {signal}'s", signal, *(f"{x:.2f}" for x in total)])
+    heads = ("filter", "of", *(f"delay at {x:g} Hz, ms" for x in _SHOWN))
+    return Table(f"Filters {design}, with their shares of the delay", heads, rows, texts=2)
+
+
+def _noise(page: PilotPage) -> Section:
+    image = embed_figure(
+        lambda: spectra_figure(page.gyro, page.derivative, unit=page.unit),
+        alt=f"Spectra of the gyro and of the D term: {', '.join(page.gyro)}.",
+        caption="Noise of the gyro, and what the D term makes of it; before the filters by the "
+        "gain that flew.",
+    )
+    return {"image": image, "text": page.noise}
+
+
+def _steps(page: PilotPage) -> Section:
+    image = embed_figure(
+        lambda: steps_figure(page.steps),
+        alt=f"Rate after a step of the set-point: {', '.join(page.steps)}; 95 % of the plants.",
+        caption="The logged rate after a step of 1 of the set-point, without feed-forward: median "
+        "and 95 % of the plants that the log leaves possible.",
+    )
+    rows = [[Cell(name), *_step_numbers(band)] for name, band in page.steps.items()]
+    heads = ("gains", "overshoot, %", "worst, %", "half way after, ms")
+    return {"image": image, "table": Table("Step responses", heads, rows)}
+
+
+def _step_numbers(band: StepBand) -> list[str]:
+    half = float(band.time[(band.middle >= 0.5).argmax()])
+    over = [100 * max(float(x.max()) - 1, 0.0) for x in (band.middle, band.high)]
+    return [f"{over[0]:.0f}", f"{over[1]:.0f}", f"{1e3 * half:.0f}"]
+
+
+def _balance(page: PilotPage) -> Section:
+    image = None
+    if page.terms:
+        shown = ", ".join(f"{name} {value:.3g}" for name, value in page.terms.items())
+        image = embed_figure(
+            lambda: balance_figure(page.terms, unit=page.unit),
+            alt=f"Root mean squares of the terms: {shown} {page.unit}.",
+            caption=f"Root mean square of each term of the command in the log, {page.terms_are}; "
+            "the mean of I is left out.",
+        )
+    rows = [
+        [Cell(name), f"{100 * low:.2f}", f"{100 * high:.2f}"] for name, low, high in page.motors
+    ]
+    motors = Table("Motors at their limits", ("motor", "lowest, %", "highest, %"), rows)
+    return {"image": image, "motors": motors if rows else None}

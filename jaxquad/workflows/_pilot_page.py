@@ -1,0 +1,252 @@
+"""The page of a proposal for an autopilot, from what `autopilot` found."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jaxquad.control.autopilots import ArduPilotRate, BetaflightPID, FilterChain, PT1
+from jaxquad.plot import Spectrum, StepBand
+from jaxquad.records import AXES
+from jaxquad.report import Cell, Headline, PilotPage, Provenance, Table
+
+from ._flight_channels import FlightChannels
+from ._gyro_noise import gyro_noise, GyroNoise
+from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, make_loops, RateLaw
+
+
+if TYPE_CHECKING:
+    from ._autopilot import AutopilotProposal
+
+Chains = dict[str, tuple[FilterChain, ...]]
+_PLANTS, _SEED = 100, 77  # of the steps' bands
+_PERIOD, _SHOWN, _FINEST = 8.0, 1.2, 1 / 400  # s, of a computed step, of a shown one, of a sample
+_WINDOW = 4.0  # s, of computed terms
+_NEAR = 0.005  # of a motor's range, from its ends
+_SLOWEST = 20.0  # Hz, below which motion is taken for noise
+_UNITS = {"betaflight": "pidsum", "px4": "torque set-point", "ardupilot": "ROut"}
+
+
+def pilot_page(found: "AutopilotProposal", origin: Provenance) -> PilotPage:
+    """All that the page shows."""
+    flown, axis = found.flown, found.flown.axis
+    after = _proposed_law(found)
+    noise = found.noise
+    if noise is None and found.flight is not None:
+        told = gyro_noise(found.flight, flown.law, axis, _SLOWEST)
+        noise = told if isinstance(told, GyroNoise) else None
+    designs = {"flown": (flown.law, gains_of(flown.law, axis))}
+    if after is not None:
+        designs["proposed"] = (after, gains_in(flown.law, axis, found.new))
+    gyro, derivative = ({}, {}) if noise is None else _spectra(noise, axis, designs)
+    version = ".".join(map(str, flown.version))
+    terms, terms_are = _terms(found.flight, flown.law, axis)
+    return PilotPage(
+        title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
+        headlines=_headlines(found),
+        remarks=[f"not modelled: {each}" for each in flown.unmodelled],
+        filters=_filters(flown.law, after, axis),
+        gyro=gyro,
+        derivative=derivative,
+        noise="" if noise is None else (
+            f"Noise of {noise.source}, less what the set-point explains. Below "
+            f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
+        ),
+        steps=_steps(found, designs) if found.identification.fit.identifiable else {},
+        terms=terms,
+        terms_are=terms_are,
+        motors=[] if found.flight is None else _motors(found.flight),
+        stages=_stage_rows(found) if found.stages else None,
+        changes=_change_rows(found) if found.new else None,
+        text=str(found),
+        unit=_UNITS[flown.firmware],
+        provenance=origin,
+    )  # fmt: skip
+
+
+_WORDS = {
+    "proposed": ("good", "PROPOSED"), "kept": ("good", "WHAT FLEW IS KEPT"),
+    "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
+}  # fmt: skip
+
+
+def _headlines(found: "AutopilotProposal") -> list[Headline]:
+    headlines = [Headline(*_WORDS[found.kind], found.verdict)]
+    if found.reproduction is not None:
+        flew = found.reproduction.kind == "flown"
+        word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
+        level = "good" if flew else "bad"
+        headlines.append(Headline(level, word, found.reproduction.verdict))
+    if found.filters is not None:
+        level = "good" if found.filters.flown else "warn"
+        headlines.append(Headline(level, "FILTERS", found.filters.text))
+    return headlines
+
+
+def _proposed_law(found: "AutopilotProposal") -> RateLaw | None:
+    """The law with the proposed filters; None where nothing is proposed."""
+    if not found.new:
+        return None
+    filters = {} if found.filters is None else dict(found.filters.flown)
+    if not filters:
+        return found.flown.law
+    return found.flown.with_filters({name: found.new[name] for name in filters})
+
+
+def _filters(law: RateLaw, after: RateLaw | None, axis: int) -> dict[str, Chains]:
+    before = chains_of(law, axis)
+    if after is None or after is law:
+        return {"flown": before}
+    return {"flown": before, "proposed": chains_of(after, axis)}
+
+
+def chains_of(law: RateLaw, axis: int) -> Chains:
+    """The filters of the gyro and those of the D term alone."""
+    rate = 1 / law.dt
+    if isinstance(law, BetaflightPID):
+        gyro, slope = (law.gyro, FilterChain(law.filters, rate)), FilterChain(law.dterm, rate)
+    else:
+        cutoff = float(np.broadcast_to(law.derivative_hz, (3,))[axis])
+        own = rate if isinstance(law, ArduPilotRate) else law.gyro.rate_hz
+        gyro, slope = (law.gyro,), FilterChain((PT1(cutoff),) if cutoff > 0 else (), own)
+    chains: Chains = {"gyro": tuple(each for each in gyro if each.filters)}
+    if slope.filters and gains_of(law, axis)[2] > 0:
+        chains["D term"] = (slope,)
+    return chains
+
+
+Designs = Mapping[str, tuple[RateLaw, Float[np.ndarray, " gains"]]]
+
+
+def _spectra(
+    noise: GyroNoise, axis: int, designs: Designs
+) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
+    """Of gyro and D term: before all filters, then behind those of each design."""
+    seen = (noise.before.hertz > 1.0) & (noise.before.hertz <= noise.known_hz)
+    hertz, before = noise.before.hertz[seen], noise.before.power[seen]
+    behind = noise.behind.power[seen]
+    omega = 2 * np.pi * np.minimum(hertz, 0.4999 / designs["flown"][0].dt)
+    law, gains = designs["flown"]
+    gyro, derivative = {"before the filters": Spectrum(hertz, before)}, {}
+    chain = gyro_chain_response(law, omega)
+    for name, (each, own) in designs.items():
+        changed = np.abs(gyro_chain_response(each, omega) / chain) ** 2
+        if name == "flown" or each is not law:
+            gyro[name] = Spectrum(hertz, behind * changed)
+        through = np.abs(own[2] * law_paths(each, axis, omega)[0][2]) ** 2
+        if name == "flown" and gains[2] > 0:
+            slope = _response(chains_of(law, axis).get("D term", ()), hertz)
+            open = before * through / np.abs(slope) ** 2
+            derivative["before the filters"] = Spectrum(hertz, open)
+        if own[2] > 0:
+            derivative[name] = Spectrum(hertz, behind * changed * through)
+    return gyro, derivative
+
+
+def _response(
+    chains: Sequence[FilterChain], hertz: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, " frequencies"]:
+    found = np.ones(hertz.size, complex)
+    for each in chains:
+        found = found * np.asarray(each.response(hertz))
+    return found
+
+
+def _steps(found: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
+    """From set-point to rate, of plants drawn from the fit: by their responses."""
+    flown, unit = found.flown, found.identification.records[0].output_units[0]
+    dt = max(flown.law.dt, _FINEST)
+    count = 2 * int(_PERIOD / dt / 2)
+    omega = 2 * np.pi * np.arange(1, count // 2) / (count * dt)
+    seed = found.settings.seed + _SEED
+    loops = make_loops(flown.law, flown.axis, found.identification.fit, unit, _PLANTS, seed, omega)
+    fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2 if dt > flown.law.dt else 1.0
+    steps = {}
+    for name, (law, gains) in designs.items():
+        mine = loops if law is flown.law else loops.of_law(law, flown.axis)
+        [back], [ahead] = mine.paths(gains[None])
+        closed = fade * ahead * mine.plants / (1 + back * mine.plants)
+        ends = np.ones((len(closed), 1)), np.zeros((len(closed), 1))
+        impulse = np.fft.irfft(np.concatenate([ends[0], closed, ends[1]], axis=1), count, axis=1)
+        shown = int(_SHOWN / dt)
+        low, middle, high = np.percentile(
+            np.cumsum(impulse, axis=1)[:, :shown], [2.5, 50.0, 97.5], axis=0
+        )
+        steps[name] = StepBand(np.arange(shown) * dt, middle, low, high)
+    return steps
+
+
+def _terms(flight: FlightChannels | None, law: RateLaw, axis: int) -> tuple[dict[str, float], str]:
+    """Root mean squares of the terms, and where they are from."""
+    if flight is None:
+        return {}, ""
+    if {"P", "I"} <= set(flight.terms):
+        moved = {name: x - x.mean() if name == "I" else x for name, x in flight.terms.items()}
+        return {name: float(np.sqrt(np.mean(x**2))) for name, x in moved.items()}, "as logged"
+    return _computed_terms(flight, law, axis), "computed by the law from set-point and rate"
+
+
+def _computed_terms(flight: FlightChannels, law: RateLaw, axis: int) -> dict[str, float]:
+    size = min(int(_WINDOW / flight.dt), len(flight.setpoint))
+    hertz = np.fft.rfftfreq(size, flight.dt)
+    seen = (hertz > 0) & (hertz < 0.4999 / law.dt)
+    back, ahead = law_paths(law, axis, 2 * np.pi * hertz[seen])
+    places = np.arange(0, len(flight.setpoint) - size + 1, size // 2)[:, None] + np.arange(size)
+    taper = np.hanning(size)
+    rate = flight.rates[min(axis, len(flight.rates) - 1)]
+    r, y = (
+        np.fft.rfft((x[places] - x[places].mean(axis=1, keepdims=True)) * taper, axis=1)[:, seen]
+        for x in (flight.setpoint, rate)
+    )
+    found = {}
+    for k, (name, gain) in enumerate(zip("PID", gains_of(law, axis), strict=True)):
+        power = np.mean(np.sum(np.abs(gain * (ahead[k] * r - back[k] * y)) ** 2, axis=1))
+        found[name] = float(np.sqrt(2 * power / (size * np.sum(taper**2))))
+    return found
+
+
+def _motors(flight: FlightChannels) -> list[tuple[str, float, float]]:
+    if flight.motors is None:
+        return []
+    low, high = flight.motor_ends
+    near = _NEAR * (high - low)
+    return [
+        (f"motor {k + 1}", float(np.mean(x <= low + near)), float(np.mean(x >= high - near)))
+        for k, x in enumerate(flight.motors.T)
+    ]
+
+
+def _stage_rows(found: "AutopilotProposal") -> Table:
+    names = ["what flew", "a third of the way", "all of it"]
+    stages = list(found.stages)
+    if found.filters is not None and found.filters.flown and found.filters.gains_alone:
+        names.append("gains alone, filters as flown")
+        stages.append(found.filters.gains_alone)
+    rows: list[list[str | Cell]] = [
+        [
+            name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
+            f"{x.crossover / (2 * np.pi):.1f}", f"{x.rejection:.2f}", f"{x.noise:.2f}",
+        ]
+        for name, x in zip(names, stages, strict=True)
+    ]  # fmt: skip
+    heads = ("gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "torque", "noise")
+    return Table(f"On {found.settings.fresh} fresh plants", heads, rows)
+
+
+def _change_rows(found: "AutopilotProposal") -> Table:
+    rows: list[list[str | Cell]] = [
+        [
+            Cell(row.name), row.unit, _range(row.low, row.high), reason,
+            f"{old:.5g}", f"{new:.5g}",
+        ]
+        for row, old, new, reason in found.changes
+    ]  # fmt: skip
+    heads = ("parameter", "unit", "range", "reason", "old", "new")
+    return Table("From what flew to the proposal", heads, rows, texts=4)
+
+
+def _range(low: float, high: float) -> str:
+    if not np.isfinite(low):
+        return "none documented"
+    return f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} or above"

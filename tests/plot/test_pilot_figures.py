@@ -1,0 +1,62 @@
+"""Filters, noise, steps and terms of an autopilot: what is drawn is what the filters do."""
+
+import numpy as np
+import pytest
+
+from jaxquad.control.autopilots import FilterChain, Notch, PT1
+from jaxquad.plot import (
+    balance_figure,
+    filters_figure,
+    headless,
+    spectra_figure,
+    Spectrum,
+    StepBand,
+    steps_figure,
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def without_pyplot():
+    with headless():
+        yield
+
+
+GYRO = FilterChain((PT1(200.0), Notch(160.0, 4.0)), 4000.0)
+SLOPE = FilterChain((PT1(100.0),), 1000.0)
+
+
+def lines(panel):
+    return {str(line.get_label()): np.asarray(line.get_data()) for line in panel.get_lines()}
+
+
+def test_delays_of_chains_add_up_and_end_at_half_of_the_slowest_rate():
+    _, delay = filters_figure({"gyro": [GYRO], "D term": [GYRO, SLOPE]})
+    (hertz, gyro), (same, both) = lines(delay).values()
+    np.testing.assert_array_equal(hertz, same)
+    assert hertz[-1] < 500.0
+    np.testing.assert_allclose(both - gyro, SLOPE.delay_ms(hertz), rtol=1e-6, atol=1e-9)
+
+
+def test_a_spectrum_has_one_line_in_both_panels_and_degrees():
+    hertz = np.linspace(5.0, 400.0, 80)
+    flat = Spectrum(hertz, np.full(80, np.radians(1.0) ** 2))
+    falling = Spectrum(hertz, 1 / hertz)
+    gyro, slope = spectra_figure({"before": flat}, {"flown": falling, "before": falling}, unit="u")
+    np.testing.assert_allclose(lines(gyro)["before"][1], 0.0, atol=1e-9)  # 1 (deg/s)^2/Hz
+    looks = [
+        next(each for each in panel.get_lines() if each.get_label() == "before")
+        for panel in (gyro, slope)
+    ]
+    assert looks[0].get_linestyle() == looks[1].get_linestyle()
+    assert "re 1 u" in slope.get_ylabel()
+
+
+def test_steps_have_their_bands_and_terms_their_shares():
+    time = np.linspace(0.0, 1.0, 50)
+    rise = 1 - np.exp(-10 * time)
+    bands = {k: StepBand(time, rise, rise - 0.1, rise + 0.1) for k in ("flown", "proposed")}
+    [panel] = steps_figure(bands)
+    filled = panel.collections
+    assert len(filled) == 2 and filled[0].get_hatch() != filled[1].get_hatch()
+    [bars] = balance_figure({"P": 3.0, "I": 1.0}, unit="pidsum")
+    assert [text.get_text() for text in bars.texts] == ["3 (75 %)", "1 (25 %)"]
