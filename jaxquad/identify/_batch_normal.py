@@ -83,26 +83,45 @@ def evaluates_singly(batch: Batch) -> bool:
 
 
 def _one_by_one(batch: Batch, member: Member) -> Evaluate:
-    members = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), member)
-    problems = jax.vmap(ft.partial(_problem_of_one, batch))(members)
+    members = _lay_out(member)
 
     def one(given):
-        active, z, problem = given
-        shapes = jax.eval_shape(problem_normal, z, problem)
+        active, z, mine = given
+        normal = lambda z, mine: problem_normal(z, _problem_of_one(batch, mine))
+        shapes = jax.eval_shape(normal, z, mine)
         skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return jax.lax.cond(active, problem_normal, skip, z, problem)
+        return jax.lax.cond(active, normal, skip, z, mine)
 
     def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
-        found = jax.lax.map(one, (active, z.T, problems))
+        found = jax.lax.map(one, (active, z.T, members))
         return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), found)
 
     return evaluate
 
 
-def _problem_of_one(batch: Batch, member: Member) -> Problem:
+class _Single(NamedTuple):
+    """What one member is fitted to, in the order in which normal equations take it."""
+
+    measured: tuple[Array, Array]  # outputs inputs frequencies: real, imaginary
+    weights: Array  # 2 outputs inputs frequencies
+    factor: tuple[Array, Array] | None  # outputs inputs frequencies frequencies
+
+
+def _lay_out(member: Member) -> _Single:
+    """With the members first: transposed once, not at each evaluation."""
+    measured = jnp.moveaxis(1 / jax.lax.complex(*member.inverse), (3, 0), (0, 3))
+    weights = jnp.moveaxis(member.weights, (4, 3, 0), (0, 1, 4))
+    factor = None
+    if member.factor is not None:
+        real, imag = (jnp.moveaxis(x, (4, 0, 1), (0, 3, 4)) for x in member.factor)
+        factor = real, imag
+    return _Single((jnp.real(measured), jnp.imag(measured)), weights, factor)
+
+
+def _problem_of_one(batch: Batch, member: _Single) -> Problem:
     mixing = None
     if member.factor is not None:
-        factor = jnp.moveaxis(jax.lax.complex(*member.factor), (0, 1), (2, 3))
+        factor = jax.lax.complex(*member.factor)
         # Traced, in the place of NumPy's arrays; correlations matter to nothing here.
         mixing = Mixing(factor, factor)  # pyright: ignore[reportArgumentType]
     return Problem(
@@ -111,8 +130,8 @@ def _problem_of_one(batch: Batch, member: Member) -> Problem:
         conditions=(unchanged,),
         quantities=(),
         omega=(batch.omega,),
-        measured=(1 / jax.lax.complex(*member.inverse),),
-        weights=(member.weights,),
+        measured=(jnp.moveaxis(jax.lax.complex(*member.measured), -1, 0),),
+        weights=(jnp.moveaxis(member.weights, (3, 0), (0, 3)),),
         known=np.zeros((0, 2)),
         aliases=(None,),
         silent=((),),

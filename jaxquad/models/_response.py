@@ -216,7 +216,7 @@ def solve_states(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Sol
     """The response without a look at its rounding error."""
     scales = jax.lax.stop_gradient(_scales(matrices, omega))
     resolvent = inverse(_pencil(matrices, omega), scales)
-    states = Split(*(_multiply_columns(part, matrices.G) for part in resolvent))
+    states = Split(*(no_fuse(_multiply_columns, part, matrices.G) for part in resolvent))
     value = _apply_delay(output_of(matrices, omega, states), matrices.late, omega)
     return Solved(value, resolvent, states, scales)
 
