@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxquad._xla import no_fuse
 
-from ._response import Matrices, output_of, solve_states, Split
+from ._response import inverse_by_diagonal, Matrices, output_of, solve_states, Split
 
 
 class Entry(NamedTuple):
@@ -53,7 +53,7 @@ def logarithmic_slopes(
     They are those by each entry times its `scale`, the real and the imaginary part times `weights`.
     Both without a look at rounding near a pole; the slope of a response of 0 is not finite.
     """
-    found = solve_states(matrices, omega)
+    found = solve_states(matrices, omega, inverse_by_diagonal)
     seen, undelayed = (output_of(matrices, omega, x) for x in (found.resolvent, found.states))
     factors, places = _make_factors(entries, scale, seen, found.states, undelayed, omega)
     real = no_fuse(ft.partial(_real_slopes, places), factors, weights.real)
@@ -70,7 +70,10 @@ def _real_slopes(places: _Places, factors: _Factors, weights: Array) -> Array:
 
 def _imag_slopes(places: _Places, factors: _Factors, omega: Array, weights: Array) -> Array:
     a, b = _pick_factors(places, factors)
-    scale, delays = factors.scale[:, None, None, None], factors.late[..., None] * omega
+    scale, delays = (
+        factors.scale[:, None, None, None],
+        factors.late[..., None] * omega[None, None, None],
+    )
     return ((a.real * b.imag + a.imag * b.real) * scale - delays) * weights[None]
 
 
@@ -104,7 +107,9 @@ def _make_factors(
     left, right = (Split(*(x[at] for x in y)) for at, y in ((used, left), (pushed, right)))
     relative = no_fuse(_divide, left, no_fuse(_reciprocal, undelayed))
     places = _Places(tuple(column.tolist()), tuple(row.tolist()))
-    return _Factors(relative, right, signs * scale, late * scale[:, None, None]), places
+    return _Factors(
+        relative, right, jnp.asarray(signs, scale.dtype) * scale, late * scale[:, None, None]
+    ), places
 
 
 def _reciprocal(response: Split) -> Split:

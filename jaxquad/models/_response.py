@@ -1,5 +1,5 @@
 import functools as ft
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -18,6 +18,7 @@ class Split(NamedTuple):
 
 
 Scales = tuple[Float[Array, "states frequencies"], Float[Array, "states frequencies"]]
+Inverse = Callable[[Split, Scales], Split]
 
 
 def product(a: Split, b: Split) -> Split:
@@ -39,9 +40,28 @@ def inverse(matrix: Split, scales: Scales) -> Split:
     undefined.
     Source: Higham, Accuracy and Stability of Numerical Algorithms, section 14.4.
     """
+    return _in_units(_invert_in_place, matrix, scales)
+
+
+@jax.custom_jvp
+def inverse_by_diagonal(matrix: Split, scales: Scales) -> Split:
+    """As `inverse`, in half the time where the diagonal elements will do as pivots.
+
+    They do where, at all frequencies, none is below a hundredth of what is left of its column.
+    Source: Duff, Erisman, Reid, Direct Methods for Sparse Matrices, threshold pivoting.
+    """
+
+    def invert(scaled: Split) -> Split:
+        found, sound = _invert_by_diagonal(scaled)
+        return jax.lax.cond(sound, lambda _: found, _invert_in_place, scaled)
+
+    return _in_units(invert, matrix, scales)
+
+
+def _in_units(invert: Callable[[Split], Split], matrix: Split, scales: Scales) -> Split:
     rows, columns = scales
-    scaled = Split(*(rows[:, None] * part * columns[None] for part in matrix))
-    return Split(*(columns[:, None] * part * rows[None] for part in _invert_in_place(scaled)))
+    found = invert(Split(*(rows[:, None] * part * columns[None] for part in matrix)))
+    return Split(*(columns[:, None] * part * rows[None] for part in found))
 
 
 def invert(matrix: Complex[Array, "frequencies n n"]) -> Complex[Array, "frequencies n n"]:
@@ -67,10 +87,10 @@ def _invert_definite(
     matrix: Complex[Array, "frequencies n n"],
 ) -> Complex[Array, "frequencies n n"]:
     parts = Split(*(jnp.moveaxis(part(matrix), 0, -1) for part in (jnp.real, jnp.imag)))
-    count, _, frequencies = parts.real.shape
+    count = len(parts.real)
 
     def step(k: Int[Array, ""], table: Split) -> Split:
-        return _exchange_pivot(table, jnp.full(frequencies, k), k)
+        return _exchange_diagonal(table, _column(table, k), k)
 
     found = jax.lax.fori_loop(0, count, step, parts)
     return jnp.moveaxis(jax.lax.complex(*found), -1, 0)
@@ -82,11 +102,17 @@ def _invert(matrix: Complex[Array, "frequencies n n"]) -> Complex[Array, "freque
     return jnp.moveaxis(jax.lax.complex(*found), -1, 0)
 
 
-@inverse.defjvp
-def _inverse_jvp(primals, tangents):
-    found = inverse(*primals)  # whatever the scales
-    change = product(product(found, tangents[0]), found)
-    return found, Split(-change.real, -change.imag)
+def _derivative_of(inverse: Inverse) -> Callable[[tuple, tuple], tuple[Split, Split]]:
+    def derivative(primals, tangents):
+        found = inverse(*primals)  # whatever the scales
+        change = product(product(found, tangents[0]), found)
+        return found, Split(-change.real, -change.imag)
+
+    return derivative
+
+
+inverse.defjvp(_derivative_of(inverse))
+inverse_by_diagonal.defjvp(_derivative_of(inverse_by_diagonal))
 
 
 def equilibrium(
@@ -126,6 +152,31 @@ def _invert_in_place(matrix: Split) -> Split:
     return Split(order(table.real), order(table.imag))
 
 
+_LEAST = 0.01  # of its column, that a diagonal element must be to do as a pivot
+
+
+def _invert_by_diagonal(matrix: Split) -> tuple[Split, Bool[Array, ""]]:
+    """The inverse without a choice of pivots, and whether they all did."""
+    left = jnp.arange(len(matrix.real))[:, None]
+
+    def step(k: Int[Array, ""], carry: tuple[Split, Array]) -> tuple[Split, Array]:
+        table, sound = carry
+        column = _column(table, k)
+        size = column.real * column.real + column.imag * column.imag
+        largest = jnp.max(jnp.where(left >= k, size, 0), axis=0)
+        pivot = jax.lax.dynamic_index_in_dim(size, k, keepdims=False)
+        return _exchange_diagonal(table, column, k), sound & (pivot >= _LEAST**2 * largest)
+
+    sound = jnp.ones(matrix.real.shape[2], bool)
+    found, sound = jax.lax.fori_loop(0, len(matrix.real), step, (matrix, sound))
+    return found, jnp.all(sound)
+
+
+def _exchange_diagonal(table: Split, column: Split, k: Int[Array, ""]) -> Split:
+    row = Split(*(jax.lax.dynamic_index_in_dim(part, k, keepdims=False) for part in table))
+    return _exchange(table, row, column, (jnp.arange(len(table.real)) == k)[:, None], k)
+
+
 def _pivot_row(
     table: Split, unused: Float[Array, "states frequencies"], k: Int[Array, ""]
 ) -> Int[Array, " frequencies"]:
@@ -138,14 +189,16 @@ def _pivot_row(
 
 
 def _exchange_pivot(table: Split, row: Int[Array, " frequencies"], k: Int[Array, ""]) -> Split:
-    states = len(table.real)
-    mine, diagonal = _is_row(row, states), (jnp.arange(states) == k)[:, None]
-    pivots = [_take_along(part, row[None, None], 0)[0] for part in table]
-    here = [jax.lax.dynamic_index_in_dim(part, k) for part in pivots]
-    real, imag = _reciprocal(*here)
-    a, b = jnp.where(diagonal, 1, pivots[0]), jnp.where(diagonal, 0, pivots[1])
+    pivots = Split(*(_take_along(part, row[None, None], 0)[0] for part in table))
+    return _exchange(table, pivots, _column(table, k), _is_row(row, len(table.real)), k)
+
+
+def _exchange(table: Split, row: Split, column: Split, mine: Array, k: Int[Array, ""]) -> Split:
+    """Unknown k against the right side of a `row`, which is where `mine` says."""
+    diagonal = (jnp.arange(len(table.real)) == k)[:, None]
+    real, imag = _reciprocal(*(jax.lax.dynamic_index_in_dim(part, k) for part in row))
+    a, b = jnp.where(diagonal, 1, row.real), jnp.where(diagonal, 0, row.imag)
     scaled = Split((a * real - b * imag)[None], (a * imag + b * real)[None])
-    column = _column(table, k)
     column = Split(
         jnp.where(mine, -1, column.real)[:, None], jnp.where(mine, 0, column.imag)[:, None]
     )
@@ -212,10 +265,12 @@ class Solved(NamedTuple):
     scales: Scales
 
 
-def solve_states(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Solved:
+def solve_states(
+    matrices: Matrices, omega: Float[Array, " frequencies"], invert: Inverse = inverse
+) -> Solved:
     """The response without a look at its rounding error."""
     scales = jax.lax.stop_gradient(_scales(matrices, omega))
-    resolvent = inverse(_pencil(matrices, omega), scales)
+    resolvent = invert(_pencil(matrices, omega), scales)
     states = Split(*(no_fuse(_multiply_columns, part, matrices.G) for part in resolvent))
     value = _apply_delay(output_of(matrices, omega, states), matrices.late, omega)
     return Solved(value, resolvent, states, scales)

@@ -1,5 +1,6 @@
 """Normal equations from the structure of a state space against its derivative."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,11 +47,11 @@ def measured(seed):
     )
 
 
-def problem(**options):
+def problem(model=MODEL, entries=ENTRIES, **options):
     frfs = [measured(0), measured(1)]
-    parameters = select_parameters(MODEL, ENTRIES, options.pop("tied", None))
+    parameters = select_parameters(model, entries, options.pop("tied", None))
     weights = np.random.default_rng(2).random((2, *frfs[0].response.shape, 2))
-    return make_problem(MODEL, parameters, frfs, **options).weighted(list(jnp.asarray(weights)))
+    return make_problem(model, parameters, frfs, **options).weighted(list(jnp.asarray(weights)))
 
 
 @pytest.mark.slow
@@ -69,4 +70,20 @@ def test_normal_equations_are_those_of_the_differentiated_residuals(options):
     found = jax.jit(problem_normal)(z, made)
     wanted = jax.jit(normal_equations, static_argnums=0)(residuals, z, made)
     for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.max(np.abs(other)))
+
+
+@pytest.mark.slow
+def test_equations_may_stand_in_any_order():
+    # In the second one no diagonal element is large enough for a pivot.
+    order = np.array([1, 2, 0])
+    turned = eqx.tree_at(
+        lambda m: (m.F, m.G, m.M), MODEL, tuple(x[order] for x in (MODEL.F, MODEL.G, MODEL.M))
+    )
+    normals = []
+    for model, row in ((MODEL, 1), (turned, 0)):
+        entries = [f"F[{row}][0]", f"F[{row}][1]", f"G[{row}][0]", f"M[{row}][1]", "H1[0][1]"]
+        made = problem(model, entries)
+        normals.append(jax.jit(problem_normal)(made.parameters.start[: len(entries)], made))
+    for one, other in zip(*normals, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.max(np.abs(other)))
