@@ -1,6 +1,7 @@
 """What a process is set to: double precision where single gives wrong numbers, and one thread."""
 
 import contextlib
+import functools as ft
 from collections.abc import Iterator
 
 import jax
@@ -46,8 +47,13 @@ def one_blas_thread() -> Iterator[None]:
 
     The environment's OPENBLAS_NUM_THREADS and its kin count only before NumPy is imported.
     """
+    with _libraries().limit(limits=1, user_api="blas"):
+        yield
+
+
+@ft.cache  # to look for them takes as long as a small fit
+def _libraries() -> threadpoolctl.ThreadpoolController:
     import scipy.linalg.lapack  # SciPy has a BLAS of its own, and only loaded ones are limited
 
     del scipy
-    with threadpoolctl.threadpool_limits(limits=1, user_api="blas"):
-        yield
+    return threadpoolctl.ThreadpoolController()

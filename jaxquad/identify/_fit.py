@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 
@@ -5,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import require_x64
+from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
@@ -134,6 +135,9 @@ def fit(
     return fit_with(model, frfs, options)
 
 
+_SMALL = 256  # frequencies, up to which a second thread of BLAS waits longer than it works
+
+
 def fit_with(
     model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
 ) -> Fit:
@@ -145,6 +149,14 @@ def fit_with(
     - `rounds`: how often to solve again with what the model leaves unexplained as a floor on the
         random error; 0 for estimates under the noise alone, whose costs compare structures.
     """
+    small = all(np.size(one.omega) <= _SMALL for one in frfs)
+    with one_blas_thread() if small else contextlib.nullcontext():
+        return _fit_with(model, frfs, options, rounds)
+
+
+def _fit_with(
+    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int
+) -> Fit:
     model = with_arrays(model)
     parameters = select_parameters(model, options.free, options.tied)
     least = [least_coherence(options.min_coherence, options.cost, one) for one in frfs]

@@ -1,5 +1,7 @@
 """A rational model of whole records with the transients of their ends, from all bins at once."""
 
+import functools as ft
+import hashlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -12,6 +14,7 @@ from ._local_fit import Bins
 _BEYOND = 5.0  # ratio of the highest bin that is modelled to the highest frequency asked for
 _MOST_BINS = 20000  # that a model is fitted to
 _TRIAL_BINS = 4000  # with which its order is chosen
+_KEPT_BINS = 10000  # of a model that is kept: at most 10 MB
 _RELAXATIONS, _STEPS = 12, 20  # of Sanathanan and Koerner, of Gauss and Newton
 _SETTLED, _TRIAL = 1e-6, 1e-3  # relative gain of a step at which the descent, or a trial, ends
 _NEAREST = 1e-9  # size of the denominator, to its largest, so that no pole falls onto a bin
@@ -144,7 +147,10 @@ def global_models(
         Equations(lag / scale, u, own, bins.values[places, o])
         for o in range(outputs.start, outputs.stop)
     )
-    found = (_identify(equations, bins.omega[places], most) for equations in each)
+    tasks = (_Task(equations, bins.omega[places], most) for equations in each)
+    found = (
+        _identify_kept(task) if places.size <= _KEPT_BINS else task.identify() for task in tasks
+    )
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
         for one in found
@@ -162,9 +168,33 @@ def _thin(count: int, most: int) -> Int[np.ndarray, " places"]:
     return np.minimum(first + shift, count - 1)
 
 
+Identified = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
+
+
+class _Task:
+    """Equations to solve, equal to others of the same content."""
+
+    def __init__(self, equations: Equations, omega: Float[np.ndarray, " bins"], most: int):
+        self.identify = ft.partial(_identify, equations, omega, most)
+        whole = b"".join(each.tobytes() for each in (*equations, omega))
+        self.content = hashlib.blake2b(whole).digest(), equations.own.shape, most
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Task) and self.content == other.content
+
+    def __hash__(self) -> int:
+        return hash(self.content)
+
+
+@ft.lru_cache(maxsize=2)
+def _identify_kept(task: _Task) -> Identified | None:
+    """A fit with another delay of the outputs asks for the model of the inputs once more."""
+    return task.identify()
+
+
 def _identify(
     equations: Equations, omega: Float[np.ndarray, " bins"], most: int
-) -> tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray] | None:
+) -> Identified | None:
     """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
     every = _thin(len(omega), _TRIAL_BINS)
     first = _choose(equations.pick(every), most)

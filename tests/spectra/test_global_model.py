@@ -130,3 +130,10 @@ def test_bins_are_thinned_without_losing_the_lines_of_a_periodic_input():
     found = frequency_response(Record(DT * np.arange(u.size), u, ringing(3, u)), omega)
     errors = np.abs(np.asarray(found.response).ravel() / exact(omega) - 1)
     assert np.all(errors < 5 * np.sqrt(2) * np.asarray(found.random_error).ravel() + 1e-3)
+
+
+def test_an_estimate_does_not_depend_on_those_before_it():
+    first, other, again = (estimate(seed) for seed in (0, 1, 0))
+    np.testing.assert_array_equal(again.response, first.response)
+    between = np.abs(np.asarray(other.response) - np.asarray(first.response)).ravel()
+    assert np.all(between > 0)
