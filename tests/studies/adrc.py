@@ -8,7 +8,9 @@ shares nothing with the library, at five throttles between the lowest and the hi
 """
 
 import argparse
+import json
 import time
+from pathlib import Path
 
 import adrc_loop
 import numpy as np
@@ -48,6 +50,18 @@ def designs_of(flights: simulated.Flights, k: int) -> dict[str, tuple]:
     }
 
 
+def designed(flights: simulated.Flights, count: int, kept: Path | None) -> list[dict[str, tuple]]:
+    """Of the first flights; those in `kept`, a line each, are not made again."""
+    found = [json.loads(line) for line in kept.open()] if kept and kept.is_file() else []
+    for k in range(len(found), count):
+        found.append(designs_of(flights, k))
+        if kept:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            with kept.open("a") as file:
+                file.write(json.dumps(found[-1]) + "\n")
+    return found[:count]
+
+
 def throttles(flights: simulated.Flights) -> np.ndarray:
     """Five for each flight, (5, flights)."""
     third = len(flights.time) // 3
@@ -67,14 +81,16 @@ def judge(truth, levels: np.ndarray, rows: np.ndarray) -> list[adrc_loop.Found]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="tuned ADRC parameters on the true plants")
     parser.add_argument("--flights", type=int, default=200)
-    count = parser.parse_args().flights
+    parser.add_argument("--raw", type=Path, help="folder of designs, to continue after a stop")
+    options = parser.parse_args()
+    count = options.flights
     jq.enable_x64()
     rng, began = np.random.default_rng(study.SEED), time.process_time()
     ways, judged = {}, {}
     for log_rate in (1000, 2000):
         truth = simulated.draw(rng, count // 2)
         flights = simulated.fly(truth, rng, log_rate)
-        each = [designs_of(flights, k) for k in range(count // 2)]
+        each = designed(flights, count // 2, options.raw and options.raw / f"{log_rate}.jsonl")
         levels = throttles(flights)
         for way in each[0]:
             rows = np.array([one[way] for one in each], float)
