@@ -226,16 +226,15 @@ def projected_noise(
     length = int(next_fast_len(2 * samples, real=True) or 2 * samples)
     # One series after the other: fresh memory for all of them would take longer than they do.
     turn = lambda series: np.asarray(rfft(series, length))
-    power = lambda rows: (rows.real**2 + rows.imag**2) / samples
-    rest = [turn(residual[:, o]) for o in range(outputs)]
-    seen = np.empty((outputs, columns.shape[2], length // 2 + 1), complex)
-    smooth, left = [], []
+    power = lambda spectrum: (spectrum.real**2 + spectrum.imag**2) / samples
+    rest = [turn(each) for each in residual.T]
+    seen, smooth, left = [], [], []
     reach = _reach(length // 2 + 1, length / samples)
     for o in range(outputs):
-        for k in range(columns.shape[2]):
-            seen[o, k] = turn(columns[:, o, k])
-        taken = sum(power(each) for each in seen[o, :count])
-        taken += sum(power(turn(each)) for each in nuisance[:, o].T)
+        seen.append([turn(each) for each in columns[:, o].T])
+        taken = np.zeros(len(reach))
+        for each in (*seen[o][:count], *map(turn, nuisance[:, o].T)):
+            taken += power(each)
         smooth.append(_averaged(power(rest[o]), reach))
         left.append(np.sqrt(np.maximum(1 - _averaged(taken, reach), _FLOOR)))
     twice = np.full(len(reach), 2.0 / length)
@@ -251,14 +250,16 @@ def projected_noise(
 
 
 def _product(
-    one: Complex[np.ndarray, "columns bins"],
+    one: Sequence[Complex[np.ndarray, " bins"]],
     weight: Float[np.ndarray, " bins"] | Complex[np.ndarray, " bins"],
-    other: Complex[np.ndarray, "columns bins"],
+    other: Sequence[Complex[np.ndarray, " bins"]],
 ) -> Float[np.ndarray, "columns columns"]:
     """The real part of the sum of conj(weight one) other over the bins."""
-    if np.iscomplexobj(weight):
-        return np.real(np.conj(weight * one) @ other.T)
-    return (np.repeat(weight, 2) * one.view(float)) @ other.view(float).T
+    total = np.zeros((len(one), len(other)))
+    for k, row in enumerate(one):
+        weighted = (weight * row).view(float)
+        total[k] = [weighted @ each.view(float) for each in other]
+    return total
 
 
 def orthonormal(
@@ -267,7 +268,34 @@ def orthonormal(
     """An orthonormal basis of what the columns span over all samples and outputs."""
     scale = np.linalg.norm(columns, axis=(0, 1))
     columns = columns / np.where(scale > 1e-12 * np.max(scale, initial=0.0), scale, np.inf)
-    return np.linalg.qr(columns.reshape(-1, columns.shape[2]))[0].reshape(columns.shape)
+    return orthogonal_factors(columns.reshape(-1, columns.shape[2]))[0].reshape(columns.shape)
+
+
+_WELL = 1e-3  # smallest eigenvalue of the products of columns of unit length for two rounds
+
+
+def orthogonal_factors(
+    columns: Float[np.ndarray, "rows columns"],
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "columns columns"]]:
+    """Orthonormal columns and the triangle that makes the given ones of them.
+
+    By their products, twice, where they are far from dependent: for tall matrices that takes a
+    third of the time of reflections, and is as orthogonal.
+    Source: Yamamoto et al. (2015), Roundoff error analysis of the CholeskyQR2 algorithm.
+    """
+    scale = np.sqrt(np.einsum("ri,ri->i", columns, columns))
+    if not np.all(scale > 0) or not np.all(np.isfinite(scale)):
+        return np.linalg.qr(columns)
+    basis, triangle = columns, np.eye(scale.size)
+    for _ in range(2):
+        products = basis.T @ basis
+        unit = products / np.outer(scale, scale)
+        if len(basis) < scale.size or np.linalg.eigvalsh(unit)[0] < _WELL:
+            return np.linalg.qr(columns)
+        upper = np.linalg.cholesky(unit).T * scale
+        basis, triangle = basis @ np.linalg.inv(upper), upper @ triangle
+        scale = np.ones(scale.size)
+    return basis, triangle
 
 
 def _reach(bins: int, finer: float) -> np.ndarray:

@@ -265,7 +265,8 @@ def discrepancy_at(
 def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> list[str]:
     """Those of the responses' remarks that concern the points in use, each once."""
     used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
-    parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True)]
+    pairs = [(frf, mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
+    parts = [frf.remarks_about(mine) for frf, mine in pairs]
     return list(dict.fromkeys(remark for part in parts for remark in part))
 
 
@@ -276,6 +277,8 @@ def _decrement(
 ) -> float:
     """What a Gauss-Newton step lowers the cost by; parameters at zero do not become negative."""
     held = [k for k in at_zero if gradient[k] > 0]
+    if not held:
+        return 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
     free = np.setdiff1d(np.arange(gradient.size), held)
     inverse = scaled_inverse(bread[np.ix_(free, free)])
     return 0.5 * float(gradient[free] @ inverse @ gradient[free])

@@ -1,6 +1,5 @@
 """Costs: weights on the logarithm of the ratio of model to measurement."""
 
-import dataclasses
 import functools as ft
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
@@ -50,7 +49,6 @@ def paper_cost(
 
 
 @pytree_node
-@dataclasses.dataclass(frozen=True, eq=False)
 class Points:
     """The points of one measured response as a fit counts them.
 

@@ -8,7 +8,6 @@ Source: Kennedy & O'Hagan (2001), Bayesian calibration of computer models; Rasmu
 (2006), Gaussian Processes for Machine Learning, eq. 2.45.
 """
 
-import dataclasses
 import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -33,13 +32,11 @@ _RANK = 16  # of a kernel over a band of two decades: what is left of its varian
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
 _FOLLOWS = 1.25  # factor by which such a width grows
 
-_PAIR = ["einsum_path", (0, 1)]  # to search for a path takes longer than the products
 
 Widths = Float[np.ndarray, " parameters"]
 
 
 @pytree_node
-@dataclasses.dataclass(frozen=True, eq=False)
 class Discrepancy:
     """How far a model is off beyond the noise, in rad of phase; 0.6 of it in neper of magnitude.
 
@@ -183,9 +180,8 @@ def discrepancy_effect(
     for record in records:
         pulls = np.where(record.weights[..., None] > 0, record.pulls(count), 0.0)
         basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
-        pulls = pulls * SHARES[:, None]
-        along = np.einsum("lfr,foimx->lroimx", basis, pulls, optimize=_PAIR)
-        along = along.reshape(len(LENGTHS), -1, count)
+        pulls = np.reshape(pulls * SHARES[:, None], (len(pulls), -1))
+        along = (np.swapaxes(basis, 1, 2) @ pulls).reshape(len(LENGTHS), -1, count)
         total += np.swapaxes(along, 1, 2) @ along
     return total
 

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import Normal
-from jaxquad.models import sample_rational, SampledRational, TransferFunction
+from jaxquad.models import sample_rational, TransferFunction
 
 from ._evaluate import evaluate, Frame, take_apart
 from ._output_error_problem import Evaluation, insert_parameters, OutputError, RecordTerm
@@ -35,15 +35,19 @@ _DIGITS = 1e6  # rounding of the output, in units of the last bit of its largest
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
 _REFINEMENTS = 3
 _SETTLED = 1e-7  # change of an unknown, whose square is left to the next refinement
-_GONE = 1e-30  # of a free motion, relative to its start
+_GONE = 1e-20  # of the states, relative to their start
 
 Rows = Float[np.ndarray, "rows samples"]
 
 
 class Sampled(NamedTuple):
-    """A model at its samples, and what the parameters do to the coefficients."""
+    """A `SampledRational` on the host, and what the parameters do to its coefficients."""
 
-    model: SampledRational  # of NumPy's arrays
+    above: Float[np.ndarray, " zeros"]
+    below: Float[np.ndarray, " poles"]
+    shift: int
+    step: Float[np.ndarray, "both both"]
+    row: Float[np.ndarray, " both"]
     slopes: Float[np.ndarray, "coefficients parameters"]  # of B and then of A
 
 
@@ -51,7 +55,7 @@ class Columns(NamedTuple):
     """What start and trim do to a record."""
 
     free: Rows  # unit shift, biases and initial values
-    seen: Rows  # these as they count
+    seen: Rows  # these within the band
     scale: Float[np.ndarray, " rows"]  # that brings them to unit length
     normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
 
@@ -102,7 +106,7 @@ class FilteredPoint:
     @ft.cached_property
     def behind(self) -> list[Float[np.ndarray, " samples"]]:
         """y / A of each record."""
-        return [_over(one.sampled.model.below, one.output) for one in self.records]
+        return [_over(one.sampled.below, one.output) for one in self.records]
 
     @ft.cached_property
     def rows(self) -> list[Rows]:
@@ -137,7 +141,8 @@ class FilteredPoint:
         misfits = [one.misfit[:, None] for one in self.records]
         slopes = [rows.T[:, None] for rows in self.rows]
         columns = [one.columns.seen.T[:, None] for one in self.records]
-        return Evaluation(misfits, slopes, columns, Normal(self.cost, *self.normal))
+        normal = Normal(self.cost, *self.normal)  # pyright: ignore[reportArgumentType]
+        return Evaluation(misfits, slopes, columns, normal)
 
 
 def filtered_point(problem: OutputError, z: Float[np.ndarray, " parameters"]) -> FilteredPoint:
@@ -164,8 +169,7 @@ def _sampler(frame: Frame, arrays: list[Numbers], hold: str, dt: float) -> Progr
         coefficients, motion, shift = map(np.asarray, run(z, dt, arrays))
         both = motion.shape[1]
         above, below = np.split(coefficients[:, 0], [both // 2 + 2])
-        model = SampledRational(above, below, shift, motion[:both], motion[both:])
-        return Sampled(model, coefficients[:, 1:])
+        return Sampled(above, below, int(shift), motion[:both], motion[both], coefficients[:, 1:])
 
     return sample
 
@@ -191,17 +195,17 @@ def _program(frame: Frame, hold: str) -> Callable[[np.ndarray, float, list[Numbe
 
 
 def _simulated(term: RecordTerm, sampled: Sampled) -> Simulated:
-    model, samples = sampled.model, len(term.y)
-    late = _shifted(np.asarray(term.u)[:, 0], int(model.shift))
+    samples = len(term.y)
+    late = _shifted(np.asarray(term.u)[:, 0], sampled.shift)
     with np.errstate(all="ignore"):  # an unstable model is a failed step
-        driven = _over(model.below, late)
-        forced = np.convolve(driven, model.above)[:samples]
-        columns = _columns(term, _free_motions(term, model, samples))
-        measured = np.asarray(term.y)[:, 0] * term.weights[0]
-        misfit, unknowns = _project_out(measured - _weighted(term, forced), columns)
+        driven = _over(sampled.below, late)
+        forced = np.convolve(driven, sampled.above)[:samples]
+        columns = _columns(term, _free_motions(term, sampled, samples))
+        left = np.asarray(term.y)[:, 0] - _in_band(term, forced)
+        misfit, unknowns = _project_out(left, columns)
         # A shift stays what it is, whatever A does.
         output = forced + unknowns[1:] @ columns.free[1:]
-    return Simulated(sampled, driven, output, columns, misfit)
+    return Simulated(sampled, driven, output, columns, float(term.weights[0]) * misfit)
 
 
 def _shifted(u: Float[np.ndarray, " samples"], shift: int) -> Float[np.ndarray, " samples"]:
@@ -215,14 +219,14 @@ def _shifted(u: Float[np.ndarray, " samples"], shift: int) -> Float[np.ndarray, 
 
 
 def _slope_rows(term: RecordTerm, one: Simulated, behind: Float[np.ndarray, " samples"]) -> Rows:
-    model, samples = one.sampled.model, len(behind)
-    parts = np.zeros((model.above.size + model.below.size, samples))
-    for k in range(model.above.size):
-        parts[k, k:] = one.driven[: samples - k]
-    for k in range(model.below.size):
-        parts[model.above.size + k, k + 1 :] = behind[: samples - k - 1]
-    signs = np.repeat([-1.0, 1.0], [model.above.size, model.below.size])
-    return _weighted(term, (signs[:, None] * one.sampled.slopes).T @ parts)
+    model, samples = one.sampled, len(behind)
+    changes = np.split(term.weights[0] * one.sampled.slopes, [model.above.size])
+    rows = np.empty((one.sampled.slopes.shape[1], samples))
+    # One after the other: fresh memory for all shifts would take longer than they do.
+    for row, above, below in zip(rows, changes[0].T, changes[1].T, strict=True):
+        row[:] = np.convolve(one.driven, -above)[:samples]
+        row[1:] += np.convolve(behind, below)[: samples - 1]
+    return _in_band(term, rows)
 
 
 def _over(below: Float[np.ndarray, " poles"], x: Float[np.ndarray, " samples"]) -> np.ndarray:
@@ -233,24 +237,23 @@ def _over(below: Float[np.ndarray, " poles"], x: Float[np.ndarray, " samples"]) 
         return np.asarray(lfilter(np.ones(1), np.concatenate([[1.0], below]), x))
 
 
-def _weighted(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndarray:
-    seen = x if term.gain is None else np.asarray(band_filter(x.T, np.asarray(term.gain))).T
-    return seen * term.weights[0]
+def _in_band(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndarray:
+    return x if term.gain is None else np.asarray(band_filter(x.T, np.asarray(term.gain))).T
 
 
-def _free_motions(term: RecordTerm, model: SampledRational, samples: int) -> Rows:
+def _free_motions(term: RecordTerm, sampled: Sampled, samples: int) -> Rows:
     """A shift, biases on the slow motions and initial values of the fast ones, as rows."""
     assert term.motions is not None
     slow, fast = (np.asarray(each) for each in term.motions)
     states = len(slow)
     if not slow.shape[1]:  # the biases are those of no one
-        step, rows, ways = model.step[:states, :states], model.rows[:, :states], fast.T
+        step, row, ways = sampled.step[:states, :states], sampled.row[:states], fast.T
     else:
-        step, rows = model.step, model.rows
+        step, row = sampled.step, sampled.row
         ways = np.zeros((slow.shape[1] + fast.shape[1], 2 * states))
         ways[: slow.shape[1], states:], ways[slow.shape[1] :, :states] = slow.T, fast.T
     found = np.ones((1 + len(ways), samples))
-    found[1:] = ways @ _motion(rows[0], step, samples)
+    found[1:] = ways @ _motion(row, step, samples)
     return found
 
 
@@ -260,19 +263,16 @@ def _motion(
     """`row` step^k for each sample k, as far as anything is left of it."""
     found = np.zeros((len(row), samples))
     found[:, 0], done = row, 1
-    largest = np.max(np.abs(row), initial=0.0)
     power = step.T
-    while done < samples:
+    while done < samples and np.max(np.abs(power)) > _GONE:
         more = min(done, samples - done)
         found[:, done : done + more] = power @ found[:, :more]
-        if np.max(np.abs(found[:, done : done + more])) < _GONE * largest:
-            break
         power, done = power @ power, done + more
     return found
 
 
 def _columns(term: RecordTerm, free: Rows) -> Columns:
-    seen = _weighted(term, free)
+    seen = _in_band(term, free)
     normal = seen @ seen.T
     square = np.diagonal(normal)
     scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
@@ -304,6 +304,6 @@ def _without_columns(rows: Rows, columns: Columns) -> Float[np.ndarray, "paramet
 
 
 def _is_precise(one: Simulated, behind: Float[np.ndarray, " samples"]) -> bool:
-    above, size = np.sum(np.abs(one.sampled.model.above)), float(np.max(np.abs(one.output)))
+    above, size = np.sum(np.abs(one.sampled.above)), float(np.max(np.abs(one.output)))
     needed = max(float(np.max(np.abs(behind))), float(above * np.max(np.abs(one.driven))))
     return np.isfinite(needed) and needed <= _DIGITS * size

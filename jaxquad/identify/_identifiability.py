@@ -163,6 +163,8 @@ def assess_identifiability(information: Information, bounds: tuple[Bound, ...] =
 
     Parameters with a bound are determined by it, and take part in no direction.
     """
+    if not bounds:
+        return _assess(information)
     count = len(information.covariance)
     at_zero = [information.names.index(bound.name) for bound in bounds]
     kept = np.setdiff1d(np.arange(len(information.names)), at_zero)

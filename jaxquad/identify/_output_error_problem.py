@@ -144,9 +144,9 @@ def project_out(
 class Evaluation(NamedTuple):
     """Misfits, slopes and columns at one place, record by record; all weighted."""
 
-    misfits: list[Float[Array, "samples outputs"]]
-    slopes: list[Float[Array, "samples outputs n"]]  # by parameters, then initial states
-    columns: list[Float[Array, "samples outputs unknowns"]]  # of start, trim and shift
+    misfits: Sequence[Float[Numbers, "samples outputs"]]
+    slopes: Sequence[Float[Numbers, "samples outputs n"]]  # by parameters, then initial states
+    columns: Sequence[Float[Numbers, "samples outputs unknowns"]]  # of start, trim and shift
     normal: Normal  # of these, of the priors and of a hold on the initial states
 
     def reweighted(self, sizes: Sequence[Float[np.ndarray, " outputs"]]) -> "Evaluation":

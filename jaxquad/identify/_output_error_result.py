@@ -14,6 +14,7 @@ from ._accuracy import (
     calibrated_covariance,
     Matrix,
     Noise,
+    orthogonal_factors,
     orthonormal,
     PriorRows,
     projected_noise,
@@ -147,7 +148,7 @@ def reduced_rows(
     """Slopes, misfit, noise and output in one orthonormal basis of the slopes of all records."""
     every = projected[0].slopes.shape[2]
     stacked = np.concatenate([one.slopes.reshape(-1, every) for one in projected])
-    basis, root = np.linalg.qr(np.concatenate([stacked, np.zeros((every, every))]))
+    basis, root = orthogonal_factors(np.concatenate([stacked, np.zeros((every, every))]))
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
     for one, term in zip(projected, terms, strict=True):
         mine = basis[at : at + one.misfit.size].reshape(one.slopes.shape)

@@ -1,6 +1,5 @@
 """Which numbers of a model are free, under which names, and how each is scaled."""
 
-import dataclasses
 import functools as ft
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -46,7 +45,6 @@ Tie = Callable[[PyTree], Float[Array, ""]]
 
 
 @pytree_node
-@dataclasses.dataclass(frozen=True, eq=False)
 class Parameters:
     """Free numbers first, then the fixed nonzero ones; `z` is the vector that a solver moves.
 
@@ -138,10 +136,11 @@ def _places(
     hollow = jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])
     places, names, given = [], [], _given_names(hollow)
     for leaf, (path, array) in enumerate(jax.tree_util.tree_flatten_with_path(hollow)[0]):
-        names.append(jax.tree_util.keystr(path, simple=True, separator="."))
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        names.append(name)
         for index in range(array.size):
             place = np.unravel_index(index, array.shape)
-            entry = names[-1] + "".join(f"[{i}]" for i in place)
+            entry = name + "".join(f"[{i}]" for i in place)
             places.append(Place(given.get(entry, entry), leaf, index, entry))
     return tuple(places), tuple(names)
 

@@ -53,7 +53,6 @@ class Prior(eqx.Module):
 
 
 @pytree_node
-@dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
     """One least-squares problem: residuals as a function of `z`, with all that they depend on."""
 

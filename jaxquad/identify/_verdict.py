@@ -1,6 +1,5 @@
 """What a record determines of a model's parameters, in numbers and in words."""
 
-import dataclasses
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -77,7 +76,6 @@ class Bound(NamedTuple):
 
 
 @pytree_node
-@dataclasses.dataclass(frozen=True, eq=False)
 class Verdict:
     """Which free parameters a record determines; true if it determines each of them individually.
 
