@@ -104,12 +104,12 @@ def main() -> None:
     }
     table = [_row(way, rows[way], found[way], found["defaults"]) for way in rows]
     certified = rows["tuned"][:, -1]
-    kept = int(np.sum(found["tuned"].peak.max(axis=0) <= certified))
-    write("adrc", _study(count, table, kept, {way: rows[way][:, :3] for way in rows}))
+    excess = found["tuned"].peak.max(axis=0) / certified - 1
+    write("adrc", _study(count, table, excess, {way: rows[way][:, :3] for way in rows}))
     print(f"{time.process_time() - began:.0f} s of CPU")
     for line in table:
         print(*line, sep=" | ")
-    print(f"true Ms within the certificate: {kept} of {count}")
+    print(f"true Ms over the certificate's: {excess.max():.4f} at most")
 
 
 TITLES = {
@@ -143,7 +143,8 @@ def _row(way: str, rows: np.ndarray, found: adrc_loop.Found, beside: adrc_loop.F
     ]
 
 
-def _study(count: int, table: list, kept: int, raw: dict) -> dict:
+def _study(count: int, table: list, excess: np.ndarray, raw: dict) -> dict:
+    below, most = int(np.sum(excess <= 0)), 100 * excess.max()
     return {
         "title": "ADRC parameters from a log, on the true plant",
         "command": f"python tests/studies/adrc.py --flights {count}",
@@ -161,13 +162,17 @@ def _study(count: int, table: list, kept: int, raw: dict) -> dict:
         "columns": [
             "parameters", "wc / wo / b0, median", "stable, % of flights", "Ms at most 1.8, %",
             "median Ms", "greatest", "peak of r to rate", "bandwidth, Hz", "settling to 5 %, ms",
-            "rate after torque, of the defaults'",
+            "rate after torque, relative to the defaults",
         ],
         "rows": table,
         "notes": [
-            f"The true Ms is at most the certificate's worst in {kept} of {count} flights.",
-            "Medians from the fourth column on are over the flights that are stable. Filters of "
-            "the gyro stay as they flew in all rows, where the guide switches them off.",
+            f"The true Ms is at most the certificate's worst in {below} of {count} flights, and at "
+            f"most {most:.1f} % above it in the others. The search keeps 3 % in reserve.",
+            "Times two holds Ms, too: gain / lag alone is too small a b0, since the motors' pole is "
+            "a part of what the observer has to follow. What it costs stands in the last columns.",
+            "Peak, bandwidth (lowest throttle), settling and the rate after a step of torque are "
+            "medians over the stable flights. Filters of the gyro stay as they flew in all rows, "
+            "where the guide switches them off.",
             "The simulated plant has the model's structure.",
         ],
         "designs": raw,
