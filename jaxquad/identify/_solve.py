@@ -56,7 +56,8 @@ def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[No
     matrices = matrices_of(parameters.insert(problem.model, z))
     entries = [_entry(place.path) for place in parameters.places[: z.size]]
     weights = Split(*jnp.moveaxis(jnp.asarray(problem.weights[k]), (0, 3), (3, 0)))
-    value, rows = logarithmic_slopes(matrices, omega, entries, parameters.slopes(z), weights)
+    scale = jnp.asarray(parameters.slopes(z))
+    value, rows = logarithmic_slopes(matrices, omega, entries, scale, weights)
     misfit = _logarithm(value, jnp.asarray(problem.measured[k]))
     residual = [part * weight for part, weight in zip(misfit, weights, strict=True)]
     mixing = problem.mixings[k]

@@ -107,9 +107,8 @@ def _make_factors(
     left, right = (Split(*(x[at] for x in y)) for at, y in ((used, left), (pushed, right)))
     relative = no_fuse(_divide, left, no_fuse(_reciprocal, undelayed))
     places = _Places(tuple(column.tolist()), tuple(row.tolist()))
-    return _Factors(
-        relative, right, jnp.asarray(signs, scale.dtype) * scale, late * scale[:, None, None]
-    ), places
+    signs, delays = (jnp.asarray(x, scale.dtype) for x in (signs, late))
+    return _Factors(relative, right, signs * scale, delays * scale[:, None, None]), places
 
 
 def _reciprocal(response: Split) -> Split:
