@@ -64,7 +64,9 @@ def _row(job: Job, rounds: int) -> list[str]:
 
 
 def _run(job: Job, told: dict[str, str]) -> Times:
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")} | told
+    # Modules are kept compiled, as after an installation.
+    other = ("JAX_", "PYTHONDONTWRITEBYTECODE")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(other)} | told
     with tempfile.TemporaryDirectory() as folder:
         if job.after:
             _process(job.after, folder, environment)
