@@ -190,21 +190,23 @@ def propose_adrc(
     ]
     edge = np.inf if found.fit.origin is None else found.fit.origin.band[1]
     default = np.array([row.default for row in _rows(axis)], float)
-    loops, best, stages = make(max(1, members // bins), seed), default, ()
-    for attempt in range(1, _CERTIFICATES + 1):
+    loops, attempt = make(max(1, members // bins), seed), 1
+    while True:
         announce(f"searching wc, wo and b0 at {bins} throttles")
         best = _search(loops, scaled.b0.value, targets, edge, axis)
         announce(f"certifying the whole numbers on {fresh} new plants")
         new = make(fresh, seed + attempt)
-        stages = tuple(_stage(new, each) for each in (best, default))
-        if not _beyond(stages[0], targets, edge):
+        stage = _stage(new, best)
+        if attempt == _CERTIFICATES or not _beyond(stage, targets, edge):
             break
         loops = [old.joined(each, best) for old, each in zip(loops, new, strict=True)]
-    kind, verdict = _judge(stages[0], targets, edge, fresh, grid)
+        attempt += 1
+    kind, verdict = _judge(stage, targets, edge, fresh, grid)
     values = {row.name: float(x) for row, x in zip(_rows(axis), best, strict=True)}
     values["adrc_hover_throttle"] = round(100 * hover)
     stored = store_parameters("betaflight", values) if kind == "proposed" else {}
-    return ADRCProposal(kind, verdict, stored, scaled.law, tuple(map(float, grid)), *stages)
+    at = tuple(map(float, grid))
+    return ADRCProposal(kind, verdict, stored, scaled.law, at, stage, _stage(new, default))
 
 
 def _rows(axis: str) -> list[Parameter]:
@@ -363,8 +365,11 @@ def _stage(loops: Sequence[_Loop], design: np.ndarray) -> ADRCStage:
     flown = [each.loops.qualities(np.eye(1)) for each in loops]
     joined, before = _together(found), _together(flown)
     relative = lambda new, old: float(np.sqrt(np.mean((new / old) ** 2)))
+    wc, wo, b0 = map(float, design)
     return ADRCStage(
-        *map(float, design),
+        wc,
+        wo,
+        b0,
         float(np.mean(joined.stable)),
         float(np.max(joined.peak)),
         float(np.max(joined.resonance)),

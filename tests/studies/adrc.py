@@ -168,7 +168,7 @@ def _study(count: int, table: list, excess: np.ndarray, raw: dict) -> dict:
         "notes": [
             f"The true Ms is at most the certificate's worst in {below} of {count} flights, and at "
             f"most {most:.1f} % above it in the others. The search keeps 3 % in reserve.",
-            "Times two holds Ms, too: gain / lag alone is too small a b0, since the motors' pole is "
+            "Times two holds Ms, too: gain / lag is too small a b0, since the motors' pole is "
             "a part of what the observer has to follow. What it costs stands in the last columns.",
             "Peak, bandwidth (lowest throttle), settling and the rate after a step of torque are "
             "medians over the stable flights. Filters of the gyro stay as they flew in all rows, "
