@@ -123,20 +123,14 @@ def _smooth_peak(loop: OpenLoop) -> Float[Array, ""]:
     """Of all points on a grid; only those about the peak are differentiated."""
     grid = np.geomspace(_SMOOTH_LOWEST, 1.0, _SMOOTH_POINTS) * np.pi / loop.dt
     omega = jnp.asarray(grid, loop.shift.dtype)
-    place = jnp.argmin(_parabolas(_distances(jax.lax.stop_gradient(loop), omega)))
+    place = jnp.argmin(_parabolas(jax.lax.stop_gradient(loop).squared_distance(omega)))
     about = jax.lax.dynamic_slice(omega, (place,), (3,))
-    square = _distances(loop, jnp.concatenate([about, omega[-1:]]))
+    square = loop.squared_distance(jnp.concatenate([about, omega[-1:]]))
     return 1 / jnp.sqrt(jnp.minimum(_parabolas(square[:3])[0], square[3]))
 
 
-def _distances(loop: OpenLoop, omega: Float[Array, " points"]) -> Float[Array, " points"]:
-    """|1 + L|^2: about a sharp peak of the sensitivity it is a parabola."""
-    distance = 1 + loop.loop(omega)
-    return distance.real**2 + distance.imag**2
-
-
 def _parabolas(square: Float[Array, " points"]) -> Float[Array, " inner"]:
-    """The least value near each inner point, of a parabola through it and its neighbours."""
+    """The least |1 + L|^2 near each inner point: about a sharp peak of |S| it is a parabola."""
     low, middle, high = square[:-2], square[1:-1], square[2:]
     slope, bend = 0.5 * (high - low), low - 2 * middle + high
     deepest = (middle <= low) & (middle <= high) & (bend > 0)

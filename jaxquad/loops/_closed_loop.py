@@ -25,11 +25,18 @@ class Rational(NamedTuple):
 
     def __call__(self, ahead: Complex[Array, " points"]) -> Complex[Array, "inputs points"]:
         """The values at `ahead`, which is z - 1."""
+        above, below = self.split(ahead)
+        return above / below
+
+    def split(
+        self, ahead: Complex[Array, " points"]
+    ) -> tuple[Complex[Array, "inputs points"], Complex[Array, "1 points"]]:
+        """The values of the numerators and of the denominator at `ahead`."""
         rows = jnp.concatenate([self.numerators, self.denominator[None]]).astype(ahead.dtype)
         value = jnp.broadcast_to(rows[:, :1], (len(rows), *ahead.shape))
         for k in range(1, rows.shape[1]):
             value = value * ahead[None] + rows[:, k, None]
-        return value[:-1] / value[-1:]
+        return value[:-1], value[-1:]
 
 
 def rational(
@@ -83,14 +90,24 @@ class OpenLoop(eqx.Module):
 
     def parts(self, omega: Float[Array, " points"]) -> Complex[Array, "4 points"]:
         """Angle per command and per disturbance torque, command per angle and per reference."""
-        # exp(j angle) - 1 without the cancellation at small angles
         angle = omega * self.dt
-        ahead = jax.lax.complex(-2 * jnp.sin(angle / 2) ** 2, jnp.sin(angle))
+        ahead = _ahead(angle)
         fresh, stale, disturbance = self.angle(ahead)
         late = jnp.exp(-self.shift.astype(ahead.dtype) * imaginary(angle))
         driven = late * (fresh + stale / (1 + ahead))
         feedback, prefilter = self.command(ahead)
         return jnp.stack([driven, disturbance, feedback, prefilter])
+
+    def squared_distance(self, omega: Float[Array, " points"]) -> Float[Array, " points"]:
+        """|1 + L|^2, without a complex quotient: in float64 only, the products are that small."""
+        angle = omega * self.dt
+        ahead = _ahead(angle)
+        (fresh, stale, _), below = self.angle.split(ahead)
+        (feedback, _), inner = self.command.split(ahead)
+        late = jnp.exp(-self.shift.astype(ahead.dtype) * imaginary(angle))
+        driven = late * (fresh + stale * (1 + jnp.conj(ahead)))  # |1 + ahead| is 1
+        denominator = below[0] * inner[0]
+        return _square(denominator - driven * feedback) / _square(denominator)
 
     def static_gain_margin(self) -> Float[Array, ""]:
         """-1 / L at frequency 0, the gain at which a pole passes z = 1; `nan` without one.
@@ -103,6 +120,15 @@ class OpenLoop(eqx.Module):
         below = self.angle.denominator[-1] * self.command.denominator[-1]
         crosses = above * below > 0  # L is their ratio, with a minus
         return jnp.where(crosses, below / jnp.where(above == 0, 1.0, above), jnp.nan)
+
+
+def _ahead(angle: Float[Array, " points"]) -> Complex[Array, " points"]:
+    """exp(j angle) - 1 without the cancellation at small angles."""
+    return jax.lax.complex(-2 * jnp.sin(angle / 2) ** 2, jnp.sin(angle))
+
+
+def _square(x: Complex[Array, " points"]) -> Float[Array, " points"]:
+    return x.real**2 + x.imag**2
 
 
 def join(plant: SampledAxis, controller: LinearController) -> OpenLoop:

@@ -219,25 +219,42 @@ def identify(
         result.write("results/flight")
         ```
     """
+    found = _identify(path, settings, proposal, beside=True)
+    return dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
+
+
+def identify_fit(
+    path: str | Path | Sequence[str | Path], settings: IdentifySettings
+) -> Identification:
+    """The estimate to trust and its fit alone, which are what a design needs."""
+    return _identify(path, settings, None, beside=False)
+
+
+def _identify(
+    path: str | Path | Sequence[str | Path],
+    settings: IdentifySettings | None,
+    proposal: Proposal | None,
+    *,
+    beside: bool,
+) -> Identification:
+    """`beside` the estimate to trust, the direct one is fitted, too."""
     path, *more = [Path(path)] if isinstance(path, str | Path) else map(Path, path)
     if proposal is None:
         given = settings or IdentifySettings()
         settings, proposal = propose_settings(path, given, several=bool(more))
     settings = settings or IdentifySettings()
     records = read_logs((path, *more), settings)
-    methods = ("joint", "direct") if settings.reference else ("direct",)
+    best, *others = ("joint", "direct") if settings.reference else ("direct",)
     responses, fits, delay = {}, {}, 0.0
-    for method in methods:
+    for method in (best, *(others if beside else ())):
         responses[method], found, delay = fit_twice(records, method, settings, delay)
         fits[method] = with_units(with_remedies(found, settings), records[0])
     announce("fits to parts of the band")
-    best = methods[0]
     fits[best], parts = fit_parts(fits[best], responses[best], settings)
     fits = {name: in_option_words(each) for name, each in fits.items()}
-    found = Identification(
+    return Identification(
         path, settings, records, responses, fits, parts, None, proposal, more=tuple(more)
     )
-    return dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
 
 
 def _fitted_again(found: Identification) -> dict[str, Bands | Explanation | None]:

@@ -12,7 +12,7 @@ from jaxquad.identify import Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError
 from jaxquad.report import provenance, sha256_of, write_report, write_results
 
-from ._identify import Identification, identify
+from ._identify import Identification, identify, identify_fit
 from ._log import read_records
 from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
@@ -148,6 +148,20 @@ def identify_again(
 
     **Raises:** ValueError where a log is gone, or is not the same file by its SHA-256.
     """
+    return identify(*_unchanged_logs(result, log))
+
+
+def fit_again(
+    result: str | Path | StoredResult, *, log: str | Path | None = None
+) -> Identification:
+    """As `identify_again`, but only the estimate to trust and its fit."""
+    return identify_fit(*_unchanged_logs(result, log))
+
+
+def _unchanged_logs(
+    result: str | Path | StoredResult, log: str | Path | None
+) -> tuple[list[Path], IdentifySettings]:
+    """The logs of a stored result and its settings."""
     stored = result if isinstance(result, StoredResult) else load_result(result)
     paths = stored.logs
     if log is not None:
@@ -156,7 +170,7 @@ def identify_again(
     files = [*paths, *([Path(verified)] if verified else [])]
     for file, known in zip(files, stored.hashes, strict=True):
         _check_unchanged(file, known)
-    return identify(paths, stored.settings)
+    return list(paths), stored.settings
 
 
 def _check_unchanged(path: Path, known: str) -> None:

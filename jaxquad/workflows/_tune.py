@@ -30,7 +30,7 @@ from jaxquad.tuning import (
 
 from ._identify import Identification
 from ._result_file import StoredResult
-from ._stored import identify_again
+from ._stored import fit_again
 from ._tune_settings import TuneSettings
 
 
@@ -46,7 +46,7 @@ class Tuning:
 
     **Attributes:**
 
-    - `identification`: the axis.
+    - `identification`: the axis; of a stored result its fit alone, without what stands beside it.
     - `settings`: those that were used.
     - `tuned`: controller, gains and certificate.
     - `loop`, `ensemble`, `flight`: what it was tuned on.
@@ -130,7 +130,7 @@ def tune(
 
     **Arguments:**
 
-    - `result`: what `identify` returned, or the folder of a result, which is identified again.
+    - `result`: what `identify` returned, or the folder of a result, whose fit is made again.
     - `settings`: what the record does not tell: inertia, limits, noise.
     - `log`: where the log lies, if it was moved.
     - `progress`: as in `jq.tune`.
@@ -140,7 +140,7 @@ def tune(
     **Raises:** ValueError for an output whose unit is neither rad nor rad/s, and for a negative
     gain; `UndeterminedError` (a ValueError) where the record does not determine the plant.
     """
-    found = result if isinstance(result, Identification) else identify_again(result, log=log)
+    found = result if isinstance(result, Identification) else fit_again(result, log=log)
     if not found.fit.verdict.fitted:
         raise UndeterminedError(found.fit.verdict.summary)
     record = found.records[0]
