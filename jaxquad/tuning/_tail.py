@@ -27,6 +27,7 @@ SLICE = 2048  # linear loops that are evaluated at once
 GUARDS = 16  # members that fly for limits alone
 _LOOPS, _FLIGHTS = 8192, 2048  # of a search, unless it has enough members to go on with before
 _ENOUGH = 16  # members beyond a limit
+_NEAR = 0.1  # nepers within a limit: so near, they are tuned on with those beyond it
 _ADDED = 64  # linear loops at most, after a search
 
 
@@ -119,17 +120,17 @@ def search_tail(
     found = Beyond(None, None, 0)
     if search.linear is not None:
         levels = lambda loops: [_levels(x, coordinates, loops, limits) for x, limits in designs]
-        slices, ranked = _search(search.linear, number, _LOOPS // SLICE, levels)
+        slices, ranked, count = _search(search.linear, number, _LOOPS // SLICE, levels)
         loops = WorstLoops(slices, [place for _, place in ranked[:_ADDED]])
-        found = Beyond(loops, None, len(ranked), len(slices) * SLICE)
+        found = Beyond(loops, None, count, len(slices) * SLICE)
     if search.flights is not None:
         fly, most = search.flights.fly, max(1, _FLIGHTS // search.flights.size)
         controllers = [(build_design(coordinates, x), limits) for x, limits in designs]
         levels = lambda flown: [flight_levels(fly(x, flown), limits) for x, limits in controllers]
-        slices, ranked = _search(search.flights.draw, number, most, levels)
+        slices, ranked, count = _search(search.flights.draw, number, most, levels)
         members = take_members(slices, [place for _, place in ranked[:GUARDS]])
         flights = len(slices) * search.flights.size
-        found = found._replace(members=members, count=found.count + len(ranked), flights=flights)
+        found = found._replace(members=members, count=found.count + count, flights=flights)
     return found
 
 
@@ -142,17 +143,22 @@ def _search(
     number: int,
     most: int,
     levels: Callable[[Slice], Sequence[Float[ArrayLike, " members"]]],
-) -> tuple[list[Slice], Ranked]:
-    """Slices, `most` of them unless there are members enough to go on, and who is beyond."""
+) -> tuple[list[Slice], Ranked, int]:
+    """Slices, `most` of them unless there are members enough to go on, and who is near a limit.
+
+    Also returns how many of these are beyond it.
+    """
     slices: list[Slice] = []
     ranked: Ranked = []
+    count = 0
     for s in range(most):
         slices.append(draw(number * most + s))
         level = np.max([np.asarray(x) for x in levels(slices[s])], axis=0)
-        ranked += [(float(level[k]), (s, int(k))) for k in np.flatnonzero(level > 0)]
-        if len(ranked) >= _ENOUGH:
+        ranked += [(float(level[k]), (s, int(k))) for k in np.flatnonzero(level > -_NEAR)]
+        count += int(np.sum(level > 0))
+        if count >= _ENOUGH:
             break
-    return slices, sorted(ranked, reverse=True)
+    return slices, sorted(ranked, reverse=True), count
 
 
 _LOST = 5.0  # nepers beyond a limit: the peak of a loop that is unstable, or as good as that
