@@ -92,6 +92,10 @@ def begin_evaluating(evaluate: Callable[[], Beside], devices: DeviceChoice) -> C
 
 def _thread_settings() -> tuple[object, ...]:
     """Of JAX, those that change numbers and that a `with` can set for one thread alone."""
-    config = jax.config
-    precision = config.jax_default_matmul_precision
-    return jnp.result_type(float), config.jax_default_device, precision, config.jax_debug_nans
+    config = jax.config  # makes its attributes while it is imported, which no type checker sees
+    return (
+        jnp.result_type(float),
+        config.jax_default_device,  # pyright: ignore[reportAttributeAccessIssue]
+        config.jax_default_matmul_precision,  # pyright: ignore[reportAttributeAccessIssue]
+        config.jax_debug_nans,  # pyright: ignore[reportAttributeAccessIssue]
+    )
