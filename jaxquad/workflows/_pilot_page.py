@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Complex, Float
 
+from jaxquad._core import Number
 from jaxquad.control.autopilots import ArduPilotRate, BetaflightPID, FilterChain, PT1
 from jaxquad.plot import Spectrum, StepBand
 from jaxquad.records import AXES
@@ -246,7 +247,7 @@ def _change_rows(found: "AutopilotProposal") -> Table:
     return Table("From what flew to the proposal", heads, rows, texts=4)
 
 
-def _range(low: float, high: float) -> str:
+def _range(low: Number, high: Number) -> str:
     if not np.isfinite(low):
         return "none documented"
     return f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} or above"

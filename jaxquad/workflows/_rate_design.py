@@ -94,11 +94,12 @@ def design_gains(
     bank = work.bank(loops)
     if noise is not None and bank is None:
         why = "the firmware's filters are off, so there is none to change"
+    gains = None
     for attempt in range(1, _CERTIFICATES + 1):
         fresh = work.loops(settings.fresh, attempt)
         announce(f"searching gains on {len(loops.plants)} plants")
         search = Search(loops, work.before, targets, flown.firmware, flown.axis, bank)
-        gains = search.gains()
+        gains = search.gains(gains)
         plain = work.certified(fresh, parameters_of(flown.law, flown.axis, gains), {})
         design, verdict = plain, FilterVerdict(f"as they flew: {why}")
         if bank is not None and noise is not None:
@@ -247,12 +248,17 @@ def _compared(
     )  # fmt: skip
     flown = work.flown_filters(both.filters)
     gyro, slope = shared.delay_ms
+    elsewhere = (
+        f"The other axes have the same filters: their commands' noise is at most "
+        f"{shared.noise:.2f} of what flew"
+        if shared.noise > 0
+        else "The other axes have the same filters; the log shows no noise of their gyros"
+    )
     text = (
         f"gains alone leave {alone.rejection:.2f} of the flown effect of torque, with filters it "
         f"is {freed.rejection:.2f}; command noise {alone.noise:.2f} and {freed.noise:.2f} of what "
         f"flew. Delay of the gyro's filters {gyro:+.2f} ms, with those of the D term {slope:+.2f} "
-        f"ms; on the other axes, which have the same filters, the command's noise grows by at most "
-        f"{max(shared.noise, 0):.2f}. {heard[0].upper()}{heard[1:]}"
+        f"ms. {elsewhere}. {heard[0].upper()}{heard[1:]}"
     )
     reason = (
         f"delay of gyro {gyro:+.2f} ms, of D {slope:+.2f} ms, at command noise {freed.noise:.2f}"
@@ -267,7 +273,7 @@ def _judge(
     beyond = _beyond(third, whole, flown, settings, edge)
     if shared is not None and shared.noise > _ALLOWED * settings.noise:
         beyond.append(
-            f"the command's noise on another axis grows by {shared.noise:.2f}, above "
+            f"the command's noise on another axis is {shared.noise:.2f} of what flew, above "
             f"{settings.noise:g}"
         )
     if beyond:

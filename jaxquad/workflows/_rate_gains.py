@@ -131,7 +131,7 @@ class RateLoops:
 
     def _qualities(self, feedback: Paths, ahead: Paths) -> LoopQualities:
         through = feedback[:, None] * self.plants[None]
-        real, imaginary = 1 + through.real, through.imag
+        real, imaginary = 1 + np.real(through), np.imag(through)
         distance = real**2 + imaginary**2
         inverse = 1 / distance
         plants, cells = _power(self.plants), cells_of(self.omega)
@@ -149,7 +149,7 @@ class RateLoops:
 
 
 def _power(response: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    return response.real**2 + response.imag**2
+    return np.real(response) ** 2 + np.imag(response) ** 2
 
 
 def cells_of(omega: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " frequencies"]:
@@ -164,13 +164,15 @@ def _is_stable(
 ) -> Bool[np.ndarray, "designs plants"]:
     """Whether 1 + L turns from -pi, of the double integrator, to 0; 2 pi for each unstable pair."""
     upper = imaginary >= 0
-    design, plant, k = np.nonzero(upper[..., 1:] != upper[..., :-1])
-    at = lambda x, k: x[design, plant, k]
-    cross = at(real, k) * at(imaginary, k + 1) - at(real, k + 1) * at(imaginary, k)
-    falls = at(upper, k)  # through the real axis; left of 0 where the cross product says so
-    turns = np.where(falls & (cross > 0), 1, 0) - np.where(~falls & (cross < 0), 1, 0)
-    whole = np.zeros(real.shape[:2])
-    np.add.at(whole, (design, plant), turns)
+    crossed = np.zeros(upper.shape, bool)
+    np.not_equal(upper[..., 1:], upper[..., :-1], out=crossed[..., :-1])
+    k = np.flatnonzero(crossed)  # through the real axis; left of 0 by the cross product
+    x, y = real.ravel(), imaginary.ravel()
+    cross = x[k] * y[k + 1] - x[k + 1] * y[k]
+    falls = y[k] >= 0
+    turns = np.where(falls & (cross > 0), 1.0, 0.0) - np.where(~falls & (cross < 0), 1.0, 0.0)
+    loop = k // upper.shape[-1]
+    whole = np.bincount(loop, turns, minlength=x.size // upper.shape[-1]).reshape(real.shape[:2])
     ends = [np.arctan2(imaginary[..., end], real[..., end]) for end in (0, -1)]
     rounds = np.round((ends[1] + 2 * np.pi * whole) / (2 * np.pi))
     return ends[0] - 2 * np.pi * rounds < 0

@@ -26,8 +26,9 @@ from ._rate_gains import (
 
 Picks = Int[np.ndarray, "designs choices"]
 _POINTS, _LEVELS, _NARROWED = 7, 6, 0.4  # of the search, along each gain and one after the other
+_AROUND, _POINTS_AROUND, _LEVELS_AROUND = 0.3, 5, 4  # likewise, around known gains, in ln
 _RESERVE = 0.97  # of the limit, because fresh plants reach further than those that were tuned on
-_TOGETHER = 64  # designs evaluated at once
+_TOGETHER = 12  # designs evaluated at once: what a cache holds
 _ROUNDS, _DRAWN, _BEST, _KEPT = 14, 140, 18, 0.3  # of the search with filters
 _WIDTH, _NARROWEST = (0.35, 0.25), (0.02, 0.3)  # of gains in ln, of filters in options
 _SLOW = 2 * np.pi * 5.0  # rad/s, where delays are compared
@@ -180,16 +181,20 @@ class Search:
         self.low = np.clip(flown[self.free] / targets.change, least, most)
         self.high = np.clip(flown[self.free] * targets.change, least, most)
 
-    def gains(self) -> Float[np.ndarray, " gains"]:
+    def gains(self, near: Float[np.ndarray, " gains"] | None = None) -> Float[np.ndarray, " gains"]:
         """The stored gains that reject torque best with the filters that flew.
 
-        Gains of 0 stay. Where nothing keeps the targets, the gains that come nearest.
+        Gains of 0 stay. Where nothing keeps the targets, the gains that come nearest. With `near`
+        they are looked for around these alone.
         """
         low, high = np.log(self.low), np.log(self.high)
-        middle, half = (low + high) / 2, (high - low) / 2
-        for _ in range(_LEVELS):
+        middle, half, points_each, levels = (low + high) / 2, (high - low) / 2, _POINTS, _LEVELS
+        if near is not None:
+            middle, half = np.log(near[self.free]), np.full(low.size, _AROUND)
+            points_each, levels = _POINTS_AROUND, _LEVELS_AROUND
+        for _ in range(levels):
             axes = [
-                np.clip(np.linspace(m - h, m + h, _POINTS), a, b)
+                np.clip(np.linspace(m - h, m + h, points_each), a, b)
                 for m, h, a, b in zip(middle, half, low, high, strict=True)
             ]
             points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
