@@ -23,6 +23,7 @@ _PER_PARAMETER = 6  # real equations
 _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
 _THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
 _PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
+_FEW = 3  # poles, up to which growing ones are tried mirrored, too
 _BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of the residual's power: in ln(omega), and bins a side at least
 
 Vector = Float[np.ndarray, " parameters"]
@@ -147,7 +148,7 @@ def global_models(
         Equations(lag / scale, u, own, bins.values[places, o])
         for o in range(outputs.start, outputs.stop)
     )
-    tasks = (_Task(equations, bins.omega[places], most) for equations in each)
+    tasks = (_Task(equations, bins.omega[places], most, scale) for equations in each)
     found = (
         _identify_kept(task) if places.size <= _KEPT_BINS else task.identify() for task in tasks
     )
@@ -174,10 +175,12 @@ Identified = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
 class _Task:
     """Equations to solve, equal to others of the same content."""
 
-    def __init__(self, equations: Equations, omega: Float[np.ndarray, " bins"], most: int):
-        self.identify = ft.partial(_identify, equations, omega, most)
+    def __init__(
+        self, equations: Equations, omega: Float[np.ndarray, " bins"], most: int, scale: float
+    ):
+        self.identify = ft.partial(_identify, equations, omega, most, scale)
         whole = b"".join(each.tobytes() for each in (*equations, omega))
-        self.content = hashlib.blake2b(whole).digest(), equations.own.shape, most
+        self.content = hashlib.blake2b(whole).digest(), equations.own.shape, most, scale
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Task) and self.content == other.content
@@ -193,11 +196,11 @@ def _identify_kept(task: _Task) -> Identified | None:
 
 
 def _identify(
-    equations: Equations, omega: Float[np.ndarray, " bins"], most: int
+    equations: Equations, omega: Float[np.ndarray, " bins"], most: int, scale: float
 ) -> Identified | None:
     """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
     every = _thin(len(omega), _TRIAL_BINS)
-    first = _choose(equations.pick(every), most)
+    first = _choose(equations.pick(every), most, scale)
     if first is None:
         return None
     noise = running_power(omega, _residual(equations, first), np.ones_like(omega))
@@ -205,7 +208,7 @@ def _identify(
     if np.max(noise) < _EVEN * np.min(noise):
         weight = np.full_like(noise, np.mean(weight))
     white = equations.weighted(weight)
-    chosen = _choose(white.pick(every), most) if np.ptp(weight) > 0 else first
+    chosen = _choose(white.pick(every), most, scale) if np.ptp(weight) > 0 else first
     if chosen is None:
         return None
     solved = _descend(white, chosen.denominator, _SETTLED)
@@ -233,17 +236,23 @@ def _residual(equations: Equations, solved: Solved) -> Complex[np.ndarray, " bin
     return equations.y - basis.columns @ solved.linear / (basis.powers @ solved.denominator)
 
 
-def _choose(equations: Equations, most: int) -> Solved | None:
+def _choose(equations: Equations, most: int, scale: float) -> Solved | None:
     count = 2 * len(equations.y)
     best, least, worse = None, _information(_proportional(equations), 1, count), 0
-    floor = _EXACT * float(np.sum(np.abs(equations.y) ** 2))
+    lowest, floor = least, _EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for order in _orders(most):
         parameters = equations.parameters(order)
         if parameters * _PER_PARAMETER > count:
             break
         solved = _descend(equations, _relax(equations, order), _TRIAL)
         value = _information(solved.cost + 0.01 * floor, parameters, count)
-        worse = 0 if value < least else worse + 1
+        # What mirrored poles find must not end the search: higher orders may find more.
+        worse, lowest = (0, value) if value < lowest else (worse + 1, lowest)
+        mirrored = _mirrored(solved.denominator, scale) if order <= _FEW else None
+        if mirrored is not None:
+            again = _descend(equations, mirrored, _TRIAL)
+            solved = again if again.cost < solved.cost else solved
+            value = _information(solved.cost + 0.01 * floor, parameters, count)
         if value < least:
             best, least = solved, value
         if (worse >= _PATIENCE and order >= _THOROUGH) or solved.cost <= floor:
@@ -280,6 +289,24 @@ def _relax(equations: Equations, order: int) -> Float[np.ndarray, " powers"]:
         weight = 1 / np.abs(solved.below)[:, None]
     assert best is not None
     return best.denominator
+
+
+def _mirrored(
+    denominator: Float[np.ndarray, " powers"], scale: float
+) -> Float[np.ndarray, " powers"] | None:
+    """The denominator with its growing poles mirrored into decaying ones; `None` without any.
+
+    The noise of the equations draws poles across the stability limit, from where few descents find
+    back: a model of few poles that ends there can lack a lag of the plant, for hundreds of the
+    criterion. Of many poles some are the noise's own.
+    """
+    lags = 1 + scale * np.roots(denominator[::-1])  # 1 / z of the poles: of growing ones below 1
+    growing = (np.abs(lags) < 1) & (lags != 0)
+    if not np.any(growing):
+        return None
+    lags[growing] = 1 / np.conj(lags[growing])
+    powers = np.real(np.poly((lags - 1) / scale))[::-1]
+    return np.pad(powers / np.linalg.norm(powers), (0, denominator.size - powers.size))
 
 
 def _null_vector(matrix: Float[np.ndarray, "rows columns"], first: int) -> Vector:

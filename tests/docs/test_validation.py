@@ -47,6 +47,21 @@ def test_the_efficient_estimate_scatters_as_the_bound_says(name):
     assert np.all(np.abs(np.mean(errors, axis=0)) < 0.3)
 
 
+@pytest.mark.parametrize("seed", [20, 34])
+def test_a_global_model_does_not_miss_the_lag_of_a_short_record(seed):
+    """Of these records descents end at growing poles: estimates were off by 1.2 and 1.8 bounds."""
+    from bounds import efficient  # pyright: ignore
+    from healthy import identify  # pyright: ignore
+    from plants import make  # pyright: ignore
+
+    plant = make("short-20")
+    best, (flown,) = efficient(plant), plant.fly(np.array([seed]))
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as a user's
+        found = identify(plant, flown)
+    lost = found["values"] - plant.truth - best.errors(flown)
+    assert np.all(np.abs(lost) < 0.7 * best.bound)
+
+
 @pytest.mark.slow
 def test_a_study_continues_where_it_stopped_and_makes_its_tables(tmp_path):
     from bounds import cramer_rao  # pyright: ignore

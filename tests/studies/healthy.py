@@ -43,14 +43,19 @@ LONG = ("two-inputs", "three-inputs", "closed-setpoint", "closed-input")  # thes
 AT_ONCE = 20  # runs that are simulated side by side
 
 
+def by_scipy(plant: Plant, flown: Flown) -> dict:
+    """One record through scipy."""
+    values, errors = fit_by_scipy(plant, flown)
+    return {"scipy": values, "scipy_error": errors}
+
+
 def identify(plant: Plant, flown: Flown) -> dict:
-    """One record through the defaults, and through scipy."""
+    """One record through the defaults."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", jq.records.RecordWarning)
         response = jq.frequency_response(record(plant, flown))
     kind = plant.kind
     fit = jq.fit(start(plant), response, free=kind.free, tied=kind.tied)
-    values, errors = fit_by_scipy(plant, flown)
     return {
         "values": fit.values,
         "noise_error": fit.noise_standard_errors,
@@ -60,8 +65,6 @@ def identify(plant: Plant, flown: Flown) -> dict:
         "determined": fit.determined,
         "misfit": fit.chi_squared**0.5,
         "remarks": list(fit.remarks),
-        "scipy": values,
-        "scipy_error": errors,
     }
 
 
@@ -71,14 +74,11 @@ def _tried(plant: Plant, flown: Flown) -> dict:
         return identify(plant, flown)
     except ValueError as error:
         unknown = np.full(plant.truth.size, np.nan)
-        values, errors = fit_by_scipy(plant, flown)
         keys = ("values", "noise_error", "error", "noise_interval", "interval")
         return dict.fromkeys(keys, unknown) | {
             "determined": np.zeros(plant.truth.size, bool),
             "misfit": np.nan,
             "remarks": [f"ValueError: {error}"],
-            "scipy": values,
-            "scipy_error": errors,
         }
 
 
@@ -87,18 +87,26 @@ def run(name: str, seeds: list[int], raw: Path) -> float:
     began = time.process_time()
     jax.config.update("jax_enable_x64", True)
     plant = make(name)
-    path = raw / f"{name}.jsonl"
+    path, kept = raw / f"{name}.jsonl", raw.parent / of_scipy() / f"{name}.jsonl"
+    kept.parent.mkdir(parents=True, exist_ok=True)
     missing = sorted(set(seeds) - {row["seed"] for row in drawn(path)})
-    best = efficient(plant)
+    theirs, best = {row["seed"]: row for row in drawn(kept)}, efficient(plant)
     for at in range(0, len(missing), AT_ONCE):
         some = missing[at : at + AT_ONCE]
         for seed, flown in zip(some, plant.fly(np.array(some)), strict=True):
-            row = {"seed": seed, "efficient": best.errors(flown)} | _tried(plant, flown)
-            with path.open("a") as file:
-                file.write(json.dumps(row, default=np.ndarray.tolist) + "\n")
+            if seed not in theirs:
+                theirs[seed] = {"seed": seed} | by_scipy(plant, flown)
+                _append(kept, theirs[seed])
+            row = theirs[seed] | {"efficient": best.errors(flown)} | _tried(plant, flown)
+            _append(path, row)
         spent = time.process_time() - began
         print(f"{name}: {at + len(some)} of {len(missing)}, {spent:.0f} CPU s", flush=True)
     return time.process_time() - began
+
+
+def _append(path: Path, row: dict) -> None:
+    with path.open("a") as file:
+        file.write(json.dumps(row, default=np.ndarray.tolist) + "\n")
 
 
 def drawn(path: Path) -> list[dict]:
@@ -106,10 +114,23 @@ def drawn(path: Path) -> list[dict]:
 
 
 def state_of_sources() -> str:
-    """Of the package and of what is flown: draws of another state do not count."""
+    """The folder of draws: those of another package, or of other flights, do not count."""
+    return _digest([*sorted((ROOT / "jaxquad").rglob("*.py")), *_own("healthy", "bounds")])
+
+
+def of_scipy() -> str:
+    """The folder of what does not depend on the package."""
+    return f"scipy-{_digest(_own('by_scipy'))}"
+
+
+def _own(*names: str) -> list[Path]:
+    """Files of this folder, with those of what is flown."""
+    return [Path(__file__).parent / f"{name}.py" for name in (*names, "plants", "systems")]
+
+
+def _digest(paths: list[Path]) -> str:
     digest = hashlib.sha256()
-    own = [Path(__file__).parent / name for name in ("healthy.py", "plants.py", "systems.py")]
-    for path in [*sorted((ROOT / "jaxquad").rglob("*.py")), *own]:
+    for path in paths:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 
