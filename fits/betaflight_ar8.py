@@ -50,8 +50,8 @@ def terms_again(path: Path, flown: FlownBetaflight) -> dict[str, list[float]]:
     table = load_log(path).tables[""].columns
     columns = lambda kind: np.stack([table[f"{kind}[{k}]"] * 1.0 for k in range(3)], 1)
     throttle = np.clip((table["rcCommand[3]"] - 1000) / 1000, 0, 1)
-    signals = (np.deg2rad(columns(name)) for name in ("setpoint", "gyroADC"))
-    found = replay_terms(flown, *signals, throttle, dt=1e-3, integral=columns("axisI"))
+    setpoint, gyro = (np.deg2rad(columns(name)) for name in ("setpoint", "gyroADC"))
+    found = replay_terms(flown, setpoint, gyro, throttle, dt=1e-3, integral=columns("axisI"))
     off = {}
     for name in "PID":
         logged = np.stack([table[f"axis{name}[{k}]"] * 1.0 for k in range(2)], 1)

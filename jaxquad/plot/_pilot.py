@@ -83,7 +83,8 @@ def spectra_figure(
         for name, each in spectra.items():
             seen = (each.hertz >= _LOWEST) & (each.power > 0)
             level = 10 * np.log10(factor * each.power[seen])
-            panel.plot(each.hertz[seen], level, **look_of(places[name], name) | {"lw": 1.2})
+            (line,) = panel.plot(each.hertz[seen], level, **look_of(places[name], name))
+            line.set_linewidth(1.2)
             top = max(top, float(level.max(initial=-np.inf)))
         if np.isfinite(top):
             panel.set_ylim(max(panel.get_ylim()[0], top - _SPAN), top + 4)

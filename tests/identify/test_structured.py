@@ -78,7 +78,9 @@ def test_equations_may_stand_in_any_order():
     # In the second one no diagonal element is large enough for a pivot.
     order = np.array([1, 2, 0])
     turned = eqx.tree_at(
-        lambda m: (m.F, m.G, m.M), MODEL, tuple(x[order] for x in (MODEL.F, MODEL.G, MODEL.M))
+        lambda m: (m.F, m.G, m.M),
+        MODEL,
+        tuple(np.asarray(x)[order] for x in (MODEL.F, MODEL.G, MODEL.M)),
     )
     normals = []
     for model, row in ((MODEL, 1), (turned, 0)):

@@ -65,8 +65,8 @@ def designed(flights: simulated.Flights, count: int, kept: Path | None) -> list[
 def throttles(flights: simulated.Flights) -> np.ndarray:
     """Five for each flight, (5, flights)."""
     third = len(flights.time) // 3
-    means = [flights.throttle[part].mean(axis=0) for part in (slice(0, third), slice(-third, None))]
-    return np.linspace(*means, 5)
+    first, last = flights.throttle[:third], flights.throttle[-third:]
+    return np.linspace(first.mean(axis=0), last.mean(axis=0), 5)
 
 
 def judge(truth, levels: np.ndarray, rows: np.ndarray) -> list[adrc_loop.Found]:

@@ -40,7 +40,7 @@ def period(state: np.ndarray, setpoint, push, truth: Truth, throttle, design: De
     16 commands that the ESCs delay; motors, rate in rad/s, first filter; notch; second filter; the
     halves of the observer's low-pass; z1, z2, z3; command. `push` is added to what the ESCs get.
     """
-    sent, state = list(state[:16]), list(state)
+    sent = list(state[:16])
     spin, rate, x1, s0, s1, x2, l1, l2, z1, z2, z3, command = state[16:]
     share = 1 - np.exp(-1 / (RATE * truth.lag))
     slope = truth.gain(throttle) / 1000
@@ -70,11 +70,10 @@ def period(state: np.ndarray, setpoint, push, truth: Truth, throttle, design: De
 
 def matrices(truth: Truth, throttle, design: Design) -> np.ndarray:
     """A, and what the set-point and a push on the command add, (loops, states, states + 2)."""
-    n = truth.slope.size
-    found = [
-        period(np.tile(each[:STATES, None], n), *each[STATES:], truth, throttle, design)
-        for each in np.eye(STATES + 2)
-    ]
+    n, found = truth.slope.size, []
+    for each in np.eye(STATES + 2):
+        state, setpoint, push = np.tile(each[:STATES, None], n), each[STATES], each[STATES + 1]
+        found.append(period(state, setpoint, push, truth, throttle, design))
     return np.moveaxis(np.array(found), (0, 1, 2), (2, 1, 0))
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import lfilter
 
 import jaxquad as jq
 from jaxquad.control.autopilots import (
@@ -39,8 +39,10 @@ def found():
     local = np.tile(np.arange(count) * dt, 3)
     u = np.where(local < 7, 100 * np.sin(2 * np.pi * (local + 34 * local**2 / 14)), 0.0)
     throttle = np.repeat([0.25, 0.4, 0.6], count)
-    b, a = cont2discrete(([1.0], [LAG, 1.0, 0.0]), dt, "zoh")[:2]
-    y = lfilter(np.ravel(b), a, 80 * (1 - CURVE + 2 * CURVE * throttle) * u)
+    pole = np.exp(-dt / LAG)  # of 1 / (s (LAG s + 1)) under held inputs
+    b = [0.0, dt - LAG * (1 - pole), LAG * (1 - pole) - pole * dt]
+    gain = 80 * (1 - CURVE + 2 * CURVE * throttle)
+    y = np.asarray(lfilter(b, [1.0, -1.0 - pole, pole], gain * u))
     record = jq.Record(
         np.arange(local.size) * dt, np.stack([u, throttle], axis=1),
         y + 2 * rng.standard_normal(y.size), input_names=("sum", "throttle"),

@@ -200,7 +200,7 @@ def gyro_of(parameters, omega):
     centre, low = (parameters.get(f"gyro_notch1_{end}", 0.0) for end in ("hz", "cutoff"))
     if centre:
         b, a = signal.iirnotch(centre, centre * low / (centre**2 - low**2), fs=RATE)
-        passed = passed * signal.freqz(b, a, worN=omega / RATE)[1]
+        passed = passed * np.polyval(b, z) / np.polyval(a, z)
     return passed
 
 
