@@ -76,7 +76,9 @@ def delay_input(
     """The input itself, `delay` s late, at the samples; where it jumps, the value just after."""
     shift, late = split_delay(delay, dt)
     old, new = shift_samples(segments, shift + 1), shift_samples(segments, shift)
-    return jnp.where(late <= _WHOLE, new[:, 0], old[:, 0] + (1 - late) * old[:, 1])
+    # At whole samples the slope by the delay is that of a longer one.
+    now = new[:, 0] - late * old[:, 1]
+    return jnp.where(late <= _WHOLE, now, old[:, 0] + (1 - late) * old[:, 1])
 
 
 def shift_samples(
@@ -256,9 +258,8 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
 
 def _direct(late: Float[Array, ""], hold: str) -> Float[Array, "2"]:
     """What `delay_input` makes of u[k] and u[k-1]."""
-    one, now = jnp.ones_like(late), late <= _WHOLE
-    share = 1 - late if hold == "first" else jnp.zeros_like(late)
-    share = jnp.where(now, one, share)
+    whole = jnp.where(late <= _WHOLE, jnp.ones_like(late), 0)
+    share = 1 - late if hold == "first" else whole
     return jnp.stack([share, 1 - share])
 
 
