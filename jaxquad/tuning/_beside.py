@@ -91,11 +91,13 @@ def begin_evaluating(evaluate: Callable[[], Beside], devices: DeviceChoice) -> C
 
 
 def _thread_settings() -> tuple[object, ...]:
-    """Of JAX, those that change numbers and that a `with` can set for one thread alone."""
+    """Of JAX, those that change numbers or raise, and that a `with` can set for one thread."""
     config = jax.config  # makes its attributes while it is imported, which no type checker sees
     return (
         jnp.result_type(float),
         config.jax_default_device,  # pyright: ignore[reportAttributeAccessIssue]
         config.jax_default_matmul_precision,  # pyright: ignore[reportAttributeAccessIssue]
         config.jax_debug_nans,  # pyright: ignore[reportAttributeAccessIssue]
+        config.jax_numpy_rank_promotion,  # pyright: ignore[reportAttributeAccessIssue]
+        config.jax_numpy_dtype_promotion,  # pyright: ignore[reportAttributeAccessIssue]
     )

@@ -80,7 +80,7 @@ def test_equations_may_stand_in_any_order():
     turned = eqx.tree_at(
         lambda m: (m.F, m.G, m.M),
         MODEL,
-        tuple(np.asarray(x)[order] for x in (MODEL.F, MODEL.G, MODEL.M)),
+        tuple(jnp.asarray(x)[order] for x in (MODEL.F, MODEL.G, MODEL.M)),
     )
     normals = []
     for model, row in ((MODEL, 1), (turned, 0)):
