@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxquad._core import Number, write_file
 from jaxquad.control.autopilots import (
     check_ranges,
@@ -127,7 +129,9 @@ Values = Sequence[tuple[Parameter, float, float]]  # parameter, the value to set
 
 def _number(value: Number, whole: bool) -> str:
     """The shortest text that single precision reads back exactly."""
-    return str(int(value)) if whole else f"{value:.9g}"
+    if whole:
+        return str(int(value))
+    return np.format_float_positional(np.float32(value), trim="-")
 
 
 def _px4(values: Values, title: str) -> str:

@@ -275,7 +275,7 @@ class _Plant(NamedTuple):
 
 def _plant(model: TransferFunction | StateSpace) -> _Plant:
     if isinstance(model, TransferFunction):
-        return _Plant(*realise(model), None, model.delay[None], None)
+        return _Plant(*realise(model), None, jnp.atleast_1d(model.delay), None)
     A, B, C, D = explicit(model)
     late = jnp.zeros(B.shape[1], B.dtype) if model.input_delay is None else model.input_delay
     passing = None if model.H1 is None else D

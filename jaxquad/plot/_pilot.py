@@ -74,8 +74,8 @@ def spectra_figure(
     **Returns:** `jq.plot.Panels`.
     """
     panels = stacked(2, ax)
-    per = f", dB re 1 {unit}" if unit else ", dB"
-    labels = ("gyro, dB re 1 deg/s /√Hz", f"D term{per} /√Hz")
+    per = f"dB re 1 {unit} /√Hz" if unit else "dB /√Hz"  # a line of its own: the panels are low
+    labels = ("gyro\ndB re 1 deg/s /√Hz", f"D term\n{per}")
     places = {name: k for k, name in enumerate(dict.fromkeys([*gyro, *derivative]))}
     for panel, spectra, label in zip(panels, (gyro, derivative), labels, strict=True):
         factor = np.degrees(1.0) ** 2 if panel is panels[0] else 1.0
