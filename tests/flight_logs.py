@@ -4,7 +4,7 @@ import struct
 from typing import Any
 
 import numpy as np
-from log_writers import DataFlash, structured, ULog
+from log_writers import crazyflie_log, DataFlash, structured, ULog
 
 
 RATE_HZ = 400
@@ -12,20 +12,26 @@ TIME = 20.0 + np.arange(12 * RATE_HZ) / RATE_HZ
 CHIRP = np.sin(2 * np.pi * (0.5 * (TIME - 22) + 0.5 * (TIME - 22) ** 2))
 IN_RUN = (TIME >= 22) & (TIME < 30)
 WAVE = np.sin(5 * TIME)
+COLLECTIVE = 0.4 + 0.2 * np.sin(0.5 * TIME)  # throttle, 0 to 1
 
 
-def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),), changes=()):
+def ardupilot(
+    folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),), changes=(), collective=""
+):
     """A log with chirps of 0.5 Hz up to so many, from and to so many seconds.
 
     `changes` are pairs of a time in s and a value of ATC_RAT_RLL_P, which begins at 0.135.
+    `collective` is "RATE.AOut", at 400 Hz, "CTUN.ThO", at 10 Hz, or none.
     """
     log = DataFlash()
     log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
     log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
+    beside = int(collective == "RATE.AOut")
     log.define(
-        "RATE", "Qfffffffff", "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut",
-        units="skk-kk-kk-", mults="F---------",
+        "RATE", "Qfffffffff" + beside * "f", "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut"
+        + beside * ",AOut", units="skk-kk-kk-" + beside * "-", mults="F---------" + beside * "-",
     )  # fmt: skip
+    log.define("CTUN", "Qff", "TimeUS,ThI,ThO", units="s--", mults="F00")
     log.write("PARM", 0, b"SID_AXIS", float(place))
     log.write("PARM", 0, b"ATC_RAT_PIT_I", float(gain))
     log.write("PARM", 0, b"ATC_RAT_RLL_P", 0.135)
@@ -40,7 +46,10 @@ def ardupilot(folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),), chan
                 log.write("PARM", t, b"ATC_RAT_RLL_P", value)
                 log.write("PARM", t, b"LOG_BITMASK", 1e3 * value)
         w = float(WAVE[k])
-        log.write("RATE", t + 30, w, 2 * w, 0.1 * w, w, 3 * w, 0.2 * w, w, w, w)
+        last = beside * (float(COLLECTIVE[k]),)
+        log.write("RATE", t + 30, w, 2 * w, 0.1 * w, w, 3 * w, 0.2 * w, w, w, w, *last)
+        if collective == "CTUN.ThO" and k % 40 == 0:
+            log.write("CTUN", t + 35, 0.9, float(COLLECTIVE[k]))
     path = folder / "log.bin"
     path.write_bytes(log.content)
     return path
@@ -80,3 +89,14 @@ def px4(folder, *, state: Any = 0, nav_state=15, change: float | None = None):
         log.write_rows(number, rows[late:])
     (folder / "log.ulg").write_bytes(log.content)
     return folder / "log.ulg"
+
+
+def crazyflie(folder, collective):
+    """A log at 400 Hz of a command, a rate and a collective of that name, in their own units."""
+    names = ("controller.cmd_roll", "gyro.x", collective)
+    kind = (0xFFFF, "fixedFrequency", [(name, "f") for name in names])
+    columns = zip(3e4 * WAVE, 100 * WAVE, 65535 * COLLECTIVE, strict=True)
+    stamps = np.round(1e6 * TIME).astype(int).tolist()
+    events = [(0, stamp, values) for stamp, values in zip(stamps, columns, strict=True)]
+    (folder / "log00").write_bytes(crazyflie_log([kind], events))
+    return folder / "log00"

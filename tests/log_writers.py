@@ -2,6 +2,7 @@
 
 import struct
 import tempfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -89,6 +90,20 @@ class ULog:
 
     def sync(self):
         self.message("S", SYNC)
+
+
+def crazyflie_log(kinds, events, *, version=2):
+    """A file of `events` (which of the kinds, time stamp, values)."""
+    data = struct.pack("<BHH", 0xBC, version, len(kinds))
+    for number, name, variables in kinds:
+        data += struct.pack("<H", number) + name.encode() + b"\0"
+        data += struct.pack("<H", len(variables))
+        data += b"".join(f"{each}({letter})".encode() + b"\0" for each, letter in variables)
+    for kind, time, values in events:
+        number, _, variables = kinds[kind]
+        letters = ("Q" if version == 2 else "I") + "".join(letter for _, letter in variables)
+        data += struct.pack(f"<H{letters}", number, time, *values)
+    return data + struct.pack("<I", zlib.crc32(data))
 
 
 def structured(columns: Mapping[str, tuple[str, np.ndarray]]) -> np.ndarray:

@@ -1,11 +1,8 @@
-import struct
-import zlib
-
 import numpy as np
 import pytest
 from blackbox_rows import clock
 from hypothesis import given, settings, strategies as st
-from log_writers import decode
+from log_writers import crazyflie_log as log, decode
 
 from jaxquad.records import channels, read, ReadError
 from jaxquad.records.formats import load_log
@@ -14,20 +11,6 @@ from jaxquad.records.formats import load_log
 FIXED = (0xFFFF, "fixedFrequency", [("gyro.x", "f"), ("motor.m1", "H"), ("pm.state", "b")])
 EVENT = (7, "estTDOA", [("idA", "B"), ("distanceDiff", "f")])
 FUZZ = settings(max_examples=300, deadline=None, derandomize=True, database=None)
-
-
-def log(kinds, events, *, version=2):
-    """A file of `events` (which of the kinds, time stamp, values)."""
-    data = struct.pack("<BHH", 0xBC, version, len(kinds))
-    for number, name, variables in kinds:
-        data += struct.pack("<H", number) + name.encode() + b"\0"
-        data += struct.pack("<H", len(variables))
-        data += b"".join(f"{each}({letter})".encode() + b"\0" for each, letter in variables)
-    for kind, time, values in events:
-        number, _, variables = kinds[kind]
-        letters = ("Q" if version == 2 else "I") + "".join(letter for _, letter in variables)
-        data += struct.pack(f"<H{letters}", number, time, *values)
-    return data + struct.pack("<I", zlib.crc32(data))
 
 
 EVENTS = [(0, 1000 * i, (i / 8, 500 + i, i % 100 - 50)) for i in range(60)]

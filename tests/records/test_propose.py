@@ -2,7 +2,7 @@ import shlex
 
 import numpy as np
 import pytest
-from flight_logs import ardupilot, CHIRP, IN_RUN, px4, TIME, WAVE
+from flight_logs import ardupilot, CHIRP, COLLECTIVE, crazyflie, IN_RUN, px4, TIME, WAVE
 from log_writers import DataFlash
 
 from jaxquad.cli import make_parser
@@ -99,6 +99,25 @@ def test_the_collective_is_proposed_as_a_second_input(data, tmp_path):
     assert throttle.min() > -0.01 and 0.2 < throttle.max() <= 1.0
     with pytest.raises(RecordError, match="holds no collective"):
         propose(ardupilot(tmp_path, 10)).options_with_throttle  # noqa: B018
+
+
+@pytest.mark.filterwarnings("ignore:resampled to 400 Hz, faster than 'CTUN.ThO' 10 Hz")
+@pytest.mark.parametrize(
+    ("firmware", "channel"),
+    [("ardupilot", "RATE.AOut"), ("ardupilot", "CTUN.ThO"), ("crazyflie", "controller.cmd_thrust"),
+     ("crazyflie", "stabilizer.thrust")],
+)  # fmt: skip
+def test_the_collective_of_every_vehicle_is_a_share_of_full_thrust(tmp_path, firmware, channel):
+    if firmware == "ardupilot":
+        proposal = propose(ardupilot(tmp_path, 10, collective=channel))
+    else:
+        proposal = propose(crazyflie(tmp_path, channel), axis="roll")
+    assert list(proposal.setup.throttle) == [channel]
+    record = read(proposal.path, **proposal.options_with_throttle)
+    assert len(record.input_names) == 2 and record.input_names[1] == "throttle"
+    inside = slice(200, -200)  # of ends that anti-aliasing and 10 Hz know less well
+    wanted = np.interp(record.time, TIME, COLLECTIVE)
+    np.testing.assert_allclose(record.channel("throttle")[inside], wanted[inside], atol=2e-3)
 
 
 def settings_typed(words):
