@@ -289,7 +289,8 @@ def _read_flight(
     if settings.throttle is None and flight is not None and flight.throttle is not None:
         middle = float(np.clip(np.median(flight.throttle), 0.01, 1.0))
         settings = dataclasses.replace(settings, throttle=middle)
-    return read_flown(path, proposal, settings), flight
+    tracked = {} if flight is None else flight.tracked_hz
+    return read_flown(path, proposal, settings, tracked), flight
 
 
 def _reproduce(found: Identification, flown: FlownAutopilot) -> Reproduction:

@@ -1,6 +1,7 @@
 """What a proposal reads of a flight beside the record: gyros, set-point, terms, motors."""
 
 import dataclasses
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -32,6 +33,8 @@ class FlightChannels:
     - `motors`: a column each; `motor_ends`: lowest and highest command.
     - `throttle`: 0 to 1.
     - `names`: of the gyro's channels, filtered and unfiltered.
+    - `tracked_hz`: medians of what ArduPilot's harmonic notches follow, by INS_HNTCH_MODE: the
+        speeds of the motors (3) and of RPM sensors (2, 5).
     """
 
     rates: tuple[Samples, ...]
@@ -45,6 +48,7 @@ class FlightChannels:
     motor_ends: tuple[float, float] = (0.0, 1.0)
     throttle: Samples | None = None
     names: tuple[str, str] = ("", "")
+    tracked_hz: Mapping[int, tuple[float, ...]] = dataclasses.field(default_factory=dict)
 
 
 def read_channels(
@@ -80,7 +84,34 @@ def read_channels(
         motor_ends=_motor_ends(firmware, values),
         throttle=_mixed(found, throttle),
         names=(rate, "" if raw is None else names.unfiltered[axis]),
+        tracked_hz=_tracked(path, _span(settings)) if firmware == "ardupilot" else {},
     )  # fmt: skip
+
+
+_SPEEDS = {
+    3: re.compile(r"ESC(\[\d+\])?\.RPM"), 2: re.compile(r"RPM(\.rpm1|\[0\]\.RPM)"),
+    5: re.compile(r"RPM(\.rpm2|\[1\]\.RPM)"),
+}  # fmt: skip
+
+
+def _tracked(path: Path, span: tuple[float | None, float | None]) -> dict[int, tuple[float, ...]]:
+    """The median speeds in Hz that the log holds, of those that turn."""
+    held = [each.name for each in channels(path)]
+    found: dict[int, tuple[float, ...]] = {}
+    for mode, pattern in _SPEEDS.items():
+        names = [name for name in held if pattern.fullmatch(name)]
+        records = _read(path, names, (None, None)) if names else {}
+        medians = [_median(record, name, span) / 60 for name, record in records.items()]
+        if turning := tuple(each for each in medians if each > 0):
+            found[mode] = turning
+    return found
+
+
+def _median(record: Record, name: str, span: tuple[float | None, float | None]) -> float:
+    """Within a span; 0 without samples there."""
+    low, high = (end if x is None else x for x, end in zip(span, (-np.inf, np.inf), strict=True))
+    inside = record.channel(name)[(record.time >= low) & (record.time <= high)]
+    return float(np.median(inside)) if inside.size else 0.0
 
 
 class _Names(NamedTuple):

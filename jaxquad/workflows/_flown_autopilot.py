@@ -1,7 +1,7 @@
 """The rate loop of a log: its law, its parameters, and the same with other filters."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,8 @@ from ._tune_settings import AutopilotSettings
 class FlownAutopilot:
     """The rate loop of a log: firmware, version, law and what of it is not modelled.
 
-    `values` are the log's own parameters, and `throttle` is where Betaflight's dynamic filters and
-    TPA are taken.
+    `values` are the log's own parameters, `throttle` is where Betaflight's dynamic filters and TPA
+    and ArduPilot's notches are taken, and `tracked_hz` what other notches of the latter followed.
     """
 
     firmware: Firmware
@@ -30,11 +30,14 @@ class FlownAutopilot:
     unmodelled: tuple[str, ...]
     values: Mapping[str, str] = dataclasses.field(default_factory=dict)
     throttle: float = 0.3
+    tracked_hz: Mapping[int, Sequence[float]] = dataclasses.field(default_factory=dict)
 
     def with_filters(self, parameters: Mapping[str, Number]) -> RateLaw:
         """The law as it is read from a log with these cutoffs and notches."""
         values = change_filters(self.firmware, self.values, parameters)
-        return flown_loop(self.firmware, values, self.version, throttle=self.throttle).law
+        return flown_loop(
+            self.firmware, values, self.version, throttle=self.throttle, tracked_hz=self.tracked_hz
+        ).law
 
     @property
     def old(self) -> dict[str, float]:
@@ -53,19 +56,24 @@ def settings_of(path: Path, proposal: Proposal) -> LogSettings:
 _HOVER = 0.3  # of the throttle, where a log does not hold it
 
 
-def read_flown(path: Path, proposal: Proposal, settings: AutopilotSettings) -> FlownAutopilot:
+def read_flown(
+    path: Path, proposal: Proposal, settings: AutopilotSettings,
+    tracked_hz: Mapping[int, Sequence[float]],
+) -> FlownAutopilot:  # fmt: skip
     """The loop that flew. Raises ValueError where the log does not hold its gains."""
     setup, given = proposal.setup, settings_of(path, proposal)
     axis = AXES.index(setup.axis)
     known: dict[str, Firmware] = {"betaflight": "betaflight", "px4": "px4"}
     firmware = known.get(proposal.vehicle, "ardupilot")
     throttle = _HOVER if settings.throttle is None else settings.throttle
-    loop = flown_loop(firmware, given.values, given.version, throttle=throttle)
+    loop = flown_loop(
+        firmware, given.values, given.version, throttle=throttle, tracked_hz=tracked_hz
+    )
     if not np.any(gains_of(loop.law, axis) > 0):
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
     return FlownAutopilot(
         firmware, tuple(given.version), axis, loop.law, loop.parameters(), loop.unmodelled,
-        given.values, throttle,
+        given.values, throttle, tracked_hz,
     )  # fmt: skip

@@ -118,7 +118,7 @@ def _sources(flight, chain, least: float, loop_dt: float) -> list[_Source]:
         hertz, power = _residual(rate, flight.setpoint, flight.dt)
         passed = chain(hertz)
         clear = passed >= _PASSED
-        limit = hertz[-1] if clear.all() else hertz[np.argmin(clear)]
+        limit = hertz[min(int(np.flatnonzero(clear)[-1]) + 1, len(hertz) - 1)]
         if k < len(flight.unfiltered):
             raw = flight.unfiltered[k]
             time = np.arange(len(raw)) * flight.unfiltered_dt
@@ -140,7 +140,8 @@ def _sources(flight, chain, least: float, loop_dt: float) -> list[_Source]:
                 )  # fmt: skip
                 continue
         behind = _flat_below(hertz, power, least)
-        before = np.where(clear, behind / np.maximum(passed, _PASSED), 0.0)
+        # In a notch the level is that beside it.
+        before = np.interp(hertz, hertz[clear], behind[clear] / passed[clear])
         found.append(
             _Source(Density(hertz, before), Density(hertz, behind), min(limit, most), False)
         )

@@ -9,11 +9,13 @@ import pytest
 from scipy import signal
 
 from jaxquad.control.autopilots import (
+    ardupilot_harmonic_notch,
     ardupilot_notch,
     BandwidthNotch,
     betaflight_quality,
     Butterworth,
     FilterChain,
+    HarmonicNotch,
     Notch,
     PT1,
     PT2,
@@ -146,3 +148,61 @@ def test_the_response_is_differentiable_by_cutoff_and_quality():
 def test_a_filter_beyond_half_the_rate_is_refused():
     with pytest.raises(ValueError, match="below 200 Hz"):
         FilterChain((Butterworth(250.0),), 400.0)
+
+
+def firmware_quality(centre, bandwidth):
+    octaves = 2 * np.log2(centre / (centre - bandwidth / 2))
+    return np.sqrt(2**octaves) / (2**octaves - 1)
+
+
+def run_ardupilots_bank(samples, frequency, bandwidth, attenuation, harmonics, count, rate):
+    """The bank of INS_HNTCH_* at `frequency`, sample by sample: a second writing of its law."""
+    a = 10 ** (-attenuation / 40)
+    quality = firmware_quality(frequency, bandwidth / count)
+    apart = bandwidth / (32 * frequency)
+    places = {1: [0], 2: [-1, 1], 3: [-1, 0, 1], 5: [-2, -1, 0, 1, 2]}[count]
+    for harmonic in harmonics:
+        if harmonic * frequency >= 0.48 * rate:
+            continue
+        for place in places:
+            w = 2 * np.pi * harmonic * frequency * (1 + place * apart) / rate
+            wide = np.sin(w) / (2 * quality)
+            u1 = u2 = y1 = y2 = 0.0
+            passed = []
+            for u in samples:
+                y = (1 + wide * a**2) * u - 2 * np.cos(w) * (u1 - y1) + (1 - wide * a**2) * u2
+                y = (y - (1 - wide) * y2) / (1 + wide)
+                u1, u2, y1, y2 = u, u1, y, y1
+                passed.append(y)
+            samples = passed
+    return np.array(samples)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_a_harmonic_notch_is_ardupilots_bank_and_leaves_out_what_is_near_half_the_rate(count):
+    harmonics = (1, 2, 5)  # 5 x 397 Hz is beyond 0.48 of the rate
+    notch = ardupilot_harmonic_notch(397.0, 160.0, 35.0, harmonics=harmonics, notches=count)
+    found = run(FilterChain((notch,), RATE), jnp.asarray(NOISE))
+    expected = run_ardupilots_bank(NOISE, 397.0, 160.0, 35.0, harmonics, count, RATE)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    quality, apart = firmware_quality(397.0, 160.0 / count), 160.0 / 32
+    places = {1: [0], 2: [-1, 1], 3: [-1, 0, 1], 5: [-2, -1, 0, 1, 2]}[count]
+    rows = [
+        np.concatenate(prewarped(k * (397.0 + place * apart), quality, 10 ** (-35 / 20)))
+        for k in (1, 2)
+        for place in places
+    ]
+    expected = signal.sosfilt(np.array(rows), NOISE)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_a_harmonic_notch_keeps_its_quality_where_its_centre_moves_and_names_its_harmonics():
+    notch = ardupilot_harmonic_notch(80.0, 40.0, 40.0)
+    moved = HarmonicNotch(100.0, notch.quality, notch.residual)
+    names = [x.in_words() for x in (notch, moved)]
+    assert names == ["harmonic notch 80, 160 Hz, Q 1.71", "harmonic notch 100, 200 Hz, Q 1.71"]
+    deep = np.abs(FilterChain((moved,), RATE).response([100.0, 200.0]))
+    alone = np.abs(FilterChain((Notch(200.0, 1.7142857, 0.01),), RATE).response([100.0]))
+    assert deep[0] == pytest.approx(0.01 * float(alone[0]), rel=1e-6)
+    with pytest.raises(ValueError, match="multiples"):
+        HarmonicNotch(100.0, 2.0, harmonics=(0, 1))

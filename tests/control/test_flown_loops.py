@@ -141,6 +141,52 @@ def test_ardupilots_parameters_give_its_loop():
     assert np.all(np.isinf(law.pd_limit)) and "SMAX" in flown.unmodelled[0]
 
 
+def notches_of(changed, **options):
+    gains = {f"ATC_RAT_{x}_{k}": "0.1" for x in ("RLL", "PIT", "YAW") for k in "PID"}
+    flown = ardupilot_loop({**gains, "INS_GYRO_RATE": "1", **changed}, **options)
+    *notches, low_pass = flown.law.gyro.filters
+    assert low_pass.in_words() == "Butterworth 2 20 Hz"
+    return flown, [x.in_words() for x in notches]
+
+
+FIXED = {"INS_HNTC2_ENABLE": "1", "INS_HNTC2_MODE": "0", "INS_HNTC2_FREQ": "50",
+         "INS_HNTC2_BW": "10", "INS_HNTC2_HMNCS": "5", "INS_HNTC2_OPTS": "17"}  # fmt: skip
+FOLLOWING = {"INS_HNTCH_ENABLE": "1", "INS_HNTCH_FREQ": "90", "INS_HNTCH_REF": "0.25",
+             "INS_HNTCH_FM_RAT": "0.7"}  # fmt: skip
+
+
+def test_ardupilots_harmonic_notches_are_where_the_throttle_puts_them():
+    flown, names = notches_of({**FOLLOWING, **FIXED}, throttle=0.36)
+    assert not flown.unmodelled
+    # 90 Hz sqrt(0.36 / 0.25); the fixed one is double before triple, of harmonics 1 and 3.
+    assert names == [
+        "harmonic notch 108, 216 Hz, Q 1.97", "double harmonic notch 50, 150 Hz, Q 9.74",
+    ]  # fmt: skip
+    centre = lambda law: float(law.gyro.filters[0].centre_hz)
+    expected = [63.0, 63.0, 90.0, 180.0]
+    assert [centre(flown.at(x)) for x in (0.0, 0.1, 0.25, 1.0)] == pytest.approx(expected)
+    assert notches_of({**FOLLOWING, "INS_HNTCH_HMNCS": "0"})[1] == []
+    # Without a reference nothing is tracked, whatever the mode.
+    still = {**FOLLOWING, "INS_HNTCH_REF": "0", "INS_HNTCH_MODE": "3"}
+    assert notches_of(still, throttle=0.9)[1] == ["harmonic notch 90, 180 Hz, Q 1.97"]
+
+
+@pytest.mark.parametrize(("mode", "what"), [("2", "RPM"), ("3", "ESC"), ("4", "spectrum")])
+def test_notches_that_follow_what_parameters_do_not_say_ask_for_it(mode, what):
+    changed = {**FOLLOWING, "INS_HNTCH_REF": "1", "INS_HNTCH_MODE": mode}
+    flown, names = notches_of(changed)
+    [words] = flown.unmodelled
+    assert names == [] and what in words and "from 90 Hz on" in words
+    followed = lambda *sources: {"tracked_hz": {int(mode): sources}}
+    assert notches_of(changed, **followed(100.0, 120.0))[1] == [
+        "harmonic notch 110, 220 Hz, Q 1.97"
+    ]
+    several = {**changed, "INS_HNTCH_OPTS": "2"}
+    names = notches_of(several, **followed(70.0, 120.0))[1]
+    assert len(names) == (1 if mode == "2" else 2)
+    assert mode == "2" or names[0] == "harmonic notch 90, 180 Hz, Q 1.97"  # not below FREQ
+
+
 @pytest.mark.slow
 def test_the_terms_of_a_measured_log_follow_from_its_set_point_and_gyro(data):
     path = data / "betaflight_ar8" / "LOG00037.BFL"

@@ -243,24 +243,45 @@ def test_a_log_that_is_too_slow_for_the_noise_keeps_its_filters_and_says_why(tmp
     assert not any("lpf" in name for name in read_cli(tmp_path / "proposal_revert.txt"))
 
 
+AVERAGE, SPEED = 0.25, 150.0  # throttle; of the motors, Hz
+NOTCHED = {
+    "INS_HNTCH_ENABLE": 1.0, "INS_HNTCH_MODE": 1.0, "INS_HNTCH_REF": 0.16, "INS_HNTCH_FREQ": 80.0,
+    "INS_HNTCH_BW": 40.0, "INS_HNTCH_ATT": 40.0, "INS_HNTCH_HMNCS": 3.0, "INS_HNTCH_OPTS": 0.0,
+    "INS_HNTCH_FM_RAT": 1.0,
+    "INS_HNTC2_ENABLE": 1.0, "INS_HNTC2_MODE": 3.0, "INS_HNTC2_REF": 1.0, "INS_HNTC2_FREQ": 60.0,
+    "INS_HNTC2_BW": 20.0, "INS_HNTC2_ATT": 20.0, "INS_HNTC2_HMNCS": 1.0, "INS_HNTC2_OPTS": 0.0,
+}  # fmt: skip
+# Centre in Hz, FREQ and BW, the gain left: 80 Hz sqrt(0.25 / 0.16) with its octave, and the motors.
+NOTCHES = [(100.0, 80.0, 40.0, 0.01), (200.0, 80.0, 40.0, 0.01), (SPEED, 60.0, 20.0, 0.1)]
+
+
+def notch_of(centre, frequency, bandwidth, left):
+    """b0, b1 = a1, b2 and a2 at 2 kHz."""
+    octaves = 2 * np.log2(frequency / (frequency - bandwidth / 2))
+    w, wide = 2 * np.pi * centre / 2000, (2**octaves - 1) / np.sqrt(2**octaves) / 2
+    wide *= np.sin(w)
+    found = np.array([1 + wide * left, -2 * np.cos(w), 1 - wide * left, 1 - wide]) / (1 + wide)
+    return found.tolist()
+
+
 def fly_ardupilot(gains, seconds=30.0, noise=0.01):
     """Chirp, set-point, rate in rad/s and output at 400 Hz: a loop that holds the level.
 
-    The gyro is filtered at 2 kHz; the chirp of 0.5 to 30 Hz enters at the mixer.
+    The gyro is filtered at 2 kHz, by `NOTCHES` too; the chirp of 0.5 to 30 Hz enters at the mixer.
     """
     rng, parts, dt = np.random.default_rng(7), 5, 1 / 400
     count = int(seconds / dt)
     time, rise = np.arange(count) * dt, np.log(60.0) / seconds
     chirp = (0.1 * np.sin(2 * np.pi * 0.5 * (np.exp(rise * time) - 1) / rise)).tolist()
     jitter = (noise * rng.standard_normal(parts * count)).tolist()
-    k = float(np.tan(np.pi * 40.0 / 2000))
+    k = float(np.tan(np.pi * 80.0 / 2000))
     c = 1 + 2**0.5 * k + k * k
     b, a1, a2 = k * k / c, 2 * (k * k - 1) / c, (1 - 2**0.5 * k + k * k) / c
     p, i, d = gains
     share, fine, late = 1 - 1 / (1 + 2 * np.pi * 20.0 * dt), dt / parts, 10
     decay = float(np.exp(-fine / 0.03))
     s1 = s2 = y = push = rate = angle = target = error = slope = integral = 0.0
-    sent, rows = [0.0] * late, []
+    sent, rows, banks = [0.0] * late, [], [[notch_of(*x), 0.0, 0.0] for x in NOTCHES]
     for n in range(count):
         wanted = -4.5 * angle
         target += share * (wanted - target)
@@ -275,6 +296,11 @@ def fly_ardupilot(gains, seconds=30.0, noise=0.01):
             step = moved * fine + (push - moved) * 0.03 * (1 - decay)
             push, rate, angle = moved + (push - moved) * decay, rate + step, angle + rate * fine
             now = rate + jitter[parts * n + m]
+            for bank in banks:
+                (c0, c1, c2, c3), first, second = bank
+                after = c0 * now + first
+                bank[1:] = c1 * (now - after) + second, c2 * now - c3 * after
+                now = after
             y = b * now + s1
             s1, s2 = 2 * b * now - a1 * y + s2, b * now - a2 * y
     return np.array(rows).T
@@ -286,18 +312,26 @@ def write_dataflash(path, flown, gains):
     log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
     log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
     log.define(
-        "RATE", "Qffffff", "TimeUS,RDes,R,ROut,PDes,P,POut", units="skk-kk-", mults="F------"
+        "RATE",
+        "Qfffffff",
+        "TimeUS,RDes,R,ROut,PDes,P,POut,AOut",
+        units="skk-kk--",
+        mults="F-------",
     )
+    log.define("ESC", "QBf", "TimeUS,Instance,RPM", units="s#-", mults="F--")
     kept = {f"ATC_RAT_{axis}_{k}": x for axis in ("RLL", "PIT", "YAW")
             for k, x in zip("PID", gains, strict=True)}  # fmt: skip
-    kept |= {"INS_GYRO_RATE": 1.0, "INS_GYRO_FILTER": 40.0, "SCHED_LOOP_RATE": 400.0}
+    kept |= {"INS_GYRO_RATE": 1.0, "INS_GYRO_FILTER": 80.0, "SCHED_LOOP_RATE": 400.0, **NOTCHED}
     for name, value in kept.items():
         log.write("PARM", 0, name.encode(), value)
     log.write("SIDS", 9_999_000, 10, 0.1, 0.5, 30.0)
     for n, (chirp, wanted, y, u) in enumerate(flown.T.tolist()):
         stamp = 10_000_000 + 2500 * n
         log.write("SIDD", stamp, chirp, 1.0)
-        log.write("RATE", stamp, np.degrees(wanted), np.degrees(y), u, 0.0, 0.0, 0.0)
+        log.write("RATE", stamp, np.degrees(wanted), np.degrees(y), u, 0.0, 0.0, 0.0, AVERAGE)
+        if n % 40 == 0:
+            for motor in range(4):
+                log.write("ESC", stamp, motor, 60 * (SPEED + 4 * motor - 6))
     path.write_bytes(log.content)
     return path
 
@@ -311,6 +345,11 @@ def test_ardupilots_chirp_at_the_mixer_shows_its_law(tmp_path, capsys):
     assert content["axis"] == "roll" and content["reproduction"]["misfit"] < 0.05
     assert content["reproduction"]["gain_scale"] == pytest.approx(1, abs=0.05)
     assert (tmp_path / "proposal_100.param").read_text().count("ATC_RAT_RLL_") >= 4
+    # The gyro's notches are part of the loop, and stay; beyond them the log shows the noise.
+    assert content["unmodelled"] == [] and not any("HNTC" in name for name in content["new"])
+    page = (tmp_path / "autopilot.html").read_text()
+    assert "harmonic notch 100, 200 Hz" in page and "harmonic notch 150 Hz" in page
+    assert content["noise"]["known_hz"] > 120
     # The log of other gains.
     path = write_dataflash(tmp_path / "other.bin", fly_ardupilot((0.2, 0.2, 0.0036)), gains)
     assert main(["autopilot", str(path), "--out", str(tmp_path / "other")]) == 3

@@ -36,6 +36,7 @@ from ._filters import (
 from ._flown import (
     ardupilot_loop as ardupilot_loop,
     betaflight_loop as betaflight_loop,
+    FlownArduPilot as FlownArduPilot,
     FlownBetaflight as FlownBetaflight,
     FlownLoop as FlownLoop,
     px4_loop as px4_loop,
@@ -54,6 +55,10 @@ from ._gains import (
     rate_parameters as rate_parameters,
     RateGains as RateGains,
     torque_per_unit as torque_per_unit,
+)
+from ._harmonic_notch import (
+    ardupilot_harmonic_notch as ardupilot_harmonic_notch,
+    HarmonicNotch as HarmonicNotch,
 )
 from ._law import AngleLoop as AngleLoop, FirmwareLoop as FirmwareLoop, LoopState as LoopState
 from ._parameters import (

@@ -63,6 +63,7 @@ def flown_loop(
     version: Sequence[int] = (),
     *,
     throttle: float = 0.3,
+    tracked_hz: Mapping[int, Sequence[float]] | None = None,
 ) -> FlownLoop:
     """The rate loop of the parameters of a log.
 
@@ -70,7 +71,8 @@ def flown_loop(
 
     - `firmware`: "betaflight", "px4" or "ardupilot".
     - `values`, `version`: as `jq.records.read_settings` returns them.
-    - `throttle`: 0 to 1, at which Betaflight's dynamic cutoffs are.
+    - `throttle`: 0 to 1, at which Betaflight's dynamic cutoffs and ArduPilot's notches are.
+    - `tracked_hz`: as in `ardupilot_loop`.
 
     **Raises:**
 
@@ -78,7 +80,9 @@ def flown_loop(
     """
     if firmware == "betaflight":
         return betaflight_loop(values, version, throttle=throttle)
-    return px4_loop(values) if firmware == "px4" else ardupilot_loop(values)
+    if firmware == "px4":
+        return px4_loop(values)
+    return ardupilot_loop(values, throttle=throttle, tracked_hz=tracked_hz)
 
 
 def filter_choices(

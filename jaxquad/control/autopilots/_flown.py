@@ -1,6 +1,7 @@
 """The loop that a log's parameters describe, for Betaflight, PX4 and ArduPilot."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Generic, Literal, NamedTuple, TypeVar
 
@@ -23,6 +24,7 @@ from ._filters import (
     PT2,
     PT3,
 )
+from ._harmonic_notch import HarmonicNotch, read_harmonic_notches, Tracking
 from ._parameters import list_parameters
 from ._px4 import PX4Rate
 
@@ -339,12 +341,41 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
     return FlownLoop(law, tuple(unmodelled))
 
 
-def ardupilot_loop(values: Mapping[str, str]) -> FlownLoop[ArduPilotRate]:
+class FlownArduPilot(FlownLoop[ArduPilotRate]):
+    """ArduPilot's rate loop of a log, with the notches that follow the throttle.
+
+    **Arguments:** (those of `FlownLoop`, and)
+
+    - `tracking`: which of the gyro's filters follow the throttle, and how.
+    """
+
+    tracking: tuple[Tracking, ...] = eqx.field(static=True, default=())
+
+    def at(self, throttle: Float[ArrayLike, "..."]) -> ArduPilotRate:
+        """The law at a throttle of 0 to 1: where its notches are."""
+        filters = list(self.law.gyro.filters)
+        for each in self.tracking:
+            notch = filters[each.place]
+            assert isinstance(notch, HarmonicNotch)
+            filters[each.place] = dataclasses.replace(notch, centre_hz=each.centre_hz(throttle))
+        chain = FilterChain(tuple(filters), self.law.gyro.rate_hz)
+        return dataclasses.replace(self.law, gyro=chain)
+
+
+def ardupilot_loop(
+    values: Mapping[str, str],
+    *,
+    throttle: float = 0.3,
+    tracked_hz: Mapping[int, Sequence[float]] | None = None,
+) -> FlownArduPilot:
     """The rate loop of ArduPilot's parameters (Copter).
 
     **Arguments:**
 
-    - `values`: the parameters by name.
+    - `values`: the parameters by name. The gyro's rate is rounded up to a multiple of the loop's.
+    - `throttle`: 0 to 1 of the mixer (`RATE.AOut`), where notches are that follow it.
+    - `tracked_hz`: what harmonic notches follow that go by an RPM sensor (2, 5), ESC telemetry (3)
+        or the gyro's spectrum (4), in Hz: by INS_HNTCH_MODE, with a number for each source.
 
     **Raises:**
 
@@ -353,16 +384,17 @@ def ardupilot_loop(values: Mapping[str, str]) -> FlownLoop[ArduPilotRate]:
     read = _Parameters(values)
     rate = read.number("SCHED_LOOP_RATE", 400.0)
     gyro_rate = 1000.0 * 2 ** read.number("INS_GYRO_RATE", 0.0)
-    gyro_rate = rate * max(1, round(gyro_rate / rate))
+    gyro_rate = rate * max(1, math.ceil(gyro_rate / rate - 1e-9))
     per_axis = lambda end, default=None: [
         read.number(f"ATC_RAT_{x}_{end}", default) for x in ("RLL", "PIT", "YAW")
     ]
     limit = np.array(per_axis("PDMX", 0.0))
     cutoff = read.number("INS_GYRO_FILTER", 20.0)
+    notches = read_harmonic_notches(read.number, tracked_hz or {})
+    low_pass = (Butterworth(cutoff),) if cutoff > 0 else ()
     law = ArduPilotRate(
         p=per_axis("P"), i=per_axis("I"), d=per_axis("D"), ff=per_axis("FF", 0.0),
-        d_ff=per_axis("D_FF", 0.0),
-        gyro=FilterChain((Butterworth(cutoff),) if cutoff > 0 else (), gyro_rate),
+        d_ff=per_axis("D_FF", 0.0), gyro=FilterChain((*notches.filters, *low_pass), gyro_rate),
         target_hz=per_axis("FLTT", 20.0), error_hz=per_axis("FLTE", 0.0),
         derivative_hz=per_axis("FLTD", 20.0), integral_limit=per_axis("IMAX", 0.5),
         pd_limit=np.where(limit > 0, limit, np.inf), dt=1 / rate,
@@ -370,12 +402,11 @@ def ardupilot_loop(values: Mapping[str, str]) -> FlownLoop[ArduPilotRate]:
     switched = {
         **{f"ATC_RAT_{x}_SMAX": "the slew limiter lowers P and D" for x in ("RLL", "PIT", "YAW")},
         **{f"ATC_RAT_{x}_{n}": "a notch" for x in ("RLL", "PIT", "YAW") for n in ("NTF", "NEF")},
-        "INS_HNTCH_ENABLE": "harmonic notches follow the motors",
-        "INS_HNTC2_ENABLE": "harmonic notches follow the motors",
         "FSTRATE_ENABLE": "the rate loop runs faster than SCHED_LOOP_RATE",
     }
-    found = tuple(f"{k}: {words}" for k, words in switched.items() if read.number(k, 0.0) > 0)
-    return FlownLoop(law, found)
+    found = [f"{k}: {words}" for k, words in switched.items() if read.number(k, 0.0) > 0]
+    flown = FlownArduPilot(law, (*found, *notches.unmodelled), notches.tracking)
+    return dataclasses.replace(flown, law=flown.at(throttle))
 
 
 class _Parameters:
