@@ -130,22 +130,40 @@ class RateLoops:
         return back * both, slow @ self.ahead[:2] + (quick @ self.ahead[2:]) * filters.derivative
 
     def _qualities(self, feedback: Paths, ahead: Paths) -> LoopQualities:
-        through = feedback[:, None] * self.plants[None]
-        real, imaginary = 1 + np.real(through), np.imag(through)
-        distance = real**2 + imaginary**2
-        inverse = 1 / distance
-        plants, cells = _power(self.plants), cells_of(self.omega)
-        asked = (inverse * _power(ahead)[:, None] * plants).max(axis=-1)
-        above = distance - 2 * real + 1 > 1  # |L|
+        plants, cells, gain = _power(self.plants), cells_of(self.omega), _power(feedback)
+        real, imaginary = _one_plus(feedback, self.plants)
+        stable = _is_stable(real, imaginary)
+        distance, product = real**2, imaginary**2
+        distance += product
+        above = np.multiply(gain[:, None], plants, out=product) > 1  # |L|
         last = above.shape[-1] - 1 - np.argmax(above[..., ::-1], axis=-1)
+        inverse = np.divide(1.0, distance, out=real)
+        asked = np.multiply(_power(ahead)[:, None], plants, out=product)
+        asked *= inverse
         return LoopQualities(
-            _is_stable(real, imaginary),
+            stable,
             1 / np.sqrt(distance.min(axis=-1)),
-            np.sqrt(asked),
+            np.sqrt(asked.max(axis=-1)),
             np.where(above.any(axis=-1), self.omega[last], 0.0),
             np.sqrt(np.einsum("dpf,pf->dp", inverse, plants / self.omega**2 * cells)),
-            np.sqrt(np.einsum("dpf,df->dp", inverse, _power(feedback) * self.noise)),
+            np.sqrt(np.einsum("dpf,df->dp", inverse, gain * self.noise)),
         )
+
+
+def _one_plus(
+    feedback: Paths, plants: Complex[np.ndarray, "plants frequencies"]
+) -> tuple[
+    Float[np.ndarray, "designs plants frequencies"], Float[np.ndarray, "designs plants frequencies"]
+]:
+    """Real and imaginary part of 1 + L, each in one piece of memory."""
+    a, b = np.real(feedback)[:, None], np.imag(feedback)[:, None]
+    c, d = (np.ascontiguousarray(part) for part in (np.real(plants), np.imag(plants)))
+    real, product = a * c, b * d
+    real -= product
+    real += 1
+    imaginary = a * d
+    imaginary += np.multiply(b, c, out=product)
+    return real, imaginary
 
 
 def _power(response: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -163,16 +181,15 @@ def _is_stable(
     imaginary: Float[np.ndarray, "designs plants frequencies"],
 ) -> Bool[np.ndarray, "designs plants"]:
     """Whether 1 + L turns from -pi, of the double integrator, to 0; 2 pi for each unstable pair."""
-    upper = imaginary >= 0
-    crossed = np.zeros(upper.shape, bool)
-    np.not_equal(upper[..., 1:], upper[..., :-1], out=crossed[..., :-1])
-    k = np.flatnonzero(crossed)  # through the real axis; left of 0 by the cross product
+    size = imaginary.shape[-1]
+    upper = (imaginary >= 0).ravel()
+    k = np.flatnonzero(upper[1:] != upper[:-1])  # through the real axis
+    k = k[(k + 1) % size != 0]  # of one loop
     x, y = real.ravel(), imaginary.ravel()
-    cross = x[k] * y[k + 1] - x[k + 1] * y[k]
+    cross = x[k] * y[k + 1] - x[k + 1] * y[k]  # by which it is left or right of 0
     falls = y[k] >= 0
     turns = np.where(falls & (cross > 0), 1.0, 0.0) - np.where(~falls & (cross < 0), 1.0, 0.0)
-    loop = k // upper.shape[-1]
-    whole = np.bincount(loop, turns, minlength=x.size // upper.shape[-1]).reshape(real.shape[:2])
+    whole = np.bincount(k // size, turns, minlength=x.size // size).reshape(real.shape[:2])
     ends = [np.arctan2(imaginary[..., end], real[..., end]) for end in (0, -1)]
     rounds = np.round((ends[1] + 2 * np.pi * whole) / (2 * np.pi))
     return ends[0] - 2 * np.pi * rounds < 0

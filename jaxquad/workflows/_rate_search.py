@@ -28,7 +28,7 @@ Picks = Int[np.ndarray, "designs choices"]
 _POINTS, _LEVELS, _NARROWED = 7, 6, 0.4  # of the search, along each gain and one after the other
 _AROUND, _POINTS_AROUND, _LEVELS_AROUND = 0.3, 5, 4  # likewise, around known gains, in ln
 _RESERVE = 0.97  # of the limit, because fresh plants reach further than those that were tuned on
-_TOGETHER = 12  # designs evaluated at once: what a cache holds
+_TOGETHER = 384  # loops of designs and plants evaluated at once: beyond, memory is slow
 _ROUNDS, _DRAWN, _BEST, _KEPT = 14, 140, 18, 0.3  # of the search with filters
 _WIDTH, _NARROWEST = (0.35, 0.25), (0.02, 0.3)  # of gains in ln, of filters in options
 _SLOW = 2 * np.pi * 5.0  # rad/s, where delays are compared
@@ -236,7 +236,8 @@ class Search:
         """Of free gains, and picked filters."""
         gains = np.tile(self.flown, (len(points), 1))
         gains[:, self.free] = points
-        parts = np.array_split(np.arange(len(gains)), -(-len(gains) // _TOGETHER))
+        count = max(1, _TOGETHER // len(self.loops.plants))
+        parts = np.array_split(np.arange(len(gains)), -(-len(gains) // count))
         return np.concatenate(
             [self._of(gains[part], None if picks is None else picks[part]) for part in parts]
         )
