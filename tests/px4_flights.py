@@ -30,6 +30,7 @@ class Vehicle(NamedTuple):
     gains: tuple[float, float, float] = (0.15, 0.2, 0.003)
     cutoff: float = CUTOFF  # Hz, of the gyro
     slope: float = SLOPE_HZ  # Hz, of the D term
+    curve: float = 0.0  # f of the thrust f x^2 + (1 - f) x; the gain is that at half throttle
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -56,15 +57,24 @@ class Vehicle(NamedTuple):
         turn = 2 * np.pi * self.slope / GYRO_HZ
         return turn / (1 + turn)
 
+    def at(self, throttle: float) -> "Vehicle":
+        """The same at one throttle, which is the motors' command."""
+        return self._replace(gain=self.gain * (1 - self.curve + 2 * self.curve * throttle), curve=0)
+
     def fly(
-        self, seconds=30.0, amplitude=1.5, noise=0.05, gust=0.02, seed=3
+        self, seconds=30.0, amplitude=1.5, noise=0.05, gust=0.02, seed=3, throttles=(0.5,)
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Set-point, torque and filtered rate at 400 Hz: a chirp from 0.5 to 30 Hz."""
+        """Set-point, torque and filtered rate at 400 Hz.
+
+        A chirp from 0.5 to 30 Hz at each throttle, which take equal shares of the seconds.
+        """
         p, i, d = self.gains
         rng = np.random.default_rng(seed)
-        steps = int(seconds * GYRO_HZ)
-        time = np.arange(steps) / GYRO_HZ
-        rise = np.log(60.0) / seconds
+        each = int(seconds * GYRO_HZ) // len(throttles)
+        steps = each * len(throttles)
+        gains = np.repeat([self.at(x).gain for x in throttles], each).tolist()
+        time = np.arange(steps) % each / GYRO_HZ
+        rise = np.log(60.0) / (each / GYRO_HZ)
         sweep = np.sin(2 * np.pi * 0.5 * (np.exp(rise * time) - 1) / rise)
         r = (amplitude * sweep[::EACH]).tolist()
         jitter = (noise * rng.standard_normal(steps)).tolist()
@@ -86,7 +96,7 @@ class Vehicle(NamedTuple):
                 rates.append(y)
                 torques.append(u)
             sent[k + self.late] = u
-            wanted = self.gain * (sent[k] + gusts[k])
+            wanted = gains[k] * (sent[k] + gusts[k])
             rate += (wanted + (push - wanted) * self.lag * GYRO_HZ * (1 - decay)) / GYRO_HZ
             push = wanted + (push - wanted) * decay
         return np.array(r), np.array(torques), np.array(rates)
@@ -108,8 +118,8 @@ class Vehicle(NamedTuple):
         return plant * smooth * (p + i * DT / (z - 1) + d * slope)
 
 
-def write_log(path: Path, flown, parameters: Mapping[str, float]) -> Path:
-    """A ULog of a flight in acro."""
+def write_log(path: Path, flown, parameters: Mapping[str, float], throttles=()) -> Path:
+    """A ULog of a flight in acro, with the throttles if they are given."""
     r, u, y = flown
     log = ULog()
     for name, value in parameters.items():
@@ -128,6 +138,11 @@ def write_log(path: Path, flown, parameters: Mapping[str, float]) -> Path:
         },
         "vehicle_status": {"nav_state": ("u1", np.full(len(r), 10))},
     }
+    if throttles:
+        log.define("vehicle_thrust_setpoint:uint64_t timestamp;float[3] xyz;")
+        up = np.repeat(throttles, -(-len(r) // len(throttles)))[: len(r)]
+        down = np.stack([0 * up, 0 * up, -up], axis=1).astype("<f4")
+        tables["vehicle_thrust_setpoint"] = {"xyz": ("(3,)<f4", down)}
     for number, (name, columns) in enumerate(tables.items()):
         log.subscribe(number, name)
         log.write_rows(number, structured(clock | columns))

@@ -25,6 +25,7 @@ from ._fit_remarks import MISFIT as MISFIT
 from ._gain_over_throttle import (
     gain_over_throttle as gain_over_throttle,
     KnownFilter as KnownFilter,
+    throttle_levels as throttle_levels,
     ThrottledIntegrator as ThrottledIntegrator,
 )
 from ._half_bands import Bands as Bands
@@ -71,11 +72,15 @@ from ._starts import (
     spread_starts as spread_starts,
 )
 from ._thrust_curve import (
+    actuator as actuator,
+    curve_of_parameter as curve_of_parameter,
+    CurveFirmware as CurveFirmware,
     FirmwareValue as FirmwareValue,
     GainBand as GainBand,
     GainOverThrottle as GainOverThrottle,
     PlantsOverThrottle as PlantsOverThrottle,
     ScaledB0 as ScaledB0,
+    ThrottleLevels as ThrottleLevels,
 )
 from ._transfer_function_fit import fit_transfer_function as fit_transfer_function
 from ._transfer_function_guess import guess_transfer_function as guess_transfer_function

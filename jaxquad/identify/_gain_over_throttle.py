@@ -25,12 +25,13 @@ from ._cost import usable
 from ._fit import fit, guess_lagged_integrator
 from ._problem import Condition
 from ._result import Fit
-from ._thrust_curve import GainOverThrottle, relative_slope
+from ._thrust_curve import GainOverThrottle, relative_slope, ThrottleLevels
 
 
 _FEWEST = 8  # usable frequencies of a level
 _LINES = 40  # frequencies of a response
 _QUIET = 0.03  # of the strongest excitation, below which a level holds none
+_SLOW_RATE = 100.0  # Hz, enough for levels alone
 _OVERSAMPLED = 5.0  # samples per cycle of the highest frequency
 
 
@@ -174,6 +175,41 @@ def gain_over_throttle(
         return found
     curve = float(np.clip(found.curve.value, -0.9, 0.95))
     return _result(levels, [respond(level, curve) for level in levels], flown_curve, remarks)
+
+
+def throttle_levels(
+    record: Record | Sequence[Record],
+    *,
+    throttle: str = "throttle",
+    throttle_range: tuple[float, float] = (0.0, 1.0),
+    width: float = 0.1,
+    shortest: float = 3.0,
+) -> ThrottleLevels:
+    """The levels of throttle with an excitation, as `gain_over_throttle` finds them.
+
+    **Arguments:** as there.
+
+    **Returns:** a `jq.identify.ThrottleLevels`.
+
+    **Raises:**
+
+    - `ValueError`: as there.
+    """
+    records = [record] if isinstance(record, Record) else list(record)
+    _check(records, throttle_range, 0.0, width, shortest)
+    signals = [_on_one_clock(each, throttle, throttle_range, _SLOW_RATE) for each in records]
+    pieces = [piece for each in signals for piece in _pieces(each, width, shortest)]
+    return _extent(_levels(pieces, width, shortest)[0])
+
+
+def _extent(levels: Sequence[_Level]) -> ThrottleLevels:
+    throttle = [np.concatenate([piece.throttle for piece in level]) for level in levels]
+    return ThrottleLevels(
+        np.array([each.mean() for each in throttle]),
+        np.array([each.min() for each in throttle]),
+        np.array([each.max() for each in throttle]),
+        np.array([sum(piece.seconds for piece in level) for level in levels]),
+    )
 
 
 def _default(record: Record, throttle: str) -> Estimator:
@@ -351,13 +387,9 @@ def _result(
     remarks: tuple[str, ...],
 ) -> GainOverThrottle:
     found = _fitted(responses)
-    throttle = [np.concatenate([piece.throttle for piece in level]) for level in levels]
     record = levels[0][0].signals.record
     return GainOverThrottle(
-        throttle=np.array([each.mean() for each in throttle]),
-        low=np.array([each.min() for each in throttle]),
-        high=np.array([each.max() for each in throttle]),
-        seconds=np.array([sum(piece.seconds for piece in level) for level in levels]),
+        **_extent(levels)._asdict(),
         fit=found,
         flown=flown,
         input_unit=record.input_units[0],

@@ -16,7 +16,7 @@ from ._verdict import Combination, reach_of_interval, UndeterminedError
 
 
 Levels = Float[np.ndarray, " levels"]
-Firmware = Literal["px4", "ardupilot", "betaflight", "betaflight 2025.12"]
+CurveFirmware = Literal["px4", "ardupilot", "betaflight", "betaflight 2025.12"]
 _PARAMETERS: Mapping[str, tuple[str, float, float, float]] = {  # name, factor on f, least, most
     "px4": ("THR_MDL_FAC", 1.0, 0.0, 1.0),
     "ardupilot": ("MOT_THST_EXPO", 1.0, -1.0, 1.0),
@@ -90,6 +90,27 @@ class GainBand(NamedTuple):
     high: Float[np.ndarray, " points"]
 
 
+class ThrottleLevels(NamedTuple):
+    """Levels of throttle at which records hold an excitation, the lowest first.
+
+    **Attributes:**
+
+    - `throttle`: mean of each level, 0 to 1; `low`, `high`: of the throttle within it.
+    - `seconds`: flown at each.
+    """
+
+    throttle: Levels
+    low: Levels
+    high: Levels
+    seconds: Levels
+
+    def what_to_fly(self) -> str:
+        """In words, for gains at other throttles; empty where there are several levels."""
+        if self.throttle.size > 1:
+            return ""
+        return _beside_one(float(self.throttle[0]), float(self.seconds[0]))
+
+
 class PlantsOverThrottle(NamedTuple):
     """Plants K e^(-delay s) / (s (lag s + 1)) that a record leaves possible, at some throttles."""
 
@@ -157,6 +178,15 @@ class GainOverThrottle(eqx.Module):
         slope = np.array([-b / 2, a / 2]) / total**2
         return self._by_law("f", float(b / 2 / total), slope @ line.weights, 0.0)
 
+    @property
+    def straight_gain(self) -> Combination | None:
+        """The gain at every throttle once the firmware inverts the curve; None as `curve`."""
+        line = self._line()
+        if line is None:
+            return None
+        half = np.array([1.0, 0.5])
+        return self._by_law("gain", float(half @ line.ends), half @ line.weights, 0.0)
+
     def over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
         """The gain by the thrust curve, at any throttle.
 
@@ -208,7 +238,7 @@ class GainOverThrottle(eqx.Module):
         gain = rows @ (line.ends[:, None] + self._widening(line) * away)
         return PlantsOverThrottle(gain, wide(models.lag), wide(models.delay))
 
-    def firmware_value(self, firmware: Firmware) -> FirmwareValue:
+    def firmware_value(self, firmware: CurveFirmware) -> FirmwareValue:
         """The parameter with which a firmware makes the gain the same at every throttle.
 
         **Arguments:**
@@ -270,13 +300,12 @@ class GainOverThrottle(eqx.Module):
         """In words: whether the record holds enough of the thrust curve, and what to fly if not."""
         seconds = float(np.median(self.seconds))
         first, last = float(self.throttle[0]), float(self.throttle[-1])
-        fly = f"with the same excitation for {seconds:.0f} s at each"
+        fly = _with_the_same(seconds)
         curve = self.curve
         if curve is None:
-            lower, upper = _around(first, 0.3)
             return (
-                f"the log holds one level of throttle ({first:.2f}), which shows no curve: fly "
-                f"{lower:.2f} and {upper:.2f} as well, {fly}"
+                f"the log holds one level of throttle ({first:.2f}), which shows no curve: "
+                f"{_beside_one(first, seconds)}"
             )
         reach = _reach(curve)
         if reach <= _SHARP:
@@ -443,6 +472,16 @@ def _around(middle: float, span: float) -> tuple[float, float]:
     return lower, min(lower + span, 0.85)
 
 
+def _beside_one(throttle: float, seconds: float) -> str:
+    """What to fly beside one level."""
+    lower, upper = _around(throttle, 0.3)
+    return f"fly {lower:.2f} and {upper:.2f} as well, {_with_the_same(seconds)}"
+
+
+def _with_the_same(seconds: float) -> str:
+    return f"with the same excitation for {seconds:.0f} s at each"
+
+
 def _half(low: float, high: float) -> float:
     return (high - low) / 2
 
@@ -461,6 +500,31 @@ def _cubic(curve: float) -> float:
     t = (np.arange(1000) + 0.5) / 1000
     shape = t * (1 - t) ** 2
     return float(shape @ (actuator(t, curve) - t) / (shape @ shape))
+
+
+def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
+    """f of the thrust curve that a firmware inverts with this value of its parameter.
+
+    It is the inverse of `GainOverThrottle.firmware_value`.
+
+    **Arguments:**
+
+    - `firmware`: as there.
+    - `value`: of THR_MDL_FAC, MOT_THST_EXPO or thrust_linear.
+
+    **Returns:** -1 to 1; for thrust_linear beyond what a curve of this family can be, the nearest.
+
+    **Raises:**
+
+    - `ValueError`: for another firmware.
+    """
+    if firmware not in _PARAMETERS:
+        raise ValueError(f"firmware is {firmware!r}: use one of {', '.join(_PARAMETERS)}")
+    share = float(value) / _PARAMETERS[firmware][1]
+    if firmware == "betaflight 2025.12":
+        curves = np.linspace(0.0, 1.0, 201)
+        return float(np.interp(share, [_cubic(float(each)) for each in curves], curves))
+    return float(np.clip(share, -1.0, 1.0))
 
 
 def _content(found: Combination) -> dict[str, object]:

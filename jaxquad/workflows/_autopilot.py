@@ -2,7 +2,7 @@
 
 import dataclasses
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +41,9 @@ from ._gyro_noise import GyroNoise
 from ._identify import Identification, identify
 from ._kinds import SettingsError
 from ._log import propose_settings, read_records
+from ._over_throttle import study_throttle, ThrottleVerdict
 from ._pilot_page import pilot_page
+from ._plants import PlantSource
 from ._rate_design import design_gains, FilterVerdict, Kind
 from ._rate_gains import law_responses, Stage
 from ._settings import IdentifySettings
@@ -49,7 +51,7 @@ from ._tune_settings import AutopilotSettings
 
 
 _THIRD, _ALL = 1 / 3, 1.0
-_STEM = "proposal"
+_STEM, _CURVE = "proposal", "thrust_curve"
 _INJECTED = "SIDD.Targ"  # ArduPilot's chirp
 
 
@@ -71,6 +73,8 @@ class AutopilotProposal:
     - `filters`: what freeing the filters brings, or why they stay as they flew; None without a
       search.
     - `noise`: of the gyros, where the log shows it; `flight`: the channels that were read.
+    - `throttle`: at which throttles the gains hold, and the thrust curve, which is proposed apart
+      from them; None where the log cannot tell.
     """
 
     kind: Kind
@@ -84,6 +88,15 @@ class AutopilotProposal:
     filters: FilterVerdict | None = None
     noise: GyroNoise | None = None
     flight: FlightChannels | None = None
+    throttle: ThrottleVerdict | None = None
+
+    @property
+    def plants(self) -> PlantSource:
+        """What the log leaves possible."""
+        found = self.identification
+        if self.throttle is not None:
+            return self.throttle.plants(found)
+        return PlantSource(found.fit, found.records[0].output_units[0])
 
     @property
     def old(self) -> dict[str, float]:
@@ -126,6 +139,7 @@ class AutopilotProposal:
             "stages": [stage._asdict() for stage in self.stages],
             "filters": None if self.filters is None else self.filters.content(),
             "noise": None if self.noise is None else self.noise.content(),
+            "throttle": None if self.throttle is None else self.throttle.content(),
             "reproduction": None if self.reproduction is None else self.reproduction.to_dict(),
             "plant": self._plant,
             "settings": self.settings.content(),
@@ -159,14 +173,29 @@ class AutopilotProposal:
         )
         announce("the page")
         page = write_pilot_page(folder / "autopilot.html", pilot_page(self, origin))
+        beside = [page, stored, *self._write_curve(folder)]
         if self.kind != "proposed":
-            return [page, stored, self._write_flown(folder)]
+            return [*beside, self._write_flown(folder)]
         files = write_parameter_files(
             folder, flown.firmware, self.old, self.new, stem=_STEM, shares=(_THIRD, _ALL),
             reasons=self._reasons, beyond=list(self.new), version=flown.version or (2025, 12),
             at_once=() if self.filters is None else self.filters.at_once, profile=None,
         )  # fmt: skip
-        return [page, stored, *files.stages, files.revert, files.table]
+        return [*beside, *files.stages, files.revert, files.table]
+
+    def _write_curve(self, folder: Path) -> list[Path]:
+        """The thrust curve's parameter and what flew of it, never in a file with gains."""
+        curve = None if self.throttle is None else self.throttle.curve
+        if curve is None or curve.change is None:
+            return []
+        titles = {
+            "": f"{curve.name} alone: all loops and the throttle at hover change with it",
+            "_revert": f"the {curve.name} that flew",
+        }
+        return [
+            self._write_text(f"{_CURVE}{end}", [curve.change], title, folder, revert=bool(end))
+            for end, title in titles.items()
+        ]
 
     def _write_flown(self, folder: Path) -> Path:
         flown = self.flown
@@ -174,13 +203,20 @@ class AutopilotProposal:
             ParameterChange(find_parameter(flown.firmware, name), value, value)
             for name, value in self.old.items()
         ]
+        return self._write_text(f"{_STEM}_revert", same, "what flew", folder, revert=True)
+
+    def _write_text(
+        self, stem: str, changes: Sequence[ParameterChange], title: str, folder: Path, *,
+        revert: bool,
+    ) -> Path:  # fmt: skip
+        flown = self.flown
         raised = [AXES[flown.axis]] if f"d_max_{AXES[flown.axis]}" in self.old else []
         text = parameter_file(
-            flown.firmware, same, revert=True, version=flown.version or (2025, 12), raised=raised,
-            title="what flew", profile=None,
+            flown.firmware, changes, revert=revert, version=flown.version or (2025, 12),
+            raised=raised, title=title, profile=None,
         )  # fmt: skip
         suffix = {"betaflight": "txt", "px4": "params", "ardupilot": "param"}[flown.firmware]
-        return write_file(folder / f"{_STEM}_revert.{suffix}", text)
+        return write_file(folder / f"{stem}.{suffix}", text)
 
     def __str__(self) -> str:
         flown = self.flown
@@ -193,17 +229,39 @@ class AutopilotProposal:
             lines += ["", f"flown loop: {self.reproduction.verdict}"]
         if self.stages:
             lines += ["", _stage_table(self.stages)]
+        if self.throttle is not None:
+            lines += ["", *_throttle_lines(self.throttle, self.stages)]
         if self.filters is not None:
             lines += ["", f"filters: {self.filters.text}"]
         if self.kind == "proposed":
             lines += ["", change_table(self.changes).rstrip()]
+        curve = None if self.throttle is None else self.throttle.curve
+        if curve is not None:
+            lines += ["", f"thrust curve: {curve.text}"]
+            if curve.change is not None:
+                lines += ["", change_table([curve.change]).rstrip()]
         return "\n".join([*lines, "", self.verdict])
 
 
+_WAYS = ("what flew", "a third of the way", "all of it")
+
+
+def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> list[str]:
+    lines = [f"throttle: {throttle.text}"]
+    if throttle.gains is None:
+        return lines
+    lines.append(throttle.table)
+    if stages:
+        heads = " ".join(f"{each:6.2f}" for each in throttle.logged)
+        lines += ["", f"{'worst Ms at throttle':<20} {heads}"]
+        for name, stage in zip(_WAYS, stages, strict=False):
+            lines.append(f"{name:<20} " + " ".join(f"{peak:6.2f}" for peak in stage.peaks))
+    return lines
+
+
 def _stage_table(stages: tuple[Stage, ...]) -> str:
-    names = ("what flew", "a third of the way", "all of it")
     rows = [f"{'on fresh plants':<20} stable   worst Ms   resonance   crossover   torque   noise"]
-    for name, stage in zip(names, stages, strict=False):
+    for name, stage in zip(_WAYS, stages, strict=False):
         rows.append(
             f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
             f"  {stage.crossover / (2 * np.pi):8.1f} Hz {stage.rejection:8.2f} {stage.noise:7.2f}"
@@ -219,7 +277,8 @@ def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> Au
     loop are searched over the plants that the fit leaves uncertain: least rate after a step of
     torque, with limits on the peak of |S|, on the command's noise and on the crossover, which stays
     in the identified band. Where the log shows the gyro's noise, cutoffs and notches are searched
-    with them. The rounded numbers are certified on fresh plants, as is a third of the way.
+    with them. The rounded numbers are certified on fresh plants, as is a third of the way. Where
+    the log holds several levels of throttle, plants have the gain that it shows at each of them.
     Feed-forward and the angle loop stay as they are. Loops are taken as linear: no
     limit of the motors is simulated. Source: docs/autopilots.md.
 
@@ -256,10 +315,11 @@ def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> Au
     if again.kind != "flown":
         why = again.verdict
         return unsure(why if again.kind == "unknown" else f"this log cannot tell: {why}", again)
-    made = design_gains(settings, found, flown, flight)
+    throttle = study_throttle(found, proposal, flown)
+    made = design_gains(settings, found, flown, flight, throttle)
     return AutopilotProposal(
         made.kind, made.verdict, *known, again, made.stages,
-        made.new if made.kind == "proposed" else {}, made.filters, made.noise, flight,
+        made.new if made.kind == "proposed" else {}, made.filters, made.noise, flight, throttle,
     )  # fmt: skip
 
 

@@ -39,6 +39,13 @@ class FlownAutopilot:
             self.firmware, values, self.version, throttle=self.throttle, tracked_hz=self.tracked_hz
         ).law
 
+    def at(self, throttle: float) -> "FlownAutopilot":
+        """The same at another throttle, which moves cutoffs, notches and TPA of some firmwares."""
+        if self.firmware == "px4":
+            return self
+        there = dataclasses.replace(self, throttle=throttle)
+        return dataclasses.replace(there, law=there.with_filters({}))
+
     @property
     def old(self) -> dict[str, float]:
         """P, I and D of the axis by the firmware's names."""

@@ -87,10 +87,13 @@ def _check_units(logs: Mapping[Path, tuple[Record, ...]]) -> None:
                 )
 
 
-def read_records(path: Path, settings: IdentifySettings) -> tuple[Record, ...]:
-    """One record for each segment. Raises RecordError, ReadError."""
+def read_records(
+    path: Path, settings: IdentifySettings, *, beside: Mix | None = None
+) -> tuple[Record, ...]:
+    """One record for each segment, with further inputs. Raises RecordError, ReadError."""
     announce(f"reading {path.name}")
     inputs, outputs, references = map(mix_of, (settings.input, settings.output, settings.reference))
+    inputs = inputs | (beside or {})
     asked = {*inputs, *outputs, *references}
     segments: list[Segment] = list(settings.segments) or [(settings.start, settings.stop)]
     records = read_segments(

@@ -14,7 +14,7 @@ from jaxquad.report import Cell, Headline, PilotPage, Provenance, Table
 
 from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
-from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, make_loops, RateLaw
+from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, RateLaw
 
 
 if TYPE_CHECKING:
@@ -82,6 +82,12 @@ def _headlines(found: "AutopilotProposal") -> list[Headline]:
     if found.filters is not None:
         level = "good" if found.filters.flown else "warn"
         headlines.append(Headline(level, "FILTERS", found.filters.text))
+    if found.throttle is not None:
+        level = "warn" if found.throttle.gains is None else "good"
+        headlines.append(Headline(level, "THROTTLE", found.throttle.text))
+        if found.throttle.curve is not None:
+            level = "warn" if found.throttle.curve.change else "good"
+            headlines.append(Headline(level, "THRUST CURVE", found.throttle.curve.text))
     return headlines
 
 
@@ -156,12 +162,12 @@ def _response(
 
 def _steps(found: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
     """From set-point to rate, of plants drawn from the fit: by their responses."""
-    flown, unit = found.flown, found.identification.records[0].output_units[0]
+    flown = found.flown
     dt = max(flown.law.dt, _FINEST)
     count = 2 * int(_PERIOD / dt / 2)
     omega = 2 * np.pi * np.arange(1, count // 2) / (count * dt)
     seed = found.settings.seed + _SEED
-    loops = make_loops(flown.law, flown.axis, found.identification.fit, unit, _PLANTS, seed, omega)
+    loops = found.plants.loops(flown.law, flown.axis, _PLANTS, seed, omega=omega)
     fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2 if dt > flown.law.dt else 1.0
     steps = {}
     for name, (law, gains) in designs.items():

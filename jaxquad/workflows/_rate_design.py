@@ -1,6 +1,7 @@
 """The design of a rate loop: searched, rounded, and certified on fresh plants."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
@@ -14,12 +15,13 @@ from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
 from ._identify import Identification
+from ._over_throttle import ThrottleVerdict
 from ._rate_gains import (
     ceiling_in,
     certify_gains,
     gains_in,
     gains_of,
-    make_loops,
+    grouped,
     parameters_of,
     RateLoops,
     Stage,
@@ -85,9 +87,10 @@ def design_gains(
     found: Identification,
     flown: FlownAutopilot,
     flight: FlightChannels | None,
+    throttle: ThrottleVerdict,
 ) -> Design:
     """Search gains, and filters where the log shows the gyro's noise; certify the rounded ones."""
-    work = _Work(settings, found, flown)
+    work = _Work(settings, found, flown, throttle)
     noise, why = _noise_of(settings, flown, flight, work)
     work = dataclasses.replace(work, noise=noise)
     loops, targets = work.loops(settings.members, 0), work.targets
@@ -96,7 +99,7 @@ def design_gains(
         why = "the firmware's filters are off, so there is none to change"
     gains = None
     for attempt in range(1, _CERTIFICATES + 1):
-        fresh = work.loops(settings.fresh, attempt)
+        fresh = work.fresh(attempt)
         announce(f"searching gains on {len(loops.plants)} plants")
         search = Search(loops, work.before, targets, flown.firmware, flown.axis, bank)
         gains = search.gains(gains)
@@ -111,7 +114,7 @@ def design_gains(
             if filters:
                 design = work.certified(fresh, parameters_of(flown.law, flown.axis, both), filters)
             design, verdict = _compared(work, plain, design, bank, noise)
-        kind, text = _judge(design.stages, settings, found.band[1], verdict.shared)
+        kind, text = _judge(design.stages, settings, found.band[1], verdict.shared, throttle)
         if kind != "not to be flown":
             break
         loops = loops.joined(design.loops[-1].worst(design.gains[-1][None], _WORST))
@@ -131,6 +134,7 @@ class _Work:
     settings: AutopilotSettings
     found: Identification
     flown: FlownAutopilot
+    throttle: ThrottleVerdict
     noise: GyroNoise | None = None
 
     @property
@@ -146,16 +150,47 @@ class _Work:
         )
 
     def loops(self, count: int, seed: int) -> RateLoops:
-        """Of what flew, with the noise of the log where it shows it."""
-        found, flown = self.found, self.flown
-        unit = found.records[0].output_units[0]
-        loops = make_loops(flown.law, flown.axis, found.fit, unit, count, self.settings.seed + seed)
+        """Of what flew, with the noise of the log where it shows it.
+
+        Where the log has several levels of throttle, the plants are spread over those that are
+        certified.
+        """
+        share = -(-count // max(len(self.throttle.certified), 1))
+        first, *others = self._groups(share, seed)
+        if all(each.law is self.flown.law for each in self._flown_there):  # one group is quicker
+            plants = np.concatenate([first.plants, *(each.plants for each in others)])
+            return dataclasses.replace(first, plants=plants)
+        return grouped([first, *others])
+
+    def fresh(self, attempt: int) -> RateLoops:
+        """Other plants, all of them at each throttle that is certified."""
+        return grouped(self._groups(self.settings.fresh, attempt))
+
+    def _groups(self, count: int, seed: int) -> list[RateLoops]:
+        source, seed = self.throttle.plants(self.found), self.settings.seed + seed
+        places = self.throttle.certified or (None,)
+        groups = [
+            source.loops(each.law, each.axis, count, seed, throttle=throttle)
+            for each, throttle in zip(self._flown_there, places, strict=True)
+        ]
+        return self._heard(groups)
+
+    @ft.cached_property
+    def _flown_there(self) -> list[FlownAutopilot]:
+        """What flew, at each throttle that is certified."""
+        if not self.throttle.certified:
+            return [self.flown]
+        return [self.flown.at(throttle) for throttle in self.throttle.logged]
+
+    def _heard(self, groups: list[RateLoops]) -> list[RateLoops]:
+        """With the noise of the log, which was measured at all throttles together."""
         if self.noise is None:
-            return loops
+            return groups
         # What was measured has passed the flown loop.
-        opened = np.abs(1 + (self.before @ loops.feedback) * loops.plants) ** 2
-        power = self.noise.powers(self.noise.behind, loops.omega)
-        return dataclasses.replace(loops, noise=power * np.median(opened, axis=0))
+        opened = [np.abs(1 + (self.before @ each.feedback) * each.plants) ** 2 for each in groups]
+        power = self.noise.powers(self.noise.behind, groups[0].omega)
+        noise = power * np.median(np.concatenate(opened), axis=0)
+        return [dataclasses.replace(each, noise=noise) for each in groups]
 
     def bank(self, loops: RateLoops) -> FilterBank | None:
         if self.noise is None:
@@ -177,14 +212,21 @@ class _Work:
         third = self._third(whole, filters)
         ways = (third, whole)
         ceiling = ceiling_in(law, axis, ways)
-        loops = [dataclasses.replace(fresh, ceiling=ceiling)]
+        loops = [grouped(dataclasses.replace(each, ceiling=ceiling) for each in fresh.groups)]
         for way in ways:
             parts = {name: way[name] for name in filters}
-            changed = self.flown.with_filters(parts) if filters else law
-            loops.append(loops[0].of_law(changed, axis) if filters else loops[0])
+            loops.append(self._filtered(loops[0], parts) if filters else loops[0])
         designs = [self.before, *(gains_in(law, axis, way) for way in ways)]
         stages = tuple(certify_gains(loops, designs))
         return _Certified(stages, whole, dict(filters), designs, loops)
+
+    def _filtered(self, flown: RateLoops, filters: Mapping[str, float]) -> RateLoops:
+        """The loops with other filters, at each throttle."""
+        laws = [each.with_filters(filters) for each in self._flown_there]
+        return grouped(
+            loops.of_law(law, self.flown.axis)
+            for loops, law in zip(flown.groups, laws, strict=True)
+        )
 
     def _third(self, new: Mapping[str, float], filters: Mapping[str, float]) -> dict[str, float]:
         """A third of the way, as the firmware stores it."""
@@ -267,7 +309,11 @@ def _compared(
 
 
 def _judge(
-    stages: Sequence[Stage], settings: AutopilotSettings, edge: float, shared: SharedChange | None
+    stages: Sequence[Stage],
+    settings: AutopilotSettings,
+    edge: float,
+    shared: SharedChange | None,
+    throttle: ThrottleVerdict,
 ) -> tuple[Kind, str]:
     flown, third, whole = stages
     beyond = _beyond(third, whole, flown, settings, edge)
@@ -281,16 +327,19 @@ def _judge(
             f"no gains are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, `resonance`, "
             "`noise`, `change`), or fly more excitation"
         )
-    limit, count = settings.sensitivity, settings.fresh
+    limit, plants = settings.sensitivity, f"{settings.fresh} fresh plants"
+    if throttle.logged:
+        at = ", ".join(f"{each:.2f}" for each in throttle.logged)
+        plants += f" at each of the throttles {at}"
     better = f"{whole.rejection:.2f} of the flown effect of torque"
     within = flown.peak <= limit and flown.resonance <= settings.resonance
     if flown.stable == 1 and within and whole.rejection > _WORTH:
         return "kept", (
             f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
-            f"{count} fresh plants is {flown.peak:.2f}"
+            f"{plants} is {flown.peak:.2f}"
         )
     return "proposed", (
-        f"proposed: stable on all {count} fresh plants, worst Ms {whole.peak:.2f} of at most "
+        f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most "
         f"{limit:g}, {better}. Load the file for a third of the way first"
     )
 

@@ -6,7 +6,7 @@ Source: docs/autopilots.md.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -26,7 +26,6 @@ from jaxquad.control.autopilots import (
     store_parameters,
     without_gyro_filters,
 )
-from jaxquad.identify import draw_models, Fit
 from jaxquad.records import AXES
 
 
@@ -34,8 +33,6 @@ RateLaw = BetaflightPID | PX4Rate | ArduPilotRate
 Gains = Float[np.ndarray, "designs gains"]
 Paths = Complex[np.ndarray, "designs frequencies"]
 FIELDS = ("p", "i", "d")
-_LOWEST = 0.05  # rad/s, below which only the integrals count
-_FREQUENCIES = 300
 
 
 class LoopQualities(NamedTuple):
@@ -78,6 +75,7 @@ class RateLoops:
     - `noise`: power of the logged rate's noise around each frequency, behind the flown filters.
     - `passed`: response of the gyro's filters that flew.
     - `ceiling`: by which factor D can rise in flight (D_MAX); 1 where it cannot.
+    - `beside`: loops at other throttles, under the law there; their plants count, too.
     """
 
     omega: Float[np.ndarray, " frequencies"]
@@ -87,29 +85,58 @@ class RateLoops:
     noise: Float[np.ndarray, " frequencies"]
     passed: Complex[np.ndarray, " frequencies"]
     ceiling: float = 1.0
+    beside: tuple["RateLoops", ...] = ()
+
+    @property
+    def groups(self) -> tuple["RateLoops", ...]:
+        """For each throttle its own."""
+        return dataclasses.replace(self, beside=()), *self.beside
 
     def of_law(self, law: RateLaw, axis: int) -> "RateLoops":
-        """The same plants under a law with other filters, as exactly as those of the flown one."""
+        """The same plants under a law with other filters, as exactly as those of the flown one.
+
+        Without those beside.
+        """
         back, ahead = law_paths(law, axis, self.omega)
         changed = gyro_chain_response(law, self.omega) / self.passed
         return dataclasses.replace(self, feedback=back * changed, ahead=ahead)
 
     def worst(self, gains: Gains, count: int) -> "RateLoops":
         """With those plants alone that have the greatest peaks under these gains."""
-        found = self.qualities(gains)
-        peak = np.where(found.stable, np.maximum(found.peak, found.resonance), np.inf)
-        order = np.argsort(peak.max(axis=0), kind="stable")
-        return dataclasses.replace(self, plants=self.plants[order[-count:]])
+        groups, peaks = self.groups, []
+        for each in groups:
+            found = each.qualities(gains)
+            peak = np.where(found.stable, np.maximum(found.peak, found.resonance), np.inf)
+            peaks.append(peak.max(axis=0))
+        chosen = np.zeros(sum(map(len, peaks)), bool)
+        chosen[np.argsort(np.concatenate(peaks), kind="stable")[-count:]] = True
+        parts = np.split(chosen, np.cumsum([len(peak) for peak in peaks])[:-1])
+        return grouped(
+            dataclasses.replace(each, plants=each.plants[part])
+            for each, part in zip(groups, parts, strict=True)
+        )
 
     def joined(self, others: "RateLoops") -> "RateLoops":
-        """With the plants of `others`."""
-        return dataclasses.replace(self, plants=np.concatenate([self.plants, others.plants]))
+        """With the plants of `others`, each at its throttle, under the laws of these."""
+        plants = [each.plants for each in others.groups]
+        groups = self.groups if self.beside else (self,)
+        if not self.beside:
+            plants = [np.concatenate(plants)]
+        return grouped(
+            dataclasses.replace(each, plants=np.concatenate([each.plants, more]))
+            for each, more in zip(groups, plants, strict=True)
+        )
 
     def qualities(self, gains: Gains, filters: Filters | None = None) -> LoopQualities:
         """What each row of P, I and D gives; stability and Ms with D at its ceiling, too.
 
         `filters` are the responses of other filters over those that flew.
         """
+        found = [self._own_qualities(gains, filters)]
+        found += [each.qualities(gains, filters) for each in self.beside]
+        return found[0] if len(found) == 1 else _together(found)
+
+    def _own_qualities(self, gains: Gains, filters: Filters | None) -> LoopQualities:
         base = self._qualities(*self.paths(gains, filters))
         if self.ceiling == 1:
             return base
@@ -166,6 +193,17 @@ def _one_plus(
     return real, imaginary
 
 
+def grouped(groups: Iterable[RateLoops]) -> RateLoops:
+    """The loops of several throttles as one."""
+    first, *others = groups
+    return dataclasses.replace(first, beside=tuple(others))
+
+
+def _together(parts: Sequence[LoopQualities]) -> LoopQualities:
+    """Of the plants of all parts."""
+    return LoopQualities(*(np.concatenate(each, axis=1) for each in zip(*parts, strict=True)))
+
+
 def _power(response: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.real(response) ** 2 + np.imag(response) ** 2
 
@@ -195,24 +233,6 @@ def _is_stable(
     return ends[0] - 2 * np.pi * rounds < 0
 
 
-def make_loops(
-    law: RateLaw, axis: int, fit: Fit, unit: str, plants: int, seed: int,
-    omega: Float[np.ndarray, " frequencies"] | None = None,
-) -> RateLoops:  # fmt: skip
-    """The loops of a flown law with so many plants drawn from a fit up to the logged rate.
-
-    Raises ValueError where a drawn gain is not above 0.
-    """
-    if omega is None:
-        omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
-    back, ahead = law_paths(law, axis, omega)
-    per_radian = np.pi / 180 if unit == "deg/s" else 1.0
-    responses = per_radian * _sampled_plants(fit, omega, law.dt, plants, seed)
-    passed = gyro_chain_response(law, omega)
-    white = cells_of(omega) * _power(passed)
-    return RateLoops(omega, back, ahead, responses, white, passed, _ceiling(law, axis))
-
-
 def law_paths(
     law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> tuple[Complex[np.ndarray, "gains frequencies"], Complex[np.ndarray, "gains frequencies"]]:
@@ -223,14 +243,21 @@ def law_paths(
     return -back, ahead
 
 
+def gyro_chains(law: RateLaw) -> list[FilterChain]:
+    """All filters of the gyro, at their own rates."""
+    if isinstance(law, BetaflightPID) and law.filters:
+        return [law.gyro, FilterChain(law.filters, 1 / law.dt)]
+    return [law.gyro]
+
+
 def gyro_chain_response(
     law: RateLaw, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, " frequencies"]:
-    """Of all filters of the gyro, at their own rates."""
+    """Of all filters of the gyro."""
     hertz = omega / (2 * np.pi)
-    passed = np.asarray(law.gyro.response(hertz))
-    if isinstance(law, BetaflightPID) and law.filters:
-        passed = passed * np.asarray(FilterChain(law.filters, 1 / law.dt).response(hertz))
+    passed = np.ones(omega.size, complex)
+    for chain in gyro_chains(law):
+        passed = passed * np.asarray(chain.response(hertz))
     return passed
 
 
@@ -257,23 +284,6 @@ def law_responses(
     return (c @ inner + through).T
 
 
-def _sampled_plants(
-    fit: Fit, omega: Float[np.ndarray, " frequencies"], dt: float, count: int, seed: int
-) -> Complex[np.ndarray, "plants frequencies"]:
-    """Plants drawn from a fit, behind a hold."""
-    scores = np.random.default_rng(seed).standard_normal((len(fit.names), count))
-    models = draw_models(fit, jnp.asarray(scores))
-    wide = lambda x: np.broadcast_to(np.asarray(x, float), (count,))[:, None]
-    gain, lag, delay = (wide(x) for x in (models.gain, models.lag, models.delay))
-    if np.any(gain <= 0):
-        raise ValueError(
-            f"the gain from the command to the rate is not above 0 in {int(np.sum(gain <= 0))} of "
-            f"{count} plants drawn from the fit: check the sign of the input, or fly more "
-            "excitation"
-        )
-    return hold_plants(gain, lag, delay, omega, dt)
-
-
 def hold_plants(
     gain: Float[np.ndarray, "plants 1"],
     lag: Float[np.ndarray, "plants 1"],
@@ -291,7 +301,8 @@ def hold_plants(
     return gain * (1 - q) * q ** (whole + 1) * steps
 
 
-def _ceiling(law: RateLaw, axis: int) -> float:
+def ceiling_of(law: RateLaw, axis: int) -> float:
+    """By which factor D can rise in flight (D_MAX); 1 where it cannot."""
     if not isinstance(law, BetaflightPID) or law.d_max is None:
         return 1.0
     base, most = (float(np.broadcast_to(x, (3,))[axis]) for x in (law.d, law.d_max.ceiling))
@@ -318,14 +329,14 @@ def parameters_of(law: RateLaw, axis: int, gains: Float[np.ndarray, " gains"]) -
         for name, gain, old in zip(FIELDS, gains, flown, strict=True)
         if old > 0
     }
-    if (ceiling := _ceiling(law, axis)) > 1:
+    if (ceiling := ceiling_of(law, axis)) > 1:
         found[f"d_max_{AXES[axis]}"] = ceiling * float(gains[2])
     return store_parameters(firmware, found)
 
 
 def ceiling_in(law: RateLaw, axis: int, designs: Sequence[Mapping[str, Number]]) -> float:
     """The most by which D can rise in flight under one of these stored sets of parameters."""
-    flown = _ceiling(law, axis)
+    flown = ceiling_of(law, axis)
     pairs = [(each.get(f"d_max_{AXES[axis]}"), gains_in(law, axis, each)[2]) for each in designs]
     return max([flown, *(float(top / base) for top, base in pairs if top and base > 0)])
 
@@ -349,6 +360,7 @@ class Stage(NamedTuple):
     - `stable`: share of the plants; `peak`, `resonance`: the greatest of them.
     - `crossover`: their median in rad/s.
     - `rejection`, `noise`: relative to what flew.
+    - `peaks`: the greatest Ms at each throttle.
     """
 
     gains: tuple[float, ...]
@@ -358,13 +370,18 @@ class Stage(NamedTuple):
     crossover: float
     rejection: float
     noise: float
+    peaks: tuple[float, ...] = ()
 
 
 def certify_gains(
     loops: Sequence[RateLoops], designs: Sequence[Float[np.ndarray, " gains"]]
 ) -> list[Stage]:
     """What each of the designs gives under its own law, the first of which is what flew."""
-    found = [one.qualities(gains[None]) for one, gains in zip(loops, designs, strict=True)]
+    parts = [
+        [group.qualities(gains[None]) for group in one.groups]
+        for one, gains in zip(loops, designs, strict=True)
+    ]
+    found = [_together(each) for each in parts]
     rms = lambda x: float(np.sqrt(np.mean(x**2)))
     first = found[0]
     return [
@@ -376,6 +393,7 @@ def certify_gains(
             float(np.median(each.crossover)),
             rms(each.rejection) / rms(first.rejection),
             rms(each.noise) / rms(first.noise),
+            tuple(float(np.max(group.peak)) for group in groups),
         )
-        for each, gains in zip(found, designs, strict=True)
+        for each, groups, gains in zip(found, parts, designs, strict=True)
     ]

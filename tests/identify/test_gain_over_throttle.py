@@ -9,6 +9,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import jaxquad as jq
 from jaxquad.control.autopilots import adrc_b0
+from jaxquad.identify import curve_of_parameter, throttle_levels
 
 
 DT = 0.004
@@ -103,6 +104,27 @@ def test_one_curve_gives_the_parameter_of_each_firmware(found):
     t = np.linspace(0, 1, 201)
     x = t * (1 + older * (1 - t) ** 2)  # what that firmware sends for a thrust t
     assert np.max(np.abs(f * x**2 + (1 - f) * x - t)) < 0.07 < np.max(np.abs(f * t**2 - f * t))
+
+
+def test_a_firmwares_parameter_and_its_curve_are_each_others_inverse(found):
+    assert curve_of_parameter("ardupilot", -0.3) == -0.3
+    for firmware in ("px4", "betaflight", "betaflight 2025.12"):
+        value = found.firmware_value(firmware).value
+        assert curve_of_parameter(firmware, value) == pytest.approx(found.curve.value, abs=2e-3)
+
+
+def test_the_gain_under_an_inverted_curve_is_that_of_a_full_slope(found):
+    straight = found.straight_gain
+    assert abs(straight.value - SLOPE) < 3.5 * straight.standard_error < 0.1 * SLOPE
+
+
+def test_levels_of_throttle_are_those_of_the_gains_and_one_alone_says_what_to_fly(found):
+    levels = throttle_levels(flight(), throttle_range=(0.0, 1000.0))
+    np.testing.assert_allclose(levels.throttle, found.throttle, atol=0.005)
+    assert np.all((levels.low < levels.throttle) & (levels.throttle < levels.high))
+    assert levels.what_to_fly() == ""
+    single = throttle_levels(flight((0.4,)), throttle_range=(0.0, 1000.0))
+    assert single.what_to_fly().startswith("fly 0.25 and 0.55 as well, with the same excitation")
 
 
 def test_the_table_and_the_mapping_hold_the_levels_and_the_parameters(found):

@@ -105,15 +105,18 @@ BETAFLIGHT = {
 }  # fmt: skip
 
 
-def fly_betaflight(seconds=24.0, noise=2.0, gyro_hz=0.0, line=(0.0, 0.0)):
+def fly_betaflight(seconds=24.0, noise=2.0, gyro_hz=0.0, line=(0.0, 0.0), parts=((1.0, 1.0),)):
     """Set-point, pidsum, filtered and unfiltered rate in deg/s at 1 kHz, by its equations.
 
-    The gyro has a pt1 at `gyro_hz` (0: none), and a line of so many Hz and deg/s.
+    The gyro has a pt1 at `gyro_hz` (0: none), and a line of so many Hz and deg/s. Each of the
+    `parts` has a chirp, and factors of the plant's gain and of D.
     """
-    rng, samples = np.random.default_rng(5), int(seconds * RATE)
-    time, rise = np.arange(samples) / RATE, np.log(50.0) / seconds
+    rng, each = np.random.default_rng(5), int(seconds * RATE) // len(parts)
+    samples = each * len(parts)
+    gains, damping = np.repeat(parts, each, axis=0).T.tolist()
+    time, rise = np.arange(samples) % each / RATE, np.log(50.0) / (each / RATE)
     r = np.round(150 * np.sin(2 * np.pi * (np.exp(rise * time) - 1) / rise)).tolist()
-    hum = line[1] * np.sin(2 * np.pi * line[0] * time)
+    hum = line[1] * np.sin(2 * np.pi * line[0] * np.arange(samples) / RATE)
     jitter = (noise * rng.standard_normal(samples) + hum).tolist()
     decay = float(np.exp(-1 / RATE / LAG))
     passed = 1 - 1 / (1 + 2 * np.pi * gyro_hz / RATE) if gyro_hz else 1.0
@@ -126,9 +129,9 @@ def fly_betaflight(seconds=24.0, noise=2.0, gyro_hz=0.0, line=(0.0, 0.0)):
         y += passed * (rate + jitter[k] - y)
         integral += i * (r[k] - y) / RATE
         before, smooth = smooth, smooth + share * (y - smooth)
-        sent.append(p * (r[k] - y) + integral - d * (smooth - before) * RATE)
+        sent.append(p * (r[k] - y) + integral - damping[k] * d * (smooth - before) * RATE)
         rates.append(y)
-        wanted = GAIN * sent[k]
+        wanted = GAIN * gains[k] * sent[k]
         rate += (wanted + (push - wanted) * LAG * RATE * (1 - decay)) / RATE
         push = wanted + (push - wanted) * decay
     return r, sent[LATE:], rates, unfiltered
@@ -145,15 +148,21 @@ def betaflight_loop_of(gains, omega, slope_hz=SLOPE_HZ):
     return plant * (p + i / RATE / (1 - 1 / z) + d * slope)
 
 
-def write_blackbox(path, flown, changed, every=1):
-    """A log of roll; axisI is put aside for the unfiltered gyro, with as many bits."""
+def write_blackbox(path, flown, changed, every=1, throttle=None):
+    """A log of roll; axisI is put aside for the unfiltered gyro, with as many bits.
+
+    So is rssi for a throttle of 0 to 1.
+    """
     names = [name.replace("axisI", "gyroUnfilt") for name in blackbox_writer.NAMES]
+    if throttle is not None:
+        names = [name.replace("rssi", "setpoint[3]") for name in names]
     level = {name: blackbox_rows.LEVEL.get(name, 0) for name in blackbox_writer.NAMES}
     rows = [
         level | {
             "loopIteration": every * k, "time": 5_000_000 + 1000 * every * k, "axisP[0]": round(u),
             "rcCommand[0]": round(r), "setpoint[0]": round(r), "gyroADC[0]": round(y),
             "axisI[0]": round(x),
+            **({} if throttle is None else {"rssi": round(1000 * throttle[every * k])}),
         }
         for k, (r, u, y, x) in enumerate(list(zip(*flown, strict=True))[::every])
     ]  # fmt: skip
@@ -243,6 +252,55 @@ def test_a_log_that_is_too_slow_for_the_noise_keeps_its_filters_and_says_why(tmp
     assert not any("lpf" in name for name in read_cli(tmp_path / "proposal_revert.txt"))
 
 
+CUBIC, CURVE, TPA = 0.3, 0.6, (65.0, 0.35)  # thrust_linear / 100 and TPA that flew; f of the truth
+
+
+def at_throttle(throttle):
+    """Of the plant's gain and of D, which factors Betaflight 4.5 has at a throttle.
+
+    The mixer takes thrust_linear's work out of the throttle, t, and adds it to the motors' commands
+    t (1 + e (1 - t)^2).
+    """
+    t = throttle / (1 + (CUBIC - CUBIC**2 / 2) * (1 - throttle) ** 2)
+    x = t * (1 + CUBIC * (1 - t) ** 2)
+    slope = 1 + CUBIC * (1 - t) ** 2 - 2 * CUBIC * t * (1 - t)
+    rate, start = TPA
+    damping = 1 - rate / 100 * max(0.0, (throttle - start) / (1 - start))
+    return (1 - CURVE + 2 * CURVE * x) * slope, damping
+
+
+@pytest.mark.slow
+def test_betaflights_gains_hold_at_every_throttle_with_the_tpa_of_each(tmp_path, capsys):
+    throttles = (0.25, 0.45, 0.65)
+    parts = [at_throttle(x) for x in throttles]
+    flown = fly_betaflight(seconds=36.0, parts=parts)
+    settings = {"tpa_rate": "65", "tpa_breakpoint": "1350", "thrust_linear": "30"}
+    path = write_blackbox(
+        tmp_path / "flight.bbl", flown, settings, throttle=np.repeat(throttles, 12 * RATE)
+    )
+    options = ["--axis", "roll", "--keep-filters", "--out", str(tmp_path)]
+    assert main(["autopilot", str(path), *options]) == 0, capsys.readouterr()
+    content = json.loads((tmp_path / "autopilot.json").read_text())
+    *_, after = content["stages"]
+    omega = np.geomspace(0.1, 0.99 * np.pi * RATE, 2000)
+    for (gain, damping), certified in zip(parts, after["peaks"], strict=True):
+        p, i, d = after["gains"]
+        loop = gain * betaflight_loop_of((p, i, damping * d), omega)
+        assert 1 / np.min(np.abs(1 + loop)) < 1.05 * certified <= 1.05 * 1.8
+    # The curve is that of the propellers, however much of it the firmware inverted.
+    curve = content["throttle"]["thrust_curve"]
+    assert content["throttle"]["gain_over_throttle"]["curve"]["value"] == pytest.approx(
+        CURVE,
+        abs=0.08,  # 4.5's cubic is only near the curve that is taken for it
+    )
+    low, high = curve["interval_95"]
+    assert low > 30 and curve["flown"] == 30 and curve["proposed"]
+    new = read_cli(tmp_path / "thrust_curve.txt")
+    assert set(new) == {"thrust_linear"} and low < new["thrust_linear"] < high
+    assert read_cli(tmp_path / "thrust_curve_revert.txt") == {"thrust_linear": 30}
+    assert "thrust_linear" not in read_cli(tmp_path / "proposal_100.txt")
+
+
 AVERAGE, SPEED = 0.25, 150.0  # throttle; of the motors, Hz
 NOTCHED = {
     "INS_HNTCH_ENABLE": 1.0, "INS_HNTCH_MODE": 1.0, "INS_HNTCH_REF": 0.16, "INS_HNTCH_FREQ": 80.0,
@@ -264,7 +322,7 @@ def notch_of(centre, frequency, bandwidth, left):
     return found.tolist()
 
 
-def fly_ardupilot(gains, seconds=30.0, noise=0.01):
+def fly_ardupilot(gains, seconds=30.0, noise=0.01, plant=80.0, notches=None):
     """Chirp, set-point, rate in rad/s and output at 400 Hz: a loop that holds the level.
 
     The gyro is filtered at 2 kHz, by `NOTCHES` too; the chirp of 0.5 to 30 Hz enters at the mixer.
@@ -281,7 +339,8 @@ def fly_ardupilot(gains, seconds=30.0, noise=0.01):
     share, fine, late = 1 - 1 / (1 + 2 * np.pi * 20.0 * dt), dt / parts, 10
     decay = float(np.exp(-fine / 0.03))
     s1 = s2 = y = push = rate = angle = target = error = slope = integral = 0.0
-    sent, rows, banks = [0.0] * late, [], [[notch_of(*x), 0.0, 0.0] for x in NOTCHES]
+    sent, rows = [0.0] * late, []
+    banks = [[notch_of(*x), 0.0, 0.0] for x in (NOTCHES if notches is None else notches)]
     for n in range(count):
         wanted = -4.5 * angle
         target += share * (wanted - target)
@@ -292,7 +351,7 @@ def fly_ardupilot(gains, seconds=30.0, noise=0.01):
         rows.append((chirp[n], wanted, y, u))
         for m in range(parts):
             sent.append(u + chirp[n])
-            moved = 80.0 * sent[parts * n + m]
+            moved = plant * sent[parts * n + m]
             step = moved * fine + (push - moved) * 0.03 * (1 - decay)
             push, rate, angle = moved + (push - moved) * decay, rate + step, angle + rate * fine
             now = rate + jitter[parts * n + m]
@@ -306,32 +365,33 @@ def fly_ardupilot(gains, seconds=30.0, noise=0.01):
     return np.array(rows).T
 
 
-def write_dataflash(path, flown, gains):
-    """ArduPilot's log of a SystemID flight with SID_AXIS 10."""
+def write_dataflash(path, flights, gains, throttles=(AVERAGE,), changed=None):
+    """ArduPilot's log of SystemID flights with SID_AXIS 10, one after the other."""
     log = DataFlash()
     log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
     log.define("SIDD", "Qff", "TimeUS,Targ,F", units="s--", mults="F--")
     log.define(
-        "RATE",
-        "Qfffffff",
-        "TimeUS,RDes,R,ROut,PDes,P,POut,AOut",
-        units="skk-kk--",
+        "RATE", "Qfffffff", "TimeUS,RDes,R,ROut,PDes,P,POut,AOut", units="skk-kk--",
         mults="F-------",
-    )
+    )  # fmt: skip
     log.define("ESC", "QBf", "TimeUS,Instance,RPM", units="s#-", mults="F--")
     kept = {f"ATC_RAT_{axis}_{k}": x for axis in ("RLL", "PIT", "YAW")
             for k, x in zip("PID", gains, strict=True)}  # fmt: skip
     kept |= {"INS_GYRO_RATE": 1.0, "INS_GYRO_FILTER": 80.0, "SCHED_LOOP_RATE": 400.0, **NOTCHED}
+    kept |= changed or {}
     for name, value in kept.items():
         log.write("PARM", 0, name.encode(), value)
-    log.write("SIDS", 9_999_000, 10, 0.1, 0.5, 30.0)
-    for n, (chirp, wanted, y, u) in enumerate(flown.T.tolist()):
-        stamp = 10_000_000 + 2500 * n
-        log.write("SIDD", stamp, chirp, 1.0)
-        log.write("RATE", stamp, np.degrees(wanted), np.degrees(y), u, 0.0, 0.0, 0.0, AVERAGE)
-        if n % 40 == 0:
-            for motor in range(4):
-                log.write("ESC", stamp, motor, 60 * (SPEED + 4 * motor - 6))
+    begin = 10_000_000
+    for flown, throttle in zip(flights, throttles, strict=True):
+        log.write("SIDS", begin - 1000, 10, 0.1, 0.5, 30.0)
+        for n, (chirp, wanted, y, u) in enumerate(flown.T.tolist()):
+            stamp = begin + 2500 * n
+            log.write("SIDD", stamp, chirp, 1.0)
+            log.write("RATE", stamp, np.degrees(wanted), np.degrees(y), u, 0.0, 0.0, 0.0, throttle)
+            if n % 40 == 0:
+                for motor in range(4):
+                    log.write("ESC", stamp, motor, 60 * (SPEED + 4 * motor - 6))
+        begin = stamp + 3_000_000
     path.write_bytes(log.content)
     return path
 
@@ -339,7 +399,7 @@ def write_dataflash(path, flown, gains):
 @pytest.mark.slow
 def test_ardupilots_chirp_at_the_mixer_shows_its_law(tmp_path, capsys):
     gains = (0.135, 0.135, 0.0036)
-    path = write_dataflash(tmp_path / "flight.bin", fly_ardupilot(gains), gains)
+    path = write_dataflash(tmp_path / "flight.bin", [fly_ardupilot(gains)], gains)
     assert main(["autopilot", str(path), "--out", str(tmp_path)]) == 0, capsys.readouterr()
     content = json.loads((tmp_path / "autopilot.json").read_text())
     assert content["axis"] == "roll" and content["reproduction"]["misfit"] < 0.05
@@ -351,6 +411,27 @@ def test_ardupilots_chirp_at_the_mixer_shows_its_law(tmp_path, capsys):
     assert "harmonic notch 100, 200 Hz" in page and "harmonic notch 150 Hz" in page
     assert content["noise"]["known_hz"] > 120
     # The log of other gains.
-    path = write_dataflash(tmp_path / "other.bin", fly_ardupilot((0.2, 0.2, 0.0036)), gains)
+    path = write_dataflash(tmp_path / "other.bin", [fly_ardupilot((0.2, 0.2, 0.0036))], gains)
     assert main(["autopilot", str(path), "--out", str(tmp_path / "other")]) == 3
     assert "not the one that flew" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_ardupilots_runs_at_three_throttles_show_what_its_curve_leaves(tmp_path, capsys):
+    """MOT_THST_EXPO 0.65 inverts more than there is, so that the gain falls with the throttle."""
+    gains, flown, true = (0.135, 0.135, 0.0036), 0.65, 0.3
+    throttles = np.array([0.15, 0.3, 0.5])  # of the thrust that is asked for
+    half = (1 - flown) / (2 * flown)
+    x = np.sqrt(half**2 + throttles / flown) - half
+    slope = (1 - true + 2 * true * x) / (1 - flown + 2 * flown * x)
+    flights = [fly_ardupilot(gains, seconds=15.0, plant=80.0 * each, notches=()) for each in slope]
+    settings = {"MOT_THST_EXPO": flown, "INS_HNTCH_ENABLE": 0.0, "INS_HNTC2_ENABLE": 0.0}
+    path = write_dataflash(tmp_path / "flight.bin", flights, gains, throttles.tolist(), settings)
+    assert main(["autopilot", str(path), "--out", str(tmp_path)]) == 0, capsys.readouterr()
+    throttle = json.loads((tmp_path / "autopilot.json").read_text())["throttle"]
+    low, high = throttle["ratio_of_gains"][1:]
+    assert low < slope[2] / slope[0] < high < 0.8
+    low, high = throttle["thrust_curve"]["interval_95"]
+    assert low < true < high < flown
+    assert "MOT_THST_EXPO,0." in (tmp_path / "thrust_curve.param").read_text()
+    assert "MOT_THST_EXPO,0.65" in (tmp_path / "thrust_curve_revert.param").read_text()

@@ -1,0 +1,85 @@
+"""The plants that a log leaves possible: drawn from one fit, or from the gain over the throttle."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxquad.identify import draw_models, Fit, GainOverThrottle
+
+from ._rate_gains import (
+    ceiling_of,
+    cells_of,
+    gyro_chain_response,
+    hold_plants,
+    law_paths,
+    RateLaw,
+    RateLoops,
+)
+
+
+Frequencies = Float[np.ndarray, " frequencies"]
+Drawn = Float[np.ndarray, "plants 1"]
+_LOWEST = 0.05  # rad/s, below which only the integrals count
+_FREQUENCIES = 300
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantSource:
+    """What plants are drawn from.
+
+    **Attributes:**
+
+    - `fit`: up to the logged rate, which is in `unit`.
+    - `over`: the gain over the throttle, with the gyro's filters divided out; its plants take the
+      place of those of `fit`.
+    - `span`: the lowest and the highest throttle of these.
+    """
+
+    fit: Fit
+    unit: str
+    over: GainOverThrottle | None = None
+    span: tuple[float, float] = (0.0, 1.0)
+
+    def loops(
+        self, law: RateLaw, axis: int, count: int, seed: int, *,
+        omega: Frequencies | None = None, throttle: float | None = None,
+    ) -> RateLoops:  # fmt: skip
+        """The loops of a law with so many plants.
+
+        All are at one `throttle`, or each is at its own, evenly over the span.
+
+        Raises ValueError where a drawn gain is not above 0.
+        """
+        if omega is None:
+            omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
+        back, ahead = law_paths(law, axis, omega)
+        passed = gyro_chain_response(law, omega)
+        gain, lag, delay = self._drawn(count, seed, throttle)
+        if np.any(gain <= 0):
+            raise ValueError(
+                f"the gain from the command to the rate is not above 0 in {int(np.sum(gain <= 0))} "
+                f"of {count} plants drawn from the fit: check the sign of the input, or fly more "
+                "excitation"
+            )
+        per_radian = np.pi / 180 if self.unit == "deg/s" else 1.0
+        plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt)
+        plants = plants if self.over is None else plants * passed
+        white = cells_of(omega) * np.abs(passed) ** 2
+        return RateLoops(omega, back, ahead, plants, white, passed, ceiling_of(law, axis))
+
+    def _drawn(self, count: int, seed: int, throttle: float | None) -> tuple[Drawn, Drawn, Drawn]:
+        """Gain, lag and delay."""
+        if self.over is None:
+            scores = np.random.default_rng(seed).standard_normal((len(self.fit.names), count))
+            models = draw_models(self.fit, jnp.asarray(scores))
+            wide = lambda x: np.broadcast_to(np.asarray(x, float), (count,))[:, None]
+            return wide(models.gain), wide(models.lag), wide(models.delay)
+        if throttle is None:
+            drawn = self.over.draw(np.linspace(*self.span, count), count, seed=seed)
+            gain = np.diagonal(drawn.gain)
+        else:
+            drawn = self.over.draw(np.array([throttle]), count, seed=seed)
+            gain = drawn.gain[0]
+        return gain[:, None], drawn.lag[:, None], drawn.delay[:, None]
