@@ -130,14 +130,15 @@ class GlobalModel(NamedTuple):
 def global_models(
     bins: Bins, inputs: slice, outputs: slice, highest: float, dt: float, most: int
 ) -> list[GlobalModel | None]:
-    """One model for each output, of the order up to `most` with the least criterion.
+    """One model for each output, of one order more, up to `most`, than has the least criterion.
 
-    It asks for more than Akaike's, under which a pole and a zero settle where the noise of single
-    bins happens to rise, and for less than a Bayesian one, which stops where what is left hides in
-    that noise; in a local window that would be a bias. `None` where a model explains no more than
-    chance allows. The bins reach five times `highest` (rad/s). Above 20000 of them one of each n is
-    taken: each is an equation of its own, so thinning costs precision, never resolution. The order
-    is chosen with 4000 at most.
+    The criterion asks for more than Akaike's, under which a pole and a zero settle where the noise
+    of single bins happens to rise, and for less than a Bayesian one, which stops where what is left
+    hides in that noise; in a local window that would be a bias. It cannot see what is of the size
+    of the noise, as half a sample of a delay: so the order is the next one, which takes most of it.
+    `None` where a model explains no more than chance allows. The bins reach five times `highest`
+    (rad/s). Above 20000 of them one of each n is taken: each is an equation of its own, so thinning
+    costs precision, never resolution. The order is chosen with 4000 at most.
     """
     reach = int(np.searchsorted(bins.omega, _BEYOND * highest, "right"))
     places = _thin(reach, _MOST_BINS)
@@ -237,8 +238,9 @@ def _residual(equations: Equations, solved: Solved) -> Complex[np.ndarray, " bin
 
 
 def _choose(equations: Equations, most: int, scale: float) -> Solved | None:
+    """The solution of the order above the best one, where it was tried and leaves less."""
     count = 2 * len(equations.y)
-    best, least, worse = None, _information(_proportional(equations), 1, count), 0
+    best, above, least, worse = None, None, _information(_proportional(equations), 1, count), 0
     lowest, floor = least, _EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for order in _orders(most):
         parameters = equations.parameters(order)
@@ -254,10 +256,14 @@ def _choose(equations: Equations, most: int, scale: float) -> Solved | None:
             solved = again if again.cost < solved.cost else solved
             value = _information(solved.cost + 0.01 * floor, parameters, count)
         if value < least:
-            best, least = solved, value
+            best, above, least = solved, None, value
+        elif above is None:
+            above = solved
         if (worse >= _PATIENCE and order >= _THOROUGH) or solved.cost <= floor:
             break
-    return best
+    if best is None or above is None or above.cost >= best.cost:
+        return best
+    return above
 
 
 def _orders(most: int) -> Iterator[int]:

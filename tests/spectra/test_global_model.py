@@ -132,6 +132,35 @@ def test_bins_are_thinned_without_losing_the_lines_of_a_periodic_input():
     assert np.all(errors < 5 * np.sqrt(2) * np.asarray(found.random_error).ravel() + 1e-3)
 
 
+def late(omega=None):
+    """A mode behind 1.5 samples of delay, at the samples: its output, or its response."""
+    above, below, _ = cast(
+        tuple[np.ndarray, np.ndarray, float],
+        signal.cont2discrete(([36.0], [1.0, 4.8, 36.0]), DT / 2),
+    )
+    if omega is None:
+        fast = signal.lfilter(above[0], below, np.repeat(U, 2))
+        return np.concatenate([np.zeros(3), fast])[: 2 * U.size : 2]
+    z = np.exp(1j * (omega * DT / 2 + np.pi * np.arange(2)[:, None]))  # and its alias
+    each = np.polyval(above[0], z) / np.polyval(below, z) * (1 + 1 / z) / z**3
+    return np.mean(each, axis=0)
+
+
+def test_what_the_order_of_the_model_cannot_see_biases_no_response():
+    """Noise and the same noise of the other sign: their mean shows the bias alone."""
+    y, biases = late(), []
+    for seed in range(3):
+        noise = 0.02 * np.std(y) * np.random.default_rng(seed).standard_normal(y.size)
+        both = [
+            frequency_response(Record(DT * np.arange(U.size), U, y + sign * noise), OMEGA)
+            for sign in (1, -1)
+        ]
+        first, mean = both[0], sum(np.asarray(each.response)[:, 0, 0] for each in both) / 2
+        error = np.asarray(first.random_error * np.abs(first.response))[:, 0, 0]
+        biases.append((mean - late(OMEGA)) / error)
+    assert np.sqrt(np.mean(np.abs(biases) ** 2)) < 0.13
+
+
 def test_an_estimate_does_not_depend_on_those_before_it():
     first, other, again = (estimate(seed) for seed in (0, 1, 0))
     np.testing.assert_array_equal(again.response, first.response)
