@@ -98,6 +98,7 @@ def main() -> None:
         print(f"  {name}: roll {off[0]:.2f}, pitch {off[1]:.2f}")
     for axis in AXES:
         found = autopilot(path, AutopilotSettings(axis=axis, throttle=HOVER))
+        assert isinstance(found, AutopilotProposal)
         print(f"\n{axis}\n{answer(found)}\n\n{at_hover(path, axis, flown)}")
         names = [each.name for each in found.write(options.out / axis)]
         print(f"{options.out / axis}: {', '.join(names)}")

@@ -61,6 +61,7 @@ AUTOPILOT = Command(
     """examples:
   jaxquad autopilot flight.bbl --axis roll
   jaxquad autopilot flight.ulg --axis pitch --sensitivity 1.6 --noise 1
+  jaxquad autopilot flight.bbl --axis roll --law adrc
 
 A log of Betaflight, PX4 or ArduPilot. The gains and filters that flew are read from it, the plant
 is identified in the firmware's own units, and the loop of both is compared with the flight. P, I
@@ -68,6 +69,9 @@ and D of the rate loop, and cutoffs where the log shows the gyro's noise, are tu
 that the log leaves possible, rounded to what the firmware stores, and certified on new plants. The
 folder gets a parameter file for a third of the way, one for all of it, one that reverts them, and a
 table of what changes.
+For Betaflight, --law adrc gives wc, wo and b0 of the ADRC of its pull request 15400, which only a
+build of that understands, from the gain at each level of throttle in the log. A log that was flown
+with that ADRC is tuned so without the option.
 exit codes: 0 done, or what flew is kept, 2 unusable input, 3 this log cannot tell, 4 the design is
 not to be flown (with 3 and 4 only the file with what flew is written)
 """,

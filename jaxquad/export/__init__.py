@@ -6,6 +6,7 @@ from ._autopilot import (
     ParameterChange as ParameterChange,
     ParameterFiles as ParameterFiles,
     propose_changes as propose_changes,
+    WordChange as WordChange,
     write_parameter_files as write_parameter_files,
 )
 from ._header import (

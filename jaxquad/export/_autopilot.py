@@ -34,6 +34,21 @@ class ParameterChange(NamedTuple):
     reason: str = ""
 
 
+class WordChange(NamedTuple):
+    """A parameter of Betaflight that holds a word, such as pid_type.
+
+    **Arguments:**
+
+    - `name`: as the CLI calls it; `old`, `new`: its words.
+    - `reason`: why it changes; may be empty.
+    """
+
+    name: str
+    old: str
+    new: str
+    reason: str = ""
+
+
 def propose_changes(
     firmware: Firmware,
     old: Mapping[str, Number],
@@ -97,6 +112,7 @@ def parameter_file(
     profile: int | None = 0,
     raised: Sequence[str] = ("roll", "pitch", "yaw"),
     title: str = "",
+    words: Sequence[WordChange] = (),
 ) -> str:
     """The text to load: Betaflight's CLI, PX4's .params, ArduPilot's .param, Crazyflie's YAML.
 
@@ -107,7 +123,8 @@ def parameter_file(
     - `version`: of Betaflight, whose names differ: until 4.5 d is d_min, and the maximum d.
     - `raised`: of Betaflight until 4.5, the axes on which d_min is in use; on others d is d.
     - `profile`: of Betaflight, the PID profile that is changed; None is the one in use.
-    - `title`: a line of comment.
+    - `title`: comment; its lines begin the file.
+    - `words`: of Betaflight, what changes beside numbers; set last.
 
     **Returns:**
 
@@ -115,12 +132,16 @@ def parameter_file(
 
     **Raises:**
 
-    - `ValueError`: a parameter does not exist in this version of Betaflight.
+    - `ValueError`: a parameter does not exist in this version of Betaflight, or another firmware
+        is to change words.
     """
+    if words and firmware != "betaflight":
+        raise ValueError(f"{words[0].name} is a word, and {firmware} stores numbers alone.")
     values = [(x.parameter, *((x.old, x.new) if revert else (x.new, x.old))) for x in changes]
     if firmware == "betaflight":
         names = _betaflight_names([row.name for row, *_ in values], version, raised)
-        return _betaflight(values, names, version, profile, title)
+        pairs = [(x.name, *((x.old, x.new) if revert else (x.new, x.old))) for x in words]
+        return _betaflight(values, names, version, profile, title, pairs)
     return _FORMATS[firmware](values, title)
 
 
@@ -174,14 +195,14 @@ _FORMATS: Mapping[str, Callable[[Values, str], str]] = {
 
 def _betaflight(
     values: Values, names: Sequence[str], version: tuple[int, ...], profile: int | None,
-    title: str,
+    title: str, words: Sequence[tuple[str, str, str]],
 ) -> str:  # fmt: skip
-    rows = [f"# {title}"] if title else []
+    rows = [f"# {line}" for line in title.splitlines()]
     if profile is None:
         rows.append("# select the PID profile that flew first: the log does not name it")
     else:
         rows.append(f"profile {profile}")
-    if version >= (4, 3):
+    if version >= (4, 3) and not all(name.startswith("adrc_") for name in names):
         # Sliders that stay on would rewrite what is set here.
         rows.append("set simplified_pids_mode = OFF")
         for part in ("gyro", "dterm"):
@@ -190,6 +211,8 @@ def _betaflight(
     for name, (row, value, other) in zip(names, values, strict=True):
         rows += [f"# {name} was {_number(other, row.whole)}"]
         rows += [f"set {name} = {_number(value, row.whole)}"]
+    for name, word, other in words:
+        rows += [f"# {name} was {other}", f"set {name} = {word}"]
     return _joined([*rows, "save"])
 
 
@@ -220,7 +243,7 @@ def _joined(rows: Sequence[str]) -> str:
     return "\n".join([*rows, ""])
 
 
-def change_table(changes: Sequence[ParameterChange]) -> str:
+def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> str:
     """The changes as a table in Markdown: old, new, unit, documented range and reason."""
     rows = ["| parameter | old | new | unit | range | reason |", "|---|---|---|---|---|---|"]
     for row, old, new, reason in changes:
@@ -230,6 +253,7 @@ def change_table(changes: Sequence[ParameterChange]) -> str:
             f"| {row.name} | {_number(old, row.whole)} | {_number(new, row.whole)} | {row.unit} | "
             f"{bounds} | {reason} |"
         )
+    rows += [f"| {name} | {old} | {new} |  |  | {reason} |" for name, old, new, reason in words]
     return _joined(rows)
 
 

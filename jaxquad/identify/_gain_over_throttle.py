@@ -83,6 +83,12 @@ class _Piece(NamedTuple):
         return self.signals.throttle[self.first : self.end]
 
     @property
+    def span(self) -> tuple[float, float]:
+        """In the record's time, in s."""
+        time = self.signals.record.time
+        return float(time[self.first]), float(time[self.end - 1])
+
+    @property
     def seconds(self) -> float:
         return (self.end - self.first) * self.signals.record.dt
 
@@ -394,6 +400,7 @@ def _result(
         flown=flown,
         input_unit=record.input_units[0],
         output_unit=record.output_units[0],
+        stretches=tuple(tuple(piece.span for piece in level) for level in levels),
         remarks=remarks + found.remarks,
     )
 

@@ -134,7 +134,8 @@ class GainOverThrottle(eqx.Module):
     `str()` is a table with the firmwares' parameters; where the record holds too little of the
     curve it says what to fly. The numbers are those of `fit`, a `jq.identify.Fit` of all levels
     together: parameters `gain[0]`, ..., `lag` and `delay`. Gains are in the output's unit per s,
-    per unit of input.
+    per unit of input. `stretches` are, for each level, the starts and stops of its samples in the
+    record's time, in s.
     """
 
     throttle: Levels  # mean of each level, 0 to 1
@@ -145,6 +146,7 @@ class GainOverThrottle(eqx.Module):
     flown: float = eqx.field(static=True)  # curve that the firmware inverted during the flight
     input_unit: str = eqx.field(static=True)
     output_unit: str = eqx.field(static=True)
+    stretches: tuple[tuple[tuple[float, float], ...], ...] = eqx.field(static=True, default=())
     remarks: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property

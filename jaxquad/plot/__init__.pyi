@@ -16,12 +16,14 @@ from ._labels import (
 )
 from ._panels import headless as headless, Panels as Panels
 from ._pilot import (
+    b0_figure as b0_figure,
     balance_figure as balance_figure,
     filters_figure as filters_figure,
     spectra_figure as spectra_figure,
     Spectrum as Spectrum,
     StepBand as StepBand,
     steps_figure as steps_figure,
+    ThrottleCurve as ThrottleCurve,
 )
 from ._plane import nyquist as nyquist, pzmap as pzmap
 from ._predictions import compare as compare, step as step

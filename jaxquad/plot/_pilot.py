@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxquad.control.autopilots import FilterChain
+from jaxquad.identify import GainBand
 
 from ._labels import few_ticks, look_of, plain_ticks
 from ._panels import arrange, Given, legend_of, Panels, stacked
@@ -131,6 +132,48 @@ def steps_figure(
     panel.axhline(1.0, color="0.4", lw=0.8, ls=":")
     panel.set(xlabel="time, s", ylabel=label)
     panel.margins(x=0)
+    return _finished(panels, (2.8,), title)
+
+
+class ThrottleCurve(NamedTuple):
+    """A quantity over the throttle of 0 to 1, as a firmware takes it."""
+
+    throttle: Float[np.ndarray, " points"]
+    value: Float[np.ndarray, " points"]
+
+
+def b0_figure(
+    levels: GainBand, taken: Mapping[str, ThrottleCurve], *, curve: GainBand | None = None,
+    ax: Given = None, title: str = "",
+) -> Panels:  # fmt: skip
+    """Draw b0 over the throttle: of a log with its 95 % band, and as a firmware takes it.
+
+    **Arguments:**
+
+    - `levels`: gain / lag at the levels of throttle that were flown, in deg/s^3 per unit.
+    - `taken`: by the text of the legend, what the ADRC takes for b0.
+    - `curve`: gain / lag by the thrust curve; None where the log does not show it.
+    - `ax`: axes to draw into.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
+    """
+    panels = stacked(1, ax)
+    [panel] = panels
+    if curve is not None:
+        look = look_of(0, "gain / lag of the log")
+        panel.fill_between(
+            curve.throttle, curve.low, curve.high, facecolor=look["color"], alpha=0.3, lw=0,
+            label="gain / lag, 95 %",
+        )  # fmt: skip
+        panel.plot(curve.throttle, curve.value, **look)
+    reach = [levels.value - levels.low, levels.high - levels.value]
+    panel.errorbar(levels.throttle, levels.value, yerr=reach, fmt="none", ecolor="black", capsize=4)
+    panel.plot(levels.throttle, levels.value, "o", ms=5, color="black", label="levels flown, 95 %")
+    for k, (name, each) in enumerate(taken.items(), start=1):
+        panel.plot(each.throttle, each.value, **look_of(k, name))
+    panel.set(xlabel="throttle", ylabel="b0, deg/s³ per pidsum")
+    panel.set_ylim(0, None)
     return _finished(panels, (2.8,), title)
 
 

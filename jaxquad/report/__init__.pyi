@@ -5,7 +5,11 @@ from ._page import (
     render_page as render_page,
     Table as Table,
 )
-from ._pilot import PilotPage as PilotPage, write_pilot_page as write_pilot_page
+from ._pilot import (
+    B0Section as B0Section,
+    PilotPage as PilotPage,
+    write_pilot_page as write_pilot_page,
+)
 from ._provenance import (
     Provenance as Provenance,
     provenance as provenance,

@@ -6,13 +6,16 @@ from pathlib import Path
 
 from jaxquad._core import write_file
 from jaxquad.control.autopilots import FilterChain
+from jaxquad.identify import GainBand
 from jaxquad.plot import (
+    b0_figure,
     balance_figure,
     filters_figure,
     spectra_figure,
     Spectrum,
     StepBand,
     steps_figure,
+    ThrottleCurve,
 )
 
 from ._figure import embed_figure, Section
@@ -22,6 +25,22 @@ from ._provenance import Provenance, provenance_section
 
 _SHOWN = (10.0, 50.0)  # Hz, of a table of delays
 Chains = Mapping[str, Sequence[FilterChain]]  # by the signal that they filter
+
+
+@dataclasses.dataclass(frozen=True)
+class B0Section:
+    """b0 over the throttle, for `jaxquad.plot.b0_figure`.
+
+    **Attributes:**
+
+    - `levels`, `curve`, `taken`: as the figure takes them.
+    - `text`: what they say, in words.
+    """
+
+    levels: GainBand
+    taken: Mapping[str, ThrottleCurve]
+    curve: GainBand | None = None
+    text: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +56,7 @@ class PilotPage:
     - `gyro`, `derivative`: spectra by what they are, for `jaxquad.plot.spectra_figure`.
     - `noise`: what the spectra are of, in words.
     - `steps`: for `jaxquad.plot.steps_figure`, with `step_facts`.
+    - `b0`: over the throttle, of an ADRC.
     - `terms`: root mean squares of P, I, D and F; `terms_are`: logged, or computed.
     - `motors`: rows of name and shares of samples at the lowest and the highest command.
     - `stages`, `changes`: tables.
@@ -51,6 +71,7 @@ class PilotPage:
     derivative: Mapping[str, Spectrum] = dataclasses.field(default_factory=dict)
     noise: str = ""
     steps: Mapping[str, StepBand] = dataclasses.field(default_factory=dict)
+    b0: B0Section | None = None
     terms: Mapping[str, float] = dataclasses.field(default_factory=dict)
     terms_are: str = ""
     motors: Sequence[tuple[str, float, float]] = ()
@@ -79,6 +100,7 @@ def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
         "filters": _filters(page.filters),
         "noise": _noise(page) if page.gyro else None,
         "steps": _steps(page) if page.steps else None,
+        "b0": None if page.b0 is None else _b0(page.b0),
         "balance": _balance(page) if page.terms or page.motors else None,
         "text": {"text": page.text} if page.text else None,
         "provenance": None if page.provenance is None else provenance_section(page.provenance),
@@ -163,6 +185,22 @@ def _step_numbers(band: StepBand) -> list[str]:
     half = float(band.time[(band.middle >= 0.5).argmax()])
     over = [100 * max(float(x.max()) - 1, 0.0) for x in (band.middle, band.high)]
     return [f"{over[0]:.0f}", f"{over[1]:.0f}", f"{1e3 * half:.0f}"]
+
+
+def _b0(section: B0Section) -> Section:
+    levels = section.levels
+    image = embed_figure(
+        lambda: b0_figure(levels, section.taken, curve=section.curve),
+        alt=f"b0 over the throttle: of the log, and {', '.join(section.taken)}.",
+        caption="b0 over the throttle: gain / lag of the log with what it leaves uncertain, and "
+        "what the ADRC takes.",
+    )
+    rows: list[list[str | Cell]] = [
+        [f"{x:.2f}", f"{value:.0f}", f"{low:.0f} .. {high:.0f}"]
+        for x, value, low, high in zip(*levels, strict=True)
+    ]
+    heads = ("throttle", "gain / lag, deg/s^3", "95 %")
+    return {"image": image, "table": Table("Levels flown", heads, rows), "text": section.text}
 
 
 def _balance(page: PilotPage) -> Section:

@@ -4,6 +4,7 @@ from ._adrc import (
     ADRCTargets as ADRCTargets,
     propose_adrc as propose_adrc,
 )
+from ._adrc_result import ADRCAutopilot as ADRCAutopilot
 from ._autopilot import autopilot as autopilot, AutopilotProposal as AutopilotProposal
 from ._batch._jobs import Job as Job
 from ._batch._run import batch as batch, find_logs as find_logs

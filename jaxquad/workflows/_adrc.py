@@ -7,43 +7,37 @@ search over wc, wo and b0 on responses, as `_rate_gains` searches P, I and D.
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
-from jaxquad._core import announce
+from jaxquad._core import announce, plain_content
 from jaxquad.control.autopilots import (
-    FilterChain,
+    B0Law,
+    B0Schedule,
     find_parameter,
-    FlownBetaflight,
+    FlownADRC,
     Parameter,
-    PT2,
     store_parameters,
 )
-from jaxquad.identify import GainOverThrottle
+from jaxquad.identify import GainOverThrottle, ScaledB0, UndeterminedError
 from jaxquad.records import AXES
 
-from ._rate_gains import (
-    cells_of,
-    gyro_chain_response,
-    hold_plants,
-    law_responses,
-    LoopQualities,
-    RateLoops,
-)
+from ._adrc_loops import ADRCFrame, ADRCLoop, Designs, draw_at, Flown, make_adrc_loop
+from ._rate_design import Kind
+from ._rate_gains import LoopQualities
 
 
-Designs = Float[np.ndarray, "designs 3"]  # wc, wo, b0
-Kind = Literal["proposed", "not to be flown"]
-_LAWS: Mapping[str, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
-_LARGEST = 3.0  # adrc_b0_scale_max
-_DEGREES = 180 / np.pi
-_LOWEST, _FREQUENCIES = 0.05, 300  # rad/s
+Design = Float[np.ndarray, "3"]  # wc, wo, b0
+_LAW: B0Law = "SQRT"  # of the firmware by default
+_LAWS: tuple[B0Law, ...] = ("FIXED", "SQRT", "LINEAR", "QUADRATIC")
 _POINTS, _LEVELS, _ROUGH, _NARROWED = 5, 8, 5, 0.55  # the first levels on one plant each
 _RESERVE = 0.97  # of the limits, because fresh plants reach further than those that were tuned on
-_CERTIFICATES, _WORST = 3, 8
+_CERTIFICATES = 3
 _SPREAD = 4.0  # factor on b0 to either side
+_WORTH = 0.95  # of the flown effect of torque, above which other numbers are not worth a change
+_THIRD = 1 / 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,19 +48,21 @@ class ADRCTargets:
 
     - `sensitivity`: greatest |S| at most.
     - `resonance`: peak of the response from set-point to rate at most.
-    - `noise`: of the command, relative to the PID that flew, of white noise before the gyro's
-        filters.
+    - `noise`: of the command, relative to what flew, of white noise before the gyro's filters.
+    - `change`: factor within which wc, wo and b0 stay of those that flew, where the ADRC flew.
     """
 
     sensitivity: float = 1.8
     resonance: float = 1.4
     noise: float = 1.5
+    change: float = 3.0
 
     def __post_init__(self):
-        if not (self.sensitivity > 1 and self.resonance > 1 and self.noise > 0):
+        if not (self.sensitivity > 1 and self.resonance > 1 and self.noise > 0 and self.change > 1):
             raise ValueError(
-                f"sensitivity {self.sensitivity:g}, resonance {self.resonance:g} and noise "
-                f"{self.noise:g}: the first two must be above 1, the last above 0"
+                f"sensitivity {self.sensitivity:g}, resonance {self.resonance:g}, change "
+                f"{self.change:g} and noise {self.noise:g}: the first three must be above 1, the "
+                "last above 0"
             )
 
 
@@ -75,10 +71,10 @@ class ADRCStage(NamedTuple):
 
     **Attributes:**
 
-    - `wc`, `wo`, `b0`: as the firmware stores them.
+    - `wc`, `wo`, `b0`: as the firmware stores them; nan of a PID that flew.
     - `stable`: share of the loops; `peak`, `resonance`: the greatest of them.
     - `crossover`: their median in rad/s.
-    - `rejection`, `noise`: relative to the PID that flew, root mean square.
+    - `rejection`, `noise`: relative to what flew, root mean square.
     """
 
     wc: float
@@ -98,45 +94,87 @@ class ADRCProposal:
 
     **Attributes:**
 
-    - `kind`: "proposed", or "not to be flown" where no parameters keep the targets.
+    - `kind`: "proposed"; "kept" where the ADRC that flew is as good; "not to be flown" where no
+        parameters keep the targets.
     - `verdict`: the same in words.
     - `parameters`: of the firmware by name, empty where nothing is proposed.
-    - `law`: adrc_b0_law.
+    - `schedule`: adrc_b0_law, adrc_hover_throttle and the limits of b0's scale.
     - `throttle`: at which the loops were certified.
-    - `stage`: what the parameters give on fresh plants.
-    - `defaults`: what the firmware's default wc, wo and b0 give there.
+    - `stages`: by name, what parameters give on fresh plants: "what flew", "proposed" and
+        "defaults"; "a third of the way" where the ADRC flew.
+    - `scaled`: b0 of the log and how far each law is from it; None of a log with one level of
+        throttle, which does not show it.
     """
 
     kind: Kind
     verdict: str
     parameters: Mapping[str, float]
-    law: str
+    schedule: B0Schedule
     throttle: tuple[float, ...]
-    stage: ADRCStage
-    defaults: ADRCStage
+    stages: Mapping[str, ADRCStage]
+    scaled: ScaledB0 | None = None
 
-    def __str__(self) -> str:
+    @property
+    def stage(self) -> ADRCStage:
+        """Of the proposal."""
+        return self.stages["proposed"]
+
+    @property
+    def defaults(self) -> ADRCStage:
+        """Of the firmware's default wc, wo and b0."""
+        return self.stages["defaults"]
+
+    @property
+    def law(self) -> B0Law:
+        """adrc_b0_law."""
+        return self.schedule.law
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        return plain_content({
+            "kind": self.kind,
+            "verdict": self.verdict,
+            "parameters": dict(self.parameters),
+            "schedule": self.schedule._asdict(),
+            "throttle": self.throttle,
+            "stages": {name: stage._asdict() for name, stage in self.stages.items()},
+            "b0_of_the_log": None if self.scaled is None else {
+                "hover": self.scaled.hover,
+                "b0": self.scaled.b0.value,
+                "interval_95": self.scaled.b0.interval,
+                "law": self.scaled.law,
+                "deviations": dict(self.scaled.deviations),
+                "extrapolated": self.scaled.extrapolated,
+            },
+        })  # fmt: skip
+
+    def table(self) -> str:
+        """The stages as text."""
         rows = [
-            f"{'on fresh plants':<16} {'wc':>4} {'wo':>4} {'b0':>6}   stable   worst Ms   resonance"
+            f"{'on fresh plants':<18} {'wc':>4} {'wo':>4} {'b0':>6}   stable   worst Ms   resonance"
             "   crossover   torque   noise"
         ]
-        for name, each in (("proposed", self.stage), ("defaults", self.defaults)):
+        for name, each in self.stages.items():
+            numbers = f"{each.wc:4.0f} {each.wo:4.0f} {each.b0:6.0f}"
             rows.append(
-                f"{name:<16} {each.wc:4.0f} {each.wo:4.0f} {each.b0:6.0f} "
-                f"{100 * each.stable:6.1f} % {each.peak:10.2f} {each.resonance:11.2f} "
-                f"{each.crossover / (2 * np.pi):8.1f} Hz {each.rejection:8.2f} {each.noise:7.2f}"
+                f"{name:<18} {numbers.replace('nan', '  -')} {100 * each.stable:6.1f} % "
+                f"{each.peak:10.2f} {each.resonance:11.2f} {each.crossover / (2 * np.pi):8.1f} Hz "
+                f"{each.rejection:8.2f} {each.noise:7.2f}"
             )
+        return "\n".join(rows)
+
+    def __str__(self) -> str:
         sets = [f"set {name} = {value:g}" for name, value in self.parameters.items()]
         sets += [f"set adrc_b0_law = {self.law}"] if sets else []
-        return "\n".join([*rows, *sets, "", self.verdict])
+        return "\n".join([self.table(), *sets, "", self.verdict])
 
 
 def propose_adrc(
     found: GainOverThrottle,
-    flown: FlownBetaflight,
+    flown: Flown,
     axis: str,
     *,
-    hover: float,
+    hover: float | None = None,
     targets: ADRCTargets | None = None,
     bins: int = 5,
     members: int = 32,
@@ -145,20 +183,27 @@ def propose_adrc(
 ) -> ADRCProposal:
     """Tune wc, wo and b0 of Betaflight's proposed ADRC on the plants that a log leaves possible.
 
-    The law of b0 over the throttle is the one nearest to the measured gain. Wanted is the least
-    rate after a step of torque, with the targets kept on every plant at every throttle that was
-    flown, behind the filters of the gyro that flew and adrc_gyro_lpf_hz of 150; wo is at least wc,
-    and b0 within a factor of 4 of the identified one. The whole numbers are certified on fresh
-    plants; where that fails the worst of these join the search, three times at most. Loops are
-    taken as linear. Source: docs/autopilots.md.
+    Wanted is the least rate after a step of torque, with the targets kept on every plant at every
+    throttle that was flown, behind the filters of the gyro that flew and adrc_gyro_lpf_hz. The
+    whole numbers are certified on fresh plants; where that fails the worst of these join the
+    search, three times at most. Loops are taken as linear.
+
+    Where the PID flew, the law of b0 over the throttle is the one nearest to the measured gain, wo
+    is at least wc, and b0 within a factor of 4 of the identified one. Where the ADRC flew, its law,
+    hover throttle, low-passes and leak stay, and a third of the way keeps the limit on Ms, too, or
+    that of what flew. A log with one level of throttle does not show b0 over the throttle: the law
+    is then the firmware's default or what flew, and the certificate is of that throttle alone.
+    Source: docs/autopilots.md.
 
     **Arguments:**
 
     - `found`: of `jq.identify.gain_over_throttle`, with the filters of the gyro divided out.
-    - `flown`: the loop of the log's header, `betaflight_loop`: its filters stay, and its PID is
-        what noise and torque are compared with.
+    - `flown`: the loop of the log's header, `betaflight_loop` or `betaflight_adrc_loop`: its
+        filters stay, and it is what noise and torque are compared with.
     - `axis`: "roll", "pitch" or "yaw".
-    - `hover`: adrc_hover_throttle, 0 to 1.
+    - `hover`: adrc_hover_throttle, 0 to 1; by default that of the ADRC that flew, else the lowest
+        level of throttle, because b0 is scaled up from there alone.
+    - `targets`: an `ADRCTargets`.
     - `bins`: throttles, evenly from the lowest to the highest flown.
     - `members`, `fresh`: plants to tune on, and to certify on at each throttle.
     - `seed`: of the draws.
@@ -167,8 +212,10 @@ def propose_adrc(
 
     **Raises:**
 
-    - `UndeterminedError`: the log does not tell the lag or the thrust curve; says what to fly.
-    - `ValueError`: for another axis, a hover throttle beyond 0 to 1, or units that are not known.
+    - `UndeterminedError`: the log does not tell the gain, the lag or the thrust curve; says what
+        to fly.
+    - `ValueError`: for another axis, a hover throttle beyond 0 to 1 or other than that of the ADRC
+        that flew, or units that are not known.
 
     !!! example
 
@@ -181,32 +228,75 @@ def propose_adrc(
     """
     if axis not in AXES:
         raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}")
-    targets, scaled = targets or ADRCTargets(), found.adrc_b0(hover, largest=_LARGEST)
-    grid = np.linspace(found.low.min(), found.high.max(), bins)
-    scales = np.clip((grid / hover) ** _LAWS[scaled.law], 1.0, _LARGEST)
-    pairs = list(zip(map(float, grid), map(float, scales), strict=True))
+    targets, one = targets or ADRCTargets(), found.throttle.size == 1
+    grid = found.throttle if one else np.linspace(found.low.min(), found.high.max(), bins)
+    frame, scaled, middle = _frame(found, flown, hover)
     make = lambda plants, seed: [
-        _make_loop(found, flown, AXES.index(axis), x, scale, plants, seed) for x, scale in pairs
+        make_adrc_loop(found, flown, AXES.index(axis), float(x), frame, plants, seed) for x in grid
     ]
+    _require_gains(found, grid, fresh, seed)
     edge = np.inf if found.fit.origin is None else found.fit.origin.band[1]
-    default = np.array([row.default for row in _rows(axis)], float)
-    loops, attempt = make(max(1, members // bins), seed), 1
+    before, bounds = _flown_design(flown, axis), _bounds(flown, axis, middle, targets.change)
+    loops = make(max(1, members // len(grid)), seed)
+    attempt = 1
     while True:
-        announce(f"searching wc, wo and b0 at {bins} throttles")
-        best = _search(loops, scaled.b0.value, targets, edge, axis)
+        announce(f"searching wc, wo and b0 at {len(grid)} throttles")
+        best = _search(loops, bounds, targets, edge, before)
         announce(f"certifying the whole numbers on {fresh} new plants")
         new = make(fresh, seed + attempt)
-        stage = _stage(new, best)
-        if attempt == _CERTIFICATES or not _beyond(stage, targets, edge):
+        stages = _stages(new, axis, before, best)
+        if attempt == _CERTIFICATES or not _beyond(stages, targets, edge):
             break
         loops = [old.joined(each, best) for old, each in zip(loops, new, strict=True)]
         attempt += 1
-    kind, verdict = _judge(stage, targets, edge, fresh, grid)
-    values = {row.name: float(x) for row, x in zip(_rows(axis), best, strict=True)}
-    values["adrc_hover_throttle"] = round(100 * hover)
-    stored = store_parameters("betaflight", values) if kind == "proposed" else {}
-    at = tuple(map(float, grid))
-    return ADRCProposal(kind, verdict, stored, scaled.law, at, stage, _stage(new, default))
+    kind, verdict = _judge(stages, targets, edge, fresh, grid)
+    values = _parameters(axis, best, frame) if kind == "proposed" else {}
+    stored = store_parameters("betaflight", values)
+    return ADRCProposal(
+        kind, verdict, stored, frame.schedule, tuple(map(float, grid)), stages, scaled
+    )
+
+
+def _frame(
+    found: GainOverThrottle, flown: Flown, hover: float | None
+) -> tuple[ADRCFrame, ScaledB0 | None, float]:
+    """What is not tuned, b0 of the log where it shows it, and b0 at the hover throttle."""
+    if hover is not None and not 0 < hover <= 1:
+        raise ValueError(f"hover is {hover}: give the throttle at hover, above 0 and up to 1")
+    if isinstance(flown, FlownADRC):
+        schedule = flown.schedule
+        if hover is not None and abs(hover - schedule.hover) > 0.005:
+            raise ValueError(
+                f"hover is {hover:g}, but the ADRC that flew has an adrc_hover_throttle of "
+                f"{100 * schedule.hover:.0f} %, which stays: leave hover out"
+            )
+        law = flown.law
+        frame = ADRCFrame(
+            schedule, flown.lowpass_hz, float(law.setpoint_lowpass_hz), float(law.forgetting)
+        )
+    else:
+        lowest = float(found.throttle[0]) if hover is None else hover
+        frame = ADRCFrame(B0Schedule(_LAW, max(0.05, round(lowest, 2))))
+    at = frame.schedule.hover
+    if found.throttle.size == 1:
+        degrees = 1.0 if found.output_unit == "deg/s" else 180 / np.pi
+        scale = float(frame.schedule.scale(found.throttle[0]))
+        return frame, None, degrees * found.b0(0).value / scale
+    scaled = found.adrc_b0(at, largest=frame.schedule.high)
+    if not isinstance(flown, FlownADRC):
+        [law] = [each for each in _LAWS if each == scaled.law]
+        frame = frame._replace(schedule=frame.schedule._replace(law=law))
+    return frame, scaled, scaled.b0.value
+
+
+def _require_gains(found: GainOverThrottle, grid: np.ndarray, plants: int, seed: int) -> None:
+    """Raise UndeterminedError where the log leaves gains of 0 or below possible."""
+    drawn = [draw_at(found, float(x), plants, seed)[0] for x in grid]
+    if min(float(each.min()) for each in drawn) <= 0:
+        raise UndeterminedError(
+            "the log does not tell the gain from the command to the rate: 0 is within what it "
+            "leaves possible. Fly a chirp of the rate set-point, or stronger and quicker stick"
+        )
 
 
 def _rows(axis: str) -> list[Parameter]:
@@ -214,110 +304,45 @@ def _rows(axis: str) -> list[Parameter]:
     return [find_parameter("betaflight", f"adrc_{name}_{axis}") for name in ("wc", "wo", "b0")]
 
 
-def _judge(
-    stage: ADRCStage, targets: ADRCTargets, edge: float, fresh: int, grid: np.ndarray
-) -> tuple[Kind, str]:
-    if beyond := _beyond(stage, targets, edge):
-        return "not to be flown", (
-            f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`targets`), or fly more "
-            "excitation"
-        )
-    return "proposed", (
-        f"proposed: stable on all {fresh} fresh plants from {grid[0]:.2f} to {grid[-1]:.2f} "
-        f"throttle, worst Ms {stage.peak:.2f} of at most {targets.sensitivity:g}, "
-        f"{stage.rejection:.2f} of the effect of torque with the PID that flew"
-    )
+def _flown_design(flown: Flown, axis: str) -> Design | None:
+    """wc, wo and b0 that flew; None of a PID."""
+    if not isinstance(flown, FlownADRC):
+        return None
+    law, k = flown.law, AXES.index(axis)
+    return np.array([float(np.broadcast_to(x, (3,))[k]) for x in (law.wc, law.wo, law.b0)])
 
 
-class _Loop(NamedTuple):
-    """The loops of all plants at one throttle."""
-
-    dt: float
-    loops: RateLoops  # with the PID that flew as its only design
-    passed: Complex[np.ndarray, " frequencies"]  # all filters of the rate
-    scale: float  # of b0
-
-    def qualities(self, designs: Designs) -> LoopQualities:
-        return self._with(designs).qualities(np.eye(len(designs)))
-
-    def first(self) -> "_Loop":
-        """With one plant alone."""
-        return self._replace(loops=dataclasses.replace(self.loops, plants=self.loops.plants[:1]))
-
-    def joined(self, others: "_Loop", design: np.ndarray) -> "_Loop":
-        """With the worst plants of the others."""
-        worst = others._with(design[None]).worst(np.eye(1), _WORST)
-        return self._replace(loops=self.loops.joined(worst))
-
-    def _with(self, designs: Designs) -> RateLoops:
-        back, ahead = observer_responses(designs, self.loops.omega, self.dt)
-        back, ahead = back * self.passed / self.scale, ahead / self.scale
-        return dataclasses.replace(self.loops, feedback=_DEGREES * back, ahead=_DEGREES * ahead)
+def _bounds(flown: Flown, axis: str, b0: float, change: float) -> tuple[Design, Design]:
+    """Least and most of wc, wo and b0."""
+    rows = _rows(axis)
+    low = np.array([row.low for row in rows], float)
+    high = np.array([row.high for row in rows], float)
+    before = _flown_design(flown, axis)
+    if before is not None:
+        return np.clip(before / change, low, high), np.clip(before * change, low, high)
+    low[2], high[2] = np.clip([b0 / _SPREAD, b0 * _SPREAD], low[2], high[2])
+    return low, high
 
 
-def observer_responses(
-    designs: Designs, omega: Float[np.ndarray, " frequencies"], dt: float, forgetting: float = 0.3
-) -> tuple[Complex[np.ndarray, "designs frequencies"], Complex[np.ndarray, "designs frequencies"]]:
-    """From the rate behind its low-pass to minus the command, and from the set-point to it.
-
-    Per deg/s. With q = exp(-j omega T) the observer of `BetaflightADRC` is
-    (1 - q M) z = N y + q T b u, and b u = wc^2 r - (wc^2, 2 wc, 1) z: solved by elimination.
-    """
-    wc, wo, b0 = (column[:, None] for column in designs.T)
-    wo = np.minimum(wo, 0.5 / dt)
-    q = np.exp(-1j * omega * dt)[None]
-    gains = dt * np.stack([3 * wo, 3 * wo**2, wo**3])
-    leak, one = 1 - q * (1 - forgetting * dt), 1 - q
-
-    def observed(inputs: tuple[np.ndarray | float, ...]):
-        """z for what enters each of its three rows."""
-        # z2 and z3 by z1, from the last row up; then the first row alone.
-        third = (inputs[2] / leak, -q * gains[2] / leak)
-        second = [
-            (inputs[1] + q * dt * third[0]) / one,
-            (-q * gains[1] + q * dt * third[1]) / one,
-        ]
-        first = (inputs[0] + q * dt * second[0]) / (1 - q * (1 - gains[0]) - q * dt * second[1])
-        return first, second[0] + second[1] * first, third[0] + third[1] * first
-
-    weigh = lambda z: wc**2 * z[0] + 2 * wc * z[1] + z[2]
-    by_rate, by_drive = weigh(observed(tuple(gains))), weigh(observed((0.0, q * dt, 0.0)))
-    return by_rate / (b0 * (1 + by_drive)), wc**2 / (b0 * (1 + by_drive))
-
-
-def _make_loop(
-    found: GainOverThrottle,
-    flown: FlownBetaflight,
-    axis: int,
-    throttle: float,
-    scale: float,
-    plants: int,
-    seed: int,
-) -> _Loop:
-    law = flown.at(throttle)
-    omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
-    drawn = found.draw(np.array([throttle]), plants, seed=seed)
-    per_radian = 1.0 if found.output_unit == "rad/s" else 1 / _DEGREES
-    held = hold_plants(
-        per_radian * drawn.gain.T, drawn.lag[:, None], drawn.delay[:, None], omega, law.dt
-    )
-    ahead, back = law_responses(law, axis, omega)
-    lowpass = FilterChain((PT2(150.0),), 1 / law.dt).response(omega / (2 * np.pi))
-    passed = gyro_chain_response(law, omega) * np.asarray(lowpass)
-    pid = RateLoops(omega, -back[None], ahead[None], held, cells_of(omega), np.ones_like(passed))
-    return _Loop(law.dt, pid, passed, scale)
+def _parameters(axis: str, design: Design, frame: ADRCFrame) -> dict[str, float]:
+    """What the firmware has to hold for the loops that were certified."""
+    values = {row.name: float(x) for row, x in zip(_rows(axis), design, strict=True)}
+    return values | {
+        "adrc_gyro_lpf_hz": frame.lowpass_hz,
+        "adrc_td_hz": frame.setpoint_hz,
+        "adrc_hover_throttle": 100 * frame.schedule.hover,
+        "adrc_sigma_decay": 10 * frame.forgetting,
+    }
 
 
 def _search(
-    loops: Sequence[_Loop], b0: float, targets: ADRCTargets, edge: float, axis: str
-) -> Float[np.ndarray, "3"]:
+    loops: Sequence[ADRCLoop], bounds: tuple[Design, Design], targets: ADRCTargets, edge: float,
+    before: Design | None,
+) -> Design:  # fmt: skip
     """The whole numbers with the least effect of torque; where none keep the targets: nearest."""
-    rows = _rows(axis)
-    low = np.array([row.low for row in rows])
-    high = np.array([row.high for row in rows])
-    low[2], high[2] = np.clip([b0 / _SPREAD, b0 * _SPREAD], low[2], high[2])
-    score = _Score(loops, targets, edge)
-    rough = _Score([each.first() for each in loops], targets, edge)
+    low, high = bounds
+    score = _Score(loops, targets, edge, before)
+    rough = _Score([each.first() for each in loops], targets, edge, before)
     middle, half = np.log(low * high) / 2, np.log(high / low) / 2
     for level in range(_LEVELS):
         axes = [
@@ -336,9 +361,11 @@ def _search(
 class _Score:
     """The effect of torque; designs beyond a target come after all that keep them."""
 
-    def __init__(self, loops: Sequence[_Loop], targets: ADRCTargets, edge: float):
-        self.loops, self.targets, self.edge = loops, targets, edge
-        self.flown = [each.loops.qualities(np.eye(1)) for each in loops]
+    def __init__(
+        self, loops: Sequence[ADRCLoop], targets: ADRCTargets, edge: float, before: Design | None
+    ):
+        self.loops, self.targets, self.edge, self.before = loops, targets, edge, before
+        self.flown = [each.flown() for each in loops]
 
     def __call__(self, designs: Designs) -> Float[np.ndarray, " designs"]:
         parts = np.array_split(designs, max(1, len(designs) // 64))
@@ -356,13 +383,44 @@ class _Score:
                 np.max(each.crossover, axis=1) / self.edge,
             ]).max(axis=0)  # fmt: skip
             worst = np.maximum(worst, np.where(np.all(each.stable, axis=1), beyond, 1e6 * beyond))
+            worst = np.maximum(worst, self._on_the_way(loop, flown, designs))
             rejected += np.mean((each.rejection / flown.rejection) ** 2, axis=1)
         return np.where(worst <= 1, np.sqrt(rejected / len(self.loops)), 1e9 * worst)
 
+    def _on_the_way(
+        self, loop: ADRCLoop, flown: LoopQualities, designs: Designs
+    ) -> Float[np.ndarray, " designs"]:
+        """Ms a third of the way, over the greatest that is allowed there."""
+        if self.before is None:
+            return np.zeros(len(designs))
+        each = loop.qualities(_part(self.before, designs))
+        allowed = max(_RESERVE * self.targets.sensitivity, float(np.max(flown.peak)))
+        beyond = np.max(each.peak, axis=1) / allowed
+        return np.where(np.all(each.stable, axis=1), beyond, 1e6 * beyond)
 
-def _stage(loops: Sequence[_Loop], design: np.ndarray) -> ADRCStage:
-    found = [each.qualities(design[None]) for each in loops]
-    flown = [each.loops.qualities(np.eye(1)) for each in loops]
+
+def _part(before: Design, designs: Designs) -> Designs:
+    """A third of the way."""
+    return before + _THIRD * (designs - before)
+
+
+def _stages(
+    loops: Sequence[ADRCLoop], axis: str, before: Design | None, best: Design
+) -> dict[str, ADRCStage]:
+    """What flew, a third of the way where that has a meaning, the proposal, and the defaults."""
+    flown = [each.flown() for each in loops]
+    of = lambda design: _stage(design, [x.qualities(design[None]) for x in loops], flown)
+    none = np.full(3, np.nan)
+    stages = {"what flew": _stage(none if before is None else before, flown, flown)}
+    if before is not None:
+        stages["a third of the way"] = of(np.rint(_part(before, best[None])[0]))
+    default = np.array([row.default for row in _rows(axis)], float)
+    return stages | {"proposed": of(best), "defaults": of(default)}
+
+
+def _stage(
+    design: Design, found: Sequence[LoopQualities], flown: Sequence[LoopQualities]
+) -> ADRCStage:
     joined, before = _together(found), _together(flown)
     relative = lambda new, old: float(np.sqrt(np.mean((new / old) ** 2)))
     wc, wo, b0 = map(float, design)
@@ -385,13 +443,42 @@ def _together(found: Sequence[LoopQualities]) -> LoopQualities:
     return LoopQualities(*(np.concatenate([each[0] for each in column]) for column in columns))
 
 
-def _beyond(stage: ADRCStage, targets: ADRCTargets, edge: float) -> list[str]:
-    """In words, which of the targets a stage does not keep."""
-    words = []
-    if stage.stable < 1:
-        words.append(f"only {100 * stage.stable:.1f} % of the loops are stable")
+def _judge(
+    stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float, fresh: int, grid: np.ndarray
+) -> tuple[Kind, str]:
+    if beyond := _beyond(stages, targets, edge):
+        return "not to be flown", (
+            f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, "
+            "`resonance`, `noise`), or fly more excitation"
+        )
+    flown, best = stages["what flew"], stages["proposed"]
+    better = f"{best.rejection:.2f} of the effect of torque with what flew"
+    within = flown.peak <= targets.sensitivity and flown.resonance <= targets.resonance
+    if not np.isnan(flown.wc) and flown.stable == 1 and within and best.rejection > _WORTH:
+        return "kept", (
+            f"what flew is kept: within the limits the best parameters leave {better}. Its worst "
+            f"Ms on {fresh} fresh plants is {flown.peak:.2f}"
+        )
+    where = f"from {grid[0]:.2f} to {grid[-1]:.2f}" if len(grid) > 1 else f"at {grid[0]:.2f}"
+    return "proposed", (
+        f"proposed: stable on all {fresh} fresh plants {where} throttle, worst Ms {best.peak:.2f} "
+        f"of at most {targets.sensitivity:g}, {better}"
+    )
+
+
+def _beyond(stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float) -> list[str]:
+    """In words, which of the targets are not kept."""
+    words, stage, flown = [], stages["proposed"], stages["what flew"]
+    third = stages.get("a third of the way", stage)
+    if min(stage.stable, third.stable) < 1:
+        share = 100 * min(stage.stable, third.stable)
+        words.append(f"only {share:.1f} % of the loops are stable")
     if stage.peak > targets.sensitivity:
         words.append(f"the worst Ms is {stage.peak:.2f}, above {targets.sensitivity:g}")
+    elif third.peak > max(targets.sensitivity, flown.peak):
+        words.append(
+            f"a third of the way the worst Ms is {third.peak:.2f}, above {targets.sensitivity:g}"
+        )
     if stage.resonance > targets.resonance:
         words.append(
             f"the worst peak from set-point to rate is {stage.resonance:.2f}, above "

@@ -35,6 +35,8 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
+from ._adrc_flight import flew_adrc, tune_adrc
+from ._adrc_result import ADRCAutopilot
 from ._flight_channels import FlightChannels, read_channels
 from ._flown_autopilot import FlownAutopilot, read_flown, settings_of
 from ._gyro_noise import GyroNoise
@@ -269,7 +271,9 @@ def _stage_table(stages: tuple[Stage, ...]) -> str:
     return "\n".join(rows)
 
 
-def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> AutopilotProposal:
+def autopilot(
+    path: str | Path, settings: AutopilotSettings | None = None
+) -> AutopilotProposal | ADRCAutopilot:
     """Tune the gains of the autopilot that flew a log, as `jaxquad autopilot` does.
 
     Gains and filters are read from the log, the plant is identified in the firmware's own units up
@@ -287,7 +291,8 @@ def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> Au
     - `path`: a log of Betaflight, PX4 or ArduPilot.
     - `settings`: the axis, and what is kept.
 
-    **Returns:** an `AutopilotProposal`; nothing is written before its `.write(folder)`.
+    **Returns:** an `AutopilotProposal`, or an `ADRCAutopilot` where the ADRC flew or is asked for
+    by `law`; nothing is written before its `.write(folder)`.
 
     **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
     ValueError for one without the parameters of the loop.
@@ -303,6 +308,11 @@ def autopilot(path: str | Path, settings: AutopilotSettings | None = None) -> Au
     """
     path, settings = Path(path), settings or AutopilotSettings()
     asked, proposal = _channels_of(path, settings)
+    adrc = flew_adrc(path, proposal)
+    if adrc and settings.law == "pid":
+        raise SettingsError(f"`law` is pid, but the ADRC flew {path} (pid_type): leave it out")
+    if adrc or settings.law == "adrc":
+        return tune_adrc(path, asked, proposal, settings)
     announce("gains and filters that flew")
     flown, flight = _read_flight(path, asked, proposal, settings)
     found = identify(path, asked)

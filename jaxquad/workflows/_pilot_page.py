@@ -1,13 +1,14 @@
 """The page of a proposal for an autopilot, from what `autopilot` found."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxquad._core import Number
 from jaxquad.control.autopilots import ArduPilotRate, BetaflightPID, FilterChain, PT1
+from jaxquad.export import ParameterChange, WordChange
 from jaxquad.plot import Spectrum, StepBand
 from jaxquad.records import AXES
 from jaxquad.report import Cell, Headline, PilotPage, Provenance, Table
@@ -57,23 +58,23 @@ def pilot_page(found: "AutopilotProposal", origin: Provenance) -> PilotPage:
         steps=_steps(found, designs) if found.identification.fit.identifiable else {},
         terms=terms,
         terms_are=terms_are,
-        motors=[] if found.flight is None else _motors(found.flight),
+        motors=[] if found.flight is None else motor_rows(found.flight),
         stages=_stage_rows(found) if found.stages else None,
-        changes=_change_rows(found) if found.new else None,
+        changes=change_rows(found.changes) if found.new else None,
         text=str(found),
         unit=_UNITS[flown.firmware],
         provenance=origin,
     )  # fmt: skip
 
 
-_WORDS = {
+VERDICTS = {
     "proposed": ("good", "PROPOSED"), "kept": ("good", "WHAT FLEW IS KEPT"),
     "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
 }  # fmt: skip
 
 
 def _headlines(found: "AutopilotProposal") -> list[Headline]:
-    headlines = [Headline(*_WORDS[found.kind], found.verdict)]
+    headlines = [Headline(*VERDICTS[found.kind], found.verdict)]
     if found.reproduction is not None:
         flew = found.reproduction.kind == "flown"
         word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
@@ -162,26 +163,49 @@ def _response(
 
 def _steps(found: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
     """From set-point to rate, of plants drawn from the fit: by their responses."""
-    flown = found.flown
-    dt = max(flown.law.dt, _FINEST)
-    count = 2 * int(_PERIOD / dt / 2)
-    omega = 2 * np.pi * np.arange(1, count // 2) / (count * dt)
-    seed = found.settings.seed + _SEED
-    loops = found.plants.loops(flown.law, flown.axis, _PLANTS, seed, omega=omega)
-    fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2 if dt > flown.law.dt else 1.0
+    flown, axis = found.flown, found.flown.axis
+    grid, seed = StepGrid.of(flown.law.dt), found.settings.seed + _SEED
+    loops = found.plants.loops(flown.law, axis, _PLANTS, seed, omega=grid.omega)
     steps = {}
     for name, (law, gains) in designs.items():
-        mine = loops if law is flown.law else loops.of_law(law, flown.axis)
+        mine = loops if law is flown.law else loops.of_law(law, axis)
         [back], [ahead] = mine.paths(gains[None])
-        closed = fade * ahead * mine.plants / (1 + back * mine.plants)
+        steps[name] = grid.band(ahead * mine.plants / (1 + back * mine.plants))
+    return steps
+
+
+class StepGrid(NamedTuple):
+    """Frequencies from whose closed responses steps are computed.
+
+    **Attributes:**
+
+    - `dt`: of the computed step in s; `omega`: rad/s.
+    - `fade`: of the responses, where the law runs faster than the step is computed.
+    """
+
+    dt: float
+    omega: Float[np.ndarray, " frequencies"]
+    fade: Float[np.ndarray, " frequencies"]
+
+    @classmethod
+    def of(cls, dt: float) -> "StepGrid":
+        """For a law of this interval."""
+        coarse = max(dt, _FINEST)
+        count = 2 * int(_PERIOD / coarse / 2)
+        omega = 2 * np.pi * np.arange(1, count // 2) / (count * coarse)
+        fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2
+        return cls(coarse, omega, fade if coarse > dt else np.ones(omega.size))
+
+    def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
+        """Of the responses from set-point to rate: median and 95 % of the plants."""
         ends = np.ones((len(closed), 1)), np.zeros((len(closed), 1))
-        impulse = np.fft.irfft(np.concatenate([ends[0], closed, ends[1]], axis=1), count, axis=1)
-        shown = int(_SHOWN / dt)
+        whole = np.concatenate([ends[0], self.fade * closed, ends[1]], axis=1)
+        impulse = np.fft.irfft(whole, 2 * (self.omega.size + 1), axis=1)
+        shown = int(_SHOWN / self.dt)
         low, middle, high = np.percentile(
             np.cumsum(impulse, axis=1)[:, :shown], [2.5, 50.0, 97.5], axis=0
         )
-        steps[name] = StepBand(np.arange(shown) * dt, middle, low, high)
-    return steps
+        return StepBand(np.arange(shown) * self.dt, middle, low, high)
 
 
 def _terms(flight: FlightChannels | None, law: RateLaw, axis: int) -> tuple[dict[str, float], str]:
@@ -189,9 +213,14 @@ def _terms(flight: FlightChannels | None, law: RateLaw, axis: int) -> tuple[dict
     if flight is None:
         return {}, ""
     if {"P", "I"} <= set(flight.terms):
-        moved = {name: x - x.mean() if name == "I" else x for name, x in flight.terms.items()}
-        return {name: float(np.sqrt(np.mean(x**2))) for name, x in moved.items()}, "as logged"
+        return logged_terms(flight), "as logged"
     return _computed_terms(flight, law, axis), "computed by the law from set-point and rate"
+
+
+def logged_terms(flight: FlightChannels) -> dict[str, float]:
+    """Root mean squares of P, I, D and F as they were logged, I without its mean."""
+    moved = {name: x - x.mean() if name == "I" else x for name, x in flight.terms.items()}
+    return {name: float(np.sqrt(np.mean(x**2))) for name, x in moved.items()}
 
 
 def _computed_terms(flight: FlightChannels, law: RateLaw, axis: int) -> dict[str, float]:
@@ -213,7 +242,8 @@ def _computed_terms(flight: FlightChannels, law: RateLaw, axis: int) -> dict[str
     return found
 
 
-def _motors(flight: FlightChannels) -> list[tuple[str, float, float]]:
+def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
+    """Each motor's shares of samples at the lowest and at the highest command."""
     if flight.motors is None:
         return []
     low, high = flight.motor_ends
@@ -241,14 +271,16 @@ def _stage_rows(found: "AutopilotProposal") -> Table:
     return Table(f"On {found.settings.fresh} fresh plants", heads, rows)
 
 
-def _change_rows(found: "AutopilotProposal") -> Table:
+def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
+    """Old, new, unit, range and reason, for the page."""
     rows: list[list[str | Cell]] = [
         [
             Cell(row.name), row.unit, _range(row.low, row.high), reason,
             f"{old:.5g}", f"{new:.5g}",
         ]
-        for row, old, new, reason in found.changes
+        for row, old, new, reason in changes
     ]  # fmt: skip
+    rows += [[Cell(each.name), "", "", each.reason, each.old, each.new] for each in words]
     heads = ("parameter", "unit", "range", "reason", "old", "new")
     return Table("From what flew to the proposal", heads, rows, texts=4)
 

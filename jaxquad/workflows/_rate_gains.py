@@ -16,6 +16,7 @@ from jaxtyping import Bool, Complex, Float
 from jaxquad._core import Number
 from jaxquad.control.autopilots import (
     ArduPilotRate,
+    BetaflightADRC,
     BetaflightPID,
     FilterChain,
     Firmware,
@@ -272,7 +273,7 @@ def _alone(law: RateLaw, name: str) -> RateLaw:
 
 
 def law_responses(
-    law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
+    law: RateLaw | BetaflightADRC, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, "inputs frequencies"]:
     """From the set-point and from the rate, both in rad/s, to the command."""
     linear = law.linear(axis)

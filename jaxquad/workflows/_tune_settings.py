@@ -1,6 +1,7 @@
 """Settings of the workflows that find gains: a tune, and the gains of an autopilot."""
 
 import dataclasses
+from typing import Literal
 
 from . import _kinds as kinds
 from ._kinds import Pair, SettingsError
@@ -99,7 +100,7 @@ class TuneSettings(Settings):
     )
 
 
-_PLANTS, _KEPT = "the plants", "what is kept"
+_PLANTS, _KEPT, _LAW = "the plants", "what is kept", "the law"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -132,6 +133,19 @@ class AutopilotSettings(Settings):
         "median, 0.3 where it does not hold the throttle",
         group=THE_RECORD,
     )
+    law: Literal["pid", "adrc"] | None = option_field(
+        kinds.LAW,
+        None,
+        "the law to tune: adrc is that of Betaflight's pull request 15400; by default what flew",
+        group=_LAW,
+    )
+    hover: float | None = option_field(
+        kinds.POSITIVE,
+        None,
+        "adrc_hover_throttle, of 1; by default that of the ADRC that flew, else the lowest level "
+        "of throttle that was flown",
+        group=_LAW,
+    )
     sensitivity: float = option_field(
         kinds.POSITIVE, 1.8, "upper limit of the peak of |S|; 1.8 by default", group=_KEPT
     )
@@ -150,7 +164,8 @@ class AutopilotSettings(Settings):
     change: float = option_field(
         kinds.POSITIVE,
         3.0,
-        "factor within which each gain and cutoff stays of what flew; 3 by default",
+        "factor within which each gain and cutoff, or wc, wo and b0, stays of what flew; 3 by "
+        "default",
         group=_KEPT,
     )
     keep_filters: bool = option_field(
@@ -167,6 +182,10 @@ class AutopilotSettings(Settings):
     def _check_together(self) -> None:
         if self.throttle is not None and self.throttle > 1:
             raise SettingsError(f"`throttle` is {self.throttle:g}: give a share, above 0 to 1")
+        if self.hover is not None and not 0.05 <= self.hover <= 1:
+            raise SettingsError(f"`hover` is {self.hover:g}: give a share, from 0.05 to 1")
+        if self.hover is not None and self.law == "pid":
+            raise SettingsError("`hover` is of the ADRC: leave it out, or give `law` adrc")
         if self.sensitivity <= 1:
             raise SettingsError(
                 f"`sensitivity` is {self.sensitivity:g}: no loop has a peak of |S| of 1 or below"

@@ -25,6 +25,7 @@ from jaxquad.export import (
     change_table,
     parameter_file,
     propose_changes,
+    WordChange,
     write_parameter_files,
 )
 
@@ -167,6 +168,19 @@ def test_the_adrcs_parameters_need_a_build_that_has_them():
     assert (
         read_cli(parameter_file("betaflight", changes, version=(2026, 6)))["adrc_b0_roll"] == "2730"
     )
+
+
+def test_words_are_set_last_and_back_and_for_betaflight_alone():
+    changes = propose_changes("betaflight", {"adrc_b0_roll": 2000}, {"adrc_b0_roll": 2730})
+    words = [WordChange("pid_type", "CLASSIC", "ADRC", "it flies")]
+    text = parameter_file("betaflight", changes, version=(2026, 6), words=words, title="two\nlines")
+    assert text.splitlines()[:2] == ["# two", "# lines"] and "simplified" not in text
+    assert text.splitlines()[-3:] == ["# pid_type was CLASSIC", "set pid_type = ADRC", "save"]
+    back = parameter_file("betaflight", changes, version=(2026, 6), words=words, revert=True)
+    assert read_cli(back) == {"adrc_b0_roll": "2000", "pid_type": "CLASSIC"}
+    assert "| pid_type | CLASSIC | ADRC |  |  | it flies |" in change_table(changes, words)
+    with pytest.raises(ValueError, match="px4 stores numbers alone"):
+        parameter_file("px4", [], words=words)
 
 
 def test_a_staged_proposal_goes_a_third_of_the_way_then_all_and_back(tmp_path):

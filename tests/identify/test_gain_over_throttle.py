@@ -55,6 +55,14 @@ def found():
     return identify(flight())
 
 
+def test_stretches_are_where_each_level_was_flown(found):
+    assert len(found.stretches) == found.throttle.size
+    for spans, seconds in zip(found.stretches, found.seconds, strict=True):
+        assert sum(stop - start for start, stop in spans) == pytest.approx(seconds, abs=2 * DT)
+    starts = [spans[0][0] for spans in found.stretches]
+    np.testing.assert_allclose(starts, SECONDS * np.arange(3), atol=0.05)
+
+
 def test_gains_lag_delay_and_curve_are_recovered_within_their_errors(found):
     np.testing.assert_allclose(found.throttle, LEVELS, atol=0.005)
     assert np.all(np.abs(found.gain - gain(found.throttle)) < 3.5 * found.gain_errors)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from jaxquad.control.autopilots import FilterChain, Notch, PT1
+from jaxquad.identify import GainBand
 from jaxquad.plot import (
+    b0_figure,
     balance_figure,
     filters_figure,
     headless,
@@ -12,6 +14,7 @@ from jaxquad.plot import (
     Spectrum,
     StepBand,
     steps_figure,
+    ThrottleCurve,
 )
 
 
@@ -60,3 +63,15 @@ def test_steps_have_their_bands_and_terms_their_shares():
     assert len(filled) == 2 and filled[0].get_hatch() != filled[1].get_hatch()
     [bars] = balance_figure({"P": 3.0, "I": 1.0}, unit="pidsum")
     assert [text.get_text() for text in bars.texts] == ["3 (75 %)", "1 (25 %)"]
+
+
+def test_b0_over_the_throttle_has_its_levels_band_and_what_is_taken():
+    throttle, ones = np.linspace(0.3, 0.6, 20), np.ones(20)
+    levels = GainBand(np.array([0.3, 0.6]), *(x * np.ones(2) for x in (2.0, 1.5, 2.5)))
+    curve = GainBand(throttle, 2 * ones, 1.8 * ones, 2.2 * ones)
+    taken = {"proposed": ThrottleCurve(throttle, 4 * throttle)}
+    [panel] = b0_figure(levels, taken, curve=curve)
+    np.testing.assert_array_equal(lines(panel)["proposed"][1], 4 * throttle)
+    assert panel.get_ylim()[0] == 0
+    [alone] = b0_figure(levels, {})
+    assert len(panel.collections) == len(alone.collections) + 1  # the band of the curve

@@ -77,6 +77,31 @@ def matrices(truth: Truth, throttle, design: Design) -> np.ndarray:
     return np.moveaxis(np.array(found), (0, 1, 2), (2, 1, 0))
 
 
+class Observer:
+    """The law in flight, for `throttle_flights.fly`; `design` has b0 at hover."""
+
+    def __init__(self, design: Design, hover: float, power: float = 0.5):
+        self.design, self.hover, self.power = design, hover, power
+        self.state = np.zeros((6, *np.shape(design.wc)))
+
+    def __call__(self, y: np.ndarray, setpoint: np.ndarray, throttle: np.ndarray) -> np.ndarray:
+        l1, l2, z1, z2, z3, command = self.state
+        half = _pt1(_LOWPASS, RATE / 2)
+        l1 = l1 + half * (y - l1)
+        l2 = l2 + half * (l1 - l2)
+        wc, wo, b0 = self.design
+        b = b0 * scale(throttle, self.hover, self.power)
+        error = z1 - l2
+        z1, z2, z3 = (
+            z1 + DT * (z2 - 3 * wo * error),
+            z2 + DT * (z3 + b * command - 3 * wo**2 * error),
+            z3 - DT * (_LEAK * z3 + wo**3 * error),
+        )
+        command = np.clip((wc**2 * (setpoint - z1) - 2 * wc * z2 - z3) / b, -500, 500)
+        self.state = np.stack([l1, l2, z1, z2, z3, command])
+        return command
+
+
 class Found(NamedTuple):
     """A value per loop."""
 

@@ -20,7 +20,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 import px4_flights as simulated  # noqa: E402
 
 import jaxquad as jq  # noqa: E402
-from jaxquad.workflows import autopilot, AutopilotSettings  # noqa: E402
+from jaxquad.workflows import autopilot, AutopilotProposal, AutopilotSettings  # noqa: E402
 
 
 SEED = 20261122
@@ -54,6 +54,7 @@ def main() -> None:
             flown = vehicle.fly(amplitude=options.amplitude, noise=noise, gust=gust, seed=k)
             log = simulated.write_log(Path(folder) / "log.ulg", flown, vehicle.parameters)
             found = autopilot(log, SETTINGS)
+            assert isinstance(found, AutopilotProposal)  # the PID flew
             kinds[found.kind] += 1
             line = f"{k:3d} {found.kind}"
             if found.kind == "proposed":

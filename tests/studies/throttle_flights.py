@@ -5,6 +5,7 @@ The gyro and its filter run at 8 kHz, the rest of the chain and the PID at 4 kHz
 thrust curve and the delay of the ESCs at 8 kHz. A chirp on the set-point runs at each throttle.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -53,8 +54,17 @@ def draw(rng: np.random.Generator, flights: int) -> Truth:
     )
 
 
-def fly(truth: Truth, rng: np.random.Generator, log_rate: int = 1000) -> Flights:
-    """Fly all of them, and log without an anti-aliasing filter, as a blackbox does."""
+Law = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def fly(
+    truth: Truth, rng: np.random.Generator, log_rate: int = 1000, law: Law | None = None
+) -> Flights:
+    """Fly all of them, and log without an anti-aliasing filter, as a blackbox does.
+
+    `law` takes the filtered gyro, the set-point and the throttle at 4 kHz and gives the command;
+    None is the PID.
+    """
     n, dt, steps = truth.slope.size, 1 / RATE, RATE * SECONDS
     throttle = _throttle(rng, n)
     setpoint = _chirps(rng, n)
@@ -97,10 +107,13 @@ def fly(truth: Truth, rng: np.random.Generator, log_rate: int = 1000) -> Flights
         d1 += k_d[0] * (x2 - d1)
         d2 += k_d[1] * (d1 - d2)
         r = setpoint[k // 2]
-        error = r - x2
-        integral = np.clip(integral + 0.244381 * 80 / 4000 * error, -400, 400)
-        total = 0.032029 * 45 * error + integral - 0.000529 * 30 * (d2 - before) * 4000
-        before = d2.copy()
+        if law is None:
+            error = r - x2
+            integral = np.clip(integral + 0.244381 * 80 / 4000 * error, -400, 400)
+            total = 0.032029 * 45 * error + integral - 0.000529 * 30 * (d2 - before) * 4000
+            before = d2.copy()
+        else:
+            total = law(x2, r, x)
         command = np.clip(total, -500, 500)
         if k % every == 0:
             logged[:, k // every] = np.round(r), np.round(x2), np.round(command)

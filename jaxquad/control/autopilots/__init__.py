@@ -42,6 +42,15 @@ from ._flown import (
     px4_loop as px4_loop,
     replay_terms as replay_terms,
 )
+from ._flown_adrc import (
+    adrc_parameters as adrc_parameters,
+    b0_law as b0_law,
+    B0Law as B0Law,
+    B0Schedule as B0Schedule,
+    betaflight_adrc_loop as betaflight_adrc_loop,
+    flies_adrc as flies_adrc,
+    FlownADRC as FlownADRC,
+)
 from ._gains import (
     Cascade as Cascade,
     cascade_of as cascade_of,

@@ -12,7 +12,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ._ardupilot import ArduPilotRate
-from ._betaflight import BetaflightPID, DMax, dynamic_cutoff, ItermRelax, tpa_factor
+from ._betaflight import (
+    BetaflightADRC,
+    BetaflightPID,
+    DMax,
+    dynamic_cutoff,
+    ItermRelax,
+    tpa_factor,
+)
 from ._filters import (
     BandwidthNotch,
     betaflight_quality,
@@ -29,7 +36,7 @@ from ._parameters import list_parameters
 from ._px4 import PX4Rate
 
 
-RateLaw = TypeVar("RateLaw", BetaflightPID, PX4Rate, ArduPilotRate)
+RateLaw = TypeVar("RateLaw", BetaflightPID, BetaflightADRC, PX4Rate, ArduPilotRate)
 
 
 class FlownLoop(eqx.Module, Generic[RateLaw]):
