@@ -146,7 +146,7 @@ class ADRCAutopilot:
     def remarks(self) -> tuple[str, ...]:
         """What a pilot has to know before the file is loaded."""
         found = []
-        if "pid_type" not in self.values:
+        if self.words and "pid_type" not in self.values:
             version = ".".join(map(str, self.version))
             found.append(
                 f"the firmware of the log, Betaflight {version}, has no ADRC: only a build of "
