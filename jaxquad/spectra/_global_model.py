@@ -14,7 +14,6 @@ from ._local_fit import Bins
 _BEYOND = 5.0  # ratio of the highest bin that is modelled to the highest frequency asked for
 _MOST_BINS = 20000  # that a model is fitted to
 _TRIAL_BINS = 4000  # with which its order is chosen
-_KEPT_BINS = 10000  # of a model that is kept: at most 10 MB
 _RELAXATIONS, _STEPS = 12, 20  # of Sanathanan and Koerner, of Gauss and Newton
 _SETTLED, _TRIAL = 1e-6, 1e-3  # relative gain of a step at which the descent, or a trial, ends
 _NEAREST = 1e-9  # size of the denominator, to its largest, so that no pole falls onto a bin
@@ -150,9 +149,7 @@ def global_models(
         for o in range(outputs.start, outputs.stop)
     )
     tasks = (_Task(equations, bins.omega[places], most, scale) for equations in each)
-    found = (
-        _identify_kept(task) if places.size <= _KEPT_BINS else task.identify() for task in tasks
-    )
+    found = (_identify_kept(task) for task in tasks)
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
         for one in found
@@ -192,7 +189,10 @@ class _Task:
 
 @ft.lru_cache(maxsize=2)
 def _identify_kept(task: _Task) -> Identified | None:
-    """A fit with another delay of the outputs asks for the model of the inputs once more."""
+    """A fit with another delay of the outputs asks for the model of the inputs once more.
+
+    One of 20000 bins takes 20 MB.
+    """
     return task.identify()
 
 

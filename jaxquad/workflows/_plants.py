@@ -23,6 +23,7 @@ Frequencies = Float[np.ndarray, " frequencies"]
 Drawn = Float[np.ndarray, "plants 1"]
 _LOWEST = 0.05  # rad/s, below which only the integrals count
 _FREQUENCIES = 300
+_AT_ONCE = 256  # draws: each other number would be compiled anew
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,9 +73,11 @@ class PlantSource:
     def _drawn(self, count: int, seed: int, throttle: float | None) -> tuple[Drawn, Drawn, Drawn]:
         """Gain, lag and delay."""
         if self.over is None:
-            scores = np.random.default_rng(seed).standard_normal((len(self.fit.names), count))
+            names = len(self.fit.names)
+            scores = np.zeros((names, -(-count // _AT_ONCE) * _AT_ONCE))
+            scores[:, :count] = np.random.default_rng(seed).standard_normal((names, count))
             models = draw_models(self.fit, jnp.asarray(scores))
-            wide = lambda x: np.broadcast_to(np.asarray(x, float), (count,))[:, None]
+            wide = lambda x: np.broadcast_to(np.asarray(x, float), scores[0].shape)[:count, None]
             return wide(models.gain), wide(models.lag), wide(models.delay)
         if throttle is None:
             drawn = self.over.draw(np.linspace(*self.span, count), count, seed=seed)

@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -264,12 +265,13 @@ def gyro_chain_response(
 
 def _alone(law: RateLaw, name: str) -> RateLaw:
     """The law with a gain of 1, none of the other two and no feed-forward."""
-    gains = {other: jnp.full_like(law.p, float(other == name)) for other in FIELDS}
     if isinstance(law, ArduPilotRate):
-        none = jnp.zeros_like(law.p)
-        return dataclasses.replace(law, ff=none, d_ff=none, **gains)
-    ahead = "f" if isinstance(law, BetaflightPID) else "ff"
-    return dataclasses.replace(law, **gains, **{ahead: jnp.zeros_like(law.p)})
+        ahead = ("ff", "d_ff")
+    else:
+        ahead = ("f",) if isinstance(law, BetaflightPID) else ("ff",)
+    of = lambda law: [vars(law)[each] for each in (*FIELDS, *ahead)]
+    gains = [jnp.full_like(law.p, float(each == name)) for each in (*FIELDS, *ahead)]
+    return eqx.tree_at(of, law, gains)  # what `replace` would check anew is known to be right
 
 
 def law_responses(

@@ -1,6 +1,8 @@
 """The filters of flight controllers' firmware, as each builds them, and chains of them."""
 
-from collections.abc import Sequence
+import functools as ft
+import operator
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -318,33 +320,49 @@ def run_between(
 _UNROLLED = 2
 
 
-@eqx.filter_jit
+Values = Array | np.ndarray
+
+
 def _response(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
-    result = jax.lax.complex(jnp.ones_like(frequency_hz), jnp.zeros_like(frequency_hz))
-    for section in sections:
-        result = result * _section_response(section, frequency_hz, rate_hz)
-    return result
+    back, parts = _section_responses(sections, frequency_hz, rate_hz)
+    return jnp.asarray(ft.reduce(operator.mul, parts, 0 * back + 1))
 
 
-@eqx.filter_jit
 def _delay_ms(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
     """Section by section: the phase of each stays within half a turn, that of a chain does not."""
-    phase = jnp.zeros_like(frequency_hz)
-    for section in sections:
-        phase = phase + jnp.angle(_section_response(section, frequency_hz, rate_hz))
-    return -1e3 * phase / (2 * np.pi * frequency_hz)
+    back, parts = _section_responses(sections, frequency_hz, rate_hz)
+    phase: Values = np.zeros(back.shape)
+    hertz = np.asarray(frequency_hz) if isinstance(back, np.ndarray) else frequency_hz
+    for each in parts:
+        phase = phase + (np.angle(each) if isinstance(each, np.ndarray) else jnp.angle(each))
+    return jnp.asarray(-1e3 * phase / (2 * np.pi * hertz))
 
 
-def _section_response(section: Section, frequency_hz: Array, rate_hz: float) -> Array:
-    if any(x is not None and x.size > 1 for x in section):
+def _section_responses(
+    sections: Sequence[Section], frequency_hz: Array, rate_hz: float
+) -> tuple[Values, list[Values]]:
+    """1/z, and the response of each section.
+
+    NumPy computes it unless something is traced: XLA would compile for each number of frequencies.
+    """
+    numbers = [x for section in sections for x in section if x is not None]
+    if any(x.size > 1 for x in numbers):
         raise ValueError(
             "the filter has one cutoff per axis or member: take one axis before asking for its "
             "response."
         )
+    if all(map(is_concrete, (*numbers, frequency_hz))):
+        back = np.exp(-2j * np.pi * np.asarray(frequency_hz) / rate_hz)
+        return back, [_rational(section, back, np.asarray) for section in sections]
     turn = 2 * np.pi * frequency_hz / rate_hz
-    back = jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))  # 1/z
-    whole = [jnp.zeros_like(section.b0) if x is None else x for x in section]
-    b0, b1, a1, b2, a2 = (x.reshape(()).astype(back.dtype) for x in whole)
+    back = jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))
+    return back, [_rational(section, back, jnp.asarray) for section in sections]
+
+
+def _rational(section: Section, back: Values, convert: Callable[[Array], Values]) -> Values:
+    b0, b1, a1, b2, a2 = (
+        0.0 if x is None else convert(x).reshape(()).astype(back.dtype) for x in section
+    )
     return (b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2))
 
 

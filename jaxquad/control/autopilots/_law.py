@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import (
     broadcast_gain,
     ensemble_shape,
+    is_concrete,
     match_reference,
     pick_gain,
     require_common_shape,
@@ -198,7 +199,8 @@ def require_gains(dt: float, gains: Mapping[str, Array], limits: Mapping[str, Ar
     for name, gain in gains.items():
         require_finite(name, gain)
     for name, limit in limits.items():
-        require_nonnegative(name, jnp.where(jnp.isinf(limit), 0.0, limit))
+        if is_concrete(limit):
+            require_nonnegative(name, np.where(np.isinf(limit), 0.0, limit))
     require_common_shape({**gains, **limits})
 
 
