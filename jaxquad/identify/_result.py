@@ -1,4 +1,5 @@
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -351,40 +352,63 @@ def draw_models(
 
     - `UndeterminedError`, `ValueError`: as `Fit.ensemble`.
     """
-    values = _drawn_values(fit, scores, hold_undetermined=hold_undetermined)
-    replaced = _replaced(fit.parameters, fit.model, values)
+    spread = _spread_of(fit, hold_undetermined)
+    replaced = _replaced(fit.parameters, fit.model, spread, jnp.asarray(scores))
     places = (*fit.parameters.places[: len(fit.names)], *(p for p, _ in fit.parameters.ties))
     touched, structure = {place.leaf for place in places}, jax.tree.structure(fit.model)
     floating = [k for k, x in enumerate(jax.tree.leaves(fit.model)) if _is_inexact(x)]
     drawn = {floating[leaf] for leaf in touched}
     pairs = zip(jax.tree.leaves(fit.model), jax.tree.leaves(replaced), strict=True)
-    leaves = [jnp.moveaxis(new, 0, -1) if k in drawn else x for k, (x, new) in enumerate(pairs)]
+    leaves = [new if k in drawn else x for k, (x, new) in enumerate(pairs)]
     return jax.tree.unflatten(structure, leaves)
 
 
-@eqx.filter_jit
+class _Spread(NamedTuple):
+    """How the free parameters of a fit are drawn."""
+
+    root: Matrix  # of the covariance of relative changes
+    at_zero: tuple[int, ...]  # parameters at their bound
+    along: Float[np.ndarray, "bounds parameters"]  # what changes with each of these
+    here: Float[np.ndarray, " parameters"]
+    units: Float[np.ndarray, " parameters"]
+    logarithmic: Bool[np.ndarray, " parameters"]
+
+
+def _spread_of(fit: Fit, hold_undetermined: bool) -> _Spread:
+    check_drawable(fit, hold_undetermined)
+    covariance = known_covariance(fit)
+    at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
+    along = covariance[at_zero] / np.diagonal(covariance)[at_zero, None]
+    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])
+    logarithmic[at_zero] = False
+    here, units = np.asarray(fit.values), np.asarray(fit.units)
+    return _Spread(_root(covariance), tuple(at_zero), along, here, units, logarithmic)
+
+
+@eqx.filter_jit  # as one program: eager, it would be half a dozen for each number of members
 def _replaced(
-    parameters: Parameters, model: PyTree, values: Float[Array, "parameters members"]
+    parameters: Parameters,
+    model: PyTree,
+    spread: _Spread,
+    scores: Float[Array, "parameters members"],
 ) -> PyTree:
-    return jax.vmap(lambda v: parameters.replace(model, v))(values.T)
+    """The models, with the members on the last axis of every array."""
+    values = _drawn_values(spread, scores)
+    return jax.vmap(lambda v: parameters.replace(model, v), in_axes=-1, out_axes=-1)(values)
 
 
 def _drawn_values(
-    fit: Fit, scores: Float[Array, "parameters members"], *, hold_undetermined: bool = False
+    spread: _Spread, scores: Float[Array, "parameters members"]
 ) -> Float[Array, "parameters members"]:
     """Physical values of the free parameters."""
-    check_drawable(fit, hold_undetermined)
-    covariance = known_covariance(fit)
-    changes = jnp.asarray(_root(covariance)) @ scores
-    at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
-    for k in at_zero:
+    changes = spread.root @ scores
+    here, units = spread.here[:, None], spread.units[:, None]
+    for k, along in zip(spread.at_zero, spread.along, strict=True):
         # Folded to one side of zero, with what goes along with it: they keep their sign.
-        drawn = fit.values[k] / fit.units[k] + changes[k]
+        drawn = spread.here[k] / spread.units[k] + changes[k]
         folded = jnp.abs(drawn) - drawn
-        changes += jnp.asarray(covariance[:, k] / covariance[k, k])[:, None] * folded[None]
-    here, units = jnp.asarray(fit.values)[:, None], jnp.asarray(fit.units)[:, None]
-    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])[:, None]
-    logarithmic[at_zero] = False
+        changes += along[:, None] * folded[None]
+    logarithmic = spread.logarithmic[:, None]
     return jnp.where(logarithmic, here * jnp.exp(changes), here + units * changes)
 
 

@@ -317,8 +317,7 @@ def _mirrored(
 
 def _null_vector(matrix: Float[np.ndarray, "rows columns"], first: int) -> Vector:
     """Coefficients of the columns from `first` on, of unit length, that others explain best."""
-    length = np.linalg.norm(matrix, axis=0)
-    length = np.where(length > 0, length, 1.0)
+    length = _lengths(matrix)
     corner = _triangle(matrix / length)[first:, first:]
     return np.linalg.svd(corner)[2][-1] / length[first:]
 
@@ -328,25 +327,25 @@ def _descend(
 ) -> Solved:
     """Gauss-Newton steps of the denominator, until one gains too little; the rest is linear."""
     basis = _basis(equations, len(denominator))
-    solved = _solve(equations, basis, denominator)
+    solved, reduced = _project(equations, basis, denominator)
     floor = _EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for _ in range(_STEPS):
         fixed, left = basis.largest(solved.denominator), equations.y - solved.fitted
-        slopes = _slopes(basis, solved, fixed)
-        change = _least_squares(_stacked(slopes, left[:, None]))[len(solved.linear) :]
+        further = _stacked(_turned(basis, solved, fixed), left[:, None])
+        change = _least_squares(*_extended(reduced, further))[len(solved.linear) :]
         step = np.insert(change, fixed, 0.0)
-        trials = (_solve(equations, basis, solved.denominator + step / 3**k) for k in range(6))
-        better = next((each for each in trials if each.cost < solved.cost), None)
+        trials = (_project(equations, basis, solved.denominator + step / 3**k) for k in range(6))
+        better = next((each for each in trials if each[0].cost < solved.cost), None)
         if better is None:
             break
-        gain, solved = 1 - better.cost / solved.cost, better
+        gain, (solved, reduced) = 1 - better[0].cost / solved.cost, better
         if gain < least_gain or solved.cost < floor:
             break
     return solved
 
 
 class _Basis(NamedTuple):
-    """What all models of one order have in common."""
+    """What all models of one order have in common; each column lies in one piece of memory."""
 
     powers: Powers
     columns: Complex[np.ndarray, "bins parameters"]  # of the numerators and transients
@@ -360,26 +359,49 @@ class _Basis(NamedTuple):
 def _basis(equations: Equations, size: int) -> _Basis:
     powers = equations.x[:, None] ** np.arange(size)
     columns = _regressors(powers, equations.u, equations.own)
-    return _Basis(powers, columns, np.mean(np.abs(powers), axis=0))
+    one_piece = np.asfortranarray(powers), np.asfortranarray(columns)
+    return _Basis(*one_piece, np.mean(np.abs(powers), axis=0))
+
+
+class _Reduced(NamedTuple):
+    """Columns of unit length as LAPACK's QR decomposition leaves them."""
+
+    qr: Float[np.ndarray, "rows columns"]
+    tau: Float[np.ndarray, " columns"]
+    length: Float[np.ndarray, " columns"]  # that they had
 
 
 def _solve(
     equations: Equations, basis: _Basis, denominator: Float[np.ndarray, " powers"]
 ) -> Solved:
+    return _project(equations, basis, denominator)[0]
+
+
+def _project(
+    equations: Equations, basis: _Basis, denominator: Float[np.ndarray, " powers"]
+) -> tuple[Solved, _Reduced]:
+    """The best linear coefficients under a denominator; and their columns, then the output."""
     below = basis.powers @ denominator
     least = _NEAREST * np.max(np.abs(below))
     below = np.where(np.abs(below) < least, least, below)
-    columns = basis.columns / below[:, None]
-    linear = _least_squares(_stacked(columns, equations.y[:, None]))
-    fitted = columns @ linear
-    cost = float(np.sum(np.abs(equations.y - fitted) ** 2))
-    return Solved(denominator, linear, below, fitted, cost)
+    joined = _stacked(basis.columns * (1 / below)[:, None], equations.y[:, None])
+    reduced, rows = _reduce(joined), len(below)
+    linear = _least_squares(np.triu(reduced.qr[: joined.shape[1]]), reduced.length)
+    fitted = joined[:, :-1] @ linear
+    cost = float(np.sum((joined[:, -1] - fitted) ** 2))
+    solved = Solved(denominator, linear, below, fitted[:rows] + 1j * fitted[rows:], cost)
+    return solved, reduced
+
+
+def _turned(basis: _Basis, solved: Solved, fixed: int) -> Complex[np.ndarray, "bins parameters"]:
+    """Derivatives of the fitted output by the denominator's coefficients but the fixed one."""
+    return (-solved.fitted / solved.below)[:, None] * np.delete(basis.powers, fixed, axis=1)
 
 
 def _slopes(basis: _Basis, solved: Solved, fixed: int) -> Complex[np.ndarray, "bins parameters"]:
     """Derivatives of the fitted output, all coefficients but the fixed one."""
-    turned = -solved.fitted[:, None] * np.delete(basis.powers, fixed, axis=1)
-    return np.concatenate([basis.columns, turned], axis=1) / solved.below[:, None]
+    columns = basis.columns / solved.below[:, None]
+    return np.concatenate([columns, _turned(basis, solved, fixed)], axis=1)
 
 
 def _regressors(powers: Powers, u: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -388,20 +410,52 @@ def _regressors(powers: Powers, u: np.ndarray, own: np.ndarray) -> np.ndarray:
     return np.concatenate([part.reshape(len(u), -1) for part in parts], axis=1)
 
 
-def _least_squares(joined: Float[np.ndarray, "rows columns"]) -> Vector:
-    """Coefficients of all columns but the last, which they fit."""
-    length = np.linalg.norm(joined, axis=0)
-    length = np.where(length > 0, length, 1.0)
-    corner = _triangle(joined / length)
-    found = np.linalg.lstsq(corner[:-1, :-1], corner[:-1, -1], rcond=1e-13)[0]
+def _least_squares(
+    triangle: Float[np.ndarray, "columns columns"], length: Float[np.ndarray, " columns"]
+) -> Vector:
+    """Coefficients of all columns but the last, which they fit, by the R of unit columns."""
+    found = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=1e-13)[0]
     return found * length[-1] / length[:-1]
 
 
+def _lengths(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, " columns"]:
+    """Euclidean norms; 1 for columns of zeros."""
+    length = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    return np.where(length > 0, length, 1.0)
+
+
+def _reduce(joined: Float[np.ndarray, "rows columns"]) -> _Reduced:
+    """numpy.linalg.qr takes twice the time, for copies."""
+    from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
+
+    length = _lengths(joined)
+    qr, tau, *_ = dgeqrf(joined / length, overwrite_a=True)
+    return _Reduced(qr, tau, length)
+
+
 def _triangle(matrix: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
-    """R of the QR decomposition. numpy.linalg.qr takes twice the time, for copies."""
+    """R of the QR decomposition."""
     from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
 
     return np.triu(dgeqrf(matrix, overwrite_a=True)[0][: matrix.shape[1]])
+
+
+def _extended(
+    reduced: _Reduced, further: Float[np.ndarray, "rows columns"]
+) -> tuple[Float[np.ndarray, "all all"], Float[np.ndarray, " all"]]:
+    """R and lengths of all columns that are reduced, but the last, and of `further` ones."""
+    from scipy.linalg.lapack import dormqr  # pyright: ignore[reportAttributeAccessIssue]
+
+    count, length = len(reduced.tau) - 1, _lengths(further)
+    kept, size = reduced.qr[:, :count], count + further.shape[1]
+    work = 64 * further.shape[1]
+    turned = dormqr("L", "T", kept, reduced.tau[:count], further / length, work, overwrite_c=True)[
+        0
+    ]
+    triangle = np.zeros((size, size))
+    triangle[:count, :count], triangle[:count, count:] = np.triu(kept[:count]), turned[:count]
+    triangle[count:, count:] = _triangle(turned[count:])
+    return triangle, np.concatenate([reduced.length[:count], length])
 
 
 def _stacked(
