@@ -71,7 +71,8 @@ def refine(
     - `record`: a `jq.Record` or a list of them.
     - `noise`: None for white noise (output error), or a model of each output's own noise:
         `jq.identify.AutoRegressive(order)`, `jq.identify.ARMA(poles, zeros)`, or "auto" for the one
-        of lowest Akaike criterion. `Fit.noise_models` has what was found.
+        of lowest Akaike criterion, with a `loop` always autoregressive. `Fit.noise_models` has what
+        was found.
     - `free`, `tied`, `priors`: as in `jq.fit`.
     - `loop`: the controller that closed the loop in which the record was flown, as `jq.PID` or
         `jq.LADRC`: anything with a method `linear()`, taken as exact and without limits. The
@@ -110,6 +111,8 @@ def refine(
     base = _base(model, parameters, priors)
     terms = tuple(_term(model, one, hold, band, loop) for one in records)
     problem = _with_units(OutputError(base, terms, _fixed_zeros(model, parameters)))
+    if noise == "auto" and loop is not None:
+        noise = AutoRegressive()  # a loop shapes its noise by more poles than a few zeros follow
     if noise is None:
         descent = descend_by_turns(problem, max_steps)
     else:

@@ -98,6 +98,15 @@ def test_what_does_not_go_with_a_loop_is_refused():
 
 
 @pytest.mark.slow
+def test_the_noise_of_a_known_loop_is_modelled_by_poles_alone():
+    """The loop's own poles are in it: a few zeros do not stand for them."""
+    fit = refine(TRUTH, flown(1)[0], free=FREE, loop=Filtered(), noise="auto")
+    [[model]] = fit.noise_models
+    poles, zeros = model.order
+    assert poles > 2 and zeros == 0
+
+
+@pytest.mark.slow
 def test_without_a_noise_model_the_estimate_in_a_known_loop_is_unbiased():
     """Slow noise that feedback returns to the input biases output error by many errors."""
     start = jq.TransferFunction([13.5], [0.06, 1.0, 0.0], 0.0)
