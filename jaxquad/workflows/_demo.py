@@ -21,15 +21,15 @@ DEMO = IdentifySettings(
 )
 
 
-def write_demo_log(path: str | Path) -> Path:
-    """Write time, reference x0, command M and rate q as CSV; the same at every call.
+def write_demo_log(path: str | Path, seed: int = 0) -> Path:
+    """Write time, reference x0, command M and rate q as CSV; the same for the same seed.
 
     An axis under rate feedback, in gusts, is excited by a sweep of its command. `DEMO` holds the
     settings to identify it with, `DEMO_TRUTH` the true parameters.
     """
     low, high = 2 * np.pi * 0.4, 2 * np.pi * 15
     signal = sweep(low, high, duration=40, sample_rate=_RATE, amplitude=0.06)
-    command, rate = _simulated(signal.signal)
+    command, rate = _simulated(signal.signal, seed)
     columns = (signal.time, signal.signal, command, rate)
     rows = ("{:.6f},{:.8g},{:.8g},{:.8g}\n".format(*row) for row in zip(*columns, strict=True))
     return write_file(Path(path), f"time,x0,M,q\n{''.join(rows)}")
@@ -50,9 +50,9 @@ def find_demo_flight() -> tuple[Path, IdentifySettings]:
     )  # fmt: skip
 
 
-def _simulated(swept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _simulated(swept: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """M = x0 - feedback q, held for a sample; q' = gain M(t - delay) behind a lag, and gusts."""
-    random = np.random.default_rng(0)
+    random = np.random.default_rng(seed)
     noise, shocks = random.standard_normal((2, swept.size))
     dt, delay = 1 / _RATE, round(_DELAY * _RATE)
     stay, hold = np.exp(-dt / _LAG), np.exp(-_CORNER * dt)
