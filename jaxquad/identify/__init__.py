@@ -10,6 +10,12 @@ from ._cost import (
     Points as Points,
     usable as usable,
 )
+from ._curve_parameters import (
+    actuator as actuator,
+    curve_of_parameter as curve_of_parameter,
+    CurveFirmware as CurveFirmware,
+    FirmwareValue as FirmwareValue,
+)
 from ._curves import (
     model_response as model_response,
     ResponseBand as ResponseBand,
@@ -17,6 +23,11 @@ from ._curves import (
     StepBand as StepBand,
 )
 from ._discrepancy import Discrepancy as Discrepancy
+from ._draw_models import (
+    check_drawable as check_drawable,
+    draw_models as draw_models,
+    known_covariance as known_covariance,
+)
 from ._explain import Candidate as Candidate, Explanation as Explanation
 from ._factors import Factor as Factor, Factors as Factors, factors as factors
 from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
@@ -58,12 +69,7 @@ from ._problem import (
     residuals as residuals,
 )
 from ._reduce import reduce_structure as reduce_structure, Reduction as Reduction
-from ._result import (
-    check_drawable as check_drawable,
-    draw_models as draw_models,
-    Fit as Fit,
-    known_covariance as known_covariance,
-)
+from ._result import Fit as Fit
 from ._simulated import integrate_plant as integrate_plant, linear_model as linear_model
 from ._solve import least_squares as least_squares, problem_normal as problem_normal
 from ._starts import (
@@ -72,10 +78,6 @@ from ._starts import (
     spread_starts as spread_starts,
 )
 from ._thrust_curve import (
-    actuator as actuator,
-    curve_of_parameter as curve_of_parameter,
-    CurveFirmware as CurveFirmware,
-    FirmwareValue as FirmwareValue,
     GainBand as GainBand,
     GainOverThrottle as GainOverThrottle,
     PlantsOverThrottle as PlantsOverThrottle,

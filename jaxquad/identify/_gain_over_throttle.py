@@ -22,10 +22,11 @@ from jaxquad.spectra import (
 )
 
 from ._cost import usable
+from ._curve_parameters import relative_slope
 from ._fit import fit, guess_lagged_integrator
 from ._problem import Condition
 from ._result import Fit
-from ._thrust_curve import GainOverThrottle, relative_slope, ThrottleLevels
+from ._thrust_curve import GainOverThrottle, ThrottleLevels
 
 
 _FEWEST = 8  # usable frequencies of a level

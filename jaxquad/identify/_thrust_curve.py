@@ -1,7 +1,7 @@
-"""The thrust curve t = f x^2 + (1 - f) x: gain, firmware parameters and b0 that follow from it."""
+"""The gain over the throttle by the thrust curve t = f x^2 + (1 - f) x, and b0."""
 
 from collections.abc import Callable, Mapping
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,52 +10,23 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
+from ._curve_parameters import (
+    actuator,
+    curve_parameter,
+    CurveFirmware,
+    FirmwareValue,
+    parameter_of_curve,
+)
+from ._draw_models import draw_models
 from ._fit_content import counted
-from ._result import draw_models, Fit
-from ._verdict import Combination, reach_of_interval, UndeterminedError
+from ._result import Fit
+from ._verdict import Combination, UndeterminedError
 
 
 Levels = Float[np.ndarray, " levels"]
-CurveFirmware = Literal["px4", "ardupilot", "betaflight", "betaflight 2025.12"]
-_PARAMETERS: Mapping[str, tuple[str, float, float, float]] = {  # name, factor on f, least, most
-    "px4": ("THR_MDL_FAC", 1.0, 0.0, 1.0),
-    "ardupilot": ("MOT_THST_EXPO", 1.0, -1.0, 1.0),
-    "betaflight": ("thrust_linear", 100.0, 0.0, 150.0),
-    "betaflight 2025.12": ("thrust_linear", 100.0, 0.0, 150.0),
-}
 _LAWS: Mapping[str, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
 _SHARP = 0.2  # half of the 95 % interval of f below which a firmware's parameter is given
 _DEGREES = {"deg/s": 1.0, "rad/s": 180 / np.pi}
-
-
-def actuator(throttle: Float[ArrayLike, "..."], curve: float) -> Float[np.ndarray, "..."]:
-    """The motor's command x, 0 to 1, of a firmware that inverts t = curve x^2 + (1 - curve) x."""
-    t = np.asarray(throttle, float)
-    if curve == 0:
-        return t
-    half = (1 - curve) / (2 * curve)
-    return np.asarray(-half + np.sign(curve) * np.sqrt(half**2 + t / curve))
-
-
-def relative_slope(
-    throttle: Float[ArrayLike, "..."], curve: float, flown: float
-) -> Float[np.ndarray, "..."]:
-    """The gain over the throttle, relative to that of the `flown` curve being right."""
-    x = actuator(throttle, flown)
-    return np.asarray((1 - curve + 2 * curve * x) / (1 - flown + 2 * flown * x))
-
-
-class FirmwareValue(NamedTuple):
-    """A parameter of a firmware that straightens the thrust curve, with its 95 % interval."""
-
-    name: str
-    value: float  # within the documented range
-    standard_error: float
-    interval: tuple[float, float]  # not cut to the range
-
-    def __str__(self) -> str:
-        low, high = self.interval
-        return f"{self.name} {self.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
 
 
 class ScaledB0(NamedTuple):
@@ -254,18 +225,10 @@ class GainOverThrottle(eqx.Module):
         - `UndeterminedError`: the record holds too little of the curve; says what to fly.
         - `ValueError`: for another firmware.
         """
-        if firmware not in _PARAMETERS:
-            raise ValueError(f"firmware is {firmware!r}: use one of {', '.join(_PARAMETERS)}")
-        name, factor, least, most = _PARAMETERS[firmware]
-        curve = self.curve
+        name, curve = curve_parameter(firmware), self.curve
         if curve is None or _reach(curve) > _SHARP:
             raise UndeterminedError(f"{name}: {self.what_to_fly()}")
-        convert = _cubic if firmware == "betaflight 2025.12" else _same
-        slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
-        value, error = factor * convert(curve.value), factor * abs(slope) * curve.standard_error
-        reach = reach_of_interval(curve.degrees_of_freedom) * error
-        kept = float(np.clip(value, least, most))
-        return FirmwareValue(name, kept, error, (value - reach, value + reach))
+        return parameter_of_curve(firmware, curve)
 
     def adrc_b0(self, hover: float, *, largest: float = 3.0) -> ScaledB0:
         """adrc_b0 and the law over the throttle of Betaflight's proposed ADRC.
@@ -348,7 +311,7 @@ class GainOverThrottle(eqx.Module):
             "curve": None if curve is None else _content(curve),
             "curve_flown": self.flown,
             "probability_of_curve": None if line is None else line.probability,
-            "firmware": [_content_of(each) for each in self._firmware_values()],
+            "firmware": [each.content() for each in self._firmware_values()],
             "advice": self.what_to_fly(),
             "fit": self.fit.to_dict(),
             "remarks": self.remarks,
@@ -493,47 +456,5 @@ def _reach(found: Combination) -> float:
     return _half(*found.interval)
 
 
-def _same(curve: float) -> float:
-    return curve
-
-
-def _cubic(curve: float) -> float:
-    """e of t (1 + e (1 - t)^2) nearest to the inverse of the thrust curve."""
-    t = (np.arange(1000) + 0.5) / 1000
-    shape = t * (1 - t) ** 2
-    return float(shape @ (actuator(t, curve) - t) / (shape @ shape))
-
-
-def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
-    """f of the thrust curve that a firmware inverts with this value of its parameter.
-
-    It is the inverse of `GainOverThrottle.firmware_value`.
-
-    **Arguments:**
-
-    - `firmware`: as there.
-    - `value`: of THR_MDL_FAC, MOT_THST_EXPO or thrust_linear.
-
-    **Returns:** -1 to 1; for thrust_linear beyond what a curve of this family can be, the nearest.
-
-    **Raises:**
-
-    - `ValueError`: for another firmware.
-    """
-    if firmware not in _PARAMETERS:
-        raise ValueError(f"firmware is {firmware!r}: use one of {', '.join(_PARAMETERS)}")
-    share = float(value) / _PARAMETERS[firmware][1]
-    if firmware == "betaflight 2025.12":
-        curves = np.linspace(0.0, 1.0, 201)
-        return float(np.interp(share, [_cubic(float(each)) for each in curves], curves))
-    return float(np.clip(share, -1.0, 1.0))
-
-
 def _content(found: Combination) -> dict[str, object]:
     return {**found._asdict(), "interval_95": found.interval}
-
-
-def _content_of(value: FirmwareValue) -> dict[str, object]:
-    kept: dict[str, object] = dict(value._asdict())
-    kept["interval_95"] = kept.pop("interval")
-    return kept

@@ -40,7 +40,6 @@ from ._flown import (
     FlownBetaflight as FlownBetaflight,
     FlownLoop as FlownLoop,
     px4_loop as px4_loop,
-    replay_terms as replay_terms,
 )
 from ._flown_adrc import (
     adrc_parameters as adrc_parameters,
@@ -82,6 +81,7 @@ from ._parameters import (
     with_parameters as with_parameters,
 )
 from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
+from ._replay import replay_terms as replay_terms
 from ._reproduce import (
     hold_response as hold_response,
     predict_loop as predict_loop,
