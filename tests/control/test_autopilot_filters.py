@@ -186,9 +186,10 @@ def test_a_harmonic_notch_is_ardupilots_bank_and_leaves_out_what_is_near_half_th
     expected = run_ardupilots_bank(NOISE, 397.0, 160.0, 35.0, harmonics, count, RATE)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
     quality, apart = firmware_quality(397.0, 160.0 / count), 160.0 / 32
+    residual = 10 ** (-35 / 20)
     places = {1: [0], 2: [-1, 1], 3: [-1, 0, 1], 5: [-2, -1, 0, 1, 2]}[count]
     rows = [
-        np.concatenate(prewarped(k * (397.0 + place * apart), quality, 10 ** (-35 / 20)))
+        np.hstack(list(map(np.asarray, prewarped(k * (397.0 + place * apart), quality, residual))))
         for k in (1, 2)
         for place in places
     ]
