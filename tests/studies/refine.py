@@ -139,8 +139,8 @@ def main() -> None:
             "the gusts pass two integrators, and feedback returns them to the input. With the "
             "controller known (`loop=`) it does not: the residuals are those of the loop.",
             "With a noise model the claimed errors are right within what the draws leave open, in "
-            "the closed loop too. With the controller known as well the estimate is no better: what "
-            "`loop=` buys is that it does not rest on the noise model.",
+            "the closed loop too. With the controller known as well the estimate is no better: "
+            "what `loop=` buys is that it does not rest on the noise model.",
         ],
     }
     write("refined", study)
