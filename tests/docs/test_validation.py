@@ -10,7 +10,7 @@ from conftest import ROOT
 
 
 STUDIES = ROOT / "tests" / "studies"
-sys.path.append(str(STUDIES))
+sys.path.insert(0, str(STUDIES))  # tests/benchmarks has a page.py, too
 from page import page, studies  # noqa: E402  # pyright: ignore
 
 
