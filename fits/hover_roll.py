@@ -18,8 +18,6 @@ from jaxquad.plot import bode
 from jaxquad.report import provenance, write_report, write_results
 
 
-if __name__ == "__main__":  # To look for garbage among modules takes a tenth of the time.
-    gc.set_threshold(100_000, 10, 10)
 jq.enable_x64()
 
 DT = 0.002  # s
@@ -200,4 +198,5 @@ def main(out: Path, seed: int, draws: int) -> None:
 
 if __name__ == "__main__":
     jq.enable_compile_cache()
+    gc.set_threshold(100_000, 10, 10)  # a tenth of the time would go to what lives on anyway
     main(**vars(options()))

@@ -12,6 +12,8 @@ from ._cost import (
 )
 from ._curve_parameters import (
     actuator as actuator,
+    B0Law as B0Law,
+    B0Schedule as B0Schedule,
     curve_of_parameter as curve_of_parameter,
     CurveFirmware as CurveFirmware,
     FirmwareValue as FirmwareValue,

@@ -1,4 +1,4 @@
-"""The thrust curve t = f x^2 + (1 - f) x, and the firmwares' parameters that invert it."""
+"""The thrust curve t = f x^2 + (1 - f) x, and the firmwares' parameters that go by it."""
 
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
@@ -105,3 +105,28 @@ def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
         curves = np.linspace(0.0, 1.0, 201)
         return float(np.interp(share, [_cubic(float(each)) for each in curves], curves))
     return float(np.clip(share, -1.0, 1.0))
+
+
+B0Law = Literal["FIXED", "SQRT", "LINEAR", "QUADRATIC"]
+B0_POWERS: Mapping[B0Law, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
+
+
+class B0Schedule(NamedTuple):
+    """How Betaflight's proposed ADRC scales b0 over the throttle.
+
+    **Arguments:**
+
+    - `law`: adrc_b0_law.
+    - `hover`: adrc_hover_throttle, 0 to 1, where the scale is 1.
+    - `low`, `high`: adrc_b0_scale_min and adrc_b0_scale_max, as factors.
+    """
+
+    law: B0Law
+    hover: float
+    low: float = 1.0
+    high: float = 3.0
+
+    def scale(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "..."]:
+        """The factor on b0 at a throttle of 0 to 1."""
+        scale = (np.asarray(throttle) / self.hover) ** B0_POWERS[self.law]
+        return np.asarray(np.clip(scale, self.low, self.high))

@@ -12,6 +12,9 @@ from jaxquad._core import plain_content
 
 from ._curve_parameters import (
     actuator,
+    B0_POWERS,
+    B0Law,
+    B0Schedule,
     curve_parameter,
     CurveFirmware,
     FirmwareValue,
@@ -24,7 +27,6 @@ from ._verdict import Combination, UndeterminedError
 
 
 Levels = Float[np.ndarray, " levels"]
-_LAWS: Mapping[str, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
 _SHARP = 0.2  # half of the 95 % interval of f below which a firmware's parameter is given
 _DEGREES = {"deg/s": 1.0, "rad/s": 180 / np.pi}
 
@@ -38,8 +40,8 @@ class ScaledB0(NamedTuple):
 
     hover: float  # throttle, 0 to 1
     b0: Combination  # at hover, deg/s^3 per unit of command
-    law: str
-    deviations: Mapping[str, float]
+    law: B0Law
+    deviations: Mapping[B0Law, float]
     extrapolated: bool  # hover lies outside of what was flown
 
     def __str__(self) -> str:
@@ -256,8 +258,10 @@ class GainOverThrottle(eqx.Module):
         b0 = Combination("b0", factor * value, factor * error, freedom)
         grid = np.linspace(self.low.min(), self.high.max(), 41)
         measured = self.b0_over(grid).value / value
-        scales = {law: np.clip((grid / hover) ** p, 1.0, largest) for law, p in _LAWS.items()}
-        far = {law: float(np.max(np.abs(each / measured - 1))) for law, each in scales.items()}
+        far: dict[B0Law, float] = {
+            law: _distance(B0Schedule(law, hover, high=largest).scale(grid), measured)
+            for law in B0_POWERS
+        }
         outside = not self.low.min() <= hover <= self.high.max()
         return ScaledB0(hover, b0, min(far, key=lambda law: far[law]), far, outside)
 
@@ -458,3 +462,8 @@ def _reach(found: Combination) -> float:
 
 def _content(found: Combination) -> dict[str, object]:
     return {**found._asdict(), "interval_95": found.interval}
+
+
+def _distance(scale: Float[np.ndarray, " points"], measured: Float[np.ndarray, " points"]) -> float:
+    """The largest relative distance."""
+    return float(np.max(np.abs(scale / measured - 1)))

@@ -449,9 +449,9 @@ def _extended(
     count, length = len(reduced.tau) - 1, _lengths(further)
     kept, size = reduced.qr[:, :count], count + further.shape[1]
     work = 64 * further.shape[1]
-    turned = dormqr("L", "T", kept, reduced.tau[:count], further / length, work, overwrite_c=True)[
-        0
-    ]
+    turned, *_ = dormqr(
+        "L", "T", kept, reduced.tau[:count], further / length, work, overwrite_c=True
+    )
     triangle = np.zeros((size, size))
     triangle[:count, :count], triangle[:count, count:] = np.triu(kept[:count]), turned[:count]
     triangle[count:, count:] = _triangle(turned[count:])

@@ -14,14 +14,12 @@ from jaxtyping import Float
 
 from jaxquad._core import announce, plain_content
 from jaxquad.control.autopilots import (
-    B0Law,
-    B0Schedule,
     find_parameter,
     FlownADRC,
     Parameter,
     store_parameters,
 )
-from jaxquad.identify import GainOverThrottle, ScaledB0, UndeterminedError
+from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, UndeterminedError
 from jaxquad.records import AXES
 
 from ._adrc_loops import ADRCFrame, ADRCLoop, Designs, draw_at, Flown, make_adrc_loop
@@ -31,7 +29,6 @@ from ._rate_gains import LoopQualities
 
 Design = Float[np.ndarray, "3"]  # wc, wo, b0
 _LAW: B0Law = "SQRT"  # of the firmware by default
-_LAWS: tuple[B0Law, ...] = ("FIXED", "SQRT", "LINEAR", "QUADRATIC")
 _POINTS, _LEVELS, _ROUGH, _NARROWED = 5, 8, 5, 0.55  # the first levels on one plant each
 _RESERVE = 0.97  # of the limits, because fresh plants reach further than those that were tuned on
 _CERTIFICATES = 3
@@ -284,8 +281,7 @@ def _frame(
         return frame, None, degrees * found.b0(0).value / scale
     scaled = found.adrc_b0(at, largest=frame.schedule.high)
     if not isinstance(flown, FlownADRC):
-        [law] = [each for each in _LAWS if each == scaled.law]
-        frame = frame._replace(schedule=frame.schedule._replace(law=law))
+        frame = frame._replace(schedule=frame.schedule._replace(law=scaled.law))
     return frame, scaled, scaled.b0.value
 
 

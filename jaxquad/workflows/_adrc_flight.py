@@ -17,7 +17,7 @@ from jaxquad.control.autopilots import (
 )
 from jaxquad.identify import gain_over_throttle, GainOverThrottle, UndeterminedError
 from jaxquad.loops import FlownLoop as Reproduction, reproduce_flight
-from jaxquad.records import Proposal, ReadError, Record, RecordError, RecordWarning
+from jaxquad.records import Proposal, Record, RecordError, RecordWarning
 from jaxquad.spectra import (
     frequency_response,
     FrequencyResponse,
@@ -28,7 +28,7 @@ from jaxquad.spectra import (
 from ._adrc import ADRCTargets, propose_adrc
 from ._adrc_loops import Flown, gyro_filters
 from ._adrc_result import ADRCAutopilot
-from ._flight_channels import FlightChannels, read_channels
+from ._flight_channels import FlightChannels, HOVER, read_channels_if_any
 from ._flown_autopilot import settings_of
 from ._kinds import SettingsError
 from ._log import read_records
@@ -37,7 +37,6 @@ from ._tune_settings import AutopilotSettings
 
 
 _LINES = 40  # frequencies of a reproduced response
-_AT_HOVER = 0.3  # of the throttle, where the log does not say at which dynamic filters were
 
 
 def flew_adrc(path: Path, proposal: Proposal) -> bool:
@@ -121,10 +120,7 @@ def _read_flown(
 ) -> tuple[Flown, FlightChannels | None]:
     """The loop of the header at the throttle of the log, and the channels beside the record's."""
     given = settings_of(path, proposed)
-    try:
-        flight = read_channels(path, proposed, asked, given.values)
-    except (ReadError, RecordError):  # the record has what identification needs, and says so
-        flight = None
+    flight = read_channels_if_any(path, proposed, asked, given.values)
     read = betaflight_adrc_loop if flies_adrc(given.values) else betaflight_loop
     return read(given.values, given.version, throttle=_middle(flight, settings)), flight
 
@@ -133,9 +129,7 @@ def _middle(flight: FlightChannels | None, settings: AutopilotSettings) -> float
     """The throttle at which dynamic filters are taken for the record."""
     if settings.throttle is not None:
         return settings.throttle
-    if flight is None or flight.throttle is None:
-        return _AT_HOVER
-    return float(np.clip(np.median(flight.throttle), 0.01, 1.0))
+    return (None if flight is None else flight.middle) or HOVER
 
 
 def _check_hover(flown: Flown, settings: AutopilotSettings) -> None:

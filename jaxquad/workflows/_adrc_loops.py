@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from jaxquad.control.autopilots import B0Schedule, FilterChain, FlownADRC, FlownBetaflight, PT2
-from jaxquad.identify import draw_models, GainOverThrottle
+from jaxquad.control.autopilots import FilterChain, FlownADRC, FlownBetaflight, PT2
+from jaxquad.identify import B0Schedule, draw_models, GainOverThrottle
 
 from ._rate_gains import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
 

@@ -24,8 +24,6 @@ from jaxquad.loops import FlownLoop as Reproduction, reproduce_flight
 from jaxquad.records import (
     AXES,
     Proposal,
-    ReadError,
-    RecordError,
 )
 from jaxquad.report import provenance, write_json, write_pilot_page
 from jaxquad.spectra import (
@@ -37,7 +35,7 @@ from jaxquad.spectra import (
 
 from ._adrc_flight import flew_adrc, tune_adrc
 from ._adrc_result import ADRCAutopilot
-from ._flight_channels import FlightChannels, read_channels
+from ._flight_channels import FlightChannels, read_channels_if_any
 from ._flown_autopilot import FlownAutopilot, read_flown, settings_of
 from ._gyro_noise import GyroNoise
 from ._identify import Identification, identify
@@ -352,13 +350,9 @@ def _read_flight(
 ) -> tuple[FlownAutopilot, FlightChannels | None]:
     """The loop that flew, at the throttle of the log, and the channels beside the record's."""
     values = settings_of(path, proposal).values
-    try:
-        flight = read_channels(path, proposal, asked, values)
-    except (ReadError, RecordError):  # the record has what identification needs, and says so
-        flight = None
-    if settings.throttle is None and flight is not None and flight.throttle is not None:
-        middle = float(np.clip(np.median(flight.throttle), 0.01, 1.0))
-        settings = dataclasses.replace(settings, throttle=middle)
+    flight = read_channels_if_any(path, proposal, asked, values)
+    if settings.throttle is None and flight is not None:
+        settings = dataclasses.replace(settings, throttle=flight.middle)
     tracked = {} if flight is None else flight.tracked_hz
     return read_flown(path, proposal, settings, tracked), flight
 

@@ -11,13 +11,23 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxquad.control.autopilots import Firmware
-from jaxquad.records import AXES, channels, Proposal, read, Record, RecordError, RecordWarning
+from jaxquad.records import (
+    AXES,
+    channels,
+    Proposal,
+    read,
+    ReadError,
+    Record,
+    RecordError,
+    RecordWarning,
+)
 
 from ._settings import IdentifySettings
 
 
 Samples = Float[np.ndarray, " samples"]
 _TERMS = ("P", "I", "D", "F")
+HOVER = 0.3  # of the throttle, where a log does not hold it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +59,23 @@ class FlightChannels:
     throttle: Samples | None = None
     names: tuple[str, str] = ("", "")
     tracked_hz: Mapping[int, tuple[float, ...]] = dataclasses.field(default_factory=dict)
+
+    @property
+    def middle(self) -> float | None:
+        """The median throttle, at which filters that follow it are taken."""
+        if self.throttle is None:
+            return None
+        return float(np.clip(np.median(self.throttle), 0.01, 1.0))
+
+
+def read_channels_if_any(
+    path: Path, proposal: Proposal, settings: IdentifySettings, values: Mapping[str, str]
+) -> FlightChannels | None:
+    """None where they cannot be read: the record has what identification needs, and says so."""
+    try:
+        return read_channels(path, proposal, settings, values)
+    except (ReadError, RecordError):
+        return None
 
 
 def read_channels(

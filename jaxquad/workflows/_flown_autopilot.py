@@ -10,6 +10,7 @@ from jaxquad._core import Number
 from jaxquad.control.autopilots import change_filters, Firmware, flown_loop
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
+from ._flight_channels import HOVER
 from ._rate_gains import gains_of, parameters_of, RateLaw
 from ._tune_settings import AutopilotSettings
 
@@ -60,9 +61,6 @@ def settings_of(path: Path, proposal: Proposal) -> LogSettings:
     return read_settings(path, log=prefix, at=at)
 
 
-_HOVER = 0.3  # of the throttle, where a log does not hold it
-
-
 def read_flown(
     path: Path, proposal: Proposal, settings: AutopilotSettings,
     tracked_hz: Mapping[int, Sequence[float]],
@@ -72,7 +70,7 @@ def read_flown(
     axis = AXES.index(setup.axis)
     known: dict[str, Firmware] = {"betaflight": "betaflight", "px4": "px4"}
     firmware = known.get(proposal.vehicle, "ardupilot")
-    throttle = _HOVER if settings.throttle is None else settings.throttle
+    throttle = HOVER if settings.throttle is None else settings.throttle
     loop = flown_loop(
         firmware, given.values, given.version, throttle=throttle, tracked_hz=tracked_hz
     )

@@ -7,10 +7,10 @@ from adrc_flights import ADRC, HEADER
 from jaxquad.control.autopilots import (
     adrc_parameters,
     b0_law,
-    B0Schedule,
     betaflight_adrc_loop,
     flies_adrc,
 )
+from jaxquad.identify import B0Schedule
 
 
 VERSION = (2026, 6, 0)

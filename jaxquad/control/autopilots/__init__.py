@@ -44,8 +44,6 @@ from ._flown import (
 from ._flown_adrc import (
     adrc_parameters as adrc_parameters,
     b0_law as b0_law,
-    B0Law as B0Law,
-    B0Schedule as B0Schedule,
     betaflight_adrc_loop as betaflight_adrc_loop,
     flies_adrc as flies_adrc,
     FlownADRC as FlownADRC,

@@ -2,12 +2,10 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
 
 import equinox as eqx
-import numpy as np
-from jaxtyping import ArrayLike, Float
 
+from jaxquad.identify import B0Law, B0Schedule
 from jaxquad.records import AXES
 
 from ._betaflight import BetaflightADRC
@@ -16,32 +14,8 @@ from ._flown import betaflight_loop, FlownBetaflight, FlownLoop
 from ._parameters import list_parameters
 
 
-B0Law = Literal["FIXED", "SQRT", "LINEAR", "QUADRATIC"]
-_POWERS: Mapping[B0Law, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
 _NUMBERED: tuple[B0Law, ...] = ("QUADRATIC", "SQRT", "LINEAR", "FIXED")  # as the header counts them
-_LARGEST, _LARGEST_WITHOUT_LAW = 3.0, 9.0  # adrc_b0_scale_max, with adrc_b0_law and before it
-
-
-class B0Schedule(NamedTuple):
-    """How Betaflight's proposed ADRC scales b0 over the throttle.
-
-    **Arguments:**
-
-    - `law`: adrc_b0_law.
-    - `hover`: adrc_hover_throttle, 0 to 1, where the scale is 1.
-    - `low`, `high`: adrc_b0_scale_min and adrc_b0_scale_max, as factors.
-    """
-
-    law: B0Law
-    hover: float
-    low: float = 1.0
-    high: float = _LARGEST
-
-    def scale(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "..."]:
-        """The factor on b0 at a throttle of 0 to 1."""
-        power = _POWERS[self.law]
-        scale = (np.asarray(throttle) / self.hover) ** power
-        return np.asarray(np.clip(scale, self.low, self.high))
+_LARGEST_WITHOUT_LAW = 9.0  # adrc_b0_scale_max of a build without adrc_b0_law
 
 
 class FlownADRC(FlownLoop[BetaflightADRC]):
@@ -170,7 +144,7 @@ def _schedule(values: Mapping[str, str]) -> B0Schedule:
         law or "QUADRATIC",
         _number(values, "adrc_hover_throttle", 35.0) / 100,
         _number(values, "adrc_b0_scale_min", 100.0) / 100,
-        _number(values, "adrc_b0_scale_max", _LARGEST if law else _LARGEST_WITHOUT_LAW),
+        _number(values, "adrc_b0_scale_max", 3.0 if law else _LARGEST_WITHOUT_LAW),
     )
 
 
