@@ -23,9 +23,9 @@ class DampedGaussNewton(optx.AbstractLeastSquaresSolver):
     """Gauss-Newton on the normal equations, damped as far as its steps fail.
 
     For `optimistix.least_squares` over a vector of parameters of like size, with one vector of
-    residuals. A step that meets NaN is shortened like any that fails. `result` is
-    `nonlinear_divergence` where no shorter step helps either; the last point is then the best.
-    Without LAPACK, so `vmap` over solves is safe on few cores.
+    residuals and nothing beside it. A step that meets NaN is shortened like any that fails.
+    `result` is `nonlinear_divergence` where no shorter step helps either; the last point is then
+    the best. Without LAPACK, so `vmap` over solves is safe on few cores.
     Source: Nielsen (1999), Damping parameter in Marquardt's method, IMM-REP-1999-05.
     """
 
@@ -50,7 +50,7 @@ class DampedGaussNewton(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags) -> tuple[Array, Descent, PyTree]:
         state = advance(self._evaluation(fn, args), state, jnp.iinfo(jnp.int32).max, self.rtol)
         state = jax.lax.cond(state.status == STALLED, settle, lambda same: same, state)
-        return state.z, state, fn(y, args)[1]
+        return state.z, state, None  # to ask `fn` for it would trace the residuals once more
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         failed = optx.RESULTS.nonlinear_divergence

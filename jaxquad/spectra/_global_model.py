@@ -212,8 +212,8 @@ def _identify(
     chosen = _choose(white.pick(every), most, scale) if np.ptp(weight) > 0 else first
     if chosen is None:
         return None
-    solved = _descend(white, chosen.denominator, _SETTLED)
-    basis = _basis(white, len(solved.denominator))
+    basis = _basis(white, len(chosen.denominator))
+    solved = _descend(white, basis, chosen.denominator, _SETTLED)
     fixed = basis.largest(solved.denominator)
     slopes = _stacked(_slopes(basis, solved, fixed))
     length = np.linalg.norm(slopes, axis=0)
@@ -246,13 +246,14 @@ def _choose(equations: Equations, most: int, scale: float) -> Solved | None:
         parameters = equations.parameters(order)
         if parameters * _PER_PARAMETER > count:
             break
-        solved = _descend(equations, _relax(equations, order), _TRIAL)
+        basis = _basis(equations, order + 1)
+        solved = _descend(equations, basis, _relax(equations, basis), _TRIAL)
         value = _information(solved.cost + 0.01 * floor, parameters, count)
         # What mirrored poles find must not end the search: higher orders may find more.
         worse, lowest = (0, value) if value < lowest else (worse + 1, lowest)
         mirrored = _mirrored(solved.denominator, scale) if order <= _FEW else None
         if mirrored is not None:
-            again = _descend(equations, mirrored, _TRIAL)
+            again = _descend(equations, basis, mirrored, _TRIAL)
             solved = again if again.cost < solved.cost else solved
             value = _information(solved.cost + 0.01 * floor, parameters, count)
         if value < least:
@@ -280,9 +281,8 @@ def _proportional(equations: Equations) -> float:
     return _solve(equations, _basis(equations, 1), np.ones(1)).cost
 
 
-def _relax(equations: Equations, order: int) -> Float[np.ndarray, " powers"]:
+def _relax(equations: Equations, basis: "_Basis") -> Float[np.ndarray, " powers"]:
     """The denominator by repeated linear least squares, each weighted by the one before."""
-    basis = _basis(equations, order + 1)
     moved = basis.powers * equations.y[:, None]
     weight, best = np.ones((len(moved), 1)), None
     for _ in range(_RELAXATIONS):
@@ -323,10 +323,12 @@ def _null_vector(matrix: Float[np.ndarray, "rows columns"], first: int) -> Vecto
 
 
 def _descend(
-    equations: Equations, denominator: Float[np.ndarray, " powers"], least_gain: float
+    equations: Equations,
+    basis: "_Basis",
+    denominator: Float[np.ndarray, " powers"],
+    least_gain: float,
 ) -> Solved:
     """Gauss-Newton steps of the denominator, until one gains too little; the rest is linear."""
-    basis = _basis(equations, len(denominator))
     solved, reduced = _project(equations, basis, denominator)
     floor = _EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for _ in range(_STEPS):
