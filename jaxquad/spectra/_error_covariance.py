@@ -83,7 +83,8 @@ class ErrorCovariance(eqx.Module):
     Real parameters p that the same noise W[a, c] has disturbed, as those of a model that all
     frequencies share, add `sensitivity[f, o, i, p] Re(sum_ac drive[p, a, c] W[a, c])`, where
     V[a, o] = sum_c noise[f, o, c] W[a, c]: an effect that is linear in the real and the imaginary
-    part of the noise apart. They need atoms without windows and `share`.
+    part of the noise apart. They need atoms without windows and `share`; `drive` is that of the
+    first atoms, and the others have none.
     """
 
     omega: Float[Numbers, " frequencies"]  # rad/s
@@ -93,7 +94,7 @@ class ErrorCovariance(eqx.Module):
     windows: Placement | None = None
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)  # one group without
     sensitivity: Complex[Numbers, "frequencies outputs inputs parameters"] | None = None
-    drive: Complex[Numbers, "parameters atoms roots"] | None = None
+    drive: Complex[Numbers, "parameters driven roots"] | None = None
 
     def project(
         self, columns: Complex[Numbers, "frequencies outputs inputs columns"]
@@ -109,8 +110,9 @@ class ErrorCovariance(eqx.Module):
             seen = seen.reshape(-1, places).T
             along = np.swapaxes(drawn, 1, 2).reshape(frequencies * groups * inputs, -1)
             part = (seen @ along).reshape(places, -1, count)
-            if moved is not None:
-                part += np.einsum("nac,np->acp", np.asarray(self.drive)[:, atoms], moved)
+            if moved is not None and self.drive is not None:
+                drive = np.asarray(self.drive)[:, atoms[0] : atoms[-1] + 1]
+                part[: drive.shape[1]] += np.einsum("nac,np->acp", drive, moved)
             part = part.reshape(-1, count)
             total += 0.5 * np.real(part.T @ part.conj())
         return total
@@ -128,7 +130,7 @@ class ErrorCovariance(eqx.Module):
         if self.sensitivity is None or self.drive is None:
             return total
         slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
-        both = np.tensordot(effect, np.conj(drive), axes=(2, 1))
+        both = np.tensordot(effect[:, :, : drive.shape[1]], np.conj(drive), axes=(2, 1))
         both = np.einsum("finc,foc,foin->foi", both, noise, np.conj(slope), optimize=True)
         flat = drive.reshape(len(drive), -1)
         moved = slope @ (0.5 * np.real(flat @ np.conj(flat).T))
@@ -150,7 +152,13 @@ class ErrorCovariance(eqx.Module):
         drive = np.asarray(self.drive)
         mine, its = (np.asarray(self.sensitivity)[:, o, i] for o, i in (first, second))
         local = [
-            np.einsum("ft,ntc,fc->fn", effect, np.conj(drive), noise[:, pair[0]], optimize=True)
+            np.einsum(
+                "ft,ntc,fc->fn",
+                effect[:, : drive.shape[1]],
+                np.conj(drive),
+                noise[:, pair[0]],
+                optimize=True,
+            )
             for effect, pair in ((one, first), (other, second))
         ]
         flat = drive.reshape(len(drive), -1)

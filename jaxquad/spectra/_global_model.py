@@ -139,7 +139,7 @@ def global_models(
     (rad/s). Above 20000 of them one of each n is taken: each is an equation of its own, so thinning
     costs precision, never resolution. The order is chosen with 4000 at most.
     """
-    reach = int(np.searchsorted(bins.omega, _BEYOND * highest, "right"))
+    reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
     places = _thin(reach, _MOST_BINS)
     lag = np.exp(-1j * dt * bins.omega[places]) - 1
     scale = float(np.abs(lag[-1])) / 2
@@ -154,6 +154,11 @@ def global_models(
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
         for one in found
     ]
+
+
+def highest_modelled(highest: float) -> float:
+    """Frequency in rad/s up to which bins are modelled for responses up to `highest`."""
+    return _BEYOND * highest
 
 
 def _thin(count: int, most: int) -> Int[np.ndarray, " places"]:

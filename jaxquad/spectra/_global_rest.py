@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._global_model import global_models, GlobalModel
-from ._local_fit import Bins, local_fit, LocalFit, window_slices
+from ._global_model import global_models, GlobalModel, highest_modelled
+from ._local_fit import Bins, largest_values, local_fit, LocalFit, window_slices
 from ._local_noise import Noise, SharedErrors
 
 
@@ -55,15 +55,20 @@ class Rest(NamedTuple):
         inputs = self.sources.stop - self.sources.start
         # A long record has many times the bins that the windows reach.
         reached = slice(0, int(np.max(window_slices(omega, half_width, self.bins)[1])))
-        own = self.bins.values[:, self.sources]
         values = np.zeros((reached.stop, inputs + model.follow.shape[1]), complex)
-        values[:, :inputs] = own[reached]
+        values[:, :inputs] = self.bins.values[reached, self.sources]
         inside = model.places < reached.stop
         values[model.places[inside], inputs:] = model.follow[inside]
-        bins = Bins(self.bins.omega[reached], self.bins.record[reached], values, self.bins.records)
+        largest = self.bins.largest[self.sources], largest_values(model.follow)
+        bins = Bins(
+            self.bins.omega[reached],
+            self.bins.record[reached],
+            values,
+            self.bins.records,
+            np.concatenate(largest),
+        )
         columns = slice(0, inputs), slice(inputs, values.shape[1])
-        largest = np.max(np.abs(own), axis=0)
-        fit = local_fit(omega, half_width, bins, *columns, order, "polynomial", largest=largest)
+        fit = local_fit(omega, half_width, bins, *columns, order, "polynomial")
         left = np.real(np.trace(np.nan_to_num(fit.scatter), axis1=1, axis2=2))
         return 0.5 * left * np.maximum(fit.freedom, 1.0)
 
@@ -156,14 +161,19 @@ def shared_errors(
     places = used[0].places
     roots = noise.root_at(bins.omega[places])
     lines = roots / np.maximum(np.linalg.norm(roots, axis=2, keepdims=True), 1e-300)
-    counts = [0 if model is None else len(model.drive) for model in rest.models]
-    drive, first = np.empty((sum(counts), *lines[:, 0].shape), complex), 0
     for c, model in enumerate(rest.models):
-        if model is not None:
-            level = np.sqrt(model.noise)[:, None] * lines[:, c]
-            np.multiply(model.drive[:, :, None], level, out=drive[first : first + counts[c]])
-            first += counts[c]
-    return SharedErrors(slopes, drive, places)
+        lines[:, c] *= 0.0 if model is None else np.sqrt(model.noise)[:, None]
+    counts = [0 if model is None else len(model.drive) for model in rest.models]
+    line, drive = np.repeat(np.arange(len(counts)), counts), [model.drive for model in used]
+    return SharedErrors(slopes, np.concatenate(drive), lines, line, places)
+
+
+def highest_looked_at(highest: float, grid: Grid) -> float:
+    """Frequency in rad/s above which neither models nor `left_moving` on a `grid` take any bin.
+
+    The models are those of responses up to `highest`.
+    """
+    return max(highest_modelled(highest), np.exp(_AROUND) * grid[-1])
 
 
 _END, _FEWEST = 0.05, 20  # share of a record, and samples, that count as its end
@@ -179,14 +189,15 @@ def left_moving(
     of a mode narrower than their windows. `ends` are those of the records' channels as transformed,
     and `noise` is that of the moved channels on the `grid`.
     """
-    found = np.zeros(grid.size, bool)
+    found, bins = np.zeros(grid.size, bool), rest.bins
     for c in range(len(rest.models)):
-        power = noise.power_at(rest.bins.omega)[:, c]
-        level = float(np.mean(power))
+        power = noise._replace(power=noise.power[:, c : c + 1]).power_at(bins.omega)[:, 0]
+        # All bins that were left out have the power of the last one.
+        level = float(np.sum(power) + bins.above * power[-1]) / (bins.omega.size + bins.above)
         if not any(np.var(end[:, rest.moved.start + c]) > _MOVING * level for end in ends):
             continue
-        values = np.abs(rest.bins.values[:, rest.moved.start + c]) ** 2 / power
-        found |= _peaks(np.log(rest.bins.omega), values, np.log(grid))
+        values = np.abs(bins.values[:, rest.moved.start + c]) ** 2 / power
+        found |= _peaks(np.log(bins.omega), values, np.log(grid))
     return found
 
 

@@ -9,7 +9,14 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance
 from ._estimators import LocalPolynomial
 from ._feedback import COHERENT
-from ._global_rest import end_of, left_moving, Rest, shared_errors, subtract_models
+from ._global_rest import (
+    end_of,
+    highest_looked_at,
+    left_moving,
+    Rest,
+    shared_errors,
+    subtract_models,
+)
 from ._local_fit import (
     Bins,
     check_bins,
@@ -129,6 +136,7 @@ _DIVISIBLE = 0.15  # largest random error of an input's response to the referenc
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
 _NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are estimated
 _SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
+_WIDENED, _WIDENINGS = 1.5, 6  # ratio and number of the steps from a window that is undetermined
 _WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
 _MOST = 4096  # Fourier bins of a window, unless more lie around a frequency of the grid
 _PER_OCTAVE = 4  # further frequencies, which help to choose the widths
@@ -173,9 +181,11 @@ def estimate_local_polynomial(
     grid, at = _with_neighbours(omega, bins)
     least = smallest_widths(grid, bins, coefficients, order + 1, _FREEDOM)
     whole = _whole(bins, inputs, outputs, method)
-    rest = subtract_models(bins, *whole, omega[-1], records[0].dt, options.global_order)
     most = np.maximum(least, _most(grid, bins))
     narrow_width = np.clip(_NARROW * grid, least, most)
+    furthest = _furthest(grid, narrow_width, most, options)
+    bins = bins.up_to(max(furthest, highest_looked_at(omega[-1], grid)))
+    rest = subtract_models(bins, *whole, omega[-1], records[0].dt, options.global_order)
     stack = _fit_narrow(grid, narrow_width, rest, inputs, order)
     narrow = joint_fit(stack, inputs) if method == "joint" else stack
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
@@ -337,11 +347,11 @@ def _rows(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"]) -> LocalFit:
 def _fit_widened(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
     """The fit within `width`, widened where it is undetermined, as between multisine lines."""
     fit = respond(grid, width, "polynomial")
-    for _ in range(6):
+    for _ in range(_WIDENINGS):
         lost = ~np.isfinite(fit.response[:, 0, 0])
         if not np.any(lost):
             break
-        width = np.where(lost, 1.5 * width, width)
+        width = np.where(lost, _WIDENED * width, width)
         fit = replace_rows(fit, lost, respond(grid[lost], width[lost], "polynomial"))
     return fit
 
@@ -359,6 +369,12 @@ def _most(grid: Grid, bins: Bins) -> Grid:
     steps = np.diff(grid)
     spacing = np.maximum(np.append(steps, steps[-1:]), np.insert(steps, 0, steps[:1]))
     return np.maximum(spacing, _MOST / density) / 2
+
+
+def _furthest(grid: Grid, narrow: Grid, most: Grid, options: LocalPolynomial) -> float:
+    """The end in rad/s of the windows that reach furthest: no bin beyond it matters."""
+    width = np.maximum(narrow * _WIDENED**_WIDENINGS, most)
+    return float(np.max(grid + np.maximum(width, options.width or 0.0)))
 
 
 def _widths(

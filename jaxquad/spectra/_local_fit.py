@@ -20,6 +20,17 @@ class Bins(NamedTuple):
     record: Int[np.ndarray, " bins"]  # number of the record that it belongs to
     values: Complex[np.ndarray, "bins channels"]
     records: int
+    largest: Float[np.ndarray, " channels"]  # magnitudes at any bin, those left out included
+    above: int = 0  # number of bins that `up_to` left out
+
+    def up_to(self, highest: float) -> "Bins":
+        """A copy of the bins up to `highest` in rad/s, or these where there are no others."""
+        count = int(np.searchsorted(self.omega, highest, "right"))
+        if count == self.omega.size:
+            return self
+        kept = (part[:count].copy() for part in (self.omega, self.record, self.values))
+        above = self.above + self.omega.size - count
+        return Bins(*kept, self.records, self.largest, above)
 
 
 def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bins:
@@ -43,12 +54,18 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
         grids.append(grid)
         owners.append(np.full(last, index))
     if len(parts) == 1:
-        return Bins(grids[0], owners[0], parts[0], 1)
-    omega = np.concatenate(grids)
+        return Bins(grids[0], owners[0], parts[0], 1, largest_values(parts[0]))
+    omega, values = np.concatenate(grids), np.concatenate(parts)
     order = np.argsort(omega, kind="stable")
-    return Bins(
-        omega[order], np.concatenate(owners)[order], np.concatenate(parts)[order], len(parts)
-    )
+    owner, largest = np.concatenate(owners)[order], largest_values(values)
+    return Bins(omega[order], owner, values[order], len(parts), largest)
+
+
+def largest_values(
+    values: Complex[np.ndarray, "bins channels"],
+) -> Float[np.ndarray, " channels"]:
+    """The largest magnitude of each channel."""
+    return np.array([np.max(np.abs(channel), initial=0.0) for channel in values.T])
 
 
 def recolour(
@@ -295,18 +312,14 @@ def local_fit(
     outputs: slice,
     order: int,
     shape: Literal["polynomial", "rational"],
-    *,
-    largest: Float[np.ndarray, " inputs"] | None = None,
 ) -> LocalFit:
     """Fit the response and each record's transient around every frequency.
 
     `shape` says whether both are polynomials of `order`, or such polynomials over a common
-    denominator of the first degree; `largest` are the inputs' largest values at any bin, where
-    `bins` are not all of them.
+    denominator of the first degree.
     """
     first, last = window_slices(omega, half_width, bins)
-    peak = np.max(np.abs(bins.values[:, inputs]), axis=0) if largest is None else largest
-    threshold = _UNEXCITED * np.asarray(peak)
+    threshold = _UNEXCITED * bins.largest[inputs]
     longest = max(int(np.max(last - first)), 1)
     fields, places = [], np.argsort(last - first, kind="stable")
     size = min(_CHUNK, max(_BINS // longest, 1))

@@ -112,12 +112,29 @@ def _correlation(
 class SharedErrors(NamedTuple):
     """Errors of real parameters p that the noise at some bins has moved by Re(drive W).
 
-    W are circular noises of unit power, `roots` to a bin.
+    W are circular noises of unit power, `roots` to a bin. The drive is that of one noise of unit
+    power times its share of the roots: all of a long record at once would fill the memory.
     """
 
     slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"]
-    drive: Complex[np.ndarray, "parameters places roots"]
+    single: Complex[np.ndarray, "parameters places"]
+    lines: Complex[np.ndarray, "places lines roots"]
+    line: Int[np.ndarray, " parameters"]  # that each parameter's noise has in `lines`
     places: Int[np.ndarray, " places"]  # bins, rising
+
+    def drive_at(
+        self, taken: Int[np.ndarray, " taken"]
+    ) -> Complex[np.ndarray, "parameters taken roots"]:
+        """The drive by some of the `places`, numbers of which are `taken`."""
+        lines = np.swapaxes(self.lines[taken], 0, 1)
+        return self.single[:, taken, None] * lines[self.line]
+
+    def power(self) -> Float[np.ndarray, " parameters"]:
+        """Sum of |drive|^2 over all places and roots."""
+        level = np.sum(np.abs(self.lines) ** 2, axis=2)
+        return np.array(
+            [np.abs(row) ** 2 @ level[:, k] for row, k in zip(self.single, self.line, strict=True)]
+        )
 
 
 _CHANCE = 1e-5  # of calling a residual a misfit
@@ -156,13 +173,12 @@ def error_covariance(
     size = np.sqrt(noise.power[at]) * scale / np.maximum(np.linalg.norm(root, axis=2), 1e-300)
     root = root * size[:, :, None]
     known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
-    parameters = 0 if models is None else len(models.drive)
-    shared, atoms = _on_common_bins(np.where(known, effect * back, 0.0), places, parameters)
+    shared, driven = _on_common_bins(np.where(known, effect * back, 0.0), places, models)
     kind = np.where(known, root, np.eye(*root.shape[1:]))
     slopes = drive = None
     if models is not None:
         slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
-        slopes, drive = _on_common_atoms(slopes, models, atoms, shared.shape[2])
+        slopes, drive = _on_common_atoms(slopes, models, driven)
     shared[~known[:, 0, 0], :, 0] = _UNKNOWN
     return ErrorCovariance(np.asarray(omega), shared, kind, sensitivity=slopes, drive=drive)
 
@@ -289,15 +305,23 @@ def _misfit(
 def _on_common_bins(
     effect: Complex[np.ndarray, "frequencies inputs window"],
     places: Int[np.ndarray, "frequencies window"],
-    spare: int,
-) -> tuple[Complex[np.ndarray, "frequencies inputs atoms"], Int[np.ndarray, " bins"]]:
-    """The effects of all bins that have one, with zeros for `spare` further atoms, and the bins."""
+    models: SharedErrors | None,
+) -> tuple[Complex[np.ndarray, "frequencies inputs atoms"], Int[np.ndarray, " driven"]]:
+    """The effects of all bins that have one, and the bins of the first atoms.
+
+    First come the bins whose noise disturbs the `models` too, then an atom for each of their
+    parameters, with zeros, then all other bins.
+    """
     used = np.any(effect != 0, axis=1)
-    atoms, column = np.unique(places[used], return_inverse=True)
+    bins, atom = np.unique(places[used], return_inverse=True)
+    driven, spare = np.zeros(bins.size, bool), 0
+    if models is not None:
+        driven, spare = np.isin(bins, models.places), len(models.single)
+    column = np.where(driven, np.cumsum(driven), np.sum(driven) + spare + np.cumsum(~driven)) - 1
     row, step = np.nonzero(used)
-    shared = np.zeros((*effect.shape[:2], _padded(atoms.size + spare, _ATOMS)), complex)
-    shared[row, :, column] = effect[row, :, step]
-    return shared, atoms
+    shared = np.zeros((*effect.shape[:2], _padded(bins.size + spare, _ATOMS)), complex)
+    shared[row, :, column[atom]] = effect[row, :, step]
+    return shared, bins[driven]
 
 
 def _padded(count: int, block: int) -> int:
@@ -308,44 +332,38 @@ def _padded(count: int, block: int) -> int:
 def _on_common_atoms(
     slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"],
     models: SharedErrors,
-    atoms: Int[np.ndarray, " bins"],
-    count: int,
+    driven: Int[np.ndarray, " driven"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes by the parameters' errors of unit size, and their drive by `count` atoms.
+    """Slopes by the parameters' errors of unit size, and their drive by the first atoms.
 
     Bins that no local fit uses are one more atom for each parameter, with the same covariance.
     """
-    parameters, _, roots = models.drive.shape
-    size = np.sqrt(0.5 * np.array([_power(row) for row in models.drive]))
+    parameters, roots = len(models.single), models.lines.shape[2]
+    size = np.sqrt(0.5 * models.power())
     size = np.where(size > 0, size, 1.0)
-    column = np.searchsorted(atoms, models.places)
-    mine = np.isin(models.places, atoms)
-    values, vectors = np.linalg.eigh(_gram(models.drive, ~mine) / np.outer(size, size))
+    mine = np.isin(models.places, driven)
+    values, vectors = np.linalg.eigh(_gram(models, ~mine) / np.outer(size, size))
+    count = _padded(driven.size + parameters, _ATOMS)
     drive = np.zeros((_padded(parameters, _PARAMETERS), count, roots), complex)
-    for row, whole, unit in zip(drive, models.drive, size, strict=False):
-        row[column[mine]] = whole[mine] / unit
-    spare = slice(atoms.size, atoms.size + parameters)
+    drive[:parameters, : driven.size] = models.drive_at(np.flatnonzero(mine)) / size[:, None, None]
+    spare = slice(driven.size, driven.size + parameters)
     drive[:parameters, spare, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
     known = np.zeros((*slopes.shape[:3], len(drive)), complex)
     known[..., :parameters] = slopes * size
     return known, drive
 
 
-_TOGETHER = 4096  # bins whose drives are taken at a time: those of a long record are many
-
-
-def _power(drive: Complex[np.ndarray, "places roots"]) -> float:
-    return float(np.vdot(drive, drive).real)
+_TOGETHER = 1024  # bins whose drives are taken at a time: those of a long record are many
 
 
 def _gram(
-    drive: Complex[np.ndarray, "parameters places roots"], taken: Bool[np.ndarray, " places"]
+    models: SharedErrors, taken: Bool[np.ndarray, " places"]
 ) -> Float[np.ndarray, "parameters parameters"]:
-    """Real part of the products of all pairs of rows over the bins that are `taken`."""
-    total = np.zeros((len(drive), len(drive)))
-    places = np.flatnonzero(taken)
+    """Real part of the products of all pairs of drives over the bins that are `taken`."""
+    parameters, places = len(models.single), np.flatnonzero(taken)
+    total = np.zeros((parameters, parameters))
     for first in range(0, places.size, _TOGETHER):
-        part = drive[:, places[first : first + _TOGETHER]].reshape(len(drive), -1)
+        part = models.drive_at(places[first : first + _TOGETHER]).reshape(parameters, -1)
         rows = np.ascontiguousarray(part).view(float)  # real and imaginary parts in turn
         total += rows @ rows.T
     return total

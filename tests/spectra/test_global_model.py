@@ -60,18 +60,33 @@ def test_a_model_that_is_too_small_is_remarked_and_rest_is_advised():
     assert "still moves when the record ends" in remarks and "rest at the end" in remarks
 
 
-def test_variance_covariance_and_projection_of_shared_parameters_agree():
-    errors = estimate(0).errors
+def check_that_errors_agree(errors, o, i):
+    """Variance, covariance and projection of one pair."""
     assert errors.sensitivity is not None
-    covariance, variance = errors.between((0, 0), (0, 0)), errors.variance()[:, 0, 0]
+    covariance, variance = errors.between((o, i), (o, i)), errors.variance()[:, o, i]
     np.testing.assert_allclose(np.real(np.diag(covariance)), variance, rtol=1e-9)
     # The real part of an error, and the imaginary part, add up to its mean square.
-    columns = np.zeros((OMEGA.size, 1, 1, 2), complex)
-    columns[7, 0, 0] = 1.0, 1.0j
+    columns = np.zeros((*errors.variance().shape, 2), complex)
+    columns[7, o, i] = 1.0, 1.0j
     parts = np.asarray(errors.project(jnp.asarray(columns)))
     assert np.trace(parts) == pytest.approx(variance[7], rel=1e-9)
-    turned = errors.scaled(jnp.full(OMEGA.size, 2.0j)).pair(0, 0)
+    turned = errors.scaled(jnp.full(errors.omega.size, 2.0j)).pair(o, i)
     np.testing.assert_allclose(turned.variance()[:, 0, 0], 4 * variance, rtol=1e-9)
+
+
+def test_variance_covariance_and_projection_of_shared_parameters_agree():
+    check_that_errors_agree(estimate(0).errors, 0, 0)
+
+
+def test_errors_of_a_long_record_agree_where_windows_take_few_of_its_bins():
+    """Of 10 minutes at 1 kHz: most atoms have no part in the errors of the models."""
+    samples, rng = 600_000, np.random.default_rng(0)
+    u = signal.lfilter([0.02], [1, -0.98], rng.standard_normal((samples, 2)), axis=0)
+    y = signal.lfilter([0.01], [1, -0.99], u, axis=0) + 0.02 * rng.standard_normal(u.shape)
+    record = Record(np.arange(samples) / 1000.0, np.asarray(u), np.asarray(y))
+    errors = frequency_response(record, np.geomspace(0.5, 60.0, 30)).errors
+    assert errors.drive is not None and errors.drive.shape[1] < 0.6 * errors.effect.shape[2]
+    check_that_errors_agree(errors, 1, 0)
 
 
 def test_beyond_a_chirp_that_stops_at_once_there_is_no_response():
