@@ -37,12 +37,16 @@ from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from ._fit_remarks import MISFIT as MISFIT
 from ._gain_over_throttle import (
     gain_over_throttle as gain_over_throttle,
-    KnownFilter as KnownFilter,
     throttle_levels as throttle_levels,
     ThrottledIntegrator as ThrottledIntegrator,
 )
 from ._half_bands import Bands as Bands
 from ._held import as_sampled as as_sampled
+from ._known_filters import (
+    filter_response as filter_response,
+    KnownFilter as KnownFilter,
+    without_filters as without_filters,
+)
 from ._known_loop import (
     KnownController as KnownController,
     SampledFeedback as SampledFeedback,

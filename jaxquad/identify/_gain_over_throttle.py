@@ -1,14 +1,13 @@
 """The gain over the throttle: levels of throttle in records, one lag and delay, a gain for each."""
 
-import dataclasses
 import functools as ft
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from jaxquad._core import as_float
 from jaxquad.models import LaggedIntegrator
@@ -24,6 +23,7 @@ from jaxquad.spectra import (
 from ._cost import usable
 from ._curve_parameters import relative_slope
 from ._fit import fit, guess_lagged_integrator
+from ._known_filters import KnownFilter, without_filters
 from ._problem import Condition
 from ._result import Fit
 from ._thrust_curve import GainOverThrottle, ThrottleLevels
@@ -34,17 +34,6 @@ _LINES = 40  # frequencies of a response
 _QUIET = 0.03  # of the strongest excitation, below which a level holds none
 _SLOW_RATE = 100.0  # Hz, enough for levels alone
 _OVERSAMPLED = 5.0  # samples per cycle of the highest frequency
-
-
-@runtime_checkable
-class KnownFilter(Protocol):
-    """A filter of the log's output, as `jq.control.autopilots.FilterChain` is one."""
-
-    def response(
-        self, frequency_hz: Float[np.ndarray, " frequencies"]
-    ) -> Complex[Array, " frequencies"]:
-        """At frequencies in Hz."""
-        ...
 
 
 class ThrottledIntegrator(eqx.Module):
@@ -377,14 +366,7 @@ def _respond(
         columns[:, 0] *= relative_slope(piece.throttle, curve, flown) / middle
         records.append(_copied(record, record.time[inside], columns, record.hold))
     found = frequency_response(records, omega, estimator=estimator)
-    known = np.ones(omega.size, complex)
-    for each in filters:
-        known = known * np.asarray(each.response(omega / (2 * np.pi)))
-    return dataclasses.replace(
-        found,
-        response=found.response / known[:, None, None],
-        errors=found.errors.scaled(1 / known),
-    )
+    return without_filters(found, filters)
 
 
 def _result(

@@ -11,7 +11,15 @@ from jaxtyping import Bool, Complex, Float, PyTree
 from jaxquad._core import plain_content
 from jaxquad.control import LinearController
 from jaxquad.control.autopilots import predict_loop
-from jaxquad.identify import as_sampled, Fit, KnownFilter, MISFIT, model_response, usable
+from jaxquad.identify import (
+    as_sampled,
+    filter_response,
+    Fit,
+    KnownFilter,
+    MISFIT,
+    model_response,
+    usable,
+)
 from jaxquad.records import Record, select
 from jaxquad.spectra import frequency_response, FrequencyResponse, LocalPolynomial
 
@@ -183,8 +191,7 @@ def reproduce_flight(
     of_plant = lambda model: model if plant is None else plant(model)
     at = lambda model: factor * _only(model_response(as_sampled(of_plant(model), like), omega))
     slopes, by_gain, predicted = _slopes(fit, at, law, omega)
-    for each in filters:
-        predicted = predicted * np.asarray(each.response(omega / (2 * np.pi)))
+    predicted = predicted * filter_response(filters, omega)
     spread = np.real(np.einsum("pf,pq,qf->f", slopes.conj(), fit.relative_covariance, slopes))
     errors = _only(np.asarray(response.random_error)), np.sqrt(np.maximum(spread, 0.0) / 2)
     measured = _only(np.asarray(response.response))

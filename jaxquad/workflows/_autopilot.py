@@ -38,14 +38,14 @@ from ._adrc_result import ADRCAutopilot
 from ._flight_channels import FlightChannels, read_channels_if_any
 from ._flown_autopilot import FlownAutopilot, read_flown, settings_of
 from ._gyro_noise import GyroNoise
-from ._identify import Identification, identify
+from ._identify import Identification, identify_plant
 from ._kinds import SettingsError
 from ._log import propose_settings, read_records
 from ._over_throttle import study_throttle, ThrottleVerdict
 from ._pilot_page import pilot_page
 from ._plants import PlantSource
 from ._rate_design import design_gains, FilterVerdict, Kind
-from ._rate_gains import law_responses, Stage
+from ._rate_gains import gyro_chains, law_responses, Stage
 from ._settings import IdentifySettings
 from ._tune_settings import AutopilotSettings
 
@@ -64,7 +64,7 @@ class AutopilotProposal:
     - `kind`: "proposed"; "kept" where what flew is as good; "cannot tell" where the log does not
       show the plant or the loop; "not to be flown" where no gains keep the limits.
     - `verdict`: the same in words, and what to do.
-    - `identification`: of the plant, in the firmware's units.
+    - `identification`: of the plant, in the firmware's units, with the gyro's filters divided out.
     - `flown`: the loop that flew.
     - `reproduction`: that loop and plant compared with the flight; None without a plant.
     - `stages`: on fresh plants what flew, then a third of the way and all of it; empty where the
@@ -224,7 +224,8 @@ class AutopilotProposal:
         lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
         lines += [f"  not modelled: {each}" for each in flown.unmodelled]
-        lines += ["", f"plant, in the firmware's units:\n{self.identification.fit}"]
+        plant = "plant up to the gyro's filters, in the firmware's units"
+        lines += ["", f"{plant}:\n{self.identification.fit}"]
         if self.reproduction is not None:
             lines += ["", f"flown loop: {self.reproduction.verdict}"]
         if self.stages:
@@ -275,14 +276,14 @@ def autopilot(
     """Tune the gains of the autopilot that flew a log, as `jaxquad autopilot` does.
 
     Gains and filters are read from the log, the plant is identified in the firmware's own units up
-    to the logged rate, and the loop of both has to reproduce the flight. P, I and D of the rate
-    loop are searched over the plants that the fit leaves uncertain: least rate after a step of
-    torque, with limits on the peak of |S|, on the command's noise and on the crossover, which stays
-    in the identified band. Where the log shows the gyro's noise, cutoffs and notches are searched
-    with them. The rounded numbers are certified on fresh plants, as is a third of the way. Where
-    the log holds several levels of throttle, plants have the gain that it shows at each of them.
-    Feed-forward and the angle loop stay as they are. Loops are taken as linear: no
-    limit of the motors is simulated. Source: docs/autopilots.md.
+    to what the gyro's filters are given, and the loop of both has to reproduce the flight. P, I and
+    D of the rate loop are searched over the plants that the fit leaves uncertain: least rate after
+    a step of torque, with limits on the peak of |S|, on the command's noise and on the crossover,
+    which stays in the identified band. Where the log shows the gyro's noise, cutoffs and notches
+    are searched with them. The rounded numbers are certified on fresh plants, as is a third of the
+    way. Where the log holds several levels of throttle, plants have the gain that it shows at each
+    of them. Feed-forward and the angle loop stay as they are. Loops are taken as linear: no limit
+    of the motors is simulated. Source: docs/autopilots.md.
 
     **Arguments:**
 
@@ -313,7 +314,7 @@ def autopilot(
         return tune_adrc(path, asked, proposal, settings)
     announce("gains and filters that flew")
     flown, flight = _read_flight(path, asked, proposal, settings)
-    found = identify(path, asked)
+    found = identify_plant(path, asked, proposal, gyro_chains(flown.law))
     known = (settings, found, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
     if not found.fit.identifiable:
@@ -369,8 +370,8 @@ def _reproduce(found: Identification, flown: FlownAutopilot) -> Reproduction:
     except ValueError:  # the stick is the set-point in another unit: that one is external
         response = _response_of(found, input=setpoint, reference=None)
     return reproduce_flight(
-        found.fit, without_gyro_filters(flown.law), response,
-        unit="deg/s" if unit == "deg/s" else "rad/s", axis=flown.axis,
+        found.fit, flown.law, response, unit="deg/s" if unit == "deg/s" else "rad/s",
+        filters=gyro_chains(flown.law), axis=flown.axis,
     )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """Responses and fits of an identification, over the whole band and over parts of it."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,8 +13,10 @@ from jaxquad.identify import (
     fit,
     fit_transfer_function,
     guess_lagged_integrator,
+    KnownFilter,
     MaximumLikelihood,
     usable,
+    without_filters,
 )
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.records import Record
@@ -42,11 +44,13 @@ _DOMINATED = "feedback-dominated"
 
 
 def fit_twice(
-    records: tuple[Record, ...], method: str, settings: IdentifySettings, delay: float
-) -> tuple[FrequencyResponse, Fit, float]:
+    records: tuple[Record, ...], method: str, settings: IdentifySettings, delay: float,
+    filters: Sequence[KnownFilter] = (),
+) -> tuple[FrequencyResponse, Fit, float]:  # fmt: skip
     """The second response is estimated with the delay (s) that the first fit found taken out.
 
-    Once is enough where a delay is known. Returns the delay, too.
+    Once is enough where a delay is known. Returns the delay, too. Known `filters` of the output
+    are divided out.
     """
     band = _band(settings)
     dt, duration = records[0].dt, max(record.duration for record in records)
@@ -55,6 +59,7 @@ def fit_twice(
         announce(f"{method} response{f', {delay:.4g} s of delay taken out' if delay else ''}")
         estimator = _estimator(settings, method, delay)
         frf = frequency_response(list(records), omega, estimator=estimator)
+        frf = without_filters(frf, filters)
         announce(f"fit to the {method} response")
         found = _fitted(frf, settings)
         if not found.verdict.fitted:

@@ -14,6 +14,7 @@ from jaxquad.identify import (
     Explanation,
     factors,
     Fit,
+    KnownFilter,
     MISFIT,
     UndeterminedError,
     Verification,
@@ -230,12 +231,20 @@ def identify_fit(
     return _identify(path, settings, None, beside=False)
 
 
+def identify_plant(
+    path: Path, settings: IdentifySettings, proposal: Proposal, filters: Sequence[KnownFilter]
+) -> Identification:
+    """Likewise, up to what the `filters` of the output were given."""
+    return _identify(path, settings, proposal, beside=False, filters=filters)
+
+
 def _identify(
     path: str | Path | Sequence[str | Path],
     settings: IdentifySettings | None,
     proposal: Proposal | None,
     *,
     beside: bool,
+    filters: Sequence[KnownFilter] = (),
 ) -> Identification:
     """`beside` the estimate to trust, the direct one is fitted, too."""
     path, *more = [Path(path)] if isinstance(path, str | Path) else map(Path, path)
@@ -247,7 +256,7 @@ def _identify(
     best, *others = ("joint", "direct") if settings.reference else ("direct",)
     responses, fits, delay = {}, {}, 0.0
     for method in (best, *(others if beside else ())):
-        responses[method], found, delay = fit_twice(records, method, settings, delay)
+        responses[method], found, delay = fit_twice(records, method, settings, delay, filters)
         fits[method] = with_units(with_remedies(found, settings), records[0])
     announce("fits to parts of the band")
     fits[best], parts = fit_parts(fits[best], responses[best], settings)

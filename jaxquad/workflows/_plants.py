@@ -32,9 +32,8 @@ class PlantSource:
 
     **Attributes:**
 
-    - `fit`: up to the logged rate, which is in `unit`.
-    - `over`: the gain over the throttle, with the gyro's filters divided out; its plants take the
-      place of those of `fit`.
+    - `fit`: up to what the gyro's filters are given, in `unit`.
+    - `over`: the gain over the throttle, whose plants take the place of those of `fit`.
     - `span`: the lowest and the highest throttle of these.
     """
 
@@ -66,9 +65,8 @@ class PlantSource:
             )
         per_radian = np.pi / 180 if self.unit == "deg/s" else 1.0
         plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt)
-        plants = plants if self.over is None else plants * passed
         white = cells_of(omega) * np.abs(passed) ** 2
-        return RateLoops(omega, back, ahead, plants, white, passed, ceiling_of(law, axis))
+        return RateLoops(omega, back, ahead, plants * passed, white, passed, ceiling_of(law, axis))
 
     def _drawn(self, count: int, seed: int, throttle: float | None) -> tuple[Drawn, Drawn, Drawn]:
         """Gain, lag and delay."""

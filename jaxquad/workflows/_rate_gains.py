@@ -28,6 +28,7 @@ from jaxquad.control.autopilots import (
     store_parameters,
     without_gyro_filters,
 )
+from jaxquad.identify import filter_response
 from jaxquad.records import AXES
 
 
@@ -256,11 +257,7 @@ def gyro_chain_response(
     law: RateLaw, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, " frequencies"]:
     """Of all filters of the gyro."""
-    hertz = omega / (2 * np.pi)
-    passed = np.ones(omega.size, complex)
-    for chain in gyro_chains(law):
-        passed = passed * np.asarray(chain.response(hertz))
-    return passed
+    return filter_response(gyro_chains(law), omega)
 
 
 def _alone(law: RateLaw, name: str) -> RateLaw:

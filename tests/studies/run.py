@@ -1,9 +1,8 @@
-"""The validation page from the beginning: healthy plants, tuned designs, the page.
+"""The validation page from the beginning: all studies that have results, and the page.
 
     python tests/studies/run.py
 
-Healthy plants run in two processes and continue where they were stopped. The other studies of this
-folder keep their results; their commands are in those files.
+Healthy plants, which take the longest, run in two processes and continue where they were stopped.
 """
 
 import subprocess
@@ -14,8 +13,15 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 STEPS = (
-    ["healthy.py", "--draws", "1200", "--workers", "2"],
+    ["healthy.py", "--draws", "400", "--workers", "2"],
+    ["coverage_short.py", "--draws", "200"],
+    ["ringdown.py", "--draws", "40"],
+    ["nonlinearity.py", "--draws", "100"],
+    ["hold.py", "--draws", "200"],
+    ["model_error.py", "--draws", "40"],
+    ["refine.py", "--draws", "200"],
     ["tuned.py"],
+    ["adrc.py", "--flights", "200"],
     ["page.py"],
 )
 

@@ -8,7 +8,7 @@ import flight_logs
 import numpy as np
 import pytest
 from log_writers import DataFlash
-from px4_flights import Vehicle, write_log
+from px4_flights import GYRO_HZ as SAMPLED_HZ, Vehicle, write_log
 from scipy import signal
 
 from jaxquad.cli import main
@@ -62,6 +62,10 @@ def test_the_written_parameters_hold_on_the_true_plant(log, tmp_path, capsys, ca
     assert code == 0, printed
     content = json.loads((tmp_path / "autopilot.json").read_text())
     assert content["kind"] == "proposed" and content["reproduction"]["kind"] == "flown"
+    # The plant is the vehicle's own, though the log is behind a low-pass of 40 Hz.
+    assert content["plant"]["gain"] == pytest.approx(VEHICLE.gain, rel=0.03)
+    assert content["plant"]["lag"] == pytest.approx(VEHICLE.lag, rel=0.05)
+    assert content["plant"]["delay"] == pytest.approx(VEHICLE.late / SAMPLED_HZ, abs=4e-4)
     whole = read_params((tmp_path / "proposal_100.params").read_text())
     back = read_params((tmp_path / "proposal_revert.params").read_text())
     assert set(whole) == set(back) <= {"MC_ROLLRATE_P", "MC_ROLLRATE_I", "MC_ROLLRATE_D"}
