@@ -41,6 +41,7 @@ _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
 _DOMINATED = "feedback-dominated"
+EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
 
 
 def fit_twice(
@@ -128,8 +129,7 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
     kind, lost = found.verdict.kind, found.verdict.undetermined
     if kind == "identifiable":
         return found
-    excite = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
-    remedies = [excite]
+    remedies = [EXCITE]
     if kind == "too few points":
         remedies += ["use longer windows (--estimator welch --window S)"]
     elif kind == "no model":
@@ -138,9 +138,9 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
             "fit a model of higher order (--poles), or ask which term is missing (--explain)",
         ]
     elif settings.poles is not None:
-        remedies = ["fit fewer poles and zeros (--poles, --zeros)", excite]
+        remedies = ["fit fewer poles and zeros (--poles, --zeros)", EXCITE]
     elif {"lag", "delay"} & set(lost) and settings.lag and settings.delay:
-        remedies = ["fit without the lag (--no-lag) or without the delay (--no-delay)", excite]
+        remedies = ["fit without the lag (--no-lag) or without the delay (--no-delay)", EXCITE]
     verdict = dataclasses.replace(found.verdict, remedies=tuple(remedies))
     return dataclasses.replace(found, verdict=verdict)
 

@@ -30,7 +30,7 @@ from jaxquad.spectra import (
     FrequencyResponse,
 )
 
-from ._fits import fit_parts, fit_twice, in_option_words, sums_of, with_remedies, with_units
+from ._fits import EXCITE, fit_parts, fit_twice, in_option_words, sums_of, with_remedies, with_units
 from ._log import mix_of, propose_settings, read_logs, read_records
 from ._result_file import default_folder
 from ._settings import IdentifySettings
@@ -234,8 +234,19 @@ def identify_fit(
 def identify_plant(
     path: Path, settings: IdentifySettings, proposal: Proposal, filters: Sequence[KnownFilter]
 ) -> Identification:
-    """Likewise, up to what the `filters` of the output were given."""
-    return _identify(path, settings, proposal, beside=False, filters=filters)
+    """Likewise, up to what the `filters` of the output were given; its remedies are flights."""
+    found = _identify(path, settings, proposal, beside=False, filters=filters)
+    fits = {method: _with_remedy(each, EXCITE) for method, each in found.fits.items()}
+    return dataclasses.replace(found, fits=fits)
+
+
+def _with_remedy(found: Fit, remedy: str) -> Fit:
+    """With this alone where something is not determined."""
+    verdict = found.verdict
+    if verdict.kind == "identifiable":
+        return found
+    verdict = dataclasses.replace(verdict, remedies=(remedy,))
+    return dataclasses.replace(found, verdict=verdict)
 
 
 def _identify(

@@ -45,7 +45,7 @@ _PHRASES = {
         "choose another band (--band) or a simpler model (--no-lag, --no-delay)",
     r"start from other values": "choose another band (--band)",
     r"as valid=\{[^}]*\}": "as --valid NAME=-20:20",
-    r"try other starting values": "try another band (--band), or --no-lag",
+    r"try other starting values": "try another band (--band), or jaxquad identify --no-lag",
     r"Fit\.explain\(\)": "--explain",
     r"jq\.verify\b": "jaxquad verify",
     r"jq\.propose\b": "jaxquad identify",
