@@ -257,6 +257,7 @@ def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
 def _stage_rows(found: "AutopilotProposal") -> Table:
     names = ["what flew", "a third of the way", "all of it"]
     stages = list(found.stages)
+    levels = () if found.throttle is None else found.throttle.logged
     if found.filters is not None and found.filters.flown and found.filters.gains_alone:
         names.append("gains alone, filters as flown")
         stages.append(found.filters.gains_alone)
@@ -264,10 +265,14 @@ def _stage_rows(found: "AutopilotProposal") -> Table:
         [
             name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
             f"{x.crossover / (2 * np.pi):.1f}", f"{x.rejection:.2f}", f"{x.noise:.2f}",
+            *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
         ]
         for name, x in zip(names, stages, strict=True)
     ]  # fmt: skip
-    heads = ("gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "torque", "noise")
+    heads = (
+        "gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "torque", "noise",
+        *(f"Ms at throttle {each:.2f}" for each in levels),
+    )  # fmt: skip
     return Table(f"On {found.settings.fresh} fresh plants", heads, rows)
 
 

@@ -51,6 +51,7 @@ def test_gains_of_three_throttles_keep_ms_at_each_and_the_curve_has_its_own_file
     assert "levels: plants are drawn over all of it" in said and "in files of its own" in said
     page = (tmp_path / "autopilot.html").read_text()
     assert "THRUST CURVE" in page and "gains hold from throttle" in page
+    assert page.count(">Ms at throttle") == 3 and f">{after['peaks'][0]:.2f}<" in page
 
 
 @pytest.mark.slow
