@@ -198,5 +198,5 @@ def main(out: Path, seed: int, draws: int) -> None:
 
 if __name__ == "__main__":
     jq.enable_compile_cache()
-    gc.set_threshold(1_000_000, 10, 10)  # a tenth of the time would go to what lives on anyway
+    gc.set_threshold(500_000, 10, 10)  # a tenth of the time would go to what lives on anyway
     main(**vars(options()))

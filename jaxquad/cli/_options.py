@@ -159,7 +159,7 @@ def start_computing() -> None:
     What a command can say without JAX it says before.
     """
     # Modules and compiled programs stay: to look for garbage among them takes a tenth of the time.
-    gc.set_threshold(1_000_000, 10, 10)
+    gc.set_threshold(500_000, 10, 10)
     from jaxquad._core import enable_x64
     from jaxquad._xla import enable_compile_cache
 

@@ -142,9 +142,9 @@ class ErrorCovariance(eqx.Module):
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
         """Covariance E[dT dT^H] of two pairs (output, input) between all pairs of frequencies."""
         atoms, share, noise = _at(self, _places(self)), _share(self), np.asarray(self.noise)
-        one, other = (
-            np.einsum("fgt,fg->ft", atoms[:, :, i], share[:, o, i]) for o, i in (first, second)
-        )
+        pairs = (first,) if first == second else (first, second)
+        seen = [np.einsum("fgt,fg->ft", atoms[:, :, i], share[:, o, i]) for o, i in pairs]
+        one, other = seen[0], seen[-1]
         shared = noise[:, first[0]] @ noise[:, second[0]].conj().T
         total = (one @ other.conj().T) * shared
         if self.sensitivity is None or self.drive is None:
@@ -159,11 +159,11 @@ class ErrorCovariance(eqx.Module):
                 noise[:, pair[0]],
                 optimize=True,
             )
-            for effect, pair in ((one, first), (other, second))
+            for effect, pair in zip(seen, pairs, strict=True)
         ]
         flat = drive.reshape(len(drive), -1)
         moved = mine @ (0.5 * np.real(flat @ np.conj(flat).T)) @ its.conj().T
-        return total + moved + 0.5 * (local[0] @ its.conj().T + mine @ local[1].conj().T)
+        return total + moved + 0.5 * (local[0] @ its.conj().T + mine @ local[-1].conj().T)
 
     def pair(self, output: int, input: int) -> "ErrorCovariance":
         """That of a single response."""
