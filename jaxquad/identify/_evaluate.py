@@ -28,13 +28,27 @@ def evaluate(problem: Problem, z: Float[np.ndarray, " parameters"]) -> Evaluatio
     Records of equal shape share a program, whatever they are weighted by: compiling it takes longer
     than a fit.
     """
-    z_all = np.array(problem.parameters.start)
-    z_all[: z.size] = z
-    found = [run(z_all, arrays) for run, arrays in _programs(_Same(problem))]
+    return evaluate_each(problem, [z])[0]
+
+
+def evaluate_each(
+    problem: Problem, places: Sequence[Float[np.ndarray, " parameters"]]
+) -> list[Evaluation]:
+    """The same at several places, all of which are started before the first is waited for."""
+    programs, found = _programs(_Same(problem)), []
+    for z in places:
+        z_all = np.array(problem.parameters.start)
+        z_all[: z.size] = z
+        found.append([run(z_all, arrays) for run, arrays in programs])
+    return [_joined(parts, problem.parameters.start.size) for parts in found]
+
+
+def _joined(found: Sequence[tuple[Array, Array]], count: int) -> Evaluation:
+    """Of all records, one after the other."""
     parts = [(np.asarray(r), np.asarray(rows)) for r, rows in found]
     if len(parts) == 1:
         return Evaluation(*parts[0])
-    none = np.zeros(0), np.zeros((z_all.size, 0))
+    none = np.zeros(0), np.zeros((count, 0))
     misfits, slopes = zip(none, *parts, strict=True)
     return Evaluation(np.concatenate(misfits), np.concatenate(slopes, axis=1))
 

@@ -297,7 +297,8 @@ def _mixings(
 
 
 def _weights(cost: Cost, points: Sequence[Points], ratios: Sequence[Ratio]) -> list[Weights]:
-    return [cost.weights(*each) for each in zip(points, ratios, strict=True)]
+    weigh = type(cost).weights  # a bound method of an `eqx.Module` is made like a model
+    return [weigh(cost, *each) for each in zip(points, ratios, strict=True)]
 
 
 def _ratios(solution: Solution) -> list[Ratio]:

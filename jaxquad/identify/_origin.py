@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import PyTree
 
+from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
 
 from ._cost import Band, Cost, Points
@@ -29,7 +30,8 @@ class Options(NamedTuple):
     max_steps: int
 
 
-class Origin(eqx.Module):
+@pytree_node
+class Origin:
     """The responses and options of a fit.
 
     `run(model, responses, options, rounds=...)` fits as `jq.fit` does; 0 rounds leave out what the

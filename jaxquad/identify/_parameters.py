@@ -104,6 +104,10 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
     leaves, structure = jax.tree.flatten(arrays)
     if _namespace(values) is np:
         leaves = [np.array(leaf) if is_concrete(leaf) else leaf for leaf in leaves]
+        if all(isinstance(leaf, np.ndarray) for leaf in leaves):
+            for place, value in zip(places, values, strict=True):
+                leaves[place.leaf].reshape(-1)[place.index] = value
+            return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
     for leaf in {place.leaf for place in places}:
         mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
         index = np.array([places[k].index for k in mine])
@@ -191,8 +195,8 @@ def select_parameters(
     ties = _tied(places, tied or {})
     bound = {place.name for place, _ in ties}
     wanted = _expand(model, [p for p in places if free is not None or p.name not in bound], free)
-    values = _numbers(model, places)
-    chosen = [_choose(item, places, values) for item in wanted]
+    values, by_name = _numbers(model, places), _by_name(places)
+    chosen = [_choose(item, by_name, values) for item in wanted]
     names = [place.name for place, _, _ in chosen]
     if len(set(names)) != len(names) or not names:
         raise ValueError(f"free={names}: name each free parameter once, and at least one")
@@ -255,12 +259,11 @@ def _numbers(model: PyTree, places: list[Place]) -> dict[str, float]:
 
 
 def _choose(
-    item: str | Positive | Real, places: list[Place], values: dict[str, float]
+    item: str | Positive | Real, by_name: dict[str, Place], values: dict[str, float]
 ) -> tuple[Place, bool, float]:
     name = item if isinstance(item, str) else item.name
-    by_name = _by_name(places)
     if name not in by_name:
-        known = ", ".join(place.name for place in places)
+        known = ", ".join(values)
         raise ValueError(f"no parameter {name!r} in the model; it has: {known}")
     name = by_name[name].name
     value = values[name]

@@ -22,7 +22,7 @@ from jaxquad._core import (
 from ._accuracy import Matrix
 from ._parameters import Numbers, Parameters
 from ._problem import Problem, residuals
-from ._solve import cost_at, least_squares, problem_normal, Solution, solution_at, stopped_early
+from ._solve import costs_at, least_squares, problem_normal, Solution, solution_at, stopped_early
 
 
 MINIMUM = "minimum"
@@ -265,5 +265,5 @@ def _falls_aside(problem: Problem, solution: Solution, here: float, bread: Matri
     weakest = vectors[:, 0] / size
     step = np.sqrt(1e-2 * max(here, 1e-12) / max(values[0], 1e-12))
     step = min(step, _ASIDE / max(np.max(np.abs(weakest)), 1e-300))
-    sides = [cost_at(problem, solution.z + sign * step * weakest) for sign in (1, -1)]
-    return min(sides) < here * (1 - 1e-6) - 1e-12
+    sides = [solution.z + sign * step * weakest for sign in (1, -1)]
+    return min(costs_at(problem, sides)) < here * (1 - 1e-6) - 1e-12
