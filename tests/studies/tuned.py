@@ -216,7 +216,7 @@ def designs() -> dict[str, Design]:
     first, *others = printed = {name: row[0] for name, row in PRINTED.items()}
     judged = jq.certify(
         loop(printed[first]), ensemble(), flight(), name=first, events=EVENTS, members=256,
-        peers={name: printed[name] for name in others}, key=jax.random.key(5), linear_members=0,
+        peers={name: printed[name] for name in others}, key=jax.random.key(0), linear_members=0,
     )  # fmt: skip
     found = {name: Design(printed[name], judged.summaries[name]) for name in printed}
     start = STARTS["certainty equivalence"]
@@ -286,8 +286,8 @@ def main() -> None:
             f"Section 3 of the paper (`tests/tuning_case.py`): {given.members} members drawn by "
             "NumPy, flown by a Runge-Kutta simulation and analysed by eigenvalues and a frequency "
             "response, all written once more in `tests/studies/tuned.py`, beside what the "
-            "certificate says of its own members: 256 that fly and, for `jq.tune`, the linear "
-            "loops of 2048 more. ITAE in deg s^2, mean / worst; 95 % intervals."
+            "certificate says: on 256 other members, the same for all designs, and, for `jq.tune`, "
+            "the linear loops of 2048 more. ITAE in deg s^2, mean / worst; 95 % intervals."
         ),
         "columns": [
             "design", "unstable, %", "ITAE", "certificate: ITAE",
@@ -297,7 +297,7 @@ def main() -> None:
         "rows": rows,
         "notes": [
             "The worst of a sample is no bound: of 256 members it proves, with 95 % confidence, "
-            "that at most 1.2 % of all are beyond it.",
+            "that at most 1.2 % of all are beyond it; of such claims, one in twenty may fail.",
             f"`jq.tune` was given the limit Ms <= {PEAK:g}. It searches thousands of members for "
             "such as are beyond it, and tunes on with the worst of them.",
         ],
