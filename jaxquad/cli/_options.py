@@ -1,6 +1,7 @@
 """What several commands share: how a command is declared, and how results are shown."""
 
 import argparse
+import atexit
 import contextlib
 import gc
 import json
@@ -160,6 +161,7 @@ def start_computing() -> None:
     """
     # Modules and compiled programs stay: to look for garbage among them takes a tenth of the time.
     gc.set_threshold(500_000, 10, 10)
+    atexit.register(gc.freeze)  # at the end, too: looking takes Python half a second there
     from jaxquad._core import enable_x64
     from jaxquad._xla import enable_compile_cache
 
