@@ -1,11 +1,11 @@
-from ._adrc import (
+from ._autopilot._adrc import (
     ADRCProposal as ADRCProposal,
-    ADRCStage as ADRCStage,
-    ADRCTargets as ADRCTargets,
     propose_adrc as propose_adrc,
 )
-from ._adrc_result import ADRCAutopilot as ADRCAutopilot
-from ._autopilot import autopilot as autopilot, AutopilotProposal as AutopilotProposal
+from ._autopilot._adrc_result import ADRCAutopilot as ADRCAutopilot
+from ._autopilot._adrc_stages import ADRCStage as ADRCStage, ADRCTargets as ADRCTargets
+from ._autopilot._proposal import AutopilotProposal as AutopilotProposal
+from ._autopilot._run import autopilot as autopilot
 from ._batch._jobs import Job as Job
 from ._batch._run import batch as batch, find_logs as find_logs
 from ._batch._settings import BatchSettings as BatchSettings, Override as Override

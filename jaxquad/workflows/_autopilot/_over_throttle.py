@@ -22,9 +22,9 @@ from jaxquad.identify import (
 )
 from jaxquad.records import Proposal, Record, RecordWarning
 
+from .._identify import Identification
+from .._log import read_records
 from ._flown_autopilot import FlownAutopilot
-from ._identify import Identification
-from ._log import read_records
 from ._plants import PlantSource
 from ._rate_gains import gyro_chains
 

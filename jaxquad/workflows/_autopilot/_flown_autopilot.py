@@ -10,9 +10,9 @@ from jaxquad._core import Number
 from jaxquad.control.autopilots import change_filters, Firmware, flown_loop
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
+from .._tune_settings import AutopilotSettings
 from ._flight_channels import HOVER
 from ._rate_gains import gains_of, parameters_of, RateLaw
-from ._tune_settings import AutopilotSettings
 
 
 @dataclasses.dataclass(frozen=True)

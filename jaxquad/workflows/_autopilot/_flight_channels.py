@@ -22,7 +22,7 @@ from jaxquad.records import (
     RecordWarning,
 )
 
-from ._settings import IdentifySettings
+from .._settings import IdentifySettings
 
 
 Samples = Float[np.ndarray, " samples"]

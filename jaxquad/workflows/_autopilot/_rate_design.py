@@ -11,10 +11,11 @@ from jaxquad._core import announce
 from jaxquad.control.autopilots import filter_choices
 from jaxquad.export import propose_changes
 
+from .._identify import Identification
+from .._tune_settings import AutopilotSettings
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
-from ._identify import Identification
 from ._over_throttle import ThrottleVerdict
 from ._rate_gains import (
     ceiling_in,
@@ -27,7 +28,6 @@ from ._rate_gains import (
     Stage,
 )
 from ._rate_search import filter_values, FilterBank, Search, shared_change, SharedChange, Targets
-from ._tune_settings import AutopilotSettings
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]

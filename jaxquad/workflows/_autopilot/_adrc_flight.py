@@ -25,15 +25,16 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
-from ._adrc import ADRCTargets, propose_adrc
+from .._kinds import SettingsError
+from .._log import read_records
+from .._settings import IdentifySettings
+from .._tune_settings import AutopilotSettings
+from ._adrc import propose_adrc
 from ._adrc_loops import Flown, gyro_filters
 from ._adrc_result import ADRCAutopilot
+from ._adrc_stages import ADRCTargets
 from ._flight_channels import FlightChannels, HOVER, read_channels_if_any
 from ._flown_autopilot import settings_of
-from ._kinds import SettingsError
-from ._log import read_records
-from ._settings import IdentifySettings
-from ._tune_settings import AutopilotSettings
 
 
 _LINES = 40  # frequencies of a reproduced response

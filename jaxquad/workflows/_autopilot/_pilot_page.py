@@ -19,7 +19,7 @@ from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, Rat
 
 
 if TYPE_CHECKING:
-    from ._autopilot import AutopilotProposal
+    from ._proposal import AutopilotProposal
 
 Chains = dict[str, tuple[FilterChain, ...]]
 _PLANTS, _SEED = 100, 77  # of the steps' bands

@@ -7,82 +7,38 @@ search over wc, wo and b0 on responses, as `_rate_gains` searches P, I and D.
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxquad._core import announce, plain_content
 from jaxquad.control.autopilots import (
-    find_parameter,
     FlownADRC,
-    Parameter,
     store_parameters,
 )
 from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, UndeterminedError
 from jaxquad.records import AXES
 
 from ._adrc_loops import ADRCFrame, ADRCLoop, Designs, draw_at, Flown, make_adrc_loop
+from ._adrc_stages import (
+    a_third,
+    ADRCStage,
+    ADRCTargets,
+    beyond_targets,
+    Design,
+    judge,
+    rows_of,
+    stages_of,
+)
 from ._rate_design import Kind
 from ._rate_gains import LoopQualities
 
 
-Design = Float[np.ndarray, "3"]  # wc, wo, b0
 _LAW: B0Law = "SQRT"  # of the firmware by default
 _POINTS, _LEVELS, _ROUGH, _NARROWED = 5, 8, 5, 0.55  # the first levels on one plant each
 _RESERVE = 0.97  # of the limits, because fresh plants reach further than those that were tuned on
 _CERTIFICATES = 3
 _SPREAD = 4.0  # factor on b0 to either side
-_WORTH = 0.95  # of the flown effect of torque, above which other numbers are not worth a change
-_THIRD = 1 / 3
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ADRCTargets:
-    """What tuned ADRC parameters keep on every plant and at every throttle.
-
-    **Arguments:**
-
-    - `sensitivity`: greatest |S| at most.
-    - `resonance`: peak of the response from set-point to rate at most.
-    - `noise`: of the command, relative to what flew, of white noise before the gyro's filters.
-    - `change`: factor within which wc, wo and b0 stay of those that flew, where the ADRC flew.
-    """
-
-    sensitivity: float = 1.8
-    resonance: float = 1.4
-    noise: float = 1.5
-    change: float = 3.0
-
-    def __post_init__(self):
-        if not (self.sensitivity > 1 and self.resonance > 1 and self.noise > 0 and self.change > 1):
-            raise ValueError(
-                f"sensitivity {self.sensitivity:g}, resonance {self.resonance:g}, change "
-                f"{self.change:g} and noise {self.noise:g}: the first three must be above 1, the "
-                "last above 0"
-            )
-
-
-class ADRCStage(NamedTuple):
-    """What parameters give on fresh plants, over all throttles.
-
-    **Attributes:**
-
-    - `wc`, `wo`, `b0`: as the firmware stores them; nan of a PID that flew.
-    - `stable`: share of the loops; `peak`, `resonance`: the greatest of them.
-    - `crossover`: their median in rad/s.
-    - `rejection`, `noise`: relative to what flew, root mean square.
-    """
-
-    wc: float
-    wo: float
-    b0: float
-    stable: float
-    peak: float
-    resonance: float
-    crossover: float
-    rejection: float
-    noise: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -241,12 +197,12 @@ def propose_adrc(
         best = _search(loops, bounds, targets, edge, before)
         announce(f"certifying the whole numbers on {fresh} new plants")
         new = make(fresh, seed + attempt)
-        stages = _stages(new, axis, before, best)
-        if attempt == _CERTIFICATES or not _beyond(stages, targets, edge):
+        stages = stages_of(new, axis, before, best)
+        if attempt == _CERTIFICATES or not beyond_targets(stages, targets, edge):
             break
         loops = [old.joined(each, best) for old, each in zip(loops, new, strict=True)]
         attempt += 1
-    kind, verdict = _judge(stages, targets, edge, fresh, grid)
+    kind, verdict = judge(stages, targets, edge, fresh, grid)
     values = _parameters(axis, best, frame) if kind == "proposed" else {}
     stored = store_parameters("betaflight", values)
     return ADRCProposal(
@@ -295,11 +251,6 @@ def _require_gains(found: GainOverThrottle, grid: np.ndarray, plants: int, seed:
         )
 
 
-def _rows(axis: str) -> list[Parameter]:
-    """Of wc, wo and b0."""
-    return [find_parameter("betaflight", f"adrc_{name}_{axis}") for name in ("wc", "wo", "b0")]
-
-
 def _flown_design(flown: Flown, axis: str) -> Design | None:
     """wc, wo and b0 that flew; None of a PID."""
     if not isinstance(flown, FlownADRC):
@@ -310,7 +261,7 @@ def _flown_design(flown: Flown, axis: str) -> Design | None:
 
 def _bounds(flown: Flown, axis: str, b0: float, change: float) -> tuple[Design, Design]:
     """Least and most of wc, wo and b0."""
-    rows = _rows(axis)
+    rows = rows_of(axis)
     low = np.array([row.low for row in rows], float)
     high = np.array([row.high for row in rows], float)
     before = _flown_design(flown, axis)
@@ -322,7 +273,7 @@ def _bounds(flown: Flown, axis: str, b0: float, change: float) -> tuple[Design, 
 
 def _parameters(axis: str, design: Design, frame: ADRCFrame) -> dict[str, float]:
     """What the firmware has to hold for the loops that were certified."""
-    values = {row.name: float(x) for row, x in zip(_rows(axis), design, strict=True)}
+    values = {row.name: float(x) for row, x in zip(rows_of(axis), design, strict=True)}
     return values | {
         "adrc_gyro_lpf_hz": frame.lowpass_hz,
         "adrc_td_hz": frame.setpoint_hz,
@@ -389,102 +340,7 @@ class _Score:
         """Ms a third of the way, over the greatest that is allowed there."""
         if self.before is None:
             return np.zeros(len(designs))
-        each = loop.qualities(_part(self.before, designs))
+        each = loop.qualities(a_third(self.before, designs))
         allowed = max(_RESERVE * self.targets.sensitivity, float(np.max(flown.peak)))
         beyond = np.max(each.peak, axis=1) / allowed
         return np.where(np.all(each.stable, axis=1), beyond, 1e6 * beyond)
-
-
-def _part(before: Design, designs: Designs) -> Designs:
-    """A third of the way."""
-    return before + _THIRD * (designs - before)
-
-
-def _stages(
-    loops: Sequence[ADRCLoop], axis: str, before: Design | None, best: Design
-) -> dict[str, ADRCStage]:
-    """What flew, a third of the way where that has a meaning, the proposal, and the defaults."""
-    flown = [each.flown() for each in loops]
-    of = lambda design: _stage(design, [x.qualities(design[None]) for x in loops], flown)
-    none = np.full(3, np.nan)
-    stages = {"what flew": _stage(none if before is None else before, flown, flown)}
-    if before is not None:
-        stages["a third of the way"] = of(np.rint(_part(before, best[None])[0]))
-    default = np.array([row.default for row in _rows(axis)], float)
-    return stages | {"proposed": of(best), "defaults": of(default)}
-
-
-def _stage(
-    design: Design, found: Sequence[LoopQualities], flown: Sequence[LoopQualities]
-) -> ADRCStage:
-    joined, before = _together(found), _together(flown)
-    relative = lambda new, old: float(np.sqrt(np.mean((new / old) ** 2)))
-    wc, wo, b0 = map(float, design)
-    return ADRCStage(
-        wc,
-        wo,
-        b0,
-        float(np.mean(joined.stable)),
-        float(np.max(joined.peak)),
-        float(np.max(joined.resonance)),
-        float(np.median(joined.crossover)),
-        relative(joined.rejection, before.rejection),
-        relative(joined.noise, before.noise),
-    )
-
-
-def _together(found: Sequence[LoopQualities]) -> LoopQualities:
-    """Of one design, the plants of all throttles one after the other."""
-    columns = zip(*found, strict=True)
-    return LoopQualities(*(np.concatenate([each[0] for each in column]) for column in columns))
-
-
-def _judge(
-    stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float, fresh: int, grid: np.ndarray
-) -> tuple[Kind, str]:
-    if beyond := _beyond(stages, targets, edge):
-        return "not to be flown", (
-            f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, "
-            "`resonance`, `noise`), or fly more excitation"
-        )
-    flown, best = stages["what flew"], stages["proposed"]
-    better = f"{best.rejection:.2f} of the effect of torque with what flew"
-    within = flown.peak <= targets.sensitivity and flown.resonance <= targets.resonance
-    if not np.isnan(flown.wc) and flown.stable == 1 and within and best.rejection > _WORTH:
-        return "kept", (
-            f"what flew is kept: within the limits the best parameters leave {better}. Its worst "
-            f"Ms on {fresh} fresh plants is {flown.peak:.2f}"
-        )
-    where = f"from {grid[0]:.2f} to {grid[-1]:.2f}" if len(grid) > 1 else f"at {grid[0]:.2f}"
-    return "proposed", (
-        f"proposed: stable on all {fresh} fresh plants {where} throttle, worst Ms {best.peak:.2f} "
-        f"of at most {targets.sensitivity:g}, {better}"
-    )
-
-
-def _beyond(stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float) -> list[str]:
-    """In words, which of the targets are not kept."""
-    words, stage, flown = [], stages["proposed"], stages["what flew"]
-    third = stages.get("a third of the way", stage)
-    if min(stage.stable, third.stable) < 1:
-        share = 100 * min(stage.stable, third.stable)
-        words.append(f"only {share:.1f} % of the loops are stable")
-    if stage.peak > targets.sensitivity:
-        words.append(f"the worst Ms is {stage.peak:.2f}, above {targets.sensitivity:g}")
-    elif third.peak > max(targets.sensitivity, flown.peak):
-        words.append(
-            f"a third of the way the worst Ms is {third.peak:.2f}, above {targets.sensitivity:g}"
-        )
-    if stage.resonance > targets.resonance:
-        words.append(
-            f"the worst peak from set-point to rate is {stage.resonance:.2f}, above "
-            f"{targets.resonance:g}"
-        )
-    if stage.noise > targets.noise:
-        words.append(f"the noise is {stage.noise:.2f} of what flew, above {targets.noise:g}")
-    if stage.crossover > edge:
-        words.append(
-            f"the crossover of {stage.crossover / (2 * np.pi):.1f} Hz is beyond the identified "
-            f"{edge / (2 * np.pi):.1f} Hz"
-        )
-    return words

@@ -19,12 +19,12 @@ from jaxquad.loops import FlownLoop as Reproduction
 from jaxquad.records import AXES
 from jaxquad.report import provenance, write_json, write_pilot_page
 
+from .._tune_settings import AutopilotSettings
 from ._adrc import ADRCProposal
 from ._adrc_loops import Flown
 from ._adrc_page import adrc_page
 from ._flight_channels import FlightChannels
 from ._rate_design import Kind
-from ._tune_settings import AutopilotSettings
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has
