@@ -28,6 +28,7 @@ from ._gains import (
     require_sample_interval as require_sample_interval,
     signal_shape as signal_shape,
 )
+from ._garbage import collect_seldom as collect_seldom
 from ._json import plain_content as plain_content
 from ._levenberg_marquardt import (
     advance as advance,

@@ -1,15 +1,14 @@
 """What several commands share: how a command is declared, and how results are shown."""
 
 import argparse
-import atexit
 import contextlib
-import gc
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from jaxquad._core import collect_seldom
 from jaxquad.workflows import (
     AutopilotSettings,
     BatchSettings,
@@ -159,9 +158,7 @@ def start_computing() -> None:
 
     What a command can say without JAX it says before.
     """
-    # Modules and compiled programs stay: to look for garbage among them takes a tenth of the time.
-    gc.set_threshold(500_000, 10, 10)
-    atexit.register(gc.freeze)  # at the end, too: looking takes Python half a second there
+    collect_seldom()
     from jaxquad._core import enable_x64
     from jaxquad._xla import enable_compile_cache
 

@@ -12,6 +12,8 @@ from itertools import islice
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
+from jaxquad._core import collect_seldom
+
 from ._jobs import Content, failure, Job, perform, store_result, stored_result, Work
 
 
@@ -138,6 +140,7 @@ def _serve(work: Work, connection: Connection) -> None:
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)  # What it starts ends with it, see _kill.
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
+    collect_seldom()
     while True:
         try:
             job = connection.recv()
