@@ -226,7 +226,7 @@ def projected_noise(
     length = int(next_fast_len(2 * samples, real=True) or 2 * samples)
     # One series after the other: fresh memory for all of them would take longer than they do.
     turn = lambda series: np.asarray(rfft(series, length))
-    power = lambda spectrum: (spectrum.real**2 + spectrum.imag**2) / samples
+    power = lambda spectrum: np.abs(spectrum) ** 2 / samples
     rest = [turn(each) for each in residual.T]
     seen, smooth, left = [], [], []
     reach = _reach(length // 2 + 1, length / samples)
@@ -283,21 +283,23 @@ def orthogonal_factors(
     third of the time of reflections, and is as orthogonal.
     Source: Yamamoto et al. (2015), Roundoff error analysis of the CholeskyQR2 algorithm.
     """
-    scale = np.sqrt(np.einsum("ri,ri->i", columns, columns))
+    products = columns.T @ columns
+    scale = np.sqrt(np.diagonal(products))
     if not np.all(scale > 0) or not np.all(np.isfinite(scale)):
         return np.linalg.qr(columns)
     basis, triangle = columns, np.eye(scale.size)
-    for _ in range(2):
-        products = basis.T @ basis
+    for last in (False, True):
         unit = products / np.outer(scale, scale)
         if len(basis) < scale.size or np.linalg.eigvalsh(unit)[0] < _WELL:
             return np.linalg.qr(columns)
         upper = np.linalg.cholesky(unit).T * scale
         basis, triangle = basis @ np.linalg.inv(upper), upper @ triangle
-        scale = np.ones(scale.size)
+        if not last:
+            products, scale = basis.T @ basis, np.ones(scale.size)
     return basis, triangle
 
 
+@ft.lru_cache(maxsize=8)
 def _reach(bins: int, finer: float) -> np.ndarray:
     return np.ceil(np.maximum(_LEAST * finer, _SHARE * np.arange(bins))).astype(int)
 

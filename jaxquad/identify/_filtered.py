@@ -35,6 +35,7 @@ _DIGITS = 1e6  # rounding of the output, in units of the last bit of its largest
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
 _REFINEMENTS = 3
 _SETTLED = 1e-7  # change of an unknown, whose square is left to the next refinement
+_CLOSE = 1e-8  # a step, relative to 1 + |z|, whose square is rounding
 _GONE = 1e-20  # of the states, relative to their start
 
 Rows = Float[np.ndarray, "rows samples"]
@@ -52,12 +53,34 @@ class Sampled(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What start and trim do to a record."""
+    """What start and trim do to a record: a unit shift, then the free motions.
 
-    free: Rows  # unit shift, biases and initial values
-    seen: Rows  # these within the band
-    scale: Float[np.ndarray, " rows"]  # that brings them to unit length
+    These are biases and initial values, up to the sample at which nothing is left of them.
+    """
+
+    shift: Float[np.ndarray, " samples"]  # within the band
+    free: Float[np.ndarray, "motions moving"]
+    seen: Float[np.ndarray, "motions moving"]  # these within the band, in which they last longer
+    scale: Float[np.ndarray, " rows"]  # that brings shift and motions to unit length
     normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
+
+    def products(self, x: Float[np.ndarray, "*series samples"]) -> Float[np.ndarray, "rows ..."]:
+        """Shift and motions times one series, or times each of several."""
+        moving = self.seen.shape[1]
+        return np.concatenate([(x @ self.shift)[None], self.seen @ x[..., :moving].T])
+
+    def taken_off(
+        self, x: Float[np.ndarray, " samples"], unknowns: Float[np.ndarray, " rows"]
+    ) -> Float[np.ndarray, " samples"]:
+        """The series without so much of each."""
+        left = x - unknowns[0] * self.shift
+        left[: self.seen.shape[1]] -= unknowns[1:] @ self.seen
+        return left
+
+    @property
+    def rows(self) -> Rows:
+        """Shift and motions within the band, over all samples."""
+        return np.concatenate([self.shift[None], _lengthened(self.seen, self.shift.size)])
 
 
 class Simulated(NamedTuple):
@@ -95,6 +118,7 @@ class FilteredPoint:
     records: list[Simulated]
     prior_misfits: Float[np.ndarray, " priors"]
     prior_slopes: Float[np.ndarray, "priors parameters"]
+    next_to: "FilteredPoint | None" = None  # a point so near that it has the same slopes
 
     @property
     def cost(self) -> float:
@@ -111,6 +135,8 @@ class FilteredPoint:
     @ft.cached_property
     def rows(self) -> list[Rows]:
         """The slopes of each record's misfit, up to what start and trim can do."""
+        if self.next_to is not None:
+            return self.next_to.rows
         parts = zip(self.problem.terms, self.records, self.behind, strict=True)
         return [_slope_rows(*each) for each in parts]
 
@@ -128,7 +154,30 @@ class FilteredPoint:
         return self.normal
 
     def moved(self, change: Float[np.ndarray, " parameters"]) -> "FilteredPoint":
+        if self._is_last(change):
+            return self._next_to(change)
         return _point(self.problem, self.programs, self.z + change)
+
+    def _is_last(self, change: Float[np.ndarray, " parameters"]) -> bool:
+        """Whether the misfit after a step of Gauss and Newton is known by its slopes."""
+        if np.max(np.abs(change) / (1 + np.abs(self.z))) > _CLOSE or self.next_to is not None:
+            return False
+        gradient, hessian = self.normal
+        # A step that damping has shortened is none of these, and its cost has to be seen.
+        return np.allclose(hessian @ change, -gradient, rtol=0.1, atol=0.0)
+
+    def _next_to(self, change: Float[np.ndarray, " parameters"]) -> "FilteredPoint":
+        parts = zip(self.records, self.rows, strict=True)
+        misfits = [_project_out(one.misfit + change @ rows, one.columns)[0] for one, rows in parts]
+        return dataclasses.replace(
+            self,
+            z=self.z + change,
+            records=[
+                one._replace(misfit=left) for one, left in zip(self.records, misfits, strict=True)
+            ],
+            prior_misfits=self.prior_misfits + self.prior_slopes @ change,
+            next_to=self,
+        )
 
     @property
     def is_precise(self) -> bool:
@@ -140,7 +189,7 @@ class FilteredPoint:
         """As the general way gives it."""
         misfits = [one.misfit[:, None] for one in self.records]
         slopes = [rows.T[:, None] for rows in self.rows]
-        columns = [one.columns.seen.T[:, None] for one in self.records]
+        columns = [one.columns.rows.T[:, None] for one in self.records]
         normal = Normal(self.cost, *self.normal)  # pyright: ignore[reportArgumentType]
         return Evaluation(misfits, slopes, columns, normal)
 
@@ -201,11 +250,12 @@ def _simulated(term: RecordTerm, sampled: Sampled) -> Simulated:
         driven = _over(sampled.below, late)
         forced = np.convolve(driven, sampled.above)[:samples]
         columns = _columns(term, _free_motions(term, sampled, samples))
+        moving = columns.free.shape[1]
         left = np.asarray(term.y)[:, 0] - _in_band(term, forced)
         misfit, unknowns = _project_out(left, columns)
         # A shift stays what it is, whatever A does.
-        output = forced + unknowns[1:] @ columns.free[1:]
-    return Simulated(sampled, driven, output, columns, float(term.weights[0]) * misfit)
+        forced[:moving] += unknowns[1:] @ columns.free
+    return Simulated(sampled, driven, forced, columns, float(term.weights[0]) * misfit)
 
 
 def _shifted(u: Float[np.ndarray, " samples"], shift: int) -> Float[np.ndarray, " samples"]:
@@ -241,8 +291,10 @@ def _in_band(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndar
     return x if term.gain is None else np.asarray(band_filter(x.T, np.asarray(term.gain))).T
 
 
-def _free_motions(term: RecordTerm, sampled: Sampled, samples: int) -> Rows:
-    """A shift, biases on the slow motions and initial values of the fast ones, as rows."""
+def _free_motions(
+    term: RecordTerm, sampled: Sampled, samples: int
+) -> Float[np.ndarray, "motions moving"]:
+    """Biases on the slow motions and initial values of the fast ones, as rows."""
     assert term.motions is not None
     slow, fast = (np.asarray(each) for each in term.motions)
     states = len(slow)
@@ -252,14 +304,12 @@ def _free_motions(term: RecordTerm, sampled: Sampled, samples: int) -> Rows:
         step, row = sampled.step, sampled.row
         ways = np.zeros((slow.shape[1] + fast.shape[1], 2 * states))
         ways[: slow.shape[1], states:], ways[slow.shape[1] :, :states] = slow.T, fast.T
-    found = np.ones((1 + len(ways), samples))
-    found[1:] = ways @ _motion(row, step, samples)
-    return found
+    return ways @ _motion(row, step, samples)
 
 
 def _motion(
     row: Float[np.ndarray, " both"], step: Float[np.ndarray, "both both"], samples: int
-) -> Float[np.ndarray, "both samples"]:
+) -> Float[np.ndarray, "both moving"]:
     """`row` step^k for each sample k, as far as anything is left of it."""
     found = np.zeros((len(row), samples))
     found[:, 0], done = row, 1
@@ -268,16 +318,23 @@ def _motion(
         more = min(done, samples - done)
         found[:, done : done + more] = power @ found[:, :more]
         power, done = power @ power, done + more
-    return found
+    return found[:, :done]
 
 
-def _columns(term: RecordTerm, free: Rows) -> Columns:
-    seen = _in_band(term, free)
-    normal = seen @ seen.T
+def _lengthened(rows: Rows, samples: int) -> Rows:
+    return np.pad(rows, ((0, 0), (0, samples - rows.shape[1])))
+
+
+def _columns(term: RecordTerm, free: Float[np.ndarray, "motions moving"]) -> Columns:
+    samples = len(term.y)
+    shift = _in_band(term, np.ones(samples))
+    seen = free if term.gain is None else _in_band(term, _lengthened(free, samples))
+    along = seen @ shift[: seen.shape[1]]
+    normal = np.block([[shift @ shift, along], [along[:, None], seen @ seen.T]])
     square = np.diagonal(normal)
     scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
     ridged = normal * np.outer(scale, scale) + _RIDGE * np.eye(len(normal))
-    return Columns(free, seen, scale, ridged)
+    return Columns(shift, free, seen, scale, ridged)
 
 
 def _project_out(
@@ -286,12 +343,12 @@ def _project_out(
     """The misfit that no start, trim or shift explains, and how much of each does explain."""
     unknowns, rest = np.zeros(len(columns.scale)), misfit
     for _ in range(_REFINEMENTS):
-        aim = columns.scale * (columns.seen @ rest)
+        aim = columns.scale * columns.products(rest)
         if not np.all(np.isfinite(aim)):
             return np.full_like(misfit, np.nan), unknowns
         step = np.linalg.solve(columns.normal, aim) * columns.scale
         unknowns = unknowns + step
-        rest = misfit - unknowns @ columns.seen
+        rest = columns.taken_off(misfit, unknowns)
         if np.all(np.abs(step) <= _SETTLED * np.abs(unknowns)):
             break
     return rest, unknowns
@@ -299,7 +356,7 @@ def _project_out(
 
 def _without_columns(rows: Rows, columns: Columns) -> Float[np.ndarray, "parameters parameters"]:
     """Products of the rows' parts orthogonal to the columns."""
-    shared = columns.scale[:, None] * (columns.seen @ rows.T)
+    shared = columns.scale[:, None] * columns.products(rows)
     return rows @ rows.T - shared.T @ np.linalg.solve(columns.normal, shared)
 
 

@@ -151,10 +151,10 @@ def reduced_rows(
     basis, root = orthogonal_factors(np.concatenate([stacked, np.zeros((every, every))]))
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
     for one, term in zip(projected, terms, strict=True):
-        mine = basis[at : at + one.misfit.size].reshape(one.slopes.shape)
-        measured = np.asarray(term.measured)
-        aim += np.einsum("tok,to->k", mine, one.misfit)
-        output += np.einsum("tok,to->k", mine, measured)
+        flat = basis[at : at + one.misfit.size]
+        mine = flat.reshape(one.slopes.shape)
+        aim += one.misfit.reshape(-1) @ flat
+        output += np.asarray(term.measured).reshape(-1) @ flat
         noise += projected_noise(mine, one.misfit, one.nuisance, count)
         at += one.misfit.size
     return Reduced(root, aim, noise, output)

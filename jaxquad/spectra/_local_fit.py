@@ -28,9 +28,12 @@ class Bins(NamedTuple):
         count = int(np.searchsorted(self.omega, highest, "right"))
         if count == self.omega.size:
             return self
-        kept = (part[:count].copy() for part in (self.omega, self.record, self.values))
-        above = self.above + self.omega.size - count
-        return Bins(*kept, self.records, self.largest, above)
+        return self._replace(
+            omega=self.omega[:count].copy(),
+            record=self.record[:count].copy(),
+            values=self.values[:count].copy(),
+            above=self.above + self.omega.size - count,
+        )
 
 
 def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bins:

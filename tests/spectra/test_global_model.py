@@ -81,9 +81,10 @@ def test_variance_covariance_and_projection_of_shared_parameters_agree():
 def test_errors_of_a_long_record_agree_where_windows_take_few_of_its_bins():
     """Of 10 minutes at 1 kHz: most atoms have no part in the errors of the models."""
     samples, rng = 600_000, np.random.default_rng(0)
-    u = signal.lfilter([0.02], [1, -0.98], rng.standard_normal((samples, 2)), axis=0)
-    y = signal.lfilter([0.01], [1, -0.99], u, axis=0) + 0.02 * rng.standard_normal(u.shape)
-    record = Record(np.arange(samples) / 1000.0, np.asarray(u), np.asarray(y))
+    white, noise = rng.standard_normal((2, samples, 2))
+    u = np.asarray(signal.lfilter([0.02], [1, -0.98], white, axis=0))
+    y = np.asarray(signal.lfilter([0.01], [1, -0.99], u, axis=0)) + 0.02 * noise
+    record = Record(np.arange(samples) / 1000.0, u, y)
     errors = frequency_response(record, np.geomspace(0.5, 60.0, 30)).errors
     assert errors.drive is not None and errors.drive.shape[1] < 0.6 * errors.effect.shape[2]
     check_that_errors_agree(errors, 1, 0)
