@@ -67,9 +67,15 @@ def evaluate_beside(
     return Beside(drawn, flight, {n: run(x) for n, x in peers.items()}, run(_Idle()), start)
 
 
-def begin_evaluating(evaluate: Callable[[], Beside], devices: DeviceChoice) -> Callable[[], Beside]:
+def begin_evaluating(
+    evaluate: Callable[[], Beside],
+    devices: DeviceChoice,
+    *,
+    before: Callable[[], None] = lambda: None,
+) -> Callable[[], Beside]:
     """Begin in a thread, whose programs are compiled while others are; the function waits for it.
 
+    The thread calls `before` first: what it compiles there, the caller needs before the result.
     With several devices, and where JAX is set differently for the caller's thread alone, the
     function itself evaluates.
     """
@@ -78,7 +84,10 @@ def begin_evaluating(evaluate: Callable[[], Beside], devices: DeviceChoice) -> C
     pool, settings = ThreadPoolExecutor(1), _thread_settings()
 
     def run() -> Beside | None:
-        return evaluate() if _thread_settings() == settings else None
+        if _thread_settings() != settings:
+            return None
+        before()
+        return evaluate()
 
     begun: Future[Beside | None] = pool.submit(run)
     pool.shutdown(wait=False)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._xla import Jit
 from jaxquad.control import ObserverController
 
 from ._objective import Limit, Objective, soft, Worst
@@ -67,7 +68,7 @@ class CostResult(NamedTuple):
     beyond: tuple[Float[Array, "problems members"], ...]  # as levels: above 0, missed
 
 
-@eqx.filter_jit
+@Jit
 def evaluate_cost(
     z: Float[Array, "problems n"],
     on: Bool[Array, " problems"],
@@ -75,8 +76,15 @@ def evaluate_cost(
     problem: Problem,
     subproblem: Subproblem,
 ) -> CostResult:
-    """Value and gradient for each problem that is `on`; zeros for the others."""
+    """Value and gradient for each problem that is `on`; zeros for the others.
+
+    A problem by itself is evaluated in any case.
+    """
     arrays, rest = eqx.partition(subproblem, eqx.is_array)
+    if len(z) == 1:
+        alone = eqx.combine(jax.tree.map(lambda x: x[0], arrays), rest)
+        found = _evaluate_one(z[0], coordinates, problem, alone)
+        return jax.tree.map(lambda x: x[None], found)
     common, fixed = eqx.partition((coordinates, problem), eqx.is_array)
 
     @jax.jit  # traced once, for its shapes and for its use

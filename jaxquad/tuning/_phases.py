@@ -1,14 +1,14 @@
 """Stabilise, then optimise: all problems in lockstep, limits by an augmented Lagrangian."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad.control import ObserverController
 from jaxquad.ensembles import Members
@@ -143,10 +143,13 @@ def solve(
     rate: float,
     progress: Progress,
     search: Search | None = None,
+    traced: Callable[[], None] = lambda: None,
 ) -> Solution:
     """Both phases of all problems: `objectives` and `limits` hold arrays [problems, ...].
 
     A `search` finds members that are beyond limits, and the problems descend again with these.
+    `traced` is called when all that is left is to compile and to run: another thread that began
+    before would share the interpreter with the tracing, and both would end later.
 
     A problem whose members cannot all be made to decay at `rate` (1/s, negative) stays with the
     first phase's best if one of them is unstable. Otherwise no step is taken to where one is, and
@@ -156,6 +159,8 @@ def solve(
     runner = _Runner(
         coordinates, problem, objectives, tuple(limits), method, rate, progress, memory
     )
+    runner.trace(np.asarray(start, float))
+    traced()
     first = runner.stabilise(np.asarray(start, float))
     slowest = runner.slowest(first.z)
     stable = slowest < 0
@@ -263,17 +268,26 @@ class _Runner(eqx.Module):
     progress: Progress
     memory: _Memory
 
+    def trace(self, z: np.ndarray) -> None:
+        """Trace and lower the program of all evaluations, which the first one compiles."""
+        multipliers = initial_multipliers(self.problem, self.limits, len(z))
+        evaluate_cost.lower(*self._given(z, np.ones(len(z), bool), False, multipliers))
+
     def evaluate(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
     ) -> CostResult:
         """One evaluation of the problems that are on."""
-        count = len(z)
-        rate = jnp.full(count, self.rate - _BEYOND_KNEE)
-        flies = jnp.broadcast_to(jnp.asarray(fly), (count,))
-        subproblem = Subproblem(self.objectives, self.limits, multipliers, flies, rate)
-        given = (jnp.asarray(z), jnp.asarray(on))
-        result = evaluate_cost(*given, self.coordinates, self.problem, subproblem)
+        result = evaluate_cost(*self._given(z, on, fly, multipliers))
         return jax.tree.map(np.asarray, result)  # NumPy compiles nothing for what follows
+
+    def _given(
+        self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
+    ) -> tuple[Array, Array, Coordinates, Problem, Subproblem]:
+        count = len(z)
+        rate = jnp.asarray(np.full(count, self.rate - _BEYOND_KNEE))
+        flies = jnp.asarray(np.broadcast_to(np.asarray(fly), (count,)))
+        subproblem = Subproblem(self.objectives, self.limits, multipliers, flies, rate)
+        return jnp.asarray(z), jnp.asarray(on), self.coordinates, self.problem, subproblem
 
     def evaluator(self, fly: bool, multipliers: Multipliers) -> Evaluate:
         """What a descent calls: infinite where a step must not go."""

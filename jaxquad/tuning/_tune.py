@@ -39,6 +39,7 @@ from ._tail import (
     GUARDS,
     is_kept_by_flights,
     is_kept_by_loops,
+    prepare_search,
     Search,
     SLICE,
     take_members,
@@ -157,14 +158,23 @@ def tune(
         evaluate_beside, loop, others, scenario, peers=peers or {}, begun=loop.controller,
         members=count, span=span, devices=devices,
     )  # fmt: skip
-    first = begin_evaluating(lambda: beside(key), devices) if certified else None
+    first: list[Callable[[], Beside]] = []
+
+    def prepare() -> None:
+        if search is not None:
+            prepare_search(search, coordinates, coordinates.start)
+
+    def traced() -> None:
+        if certified:
+            first.append(begin_evaluating(lambda: beside(key), devices, before=prepare))
+
     solution = solve(
         coordinates, problem, begun, stack_copies(objective, starts),
         stack_copies(tightened, starts), method=method, rate=stabilising_rate(objective),
-        progress=watched, search=search,
+        progress=watched, search=search, traced=traced,
     )  # fmt: skip
     best, seconds, certificate, certificates = _best(solution), watched.seconds, None, 0
-    if first is not None:
+    if certified:
 
         def judge(solution: Solution, key: Key[Array, ""], found: Beside) -> Certificate:
             watched.say("certificate on fresh members ...")
@@ -174,7 +184,7 @@ def tune(
                 linear_members=None, key=key, span=span, name="tuned", devices=devices,
             )  # fmt: skip
 
-        certificate, certificates = judge(solution, key, first()), 1
+        certificate, certificates = judge(solution, key, first[0]()), 1
         if search is not None and isinstance(ensemble, Ensemble) and isinstance(fresh, int):
             redraw = ft.partial(certified_members, loop, ensemble, flown=fresh)
             again = lambda solution, key: judge(solution, key, beside(key))
@@ -303,7 +313,7 @@ def _search(
     flights = FlightSearch(
         lambda k: fresh(_FLOWN + k, size), fly_around, problem, fresh(_GUARDING, GUARDS), size
     )
-    loops = lambda k: linear_loops(fresh(_FIRST + k, SLICE), devices)
+    loops = ft.cache(lambda k: linear_loops(fresh(_FIRST + k, SLICE), devices))
     aimed = [tighten(x, min(reserve, _MARGIN) if isinstance(x.over, Worst) else reserve)
              for x in limits]  # fmt: skip
     return Search(
