@@ -5,7 +5,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
@@ -18,6 +17,7 @@ from jaxquad.simulation import Scenario
 from ._design_result import DesignResult
 from ._evaluate_design import evaluate_design
 from ._problem import DeviceChoice, require_same_rate, TimeSpan
+from ._threads import thread_settings
 
 
 class Beside(NamedTuple):
@@ -81,10 +81,10 @@ def begin_evaluating(
     """
     if may_be_several(asked_devices(devices)):
         return evaluate
-    pool, settings = ThreadPoolExecutor(1), _thread_settings()
+    pool, settings = ThreadPoolExecutor(1), thread_settings()
 
     def run() -> Beside | None:
-        if _thread_settings() != settings:
+        if thread_settings() != settings:
             return None
         before()
         return evaluate()
@@ -97,16 +97,3 @@ def begin_evaluating(
         return evaluate() if found is None else found
 
     return wait
-
-
-def _thread_settings() -> tuple[object, ...]:
-    """Of JAX, those that change numbers or raise, and that a `with` can set for one thread."""
-    config = jax.config  # makes its attributes while it is imported, which no type checker sees
-    return (
-        jnp.result_type(float),
-        config.jax_default_device,  # pyright: ignore[reportAttributeAccessIssue]
-        config.jax_default_matmul_precision,  # pyright: ignore[reportAttributeAccessIssue]
-        config.jax_debug_nans,  # pyright: ignore[reportAttributeAccessIssue]
-        config.jax_numpy_rank_promotion,  # pyright: ignore[reportAttributeAccessIssue]
-        config.jax_numpy_dtype_promotion,  # pyright: ignore[reportAttributeAccessIssue]
-    )

@@ -115,7 +115,7 @@ def certify_beside(
     design = evaluate_design(loop.controller, drawn, flight, span, devices)
     results = {name: design} | beside.peers
     further = None
-    if isinstance(ensemble, Ensemble):
+    if isinstance(ensemble, Ensemble) and design.unstable is not None:  # it has a linear loop
         further = analyse_further(
             loop, ensemble, scenario, key, flown=drawn.size, count=linear_members
         )

@@ -23,6 +23,7 @@ from ._design_result import DesignResult, LinearMembers
 from ._flown import fly
 from ._problem import decouple, DeviceChoice, Plant, TimeSpan
 from ._quantities import LINEAR
+from ._threads import map_in_threads
 
 
 def evaluate_design(
@@ -72,16 +73,16 @@ def analyse_further(
 
     They come in slices of as many members as have `flown`, which compile nothing anew.
     """
-    found, facts = [], []
-    for drawn in _draw_further(loop, ensemble, key, flown, count):
+
+    def analyse(drawn: Members) -> tuple[LoopNumbers | None, dict[str, np.ndarray]]:
         still = dataclasses.replace(drawn, noise=None, gust=None)
-        linear = _linear(loop.controller, drawn, still.flight(scenario))
-        if linear is None:
-            return None
-        found.append(linear)
-        facts.append(member_facts(drawn))
+        return _linear(loop.controller, drawn, still.flight(scenario)), member_facts(drawn)
+
+    parts = map_in_threads(analyse, _draw_further(loop, ensemble, key, flown, count))
+    found = [linear for linear, _ in parts if linear is not None]
     if not found:
         return None
+    facts = [known for _, known in parts]
     join = lambda parts: np.concatenate(parts, axis=-1)
     numbers = {name: join([x._asdict()[name] for x in found]) for name in LINEAR}
     unstable = ~np.all(join([x.stable for x in found]), axis=0)
@@ -97,8 +98,10 @@ def _draw_further(
     loop: Loop, ensemble: Ensemble, key: Key[Array, ""], flown: int, count: int | None
 ) -> Iterator[Members]:
     count = min(_MULTIPLE * flown, _MOST) if count is None else count
-    for each in jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown)):
-        yield ensemble.fresh(loop, flown, each)
+    keys = jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown))
+    for each in np.asarray(jax.random.key_data(keys)):  # keys by themselves: a program to part them
+        own = jax.random.wrap_key_data(jnp.asarray(each), impl=jax.random.key_impl(keys))
+        yield ensemble.fresh(loop, flown, own)
 
 
 def certified_members(

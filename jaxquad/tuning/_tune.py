@@ -3,10 +3,11 @@ import functools as ft
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
@@ -352,6 +353,11 @@ def _best(solution: Solution) -> int:
 _ACTIVE = 1e-3  # the multiplier's sum above which a limit costs something
 
 
+@eqx.filter_jit  # as one program
+def _excess(limit: Limit, values: Float[Array, " members"]) -> Float[Array, ""]:
+    return limit.excess(values)
+
+
 def _limit_results(
     limits: Sequence[Limit], solution: Solution, index: int
 ) -> tuple[LimitResult, ...]:
@@ -359,9 +365,9 @@ def _limit_results(
     results = []
     for k, limit in enumerate(limits):
         values = jnp.asarray(solution.result.limited[k][index])
-        excess = float(limit.excess(values))
+        excess = float(_excess(limit, values))
         found = float(limit.bound) + limit.sign * excess
-        active = float(solution.multipliers.values[k][index].sum()) > _ACTIVE
+        active = float(np.asarray(solution.multipliers.values[k])[index].sum()) > _ACTIVE
         results.append(LimitResult(limit, found, excess <= 0, active))
     return tuple(results)
 

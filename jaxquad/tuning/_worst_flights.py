@@ -93,13 +93,14 @@ def _members(certificate: Certificate, loop: Loop, ensemble: Ensemble | Members)
 
 
 def _member(found: Simulation, k: int) -> Simulation:
-    """One of an ensemble of simulations."""
+    """One of an ensemble of simulations. Compiles nothing."""
     count = found.diverged.shape
-    pick = lambda x: x[..., k] if x.shape[-1:] == count and x.ndim > 2 else x
+    at = lambda x: jnp.asarray(np.asarray(x)[..., k])
+    pick = lambda x: at(x) if x.shape[-1:] == count and x.ndim > 2 else x
     parts = {name: pick(part) for name, part in found.scenario.parts.items()}
     return Simulation(
-        found.time, found.angle[..., k], found.measurement[..., k], found.command[..., k],
-        found.saturated[..., k], {}, found.diverged[k], Scenario(**parts, dt=found.scenario.dt),
+        found.time, at(found.angle), at(found.measurement), at(found.command),
+        at(found.saturated), {}, at(found.diverged), Scenario(**parts, dt=found.scenario.dt),
         found.dt,
     )  # fmt: skip
 
