@@ -16,6 +16,7 @@ from jaxquad.control import schedule_for_analysis
 from jaxquad.loops import loop_numbers
 from jaxquad.tuning import paper_designs, peers, share_interval, upper_bound
 from jaxquad.tuning._beside import begin_evaluating, Beside
+from jaxquad.tuning._threads import map_in_threads
 
 
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
@@ -94,3 +95,18 @@ def test_a_thread_evaluates_only_where_jax_is_set_as_for_its_caller():
     with jax.default_matmul_precision("float32"):
         begin_evaluating(evaluate, 1)()
     assert threads[0] != threading.get_ident() == threads[1]
+
+
+def test_what_threads_do_comes_in_order_and_as_jax_is_set_for_their_caller():
+    threads = []
+
+    def double(x):
+        threads.append(threading.get_ident())
+        return 2 * x
+
+    assert map_in_threads(double, iter(range(5))) == [0, 2, 4, 6, 8]
+    assert threading.get_ident() not in threads
+    threads.clear()
+    with jax.default_matmul_precision("float32"):
+        assert map_in_threads(double, iter(range(5))) == [0, 2, 4, 6, 8]
+    assert threads == 5 * [threading.get_ident()]
