@@ -216,6 +216,7 @@ def _common_block(lengths: tuple[int, ...], angle: float) -> int:
     return int(sizes[best[np.argmin(np.abs(sizes[best] - ideal))]])
 
 
+@ft.lru_cache(maxsize=256)
 def _spread(samples: int, length: int, overlap: float, block: int) -> tuple[int, tuple[int, ...]]:
     length = min(round(length / block), samples // block) * block
     step = max(int(round(length * (1 - overlap))), 1)

@@ -144,7 +144,8 @@ def _columns(record: Record, welch: Welch) -> Float[np.ndarray, "samples channel
     """All channels, the outputs differenced and earlier by the delay."""
     n, late = welch.integrators, welch.delay_samples(record)
     outputs = np.diff(record.outputs, n, axis=0)
-    outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
+    if late:
+        outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
     # A difference delays by n/2 samples, and the window would act on it like on any delay.
     centre = slice(n - n // 2, record.samples - n // 2)
     return np.hstack([record.inputs[centre], outputs, record.references[centre]])
