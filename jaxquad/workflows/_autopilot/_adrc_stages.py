@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxquad.control.autopilots import find_parameter, Parameter
 
 from ._adrc_loops import ADRCLoop, Designs
+from ._limits import beyond_limits
 from ._rate_design import Kind
 from ._rate_gains import LoopQualities
 
@@ -142,27 +143,5 @@ def judge(
 
 def beyond_targets(stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float) -> list[str]:
     """In words, which of the targets are not kept."""
-    words, stage, flown = [], stages["proposed"], stages["what flew"]
-    third = stages.get("a third of the way", stage)
-    if min(stage.stable, third.stable) < 1:
-        share = 100 * min(stage.stable, third.stable)
-        words.append(f"only {share:.1f} % of the loops are stable")
-    if stage.peak > targets.sensitivity:
-        words.append(f"the worst Ms is {stage.peak:.2f}, above {targets.sensitivity:g}")
-    elif third.peak > max(targets.sensitivity, flown.peak):
-        words.append(
-            f"a third of the way the worst Ms is {third.peak:.2f}, above {targets.sensitivity:g}"
-        )
-    if stage.resonance > targets.resonance:
-        words.append(
-            f"the worst peak from set-point to rate is {stage.resonance:.2f}, above "
-            f"{targets.resonance:g}"
-        )
-    if stage.noise > targets.noise:
-        words.append(f"the noise is {stage.noise:.2f} of what flew, above {targets.noise:g}")
-    if stage.crossover > edge:
-        words.append(
-            f"the crossover of {stage.crossover / (2 * np.pi):.1f} Hz is beyond the identified "
-            f"{edge / (2 * np.pi):.1f} Hz"
-        )
-    return words
+    flown, whole = stages["what flew"], stages["proposed"]
+    return beyond_limits(flown, stages.get("a third of the way", whole), whole, targets, edge)

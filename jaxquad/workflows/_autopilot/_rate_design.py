@@ -16,6 +16,7 @@ from .._tune_settings import AutopilotSettings
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
+from ._limits import beyond_limits
 from ._over_throttle import ThrottleVerdict
 from ._rate_gains import (
     ceiling_in,
@@ -316,7 +317,7 @@ def _judge(
     throttle: ThrottleVerdict,
 ) -> tuple[Kind, str]:
     flown, third, whole = stages
-    beyond = _beyond(third, whole, flown, settings, edge)
+    beyond = beyond_limits(flown, third, whole, settings, edge, loud=_ALLOWED)
     if shared is not None and shared.noise > _ALLOWED * settings.noise:
         beyond.append(
             f"the command's noise on another axis is {shared.noise:.2f} of what flew, above "
@@ -342,27 +343,3 @@ def _judge(
         f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most "
         f"{limit:g}, {better}. Load the file for a third of the way first"
     )
-
-
-def _beyond(
-    third: Stage, whole: Stage, flown: Stage, settings: AutopilotSettings, edge: float
-) -> list[str]:
-    """What is beyond a limit."""
-    limit, beyond = settings.sensitivity, []
-    if min(third.stable, whole.stable) < 1:
-        beyond.append(f"only {100 * min(third.stable, whole.stable):.1f} % of the loops are stable")
-    if whole.peak > limit:
-        beyond.append(f"the worst Ms is {whole.peak:.2f}, above {limit:g}")
-    if whole.resonance > settings.resonance:
-        beyond.append(
-            f"the worst peak from set-point to rate is {whole.resonance:.2f}, above "
-            f"{settings.resonance:g}"
-        )
-    if third.peak > max(limit, flown.peak):
-        beyond.append(f"a third of the way the worst Ms is {third.peak:.2f}, above {limit:g}")
-    if whole.crossover > edge:
-        beyond.append(
-            f"the crossover of {whole.crossover / (2 * np.pi):.1f} Hz is beyond the identified "
-            f"{edge / (2 * np.pi):.1f} Hz"
-        )
-    return beyond

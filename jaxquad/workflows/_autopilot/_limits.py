@@ -1,0 +1,65 @@
+"""Which limits a certified design does not keep, in words."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+
+@runtime_checkable
+class Certified(Protocol):
+    """What gains or parameters give on fresh plants, as `Stage` and `ADRCStage` say it."""
+
+    @property
+    def stable(self) -> float: ...
+    @property
+    def peak(self) -> float: ...
+    @property
+    def resonance(self) -> float: ...
+    @property
+    def crossover(self) -> float: ...
+    @property
+    def noise(self) -> float: ...
+
+
+@runtime_checkable
+class Limits(Protocol):
+    """What is wanted of them, as `AutopilotSettings` and `ADRCTargets` say it."""
+
+    @property
+    def sensitivity(self) -> float: ...
+    @property
+    def resonance(self) -> float: ...
+    @property
+    def noise(self) -> float: ...
+
+
+def beyond_limits(
+    flown: Certified, third: Certified, whole: Certified, limits: Limits, edge: float, *,
+    loud: float = 1.0,
+) -> list[str]:  # fmt: skip
+    """In words, what is beyond a limit: `edge` of the identified band in rad/s, `loud` of noise."""
+    limit, hertz = limits.sensitivity, 2 * np.pi
+    share, most = 100 * min(third.stable, whole.stable), max(limit, flown.peak)
+    found = [
+        (share < 100, f"only {share:.1f} % of the loops are stable"),
+        (whole.peak > limit, f"the worst Ms is {whole.peak:.2f}, above {limit:g}"),
+        (
+            whole.resonance > limits.resonance,
+            f"the worst peak from set-point to rate is {whole.resonance:.2f}, above "
+            f"{limits.resonance:g}",
+        ),
+        (
+            third.peak > most,
+            f"a third of the way the worst Ms is {third.peak:.2f}, above {most:.3g}",
+        ),
+        (
+            whole.noise > loud * limits.noise,
+            f"the command's noise is {whole.noise:.2f} of what flew, above {limits.noise:g}",
+        ),
+        (
+            whole.crossover > edge,
+            f"the crossover of {whole.crossover / hertz:.1f} Hz is beyond the identified "
+            f"{edge / hertz:.1f} Hz",
+        ),
+    ]
+    return [words for is_beyond, words in found if is_beyond]
