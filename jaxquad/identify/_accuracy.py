@@ -224,51 +224,55 @@ def projected_noise(
 
     samples, outputs = residual.shape
     length = int(next_fast_len(2 * samples, real=True) or 2 * samples)
-    # One series after the other: fresh memory for all of them would take longer than they do.
+    # Several series at once: they share the vectors of the processor.
     turn = lambda series: np.asarray(rfft(series, length))
-    power = lambda spectrum: np.abs(spectrum) ** 2 / samples
-    rest = [turn(each) for each in residual.T]
-    seen, smooth, left = [], [], []
-    reach = _reach(length // 2 + 1, length / samples)
+    rest, seen, smooth, left = [], [], [], []
+    windows = _windows(length // 2 + 1, length / samples)
     for o in range(outputs):
-        seen.append([turn(each) for each in columns[:, o].T])
-        taken = np.zeros(len(reach))
-        for each in (*seen[o][:count], *map(turn, nuisance[:, o].T)):
-            taken += power(each)
-        smooth.append(_averaged(power(rest[o]), reach))
-        left.append(np.sqrt(np.maximum(1 - _averaged(taken, reach), _FLOOR)))
-    twice = np.full(len(reach), 2.0 / length)
+        seen.append(turn(columns[:, o].T))
+        others = turn(np.vstack([residual[:, o], nuisance[:, o].T]))
+        rest.append(others[0])
+        taken = _power(seen[o][:count]) + _power(others[1:])
+        smooth.append(_averaged(_power(others[:1]) / samples, windows))
+        left.append(np.sqrt(np.maximum(1 - _averaged(taken / samples, windows), _FLOOR)))
+    twice = np.full(length // 2 + 1, 2.0 / length)
     twice[0] = 1.0 / length
     twice[-1] /= 2.0 if length % 2 == 0 else 1.0
     total = np.zeros((columns.shape[2],) * 2)
     for o in range(outputs):
         total += _product(seen[o], twice * smooth[o] / left[o] ** 2, seen[o])
     for i, j in itertools.permutations(range(outputs), 2):
-        cross = _averaged(rest[i].conj() * rest[j] / samples, reach)
+        cross = _averaged(rest[i].conj() * rest[j] / samples, windows)
         total += _product(seen[i], twice * cross / (left[i] * left[j]), seen[j])
     return 0.5 * (total + total.T)
 
 
+def _power(spectra: Complex[np.ndarray, "series bins"]) -> Float[np.ndarray, " bins"]:
+    """The sum of their squares."""
+    parts = spectra.view(float)
+    squares = np.einsum("sp,sp->p", parts, parts)
+    return squares[::2] + squares[1::2]
+
+
 def _product(
-    one: Sequence[Complex[np.ndarray, " bins"]],
+    one: Complex[np.ndarray, "columns bins"],
     weight: Float[np.ndarray, " bins"] | Complex[np.ndarray, " bins"],
-    other: Sequence[Complex[np.ndarray, " bins"]],
+    other: Complex[np.ndarray, "columns bins"],
 ) -> Float[np.ndarray, "columns columns"]:
     """The real part of the sum of conj(weight one) other over the bins."""
-    total = np.zeros((len(one), len(other)))
-    for k, row in enumerate(one):
-        weighted = (weight * row).view(float)
-        total[k] = [weighted @ each.view(float) for each in other]
-    return total
+    return (weight * one).view(float) @ other.view(float).T
 
 
 def orthonormal(
     columns: Float[np.ndarray, "samples outputs columns"],
 ) -> Float[np.ndarray, "samples outputs columns"]:
     """An orthonormal basis of what the columns span over all samples and outputs."""
-    scale = np.linalg.norm(columns, axis=(0, 1))
-    columns = columns / np.where(scale > 1e-12 * np.max(scale, initial=0.0), scale, np.inf)
-    return orthogonal_factors(columns.reshape(-1, columns.shape[2]))[0].reshape(columns.shape)
+    flat = columns.reshape(-1, columns.shape[2])
+    scale = np.sqrt([column @ column for column in flat.T])
+    seen = scale > 1e-12 * np.max(scale, initial=0.0)
+    if not np.all(seen):
+        flat = flat / np.where(seen, scale, np.inf)
+    return orthogonal_factors(flat)[0].reshape(columns.shape)
 
 
 _WELL = 1e-3  # smallest eigenvalue of the products of columns of unit length for two rounds
@@ -299,17 +303,25 @@ def orthogonal_factors(
     return basis, triangle
 
 
+class _Windows(NamedTuple):
+    """Of a moving mean: its first bin and the one after its last, in a mirrored spectrum."""
+
+    start: np.ndarray
+    stop: np.ndarray
+    mirrored: int  # bins before the first and after the last
+
+
 @ft.lru_cache(maxsize=8)
-def _reach(bins: int, finer: float) -> np.ndarray:
-    return np.ceil(np.maximum(_LEAST * finer, _SHARE * np.arange(bins))).astype(int)
+def _windows(bins: int, finer: float) -> _Windows:
+    reach = np.ceil(np.maximum(_LEAST * finer, _SHARE * np.arange(bins))).astype(int)
+    furthest = min(int(reach.max()), bins - 1)
+    reach, centre = np.minimum(reach, furthest), np.arange(bins) + furthest
+    return _Windows(centre - reach, centre + reach + 1, furthest)
 
 
-def _averaged(x: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """The mean over `reach` neighbours on either side, mirrored at the ends."""
-    bins, furthest = len(x), min(int(reach.max()), len(x) - 1)
+def _averaged(x: np.ndarray, windows: _Windows) -> np.ndarray:
+    """The mean over the windows around each bin, mirrored at the ends."""
+    start, stop, furthest = windows
     mirrored = np.concatenate([x[furthest:0:-1].conj(), x, x[-2 : -furthest - 2 : -1].conj()])
-    sums = np.concatenate([np.zeros((1, *x.shape[1:]), x.dtype), np.cumsum(mirrored, axis=0)])
-    reach = np.minimum(reach, furthest)
-    centre = np.arange(bins) + furthest
-    count = (2 * reach + 1).reshape(-1, *(1,) * (x.ndim - 1))
-    return (sums[centre + reach + 1] - sums[centre - reach]) / count
+    sums = np.concatenate([np.zeros(1, x.dtype), np.cumsum(mirrored)])
+    return (sums[stop] - sums[start]) / (stop - start)

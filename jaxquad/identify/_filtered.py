@@ -34,7 +34,6 @@ _MOST = 4  # poles, beyond which the coefficients of A may say too little of the
 _DIGITS = 1e6  # rounding of the output, in units of the last bit of its largest value
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
 _REFINEMENTS = 3
-_SETTLED = 1e-7  # change of an unknown, whose square is left to the next refinement
 _CLOSE = 1e-8  # a step, relative to 1 + |z|, whose square is rounding
 _GONE = 1e-20  # of the states, relative to their start
 
@@ -80,7 +79,9 @@ class Columns(NamedTuple):
     @property
     def rows(self) -> Rows:
         """Shift and motions within the band, over all samples."""
-        return np.concatenate([self.shift[None], _lengthened(self.seen, self.shift.size)])
+        rows = np.zeros((len(self.scale), self.shift.size))
+        rows[0], rows[1:, : self.seen.shape[1]] = self.shift, self.seen
+        return rows
 
 
 class Simulated(NamedTuple):
@@ -130,6 +131,8 @@ class FilteredPoint:
     @ft.cached_property
     def behind(self) -> list[Float[np.ndarray, " samples"]]:
         """y / A of each record."""
+        if self.next_to is not None:
+            return self.next_to.behind
         return [_over(one.sampled.below, one.output) for one in self.records]
 
     @ft.cached_property
@@ -269,14 +272,13 @@ def _shifted(u: Float[np.ndarray, " samples"], shift: int) -> Float[np.ndarray, 
 
 
 def _slope_rows(term: RecordTerm, one: Simulated, behind: Float[np.ndarray, " samples"]) -> Rows:
-    model, samples = one.sampled, len(behind)
-    changes = np.split(term.weights[0] * one.sampled.slopes, [model.above.size])
-    rows = np.empty((one.sampled.slopes.shape[1], samples))
-    # One after the other: fresh memory for all shifts would take longer than they do.
-    for row, above, below in zip(rows, changes[0].T, changes[1].T, strict=True):
-        row[:] = np.convolve(one.driven, -above)[:samples]
-        row[1:] += np.convolve(behind, below)[: samples - 1]
-    return _in_band(term, rows)
+    model, driven = one.sampled, -one.driven
+    late = [(driven, k) for k in range(model.above.size)]
+    late += [(behind, k + 1) for k in range(model.below.size)]
+    signals = np.empty((len(late), len(behind)))
+    for row, (signal, k) in zip(signals, late, strict=True):
+        row[:k], row[k:] = 0.0, signal[: len(signal) - k]
+    return _in_band(term, float(term.weights[0]) * model.slopes.T @ signals)
 
 
 def _over(below: Float[np.ndarray, " poles"], x: Float[np.ndarray, " samples"]) -> np.ndarray:
@@ -311,12 +313,12 @@ def _motion(
     row: Float[np.ndarray, " both"], step: Float[np.ndarray, "both both"], samples: int
 ) -> Float[np.ndarray, "both moving"]:
     """`row` step^k for each sample k, as far as anything is left of it."""
-    found = np.zeros((len(row), samples))
+    found = np.empty((len(row), samples))
     found[:, 0], done = row, 1
     power = step.T
     while done < samples and np.max(np.abs(power)) > _GONE:
         more = min(done, samples - done)
-        found[:, done : done + more] = power @ found[:, :more]
+        np.matmul(power, found[:, :more], out=found[:, done : done + more])
         power, done = power @ power, done + more
     return found[:, :done]
 
@@ -329,8 +331,9 @@ def _columns(term: RecordTerm, free: Float[np.ndarray, "motions moving"]) -> Col
     samples = len(term.y)
     shift = _in_band(term, np.ones(samples))
     seen = free if term.gain is None else _in_band(term, _lengthened(free, samples))
-    along = seen @ shift[: seen.shape[1]]
-    normal = np.block([[shift @ shift, along], [along[:, None], seen @ seen.T]])
+    normal = np.empty((len(seen) + 1,) * 2)
+    normal[0, 0], normal[1:, 1:] = shift @ shift, seen @ seen.T
+    normal[0, 1:] = normal[1:, 0] = seen @ shift[: seen.shape[1]]
     square = np.diagonal(normal)
     scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
     ridged = normal * np.outer(scale, scale) + _RIDGE * np.eye(len(normal))
@@ -341,17 +344,14 @@ def _project_out(
     misfit: Float[np.ndarray, " samples"], columns: Columns
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " rows"]]:
     """The misfit that no start, trim or shift explains, and how much of each does explain."""
-    unknowns, rest = np.zeros(len(columns.scale)), misfit
+    aim, unknowns = columns.scale * columns.products(misfit), np.zeros(len(columns.scale))
+    if not np.all(np.isfinite(aim)):
+        return np.full_like(misfit, np.nan), unknowns
+    plain = columns.normal - _RIDGE * np.eye(len(aim))
     for _ in range(_REFINEMENTS):
-        aim = columns.scale * columns.products(rest)
-        if not np.all(np.isfinite(aim)):
-            return np.full_like(misfit, np.nan), unknowns
-        step = np.linalg.solve(columns.normal, aim) * columns.scale
-        unknowns = unknowns + step
-        rest = columns.taken_off(misfit, unknowns)
-        if np.all(np.abs(step) <= _SETTLED * np.abs(unknowns)):
-            break
-    return rest, unknowns
+        unknowns = unknowns + np.linalg.solve(columns.normal, aim - plain @ unknowns)
+    unknowns = columns.scale * unknowns
+    return columns.taken_off(misfit, unknowns), unknowns
 
 
 def _without_columns(rows: Rows, columns: Columns) -> Float[np.ndarray, "parameters parameters"]:

@@ -132,8 +132,8 @@ def project_records(
     for term, misfit, slopes, columns, noise in parts:
         slopes, states = np.asarray(slopes), term.start.size
         own = [np.asarray(columns), slopes[:, :, at : at + states]]
-        own = np.concatenate(own if noise is None else [*own, noise], axis=2)
-        basis = orthonormal(own)
+        own = [part for part in (*own, noise) if part is not None and part.shape[2]]
+        basis = orthonormal(own[0] if len(own) == 1 else np.concatenate(own, axis=2))
         mine = slopes[:, :, : rescale.size] * rescale
         rows, flat = mine.reshape(-1, rescale.size), basis.reshape(-1, basis.shape[2])
         left = np.reshape(rows - flat @ (flat.T @ rows), mine.shape)

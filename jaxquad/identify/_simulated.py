@@ -252,8 +252,9 @@ def unknown_motions(plant: TransferFunction | StateSpace, duration: float) -> Mo
     A = _dynamics(plant)
     if not len(A):
         return Motions(np.zeros((0, 0)), np.zeros((0, 0)), ())
-    edges = _edges(-np.real(np.linalg.eigvals(A)) * duration / _SLOW)
-    within = lambda low, high: _subspace(A * duration / _SLOW, low, high)
+    speeds = -np.real(np.linalg.eigvals(A)) * duration / _SLOW
+    edges = _edges(speeds)
+    within = lambda low, high: _subspace(A * duration / _SLOW, speeds, low, high)
     slow = within(-np.inf, edges[0])
     parts = [within(low, high) for low, high in zip(edges, edges[1:], strict=False)]
     parts = parts or [slow[:, :0]]
@@ -308,8 +309,16 @@ def _edges(speed: Float[np.ndarray, " states"]) -> list[float]:
     return [*first, *middles[speed[gaps + 1] > 1].tolist(), np.inf]
 
 
-def _subspace(A: np.ndarray, low: float, high: float) -> Float[np.ndarray, "states within"]:
+def _subspace(
+    A: Float[np.ndarray, "states states"],
+    speeds: Float[np.ndarray, " states"],
+    low: float,
+    high: float,
+) -> Float[np.ndarray, "states within"]:
     """An orthonormal basis of the motions that decay faster than at `low`, up to `high`."""
+    inside = (low < speeds) & (speeds <= high)
+    if not np.any(inside) or np.all(inside):
+        return np.eye(len(A), int(np.sum(inside)))
     from scipy.linalg import schur
 
     found = schur(A, output="real", sort=lambda re, im: low < -re <= high)

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxquad._core import require_all_positive
 
 from ._connect import realise
-from ._exponential import matrix_exponential
+from ._exponential import dot, matrix_exponential, small_dot
 from ._state_space import explicit, StateSpace
 from ._transfer_function import TransferFunction
 
@@ -55,8 +55,8 @@ def _crossing(A, b, late, span, dt):
     first = jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, new])])
     both = jax.vmap(lambda time: _propagate(A, b, time))(jnp.stack([old, new]) * dt)
     (before, of_old), (after, of_new) = (jax.tree.map(lambda x, k=k: x[k], both) for k in (0, 1))
-    drive = [_dot(after, _dot(of_old, last)), _dot(of_new, first)]
-    return _dot(after, before), jnp.concatenate(drive, axis=1)
+    drive = [small_dot(after, small_dot(of_old, last)), small_dot(of_new, first)]
+    return small_dot(after, before), jnp.concatenate(drive, axis=1)
 
 
 def _propagate(
@@ -66,7 +66,7 @@ def _propagate(
     states = len(A)
     plant = jnp.pad(jnp.concatenate([A, B], axis=1) * time, ((0, 0), (0, 1)))
     line = jnp.eye(2, states + 2, k=states + 1, dtype=A.dtype)
-    step = matrix_exponential(jnp.concatenate([plant, line]))[:states]
+    step = matrix_exponential(jnp.concatenate([plant, line]), small_dot)[:states]
     return step[:, :states], step[:, states:]
 
 
@@ -89,11 +89,6 @@ def shift_samples(
     return jnp.where(index[:, None] >= 0, x[jnp.maximum(index, 0)], 0)
 
 
-def _dot(a: Array, b: Array) -> Array:
-    """The matrix product; a GPU would round float32 products to 10 bits."""
-    return jnp.dot(a, b, precision="highest")
-
-
 def recursion(
     A: Float[Array, "states states"], drive: Float[Array, "samples states"]
 ) -> Float[Array, "samples states"]:
@@ -105,11 +100,11 @@ def recursion(
     by_place = jnp.swapaxes(padded.reshape(chunks, length, states), 0, 1)
 
     def sample(x, w):
-        return _dot(x, A.T) + w, x
+        return dot(x, A.T) + w, x
 
     ends, within = jax.lax.scan(sample, jnp.zeros((chunks, states), drive.dtype), by_place)
     steps, over = powers(A, length)
-    starts = jax.lax.scan(lambda x, w: (_dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
+    starts = jax.lax.scan(lambda x, w: (dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
     carried = jnp.einsum("lij,cj->lci", steps, starts, precision="highest")
     return jnp.swapaxes(within + carried, 0, 1).reshape(chunks * length, states)[:samples]
 
@@ -131,7 +126,7 @@ def powers(
 ) -> tuple[Float[Array, "count states states"], Float[Array, "states states"]]:
     """A^0 to A^(count - 1), and A^count."""
     one = jnp.eye(len(A), dtype=A.dtype)
-    last, found = jax.lax.scan(lambda P, _: (_dot(A, P), P), one, length=count)
+    last, found = jax.lax.scan(lambda P, _: (dot(A, P), P), one, length=count)
     return found, last
 
 
@@ -242,8 +237,8 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
     below, row, above = [], plant.C[0], jnp.zeros(states + 2, plant.A.dtype)
     power = jnp.eye(states, dtype=plant.A.dtype)
     for k in range(states):
-        above = above.at[k : k + 3].add(_dot(drive, _dot(row, power)))
-        power = _dot(step, power)
+        above = above + jnp.pad(small_dot(drive, small_dot(row, power)), (k, states - 1 - k))
+        power = small_dot(step, power)
         below.append(-jnp.trace(power) / (k + 1))
         power = power + below[-1] * jnp.eye(states, dtype=plant.A.dtype)
     poles = jnp.stack(below) if below else jnp.zeros(0, plant.A.dtype)
@@ -253,7 +248,8 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
         above = above.at[:-1].add(now * whole).at[1:].add(before * whole)
     block = _with_bias(plant.A)
     rows = jnp.concatenate([plant.C, jnp.zeros_like(plant.C)], axis=1)
-    return SampledRational(above, poles, shift[0], matrix_exponential(block * dt), rows)
+    exponential = matrix_exponential(block * dt, small_dot)
+    return SampledRational(above, poles, shift[0], exponential, rows)
 
 
 def _direct(late: Float[Array, ""], hold: str) -> Float[Array, "2"]:
@@ -307,9 +303,9 @@ def _simulate(
     acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
     acting = acting.reshape(segments.shape[1], 4 * len(segments))
     step, drive = propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
-    states = recursion(step, _dot(acting, drive))
+    states = recursion(step, dot(acting, drive))
     if plant.output_delay is None:
-        found = _dot(states, plant.C.T)
+        found = dot(states, plant.C.T)
     else:
         found = _late_outputs(plant, states, acting, late, dt)
     return found if plant.D is None else found + _direct_outputs(plant, plant.D, segments, dt)
@@ -326,7 +322,7 @@ def _late_outputs(
     def output(row, delay):
         shift, wait = split_delay(delay, dt)
         step, drive = propagation(plant.A, plant.B, late, 1 - wait, dt)
-        within = _dot(states, _dot(row, step)) + _dot(acting, _dot(drive, row))
+        within = dot(states, dot(row, step)) + dot(acting, dot(drive, row))
         return shift_samples(within[:, None], shift + 1)[:, 0]
 
     return jax.vmap(output, out_axes=1)(plant.C, plant.output_delay)
