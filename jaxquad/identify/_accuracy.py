@@ -1,5 +1,6 @@
 """From the derivatives at the solution to covariances, bounds and conditioning (host side)."""
 
+import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Sequence
@@ -53,7 +54,8 @@ class Noise(NamedTuple):
     cost: float  # expected cost of the noise before any parameter is fitted to it
 
 
-class ResponseTerm(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class ResponseTerm:
     """One frequency response as the fit sees it."""
 
     frf: FrequencyResponse
@@ -61,21 +63,28 @@ class ResponseTerm(NamedTuple):
     slopes: Float[np.ndarray, "frequencies outputs inputs 2 all"]
     weights: Float[np.ndarray, "frequencies outputs inputs 2"]
     mixing: Mixing | None
+    count: int  # of free parameters, the first of all
 
-    def pulls(self, count: int) -> Float[np.ndarray, "frequencies outputs inputs 2 parameters"]:
+    @ft.cached_property
+    def pulls(self) -> Float[np.ndarray, "frequencies outputs inputs 2 parameters"]:
         """How far a misfit of each point moves the gradient by each free parameter."""
-        rows = self.weights[..., None] * self.slopes[..., :count]
+        rows = self.weights[..., None] * self.slopes[..., : self.count]
         return self.weights[..., None] * mix_twice(self.mixing, rows)
 
-    @property
+    @ft.cached_property
     def ratio(self) -> Complex[np.ndarray, "frequencies outputs inputs"]:
         """Measurement over model."""
         return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
 
-    @property
+    @ft.cached_property
+    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """As in `FrequencyResponse`."""
+        return self.frf.error_exponent
+
+    @ft.cached_property
     def error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Random error relative to the model."""
-        off = np.abs(self.ratio) ** self.frf.error_exponent
+        off = np.abs(self.ratio) ** self.error_exponent
         return np.asarray(self.frf.random_error) * off
 
 
@@ -101,19 +110,21 @@ def noise_effect(
     records: Sequence[ResponseTerm], blocks: list[Block], prior: PriorRows, count: int
 ) -> Noise:
     """The responses' errors, with all their correlation, seen through weights and slopes."""
-    data = np.sum([_through_fit(record, count) for record in records], axis=0)
+    data = np.sum([_through_fit(record) for record in records], axis=0)
     cost = sum(block.expected for block in blocks)
     return Noise(data, prior.slopes[:, :count].T @ prior.slopes[:, :count], cost)
 
 
-def _through_fit(record: ResponseTerm, count: int) -> Matrix:
-    weighted = record.pulls(count)
+def _through_fit(record: ResponseTerm) -> Matrix:
+    weighted = record.pulls
     used = record.weights[..., :1] > 0
     model = np.where(used[..., 0], np.asarray(record.frf.response) / record.ratio, 1.0)
-    off = np.where(used[..., 0], np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent)
+    off = np.where(used[..., 0], np.abs(record.ratio), 1.0) ** (1 - record.error_exponent)
     # Magnitude and phase of the misfit are the parts of dT over T.
     columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / (model.conj() * off)[..., None]
-    return record.frf.errors.project(np.where(used, columns, 0.0))
+    errors = record.frf.errors
+    # A bound method of an `eqx.Module` is made like a model.
+    return type(errors).project(errors, np.where(used, columns, 0.0))
 
 
 def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -> Matrix:
@@ -140,7 +151,7 @@ def degrees_of_freedom(
     for record in records:
         used = record.weights[..., 0] > 0
         error = np.where(used, record.error, 0.0)
-        moved = record.pulls(count) @ inverse
+        moved = record.pulls @ inverse
         share = np.sum((error[..., None, None] * moved) ** 2, axis=(2, 3))
         variance += np.sum(share, axis=(0, 1))
         covariance = record.frf.log_noise_covariance

@@ -53,7 +53,7 @@ from ._parameters import Place
 from ._problem import Problem
 from ._result import Fit
 from ._solve import same_responses, Solution
-from ._starts import Minimum, remarks_on_minima
+from ._starts import look_aside, Minimum, remarks_on_minima
 from ._verdict import Bound, Verdict
 
 
@@ -92,6 +92,7 @@ def assess(
         seen = _see(problem, counted, solution, units)
     records, blocks, prior = seen.records, seen.blocks, seen.prior
     bread, gradient, noise, discrepancy = seen.bread, seen.gradient, seen.noise, seen.discrepancy
+    falls_aside = look_aside(problem, solution, _cost(blocks, prior), bread)
     halved = ft.partial(_one_sided, seen=seen, names=parameters.names, bounds=bounds)
     by_noise, covariance = halved(seen.by_noise), halved(seen.covariance)
     plain = seen
@@ -122,7 +123,7 @@ def assess(
             *_remarks_on_used(problem, frfs),
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
             *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
-            *remarks_on_minima(problem, solution, _cost(blocks, prior), bread, minima),
+            *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
             *remarks_on_priors(prior.misfit, verdict, by_data),
             *remarks_on_discrepancy(discrepancy),
             *further,
@@ -312,7 +313,7 @@ def _records(
     misfits = [np.asarray(each) for each in parts.misfits]
     slopes = [np.asarray(each) * scale for each in parts.slopes]
     terms = zip(frfs, misfits, slopes, weights, problem.mixings, strict=True)
-    return [ResponseTerm(*each) for each in terms]
+    return [ResponseTerm(*each, problem.parameters.count) for each in terms]
 
 
 def _prior_rows(solution: Solution, units: Float[np.ndarray, " all"]) -> PriorRows:

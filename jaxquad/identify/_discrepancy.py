@@ -178,7 +178,7 @@ def discrepancy_effect(
     """J'W D W J of a discrepancy D of unit amplitude, for each length."""
     total = np.zeros((len(LENGTHS), count, count))
     for record in records:
-        pulls = np.where(record.weights[..., None] > 0, record.pulls(count), 0.0)
+        pulls = np.where(record.weights[..., None] > 0, record.pulls, 0.0)
         basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
         pulls = np.reshape(pulls * SHARES[:, None], (len(pulls), -1))
         along = (np.swapaxes(basis, 1, 2) @ pulls).reshape(len(LENGTHS), -1, count)

@@ -28,19 +28,19 @@ def evaluate(problem: Problem, z: Float[np.ndarray, " parameters"]) -> Evaluatio
     Records of equal shape share a program, whatever they are weighted by: compiling it takes longer
     than a fit.
     """
-    return evaluate_each(problem, [z])[0]
+    return start_each(problem, [z])()[0]
 
 
-def evaluate_each(
+def start_each(
     problem: Problem, places: Sequence[Float[np.ndarray, " parameters"]]
-) -> list[Evaluation]:
-    """The same at several places, all of which are started before the first is waited for."""
+) -> Callable[[], list[Evaluation]]:
+    """The same at several places, begun at once and in parallel; what is returned waits for it."""
     programs, found = _programs(_Same(problem)), []
     for z in places:
         z_all = np.array(problem.parameters.start)
         z_all[: z.size] = z
         found.append([run(z_all, arrays) for run, arrays in programs])
-    return [_joined(parts, problem.parameters.start.size) for parts in found]
+    return lambda: [_joined(parts, problem.parameters.start.size) for parts in found]
 
 
 def _joined(found: Sequence[tuple[Array, Array]], count: int) -> Evaluation:

@@ -100,14 +100,21 @@ def _namespace(x: Numbers):
 
 def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, " n"]) -> PyTree:
     """Return `model` with the numbers at `places` replaced by `values`; see `Parameters`."""
-    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(arrays)
+    whole, structure = jax.tree.flatten(model)
+    numbers = [k for k, leaf in enumerate(whole) if eqx.is_inexact_array(leaf)]
+    leaves = [whole[k] for k in numbers]
+
+    def rebuilt() -> PyTree:
+        for k, leaf in zip(numbers, leaves, strict=True):
+            whole[k] = leaf
+        return jax.tree.unflatten(structure, whole)
+
     if _namespace(values) is np:
         leaves = [np.array(leaf) if is_concrete(leaf) else leaf for leaf in leaves]
         if all(isinstance(leaf, np.ndarray) for leaf in leaves):
             for place, value in zip(places, values, strict=True):
                 leaves[place.leaf].reshape(-1)[place.index] = value
-            return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+            return rebuilt()
     for leaf in {place.leaf for place in places}:
         mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
         index = np.array([places[k].index for k in mine])
@@ -120,24 +127,25 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
             continue
         flat = jnp.asarray(leaves[leaf]).reshape(-1).at[index].set(values[mine])
         leaves[leaf] = flat.reshape(leaves[leaf].shape)
-    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+    return rebuilt()
 
 
 def name_places(model: PyTree) -> list[Place]:
     """Every floating-point number of a model: `lag`, `numerator[0]`, `axis.inertia[2]`."""
-    arrays, structure = jax.tree.flatten(eqx.filter(model, eqx.is_inexact_array))
-    places, names = _places(structure, tuple(array.shape for array in arrays))
-    for name, array in zip(names, arrays, strict=True):
+    leaves, structure = jax.tree.flatten(model)
+    numbers = [leaf if eqx.is_inexact_array(leaf) else None for leaf in leaves]
+    places, names = _places(structure, tuple(x if x is None else x.shape for x in numbers))
+    for name, array in zip(names, (x for x in numbers if x is not None), strict=True):
         require_float64(f"parameter {name}", array)
     return list(places)
 
 
 @ft.lru_cache(maxsize=64)
 def _places(
-    structure: PyTree, shapes: tuple[tuple[int, ...], ...]
+    structure: PyTree, shapes: tuple[tuple[int, ...] | None, ...]
 ) -> tuple[tuple[Place, ...], tuple[str, ...]]:
-    """Of all numbers in arrays of these shapes; and the arrays' own names."""
-    hollow = jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])
+    """Of all numbers in arrays of these shapes (None: no array); and the arrays' own names."""
+    hollow = jax.tree.unflatten(structure, [x if x is None else np.zeros(x) for x in shapes])
     places, names, given = [], [], _given_names(hollow)
     for leaf, (path, array) in enumerate(jax.tree_util.tree_flatten_with_path(hollow)[0]):
         name = jax.tree_util.keystr(path, simple=True, separator=".")
@@ -253,7 +261,7 @@ def _marked(
 
 
 def _numbers(model: PyTree, places: list[Place]) -> dict[str, float]:
-    arrays = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+    arrays = (leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf))
     leaves = [np.asarray(array).reshape(-1) for array in arrays]
     return {p.name: float(leaves[p.leaf][p.index]) for p in places}
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Key, PyTree
 
-from jaxquad._core import plain_content
+from jaxquad._core import plain_content, pytree_node
 from jaxquad._xla import run_shared
 from jaxquad.records import Record
 
@@ -34,7 +34,8 @@ from ._verdict import Combination, pooled_freedom, reach_of_interval, Undetermin
 from ._verify import Verification, verify
 
 
-class Fit(eqx.Module):
+@pytree_node
+class Fit:
     """An identified model with its doubts; `str(fit)` is the table for a report.
 
     `verdict` says which parameters the record determines. Numbers of the others are kept as the

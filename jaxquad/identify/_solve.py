@@ -18,7 +18,7 @@ from jaxquad._core import (
 from jaxquad._xla import arctan2
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
-from ._evaluate import as_residuals, evaluate, evaluate_each, Evaluation, Frame, take_apart
+from ._evaluate import as_residuals, evaluate, Evaluation, Frame, start_each, take_apart
 from ._mixing import mix_parts
 from ._parameters import Numbers
 from ._problem import prior_misfits, Problem, residuals, unchanged
@@ -302,8 +302,14 @@ def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> 
     return True
 
 
-def costs_at(problem: Problem, places: Sequence[Float[np.ndarray, " parameters"]]) -> list[float]:
-    """The sums of squares at values of the free parameters."""
-    found = evaluate_each(problem, places)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return [float(np.sum(as_residuals(problem, each.misfits) ** 2)) for each in found]
+def start_costs(
+    problem: Problem, places: Sequence[Float[np.ndarray, " parameters"]]
+) -> Callable[[], list[float]]:
+    """The sums of squares at values of the free parameters; what is returned waits for them."""
+    found = start_each(problem, places)
+
+    def costs() -> list[float]:
+        with np.errstate(invalid="ignore", over="ignore"):
+            return [float(np.sum(as_residuals(problem, each.misfits) ** 2)) for each in found()]
+
+    return costs

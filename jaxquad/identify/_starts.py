@@ -1,5 +1,6 @@
 """Local minima: many starting points, solved side by side, and where each of them ended."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,14 @@ from jaxquad._core import (
 from ._accuracy import Matrix
 from ._parameters import Numbers, Parameters
 from ._problem import Problem, residuals
-from ._solve import costs_at, least_squares, problem_normal, Solution, solution_at, stopped_early
+from ._solve import (
+    least_squares,
+    problem_normal,
+    Solution,
+    solution_at,
+    start_costs,
+    stopped_early,
+)
 
 
 MINIMUM = "minimum"
@@ -237,11 +245,11 @@ _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
 def remarks_on_minima(
-    problem: Problem, solution: Solution, here: float, bread: Matrix, minima: tuple[Minimum, ...]
+    problem: Problem, falls_aside: bool, minima: tuple[Minimum, ...]
 ) -> list[str]:
-    """Remarks on a saddle instead of a minimum, and on other minima of nearly the cost `here`."""
+    """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
     remarks = []
-    if solution.converged and _falls_aside(problem, solution, here, bread):
+    if falls_aside:
         remarks.append(
             "stationary, but no minimum: the cost falls to one side; start from other values, or "
             "give starts=20"
@@ -258,12 +266,18 @@ def remarks_on_minima(
     return remarks
 
 
-def _falls_aside(problem: Problem, solution: Solution, here: float, bread: Matrix) -> bool:
-    """Whether the cost is lower a small step to either side along the weakest direction."""
+def look_aside(
+    problem: Problem, solution: Solution, here: float, bread: Matrix
+) -> Callable[[], bool]:
+    """Whether the cost is lower a small step to either side along the weakest direction.
+
+    Both costs are begun at once; what is returned waits for them.
+    """
     size = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
     values, vectors = np.linalg.eigh(bread / np.outer(size, size))
     weakest = vectors[:, 0] / size
     step = np.sqrt(1e-2 * max(here, 1e-12) / max(values[0], 1e-12))
     step = min(step, _ASIDE / max(np.max(np.abs(weakest)), 1e-300))
     sides = [solution.z + sign * step * weakest for sign in (1, -1)]
-    return min(costs_at(problem, sides)) < here * (1 - 1e-6) - 1e-12
+    costs = start_costs(problem, sides)
+    return lambda: min(costs()) < here * (1 - 1e-6) - 1e-12
