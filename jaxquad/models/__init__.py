@@ -22,11 +22,7 @@ from ._protocols import (
     Model as Model,
     with_arrays as with_arrays,
 )
-from ._response import (
-    invert as invert,
-    invert_definite as invert_definite,
-    Split as Split,
-)
+from ._response import Split as Split
 from ._rotation import (
     euler_acceleration as euler_acceleration,
     euler_from_quaternion as euler_from_quaternion,

@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxquad._xla import no_fuse, sincos
 
@@ -62,44 +62,6 @@ def _in_units(invert: Callable[[Split], Split], matrix: Split, scales: Scales) -
     rows, columns = scales
     found = invert(Split(*(rows[:, None] * part * columns[None] for part in matrix)))
     return Split(*(columns[:, None] * part * rows[None] for part in found))
-
-
-def invert(matrix: Complex[Array, "frequencies n n"]) -> Complex[Array, "frequencies n n"]:
-    """The inverse at each frequency, in any units.
-
-    Without LAPACK: two such calls for many matrices that run side by side, which a program's
-    threads share, wait for each other for ever on a machine with two cores.
-    """
-    return no_fuse(_invert, matrix)
-
-
-def invert_definite(
-    matrix: Complex[Array, "frequencies n n"],
-) -> Complex[Array, "frequencies n n"]:
-    """The inverse of Hermitian, positive definite matrices: they need no pivots.
-
-    It compiles in a quarter of the time of `invert`.
-    """
-    return no_fuse(_invert_definite, matrix)
-
-
-def _invert_definite(
-    matrix: Complex[Array, "frequencies n n"],
-) -> Complex[Array, "frequencies n n"]:
-    parts = Split(*(jnp.moveaxis(part(matrix), 0, -1) for part in (jnp.real, jnp.imag)))
-    count = len(parts.real)
-
-    def step(k: Int[Array, ""], table: Split) -> Split:
-        return _exchange_diagonal(table, _column(table, k), k)
-
-    found = jax.lax.fori_loop(0, count, step, parts)
-    return jnp.moveaxis(jax.lax.complex(*found), -1, 0)
-
-
-def _invert(matrix: Complex[Array, "frequencies n n"]) -> Complex[Array, "frequencies n n"]:
-    parts = Split(*(jnp.moveaxis(part(matrix), 0, -1) for part in (jnp.real, jnp.imag)))
-    found = inverse(parts, equilibrium(_size(parts)))
-    return jnp.moveaxis(jax.lax.complex(*found), -1, 0)
 
 
 def _derivative_of(inverse: Inverse) -> Callable[[tuple, tuple], tuple[Split, Split]]:

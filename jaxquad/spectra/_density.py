@@ -1,14 +1,15 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from jaxquad.records import Record
 
 from ._checks import check_compatible
 from ._estimators import Welch
+from ._leakage import cross_products
 from ._welch import frequencies_for, transform_records
 from ._window import coefficients
 
@@ -76,13 +77,6 @@ def spectral_density(
     [transforms], [(length, _)] = segments.transforms, segments.groups
     level, cosine = coefficients(welch.shape)
     energy = length * (level**2 + cosine**2 / 2)
-    density = _averaged(transforms, np.asarray(2 * records[0].dt / energy))
-    return SpectralDensity(jnp.asarray(omega), density, records[0].names)
-
-
-@eqx.filter_jit
-def _averaged(
-    transforms: Complex[Array, "segments frequencies channels"], scale: Float[ArrayLike, ""]
-) -> Complex[Array, "frequencies channels channels"]:
-    products = jnp.einsum("sfa,sfb->fab", jnp.conj(transforms), transforms)
-    return products * (jnp.asarray(scale) / transforms.shape[0]).astype(products.dtype)
+    scale = 2 * records[0].dt / (energy * transforms.shape[1])
+    put = jax.device_put
+    return SpectralDensity(put(omega), put(cross_products(transforms) * scale), records[0].names)

@@ -30,6 +30,7 @@ class Placement(eqx.Module):
         return np.where((into >= 0) & (into < 1), values, 0.0) * np.sqrt(step)
 
 
+@ft.lru_cache(maxsize=16)
 def place_windows(
     groups: tuple[tuple[int, tuple[int, ...]], ...], shape: str, dt: float, band: float
 ) -> Placement:

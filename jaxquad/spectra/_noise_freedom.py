@@ -1,7 +1,11 @@
 """How well an estimated noise power is known: on how many independent values it rests."""
 
+import functools as ft
+
 import numpy as np
 from jaxtyping import Float, Int
+
+from ._window import leaked_power
 
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -39,3 +43,27 @@ def covariance_of_bands(
     shared = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
     overlap = np.maximum(shared, 0) / np.sqrt(np.outer(count, count))
     return overlap / np.sqrt(np.outer(np.maximum(freedom, 1.0), np.maximum(freedom, 1.0)))
+
+
+def covariance_of_windows(
+    angle: Grid,
+    levels: Float[np.ndarray, "frequencies groups"],
+    shape: str,
+    lengths: tuple[int, ...],
+) -> Square:
+    """Of the logarithm of mean residual powers over windows of several lengths.
+
+    All lengths see the same noise, each with its own resolution; `levels` are the standard errors
+    that they contribute. `angle` is in rad per sample.
+    """
+    total, angles = np.zeros((angle.size, angle.size)), tuple(angle.tolist())
+    for level, length in zip(levels.T, lengths, strict=True):
+        total += np.outer(level, level) * _shared_power(shape, length, angles)
+    return total
+
+
+@ft.lru_cache(maxsize=12)
+def _shared_power(shape: str, length: int, angle: tuple[float, ...]) -> Square:
+    """What windows of this length have in common at two frequencies, in rad per sample."""
+    places = np.array(angle)
+    return leaked_power(shape, length, places[:, None] - places)

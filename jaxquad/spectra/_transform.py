@@ -24,7 +24,7 @@ class WindowTables(eqx.Module):
 
     tables: tuple[Float[Array, "2 _ _"], ...]  # one to a band of the compressed blocks
     taper: Float[Array, " window"]  # for the frequencies above the bands
-    turn: Complex[Array, "segments frequencies"]  # phase from the record's first sample
+    turn: Complex[Array, "frequencies segments"]  # phase from the record's first sample
     length: int = eqx.field(static=True)
     starts: tuple[int, ...] = eqx.field(static=True)
 
@@ -124,7 +124,7 @@ def _window(
     ranks: Sequence[int],
 ) -> WindowTables:
     tables = window_tables(length, shape, detrend, bands, basis, ranks) if bands else []
-    turn = np.exp(-1j * np.asarray(starts, float)[:, None] * omega)
+    turn = np.exp(-1j * omega[:, None] * np.asarray(starts, float))
     taper = jax.device_put(window(shape, length))
     return WindowTables(
         tuple(jax.device_put(table) for table in tables),
@@ -143,7 +143,7 @@ def transform_windows(
     shape: str = "hann",
     detrend: str = "constant",
     origin: float = 0.0,
-) -> list[Complex[Array, "segments frequencies channels"]]:
+) -> list[Complex[Array, "frequencies segments channels"]]:
     """Fourier sums of tapered windows of several lengths, at any frequencies at once.
 
     `sum_n taper[n] x[start + n] exp(-j angle (origin + start + n))`, one array for each pair
@@ -158,7 +158,7 @@ def transform_windows(
     of the largest sum. Fast where lengths are multiples of a block: see `lattice_windows`.
     """
     tapers = (Taper(shape, signals.shape[1]),)
-    return transform_tapers(signals, angle, windows, tapers, detrend=detrend, origin=origin)[0]
+    return transform_tapers((signals,), angle, windows, tapers, detrend=detrend, origin=origin)[0]
 
 
 class Taper(NamedTuple):
@@ -170,36 +170,37 @@ class Taper(NamedTuple):
 
 
 def transform_tapers(
-    signals: Float[np.ndarray, "samples channels"],
+    signals: tuple[Float[np.ndarray, "samples _"], ...],
     angle: Float[np.ndarray, " frequencies"],
     windows: tuple[tuple[int, tuple[int, ...]], ...],
     tapers: tuple[Taper, ...],
     *,
     detrend: str,
     origin: float,
-) -> list[list[Complex[Array, "segments frequencies _"]]]:
-    """`transform_windows` for several tapers."""
+) -> list[list[Complex[Array, "frequencies segments _"]]]:
+    """`transform_windows` of signals side by side, for several tapers."""
     require_x64("a transform")
-    angles, most = tuple(np.asarray(angle, float).tolist()), len(signals)
+    angles, most = tuple(np.asarray(angle, float).tolist()), len(signals[0])
     plans = tuple(
         plan_transform(most, angles, windows, each.shape, detrend, each.first) for each in tapers
     )
     channels = tuple(each.channels for each in tapers)
-    return _transform(plans, channels, np.asarray(signals, float), np.asarray(origin, float))
+    columns = tuple(np.asarray(each, float) for each in signals)
+    return _transform(plans, channels, columns, np.asarray(origin, float))
 
 
 @ft.partial(jax.jit, static_argnums=1)
 def _transform(
     plans: tuple[Plan, ...],
     channels: tuple[int, ...],
-    signals: Float[Array, "samples channels"],
+    signals: tuple[Float[Array, "samples _"], ...],
     origin: Float[Array, ""],
-) -> list[list[Complex[Array, "segments frequencies _"]]]:
+) -> list[list[Complex[Array, "frequencies segments _"]]]:
     """All plans are of one layout: the compressed blocks serve each of them."""
     plan = plans[0]
     if plan.detrend != "none":  # No trend is left of a constant, but its rounding errors would be.
-        signals = signals - jnp.mean(signals, axis=0)[None, :]
-    lattice, rows = plan.lattice, signals.T
+        signals = tuple(each - jnp.mean(each, axis=0)[None, :] for each in signals)
+    lattice, rows = plan.lattice, jnp.concatenate([each.T for each in signals])
     used = rows[:, lattice.offset : lattice.offset + lattice.count * lattice.block]
     blocks = used.reshape(rows.shape[0], lattice.count, lattice.block) @ plan.basis
     return [
@@ -213,16 +214,16 @@ def _apply_plan(
     rows: Float[Array, "channels samples"],
     blocks: Float[Array, "channels blocks rank"],
     origin: Float[Array, ""],
-) -> list[Complex[Array, "segments frequencies channels"]]:
+) -> list[Complex[Array, "frequencies segments channels"]]:
     sums = [_window_sums(plan, each, rows, blocks) for each in plan.windows]
     phase = turn(origin * plan.angle)
     turned = [
-        x * (each.turn * phase[None, :])[:, :, None]
+        x * (each.turn * phase[:, None])[:, :, None]
         for x, each in zip(sums, plan.windows, strict=True)
     ]
     if plan.order is None:
         return turned
-    return [each[:, np.array(plan.order)] for each in turned]
+    return [each[np.array(plan.order)] for each in turned]
 
 
 def _window_sums(
@@ -230,7 +231,7 @@ def _window_sums(
     window: WindowTables,
     rows: Float[Array, "channels samples"],
     blocks: Float[Array, "channels blocks rank"],
-) -> Complex[Array, "segments frequencies channels"]:
+) -> Complex[Array, "frequencies segments channels"]:
     parts = []
     if window.tables:
         parts.append(_compressed_sums(plan, window, rows, blocks))
@@ -239,7 +240,7 @@ def _window_sums(
         cut = jnp.moveaxis(_slices(rows, window.starts, window.length), 2, 1)
         tapered = _remove_trend(cut, plan.detrend) * window.taper[None, :, None]
         parts.append(_fourier_sums(tapered, above))
-    return jnp.concatenate(parts, axis=1)
+    return jnp.concatenate(parts)
 
 
 def _compressed_sums(
@@ -247,7 +248,7 @@ def _compressed_sums(
     window: WindowTables,
     rows: Float[Array, "channels samples"],
     blocks: Float[Array, "channels blocks rank"],
-) -> Complex[Array, "segments frequencies channels"]:
+) -> Complex[Array, "frequencies segments channels"]:
     lattice = plan.lattice
     count = -(-window.length // lattice.block)  # the last block may be cut short
     on = [lattice.holds(window.length, start) for start in window.starts]
@@ -265,8 +266,8 @@ def _compressed_sums(
         sums.append(both.reshape(2, table.shape[1], len(on), -1))
     real, imag = jnp.concatenate(sums, axis=1)
     places = np.argsort(np.argsort(~np.array(on), kind="stable"))
-    joined = jnp.moveaxis(jax.lax.complex(real, imag), 1, 0)
-    return joined if all(on) or not any(on) else joined[places]
+    joined = jax.lax.complex(real, imag)
+    return joined if all(on) or not any(on) else joined[:, places]
 
 
 def _compress(
@@ -307,7 +308,7 @@ def _remove_trend(
 
 def _fourier_sums(
     segments: Float[Array, "segments window channels"], angle: Float[Array, " frequencies"]
-) -> Complex[Array, "segments frequencies channels"]:
+) -> Complex[Array, "frequencies segments channels"]:
     """Two levels, within short blocks and over the blocks, so that few exponentials are needed."""
     count, window, channels = segments.shape
     block = max(int(np.sqrt(window)), 1)
@@ -319,4 +320,4 @@ def _fourier_sums(
     # Real factors: a product of a real with a complex array would double the arithmetic.
     real = jnp.einsum("sbnc,fn->sbfc", parts, jnp.cos(inner))
     imag = jnp.einsum("sbnc,fn->sbfc", parts, jnp.sin(inner))
-    return jnp.einsum("sbfc,fb->sfc", jax.lax.complex(real, -imag), turn(outer))
+    return jnp.einsum("sbfc,fb->fsc", jax.lax.complex(real, -imag), turn(outer))

@@ -5,26 +5,27 @@ import itertools
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Float
+from jaxtyping import ArrayLike, Bool, Complex, Float
 
 from jaxquad._core import require_x64
 from jaxquad.records import Record
 
-from ._average import average, Averaged, BANDWIDTH, Channels
+from ._average import average, Averaged, Channels
 from ._blocks import lattice_windows
 from ._checks import check_band, check_excitation, in_hertz
 from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._leakage import shows_leakage, Slopes
-from ._noise_freedom import smoothed
+from ._leakage import power_of, shows_leakage, Slopes
+from ._noise_freedom import covariance_of_windows, smoothed
+from ._noise_root import BANDWIDTH
 from ._nonlinearity import remarks_on_nonlinearity
 from ._remarks import Remark, Remarks
 from ._transform import Taper, transform_tapers
-from ._window import coefficients, leaked_power, segment_starts
+from ._window import coefficients, segment_starts
 
 
 Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
@@ -38,7 +39,7 @@ class Segments(NamedTuple):
     window. `slopes` are those behind the derivatives of the windows.
     """
 
-    transforms: tuple[Complex[Array, "windows frequencies channels"], ...]
+    transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
     slopes: tuple[Slopes, ...]  # empty where nothing can be made of them, or nobody asked
     groups: Layout
 
@@ -69,7 +70,7 @@ def transform_records(
         tuple(_joined(part) for part in zip(*each, strict=True))
         for each in zip(*parts, strict=True)
     )
-    none = Slopes(jnp.zeros((0, 0, 0), complex), jnp.zeros((0, 0, 0), complex))
+    none = Slopes(np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0), complex))
     known = tuple(map(Slopes, *slopes)) if derivatives else ()
     return Segments(joined, (none,) * (len(joined) - len(known)) + known, groups)
 
@@ -93,9 +94,9 @@ def _tapers(
 
 
 def _joined(
-    parts: Sequence[Complex[Array, "_ frequencies channels"]],
-) -> Complex[Array, "windows frequencies channels"]:
-    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+    parts: Sequence[Complex[np.ndarray, "frequencies _ channels"]],
+) -> Complex[np.ndarray, "frequencies windows channels"]:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
 def _layouts(
@@ -123,32 +124,33 @@ def _transform_record(
     layout: Layout,
     origin: int,
     tapers: tuple[Taper, ...],
-) -> list[list[Complex[Array, "_ frequencies _"]]]:
+) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
     """By taper and then by length."""
     columns = _columns(record, welch)
-    found, *slopes = transform_tapers(
+    made = transform_tapers(
         columns, omega * record.dt, layout, tapers, detrend=welch.detrend, origin=float(origin)
     )
+    found, *slopes = ([np.asarray(part) for part in each] for each in made)
     n, late = welch.integrators, welch.delay_samples(record)
     if not (n or late):
         return [found, *slopes]
     angle = omega * record.dt
-    factor = np.ones((omega.size, columns.shape[1]), complex)
+    factor = np.ones((omega.size, len(record.names)), complex)
     first = len(record.input_names)
     recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
     factor[:, first : first + record.outputs.shape[1]] = recolour[:, None]
-    return [[part * factor[None] for part in found], *slopes]
+    return [[part * factor[:, None] for part in found], *slopes]
 
 
-def _columns(record: Record, welch: Welch) -> Float[np.ndarray, "samples channels"]:
-    """All channels, the outputs differenced and earlier by the delay."""
+def _columns(record: Record, welch: Welch) -> tuple[Float[np.ndarray, "samples _"], ...]:
+    """Inputs, outputs, references; the outputs differenced and earlier by the delay."""
     n, late = welch.integrators, welch.delay_samples(record)
     outputs = np.diff(record.outputs, n, axis=0)
     if late:
         outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
     # A difference delays by n/2 samples, and the window would act on it like on any delay.
     centre = slice(n - n // 2, record.samples - n // 2)
-    return np.hstack([record.inputs[centre], outputs, record.references[centre]])
+    return record.inputs[centre], outputs, record.references[centre]
 
 
 _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
@@ -286,19 +288,26 @@ def average_windows(
     channels = _channels(records[0], method)
     independent = _independent(records, segments.groups)
     check_windows(independent, segments, channels)
+    check_spectrum(omega, _excitation(segments, channels), records, members[0], method)
     overlap = window_products(segments.groups, members[0].shape)
     found = average(
         segments.transforms, segments.slopes, channels, omega, overlap,
         _scales(segments, members[0], records[0].dt), _resolved(segments, omega * records[0].dt),
         np.maximum(np.array(independent) - channels.inputs + 1, 0.5),
     )  # fmt: skip
-    check_spectrum(omega, np.asarray(found.excitation), records, members[0], method)
     return _result(records, omega, members, segments, found, method)
 
 
 def _channels(record: Record, method: Method) -> Channels:
     instruments = len(record.reference_names) if method == "joint" else 0
     return Channels(len(record.input_names), len(record.output_names), instruments)
+
+
+def _excitation(segments: Segments, channels: Channels) -> Float[np.ndarray, "moving frequencies"]:
+    """Mean power of the inputs and of the instruments, in the longest windows."""
+    power = np.mean(power_of(segments.transforms[0]), axis=1).T
+    first, last = channels.inputs, channels.inputs + channels.outputs
+    return np.concatenate([power[:first], power[last : last + channels.instruments]])
 
 
 def _independent(records: Sequence[Record], groups: Layout) -> list[float]:
@@ -333,21 +342,25 @@ def _result(
     first, dt = records[0], records[0].dt
     counts = tuple(len(starts) for _, starts in segments.groups)
     windows = place_windows(segments.groups, members[0].shape, dt, omega[-1] - omega[0])
-    grid = jnp.asarray(omega)
+    parts = (
+        omega, found.response, found.coherence, found.random_error,
+        found.direct_coherence, found.multiple_coherence,
+    )  # fmt: skip
+    grid, response, coherence, random_error, direct, multiple = jax.device_put(parts)
     return FrequencyResponse(
         omega=grid,
-        response=found.response,
-        coherence=found.coherence,
-        random_error=found.random_error,
-        errors=ErrorCovariance(grid, found.effect, found.noise, found.share, windows, counts),
-        direct_coherence=found.direct_coherence,
-        multiple_coherence=found.multiple_coherence,
+        response=response,
+        coherence=coherence,
+        random_error=random_error,
+        errors=ErrorCovariance(omega, found.effect, found.noise, found.share, windows, counts),
+        direct_coherence=direct,
+        multiple_coherence=multiple,
         method=method,
         input_names=first.input_names,
         output_names=first.output_names,
         remarks=Remarks(ft.partial(_remarks, records, omega, segments.groups, found, method)),
         integrators=members[0].integrators,
-        log_noise_covariance=_log_noise_covariance(records, omega, members, segments, found),
+        log_noise_covariance=_log_noise_covariance(omega, dt, members[0], segments, found),
         resolution=2 * np.pi / (segments.groups[0][0] * dt),
         dt=dt,
         hold=first.hold,
@@ -365,38 +378,24 @@ def _remarks(
     method: Method,
 ) -> tuple[Remark, ...]:
     first, independent = records[0], _independent(records, groups)
-    response, coherence = np.asarray(found.response), np.asarray(found.coherence)
-    error, direct = np.asarray(found.random_error), np.asarray(found.direct_coherence)
-    names = first.output_names, first.input_names
+    response, coherence, error = found.response, found.coherence, found.random_error
+    names, direct = (first.output_names, first.input_names), found.direct_coherence
     remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
-    remarks += remarks_on_inputs(omega, np.asarray(found.input_coherence), first.input_names)
-    remarks += remarks_on_leakage(omega, np.asarray(found.leakage), error, names)
+    remarks += remarks_on_inputs(omega, found.input_coherence, first.input_names)
+    remarks += remarks_on_leakage(omega, found.leakage, error, names)
     few = max(independent) < 3
     return remarks + ((Remark(_FEW.format(count=max(independent))),) if few else ())
 
 
 def _log_noise_covariance(
-    records: Sequence[Record],
     omega: Float[np.ndarray, " frequencies"],
-    members: Sequence[Welch],
+    dt: float,
+    welch: Welch,
     segments: Segments,
     found: Averaged,
 ) -> Float[np.ndarray, "frequencies frequencies"]:
-    """All window lengths see the same noise, each with its own resolution."""
-    weights = np.mean(np.asarray(found.share), axis=(1, 2))
-    freedom = np.mean(np.asarray(found.freedom), axis=1)
-    single, angle = np.zeros((omega.size, omega.size)), tuple((omega * records[0].dt).tolist())
-    for share, left, (length, _) in zip(weights.T, freedom.T, segments.groups, strict=True):
-        level = share / np.sqrt(left)
-        single += np.outer(level, level) * _shared_power(members[0].shape, length, angle)
+    weights, freedom = np.mean(found.share, axis=(1, 2)), np.mean(found.freedom, axis=1)
+    lengths = tuple(length for length, _ in segments.groups)
+    single = covariance_of_windows(omega * dt, weights / np.sqrt(freedom), welch.shape, lengths)
     return smoothed(omega, single, np.sum(weights * freedom, axis=1), BANDWIDTH)
-
-
-@ft.lru_cache(maxsize=12)
-def _shared_power(
-    shape: str, length: int, angle: tuple[float, ...]
-) -> Float[np.ndarray, "frequencies frequencies"]:
-    """What windows of this length have in common at two frequencies, in rad per sample."""
-    places = np.array(angle)
-    return leaked_power(shape, length, places[:, None] - places)

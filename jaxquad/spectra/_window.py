@@ -1,3 +1,5 @@
+import functools as ft
+
 import numpy as np
 from jaxtyping import Float
 
@@ -32,6 +34,7 @@ def coefficients(name: str) -> tuple[float, float]:
     return _SHAPES[name]
 
 
+@ft.lru_cache(maxsize=256)
 def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]:
     """First samples of windows of `length` that overlap by at least `overlap` and reach both ends.
 

@@ -44,7 +44,7 @@ def test_jaxquad(benchmark, windows):
         first = _tapered(length, starts[:1])[:, 0] @ np.exp(
             -1j * np.multiply.outer(np.arange(length), ANGLE)
         )
-        error = np.max(np.abs(np.asarray(sums[0]).T - first)) / np.max(np.abs(first))
+        error = np.max(np.abs(np.asarray(sums[:, 0]).T - first)) / np.max(np.abs(first))
         assert error < 1e-12
     benchmark(run)
 

@@ -2,7 +2,6 @@
 
 import functools as ft
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import optimize
@@ -81,14 +80,14 @@ def spectra(seed, groups=3, frequencies=7):
     gain = 2.0 + 0.2 * rng.standard_normal(shape[:3])
     response = (1 + 0.5j) * np.exp(0.1 * rng.standard_normal(shape))
     coherence = np.clip(0.8 + 0.1 * rng.standard_normal(shape), 0.3, 0.99)
-    ones = jnp.ones(shape[:3])
+    ones = np.ones(shape[:3])
     return Conditioned(
-        response=jnp.asarray(response),
-        solver=jnp.zeros((groups, frequencies, 1, 1), complex),
-        power=jnp.asarray(gain),
+        response=response,
+        solver=np.zeros((groups, frequencies, 1, 1), complex),
+        power=gain,
         own_share=ones,
-        output_power=jnp.asarray(np.abs(response) ** 2 * gain[..., None] / coherence),
-        coherence=jnp.asarray(coherence),
+        output_power=np.abs(response) ** 2 * gain[..., None] / coherence,
+        coherence=coherence,
         instrument_share=ones,
         multiple=ones,
     )
@@ -120,7 +119,7 @@ def published(parts, freedom, f):
 
 def test_the_combination_minimises_the_published_cost():
     parts, freedom = spectra(0), np.array([4.0, 9.0, 20.0])
-    found = combine(parts, np.ones(3), jnp.asarray(freedom), np.ones((3, 7), bool))
+    found = combine(parts, np.ones(3), freedom, np.ones((3, 7), bool))
     for f in range(7):
         response, coherence = published(parts, freedom, f)
         assert complex(found.response[f, 0, 0]) == pytest.approx(response, rel=1e-6)

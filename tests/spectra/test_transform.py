@@ -25,7 +25,7 @@ def direct_sums(x, angle, length, starts, shape="hann", detrend="constant", orig
             segment = segment - np.stack(trends, 1) @ fit
         waves = np.exp(-1j * np.multiply.outer(angle, origin + start + n))
         sums.append(waves @ (window(shape, length)[:, None] * segment))
-    return np.stack(sums)
+    return np.stack(sums, axis=1)
 
 
 def assert_sums(found, expected, relative):

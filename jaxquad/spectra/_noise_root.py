@@ -1,0 +1,85 @@
+"""The covariance of the outputs' noise, from what is left of their windows."""
+
+import functools as ft
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ._leakage import Rest
+
+
+BANDWIDTH = 0.2  # of the noise's smoothing, in ln(omega)
+_FLOOR = 1e-26  # of the output's power: below it lies rounding
+
+Levels = Float[np.ndarray, "frequencies outputs groups"]
+
+
+def noise_root(
+    omega: Float[np.ndarray, " frequencies"], rest: Rest, outputs: Levels, weights: Levels
+) -> Complex[np.ndarray, "frequencies outputs outputs"]:
+    """Hermitian root of the covariance of the noise, from the residuals, smooth along frequency.
+
+    `outputs` are the outputs' own energies, and `weights` says how much a length counts.
+    """
+    freedom, kernels = rest.freedom, _kernels(tuple(omega.tolist()))
+    energy = np.real(np.einsum("foog->fog", rest.products))
+    # The logarithm of a chi-squared variable is biased by digamma(f) - ln(f).
+    low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
+    levels = np.log(np.maximum(energy, _FLOOR * outputs + 1e-280) / rest.trace) - low
+    level, weight = np.sum(weights * levels, axis=2), np.sum(weights * freedom, axis=2)
+    root = np.exp(_local_lines(kernels, level, weight) / 2)
+    if root.shape[1] == 1:
+        return root[:, :, None].astype(complex)
+    scale = np.sqrt(np.mean(weights, axis=1, keepdims=True) / (energy + 1e-280))
+    unit = np.sum(np.conj(rest.products) * (scale[:, :, None] * scale[:, None]), axis=3)
+    return _hermitian_root(_coherency(kernels[0], unit), root)
+
+
+Kernel = Float[np.ndarray, "frequencies frequencies"]
+
+
+@ft.lru_cache(maxsize=12)
+def _kernels(omega: tuple[float, ...]) -> tuple[Kernel, Kernel, Kernel]:
+    """Weights of neighbours, times 1, the distance in ln(omega) and its square."""
+    place = np.log(omega)
+    offset = place[None, :] - place[:, None]
+    kernel = np.exp(-0.5 * (offset / BANDWIDTH) ** 2)
+    return kernel, kernel * offset, kernel * offset**2
+
+
+def _local_lines(
+    kernels: Sequence[Kernel],
+    level: Float[np.ndarray, "frequencies outputs"],
+    weight: Float[np.ndarray, "frequencies outputs"],
+) -> Float[np.ndarray, "frequencies outputs"]:
+    """Weighted local straight lines: a power law passes unchanged."""
+    both = np.hstack([weight, weight * level])
+    (m0, l0), (m1, l1), (m2, _) = (np.split(each @ both, 2, axis=1) for each in kernels)
+    # A single frequency has no slope: the small term keeps the line flat there.
+    spread = m2 + 1e-9 * m0
+    return (spread * l0 - m1 * l1) / (spread * m0 - m1**2)
+
+
+def _coherency(
+    kernel: Kernel,
+    total: Complex[np.ndarray, "frequencies outputs outputs"],
+) -> Complex[np.ndarray, "frequencies outputs outputs"]:
+    """Correlation between the outputs' noise, of unit diagonal and positive semidefinite."""
+    flat = total.reshape(len(total), -1).view(float)
+    smooth = (kernel @ flat).view(complex).reshape(total.shape)
+    deviation = np.sqrt(np.maximum(np.real(np.diagonal(smooth, axis1=1, axis2=2)), 1e-300))
+    found = smooth / (deviation[:, :, None] * deviation[:, None, :])
+    outputs = np.arange(total.shape[2])
+    found[:, outputs, outputs] = 1.0  # also of an output that the inputs explain to the last digit
+    return found
+
+
+def _hermitian_root(
+    coherency: Complex[np.ndarray, "frequencies outputs outputs"],
+    root: Float[np.ndarray, "frequencies outputs"],
+) -> Complex[np.ndarray, "frequencies outputs outputs"]:
+    # Not Cholesky's: along frequency the root must change as slowly as the matrix does.
+    values, vectors = np.linalg.eigh(coherency * (root[:, :, None] * root[:, None, :]))
+    stretched = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    return stretched @ np.conj(np.swapaxes(vectors, 1, 2))
