@@ -25,7 +25,12 @@ WRONG: Any = "flight.csv"
 AXES: Any = PLANT
 NUMBER: Any = 3.0
 FLIGHT = jq.scenario(duration=1.0, axes=1)
+TIME = np.arange(100.0) / 100
+FLOWN = jq.Record(TIME, np.sin(TIME), np.cos(TIME), np.sin(TIME))
 CALLS = {
+    "entry is 'flight.csv': .* 'set-point' or 'plant input'": lambda: (
+        jq.spectra.estimate_broken_loop(FLOWN, entry=WRONG)
+    ),
     "the records hold a str: .* see jq.read": lambda: jq.frequency_response(WRONG, np.ones(1)),
     "verify needs a jq.Record, not a str": lambda: jq.verify(jq.LaggedIntegrator(1.0), WRONG),
     "scenario is a str: give jq.scenario": lambda: jq.simulate(LOOP, WRONG),

@@ -1,6 +1,6 @@
 """The broken loop of a flight, from its reference, output and input alone."""
 
-from typing import Literal, NamedTuple
+from typing import get_args, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -102,8 +102,11 @@ def estimate_broken_loop(
 
     **Returns:** a `BrokenLoop` of the frequencies with a coherence of 0.6 or more; it may be empty.
 
-    **Raises:** ValueError for a record without a reference.
+    **Raises:** ValueError for a record without a reference, and for another entry.
     """
+    if entry not in get_args(Entry):
+        known = " or ".join(f"{each!r}" for each in get_args(Entry))
+        raise ValueError(f"entry is {entry!r}: say where the reference enters, {known}")
     if reference is None and not record.reference_names:
         raise ValueError(
             "the record has no reference, so its loop is not known: name one (reference=)"

@@ -248,13 +248,19 @@ def _smooth(values: Float[np.ndarray, "*windows frequencies"]) -> Float[np.ndarr
     return sums[..., width:] - sums[..., :-width]
 
 
+def _above_rounding(power: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " frequencies"]:
+    """Sums over neighbouring frequencies, no smaller than what rounding makes of the largest."""
+    near = _smooth(power)
+    return np.maximum(near, max(np.finfo(float).eps * float(np.max(near)), 1e-150))
+
+
 def _noise_over_response(source: _Spectra, answer: _Spectra) -> Float[np.ndarray, " frequencies"]:
     """The power of noise over that of the response, in units of the reference's power."""
     each, whole = np.abs(source) ** 2, np.sum(np.abs(answer) ** 2, axis=0)
     cross = np.sum(np.conj(source) * answer, axis=0)
     near_cross = _smooth(cross.real) + 1j * _smooth(cross.imag)
-    near_power = np.maximum(_smooth(np.sum(each, axis=0)), 1e-300)
-    coherence = np.abs(near_cross) ** 2 / (near_power * np.maximum(_smooth(whole), 1e-300))
+    near_power, near_whole = _above_rounding(np.sum(each, axis=0)), _above_rounding(whole)
+    coherence = np.abs(near_cross) ** 2 / (near_power * near_whole)
     # Windows and neighbours that count: one that holds all the power makes any pair coherent.
     # Neighbours of a tapered spectrum are half as many as they seem.
     count = near_power**2 / np.maximum(_smooth(np.sum(each**2, axis=0)), 1e-300) / 2

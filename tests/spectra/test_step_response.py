@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import cont2discrete, lfilter, resample_poly
 
 import jaxquad as jq
 from jaxquad.spectra import estimate_step
@@ -92,3 +92,12 @@ def test_no_reference_and_no_room_are_refused():
     with pytest.raises(ValueError, match="no reference"):
         estimate_step(bare)
     assert estimate_step(bare, reference="u", length=0.1).names == ("u", "y")
+
+
+def test_a_log_that_was_resampled_far_above_its_own_rate_has_the_same_step():
+    record = flown(noise=0.002)
+    r, y = (resample_poly(record.channel(name), 10, 1) for name in ("r", "y"))
+    time = DT / 10 * np.arange(r.size)
+    found = estimate_step(jq.Record(time, r, y, r, input_names="u", output_names="y"))
+    assert found.is_told
+    assert np.max(np.abs(found.mean - exact_at(found))) < 0.02
