@@ -81,11 +81,13 @@ def _sweep(options: argparse.Namespace) -> "Excitation":
 
     from jaxquad.excitation import sweep
 
+    if options.lines is not None:
+        raise ValueError("--lines is for a multisine: leave it out, or design a multisine")
     low, high = _band(options)
     return sweep(
         2 * np.pi * low,
         2 * np.pi * high,
-        duration=options.duration or 5 / low,
+        duration=5 / low if options.duration is None else options.duration,
         sample_rate=options.rate,
         amplitude=options.amplitude,
     )
@@ -98,7 +100,10 @@ def _multisine(options: argparse.Namespace) -> "Excitation":
 
     low, high = _band(options)
     period = np.ceil(options.rate / low - 1e-9) / options.rate
-    periods = max(1, round((options.duration or 10 * period) / period))
+    duration = 10 * period if options.duration is None else options.duration
+    if not duration > 0:
+        raise ValueError(f"--duration is {duration:g}: give a time above 0 s")
+    periods = max(1, round(duration / period))
     lines = harmonics(2 * np.pi * low, 2 * np.pi * high, period=period, lines=options.lines)
     return multisine(
         lines,

@@ -151,9 +151,11 @@ def check_keys(content: Mapping[str, object], known: Iterable[str]) -> None:
 
 
 def read_toml(path: str | Path) -> dict[str, object]:
-    """Raises SettingsError for a file that is not TOML, OSError for none."""
+    """Raises SettingsError for a file that is not TOML, and for none."""
     try:
         return tomllib.loads(Path(path).read_text())
+    except FileNotFoundError as error:
+        raise SettingsError(f"{path}: there is no such file in {Path.cwd()}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: not TOML: {error}") from error
 
@@ -302,7 +304,7 @@ class IdentifySettings(Settings):
     window: float | None = option_field(
         kinds.DURATION,
         None,
-        "length of welch's window; a fifth of the record by default",
+        "length of welch's window, which it selects; a fifth of the record by default",
         group=_ESTIMATE,
     )
     cost: str = option_field(
@@ -351,4 +353,22 @@ class IdentifySettings(Settings):
         if self.dt is not None and (self.time is not None or self.time_unit is not None):
             raise SettingsError(
                 "`dt` is for a table without time: leave `time` and `time_unit` out"
+            )
+        self._check_unused()
+
+    def _check_unused(self) -> None:
+        """Raise SettingsError for what would change nothing beside the others."""
+        if self.zeros and self.poles is None:
+            raise SettingsError("`zeros` is for a transfer function: say its `poles`, too")
+        if self.poles is not None and not self.lag:
+            raise SettingsError(
+                "`lag` is for a model of gain, lag and delay: leave it out, or leave `poles` out"
+            )
+        if self.window is not None and self.estimator == "composite":
+            raise SettingsError(
+                "`window` is for windows of one length: leave it out, or choose `estimator` welch"
+            )
+        if self.verify is None and (self.verify_start, self.verify_stop) != (None, None):
+            raise SettingsError(
+                "`verify_start` and `verify_stop` are for a second record: name it by `verify`"
             )

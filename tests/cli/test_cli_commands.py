@@ -137,6 +137,8 @@ def test_another_signal_keeps_its_file(tmp_path, capsys):
         (["--band", "0.5", "10", "--rate", "100"], 4, "sample rate"),
         (["--band", "10", "0.5", "--rate", "100"], 2, "--band is 10 0.5: give two frequencies"),
         (["--band", "0.5", "10", "--rate", "0"], 2, "above 0"),
+        (["--band", "0.5", "10", "--rate", "500", "--duration", "0"], 2, "duration"),
+        (["--band", "0.5", "10", "--rate", "500", "--lines", "5"], 2, "--lines is for a multisine"),
     ],
 )
 def test_a_design_that_breaks_a_rule_says_so(words, code, complaint, tmp_path, capsys):

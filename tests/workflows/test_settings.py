@@ -19,11 +19,11 @@ EVERY = [
     IdentifySettings(
         input="roll=-m1-m2+0.5*m3^2", output="p", reference="x 0", units={"p": "rad/s", "m1": "V"},
         time="stamp", time_unit="ms", rate=250, segments=[(-3, 5.5), (22, 30)], band=(0.7, 12),
-        integrators=0, lag=False, delay=False, poles=3, zeros=1, estimator="welch", window=0.1,
+        integrators=0, delay=False, poles=3, zeros=1, estimator="welch", window=0.1,
         valid={"m1": (-20, 20.5), "p q": (0, 1e6)}, max_gap=0.05,
         cost="coherence", verify="b.npz", verify_start=-1e-3, verify_stop=1e6,
     ),
-    IdentifySettings(axis="pitch", start=-2.5, stop=1 / 3, band_rad=(1, 2)),
+    IdentifySettings(axis="pitch", start=-2.5, stop=1 / 3, band_rad=(1, 2), lag=False),
 ]  # fmt: skip
 
 
@@ -90,6 +90,10 @@ def test_an_option_takes_the_place_of_what_says_the_same_in_a_file():
         ({"valid": {"q": 3}}, "is no NAME=LOW:HIGH"),
         ({"valid": 3}, "valid is 3: give the valid range of each channel"),
         ({"max_gap": 0}, "max_gap is 0: give a number above 0"),
+        ({"zeros": 1}, "zeros is for a transfer function: say its poles"),
+        ({"poles": 2, "lag": False}, "lag is for a model of gain, lag and delay"),
+        ({"window": 5, "estimator": "composite"}, "window is for windows of one length"),
+        ({"verify_start": 3}, "verify_start and verify_stop are for a second record"),
     ],
 )
 def test_settings_that_cannot_be_say_what_to_change(content, complaint):
@@ -189,3 +193,8 @@ def test_batch_settings_that_cannot_be_say_what_to_change(content, complaint):
 def test_a_timeout_is_finite_and_above_zero(limit):
     with pytest.raises(SettingsError, match="`timeout` is .*: give a number"):
         BatchSettings(timeout=limit)
+
+
+def test_a_file_of_settings_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(SettingsError, match="absent.toml: there is no such file in "):
+        IdentifySettings.from_toml(tmp_path / "absent.toml")
