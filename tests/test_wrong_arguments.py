@@ -1,5 +1,6 @@
 """An argument of the wrong kind is refused with what to give instead."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import jaxtyping
@@ -26,8 +27,14 @@ AXES: Any = PLANT
 NUMBER: Any = 3.0
 FLIGHT = jq.scenario(duration=1.0, axes=1)
 TIME = np.arange(100.0) / 100
-FLOWN = jq.Record(TIME, np.sin(TIME), np.cos(TIME), np.sin(TIME))
+FLOWN = jq.Record(TIME, np.sin(TIME), np.cos(TIME), np.sin(3 * TIME))
+FIT: Any = SimpleNamespace(model=jq.LaggedIntegrator(1.0))
 CALLS = {
+    "estimator is 'flight.csv': give an object, such as jq.spectra.Welch": lambda: (
+        jq.frequency_response(FLOWN, np.ones(1), estimator=WRONG)
+    ),
+    "loop is a DecoupledAxes: .* jq.loops.margins": lambda: jq.analyse(AXES),
+    r"a SimpleNamespace is no model: .* simplenamespace.model": lambda: jq.verify(FIT, FLOWN),
     "entry is 'flight.csv': .* 'set-point' or 'plant input'": lambda: (
         jq.spectra.estimate_broken_loop(FLOWN, entry=WRONG)
     ),

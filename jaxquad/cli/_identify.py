@@ -56,7 +56,10 @@ def _channels(options: argparse.Namespace) -> int:
         rows.append((c.name, f"{c.samples}", *numbers, f"{c.maximum:.4g}", c.unit))
     print_table(rows)
     if any(math.isnan(c.rate) for c in found):
-        print("\nnan: no time of that length is known. Name it (--time), or give --dt.")
+        print(
+            "\nnan: no time of that length is known, or its unit is not, or it goes back. Name "
+            "it (--time), its unit (--time-unit), or give --dt."
+        )
     return 0
 
 

@@ -34,8 +34,10 @@ def band_gain(
         return None
     nyquist = np.pi / record.dt
     if np.shape(band) != (2,) or not 0 < band[0] < band[1] < nyquist:
+        ends = " .. ".join(f"{float(each):.4g}" for each in np.ravel(band))
         raise ValueError(
-            f"band {band} rad/s must rise and lie between 0 and the Nyquist frequency {nyquist:.4g}"
+            f"band {ends} rad/s must rise and lie between 0 and the record's Nyquist frequency "
+            f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz): give another band (band=)"
         )
     from scipy.signal import butter, sosfreqz
 
@@ -203,8 +205,11 @@ def linear_model(model: PyTree) -> TransferFunction | StateSpace:
         return model.state_space()
     if isinstance(model, HasTransferFunction):
         return model.transfer_function()
+    kind = type(model).__name__
+    if hasattr(model, "model"):
+        raise ValueError(f"a {kind} is no model: give the one that it holds, {kind.lower()}.model")
     raise ValueError(
-        f"{type(model).__name__} has no transfer_function() and no state_space(): give a "
+        f"{kind} has no transfer_function() and no state_space(): give a "
         "jq.TransferFunction, a jq.StateSpace, or a model with one of these methods"
     )
 

@@ -327,6 +327,11 @@ def analyse(
 
     Source: Franklin, Powell & Workman, Digital Control of Dynamic Systems, section 4.3.
     """
+    if not isinstance(loop, Loop):
+        raise ValueError(
+            f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...), or "
+            "jq.loops.margins(model) for the margins of a model alone"
+        )
     if not 0 < smoothing < float("inf"):
         raise ValueError(
             f"smoothing is {smoothing} 1/s: give a rate above 0, as 1e-5 or, to tune, 0.1."

@@ -146,6 +146,11 @@ def frequency_response(
     if estimator is None:
         estimator = JointInputOutput() if records[0].reference_names else LocalPolynomial()
     method = "direct"
+    if not isinstance(estimator, Estimator):
+        raise ValueError(
+            f"estimator is {estimator!r}: give an object, such as jq.spectra.Welch() or "
+            "jq.spectra.JointInputOutput(jq.spectra.LocalPolynomial())"
+        )
     if isinstance(estimator, JointInputOutput):
         check_references(records)
         method, estimator = "joint", estimator.spectra

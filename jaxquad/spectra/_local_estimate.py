@@ -206,9 +206,10 @@ def estimate_local_polynomial(
         columns = (transformed_columns(record, options.integrators) for record in records)
         ringing = left_moving(rest, [end_of(each) for each in columns], grid, sources)[at]
     doubtful = unresolved(omega, moved, sources, at, bins, rest.moved) & (options.width is None)
-    lost = doubtful
+    lost = unmoved = doubtful
     if method == "joint":
-        lost = lost | _unmoved(moved, sources, at, inputs)
+        unmoved = _unmoved(moved, sources, at, inputs)
+        lost = doubtful | unmoved
     moved = replace_rows(moved, lost, undetermined(_rows(moved, lost)))
     fit = joint_fit(moved, inputs) if method == "joint" else moved
     plain = rest
@@ -238,6 +239,7 @@ def estimate_local_polynomial(
         share_of_inputs(left, sources, at, inputs) if method == "joint" else None,
         _remark_on_lost(omega, np.all(known, axis=(1, 2)) | lost, least[at], options)
         + _remark_on_resolution(omega[doubtful & coherent])
+        + _remark_on_unmoved(unmoved if method == "joint" else np.zeros(1, bool))
         + _remark_on_ringing(omega[ringing & coherent & ~doubtful]),
     )
 
@@ -421,6 +423,18 @@ def _remark_on_lost(
         enough = np.max(least[~known])
         remark += f"; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins"
     return (Remark(remark, lost),)
+
+
+def _remark_on_unmoved(unmoved: Bool[np.ndarray, " frequencies"]) -> tuple[Remark, ...]:
+    """Where no frequency is left, the reader needs to know why."""
+    if not np.all(unmoved):
+        return ()
+    text = (
+        "no response at any frequency: the references move the inputs too little to divide by "
+        f"(random errors above {100 * _DIVISIBLE:.0f} %). Excite by the references, record longer, "
+        "or sample faster"
+    )
+    return (Remark(text),)
 
 
 def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:

@@ -106,6 +106,8 @@ def _fitted(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
 
 def _start(frf: FrequencyResponse, settings: IdentifySettings) -> LaggedIntegrator:
     """What is fixed at zero is added to what is free."""
+    if not np.any(np.isfinite(frf.response)):  # the fit says so
+        return LaggedIntegrator(1.0, 0.1, 0.1, settings.integrators)
     guess = guess_lagged_integrator(frf, settings.integrators)
     total = np.asarray(guess.lag) + np.asarray(guess.delay)
     lag = 0.0 if not settings.lag else guess.lag if settings.delay else total

@@ -48,6 +48,20 @@ def test_python_gives_what_the_command_line_gives(log, found, folder, tmp_path, 
     assert {each.name for each in tmp_path.iterdir()} == {each.name for each in folder.iterdir()}
 
 
+@pytest.mark.parametrize("poles", [None, 1])
+def test_a_reference_that_moves_nothing_leaves_no_response_and_is_named(poles, tmp_path):
+    time, random = 0.2 * np.arange(200), np.random.default_rng(0)
+    reference, command, noise = random.standard_normal((3, time.size))
+    rate = 0.2 * np.cumsum(command) + 0.1 * noise
+    np.savez(tmp_path / "idle.npz", t=time, r=reference, u=command, q=rate)
+    settings = IdentifySettings(input="u", output="q", reference="r", hold="dt", poles=poles)
+    found = identify(tmp_path / "idle.npz", settings)
+    assert found.fit.verdict.kind == "too few points"
+    [remark] = found.frf.remarks
+    assert "the references move the inputs too little" in remark
+    assert remark in str(found)
+
+
 def test_numbers_and_figures_are_at_hand_without_a_folder(found):
     assert found.fit.verdict.identifiable
     assert found.fit.values[0] == pytest.approx(GAIN, rel=0.03)
