@@ -124,7 +124,7 @@ def assess(
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
             *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
             *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
-            *remarks_on_priors(prior.misfit, verdict, by_data),
+            *remarks_on_priors(prior.misfit, verdict, by_data, chi_squared=doubted),
             *remarks_on_discrepancy(discrepancy),
             *further,
         ),

@@ -213,6 +213,8 @@ def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
     from scipy.special import log_ndtr
 
     variance = covariance[k, k]
+    if not variance > 0:  # of a matrix that rounding left singular
+        return covariance
     below = max(-optimum / np.sqrt(variance), 0.0)
     hazard = np.exp(-0.5 * below**2 - log_ndtr(-below)) / np.sqrt(2 * np.pi)
     moment = variance * max(1 - below * (hazard - below), 0.0)

@@ -84,7 +84,11 @@ def _opposite(problem: Problem, solution: Solution) -> str:
 
 
 def remarks_on_priors(
-    pulls: Float[np.ndarray, " priors"], verdict: Verdict, by_data: Verdict
+    pulls: Float[np.ndarray, " priors"],
+    verdict: Verdict,
+    by_data: Verdict,
+    *,
+    chi_squared: float = 1.0,
 ) -> list[str]:
     """Parameters that only a prior determines, and priors that the data contradict."""
     remarks = [
@@ -93,6 +97,11 @@ def remarks_on_priors(
         for k, pull in enumerate(pulls)
         if abs(pull) > 3
     ]
+    if pulls.size and not remarks and chi_squared > MISFIT**2:
+        remarks.append(
+            "the misfit may be that of a prior which the record contradicts: compare the fit "
+            "without priors="
+        )
     resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
     if resolved:
         known = ", ".join(combination.name for combination in by_data.combinations)

@@ -197,7 +197,8 @@ def select_parameters(
 
     **Raises:**
 
-    - `ValueError`: a name that the model does not have, is given twice, or starts at 0 or inf.
+    - `ValueError`: a name that the model does not have, is given twice, or starts at 0 or inf;
+        a tie that follows itself or a later one.
     """
     places = name_places(model)
     ties = _tied(places, tied or {})
@@ -220,7 +221,28 @@ def select_parameters(
     ordered = tuple(place for place, _, _ in chosen) + tuple(fixed)
     ratio = np.array([values[p.name] for p in ordered]) / np.array(scales)
     start = np.where(logs, np.log(np.where(logs, ratio, 1.0)), ratio)
-    return Parameters(ordered, ties, logs, len(chosen), np.asarray(scales, float), start)
+    found = Parameters(ordered, ties, logs, len(chosen), np.asarray(scales, float), start)
+    _check_order(model, found)
+    return found
+
+
+_MOVED = 1.01  # factor on the free parameters at which ties are looked at
+
+
+def _check_order(model: PyTree, parameters: Parameters) -> None:
+    """Raise ValueError for a tie that follows itself, or one that comes after it."""
+    if not parameters.ties:
+        return
+    values = _MOVED * parameters.values(parameters.start[: parameters.count])
+    once = parameters.replace(model, values)
+    twice = parameters.replace(once, values)
+    places = [place for place, _ in parameters.ties]
+    for name, value in _numbers(once, places).items():
+        if not np.isclose(value, _numbers(twice, places)[name], rtol=1e-9, equal_nan=True):
+            raise ValueError(
+                f"{name} is tied to itself, or to a parameter whose tie comes later: ties are "
+                "computed one after the other, each from free, fixed and earlier tied parameters"
+            )
 
 
 def _tied(places: list[Place], tied: Mapping[str, Tie]) -> tuple[tuple[Place, Tie], ...]:

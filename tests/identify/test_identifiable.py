@@ -8,6 +8,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
+from jaxquad.identify._bounds import one_sided
 
 
 ML = jq.identify.MaximumLikelihood()
@@ -98,6 +99,21 @@ def test_a_static_torque_tells_them_apart():
     assert fit.identifiable
     np.testing.assert_allclose(fit.values[:2], [0.0552, 0.1188], rtol=0.03)
     assert fit.standard_errors[1] / fit.values[1] == pytest.approx(0.01, rel=0.01)
+
+
+def test_a_variance_below_zero_by_rounding_is_left_alone():
+    covariance = np.array([[-1e-20, 0.0], [0.0, 1.0]])
+    np.testing.assert_array_equal(one_sided(covariance, 0, -1.0), covariance)
+
+
+def test_a_prior_that_only_the_model_error_reconciles_with_the_record_is_suspected():
+    truth = jq.LaggedIntegrator(60.0, 0.04, 0.015)
+    frf = response_of(truth, error=0.003, seed=0)
+    for gain, suspected in ((80.0, True), (60.0, False)):
+        fit = jq.fit(truth, frf, cost=ML, priors=[jq.identify.Prior("gain", gain, 0.1)])
+        assert (
+            any("prior which the record contradicts" in each for each in fit.remarks) == suspected
+        )
 
 
 def test_along_the_null_direction_the_posterior_is_the_prior_and_is_called_so():

@@ -59,12 +59,22 @@ def test_without_free_all_but_the_tied_numbers_are_free():
     [
         ({"gain": lambda m: m.gains[0]}, "no parameter 'gain' to tie; the model has: gains"),
         ({"gains[0]": lambda m: -m.gains[1]}, "cannot be free and tied at once"),
+        ({"gains[1]": lambda m: -2 * m.gains[1]}, r"gains\[1\] is tied to itself, or"),
         ({"gains[1]": lambda m: m.gains}, r"tied to an array of shape \(2,\): return one number"),
     ],
 )
 def test_an_impossible_tie_is_refused(tied, message):
     with pytest.raises(ValueError, match=message):
         jq.fit(START, response_of(TRUTH), free=FREE, tied=tied)
+
+
+def test_a_tie_may_follow_an_earlier_one_and_no_later_one():
+    first, second = {"lags[1]": lambda m: m.gains[0] / 60}, {"lags[0]": lambda m: 4 * m.lags[1]}
+    fit = jq.fit(START, response_of(TRUTH), tied=TIED | first | second, cost=ML)
+    assert fit.names == ("gains[0]",)
+    np.testing.assert_allclose(fit.model.lags, TRUTH.lags, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"lags\[0\] is tied .* whose tie comes later"):
+        jq.fit(START, response_of(TRUTH), tied=TIED | second | first, cost=ML)
 
 
 def test_each_pair_has_a_band_of_its_own():
