@@ -1,8 +1,10 @@
 from ._arrays import (
     align as align,
+    as_array as as_array,
     as_float as as_float,
     as_float_or_none as as_float_or_none,
     is_zero as is_zero,
+    on_host as on_host,
 )
 from ._checks import (
     is_concrete as is_concrete,
@@ -61,3 +63,4 @@ from ._process import (
 )
 from ._pytree_node import pytree_node as pytree_node
 from ._stages import announce as announce, STAGES as STAGES
+from ._threads import map_in_threads as map_in_threads, thread_settings as thread_settings

@@ -1,6 +1,7 @@
 """Arrays of JAX from what a user gives."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,9 @@ from jaxtyping import Array, ArrayLike
 from ._checks import is_concrete
 
 
+Tree = TypeVar("Tree")
+
+
 def as_float(x: ArrayLike | Sequence) -> Array:
     """`x` as an array of the default float type (a list of integers too)."""
     dtype = jnp.result_type(float)
@@ -17,6 +21,17 @@ def as_float(x: ArrayLike | Sequence) -> Array:
         return jnp.asarray(x, dtype=dtype)
     # Of numbers jnp.asarray compiles a program for each new shape.
     return jax.device_put(np.asarray(x, dtype=dtype))
+
+
+def as_array(x: ArrayLike) -> Array:
+    """`x` as an array of JAX, of its own type; without a program for each new shape."""
+    return x if isinstance(x, jax.Array) else jax.device_put(np.asarray(x))
+
+
+def on_host(tree: Tree) -> Tree:
+    """With the arrays of JAX as NumPy's, whose operations compile nothing; those traced stay."""
+    known = lambda x: isinstance(x, jax.Array) and is_concrete(x)
+    return jax.tree.map(lambda x: np.asarray(x) if known(x) else x, tree)
 
 
 def as_float_or_none(x: ArrayLike | Sequence | None) -> Array | None:

@@ -4,11 +4,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, TYPE_CHECKING
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxquad._core import as_float, is_concrete
+from jaxquad._core import as_array, as_float, is_concrete
 from jaxquad.loops import Loop
 
 from ._distributions import Distribution, normal_scores, Shares
@@ -37,7 +36,7 @@ def make_member_keys(key: Key[Array, ""], members: int) -> Key[Array, " members"
     random = make_generator(jax.random.fold_in(key, 1))
     words = random.integers(0, 2**32, (members, 2), dtype=np.uint32)
     # Other generators draw numbers under vmap that depend on how many members there are.
-    return jax.random.wrap_key_data(jnp.asarray(words), impl="threefry2x32")
+    return jax.random.wrap_key_data(as_array(words), impl="threefry2x32")
 
 
 def draw_unit_points(sampling: str, key: Key[Array, ""], rows: int, members: int) -> Shares:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import as_float, is_zero, require_all_positive, require_positive
+from jaxquad._core import as_float, is_zero, on_host, require_all_positive, require_positive
 from jaxquad.identify import check_drawable, draw_models, Fit, known_covariance, UndeterminedError
 from jaxquad.models import (
     AttitudeAxis,
@@ -23,7 +23,8 @@ from ._distributions import normal_scores
 from ._draw import draw_unit_points
 
 
-Build = Callable[[PyTree], tuple[DecoupledAxes, Array]]  # the plant, and the delay in s
+Number = Float[ArrayLike, ""]
+Build = Callable[[PyTree], tuple[DecoupledAxes, Number]]  # the plant, and the delay in s
 Given = Callable[[PyTree], tuple[DecoupledAxes, ArrayLike]]
 
 
@@ -46,7 +47,8 @@ def make_plant(
 
     - `ValueError`: the model is of another form, or `believed` is missing or not above 0.
     """
-    return _choose_builder(model, believed, None)(model)
+    plant, delay = _choose_builder(model, believed, None)(model)
+    return plant, as_float(delay)
 
 
 def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | None) -> Build:
@@ -54,7 +56,7 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
     if plant is not None:
         return _given(plant, believed)
     if believed is not None:
-        believed = as_float(believed)
+        believed = on_host(as_float(believed))
         require_positive("believed", believed, "the inertia in kg m^2 that the gain belongs to")
         if believed.ndim:
             raise ValueError(
@@ -96,21 +98,21 @@ def _given(plant: Given, believed: ArrayLike | None) -> Build:
 
 
 def _of_axis(
-    model: AttitudeAxis, believed: Array | None, *, lagging: bool
-) -> tuple[DecoupledAxes, Array]:
+    model: AttitudeAxis, believed: Number | None, *, lagging: bool
+) -> tuple[DecoupledAxes, Number]:
     """With a believed inertia the plant depends on b = L K_t / J_x and on K_af / J_x alone."""
     inertia = model.J_x if believed is None else believed
     share = inertia / model.J_x
     plant = DecoupledAxes(
-        (share * model.L * model.K_t)[None],
-        inertia[None],
-        lag=model.lag[None] if lagging else None,
-        damping=(share * model.K_af)[None],
+        share * model.L * model.K_t,
+        inertia,
+        lag=model.lag if lagging else None,
+        damping=share * model.K_af,
     )
     return plant, model.delay
 
 
-def _of_integrator(model: LaggedIntegrator, believed: Array) -> Build:
+def _of_integrator(model: LaggedIntegrator, believed: Number) -> Build:
     if model.integrators not in (1, 2):
         raise ValueError(
             f"the model has {model.integrators} integrators: an axis has 1 from command to rate, "
@@ -120,7 +122,7 @@ def _of_integrator(model: LaggedIntegrator, believed: Array) -> Build:
     return lambda m: (_axis(m.gain, m.lag if lagging else None, believed), m.delay)
 
 
-def _of_transfer_function(model: TransferFunction, believed: Array) -> Build:
+def _of_transfer_function(model: TransferFunction, believed: Number) -> Build:
     denominator = np.asarray(model.denominator)
     integrators = int(np.argmax(denominator[::-1] != 0))
     order = denominator.size - 1 - integrators
@@ -130,16 +132,15 @@ def _of_transfer_function(model: TransferFunction, believed: Array) -> Build:
             "K / (s (lag s + 1)) to a rate or K / (s^2 (lag s + 1)) to an angle: give plant="
         )
 
-    def build(m: TransferFunction) -> tuple[DecoupledAxes, Array]:
+    def build(m: TransferFunction) -> tuple[DecoupledAxes, Number]:
         lag = m.denominator[0] / m.denominator[1] if order else None
         return _axis(m.numerator[0] / m.denominator[order], lag, believed), m.delay
 
     return build
 
 
-def _axis(gain: Array, lag: Array | None, believed: Array) -> DecoupledAxes:
-    lag = None if lag is None else lag[None]
-    return DecoupledAxes((gain * believed)[None], believed[None], lag=lag)
+def _axis(gain: Number, lag: Number | None, believed: Number) -> DecoupledAxes:
+    return DecoupledAxes(gain * believed, believed, lag=lag)
 
 
 def _unmodelled_delay(fit: Fit, recorded_dt: float | None | Literal["as fitted"]) -> float:
@@ -166,6 +167,7 @@ def _unmodelled_delay(fit: Fit, recorded_dt: float | None | Literal["as fitted"]
 
 
 _LOST = 0.01  # share of a variance that may lie in directions which are not drawn
+_AT_ONCE = 256  # plants that are made together
 _DRAWS = 1024  # by which the longest delay is found
 _ROOM = 1.25  # over it: thousands of members hold longer ones, and need not be another program
 
@@ -235,7 +237,7 @@ class Posterior(eqx.Module):
             require_all_positive(largest_command=largest_command)
         self.band, self.largest_command = band, largest_command
         self.fit, self.build = fit, _choose_builder(fit.model, believed, plant)
-        self.plant, delay = self.build(fit.model)
+        self.plant, delay = self.build(on_host(fit.model) if plant is None else fit.model)
         self.delay = float(np.maximum(np.asarray(delay) - self.held_back, 0.0))
         points = draw_unit_points("latin", jax.random.key(0), self.deviates, _DRAWS)
         self.longest = float(np.max(self._drawn(normal_scores(points))[1]))
@@ -256,9 +258,9 @@ class Posterior(eqx.Module):
     def _drawn(
         self, scores: Float[np.ndarray, "parameters members"]
     ) -> tuple[DecoupledAxes, Float[np.ndarray, " members"]]:
-        plant, delay = _draw_plants(self.fit, self.build, jnp.asarray(scores))
+        plant, delay = _draw_plants(self.fit, self.build, scores)
         _check_positive(plant)
-        return plant, np.maximum(np.asarray(delay) - self.held_back, 0.0)
+        return plant, np.maximum(delay - self.held_back, 0.0)
 
     def require_nominal(self, plant: DecoupledAxes | Multirotor) -> None:
         """Raise ValueError unless `plant` is what the draws are around."""
@@ -291,11 +293,17 @@ class Posterior(eqx.Module):
 
 
 def _draw_plants(
-    fit: Fit, build: Build, deviates: Float[Array, "parameters members"]
-) -> tuple[DecoupledAxes, Float[Array, " members"]]:
-    """[axes, members] in every parameter of the plant."""
-    models = draw_models(fit, deviates, hold_undetermined=True)
-    return _build_plants(build, models, fit.model, deviates.shape[1])
+    fit: Fit, build: Build, scores: Float[np.ndarray, "parameters members"]
+) -> tuple[DecoupledAxes, Float[np.ndarray, " members"]]:
+    """[axes, members] in every parameter of the plant; equally many at a time, by one program."""
+    count, parts = scores.shape[1], []
+    for first in range(0, count, _AT_ONCE):
+        some = scores[:, first : first + _AT_ONCE]
+        padded = np.pad(some, ((0, 0), (0, _AT_ONCE - some.shape[1])))
+        models = draw_models(fit, padded, hold_undetermined=True)
+        parts.append(_build_plants(build, models, fit.model, _AT_ONCE))
+    join = lambda *parts: np.concatenate(parts, axis=-1)[..., :count]
+    return jax.tree.map(join, *parts)
 
 
 @eqx.filter_jit
@@ -314,6 +322,8 @@ def _whole_samples_above(delay: float, dt: float) -> float:
 
 def _require_determined(fit: Fit, build: Build, replaced: tuple[str, ...]) -> None:
     """Raise UndeterminedError where a quantity changes with undetermined directions of the fit."""
+    if fit.identifiable:
+        return
     here = jnp.asarray(fit.values)
 
     def numbers(values: Array) -> dict[str, Array]:
@@ -321,8 +331,6 @@ def _require_determined(fit: Fit, build: Build, replaced: tuple[str, ...]) -> No
         parts = {name: x for name, x in vars(plant).items() if x is not None} | {"delay": delay}
         return {name: jnp.ravel(x) for name, x in parts.items() if name not in replaced}
 
-    if fit.identifiable:
-        return
     slopes = {n: np.asarray(s) * fit.units for n, s in jax.jacfwd(numbers)(here).items()}
     moved = [numbers(jnp.asarray(values)) for values in fit.verdict.alternatives]
     fixed, lost = numbers(here), []

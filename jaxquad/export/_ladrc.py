@@ -1,8 +1,12 @@
 """LADRC, with its b0 fixed or scheduled by an inertia."""
 
-import numpy as np
-from jaxtyping import Array
+from collections.abc import Mapping
 
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from jaxquad._core import on_host
 from jaxquad.control import (
     CurrentObserver,
     EulerObserver,
@@ -157,13 +161,18 @@ def scheduled_ladrc_source(law: ScheduledLADRC, axes: int | None, precision: Pre
     )
 
 
+@eqx.filter_jit  # many small operations, as one program
+def _computed_gains(ladrc: LADRC) -> PyTree:
+    return ladrc.gains
+
+
 def _gains_of(
-    ladrc: LADRC, axes: int | None, precision: Precision, more: dict[str, Array]
+    ladrc: LADRC, axes: int | None, precision: Precision, more: Mapping[str, Array | np.ndarray]
 ) -> tuple[int, dict[str, np.ndarray]]:
     if type(ladrc.observer) not in _OBSERVERS:
         known = ", ".join(f"{kind.__name__}()" for kind in _OBSERVERS)
         raise ValueError(f"observer is {ladrc.observer!r}, but only {known} can be written in C.")
-    gains = ladrc.gains
+    gains = on_host(_computed_gains(ladrc))
     values = {"kp": gains.proportional}
     values |= {} if gains.derivative is None else {"kd": gains.derivative}
     values |= {f"l{k + 1}": row for k, row in enumerate(gains.correction)}

@@ -6,7 +6,6 @@ from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
 from jaxquad.control import InertiaMap
 
@@ -123,7 +122,7 @@ def axes_text(count: int) -> str:
     return f"{count} axis" if count == 1 else f"{count} axes"
 
 
-def per_axis(values: Mapping[str, jax.Array], axes: int | None) -> tuple[int, dict]:
+def per_axis(values: Mapping[str, jax.Array | np.ndarray], axes: int | None) -> tuple[int, dict]:
     """How many axes there are, and every gain as a NumPy array with one value for each.
 
     Raises ValueError for an ensemble, and where nothing says how many axes there are.
@@ -147,7 +146,7 @@ def per_axis(values: Mapping[str, jax.Array], axes: int | None) -> tuple[int, di
     return axes, {name: np.broadcast_to(x, (axes,)) for name, x in found.items()}
 
 
-def require_precision(values: Mapping[str, jax.Array], precision: Precision) -> None:
+def require_precision(values: Mapping[str, jax.Array | np.ndarray], precision: Precision) -> None:
     """Raises ValueError for gains that are known to less than the header's precision."""
     type_of(precision)
     coarse = [name for name, x in values.items() if np.asarray(x).dtype == np.float32]
@@ -278,9 +277,10 @@ def require_map(rule: object) -> InertiaMap:
     return rule
 
 
-def map_gains(rule: InertiaMap) -> dict[str, Array]:
+def map_gains(rule: InertiaMap) -> dict[str, jax.Array | np.ndarray]:
     """What a map has per axis."""
-    return {"nominal": rule.nominal} | {f"values[{k}]": row for k, row in enumerate(rule.values)}
+    values = np.asarray(rule.values)
+    return {"nominal": rule.nominal} | {f"values[{k}]": row for k, row in enumerate(values)}
 
 
 def map_source(

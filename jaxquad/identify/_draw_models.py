@@ -6,7 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+
+from jaxquad._core import as_array
 
 from ._accuracy import Matrix
 from ._parameters import Parameters
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def draw_models(
-    fit: "Fit", scores: Float[Array, "parameters members"], *, hold_undetermined: bool = False
+    fit: "Fit", scores: Float[ArrayLike, "parameters members"], *, hold_undetermined: bool = False
 ) -> PyTree:
     """Draw models from a fit at given standard normal numbers, as `Fit.ensemble` does.
 
@@ -33,7 +35,7 @@ def draw_models(
     - `UndeterminedError`, `ValueError`: as `Fit.ensemble`.
     """
     spread = _spread_of(fit, hold_undetermined)
-    replaced = _replaced(fit.parameters, fit.model, spread, jnp.asarray(scores))
+    replaced = _replaced(fit.parameters, fit.model, spread, as_array(scores))
     places = (*fit.parameters.places[: len(fit.names)], *(p for p, _ in fit.parameters.ties))
     touched, structure = {place.leaf for place in places}, jax.tree.structure(fit.model)
     floating = [k for k, x in enumerate(jax.tree.leaves(fit.model)) if _is_inexact(x)]

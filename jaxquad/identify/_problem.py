@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from jaxquad._core import pytree_node
+from jaxquad._core import as_array, on_host, pytree_node
 from jaxquad._xla import no_fuse
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
@@ -168,14 +168,9 @@ def _known(response: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
     return np.where(np.isfinite(response), response, 1.0)
 
 
-def on_host(model: PyTree) -> PyTree:
-    """The model with NumPy arrays: what a condition or a tie does to it is compiled nowhere."""
-    return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, model)
-
-
 def on_device(model: PyTree) -> PyTree:
     """The model with JAX's arrays in the place of NumPy's."""
-    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, model)
+    return jax.tree.map(lambda x: as_array(x) if isinstance(x, np.ndarray) else x, model)
 
 
 def _silent_pairs(

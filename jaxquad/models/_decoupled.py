@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxquad._core import (
     align,
     as_float,
+    on_host,
     per_member,
     require_finite,
     require_nonnegative,
@@ -18,7 +19,8 @@ from ._attitude import friction
 
 
 def _per_axis(x: ArrayLike | Sequence) -> Array:
-    return jnp.atleast_1d(as_float(x))
+    x = as_float(x)
+    return x if x.ndim else as_float(on_host(x)[None])
 
 
 def _per_axis_or_none(x: ArrayLike | Sequence | None) -> Array | None:

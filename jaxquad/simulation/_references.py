@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxquad._core import as_float, require_all_positive, require_finite
+from jaxquad._core import as_float, on_host, require_all_positive, require_finite
 
-from ._signal import as_signal, Clock, Motion, Signal, spread
+from ._signal import as_signal, Clock, Known, Motion, Signal, spread, widened
 
 
 class Step(Signal):
@@ -60,7 +60,8 @@ class Ramp(Signal):
         require_finite("before", self.before)
 
     def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
-        share, change = _progress(clock, self.at, self.within), self.after - self.before
+        share = _progress(clock, self.at, self.within)
+        change = on_host(self.after) - on_host(self.before)
         moving = (share >= 0) & (share < 1)
         value = _between(np.clip(share, 0, 1), self.before, self.after)
         return Motion(value, spread(moving / self.within, change))
@@ -96,7 +97,7 @@ class SmoothStep(Signal):
 
     def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
         s = np.clip(_progress(clock, self.at, self.within), 0, 1)
-        change = self.after - self.before
+        change = on_host(self.after) - on_host(self.before)
         rate = 30 * s**2 * (1 - s) ** 2 / self.within
         acceleration = 60 * s * (1 - s) * (1 - 2 * s) / self.within**2
         return Motion(
@@ -172,7 +173,7 @@ class ReferenceModel(Signal):
         command = self.signal.sample(clock, key).value
         stiffness, friction = self.natural_frequency**2, 2 * self.damping * self.natural_frequency
         model = [[0.0, 1.0, 0.0], [-stiffness, -friction, stiffness], [0.0, 0.0, 0.0]]
-        advance = jnp.asarray(expm(clock.dt * np.array(model))[:2], command.dtype)
+        advance = np.asarray(expm(clock.dt * np.array(model))[:2], command.dtype)
         angle, rate = _follow(advance, command)
         return Motion(angle, rate, stiffness * (command - angle) - friction * rate)
 
@@ -197,7 +198,7 @@ def _between(
     share: Float[np.ndarray, " samples"],
     before: Float[Array, "..."],
     after: Float[Array, "..."],
-) -> Float[Array, " samples *ensemble"]:
-    members = jnp.broadcast_shapes(before.shape, after.shape)
-    before, after = (jnp.broadcast_to(x, members) for x in (before, after))
-    return spread(1 - share, before) + spread(share, after)
+) -> Float[Known, " samples *ensemble"]:
+    members = np.broadcast_shapes(before.shape, after.shape)
+    start, end = (widened(on_host(x), members) for x in (before, after))
+    return spread(1 - share, start) + spread(share, end)

@@ -215,8 +215,11 @@ def _stack(
     except ValueError:
         text = ", ".join(str(shape) for shape in shapes)
         raise ValueError(f"{name}: the axes are for different ensembles, {text}") from None
-    zero = jnp.zeros((clock.samples, *members), as_float(0.0).dtype)
-    return jnp.stack([zero if x is None else fit(x, members) for x in signals], axis=1)
+    zero = np.zeros((clock.samples, *members), as_float(0.0).dtype)
+    rows = [zero if x is None else fit(x, members) for x in signals]
+    if any(isinstance(x, jax.Array) for x in rows):
+        return jnp.stack(rows, axis=1)
+    return as_float(np.stack(rows, axis=1))
 
 
 def excite(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from jaxquad._core import as_float, require_finite, whole_samples
+from jaxquad._core import as_float, on_host, require_finite, whole_samples
 from jaxquad.excitation import Excitation
 
 
@@ -38,12 +38,15 @@ class Clock(NamedTuple):
         return np.arange(self.samples) - start
 
 
+Known = Array | np.ndarray  # NumPy's where no number is traced: nothing is compiled for it
+
+
 class Motion(NamedTuple):
     """A sampled signal and its derivatives; None where they are zero."""
 
-    value: Float[Array, " samples *ensemble"]
-    rate: Float[Array, " samples *ensemble"] | None = None
-    acceleration: Float[Array, " samples *ensemble"] | None = None
+    value: Float[Known, " samples *ensemble"]
+    rate: Float[Known, " samples *ensemble"] | None = None
+    acceleration: Float[Known, " samples *ensemble"] | None = None
 
 
 class Signal(eqx.Module):
@@ -134,26 +137,32 @@ def as_signal(given: Signal | Excitation | ArrayLike) -> Signal:
 
 
 def spread(
-    shape: Float[np.ndarray, " samples"], amplitude: Float[Array, "*ensemble"]
-) -> Float[Array, " samples *ensemble"]:
+    shape: Float[np.ndarray, " samples"], amplitude: Float[ArrayLike, "*ensemble"]
+) -> Float[Known, " samples *ensemble"]:
     """A waveform times the amplitude of each member."""
-    column = jnp.asarray(shape, amplitude.dtype).reshape((-1,) + (1,) * amplitude.ndim)
-    return column * amplitude[None]
+    known = on_host(amplitude) if isinstance(amplitude, jax.Array) else np.asarray(amplitude)
+    column = np.asarray(shape, known.dtype).reshape((-1,) + (1,) * known.ndim)
+    return column * known[None]
 
 
-def fit(signal: Float[Array, "samples ..."], members: tuple[int, ...]) -> Array:
+def fit(signal: Float[Known, "samples ..."], members: tuple[int, ...]) -> Known:
     """The signal as wide as `members`."""
     missing = len(members) - (signal.ndim - 1)
     aligned = signal.reshape(signal.shape[:1] + (1,) * missing + signal.shape[1:])
-    return jnp.broadcast_to(aligned, signal.shape[:1] + members)
+    return widened(aligned, signal.shape[:1] + members)
 
 
-def _total_or_none(a: Array | None, b: Array | None) -> Array | None:
+def widened(x: Float[Known, "..."], shape: tuple[int, ...]) -> Float[Known, "..."]:
+    """`x` broadcast to a shape."""
+    return (jnp if isinstance(x, jax.Array) else np).broadcast_to(x, shape)
+
+
+def _total_or_none(a: Known | None, b: Known | None) -> Known | None:
     if a is None or b is None:
         return b if a is None else a
     return _total(a, b)
 
 
-def _total(a: Array, b: Array) -> Array:
-    members = jnp.broadcast_shapes(a.shape[1:], b.shape[1:])
+def _total(a: Known, b: Known) -> Known:
+    members = np.broadcast_shapes(a.shape[1:], b.shape[1:])
     return fit(a, members) + fit(b, members)

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from jaxquad._core import map_in_threads
+
 from ._local_fit import Bins
 
 
@@ -149,7 +151,7 @@ def global_models(
         for o in range(outputs.start, outputs.stop)
     )
     tasks = (_Task(equations, bins.omega[places], most, scale) for equations in each)
-    found = (_identify_kept(task) for task in tasks)
+    found = map_in_threads(_identify_kept, tasks)
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
         for one in found

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
+from jaxquad._core import thread_settings
 from jaxquad._xla import asked_devices, may_be_several
 from jaxquad.control import Reference
 from jaxquad.ensembles import Ensemble, Members
@@ -17,7 +18,6 @@ from jaxquad.simulation import Scenario
 from ._design_result import DesignResult
 from ._evaluate_design import evaluate_design
 from ._problem import DeviceChoice, require_same_rate, TimeSpan
-from ._threads import thread_settings
 
 
 class Beside(NamedTuple):

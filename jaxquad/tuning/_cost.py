@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._core import as_array
 from jaxquad._xla import Jit
 from jaxquad.control import ObserverController
 
@@ -29,14 +30,14 @@ Tree = TypeVar("Tree")
 def stack_copies(tree: Tree, count: int) -> Tree:
     """`count` problems with the same numbers, on a leading axis."""
     arrays, rest = eqx.partition(tree, eqx.is_array)
-    stack = lambda x: jnp.asarray(np.broadcast_to(np.asarray(x), (count, *x.shape)))
+    stack = lambda x: as_array(np.broadcast_to(np.asarray(x), (count, *x.shape)))
     return eqx.combine(jax.tree.map(stack, arrays), rest)
 
 
 def take_problem(tree: Tree, index: int) -> Tree:
     """The problem with that index on the leading axis."""
     arrays, rest = eqx.partition(tree, eqx.is_array)
-    return eqx.combine(jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), arrays), rest)
+    return eqx.combine(jax.tree.map(lambda x: as_array(np.asarray(x)[index]), arrays), rest)
 
 
 class Multipliers(NamedTuple):

@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+
+from jaxquad._core import as_array
 
 from ._objective import Limit, Risk, risk_text
 from ._quantities import QUANTITIES
@@ -340,7 +341,7 @@ def _risk(over: Risk, values: Numbers) -> float:
         return np.nan
     if np.isposinf(values).any():
         return np.inf  # whatever its weight: 0 times it would be nan
-    return float(over(jnp.asarray(values)))
+    return float(over(as_array(values)))
 
 
 def front_point(design: DesignResult, over: str) -> tuple[float, float]:

@@ -4,10 +4,10 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from jaxquad._core import as_array, map_in_threads
 from jaxquad.control import (
     LADRC,
     LinearisableController,
@@ -23,7 +23,6 @@ from ._design_result import DesignResult, LinearMembers
 from ._flown import fly
 from ._problem import decouple, DeviceChoice, Plant, TimeSpan
 from ._quantities import LINEAR
-from ._threads import map_in_threads
 
 
 def evaluate_design(
@@ -100,7 +99,7 @@ def _draw_further(
     count = min(_MULTIPLE * flown, _MOST) if count is None else count
     keys = jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown))
     for each in np.asarray(jax.random.key_data(keys)):  # keys by themselves: a program to part them
-        own = jax.random.wrap_key_data(jnp.asarray(each), impl=jax.random.key_impl(keys))
+        own = jax.random.wrap_key_data(as_array(each), impl=jax.random.key_impl(keys))
         yield ensemble.fresh(loop, flown, own)
 
 
@@ -151,7 +150,7 @@ def _full(gain: Array, name: str, axes: int, members: int) -> Array:
     shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
     given = np.asarray(gain)
     aligned = given.reshape(given.shape + (1,) * (len(shape) - given.ndim)) if given.ndim else given
-    return jnp.asarray(np.broadcast_to(aligned, shape))
+    return as_array(np.broadcast_to(aligned, shape))
 
 
 def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:

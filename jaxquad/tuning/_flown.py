@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._core import as_array
 from jaxquad._xla import Devices, gathered, Jit
 from jaxquad.loops import Loop
 from jaxquad.simulation import (
@@ -49,7 +50,7 @@ def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = No
     samples, dt = len(flight.reference), loop.dt
     whole = window(samples, dt, start=span.start, stop=span.stop, load_start=span.load_start)
     parts = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
-    windows = tuple(Window(*map(jnp.asarray, x)) for x in (whole, *parts))
+    windows = tuple(Window(*map(as_array, x)) for x in (whole, *parts))
     run, places = placed(loop, flight, devices)
     numbers, each, diverged = gathered(_run(*run, windows, places))
     found = jax.tree.map(lambda x: np.asarray(x, float), (numbers, each))

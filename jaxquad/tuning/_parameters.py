@@ -4,11 +4,10 @@ from collections.abc import Mapping
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._core import ensemble_shape
+from jaxquad._core import as_array, ensemble_shape
 from jaxquad.control import find_transform, Transform, Tunable
 from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
 
@@ -71,7 +70,7 @@ class Coordinates(eqx.Module):
 
     def values(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
         """The tuned numbers by name."""
-        tuned = eqx.filter(build_design(self, jnp.asarray(z)), eqx.is_inexact_array)
+        tuned = eqx.filter(build_design(self, as_array(z)), eqx.is_inexact_array)
         held = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(tuned)]
         places = {place.name: place for place in name_places(self.controller)}
         at = lambda place: float(held[place.leaf][place.index])
@@ -142,4 +141,4 @@ def _block(controller: PyTree, name: str, places: list[Place]) -> Block | None:
     leaves = jax.tree.leaves(eqx.filter(controller, eqx.is_inexact_array))
     values = np.asarray(leaves[mine[0].leaf])
     start = np.asarray(transform.inverse(values))
-    return Block(mine, values.shape, transform, jnp.asarray(start.reshape(-1)))
+    return Block(mine, values.shape, transform, as_array(start.reshape(-1)))

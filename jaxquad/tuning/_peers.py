@@ -1,9 +1,9 @@
 """Designs that a tuned one is compared with."""
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from jaxquad._core import on_host
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
 
@@ -37,7 +37,7 @@ def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
 
     - `ValueError`: the plant is an ensemble, or of another kind.
     """
-    b = np.asarray(_nominal(plant).gain, float)
+    b = np.asarray(on_host(_nominal(plant)).gain, float)
     designs = {}
     for b0 in PAPER_B0:
         given = b0 * b / HOVER_GAIN
@@ -67,11 +67,11 @@ def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict
     - `ValueError`: as `jq.tuning.paper_designs` does.
     """
     axes = _nominal(plant)
-    KT, J = jnp.broadcast_arrays(axes.torque_gain, axes.inertia)
+    KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain), np.asarray(axes.inertia))
     # As a map of ln J, b0 = KT / J is straight: two knots, far apart, hold it everywhere.
     map = certainty_equivalence(KT, J, span=(1e-3, 1e3), knots=2)
     designs: dict[str, PyTree] = dict(paper_designs(plant, dt=dt))
-    designs[KNOWN_INERTIA] = ScheduledLADRC(LADRC(WC, WO, axes.gain, dt=dt), map)
+    designs[KNOWN_INERTIA] = ScheduledLADRC(LADRC(WC, WO, KT / J, dt=dt), map)
     return designs if pid is None else designs | {"tuned PID": pid}
 
 

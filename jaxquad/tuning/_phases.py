@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from jaxquad._core import as_array
 from jaxquad.control import ObserverController
 from jaxquad.ensembles import Members
 
@@ -50,8 +50,8 @@ _AS_GOOD = 1.05  # of the least miss: of rounds that miss limits so nearly alike
 def initial_multipliers(problem: Problem, limits: Sequence[Limit], problems: int) -> Multipliers:
     """Before anything is known of the limits."""
     sizes = [count_members(problem, limit) for limit in limits]
-    values = tuple(jnp.asarray(np.zeros((problems, size))) for size in sizes)
-    return Multipliers(values, jnp.asarray(np.full((problems, len(sizes)), _STIFFNESS)))
+    values = tuple(as_array(np.zeros((problems, size))) for size in sizes)
+    return Multipliers(values, as_array(np.full((problems, len(sizes)), _STIFFNESS)))
 
 
 def update_multipliers(
@@ -69,12 +69,12 @@ def update_multipliers(
     for k, beyond in enumerate(map(np.asarray, result.beyond)):
         old = np.asarray(multipliers.values[k])
         raised = np.maximum(old + stiffness[:, k : k + 1] * beyond, 0)
-        values.append(jnp.asarray(np.where(keep, raised, old)))
+        values.append(as_array(np.where(keep, raised, old)))
         most.append(beyond.max(axis=1))
     missed = np.stack(most, axis=1)
     slow = missed > np.maximum(0.25 * before, MET)
     stiffer = np.where(slow & keep, _STIFFER, 1.0) * stiffness
-    return Multipliers(tuple(values), jnp.asarray(stiffer)), missed
+    return Multipliers(tuple(values), as_array(stiffer)), missed
 
 
 class Rounds:
@@ -284,10 +284,10 @@ class _Runner(eqx.Module):
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
     ) -> tuple[Array, Array, Coordinates, Problem, Subproblem]:
         count = len(z)
-        rate = jnp.asarray(np.full(count, self.rate - _BEYOND_KNEE))
-        flies = jnp.asarray(np.broadcast_to(np.asarray(fly), (count,)))
+        rate = as_array(np.full(count, self.rate - _BEYOND_KNEE))
+        flies = as_array(np.broadcast_to(np.asarray(fly), (count,)))
         subproblem = Subproblem(self.objectives, self.limits, multipliers, flies, rate)
-        return jnp.asarray(z), jnp.asarray(on), self.coordinates, self.problem, subproblem
+        return as_array(z), as_array(on), self.coordinates, self.problem, subproblem
 
     def evaluator(self, fly: bool, multipliers: Multipliers) -> Evaluate:
         """What a descent calls: infinite where a step must not go."""
@@ -404,7 +404,7 @@ class _Optimised(NamedTuple):
 
 def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
     """Why the controller at `z` cannot be built or must not be flown; empty if it can."""
-    controller = build_design(coordinates, jnp.asarray(z))
+    controller = build_design(coordinates, as_array(z))
     for part in _iter_modules(controller):
         try:
             _check_again(part)

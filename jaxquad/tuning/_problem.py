@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxquad._core import mark_members
+from jaxquad._core import as_array, mark_members
 from jaxquad._xla import asked_devices, Devices, devices_for
 from jaxquad.control import schedule_for_analysis, schedule_for_flight
 from jaxquad.ensembles import Members
@@ -91,7 +91,7 @@ class LinearLoops(eqx.Module):
                 return mine
             values = np.array(mine)
             values[..., places] = np.asarray(other)[..., chosen]
-            return jnp.asarray(values)
+            return as_array(values)
 
         marks = mark_members(self.axes, (self.members,))
         return dataclasses.replace(

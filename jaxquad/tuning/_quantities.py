@@ -1,13 +1,15 @@
 """The quantities that are tuned, limited and certified: one entry each in `QUANTITIES`."""
 
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 
+Value = TypeVar("Value", bound=ArrayLike)  # NumPy's stay so: nothing is compiled for them
 _DEGREE = float(np.degrees(1.0))
 
 
@@ -32,12 +34,13 @@ class Quantity(NamedTuple):
         """-1 where a smaller number is the worse one, else 1."""
         return -1.0 if self.smaller_is_worse else 1.0
 
-    def level(self, value: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+    def level(self, value: Value) -> Value:
         """What weights and penalties act on: ln of the value, or the value over its `scale`."""
-        bounded = jnp.minimum(jnp.asarray(value), self.most)
+        xp: Any = jnp if isinstance(value, jax.Array) else np
+        bounded = xp.minimum(value, self.most)
         if not self.logarithmic:
             return bounded / self.scale
-        return jnp.log(jnp.maximum(bounded, self.least))
+        return xp.log(xp.maximum(bounded, self.least))
 
     def combine_axes(
         self, value: Float[Array, "axes members"], *, worst: bool = False

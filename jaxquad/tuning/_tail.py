@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from jaxquad._core import mark_members
+from jaxquad._core import as_array, mark_members, on_host
 from jaxquad.ensembles import Members
 
 from ._certificate import Certificate
@@ -116,7 +116,7 @@ def search_tail(
 
     An unstable loop has no number that a limit could pull at: it is left to the certificate.
     """
-    designs = [(jnp.asarray(z[k]), take_problem(search.limits, int(k))) for k in able.nonzero()[0]]
+    designs = [(as_array(z[k]), take_problem(search.limits, int(k))) for k in able.nonzero()[0]]
     found = Beyond(None, None, 0)
     if search.linear is not None:
         levels = lambda loops: [_levels(x, coordinates, loops, limits) for x, limits in designs]
@@ -139,7 +139,7 @@ def prepare_search(search: Search, coordinates: Coordinates, z: Float[np.ndarray
     if search.linear is None:
         return
     slices = [search.linear(k) for k in range(_LOOPS // SLICE)]
-    _levels(jnp.asarray(z), coordinates, slices[0], take_problem(search.limits, 0))
+    _levels(as_array(z), coordinates, slices[0], take_problem(search.limits, 0))
 
 
 Slice = TypeVar("Slice")
@@ -203,7 +203,7 @@ def flight_levels(
 def _level(quantity: str, values: Numbers, bound: Float[ArrayLike, ""]) -> Numbers:
     """How far values are beyond a bound; minus infinity for those that are no number."""
     shown = QUANTITIES[quantity]
-    level = np.asarray(shown.sign * (shown.level(values) - shown.level(bound)))
+    level = np.asarray(shown.sign * (shown.level(values) - shown.level(on_host(bound))))
     return np.where(np.isfinite(level), level, -np.inf)
 
 
@@ -249,7 +249,7 @@ def half_of_reserve(
     limits: Sequence[Limit], allowed: Sequence[Limit]
 ) -> Float[np.ndarray, "problems limits"]:
     """Half of the level from what is aimed at to what is allowed: near enough to search again."""
-    level = lambda limit: np.asarray(QUANTITIES[limit.quantity].level(limit.bound))
+    level = lambda limit: np.asarray(QUANTITIES[limit.quantity].level(on_host(limit.bound)))
     pairs = zip(limits, allowed, strict=True)
     return np.stack([0.5 * np.abs(level(a) - level(b)) for a, b in pairs], axis=1)
 
@@ -311,7 +311,7 @@ def put_flights(
 
 
 def _with_values(multipliers: Multipliers, values: Sequence[np.ndarray]) -> Multipliers:
-    return multipliers._replace(values=tuple(map(jnp.asarray, values)))
+    return multipliers._replace(values=tuple(map(as_array, values)))
 
 
 def take_members(slices: Sequence[Members], places: Sequence[tuple[int, int]]) -> Members | None:
@@ -331,7 +331,7 @@ def take_members(slices: Sequence[Members], places: Sequence[tuple[int, int]]) -
         given = [np.asarray(jax.random.key_data(x)).T if keys else np.asarray(x) for x in parts]
         taken = [x[..., k] for x, (_, k) in zip(given, used, strict=True)]
         together = np.concatenate(taken, axis=-1)[..., order]
-        return jax.random.wrap_key_data(jnp.asarray(together.T)) if keys else jnp.asarray(together)
+        return jax.random.wrap_key_data(as_array(together.T)) if keys else as_array(together)
 
     marks = mark_members(alike[0], (alike[0].size,))
     return jax.tree.map(pick, marks, *alike)

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
+from jaxquad._core import as_array, on_host
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
 from jaxquad.loops import Loop
@@ -179,7 +179,7 @@ def tune(
 
         def judge(solution: Solution, key: Key[Array, ""], found: Beside) -> Certificate:
             watched.say("certificate on fresh members ...")
-            design = build_design(coordinates, jnp.asarray(solution.z[best]))
+            design = build_design(coordinates, as_array(solution.z[best]))
             return certify_beside(
                 loop.with_controller(design), others, scenario, found, limits=limits,
                 linear_members=None, key=key, span=span, name="tuned", devices=devices,
@@ -193,7 +193,7 @@ def tune(
                 solution, certificate, again, redraw, search, best, key
             )
             seconds += more
-    tuned = build_design(coordinates, jnp.asarray(solution.z[best]))
+    tuned = build_design(coordinates, as_array(solution.z[best]))
     found = _limit_results(limits, solution, best)
     bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
     convergence = judge_descent(solution, best, bounds, found)
@@ -339,7 +339,7 @@ def tighten(limit: Limit, reserve: float) -> Limit:
         )
     share = limit.sign * np.sign(np.asarray(limit.bound)) * reserve
     name = "at_least" if limit.at_most is None else "at_most"
-    return Limit(limit.quantity, **{name: limit.bound * (1 - share)}, over=limit.over)
+    return Limit(limit.quantity, **{name: on_host(limit.bound) * (1 - share)}, over=limit.over)
 
 
 def _best(solution: Solution) -> int:
@@ -364,7 +364,7 @@ def _limit_results(
     """Each limit as it was given, on the members that were tuned on."""
     results = []
     for k, limit in enumerate(limits):
-        values = jnp.asarray(solution.result.limited[k][index])
+        values = as_array(solution.result.limited[k][index])
         excess = float(_excess(limit, values))
         found = float(limit.bound) + limit.sign * excess
         active = float(np.asarray(solution.multipliers.values[k])[index].sum()) > _ACTIVE

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from jaxquad._core import as_array
 from jaxquad.control import schedule_for_flight
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop
@@ -81,7 +81,7 @@ def _members(certificate: Certificate, loop: Loop, ensemble: Ensemble | Members)
             raise ValueError(
                 "the certificate was made on members that were given: give these as the ensemble"
             )
-        key = jax.random.wrap_key_data(jnp.asarray(data, jnp.uint32))
+        key = jax.random.wrap_key_data(as_array(np.asarray(data, np.uint32)))
         members = ensemble.fresh(loop, certificate.members, key)
     known = certificate.facts["assumed_inertia"].shape
     if members.assumed_inertia.shape != known:
@@ -95,7 +95,7 @@ def _members(certificate: Certificate, loop: Loop, ensemble: Ensemble | Members)
 def _member(found: Simulation, k: int) -> Simulation:
     """One of an ensemble of simulations. Compiles nothing."""
     count = found.diverged.shape
-    at = lambda x: jnp.asarray(np.asarray(x)[..., k])
+    at = lambda x: as_array(np.asarray(x)[..., k])
     pick = lambda x: at(x) if x.shape[-1:] == count and x.ndim > 2 else x
     parts = {name: pick(part) for name, part in found.scenario.parts.items()}
     return Simulation(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import announce
+from jaxquad._core import announce, map_in_threads, one_blas_thread
 from jaxquad.identify import (
     CoherenceWeighted,
     Fit,
@@ -38,37 +38,68 @@ Model = LaggedIntegrator | TransferFunction
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
+_NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
+_SHORT = 1_000_000  # samples of records whose responses are estimated at the same time
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
 _DOMINATED = "feedback-dominated"
 EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
 
 
-def fit_twice(
-    records: tuple[Record, ...], method: str, settings: IdentifySettings, delay: float,
+def fit_responses(
+    records: tuple[Record, ...], methods: Sequence[str], settings: IdentifySettings,
     filters: Sequence[KnownFilter] = (),
-) -> tuple[FrequencyResponse, Fit, float]:  # fmt: skip
-    """The second response is estimated with the delay (s) that the first fit found taken out.
+) -> tuple[dict[str, FrequencyResponse], dict[str, Fit]]:  # fmt: skip
+    """By each of the methods, the one to trust first: a response, and the fit to it.
 
-    Once is enough where a delay is known. Returns the delay, too. Known `filters` of the output
-    are divided out.
+    Taken out of the responses is the delay that a fit to a quick one finds; where the fit to the
+    first one finds another, all are estimated again. Known `filters` of the output are divided out.
     """
+    best, dt = methods[0], records[0].dt
+    announce(f"quick {best} response, for the delay")
+    [quick] = _responses(records, [best], settings, filters, quick=True)
+    delay = _delay_of(_fitted(quick, settings), records)
+    frfs = _responses(records, methods, settings, filters, delay)
+    announce(f"fit to the {best} response")
+    found = _fitted(frfs[0], settings)
+    other = _delay_of(found, records)
+    if other and abs(other - delay) > _NEAR * dt:
+        frfs = _responses(records, methods, settings, filters, other)
+        found = _fitted(frfs[0], settings)
+    fits = [found, *(_fitted(frf, settings) for frf in frfs[1:])]
+    return dict(zip(methods, frfs, strict=True)), dict(zip(methods, fits, strict=True))
+
+
+def _responses(
+    records: tuple[Record, ...], methods: Sequence[str], settings: IdentifySettings,
+    filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
+) -> list[FrequencyResponse]:  # fmt: skip
+    """By each of the methods; of short records at the same time."""
     band = _band(settings)
-    dt, duration = records[0].dt, max(record.duration for record in records)
     omega = np.geomspace(*band, _POINTS) if band else None
-    while True:
-        announce(f"{method} response{f', {delay:.4g} s of delay taken out' if delay else ''}")
-        estimator = _estimator(settings, method, delay)
+
+    def respond(method: str) -> FrequencyResponse:
+        estimator = _estimator(settings, method, delay, quick=quick)
         frf = frequency_response(list(records), omega, estimator=estimator)
-        frf = without_filters(frf, filters)
-        announce(f"fit to the {method} response")
-        found = _fitted(frf, settings)
-        if not found.verdict.fitted:
-            return frf, found, delay
-        total = dt * round(float(total_delay(found.model)) / dt)
-        if delay or not 0 < total < _LONGEST * duration:
-            return frf, found, delay
-        delay = total
+        return without_filters(frf, filters)
+
+    if not quick:
+        out = f", {delay:.4g} s of delay taken out" if delay else ""
+        announce(f"{' and '.join(methods)} response{out}")
+    short = sum(record.samples for record in records) < _SHORT
+    if not short:
+        return [respond(method) for method in methods]
+    with one_blas_thread():  # by the thread that all others end before
+        return map_in_threads(respond, methods)
+
+
+def _delay_of(found: Fit, records: tuple[Record, ...]) -> float:
+    """In s, whole samples; 0 where nothing is fitted, and for one that is none of a vehicle."""
+    if not found.verdict.fitted:
+        return 0.0
+    dt, duration = records[0].dt, max(record.duration for record in records)
+    total = dt * round(float(total_delay(found.model)) / dt)
+    return total if 0 < total < _LONGEST * duration else 0.0
 
 
 def _band(settings: IdentifySettings) -> tuple[float, float] | None:
@@ -78,12 +109,14 @@ def _band(settings: IdentifySettings) -> tuple[float, float] | None:
     return settings.band_rad
 
 
-def _estimator(settings: IdentifySettings, method: str, delay: float) -> Estimator:
+def _estimator(settings: IdentifySettings, method: str, delay: float, *, quick: bool) -> Estimator:
     shape = {"integrators": settings.integrators, "delay": delay}
     if settings.window is not None or settings.estimator == "welch":
         estimator = Welch(settings.window, **shape)
     elif settings.estimator == "composite":
         estimator = Composite(**shape)
+    elif quick:
+        estimator = LocalPolynomial(**shape, global_order=0)
     else:
         estimator = LocalPolynomial(**shape)
     return JointInputOutput(estimator) if method == "joint" else estimator

@@ -30,7 +30,15 @@ from jaxquad.spectra import (
     FrequencyResponse,
 )
 
-from ._fits import EXCITE, fit_parts, fit_twice, in_option_words, sums_of, with_remedies, with_units
+from ._fits import (
+    EXCITE,
+    fit_parts,
+    fit_responses,
+    in_option_words,
+    sums_of,
+    with_remedies,
+    with_units,
+)
 from ._log import mix_of, propose_settings, read_logs, read_records
 from ._result_file import default_folder
 from ._settings import IdentifySettings
@@ -192,9 +200,9 @@ def identify(
 ) -> Identification:
     """Identify one log, or several together, as `jaxquad identify` does.
 
-    The frequency response is estimated twice: the second time with the delay taken out that the
-    first fit has found. With an external reference, the joint input-output estimate is fitted, and
-    the direct one, with the same delay taken out, beside it.
+    The frequency response is estimated with the delay taken out that a fit to a quick one has
+    found. With an external reference, the joint input-output estimate is fitted, and the direct
+    one, with the same delay taken out, beside it.
 
     **Arguments:**
 
@@ -265,10 +273,9 @@ def _identify(
     settings = settings or IdentifySettings()
     records = read_logs((path, *more), settings)
     best, *others = ("joint", "direct") if settings.reference else ("direct",)
-    responses, fits, delay = {}, {}, 0.0
-    for method in (best, *(others if beside else ())):
-        responses[method], found, delay = fit_twice(records, method, settings, delay, filters)
-        fits[method] = with_units(with_remedies(found, settings), records[0])
+    methods = (best, *(others if beside else ()))
+    responses, found = fit_responses(records, methods, settings, filters)
+    fits = {name: with_units(with_remedies(f, settings), records[0]) for name, f in found.items()}
     announce("fits to parts of the band")
     fits[best], parts = fit_parts(fits[best], responses[best], settings)
     fits = {name: in_option_words(each) for name, each in fits.items()}

@@ -181,7 +181,7 @@ def _tuned(
         largest_command=found.largest_command,
     )  # fmt: skip
     plant, ensemble = posterior.plant, _ensemble(posterior, settings)
-    gain = float(plant.torque_gain[0])
+    gain = float(np.asarray(plant.torque_gain)[0])
     if gain <= 0:
         raise ValueError(
             f"the gain is negative (KT = {gain:.4g}): identify with the sign of the input reversed "

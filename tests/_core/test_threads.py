@@ -6,7 +6,7 @@ import sys
 import pytest
 import threadpoolctl
 
-from jaxquad._core import one_blas_thread
+from jaxquad._core import map_in_threads, one_blas_thread
 
 
 def threads():
@@ -23,6 +23,24 @@ def test_within_there_is_one_thread_and_after_an_error_too_as_many_as_before():
         with pytest.raises(KeyError), one_blas_thread():
             assert set(threads()) == {1}
             raise KeyError
+        assert threads() == before
+
+
+def test_threads_within_that_ask_for_it_too_leave_what_was_there_before():
+    if not threads():
+        pytest.skip("NumPy's BLAS is not one that threadpoolctl knows")
+
+    def ask(_):
+        with one_blas_thread():
+            return set(threads())
+
+    with one_blas_thread():  # loads the libraries that it limits
+        pass
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        before = threads()
+        with one_blas_thread():
+            assert map_in_threads(ask, iter(range(8))) == 8 * [{1}]
+            assert set(threads()) == {1}
         assert threads() == before
 
 

@@ -44,6 +44,21 @@ def test_the_main_job_compiles_at_most_15_programs(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_tune_of_a_stored_result_compiles_at_most_40_programs(tmp_path):
+    command = tmp_path / "command.py"
+    command.write_text("import sys\nfrom jaxquad.cli import main\nsys.exit(main() not in (0, 4))\n")
+    log = write_sweep(tmp_path / "sweep.csv")
+    options = ["--input", "M=right-left", "--output", "q", "--band", "0.5", "6"]
+    options += ["--unit", "q=rad/s", "--out", str(tmp_path)]
+    programs(str(command), "identify", str(log), *options)
+    sizes = ["--members", "16", "--fresh", "32", "--duration", "2"]
+    found = programs(
+        str(command), "tune", str(tmp_path), "--inertia", "0.05", "--limit", "1", *sizes
+    )
+    assert len(found) <= 40, found
+
+
+@pytest.mark.slow
 def test_an_identification_compiles_at_most_6_programs(tmp_path):
     command = tmp_path / "command.py"
     command.write_text("import sys\nfrom jaxquad.cli import main\nsys.exit(main())\n")

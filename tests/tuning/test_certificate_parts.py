@@ -12,11 +12,11 @@ from conftest import ROOT
 from scipy.stats import beta, binom
 
 import jaxquad as jq
+from jaxquad._core import map_in_threads
 from jaxquad.control import schedule_for_analysis
 from jaxquad.loops import loop_numbers
 from jaxquad.tuning import paper_designs, peers, share_interval, upper_bound
 from jaxquad.tuning._beside import begin_evaluating, Beside
-from jaxquad.tuning._threads import map_in_threads
 
 
 RIG = jq.DecoupledAxes([0.0468], [0.0552])

@@ -9,6 +9,7 @@ from sweep_logs import GAIN, write_noise, write_sweep
 import jaxquad as jq
 from jaxquad.cli import main
 from jaxquad.workflows import (
+    _fits,
     identify,
     identify_again,
     IdentifySettings,
@@ -70,6 +71,21 @@ def test_numbers_and_figures_are_at_hand_without_a_folder(found):
     assert total.value == pytest.approx(found.fit.values[1] + found.fit.values[2])
     assert list(found.figures()) == ["record.png", "bode.png"]
     assert found.formula == "q / M = K e^(-delay s) / (s (lag s + 1))"
+
+
+def test_where_the_quick_response_finds_a_wrong_delay_the_right_one_is_taken_out(
+    log, found, monkeypatch
+):
+    known, taken_out = _fits._delay_of, []
+
+    def wrong_at_first(*given):
+        taken_out.append(known(*given) + (0.0 if taken_out else 0.1))
+        return taken_out[-1]
+
+    monkeypatch.setattr(_fits, "_delay_of", wrong_at_first)
+    again = identify(log, found.settings)
+    assert taken_out[0] > 0.1 > 2 * taken_out[1]
+    assert np.all(np.abs(again.fit.values - found.fit.values) < 0.1 * found.fit.standard_errors)
 
 
 def test_a_result_is_made_again_from_its_settings(found, folder, log, tmp_path):

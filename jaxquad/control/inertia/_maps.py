@@ -2,7 +2,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxquad._core import (
     as_float,
@@ -10,6 +10,7 @@ from jaxquad._core import (
     ensemble_shape,
     is_concrete,
     multiply_gains,
+    on_host,
     per_member,
     require_common_shape,
     require_finite,
@@ -203,8 +204,8 @@ def interpolate(
 
 
 def certainty_equivalence(
-    torque_gain: Float[Array, "..."] | float,
-    nominal: Float[Array, "..."] | float,
+    torque_gain: Float[ArrayLike, "..."],
+    nominal: Float[ArrayLike, "..."],
     *,
     span: tuple[float, float] = (0.2, 5.0),
     knots: int = 6,
@@ -238,5 +239,13 @@ def certainty_equivalence(
             "2 knots or more."
         )
     places = np.linspace(np.log(low), np.log(high), knots)
-    top = jnp.log(factor * multiply_gains(torque_gain, 1 / nominal))
+    top = on_host(_log_gain(torque_gain, nominal, as_float(factor)))
     return InertiaMap(nominal, places, top[None] - places.reshape((-1,) + (1,) * top.ndim))
+
+
+@eqx.filter_jit  # as one program
+def _log_gain(
+    torque_gain: Float[Array, "..."], nominal: Float[Array, "..."], factor: Float[Array, ""]
+) -> Float[Array, "..."]:
+    """ln b0 at the nominal inertia."""
+    return jnp.log(factor * multiply_gains(torque_gain, 1 / nominal))
