@@ -1,9 +1,8 @@
 """Designs that a tuned one is compared with."""
 
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
 
-from jaxquad._core import on_host
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
 
@@ -37,7 +36,8 @@ def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
 
     - `ValueError`: the plant is an ensemble, or of another kind.
     """
-    b = np.asarray(on_host(_nominal(plant)).gain, float)
+    KT, J = _nominal_numbers(plant)
+    b = KT / J
     designs = {}
     for b0 in PAPER_B0:
         given = b0 * b / HOVER_GAIN
@@ -66,13 +66,21 @@ def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict
 
     - `ValueError`: as `jq.tuning.paper_designs` does.
     """
-    axes = _nominal(plant)
-    KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain), np.asarray(axes.inertia))
+    KT, J = _nominal_numbers(plant)
     # As a map of ln J, b0 = KT / J is straight: two knots, far apart, hold it everywhere.
     map = certainty_equivalence(KT, J, span=(1e-3, 1e3), knots=2)
     designs: dict[str, PyTree] = dict(paper_designs(plant, dt=dt))
     designs[KNOWN_INERTIA] = ScheduledLADRC(LADRC(WC, WO, KT / J, dt=dt), map)
     return designs if pid is None else designs | {"tuned PID": pid}
+
+
+def _nominal_numbers(
+    plant: Plant,
+) -> tuple[Float[np.ndarray, " axes"], Float[np.ndarray, " axes"]]:
+    """KT in N m per unit of command and J in kg m^2, in NumPy: nothing is compiled."""
+    axes = _nominal(plant)
+    KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
+    return KT, J
 
 
 def _nominal(plant: Plant) -> DecoupledAxes:
