@@ -121,6 +121,7 @@ class Record:
         before = {name: np.asarray(each, np.float64) for name, each in (repaired or {}).items()}
         put("repaired", before | _repair_in_place(self, valid or {}, max_gap))
         _check_channels(self)
+        _check_hold(self)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -315,6 +316,23 @@ def _held(hold: Hold) -> float | None:
             f"is unknown."
         )
     return float(hold)
+
+
+_TIMES = 50  # over the mean time between changes of an input: no filter smears a hold so far
+
+
+def _check_hold(record: Record) -> None:
+    """Raise RecordError for a hold during which an input changes all the time."""
+    if record.hold is None or record.hold <= _TIMES * record.dt:
+        return
+    share = np.mean(np.diff(record.inputs, axis=0) != 0, axis=0)  # of the samples
+    k = int(np.argmax(share))
+    if share[k] * record.hold <= _TIMES * record.dt:
+        return
+    raise RecordError(
+        f"hold is {record.hold:.4g} s, but the input {record.input_names[k]} changes every "
+        f"{record.dt / share[k]:.3g} s: give s, so 0.004 for 4 ms, or 'dt' for the sample interval."
+    )
 
 
 def _dated(dates: np.ndarray, unit: TimeUnit | None) -> np.ndarray:

@@ -42,7 +42,7 @@ _PHRASES = {
     r", or raise global_order": "",
     r"; or use a larger width: [^;.]*": "",
     r"start from other values, or leave solver= at its default":
-        "choose another band (--band) or a simpler model (--no-lag, --no-delay)",
+        "choose another band (--band) or a simpler model (--no-lag, --no-delay, fewer --poles)",
     r"start from other values": "choose another band (--band)",
     r"as valid=\{[^}]*\}": "as --valid NAME=-20:20",
     r"try other starting values": "try another band (--band), or jaxquad identify --no-lag",

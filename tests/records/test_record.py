@@ -193,3 +193,12 @@ def test_a_size_whose_square_is_no_number_is_refused(size):
     time = 0.01 * np.arange(100)
     with pytest.raises(RecordError, match="channel .y. reaches 1e.*another unit"):
         Record(time, np.sin(time), size * np.sin(time) / np.max(np.abs(np.sin(time))))
+
+
+def test_a_hold_in_milliseconds_is_refused_and_one_that_the_input_keeps_is_not():
+    time, noise = np.arange(1000) / 250, np.random.default_rng(0).standard_normal(1000)
+    with pytest.raises(RecordError, match=r"hold is 4 s, but the input u changes every 0.004 s"):
+        Record(time, noise, noise, hold=4)
+    slow = np.repeat(noise[:2], 500)
+    assert Record(time, slow, noise, hold=2.0).hold == 2.0
+    assert Record(time, noise, noise, hold=0.004).hold == 0.004
