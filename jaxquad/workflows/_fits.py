@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import announce, map_in_threads, one_blas_thread
+from jaxquad._core import announce
 from jaxquad.identify import (
     CoherenceWeighted,
     Fit,
@@ -39,7 +39,6 @@ _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
-_SHORT = 1_000_000  # samples of records whose responses are estimated at the same time
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
 _DOMINATED = "feedback-dominated"
@@ -56,7 +55,6 @@ def fit_responses(
     first one finds another, all are estimated again. Known `filters` of the output are divided out.
     """
     best, dt = methods[0], records[0].dt
-    announce(f"quick {best} response, for the delay")
     [quick] = _responses(records, [best], settings, filters, quick=True)
     delay = _delay_of(_fitted(quick, settings), records)
     frfs = _responses(records, methods, settings, filters, delay)
@@ -74,23 +72,16 @@ def _responses(
     records: tuple[Record, ...], methods: Sequence[str], settings: IdentifySettings,
     filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
 ) -> list[FrequencyResponse]:  # fmt: skip
-    """By each of the methods; of short records at the same time."""
-    band = _band(settings)
+    """By each of the methods."""
+    band, frfs = _band(settings), []
     omega = np.geomspace(*band, _POINTS) if band else None
-
-    def respond(method: str) -> FrequencyResponse:
+    out = ", for the delay" if quick else f", {delay:.4g} s of delay taken out" if delay else ""
+    for method in methods:
+        announce(f"{'quick ' if quick else ''}{method} response{out}")
         estimator = _estimator(settings, method, delay, quick=quick)
         frf = frequency_response(list(records), omega, estimator=estimator)
-        return without_filters(frf, filters)
-
-    if not quick:
-        out = f", {delay:.4g} s of delay taken out" if delay else ""
-        announce(f"{' and '.join(methods)} response{out}")
-    short = sum(record.samples for record in records) < _SHORT
-    if not short:
-        return [respond(method) for method in methods]
-    with one_blas_thread():  # by the thread that all others end before
-        return map_in_threads(respond, methods)
+        frfs.append(without_filters(frf, filters))
+    return frfs
 
 
 def _delay_of(found: Fit, records: tuple[Record, ...]) -> float:
