@@ -146,7 +146,8 @@ def test_b0_that_moves_after_the_first_swing_leaves_the_overshoot(linear):
     early, late = steps.moving_steps().values()
     fixed = linear["u = +-V", "b0 = 3"]
     assert early.overshoot > 0.98 * fixed.overshoot and early.settling < 0.5 * fixed.settling
-    np.testing.assert_array_equal(late.angle[:2500], fixed.angle[:2500])
+    # Two programs, which round differently on some processors.
+    np.testing.assert_allclose(late.angle[:2500], fixed.angle[:2500], rtol=0, atol=1e-12)
 
 
 def test_a_verdict_counts_the_readings_under_which_a_claim_holds():
