@@ -1,6 +1,9 @@
 """How well an estimated noise power is known: on how many independent values it rests."""
 
 import functools as ft
+import inspect
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +13,13 @@ from ._window import leaked_power
 
 Grid = Float[np.ndarray, " frequencies"]
 Square = Float[np.ndarray, "frequencies frequencies"]
+Function = TypeVar("Function", bound=Callable)
+_FEW = 256  # frequencies, of which a square takes half a megabyte
+
+
+def kept_if_few(function: Function, frequencies: int) -> Function:
+    """The function with its `ft.lru_cache` for few frequencies, else without: squares are large."""
+    return function if frequencies <= _FEW else inspect.unwrap(function)
 
 
 def line_weights(place: Grid, weight: Grid, bandwidth: float) -> Square:
@@ -57,8 +67,9 @@ def covariance_of_windows(
     that they contribute. `angle` is in rad per sample.
     """
     total, angles = np.zeros((angle.size, angle.size)), tuple(angle.tolist())
+    shared = kept_if_few(_shared_power, angle.size)
     for level, length in zip(levels.T, lengths, strict=True):
-        total += np.outer(level, level) * _shared_power(shape, length, angles)
+        total += np.outer(level, level) * shared(shape, length, angles)
     return total
 
 

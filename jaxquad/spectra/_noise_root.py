@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ._leakage import Rest
+from ._noise_freedom import kept_if_few
 
 
 BANDWIDTH = 0.2  # of the noise's smoothing, in ln(omega)
@@ -22,7 +23,8 @@ def noise_root(
 
     `outputs` are the outputs' own energies, and `weights` says how much a length counts.
     """
-    freedom, kernels = rest.freedom, _kernels(tuple(omega.tolist()))
+    freedom = rest.freedom
+    kernels = kept_if_few(_kernels, omega.size)(tuple(omega.tolist()))
     energy = np.real(np.einsum("foog->fog", rest.products))
     # The logarithm of a chi-squared variable is biased by digamma(f) - ln(f).
     low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
@@ -39,7 +41,7 @@ def noise_root(
 Kernel = Float[np.ndarray, "frequencies frequencies"]
 
 
-@ft.lru_cache(maxsize=12)
+@ft.lru_cache(maxsize=4)
 def _kernels(omega: tuple[float, ...]) -> tuple[Kernel, Kernel, Kernel]:
     """Weights of neighbours, times 1, the distance in ln(omega) and its square."""
     place = np.log(omega)
