@@ -217,7 +217,7 @@ _OF_A_RECORD = {
     "hold": "for how long its input keeps each value; by default as in the result",
     "start": "",
     "stop": "",
-    "band": "compare between these frequencies, in Hz; by default those that were fitted",
+    "band": "compare between these frequencies, in Hz; by default the whole band of the result",
     "band_rad": "",
 }
 

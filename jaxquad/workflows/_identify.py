@@ -106,7 +106,7 @@ class Identification:
 
     @property
     def band(self) -> tuple[float, float]:
-        """The frequencies that were fitted, in rad/s."""
+        """The band of the response that was fitted, in rad/s."""
         omega = np.asarray(self.frf.omega)
         return float(omega[0]), float(omega[-1])
 
