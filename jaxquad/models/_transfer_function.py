@@ -14,6 +14,7 @@ from jaxquad._core import (
     as_float,
     is_concrete,
     is_zero,
+    on_host,
     require_finite,
     require_nonnegative,
     require_positive,
@@ -64,12 +65,6 @@ def require_continuous(dt: float | int | bool | None) -> None:
             f"The system is sampled (dt = {dt}), and models here are continuous: convert the one "
             "that it was sampled from, or fit one to its response with jq.fit_transfer_function."
         )
-
-
-def _on_host_if_known(*numbers: Array | np.ndarray) -> tuple[Array | np.ndarray, ...]:
-    """The numbers in NumPy where all have values: JAX would compile each operation on them."""
-    on_host = _namespace(*numbers) is np
-    return tuple(np.asarray(x) for x in numbers) if on_host else numbers
 
 
 def _namespace(*numbers: Array | np.ndarray):
@@ -289,7 +284,7 @@ class LaggedIntegrator(eqx.Module):
 
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials; a known lag of 0 is left out."""
-        gain, lag, xp = *_on_host_if_known(self.gain, self.lag), _namespace(self.gain, self.lag)
+        gain, lag, xp = *on_host((self.gain, self.lag)), _namespace(self.gain, self.lag)
         one, zero = xp.ones_like(lag), xp.zeros_like(lag)
         first = [one] if is_zero(self.lag) else [lag, one]
         denominator = xp.stack([*first, *[zero] * self.integrators])
@@ -359,7 +354,7 @@ class AttitudeAxis(eqx.Module):
         A lag of 0 has no pole and is left out. Under jit its value is unknown: it must not be 0.
         """
         numbers = self.L, self.K_t, self.J_x, self.K_af, self.lag
-        (L, K_t, J_x, K_af, lag), xp = _on_host_if_known(*numbers), _namespace(*numbers)
+        (L, K_t, J_x, K_af, lag), xp = on_host(numbers), _namespace(*numbers)
         denominator = xp.stack([J_x, K_af, xp.zeros_like(J_x)])
         if not is_zero(self.lag):
             denominator = xp.convolve(denominator, xp.stack([lag, xp.ones_like(lag)]))
@@ -367,5 +362,5 @@ class AttitudeAxis(eqx.Module):
 
     def with_added_inertia(self, inertia: ArrayLike) -> "AttitudeAxis":
         """The same axis carrying a known extra `inertia` in kg m^2."""
-        J_x, added = _on_host_if_known(self.J_x, as_float(inertia))
+        J_x, added = on_host((self.J_x, as_float(inertia)))
         return dataclasses.replace(self, J_x=J_x + added)

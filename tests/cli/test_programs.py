@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -43,26 +44,32 @@ def test_the_main_job_compiles_at_most_15_programs(tmp_path):
     assert len(found) <= 15, found
 
 
-@pytest.mark.slow
-def test_a_tune_of_a_stored_result_compiles_at_most_40_programs(tmp_path):
-    command = tmp_path / "command.py"
-    command.write_text("import sys\nfrom jaxquad.cli import main\nsys.exit(main() not in (0, 4))\n")
-    log = write_sweep(tmp_path / "sweep.csv")
-    options = ["--input", "M=right-left", "--output", "q", "--band", "0.5", "6"]
-    options += ["--unit", "q=rad/s", "--out", str(tmp_path)]
-    programs(str(command), "identify", str(log), *options)
-    sizes = ["--members", "16", "--fresh", "32", "--duration", "2"]
-    found = programs(
-        str(command), "tune", str(tmp_path), "--inertia", "0.05", "--limit", "1", *sizes
-    )
-    assert len(found) <= 40, found
+SWEEP = ["--input", "M=right-left", "--output", "q", "--band", "0.5", "6", "--unit", "q=rad/s"]
+
+
+@pytest.fixture
+def command(tmp_path):
+    """A script that is the command line; 4 is a design that is not to be flown."""
+    script = tmp_path / "command.py"
+    script.write_text("import sys\nfrom jaxquad.cli import main\nsys.exit(main() not in (0, 4))\n")
+    return str(script)
+
+
+def identified(command: str, folder: Path) -> list[str]:
+    log = write_sweep(folder / "sweep.csv")
+    return programs(command, "identify", str(log), *SWEEP, "--out", str(folder))
 
 
 @pytest.mark.slow
-def test_an_identification_compiles_at_most_6_programs(tmp_path):
-    command = tmp_path / "command.py"
-    command.write_text("import sys\nfrom jaxquad.cli import main\nsys.exit(main())\n")
-    log = write_sweep(tmp_path / "sweep.csv")
-    options = ["--input", "M=right-left", "--output", "q", "--band", "0.5", "6"]
-    found = programs(str(command), "identify", str(log), *options, "--out", str(tmp_path))
+def test_an_identification_compiles_at_most_6_programs(command, tmp_path):
+    found = identified(command, tmp_path)
     assert len(found) <= 6, found
+
+
+@pytest.mark.slow
+def test_a_tune_of_a_stored_result_compiles_at_most_40_programs(command, tmp_path):
+    identified(command, tmp_path)
+    sizes = ["--members", "16", "--fresh", "32", "--duration", "2"]
+    plant = ["--inertia", "0.05", "--limit", "1"]
+    found = programs(command, "tune", str(tmp_path), *plant, *sizes)
+    assert len(found) <= 40, found
