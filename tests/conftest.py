@@ -23,6 +23,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 MEMORY = 3 * 2**30  # bytes
 ROOT = Path(__file__).parent.parent
+QUICKLY = "jax_disable_most_optimizations"
 FOLDER, LEAST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
 
@@ -40,9 +41,22 @@ share_compiled_loops()
 
 
 def pytest_configure(config):
-    """Have quick tests compiled quickly: what they run takes no time. Slow ones run as users do."""
+    """Have quick tests compiled quickly: what they run takes no time. Slow ones run as users do.
+
+    Those of `compiled_quickly` do not either.
+    """
     if config.option.markexpr == "not slow":
         os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
+
+@pytest.fixture(scope="module")
+def compiled_quickly():
+    """For slow tests, and their processes, whose programs take longer to compile than to run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(QUICKLY.upper(), "1")
+        jax.config.update(QUICKLY, True)
+        yield
+        jax.config.update(QUICKLY, False)
 
 
 def pytest_collection_finish():

@@ -182,4 +182,4 @@ def test_random_loops_are_the_same_as_kernels_and_no_process_ends():
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_loops_with_random_delays_are_the_same_as_kernels_and_compile_in_time():
-    run_program("random_delays.py", 0, 20)
+    run_program("random_delays.py", 0, 6)

@@ -13,6 +13,9 @@ from jaxquad.cli import main
 from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     """The folder of `jaxquad demo`; tests only read it."""
@@ -33,9 +36,9 @@ def test_the_demo_finds_the_truth_of_its_log_within_its_error_bars(demo):
 
 @pytest.mark.slow
 def test_a_right_model_of_logs_like_the_demos_pays_little_for_possible_model_error(tmp_path):
-    """One log's residuals may look like a model error; over ten logs few do."""
+    """One log's residuals may look like a model error; over five logs few do."""
     truths, errors, widths = np.array([*DEMO_TRUTH.values()]), [], []
-    for seed in range(10):
+    for seed in range(5):
         fit = identify(write_demo_log(tmp_path / f"{seed}.csv", seed), DEMO).fit
         errors.append((fit.values - truths) / fit.standard_errors)
         widths.append(3 * fit.standard_errors / truths)

@@ -11,7 +11,7 @@ from conftest import ROOT
 from jaxquad.cli import main
 
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled_quickly")]
 PAGE = (ROOT / "docs" / "measured.md").read_text()
 COMMANDS = [
     shlex.split(block.replace("\\\n", " "))[1:]

@@ -10,6 +10,7 @@ from conftest import ROOT
 from sweep_logs import write_sweep
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 _COUNT = """
 import runpy, sys
 import jax

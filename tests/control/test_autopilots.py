@@ -35,6 +35,7 @@ from jaxquad.control.autopilots import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 DEGREES = 180 / np.pi
 SAMPLES = 300
 CLEAN = 1e-9

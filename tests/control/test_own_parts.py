@@ -25,6 +25,9 @@ from jaxquad.control import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
 @pytest.fixture(autouse=True)
 def usual_promotion():
     """JAX as a user has it, where shapes and types are promoted."""

@@ -14,6 +14,7 @@ from made_flights import write_flights
 from test_notebooks import words
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 RUN = (
     "comparison.md",

@@ -8,6 +8,7 @@ from conftest import ROOT
 from notebook_runs import images, printed, run_notebook
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 

@@ -25,7 +25,7 @@ def script():
 def gains(script):
     """Relative error of L K_t / J_x, its standard error and that by the noise alone."""
     joint = [("joint", "maximum likelihood"), ("joint", "Eq. (14)")]
-    found = script.draw_gains(200, joint) | script.draw_gains(50, [("direct", "Eq. (14)")])
+    found = script.draw_gains(60, joint) | script.draw_gains(50, [("direct", "Eq. (14)")])
     return {key: rows / script.TRUTH - [1.0, 0.0, 0.0] for key, rows in found.items()}
 
 
@@ -43,7 +43,7 @@ def test_the_direct_estimate_is_biased_by_several_per_cent(gains):
 def test_the_95_per_cent_interval_covers_the_truth_in_90_to_98_per_cent(gains):
     errors = gains["joint", "maximum likelihood"]
     covered = np.mean(np.abs(errors[:, 0]) < 1.96 * errors[:, 2])
-    assert len(errors) == 200 and 0.90 <= covered <= 0.98
+    assert len(errors) == 60 and 0.90 <= covered <= 0.98
 
 
 def test_with_model_error_the_interval_covers_as_well_and_is_at_most_1_6_times_as_wide(gains):

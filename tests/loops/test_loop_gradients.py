@@ -16,6 +16,7 @@ from jaxquad.models import DecoupledAxes, quanser_hover
 from jaxquad.simulation import MotorDrive
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 ss, feedback = (getattr(control, name) for name in ("ss", "feedback"))
 POINT = {"wc": 8.0, "wo": 35.0, "b0": 1.1, "lag": 0.02, "delay": 0.0033}  # and gain 0.6
 NUMBERS = ("abscissa", "sensitivity_peak", "noise_gain", "delay_margin", "phase_margin")

@@ -9,6 +9,7 @@ from jaxquad.loops import analyse, gain_window, Loop, loop_numbers
 from jaxquad.models import DecoupledAxes
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 RATIOS = (2.0, 3.0, 5.0, 10.0, 20.0)  # wo / wc
 HALF_K, HALF_L = {"feedback_factor": 0.5}, {"observer_factor": 0.5}
 

@@ -13,6 +13,7 @@ from synthetic import OMEGA, response_of
 from jaxquad.loops import attitude_bandwidth, disturbance_rejection, margins, rms_response
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 MEASURED = ratio([4.0], [0.05, 1.0, 0.0], 0.12)
 BAND = np.geomspace(0.5, 40.0, 30)
 

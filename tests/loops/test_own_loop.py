@@ -13,6 +13,7 @@ from jaxquad.loops import align, per_member
 from jaxquad.models import LinearAxis
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 DT, REST = 0.004, {"duration": 1.0, "dt": 0.004, "axes": 1}
 
 

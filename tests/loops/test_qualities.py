@@ -11,6 +11,7 @@ from jaxquad.loops import attitude_bandwidth, disturbance_rejection, margins, rm
 from jaxquad.loops.qualities._crossings import crossed, first
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 LOOPS = {
     "servo": ([10.0], [1.0, 3.0, 2.0, 0.0]),
     "conditionally stable": ([2.0, 4.0, 2.0], [1.0, 0.0, 0.0, 0.0]),

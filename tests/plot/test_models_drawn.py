@@ -12,6 +12,7 @@ from tuning_case import B, flight as case_flight, ladrc, loop as case_loop
 import jaxquad as jq
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
 TWO = jq.StateSpace(F=[[-1.0, 1.0], [-10.0, -1.0]], G=[[1.0, 0.0], [0.0, 2.0]], H0=np.eye(2))
 

@@ -16,6 +16,7 @@ from jaxquad.report import write_json
 from jaxquad.tuning import certify, CVaR, Limit, Mean, paper_designs, peers, QUANTITIES, upper_bound
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
 MEMBERS, EVENTS = 24, (0.0, 1.0)
 FLIGHT = jq.scenario(

@@ -19,6 +19,7 @@ from jaxquad.tuning import paper_designs, peers, share_interval, upper_bound
 from jaxquad.tuning._beside import begin_evaluating, Beside
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
 
 

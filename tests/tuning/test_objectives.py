@@ -21,6 +21,7 @@ from jaxquad.tuning import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 VALUES = np.random.default_rng(0).normal(size=37)
 
 

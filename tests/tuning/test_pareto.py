@@ -13,6 +13,7 @@ from jaxquad.report import write_json
 from jaxquad.tuning import LBFGS, Objective, paper_designs, pareto, Penalty
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 MEMBERS = 24  # as many as in test_certificate.py, whose compiles are shared
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
 OPEN = Ensemble(inertia=LogUniform(0.7, 1.5), noise=np.radians(0.02))

@@ -14,6 +14,9 @@ from jaxquad.tuning._tail import Tail, take_members, WorstLoops
 from jaxquad.tuning._tuned import describe_tail
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
 def loops(seed, count=6):
     return linear_loops(ensemble().draw(loop(), count, jax.random.key(seed)), None)
 

@@ -16,6 +16,9 @@ from jaxquad.simulation import scenario, Step
 from jaxquad.tuning import LBFGS, Objective, tune
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
+
 def halved(wc, wo, factor):
     start = case.equivalent(wc, wo)
     return dataclasses.replace(

@@ -14,6 +14,7 @@ from jaxquad.tuning import Bound, certify, Limit, upper_bound
 from jaxquad.tuning._verdict import judge_convergence
 
 
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
 OPEN = Ensemble(inertia=LogUniform(0.5, 3.0), noise=np.radians(0.02))
 FRESH, EVENTS = 24, (0.0, 1.0)
