@@ -29,6 +29,10 @@ FLIGHT = jq.scenario(duration=1.0, axes=1)
 TIME = np.arange(100.0) / 100
 FLOWN = jq.Record(TIME, np.sin(TIME), np.cos(TIME), np.sin(3 * TIME))
 FIT: Any = SimpleNamespace(model=jq.LaggedIntegrator(1.0))
+PRIOR: Any = jq.identify.Prior("gain", 1.0, 0.1)
+AXIS = jq.LaggedIntegrator(1.0, 0.03, 0.02)
+FREQUENCIES = np.geomspace(15.0, 60.0, 8)
+RESPONSE = jq.frequency_response(FLOWN, FREQUENCIES, estimator=jq.spectra.Welch(0.5))
 CALLS = {
     "estimator is 'flight.csv': give an object, such as jq.spectra.Welch": lambda: (
         jq.frequency_response(FLOWN, np.ones(1), estimator=WRONG)
@@ -47,6 +51,8 @@ CALLS = {
     "fit is a str: give the result of jq.fit": lambda: jq.ensembles.Posterior(
         WRONG, recorded_dt=None
     ),
+    "priors is Prior.*: give a list, priors=": lambda: jq.fit(AXIS, RESPONSE, priors=PRIOR),
+    "priors is .* standard error": lambda: jq.refine(AXIS, FLOWN, priors=[NUMBER]),
     "a float is no frequency response: give": lambda: jq.loops.margins(NUMBER),
     "estimator is 3.0: give an object with the methods": lambda: jq.AdaptiveLADRC(
         LADRC, NUMBER, lambda inertia: 1 / inertia

@@ -29,8 +29,8 @@ from ._fit_remarks import DOUBT
 from ._make_fit import unfitted
 from ._mixing import Mixing, mixings_of
 from ._origin import Options, Origin
-from ._parameters import find_place, Free, Parameters, select_parameters, Tie
-from ._problem import Condition, make_problem, Prior, Problem
+from ._parameters import Free, Parameters, select_parameters, Tie
+from ._problem import Condition, make_problem, Prior, Problem, require_priors
 from ._result import Fit
 from ._solve import Solution
 from ._starts import Minimum, solve_from_many, spread_starts
@@ -343,15 +343,13 @@ def check_options(cost: PyTree, band: PyTree, min_coherence: float | None, max_s
 
 
 def _check_priors_against(model: PyTree, priors: Sequence[Prior], cost: Cost) -> None:
-    """Raise ValueError for priors under a cost without noise, and for unknown parameters."""
+    """Raise ValueError for priors under a cost without noise, and as `require_priors` does."""
+    require_priors(model, priors)
     if priors and not isinstance(cost, MaximumLikelihood):
         raise ValueError(
             "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave cost= "
             "at its default, jq.identify.MaximumLikelihood()"
         )
-    for prior in priors:
-        if isinstance(prior.quantity, str):
-            find_place(model, prior.quantity, "for a prior")
 
 
 def _check_finite(solution: Solution) -> None:

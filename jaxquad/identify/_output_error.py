@@ -18,8 +18,8 @@ from ._output_error_descent import descend_by_turns
 from ._output_error_noise import descend_with_noise
 from ._output_error_problem import evaluate_misfits, OutputError, RecordTerm
 from ._output_error_result import assess_output_error
-from ._parameters import find_place, Free, Parameters, Positive, Real, select_parameters, Tie
-from ._problem import Prior, Problem, quantity_of
+from ._parameters import Free, Parameters, Positive, Real, select_parameters, Tie
+from ._problem import Prior, Problem, quantity_of, require_priors
 from ._result import Fit
 from ._simulated import (
     band_filter,
@@ -178,9 +178,7 @@ def _continued(
 
 
 def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Problem:
-    for prior in priors:
-        if isinstance(prior.quantity, str):
-            find_place(model, prior.quantity, "for a prior")
+    require_priors(model, priors)
     numbers = [[prior.value, prior.standard_error] for prior in priors]
     return Problem(
         model=model,

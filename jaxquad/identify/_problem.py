@@ -52,6 +52,19 @@ class Prior(eqx.Module):
             )
 
 
+def require_priors(model: PyTree, priors: Sequence[Prior]) -> None:
+    """Raise ValueError for what is no list of priors, and for parameters that do not exist."""
+    listed = isinstance(priors, Sequence) and not isinstance(priors, str)
+    if not (listed and all(isinstance(prior, Prior) for prior in priors)):
+        raise ValueError(
+            f"priors is {priors!r}: give a list, "
+            "priors=[jq.identify.Prior(name or function, value, standard error)]"
+        )
+    for prior in priors:
+        if isinstance(prior.quantity, str):
+            find_place(model, prior.quantity, "for a prior")
+
+
 @pytree_node
 class Problem:
     """One least-squares problem: residuals as a function of `z`, with all that they depend on."""
