@@ -83,14 +83,14 @@ def estimates(name, draws):
 def test_95_per_cent_intervals_of_the_response_hold_the_plant(name):
     """Where the error is below 10 % in the median; beyond, a ratio is not normal."""
     off, claimed = [], []
-    for loop, found in estimates(name, 30):
+    for loop, found in estimates(name, 60):
         off.append(np.asarray(found.response) - loop.plant(OMEGA))
         claimed.append(np.sqrt(np.asarray(found.errors.variance()) / 2))
     off, claimed = np.array(off), np.array(claimed)
     plant = np.abs(CASES[name][0].plant(OMEGA))
     counted = np.isfinite(off) & (np.median(claimed, axis=0) < 0.1 * plant)
     z = np.stack([np.real(off), np.imag(off)])[:, counted] / claimed[counted]
-    # 30 draws of some 8 independent points leave 1.4 % of doubt.
+    # 60 draws of some 8 independent points leave 1 % of doubt.
     assert 0.93 <= np.mean(np.abs(z) < 1.96) <= 0.975
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.1
 
