@@ -41,9 +41,9 @@ share_compiled_loops()
 
 
 def pytest_configure(config):
-    """Have quick tests compiled quickly: what they run takes no time. Slow ones run as users do.
+    """Have quick tests compiled quickly: what they run takes no time.
 
-    Those of `compiled_quickly` do not either.
+    Slow ones run as users do, but for those that use `compiled_quickly`.
     """
     if config.option.markexpr == "not slow":
         os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
