@@ -150,12 +150,22 @@ class _Seen(NamedTuple):
         )
 
 
+_ROWS = 16  # windows taken at once: few others overlap them
+
+
 def _weigh(
     overlap: Float[np.ndarray, "windows windows"],
     columns: Rows,
 ) -> Rows:
-    """The overlap of the windows times columns, in real arithmetic."""
-    return (overlap @ np.ascontiguousarray(columns).view(float)).view(complex)
+    """The overlap of the windows times columns, in real arithmetic and near the diagonal only."""
+    parts = np.ascontiguousarray(columns).view(float)
+    weighed = np.empty_like(parts)
+    for first in range(0, len(overlap), _ROWS):
+        rows = slice(first, first + _ROWS)
+        near = np.flatnonzero(np.any(overlap[rows], axis=0))
+        band = slice(near[0], near[-1] + 1)
+        np.matmul(overlap[rows, band], parts[:, band], out=weighed[:, rows])
+    return weighed.view(complex)
 
 
 def _noise_in_rows(

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Complex, Float
 
-from jaxquad._core import require_x64
+from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._average import average, Averaged, Channels
@@ -275,6 +275,7 @@ _FEW = (
 )
 
 
+@one_blas_thread()
 def average_windows(
     records: Sequence[Record],
     omega: Float[np.ndarray, " frequencies"] | None,
