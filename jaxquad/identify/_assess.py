@@ -36,6 +36,7 @@ from ._discrepancy import (
 )
 from ._fit_remarks import (
     DOUBT,
+    is_unfinished,
     MISFIT,
     no_minimum,
     NO_MODEL,
@@ -103,12 +104,15 @@ def assess(
     cost, misfit = costs.cost, costs.chi_squared
     # Few points of their own noise reach a large misfit by chance: both have to say so.
     doubted = misfit if discrepancy.none < DOUBT else min(misfit, 1.0)
-    decrement = _decrement(bread, gradient, solution.at_zero)
-    if decrement > _NO_MINIMUM * max(cost, 1e-9):
+    step = newton_step(bread, gradient, solution.at_zero)
+    decrement = 0.5 * float(gradient @ step)
+    if decrement > _NO_MINIMUM * max(cost, 1e-9) or is_unfinished(solution, step, seen.by_noise):
         remedies = ("start from other values", "try many starts at once (starts=20)")
-        verdict = by_data = no_minimum(parameters.names, decrement, cost, *remedies)
+        verdict = by_data = no_minimum(
+            parameters.names, decrement, cost, *remedies, message=solution.message
+        )
     elif discrepancy.amplitude > NO_MODEL:
-        verdict = by_data = no_model(parameters.names, discrepancy)
+        verdict = by_data = no_model(parameters.names, discrepancy.amplitude)
     else:
         facts = _information(problem, solution, blocks, (covariance, by_noise), units)
         verdict, by_data = _identifiability(facts, prior, bounds)
@@ -271,18 +275,18 @@ def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> lis
     return list(dict.fromkeys(remark for part in parts for remark in part))
 
 
-def _decrement(
+def newton_step(
     bread: Float[np.ndarray, "parameters parameters"],
     gradient: Float[np.ndarray, " parameters"],
     at_zero: Sequence[int],
-) -> float:
-    """What a Gauss-Newton step lowers the cost by; parameters at zero do not become negative."""
+) -> Float[np.ndarray, " parameters"]:
+    """The next Gauss-Newton step, downhill; parameters at zero do not become negative."""
     held = [k for k in at_zero if gradient[k] > 0]
     if not held:
-        return 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
-    free = np.setdiff1d(np.arange(gradient.size), held)
-    inverse = scaled_inverse(bread[np.ix_(free, free)])
-    return 0.5 * float(gradient[free] @ inverse @ gradient[free])
+        return scaled_inverse(bread) @ gradient
+    free, step = np.setdiff1d(np.arange(gradient.size), held), np.zeros(gradient.size)
+    step[free] = scaled_inverse(bread[np.ix_(free, free)]) @ gradient[free]
+    return step
 
 
 def _units(solution: Solution) -> Float[np.ndarray, " all"]:

@@ -53,13 +53,16 @@ def _parameters(fit: "Fit") -> list[str]:
     if apart:
         lines.append(_how_wide(fit))
     if not fit.identifiable:
-        lines.append(
-            "* this record does not determine it individually: where the solver stopped is for "
-            "comparison alone"
-        )
+        why = _NOT_DETERMINED.get(fit.verdict.kind, _INDIVIDUALLY)
+        lines.append(f"* {why}: where the solver stopped is for comparison alone")
     return lines
 
 
+_INDIVIDUALLY = "this record does not determine it individually"
+_NOT_DETERMINED = {
+    "no minimum": "not determined, because the fit found no minimum",
+    "no model": "not determined, because no model of this structure holds",
+}
 _BESIDE = f"{'by noise alone':>23} {'width':>6}"
 
 

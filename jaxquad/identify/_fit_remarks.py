@@ -3,18 +3,40 @@
 import numpy as np
 from jaxtyping import Float
 
+from ._accuracy import Matrix
 from ._discrepancy import Discrepancy
 from ._problem import Problem
 from ._solve import Solution
 from ._verdict import Verdict, without_numbers
 
 
-def no_minimum(names: tuple[str, ...], decrement: float, cost: float, *remedies: str) -> Verdict:
-    """The verdict on a stop from which a step would still lower the cost."""
+def no_minimum(
+    names: tuple[str, ...], decrement: float, cost: float, *remedies: str, message: str = ""
+) -> Verdict:
+    """The verdict on a stop from which a step would still lower the cost.
+
+    The `message` says why the solver stopped early, and is empty where it did not.
+    """
     reason = f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}"
+    if message:
+        reason = f"the fit has not converged: {message[:1].lower()}{message[1:]}; {reason}"
+        remedies = ("take more steps (max_steps=)", *remedies)
     return without_numbers("no minimum", names, reason, *remedies)
 
 
+def is_unfinished(
+    solution: Solution, step: Float[np.ndarray, " parameters"], covariance: Matrix
+) -> bool:
+    """Whether the solver stopped early, where the next `step` still moves an estimate.
+
+    Step and covariance, that of the noise, are those of relative changes.
+    """
+    limit = _STILL * np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) + _ROUNDING
+    return not solution.converged and bool(np.any(np.abs(step) > limit))
+
+
+_STILL = 0.25  # standard errors: a bias of that size leaves a 95 % interval at 94.3 %
+_ROUNDING = 1e-4  # relative change that nobody looks for, where there is no noise
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
 NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
@@ -38,9 +60,10 @@ def remarks_on_fit(
     if not solution.converged and (no_minimum or not remarks):
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
+        more = "take more steps (max_steps=), or " if solution.message else ""
         remarks.append(
             f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
-            f"{2 * decrement:.3g}; try other starting values{_opposite(problem, solution)}"
+            f"{2 * decrement:.3g}; {more}try other starting values{_opposite(problem, solution)}"
         )
     if chi_squared > MISFIT**2:
         ratio = np.sqrt(chi_squared)
@@ -51,9 +74,9 @@ def remarks_on_fit(
     return remarks
 
 
-def no_model(names: tuple[str, ...], discrepancy: Discrepancy) -> Verdict:
-    """The verdict on a fit that leaves more than half of the response unexplained."""
-    reason = f"it leaves {100 * min(discrepancy.amplitude, 1.0):.0f} % of the response unexplained"
+def no_model(names: tuple[str, ...], unexplained: float) -> Verdict:
+    """The verdict on a fit that leaves more than half of the response `unexplained`."""
+    reason = f"it leaves {100 * min(unexplained, 1.0):.0f} % of the response unexplained"
     remedies = (
         "fit the part of the band where it holds (band=)",
         "fit a model that explains more (Fit.explain() names terms)",

@@ -27,7 +27,7 @@ from ._assess import (
     _rescale,
     _units,
 )
-from ._fit_remarks import no_minimum, remarks_on_priors, runaways
+from ._fit_remarks import is_unfinished, no_minimum, no_model, remarks_on_priors, runaways
 from ._identifiability import Information
 from ._make_fit import Costs, Estimate, make_fit
 from ._output_error_descent import Descent, RecordNoise, with_fixed_slopes
@@ -36,6 +36,7 @@ from ._result import Fit
 from ._verdict import Verdict
 
 
+_NOTHING = 0.01  # share of the output's power: a model that explains less has no response
 _LEFT = 1e-2  # share of what the noise moves that a step may still save
 
 
@@ -201,15 +202,16 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     cost = data_cost + float(np.sum(prior.misfit**2))
     covariance = calibrated_covariance(bread, noise)
     taken = float(np.trace(scaled_inverse(bread) @ noise.data))
-    decrement = 0.5 * float(gradient @ scaled_inverse(bread) @ gradient)
+    step = scaled_inverse(bread) @ gradient
+    decrement, explained = 0.5 * float(gradient @ step), _explained(projected, problem.terms)
     # In units of what the noise moves: a share of the cost would grow with the record.
-    if decrement > count * max(taken, 1.0):
+    if decrement > count * max(taken, 1.0) or is_unfinished(solution, step, covariance):
+        remedy = "start from other values, for instance those of jq.fit"
         verdict = by_data = no_minimum(
-            parameters.names,
-            decrement,
-            cost,
-            "start from other values, for instance those of jq.fit",
+            parameters.names, decrement, cost, remedy, message=solution.message
         )
+    elif solution.at_zero and explained < _NOTHING:
+        verdict = by_data = no_model(parameters.names, 1 - explained)
     else:
         verdict, by_data = _verdict(descent, reduced, prior, covariance, units)
     fitted = count + sum(one.nuisance.shape[2] for one in projected)
@@ -267,6 +269,17 @@ def _information(
         order=_ranks(places),
         same=ft.partial(_same, descent),
     )
+
+
+def _explained(projected: Sequence[Projected], terms: Sequence[RecordTerm]) -> float:
+    """The share of the outputs' power that the inputs explain, without initial state and trim."""
+    left = total = 0.0
+    for one, term in zip(projected, terms, strict=True):
+        basis = one.nuisance.reshape(-1, one.nuisance.shape[2])
+        output = np.asarray(term.measured).reshape(-1)
+        total += float(np.sum(output**2) - np.sum((basis.T @ output) ** 2))
+        left += float(np.sum(one.misfit**2))
+    return 1 - left / total if total > 0 else 1.0
 
 
 def _deviance(problem: OutputError) -> float:

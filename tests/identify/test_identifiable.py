@@ -220,6 +220,18 @@ def test_where_there_is_no_minimum_no_number_is_given():
     assert fit.verdict.kind == "no minimum" and not fit.verdict and not fit.determined.any()
     assert np.isinf(fit.standard_errors).all() and "NO MINIMUM" in str(fit)
     assert any(remark.startswith("no minimum") for remark in fit.remarks)
+    assert "has not converged" in str(fit) and "more steps (max_steps=)" in fit.verdict.remedies[0]
+    assert "the fit found no minimum: where the solver stopped" in str(fit)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 4, 5])
+def test_a_fit_that_still_moves_by_a_quarter_of_an_error_has_no_numbers(steps):
+    frf = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), seed=0)
+    start = jq.LaggedIntegrator(150.0, 0.03, 0.02)
+    whole, short = jq.fit(start, frf), jq.fit(start, frf, max_steps=steps)
+    off = np.max(np.abs(short.values - whole.values) / whole.noise_standard_errors)
+    assert short.identifiable == (off < 0.25), f"{off:.2f} standard errors off"
+    assert steps != 3 or 0.25 < off < 1.0  # one of them is near enough to look like a minimum
 
 
 @pytest.mark.parametrize("seed", range(6))

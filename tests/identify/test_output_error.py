@@ -51,6 +51,31 @@ def late_by_scipy(x, u):
 CLEAN = late_by_scipy([*VALUES, 0.0, 0.0, 0.0], U)
 
 
+def lagged_angle(u, gain=8.0, lag=0.1, late=3):
+    """K / (s (lag s + 1)) of a held input that is some samples late, with little noise."""
+    held = np.concatenate([np.full(late, u[0]), u])[: u.size]
+    a = np.exp(-DT / lag)
+    rate = lfilter([0.0, gain * (1 - a)], [1.0, -a], held)
+    y = lfilter([0.0, DT / 2, DT / 2], [1.0, -1.0], np.append(rate[1:], rate[-1]))
+    return y + 0.02 * np.std(y) * noise(4)
+
+
+@pytest.mark.parametrize("start", [(-8.0, 0.1, 0.05), (-4.0, 0.2, 0.02)])
+def test_from_the_wrong_sign_nothing_is_called_determined(start):
+    fit = refine(jq.LaggedIntegrator(*start), jq.Record(TIME, U, lagged_angle(U)))
+    assert fit.verdict.kind in ("no minimum", "no model") and not fit.determined.any()
+    table = [line for line in str(fit).splitlines() if line.startswith(fit.names)]
+    assert len(table) == 3 and all("not determined" in line for line in table)
+
+
+def test_a_refinement_that_stops_early_says_so_and_keeps_its_numbers_apart():
+    fit = refined(CLEAN + 0.05 * noise(1))
+    short = refine(START, jq.Record(TIME, U, CLEAN + 0.05 * noise(1)), free=FREE, max_steps=1)
+    assert fit.identifiable and not short.determined.any() and np.isfinite(short.values).all()
+    assert "has not converged: the maximum of 1" in str(short)
+    assert short.verdict.remedies[0] == "take more steps (max_steps=)"
+
+
 @pytest.mark.slow
 def test_the_estimate_is_that_of_scipy_over_all_unknowns():
     y = late_by_scipy([*VALUES, 0.1, -0.5, 0.3], U) + 0.05 * noise(1)
