@@ -80,11 +80,30 @@ def check_increasing(label: str, time: Times) -> None:
         )
 
 
+def scatters(time: Times) -> bool:
+    """Whether time stamps scatter about a clock: steps are too short as often as too long."""
+    step = np.diff(time)
+    usual = np.median(step)
+    too_long, too_short = np.sum(step > GAP * usual), np.sum(step < (2 - GAP) * usual)
+    return bool(too_short > max(0.5 * too_long, _SCATTERED * step.size))
+
+
+_SCATTERED = 0.01  # of the steps; fewer are those of single late stamps
+_SPAN = 16  # samples, over which scattered stamps are counted: their ends hardly matter
+
+
+def longest_step(time: Times) -> float:
+    """The step in s beyond which samples are missing: between scattered stamps up to 2 samples."""
+    return (2.0 if scatters(time) else GAP) * float(np.median(np.diff(time)))
+
+
 def native_rate(time: Times) -> float:
     """Samples per second of jittered time stamps, without the gaps."""
-    step = np.diff(time)
-    whole = step[step <= GAP * np.median(step)]
-    return float(whole.size / whole.sum())
+    count = min(_SPAN, time.size // 2) if scatters(time) else 1
+    span = time[count:] - time[:-count]
+    usual = float(np.median(np.diff(time)))
+    whole = span[span <= np.median(span) + (longest_step(time) - usual)]
+    return float(count * whole.size / whole.sum())
 
 
 def nonuniformity(time: Times) -> float:

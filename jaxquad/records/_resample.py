@@ -6,7 +6,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ._clock import check_increasing, dates_in_seconds, FEWEST, GAP, native_rate
+from ._clock import (
+    check_increasing,
+    dates_in_seconds,
+    FEWEST,
+    longest_step,
+    native_rate,
+    nonuniformity,
+    scatters,
+)
 from ._errors import RecordError, RecordWarning
 from ._repair import as_float64, longest_gap
 
@@ -88,10 +96,10 @@ def contiguous_part(
 
 
 def gaps(channel: Channel, begin: float, end: float) -> np.ndarray:
-    """Indices of the steps within `begin` .. `end` longer than 1.5 nominal samples."""
+    """Indices of the steps within `begin` .. `end` in which samples are missing."""
     step = np.diff(channel.time)
     inside = (channel.time[1:] > begin) & (channel.time[:-1] < end)
-    return np.flatnonzero((step > GAP * np.median(step)) & inside)
+    return np.flatnonzero((step > longest_step(channel.time)) & inside)
 
 
 def _raise_for_break(channel: Channel, index: int, max_gap: float | int | None) -> None:
@@ -200,6 +208,7 @@ def resample(
     margin = half_width(sample_rate) + 20 / min(channel.rate for channel in channels)
     pieces = [contiguous_part(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
     _warn_of_gaps(pieces, begin, end)
+    _warn_of_scatter(pieces)
     _warn_of_slow(channels, sample_rate)
     fastest = max(channel.rate for channel in channels)
     curves = [_curve(piece) for piece in pieces]
@@ -284,6 +293,21 @@ def _warn_of_gaps(pieces: Sequence[Channel], begin: float, end: float) -> None:
     if texts:
         warnings.warn(
             f"gaps filled by interpolation: {'; '.join(texts)}.", RecordWarning, stacklevel=3
+        )
+
+
+def _warn_of_scatter(pieces: Sequence[Channel]) -> None:
+    names = [repr(piece.name) for piece in pieces if scatters(piece.time)]
+    if names:
+        off = max(nonuniformity(piece.time) for piece in pieces if scatters(piece.time))
+        rate = min(piece.rate for piece in pieces if scatters(piece.time))
+        warnings.warn(
+            f"the time stamps of {', '.join(names)} lie up to {off:.2g} samples off a clock of "
+            f"{rate:.5g} Hz, and steps shorter than half a sample are as frequent as long ones: "
+            f"values were interpolated at these times. If the samples were equally spaced, give "
+            f"their interval instead: {1 / rate:.4g} s (dt=).",
+            RecordWarning,
+            stacklevel=3,
         )
 
 

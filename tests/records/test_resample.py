@@ -78,6 +78,29 @@ def test_jitter_of_a_tenth_of_a_sample_costs_little():
     assert np.abs(values[:, 0] - np.cos(omega * grid)).max() < 1e-4
 
 
+def scattered(rate, jitter, seed=0):
+    """Stamps of a clock, uniformly off by up to `jitter` s."""
+    off = np.random.default_rng(seed).uniform(-jitter, jitter, 5000)
+    time = np.arange(5000) / rate + off
+    return Channel("x", time, np.cos(2 * np.pi * 3.0 * time))
+
+
+@pytest.mark.parametrize("jitter", [0.2e-3, 1e-3, 1.9e-3])
+def test_stamps_that_scatter_have_the_rate_of_their_clock(jitter):
+    channel = scattered(250.0, jitter)
+    # The ends of 5000 samples are off by the jitter at most: 2e-4 of the rate.
+    assert channel.rate == pytest.approx(250.0, rel=2e-4)
+    holed = without(channel, np.r_[0:700, 740:5000])
+    assert holed.rate == pytest.approx(250.0, rel=1e-3)
+
+
+def test_stamps_that_scatter_by_half_a_sample_are_spoken_of_and_are_no_gaps():
+    with pytest.warns(RecordWarning, match=r"off a clock of 250 Hz.*0\.004 s \(dt=\)") as caught:
+        time, values = resample([scattered(250.0, 1.9e-3)], 250.0)
+    assert len(caught) == 1
+    np.testing.assert_allclose(values[:, 0], np.cos(2 * np.pi * 3.0 * time), atol=1e-6)
+
+
 def test_the_grid_is_the_overlap_of_all_channels():
     late, short = tone(1.0, rate=100.0, offset=1.0), tone(1.0, rate=50.0, duration=6.0, name="y")
     time, values = resample([late, short], 50.0)
