@@ -18,7 +18,8 @@ class Table:
     A column has one or two dimensions and any real dtype, and may be a strided view. Its values
     times its `scale` (1 by default) are in its `unit`. Without a `time` the time stamps are found
     by their name, as `read` describes. A column with blank cells holds its values alone, and `rows`
-    says in which rows of the table they stand.
+    says in which rows of the table they stand. A column whose header has a unit is also known by
+    this whole title.
     """
 
     columns: Mapping[str, np.ndarray]
@@ -26,6 +27,7 @@ class Table:
     units: Mapping[str, str] = dataclasses.field(default_factory=dict)
     scales: Mapping[str, float] = dataclasses.field(default_factory=dict)
     rows: Mapping[str, Bool[np.ndarray, " rows"]] = dataclasses.field(default_factory=dict)
+    titles: Mapping[str, str] = dataclasses.field(default_factory=dict)  # title -> column
 
 
 class SettingChange(NamedTuple):
@@ -71,6 +73,7 @@ class Signals:
 
     arrays: Mapping[str, Signal]
     clocks: Mapping[str, Float[np.ndarray, " samples"]]
+    titles: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of headers -> array
 
 
 _MOST_CHANGES = 1000
@@ -102,12 +105,13 @@ def flattened(log: Log) -> Signals:
     In a table with a clock, columns of another length, such as parameters, are left out. In one
     without, a matrix whose rows are the channels is turned.
     """
-    arrays, clocks = {}, {}
+    arrays, clocks, titles = {}, {}, {}
     for table_name, table in log.tables.items():
         lengths = {len(each) for each in table.columns.values() if each.ndim == 1}
         clock = "" if table.time is None else f"clock of {table_name}".removesuffix(" of ")
         if table.time is not None:
             clocks[clock] = table.time
+        titles |= {printable(title): printable(name) for title, name in table.titles.items()}
         for name, values in table.columns.items():
             full = printable(f"{table_name}.{name}" if table_name else name)
             unit, scale = printable(table.units.get(name, "")), table.scales.get(name, 1.0)
@@ -118,7 +122,7 @@ def flattened(log: Log) -> Signals:
                 turned = table.time is None and _has_channel_rows(values, lengths)
                 values = values.T if turned else values
                 arrays[full] = Signal(values, clock, unit, scale, table.rows.get(name))
-    return Signals(arrays, clocks)
+    return Signals(arrays, clocks, titles)
 
 
 def _has_channel_rows(matrix: np.ndarray, lengths: set[int]) -> bool:

@@ -12,6 +12,7 @@ from ._record import as_tuple, check_distinct, Hold, Record
 from ._repair import check_ranges, repair_values, Valid, within
 from ._resample import Channel, resample
 from ._timebase import signal_names, Timebases
+from ._units import known_unit
 from .formats import load_signals
 
 
@@ -211,9 +212,31 @@ def _all_units(
     for name in given:
         if name not in mixes:
             raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, mixes)}")
-    units = {name: {logged[source] for source in mix} for name, mix in mixes.items()}
+        _check_contradiction(name, given[name], mixes[name], logged)
+    units = {
+        name: {logged[source] for source in mix} if _keeps_units(mix) else {""}
+        for name, mix in mixes.items()
+    }
     agreed = {name: unit.pop() if len(unit) == 1 else "" for name, unit in units.items()}
     return agreed | dict(given)
+
+
+def _keeps_units(mix: Mapping[str, float | int]) -> bool:
+    """Whether a mix is in the unit of its channels: a single channel's factor may convert it."""
+    return len(mix) > 1 or all(abs(weight) == 1 for weight in mix.values())
+
+
+def _check_contradiction(
+    name: str, given: str, mix: Mapping[str, float | int], logged: Mapping[str, str]
+) -> None:
+    """Raise RecordError for another unit than the log's of a channel that is taken as it is."""
+    (source, weight), *others = mix.items()
+    said, stated = known_unit(given), known_unit(logged[source])
+    if said and stated and said != stated and weight == 1 and not others:
+        raise RecordError(
+            f"the unit of {name!r} is given as {given}, but the log says {logged[source]}: leave "
+            f"it out (units=), or multiply the channel by the factor between the two."
+        )
 
 
 def _mixes(selection: Selection) -> Mixes:

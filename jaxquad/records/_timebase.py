@@ -39,6 +39,7 @@ def signal_names(
 ) -> dict[str, tuple[str, int | None]]:
     """Channel name -> array and column; the columns of `x` are `x[0]`, `x[1]`, ..."""
     names, clocks = {}, _clocks(signals.arrays)
+    time = _named(signals, time)
     stamps = _time_names(signals.arrays, clocks, time)
     for name, signal in signals.arrays.items():
         if not signal.clock and name in stamps:
@@ -49,6 +50,11 @@ def signal_names(
             del columns[f"{name}[0]"]
         names |= columns
     return {name: place for name, place in names.items() if name != time}
+
+
+def _named(signals: Signals, time: str | None) -> str | None:
+    """The time base, by its name or by its whole title."""
+    return None if time is None else signals.titles.get(time, time)
 
 
 def _columns_of(name: str, signal: Signal) -> dict[str, tuple[str, int | None]]:
@@ -72,12 +78,12 @@ class Timebases:
     ):
         check_unit(time_unit)
         _check_dt(dt, time, time_unit)
-        self._signals, self._time, self._dt = signals, time, dt
+        self._signals, self._time, self._dt = signals, _named(signals, time), dt
         self._unit: TimeUnit | None = time_unit
         self._names = signal_names(signals, time, dt)
         self._every = _all_names(signals)
         self._clocks = _clocks(signals.arrays)
-        for name in () if time is None else self._parts(time):
+        for name in () if self._time is None else self._parts(self._time):
             if name not in self._every and name not in signals.arrays:
                 raise ReadError(f"time base {name!r}: {unknown_name(name, signals.arrays)}")
         self._read: dict[str, _Stamps] = {}
@@ -103,7 +109,7 @@ class Timebases:
 
     def _checked(self, name: str) -> tuple[tuple[str, bytes], RepairedTime]:
         """The time base of a channel, of the channel's length."""
-        values, array = self.values(name), self._names[name][0]
+        values, array = self.values(name), self._place(name)[0]
         base, rows = self._base(array), self._signals.arrays[array].rows
         if self._dt is not None and base == _COUNTED:
             count = len(values) if rows is None else rows.size
@@ -125,13 +131,20 @@ class Timebases:
 
     def values(self, name: str) -> np.ndarray:
         """The values of a channel in its unit, without its time stamps."""
-        if name not in self._names:
-            raise ReadError(unknown_name(name, self._names))
-        array, column = self._names[name]
+        array, column = self._place(name)
         return column_values(self._signals.arrays[array], column)
 
     def unit(self, name: str) -> str:
-        return self._signals.arrays[self._names[name][0]].unit
+        """The unit of a channel; a whole title has it in its name."""
+        titled = name in self._signals.titles
+        return "" if titled else self._signals.arrays[self._place(name)[0]].unit
+
+    def _place(self, name: str) -> tuple[str, int | None]:
+        """The array and the column of a channel, by its name or by its whole title."""
+        known = name if name in self._names else self._signals.titles.get(name, name)
+        if known not in self._names:
+            raise ReadError(unknown_name(name, self._names))
+        return self._names[known]
 
     def _base(self, array: str) -> str:
         known = self._signals.arrays[array].clock
@@ -213,6 +226,11 @@ class Timebases:
         counter, wraps = unwrap(self._column(base, raw=True))
         stated: TimeUnit | None = signal.unit if signal.unit in PER_SECOND else None  # pyright: ignore[reportAssignmentType]
         named = _UNIT_OF_NAME.get(re.split(r"[./]", array)[-1])
+        if stated and self._unit not in (None, stated) and array in self._signals.titles.values():
+            raise ReadError(
+                f"time_unit is {self._unit!r}, but the header says that {array!r} is in {stated}: "
+                f"leave the unit out (time_unit=), or correct the header."
+            )
         return _in_rows(_seconds(base, counter, self._unit or stated or named), signal.rows), wraps
 
     def _parts(self, base: str) -> list[str]:

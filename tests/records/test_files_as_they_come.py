@@ -203,3 +203,51 @@ def test_rates_of_old_ardupilot_logs_are_in_degrees(tmp_path, size, scale):
         rate = named(path)["RATE.R"]
     assert rate.unit == "deg/s"
     assert rate.maximum == pytest.approx(0.3 * (size or 57.2958) * scale, rel=1e-3)
+
+
+def with_header(path, header):
+    columns = [1e3 * TIME, np.sin(TIME), np.cos(TIME), 2 + np.sin(3 * TIME)]
+    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=header, comments="")
+    return path
+
+
+def test_units_in_the_header_of_a_table_are_those_of_its_columns(tmp_path):
+    path = with_header(tmp_path / "flight.csv", "t [ms],q [deg/s],phi (rad),x[1]")
+    assert [(c.name, c.unit) for c in channels(path)] == [
+        ("q", "deg/s"), ("phi", "rad"), ("x[1]", "")
+    ]  # fmt: skip
+    record = read(path, inputs="q", outputs=["phi", "x[1]"])
+    assert record.sample_rate == pytest.approx(100.0)
+    assert "inputs: q [deg/s]" in str(record) and "outputs: phi [rad], x[1]" in str(record)
+    titled = read(path, inputs="q [deg/s]", outputs="phi (rad)", time="t [ms]")
+    np.testing.assert_array_equal(titled.inputs, record.inputs)
+    assert "inputs: q [deg/s]\n" in str(titled)
+
+
+def test_a_header_without_a_known_unit_or_with_one_name_twice_stays_as_it_is(tmp_path):
+    path = with_header(tmp_path / "flight.csv", "time (ms),u (left),q [deg/s],q [rad/s]")
+    names = [each.name for each in channels(path)]
+    assert names == ["u (left)", "q [deg/s]", "q [rad/s]"]
+
+
+@pytest.mark.parametrize(
+    "option, said",
+    [
+        ({"time_unit": "us"}, "time_unit is 'us', but the header says that 't' is in ms"),
+        ({"units": {"q": "rad/s"}}, "the unit of 'q' is given as rad/s, but the log says deg/s"),
+    ],
+)
+def test_an_option_that_contradicts_the_header_is_refused(tmp_path, option, said):
+    path = with_header(tmp_path / "flight.csv", "t [ms],q [deg/s],phi (rad),x[1]")
+    with pytest.raises(ValueError, match=said):
+        read(path, inputs="q", outputs="phi", **option)
+    same = read(path, inputs="q", outputs="phi", time_unit="ms", units={"q": "deg/s"})
+    assert same.unit("q") == "deg/s"
+
+
+def test_a_factor_may_convert_a_channel_whose_unit_is_then_not_that_of_the_header(tmp_path):
+    path = with_header(tmp_path / "flight.csv", "t [ms],q [deg/s],phi (rad),x[1]")
+    turned = read(path, inputs={"q": {"q": np.pi / 180}}, outputs="phi", units={"q": "rad/s"})
+    assert turned.unit("q") == "rad/s"
+    plain = read(path, inputs={"q": {"q": np.pi / 180}}, outputs="phi")
+    assert plain.unit("q") == ""

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from .._clock import FEWEST
 from .._errors import ReadError
 from .._log import Log, Table
+from .._units import columns_of
 
 
 _WORTHWHILE = 1 << 20  # bytes: below, the import takes longer than the parsing
@@ -128,21 +129,35 @@ def load(path: Path) -> Log:
     """The columns of a text table by the names in its header row.
 
     Cells are separated by commas, semicolons, tabs or blanks; lines with # are comments, the
-    last of which may be the header. Without a header the columns are those of a matrix `data`. In a
-    table of several topics the cells of a column are blank where its topic has no message. Raises
-    ReadError with the line and the column.
+    last of which may be the header. A known unit in brackets behind a name, as in `q [deg/s]` or
+    `time (us)`, is that of its column, which both `q` and the whole title select. Without a header
+    the columns are those of a matrix `data`. In a table of several topics the cells of a column are
+    blank where its topic has no message. Raises ReadError with the line and the column.
     """
     content = _as_utf8(path.read_bytes())
     header = _header(content)
     try:
         values = _rows(content, header)
     except _BlankCell as error:
-        return _topics(content, header, error)
+        return _with_units(_topics(content, header, error))
     if not header.named:
         last = f"data[{len(values) - 1}]"
         remark = f"the file has no line of channel names: its columns are called data[0] .. {last}"
         return Log({"": Table({"data": values.T})}, (remark,))
-    return Log({"": Table(dict(zip(header.names, values, strict=True)))})
+    return _with_units(Log({"": Table(dict(zip(header.names, values, strict=True)))}))
+
+
+def _with_units(log: Log) -> Log:
+    """The columns by the names in their titles, with the units that stand behind these."""
+    table = log.tables[""]
+    parts = columns_of(list(table.columns))
+    whole = Table(
+        columns={parts[title].name: values for title, values in table.columns.items()},
+        units={name: unit for name, unit in parts.values() if unit},
+        rows={parts[title].name: rows for title, rows in table.rows.items()},
+        titles={title: name for title, (name, _) in parts.items() if title != name},
+    )
+    return Log({"": whole}, log.remarks)
 
 
 class _Header(NamedTuple):
