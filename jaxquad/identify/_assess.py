@@ -1,5 +1,6 @@
 """From a solver's stop to a result that states what it is worth."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,7 +27,7 @@ from ._accuracy import (
     scaled_inverse,
 )
 from ._bounds import one_sided, one_sided_limit
-from ._cost import Points, Weights
+from ._cost import Points, Weights, widen_band
 from ._discrepancy import (
     describe_discrepancy,
     Discrepancy,
@@ -116,6 +117,7 @@ def assess(
     else:
         facts = _information(problem, solution, blocks, (covariance, by_noise), units)
         verdict, by_data = _identifiability(facts, prior, bounds)
+        verdict = _with_wider_band(verdict, problem, frfs)
     return make_fit(
         problem,
         solution,
@@ -265,6 +267,17 @@ def discrepancy_at(
     records = _records(problem, [each.frf for each in points], solution, units)
     count = problem.parameters.count
     return find_discrepancy(records, points, _prior_rows(solution, units), count)
+
+
+def _with_wider_band(
+    verdict: Verdict, problem: Problem, frfs: Sequence[FrequencyResponse]
+) -> Verdict:
+    """With the advice to excite a wider band first, where a wider one may tell parameters apart."""
+    if verdict.identifiable or len(verdict.exact):
+        return verdict
+    wider = widen_band(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights])
+    remedies = (wider, *verdict.remedies) if wider else verdict.remedies
+    return dataclasses.replace(verdict, remedies=remedies)
 
 
 def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> list[str]:

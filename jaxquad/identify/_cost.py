@@ -172,6 +172,38 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
     )
 
 
+_DECADE = 10.0
+
+
+def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> str:
+    """The advice to excite more than the band of the points `seen`, with numbers.
+
+    Empty where that is a decade or more, or nothing.
+    """
+    rows = [np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in zip(frfs, seen, strict=True)]
+    omega = np.concatenate(rows)
+    if not omega.size or np.max(omega) >= _DECADE * np.min(omega):
+        return ""
+    low, high = float(np.min(omega)), float(np.max(omega))
+    highest = max(float(np.asarray(frf.omega)[-1]) for frf in frfs)
+    top = max(high, min(_DECADE * low, highest))
+    return (
+        f"excite the axis (jq.sweep) over more than {_in_both(low, high)}, all that this record "
+        f"shows: for instance {_in_both(top / _DECADE, top)}"
+    )
+
+
+def _in_both(low: float, high: float) -> str:
+    turn = 2 * np.pi
+    return f"{low:.3g} to {high:.3g} rad/s ({low / turn:.3g} to {high / turn:.3g} Hz)"
+
+
+def known_points(frf: FrequencyResponse) -> Mask:
+    """Points that have a response, each by its own random error."""
+    error = np.asarray(frf.random_error)
+    return np.isfinite(np.asarray(frf.response)) & (np.nan_to_num(error, nan=1.0) <= _LARGEST)
+
+
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
     """The points of several responses, with a floor of 0."""
     found = []

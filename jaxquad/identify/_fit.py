@@ -16,6 +16,7 @@ from ._cost import (
     Band,
     Cost,
     describe_usable,
+    known_points,
     least_coherence,
     Mask,
     MaximumLikelihood,
@@ -24,6 +25,7 @@ from ._cost import (
     Ratio,
     usable,
     Weights,
+    widen_band,
 )
 from ._fit_remarks import DOUBT
 from ._make_fit import unfitted
@@ -215,8 +217,11 @@ def _too_few_points(
         f"{describe_usable(frfs, points, least)}{f' (band {band} rad/s)' if band else ''}, and "
         f"{parameters.count} parameters need at least {needed}"
     )
-    remedy = "excite the axis (jq.sweep), record longer, or use a longer window"
-    return without_numbers("too few points", parameters.names, reason, remedy)
+    wider = widen_band(frfs, [known_points(frf) for frf in frfs]) if band is None else ""
+    remedies = ("excite the axis (jq.sweep), record longer, or use a longer window",)
+    if wider:
+        remedies = (wider, "fit fewer parameters (free=): a delay, say, known from another source")
+    return without_numbers("too few points", parameters.names, reason, *remedies)
 
 
 def _solve_reweighted(

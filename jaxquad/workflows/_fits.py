@@ -155,7 +155,9 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
     kind, lost = found.verdict.kind, found.verdict.undetermined
     if kind == "identifiable":
         return found
-    remedies = [EXCITE]
+    wider = [each for each in found.verdict.remedies if each.startswith("excite the axis")]
+    excite = next(iter(wider), EXCITE)
+    remedies = [excite]
     if kind == "too few points":
         remedies += ["use longer windows (--estimator welch --window S)"]
     elif kind == "no model":
@@ -164,9 +166,9 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
             "fit a model of higher order (--poles), or ask which term is missing (--explain)",
         ]
     elif settings.poles is not None:
-        remedies = ["fit fewer poles and zeros (--poles, --zeros)", EXCITE]
+        remedies = ["fit fewer poles and zeros (--poles, --zeros)", excite]
     elif {"lag", "delay"} & set(lost) and settings.lag and settings.delay:
-        remedies = ["fit without the lag (--no-lag) or without the delay (--no-delay)", EXCITE]
+        remedies = ["fit without the lag (--no-lag) or without the delay (--no-delay)", excite]
     verdict = dataclasses.replace(found.verdict, remedies=tuple(remedies))
     return dataclasses.replace(found, verdict=verdict)
 

@@ -137,6 +137,26 @@ def test_lag_and_delay_of_a_narrow_band_are_determined_as_a_sum(band):
 
 
 @pytest.mark.slow
+def test_a_narrow_band_is_named_with_a_wider_one_to_excite():
+    truth = jq.LaggedIntegrator(8.0, 0.05, 0.03)
+    narrow = response_of(truth, omega=np.geomspace(5.0, 8.0, 30), error=0.1, seed=0)
+    fit = jq.fit(truth, narrow, cost=ML)
+    assert fit.verdict.remedies[0].startswith(
+        "excite the axis (jq.sweep) over more than 5 to 8 rad/s (0.796 to 1.27 Hz)"
+    )
+    few = jq.fit(truth, response_of(truth, omega=np.geomspace(5.0, 8.0, 4)), cost=ML)
+    assert few.verdict.kind == "too few points" and "5 to 8 rad/s" in few.verdict.remedies[0]
+    wide = response_of(truth, omega=np.geomspace(0.5, 8.0, 30), error=0.2, seed=0)
+    lost = jq.fit(truth, wide, cost=ML).verdict
+    assert lost.undetermined and not any("excite" in remedy for remedy in lost.remedies)
+
+
+def test_no_wider_band_is_advised_where_none_would_help(alone):
+    assert alone.verdict.undetermined and not any(
+        "excite" in each for each in alone.verdict.remedies
+    )
+
+
 def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
     truth = jq.TransferFunction([8.0], [1.0, 3.0, 9.0])
     fit = jq.fit(truth, response_of(truth, seed=0), cost=ML, free=("numerator", "denominator"))
