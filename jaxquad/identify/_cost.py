@@ -173,6 +173,7 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
 
 
 _DECADE = 10.0
+_SURE = 0.1  # random error that noise alone does not reach
 
 
 def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> str:
@@ -188,8 +189,8 @@ def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> str:
     highest = max(float(np.asarray(frf.omega)[-1]) for frf in frfs)
     top = max(high, min(_DECADE * low, highest))
     return (
-        f"excite the axis (jq.sweep) over more than {_in_both(low, high)}, all that this record "
-        f"shows: for instance {_in_both(top / _DECADE, top)}"
+        f"excite the axis (jq.sweep) over more than {_in_both(low, high)}, the band that counts "
+        f"here: for instance {_in_both(top / _DECADE, top)}"
     )
 
 
@@ -199,9 +200,9 @@ def _in_both(low: float, high: float) -> str:
 
 
 def known_points(frf: FrequencyResponse) -> Mask:
-    """Points that have a response, each by its own random error."""
-    error = np.asarray(frf.random_error)
-    return np.isfinite(np.asarray(frf.response)) & (np.nan_to_num(error, nan=1.0) <= _LARGEST)
+    """Points that have a response, each by its own random error: so small by no chance."""
+    error = np.nan_to_num(np.asarray(frf.random_error), nan=1.0)
+    return np.isfinite(np.asarray(frf.response)) & (error <= _SURE)
 
 
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
