@@ -43,6 +43,7 @@ _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band ar
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
 _DOMINATED = "feedback-dominated"
 EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
+_WIDER = "excite the axis (jq.sweep) over more than"  # as the remedy of `jq.fit` begins
 
 
 def fit_responses(
@@ -155,8 +156,8 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
     kind, lost = found.verdict.kind, found.verdict.undetermined
     if kind == "identifiable":
         return found
-    wider = [each for each in found.verdict.remedies if each.startswith("excite the axis")]
-    excite = next(iter(wider), EXCITE)
+    wider = [each for each in found.verdict.remedies if each.startswith(_WIDER)]
+    excite = in_options(wider[0]) if wider else EXCITE
     remedies = [excite]
     if kind == "too few points":
         remedies += ["use longer windows (--estimator welch --window S)"]

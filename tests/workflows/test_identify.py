@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from sweep_logs import GAIN, write_noise, write_sweep
+from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad.cli import main
@@ -116,6 +117,15 @@ def test_a_second_record_is_read_with_the_settings_of_the_first(found, folder, l
     assert verify_result(folder, log, {"band": (1, 2)}).band == pytest.approx(
         (2 * np.pi, 4 * np.pi)
     )
+
+
+def test_a_narrow_band_is_named_in_options():
+    truth = jq.LaggedIntegrator(8.0, 0.05, 0.03)
+    omega = np.geomspace(5.0, 8.0, 4)
+    few = jq.fit(truth, response_of(truth, omega=omega))
+    remedies = _fits.with_remedies(few, IdentifySettings()).verdict.remedies
+    advice = "excite the axis (jaxquad design sweep) over more than 5 to 8 rad/s"
+    assert remedies[0].startswith(advice)
 
 
 def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
