@@ -186,11 +186,9 @@ def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> str:
     if not omega.size or np.max(omega) >= _DECADE * np.min(omega):
         return ""
     low, high = float(np.min(omega)), float(np.max(omega))
-    highest = max(float(np.asarray(frf.omega)[-1]) for frf in frfs)
-    top = max(high, min(_DECADE * low, highest))
     return (
         f"excite the axis (jq.sweep) over more than {_in_both(low, high)}, the band that counts "
-        f"here: for instance {_in_both(top / _DECADE, top)}"
+        f"here: for instance {_in_both(low, _DECADE * low)}"
     )
 
 
