@@ -3,7 +3,7 @@ from typing import Literal
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
@@ -71,6 +71,9 @@ def _result(
         noted = remarks_on_feedback(method, *measured, names, found.errors)
         if isinstance(found, LocalEstimate):  # periods show their own distortion
             noted += remarks_on_nonlinearity(records, omega, response, coherence, method)
+            seconds = sum(record.duration for record in records)
+            sharp = np.isfinite(response) & (error <= _SHARP) & (coherence >= _COHERENT)
+            noted += _remarks_on_length(seconds, np.asarray(omega), np.any(sharp, axis=(1, 2)))
         return noted + found.remarks
 
     # Not jnp.asarray: it compiles a program for each new shape.
@@ -97,6 +100,33 @@ def _result(
         input_units=records[0].input_units,
         output_units=records[0].output_units,
     )
+
+
+_SHARP, _COHERENT = 0.3, 0.6  # random error and coherence of frequencies that fits rest on
+_SHORT = 5.0  # cycles in the record, of the lowest of them
+_APART = 6.0  # frequencies that a record tells apart: two for each of a lag, a delay and a gain
+
+
+def _remarks_on_length(
+    seconds: float, omega: Grid, used: Bool[np.ndarray, " frequencies"]
+) -> tuple[Remark, ...]:
+    """Remark on a record that is too short for its band, where the grid is wide enough."""
+    spacing = 2 * np.pi / seconds
+    if not used.any() or omega[-1] - omega[0] < _APART * spacing:
+        return ()
+    low, high = float(omega[used][0]), float(omega[used][-1])
+    apart = (high - low) / spacing
+    if low >= _SHORT * spacing or apart >= _APART:
+        return ()
+    needed = max(_SHORT * 2 * np.pi / low, seconds * _APART / max(apart, 1.0))
+    remark = (
+        f"the record is too short: its {seconds:.3g} s tell {apart:.1f} frequencies apart from "
+        f"{low:.3g} to {high:.3g} rad/s ({low / (2 * np.pi):.3g} to {high / (2 * np.pi):.3g} Hz; "
+        f"at least {_APART:.0f}), and hold {low / spacing:.1f} cycles of the lowest (at least "
+        f"{_SHORT:.0f}): 95 % intervals are too narrow there. Record at least {needed:.2g} s, or "
+        f"a wider band"
+    )
+    return (Remark(remark, omega[used]),)
 
 
 Estimator = Welch | Composite | LocalPolynomial | Periodic | JointInputOutput

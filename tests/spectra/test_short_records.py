@@ -1,0 +1,52 @@
+"""A record that tells too few frequencies apart says so; a longer one does not."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import jaxquad as jq
+
+
+DT = 0.004
+SAID = "the record is too short"
+
+
+def closed_loop(seconds, seed, start=12.0):
+    """A part of 30 s in which a sweep of 0.3 to 20 Hz moves a rate loop with lag and delay."""
+    rng, samples, late = np.random.default_rng(seed), 7500, 4
+    time, decay = DT * np.arange(samples), np.exp(-DT / 0.03)
+    reference = 0.5 * np.sin(2 * np.pi * DT * np.cumsum(0.3 * (20 / 0.3) ** (time / 30.0)))
+    gust = 0.005 * np.asarray(lfilter([1.0], [1.0, -0.9], rng.standard_normal(samples)))
+    noise = 0.01 * rng.standard_normal(samples)
+    rate, motor, integral, u, y = 0.0, 0.0, 0.0, np.zeros(samples), np.zeros(samples)
+    for k in range(samples):
+        y[k] = rate + noise[k]
+        integral += (reference[k] - y[k]) * DT
+        u[k] = 0.06 * (reference[k] - y[k]) + 0.05 * integral
+        pushed = (u[k - late] if k >= late else 0.0) + gust[k]
+        moved = pushed + (motor - pushed) * decay
+        rate, motor = rate + 120.0 * DT * (motor + moved) / 2, moved
+    part = (time >= start) & (time < start + seconds)
+    return jq.Record(time[part], u[part], y[part], reference[part], hold=DT)
+
+
+def remarks(record):
+    return [r for r in jq.frequency_response(record).remarks if SAID in r]
+
+
+@pytest.mark.parametrize("seconds", [0.8, 1.6])
+def test_a_second_of_a_closed_loop_is_called_too_short(seconds):
+    [said] = remarks(closed_loop(seconds, 1))
+    assert "at least 6" in said and "cycles of the lowest (at least 5)" in said
+    assert "Record at least" in said
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_six_seconds_and_thirty_are_not(seed):
+    assert not remarks(closed_loop(6.4, seed)) and not remarks(closed_loop(30.0, seed, start=0.0))
+
+
+def test_a_grid_that_is_narrow_by_choice_is_not_remarked():
+    record = closed_loop(30.0, 0, start=0.0)
+    said = jq.frequency_response(record, np.array([1.0, 1.1])).remarks
+    assert not any(SAID in remark for remark in said)
