@@ -174,6 +174,7 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
 
 _DECADE = 10.0
 _SURE = 0.1  # random error that noise alone does not reach
+_FEEDBACK = "feedback-dominated"  # as the remark of such a response begins
 
 
 def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> str:
@@ -198,9 +199,13 @@ def _in_both(low: float, high: float) -> str:
 
 
 def known_points(frf: FrequencyResponse) -> Mask:
-    """Points that have a response, each by its own random error: so small by no chance."""
+    """Points that have a response, each by its own random error: so small by no chance.
+
+    None where feedback dominates: what is known there is the controller, and not the plant.
+    """
     error = np.nan_to_num(np.asarray(frf.random_error), nan=1.0)
-    return np.isfinite(np.asarray(frf.response)) & (error <= _SURE)
+    open_loop = not any(remark.startswith(_FEEDBACK) for remark in frf.remarks)
+    return np.isfinite(np.asarray(frf.response)) & (error <= _SURE) & open_loop
 
 
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:

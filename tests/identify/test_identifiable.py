@@ -1,5 +1,7 @@
 """What a record cannot tell is said before any number is read."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -146,6 +148,12 @@ def test_a_narrow_band_is_named_with_a_wider_one_to_excite():
     )
     few = jq.fit(truth, response_of(truth, omega=np.geomspace(5.0, 8.0, 4)), cost=ML)
     assert few.verdict.kind == "too few points" and "5 to 8 rad/s" in few.verdict.remedies[0]
+    hover = jq.spectra.Remark("feedback-dominated: the reference explains neither")
+    four = response_of(truth, omega=np.geomspace(5.0, 8.0, 4))
+    fed_back = dataclasses.replace(four, remarks=(hover,))
+    assert jq.fit(truth, fed_back, cost=ML).verdict.remedies == (
+        "excite the axis (jq.sweep), record longer, or use a longer window",
+    )
     wide = response_of(truth, omega=np.geomspace(0.5, 8.0, 30), error=0.2, seed=0)
     lost = jq.fit(truth, wide, cost=ML).verdict
     assert lost.undetermined and not any("excite" in remedy for remedy in lost.remedies)
