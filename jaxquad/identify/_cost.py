@@ -204,8 +204,8 @@ def known_points(frf: FrequencyResponse) -> Mask:
     None where feedback dominates: what is known there is the controller, and not the plant.
     """
     error = np.nan_to_num(np.asarray(frf.random_error), nan=1.0)
-    open_loop = not any(remark.startswith(_FEEDBACK) for remark in frf.remarks)
-    return np.isfinite(np.asarray(frf.response)) & (error <= _SURE) & open_loop
+    dominated = any(remark.startswith(_FEEDBACK) for remark in frf.remarks)
+    return np.isfinite(np.asarray(frf.response)) & (error <= _SURE) & (not dominated)
 
 
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
