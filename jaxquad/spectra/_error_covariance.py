@@ -142,9 +142,12 @@ class ErrorCovariance(eqx.Module):
         self, first: tuple[int, int], second: tuple[int, int]
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
         """Covariance E[dT dT^H] of two pairs (output, input) between all pairs of frequencies."""
-        atoms, share, noise = _at(self, _places(self)), _share(self), np.asarray(self.noise)
-        pairs = (first,) if first == second else (first, second)
-        seen = [np.einsum("fgt,fg->ft", atoms[:, :, i], share[:, o, i]) for o, i in pairs]
+        noise, pairs = np.asarray(self.noise), (first,) if first == second else (first, second)
+        if self.windows is None and self.share is None:
+            seen = [np.asarray(self.effect)[:, i] for _, i in pairs]
+        else:
+            atoms, share = _at(self, _places(self)), _share(self)
+            seen = [np.einsum("fgt,fg->ft", atoms[:, :, i], share[:, o, i]) for o, i in pairs]
         one, other = seen[0], seen[-1]
         shared = noise[:, first[0]] @ noise[:, second[0]].conj().T
         total = (one @ other.conj().T) * shared

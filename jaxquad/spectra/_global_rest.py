@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from ._global_model import global_models, GlobalModel, highest_modelled
-from ._local_fit import Bins, largest_values, local_fit, LocalFit, window_slices
+from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_noise import Noise, SharedErrors
 
 
@@ -52,25 +52,19 @@ class Rest(NamedTuple):
 
     def _followed(self, model: GlobalModel, omega: Grid, half_width: Grid, order: int) -> Grid:
         """Complex degrees of freedom of local residuals that the model has taken."""
-        inputs = self.sources.stop - self.sources.start
         # A long record has many times the bins that the windows reach.
         reached = slice(0, int(np.max(window_slices(omega, half_width, self.bins)[1])))
-        values = np.zeros((reached.stop, inputs + model.follow.shape[1]), complex)
-        values[:, :inputs] = self.bins.values[reached, self.sources]
         inside = model.places < reached.stop
-        values[model.places[inside], inputs:] = model.follow[inside]
-        largest = self.bins.largest[self.sources], largest_values(model.follow)
-        bins = Bins(
+        follow = np.zeros((reached.stop, model.follow.shape[1]), complex)
+        follow[model.places[inside]] = model.follow[inside]
+        sources = Bins(
             self.bins.omega[reached],
             self.bins.record[reached],
-            values,
+            self.bins.values[reached, self.sources],
             self.bins.records,
-            np.concatenate(largest),
+            self.bins.largest[self.sources],
         )
-        columns = slice(0, inputs), slice(inputs, values.shape[1])
-        fit = local_fit(omega, half_width, bins, *columns, order, "polynomial")
-        left = np.real(np.trace(np.nan_to_num(fit.scatter), axis1=1, axis2=2))
-        return 0.5 * left * np.maximum(fit.freedom, 1.0)
+        return 0.5 * left_power(omega, half_width, sources, follow, order)
 
     def add_models(self, omega: Grid, fit: LocalFit) -> LocalFit:
         """The fit with the models' responses added back."""

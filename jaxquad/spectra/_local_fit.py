@@ -1,6 +1,6 @@
 """Least squares of polynomials around each frequency: the core of the local polynomial method."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -157,6 +157,7 @@ def _between(
 
 
 _DEPENDENT = 1e-6  # smallest singular value of the scaled regressors, to the largest
+_ROUNDING = 1e-14  # added to the products of unit columns, so that they have an inverse
 _STEPS = 2  # of Gauss-Newton, after the linear estimate of a denominator
 _NEAREST = 1e-3  # size of the denominator, so that no pole falls onto a bin
 
@@ -183,7 +184,7 @@ def solve_polynomial(place: Places, u: Inputs, y: Outputs, own: Own, order: int)
 
     Source: Pintelon and Schoukens, System Identification, 2nd ed., section 7.2.
     """
-    return _least_squares(_regressors(place, u, own, order), y, u.shape[2], order)
+    return _least_squares(_regressors(place, u, own, order), y, _count(own), u.shape[2], order)
 
 
 def solve_rational(place: Places, u: Inputs, y: Outputs, own: Own, order: int) -> Solution:
@@ -195,9 +196,13 @@ def solve_rational(place: Places, u: Inputs, y: Outputs, own: Own, order: int) -
     Guerin (2012).
     """
     columns, inputs = _regressors(place, u, own, order), u.shape[2]
-    each = [
-        _solve_one(place, columns, y[:, :, o : o + 1], inputs, order) for o in range(y.shape[2])
-    ]
+    normal, moved = _normal(columns), place[:, :, None] * y
+    poles = _slope(_left(normal, -moved), _left(normal, y))
+    each = []
+    for o in range(y.shape[2]):
+        one = y[:, :, o : o + 1]
+        joined = _with_pole(place[:, :, None], columns, one, poles[:, None, o : o + 1])
+        each.append(_least_squares(joined, one, _count(own), inputs, order))
     gain = np.stack([np.sum(np.abs(one.effect) ** 2, axis=(1, 2)) for one in each], axis=1)
     return Solution(
         np.concatenate([one.response for one in each], axis=1),
@@ -209,67 +214,118 @@ def solve_rational(place: Places, u: Inputs, y: Outputs, own: Own, order: int) -
     )
 
 
-def _solve_one(place: Places, columns: Columns, y: Outputs, inputs: int, order: int) -> Solution:
-    x = place[:, :, None]
-    joined = np.concatenate([columns, x * y], axis=2)
-    pole = -_coefficients(joined, y)[:, -1:]
-    for _ in range(_STEPS):
-        denominator = 1 + pole * x
-        small = np.abs(denominator) < _NEAREST
-        shaped = columns / np.where(small, _NEAREST, denominator)
-        fitted = np.sum(shaped * np.swapaxes(_coefficients(shaped, y), 1, 2), axis=2, keepdims=True)
-        slope = x * fitted / np.where(small, _NEAREST, denominator)
+def _with_pole(
+    x: Float[np.ndarray, "frequencies window 1"],
+    columns: Columns,
+    y: Outputs,
+    pole: Complex[np.ndarray, "frequencies 1 1"],
+) -> Complex[np.ndarray, "frequencies window joined"]:
+    """Regressors of the last of the Gauss-Newton steps from `pole`, its own as the last one."""
+    joined = columns
+    for step in range(_STEPS):
+        below = 1 + pole * x
+        over = 1 / np.where(np.abs(below) < _NEAREST, _NEAREST, below)
+        shaped = columns * over
+        normal = _normal(shaped)
+        left = _left(normal, y)
+        slope = x * (y - left) * over
         joined = np.concatenate([shaped, slope], axis=2)
-        pole = pole - _coefficients(joined, y)[:, -1:]
-    return _least_squares(joined, y, inputs, order)
+        if step + 1 < _STEPS:
+            pole = pole - _slope(_left(normal, slope), left)[:, None]
+    return joined
+
+
+def _count(own: Own) -> Int[np.ndarray, " frequencies"]:
+    return np.sum(np.any(own, axis=2), axis=1)
+
+
+def _slope(x: Outputs, y: Outputs) -> Complex[np.ndarray, "frequencies outputs"]:
+    """The multiple of each column of `x` that is nearest to that of `y`."""
+    power = np.maximum(np.sum(np.abs(x) ** 2, axis=1), 1e-300)
+    return np.sum(np.conj(x) * y, axis=1) / power
 
 
 def _regressors(place: Places, u: Inputs, own: Own, order: int) -> Columns:
-    columns = [np.concatenate([u, own], axis=2)]
-    for _ in range(order):
-        columns.append(columns[-1] * place[:, :, None])
-    return np.stack(columns, axis=3).reshape(*place.shape, -1)
+    """Each input, then each record, times the powers of `place`; a column lies in one piece."""
+    moving = np.concatenate([u, own], axis=2)
+    rows = np.empty((len(place), moving.shape[2], order + 1, place.shape[1]), complex)
+    rows[:, :, 0] = np.swapaxes(moving, 1, 2)
+    for power in range(order):
+        np.multiply(rows[:, :, power], place[:, None], out=rows[:, :, power + 1])
+    return np.swapaxes(rows.reshape(len(place), -1, place.shape[1]), 1, 2)
 
 
-def _decomposed(columns: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Q and R of columns of unit length, their lengths, and which were empty.
+class _Normal(NamedTuple):
+    """Normal equations of some columns.
 
-    A record without bins here has empty columns: an extra row for each makes them harmless.
+    Their inverse is wrong by the square of the columns' condition. What it gives is corrected once
+    by what it leaves, after which it is as good as that of a QR decomposition up to a condition of
+    1e4, and good to some 1e-5 where columns are as dependent as is allowed.
     """
-    length = np.sqrt(np.einsum("fwc,fwc->fc", columns, np.conj(columns)).real)
+
+    columns: Columns
+    adjoint: Complex[np.ndarray, "frequencies columns window"]
+    inverse: Complex[np.ndarray, "frequencies columns columns"]
+    independent: Bool[np.ndarray, " frequencies"]
+    count: Int[np.ndarray, " frequencies"]  # of the columns that are not empty
+
+
+def _normal(columns: Columns) -> _Normal:
+    """A record without bins here has empty columns, which take no part."""
+    adjoint = _adjoint(columns)
+    gram = adjoint @ columns
+    length = np.sqrt(np.real(np.diagonal(gram, axis1=1, axis2=2)))
     empty = length == 0
     length = np.where(empty, 1.0, length)
-    spare = empty[:, :, None] * np.eye(empty.shape[1])
-    scaled = np.concatenate([columns / length[:, None, :], spare], axis=1)
-    q, r = np.linalg.qr(scaled)
-    return q[:, : columns.shape[1]], r, length, empty
+    area = length[:, :, None] * length[:, None, :]
+    alike = gram / area + (empty[:, :, None] + _ROUNDING) * np.eye(empty.shape[1])
+    inverse = np.linalg.inv(alike)
+    independent = _independent(alike, inverse)
+    return _Normal(columns, adjoint, inverse / area, independent, np.sum(~empty, axis=1))
 
 
-def _coefficients(
-    columns: Columns, y: Outputs
-) -> Complex[np.ndarray, "frequencies columns outputs"]:
-    q, r, length, _ = _decomposed(columns)
-    strength = np.linalg.svd(r, compute_uv=False)
-    fine = strength[:, -1] > 1e-14 * strength[:, 0]
-    r = np.where(fine[:, None, None], r, np.eye(r.shape[1]))
-    return np.linalg.solve(r, _adjoint(q) @ y) / length[:, :, None]
+def _independent(
+    alike: Complex[np.ndarray, "frequencies columns columns"],
+    inverse: Complex[np.ndarray, "frequencies columns columns"],
+) -> Bool[np.ndarray, " frequencies"]:
+    """Whether unit columns are, whose products are `alike`: by norms, or by their eigenvalues."""
+    norms = (np.linalg.norm(each, axis=(1, 2)) for each in (alike, inverse))
+    found = np.prod(list(norms), axis=0) < 1 / _DEPENDENT**2
+    if not np.all(found):
+        value = np.linalg.eigvalsh(alike[~found])
+        found[~found] = value[:, 0] > _DEPENDENT**2 * value[:, -1]
+    return found
 
 
-def _least_squares(columns: Columns, y: Outputs, inputs: int, order: int) -> Solution:
-    q, r, length, empty = _decomposed(columns)
-    strength = np.linalg.svd(r, compute_uv=False)
-    size = np.sum(np.any(columns != 0, axis=2), axis=1)
-    freedom = size - np.sum(~empty, axis=1).astype(float)
-    fine = (strength[:, -1] > _DEPENDENT * strength[:, 0]) & (freedom > 0)
-    r = np.where(fine[:, None, None], r, np.eye(r.shape[1]))
-    central = np.eye(r.shape[1])[: inputs * (order + 1) : order + 1] / length[:, None, :]
-    rows = np.linalg.solve(np.swapaxes(r, 1, 2), np.swapaxes(central, 1, 2))
-    effect = np.swapaxes(rows, 1, 2) @ _adjoint(q)
-    residual = y - q @ (_adjoint(q) @ y)
+def _left(normal: _Normal, y: Outputs) -> Outputs:
+    """What the columns do not explain of `y`."""
+    for _ in range(2):
+        y = y - normal.columns @ (normal.inverse @ (normal.adjoint @ y))
+    return y
+
+
+def _effect(normal: _Normal, which: slice) -> Complex[np.ndarray, "frequencies which window"]:
+    """How each bin of an output enters some of the columns' coefficients."""
+    unit = np.eye(normal.columns.shape[2])[which]
+    first = normal.inverse[:, which] @ normal.adjoint
+    missing = unit - first @ normal.columns
+    return first + missing @ normal.inverse @ normal.adjoint
+
+
+def _least_squares(
+    columns: Columns,
+    y: Outputs,
+    bins: Int[np.ndarray, " frequencies"],
+    inputs: int,
+    order: int,
+) -> Solution:
+    normal = _normal(columns)
+    freedom = np.maximum(bins - normal.count, 0).astype(float)
+    effect = _effect(normal, slice(0, inputs * (order + 1), order + 1))
     response = np.swapaxes(effect @ y, 1, 2)
-    return Solution(
-        response, effect, np.ones((len(y), y.shape[2])), residual, np.maximum(freedom, 0.0), fine
-    )
+    boost = np.ones((len(y), y.shape[2]))
+    fine = normal.independent & (freedom > 0)
+    return Solution(response, effect, boost, _left(normal, y), freedom, fine)
 
 
 def products(
@@ -322,19 +378,14 @@ def local_fit(
     denominator of the first degree.
     """
     first, last = window_slices(omega, half_width, bins)
-    threshold = _UNEXCITED * bins.largest[inputs]
-    longest = max(int(np.max(last - first)), 1)
-    fields, places = [], np.argsort(last - first, kind="stable")
-    size = min(_CHUNK, max(_BINS // longest, 1))
-    for chunk in np.array_split(places, -(-omega.size // size)):
-        window = _gather(omega[chunk], half_width[chunk], first[chunk], last[chunk], bins)
+    longest, fields = max(int(np.max(last - first)), 1), []
+    for chunk, window in _chunks(omega, half_width, first, last, bins):
         values = bins.values[window.index]
         used, own = _own_records(window, order, bins.records)
         u, y = (values[:, :, each] * used[:, :, None] for each in (inputs, outputs))
         solve = solve_polynomial if shape == "polynomial" else solve_rational
         solution = solve(window.place, u, y, own, order)
-        excited = np.all(np.max(np.abs(u), axis=1) > threshold, axis=1)
-        excited &= np.all(_leaked(solution, u) < _LEAKED, axis=1)
+        excited = _excited(np.sum(np.abs(solution.effect) ** 2, axis=2), u, bins.largest[inputs])
         count = np.maximum(np.sum(used, axis=1), 1)[:, None, None]
         part = (*_padded(solution, excited, longest), products(u) / count)
         fields = fields or [np.empty((omega.size, *each.shape[1:]), each.dtype) for each in part]
@@ -345,14 +396,61 @@ def local_fit(
     return LocalFit(response, effect, boost, gain, first, scatter, freedom, power)
 
 
-def _leaked(solution: Solution, u: Inputs) -> Float[np.ndarray, "frequencies inputs"]:
-    """Each input's power in the window, to that which determines its response.
+def left_power(
+    omega: Float[np.ndarray, " frequencies"],
+    half_width: Float[np.ndarray, " frequencies"],
+    bins: Bins,
+    values: Complex[np.ndarray, "bins outputs"],
+    order: int,
+) -> Float[np.ndarray, " frequencies"]:
+    """Power of all `values` in each window that `local_fit` by polynomials would leave.
+
+    All channels of `bins` are the inputs; 0 where they do not determine a response.
+    """
+    left, power = np.zeros(omega.size), np.sum(np.abs(values) ** 2, axis=1)
+    for chunk, window in _chunks(omega, half_width, *window_slices(omega, half_width, bins), bins):
+        used, own = _own_records(window, order, bins.records)
+        u = bins.values[window.index] * used[:, :, None]
+        normal = _normal(_regressors(window.place, u, own, order))
+        central = np.arange(u.shape[2]) * (order + 1)
+        effect = np.real(normal.inverse[:, central, central])  # its square, summed over the window
+        known = _excited(effect, u, bins.largest)
+        known &= normal.independent & (_count(own) > normal.count)
+        moved = normal.adjoint @ values[window.index]
+        taken = np.sum(np.real(np.conj(moved) * (normal.inverse @ moved)), axis=(1, 2))
+        left[chunk] = known * (np.sum(power[window.index] * used, axis=1) - taken)
+    return np.maximum(left, 0.0)
+
+
+def _chunks(
+    omega: Float[np.ndarray, " frequencies"],
+    half_width: Float[np.ndarray, " frequencies"],
+    first: Int[np.ndarray, " frequencies"],
+    last: Int[np.ndarray, " frequencies"],
+    bins: Bins,
+) -> Iterator[tuple[Int[np.ndarray, " chunk"], "_Window"]]:
+    """Frequencies whose windows are about as long, and these windows."""
+    longest = max(int(np.max(last - first)), 1)
+    places, size = np.argsort(last - first, kind="stable"), min(_CHUNK, max(_BINS // longest, 1))
+    for chunk in np.array_split(places, -(-omega.size // size)):
+        yield chunk, _gather(omega[chunk], half_width[chunk], first[chunk], last[chunk], bins)
+
+
+def _excited(
+    effect: Float[np.ndarray, "frequencies inputs"],
+    u: Inputs,
+    largest: Float[np.ndarray, " inputs"],
+) -> Bool[np.ndarray, " frequencies"]:
+    """Whether each input's power in the window is near that which determines its response.
 
     Beyond the end of a sweep the input's transform is what the ends of the record leak, as smooth
-    along frequency as a transient, and says nothing about the response: the ratio is 1e9, or what
-    rounding makes of it. A sweep that reaches the frequency has 2 to 30.
+    along frequency as a transient, and says nothing about the response: the ratio, the summed
+    squares of the `effect` times those of the input, is 1e9, or what rounding makes of it. A sweep
+    that reaches the frequency has 2 to 30.
     """
-    return np.sum(np.abs(solution.effect) ** 2, axis=2) * np.sum(np.abs(u) ** 2, axis=1)
+    power = np.abs(u) ** 2
+    found = np.all(np.max(power, axis=1) > (_UNEXCITED * largest) ** 2, axis=1)
+    return found & np.all(effect * np.sum(power, axis=1) < _LEAKED, axis=1)
 
 
 def replace_rows(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"], part: LocalFit) -> LocalFit:

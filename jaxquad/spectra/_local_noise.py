@@ -196,11 +196,14 @@ def colour_of_noise(
     if left.shape[1] == left.shape[2] == 1:
         power = sources.power_at(inside)
         return power[places - lowest] / sources.power_at(omega)[:, None, :]
-    roots, centre = sources.root_at(inside), left @ sources.root_at(omega)
-    colour = np.empty((*places.shape, left.shape[1]))
+    roots = np.ascontiguousarray(np.swapaxes(sources.root_at(inside), 0, 1))
+    colour, moved = np.empty((*places.shape, left.shape[1])), len(roots)
     for f, mine in enumerate(places):
-        colour[f] = np.sum(np.abs(left[f] @ roots[mine - lowest]) ** 2, axis=2)
-    return colour / np.maximum(np.sum(np.abs(centre) ** 2, axis=2), 1e-300)[:, None, :]
+        parts = left[f] @ roots[:, mine - lowest].reshape(moved, -1)  # one product: many are slow
+        power = parts.real**2 + parts.imag**2
+        colour[f] = np.sum(power.reshape(-1, mine.size, moved), axis=2).T
+    centre = np.sum(np.abs(left @ sources.root_at(omega)) ** 2, axis=2)
+    return colour / np.maximum(centre, 1e-300)[:, None, :]
 
 
 def window_places(fit: LocalFit, bins: Bins) -> Int[np.ndarray, "frequencies window"]:
