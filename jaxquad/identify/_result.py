@@ -34,6 +34,9 @@ from ._verdict import Combination, pooled_freedom, reach_of_interval, Undetermin
 from ._verify import Verification, verify
 
 
+_ROUNDING = 1e-12  # of a variance, to those that cancel in it
+
+
 @pytree_node
 class Fit:
     """An identified model with its doubts; `str(fit)` is the table for a report.
@@ -246,8 +249,13 @@ class Fit:
                 "jq.identify.Prior or a second record, or ask for a determined combination"
             )
         covariance = self.relative_covariance if model_error else self.relative_noise_covariance
-        error = float(np.sqrt(slope @ covariance @ slope))
-        return Combination(name, value, error, self.freedom_of(slope))
+        variance = float(slope @ covariance @ slope)
+        if variance < _ROUNDING * float(np.abs(slope) @ np.abs(covariance) @ np.abs(slope)):
+            raise UndeterminedError(
+                f"the standard error of {name} is lost in the rounding of those of "
+                f"{', '.join(self.names)}, which are many times as large: fix one of them"
+            )
+        return Combination(name, value, float(np.sqrt(variance)), self.freedom_of(slope))
 
     def bands(self) -> Bands:
         """The same parameters from the lower and from the upper half of the band.

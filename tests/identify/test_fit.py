@@ -1,3 +1,5 @@
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -175,6 +177,14 @@ def test_derived_quantities_carry_the_covariance():
     assert total.standard_error == pytest.approx(by_hand, rel=1e-9)
     assert total.value == pytest.approx(fit.values[1] + fit.values[2], rel=1e-12)
     assert total.standard_error < 0.5 * fit.standard_errors[1]
+
+
+def test_a_variance_that_is_the_rounding_of_others_is_no_error():
+    fit = jq.fit(START, response_of(TRUTH, seed=3))
+    large = 1e14 * np.array([[0, 0, 0], [0, 1, -1 - 1e-14], [0, -1 - 1e-14, 1]])
+    lost = dataclasses.replace(fit, relative_covariance=large)
+    with pytest.raises(jq.identify.UndeterminedError, match="lost in the rounding"):
+        lost.derived(lambda m: m.lag / fit.units[1] + m.delay / fit.units[2], "lag + delay")
 
 
 def test_undamped_gauss_newton_that_diverges_says_so():
