@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import Normal
 from jaxquad.models import sample_rational, TransferFunction
 
+from ._accuracy import row_products
 from ._evaluate import evaluate, Frame, take_apart
 from ._output_error_problem import Evaluation, insert_parameters, OutputError, RecordTerm
 from ._parameters import Numbers
@@ -121,7 +122,7 @@ class FilteredPoint:
     prior_slopes: Float[np.ndarray, "priors parameters"]
     next_to: "FilteredPoint | None" = None  # a point so near that it has the same slopes
 
-    @property
+    @ft.cached_property
     def cost(self) -> float:
         """Half the sum of squares; infinite where something is not finite."""
         parts = [self.prior_misfits, *(one.misfit for one in self.records)]
@@ -332,7 +333,7 @@ def _columns(term: RecordTerm, free: Float[np.ndarray, "motions moving"]) -> Col
     shift = _in_band(term, np.ones(samples))
     seen = free if term.gain is None else _in_band(term, _lengthened(free, samples))
     normal = np.empty((len(seen) + 1,) * 2)
-    normal[0, 0], normal[1:, 1:] = shift @ shift, seen @ seen.T
+    normal[0, 0], normal[1:, 1:] = shift @ shift, row_products(seen)
     normal[0, 1:] = normal[1:, 0] = seen @ shift[: seen.shape[1]]
     square = np.diagonal(normal)
     scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
@@ -357,7 +358,7 @@ def _project_out(
 def _without_columns(rows: Rows, columns: Columns) -> Float[np.ndarray, "parameters parameters"]:
     """Products of the rows' parts orthogonal to the columns."""
     shared = columns.scale[:, None] * columns.products(rows)
-    return rows @ rows.T - shared.T @ np.linalg.solve(columns.normal, shared)
+    return row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
 
 
 def _is_precise(one: Simulated, behind: Float[np.ndarray, " samples"]) -> bool:

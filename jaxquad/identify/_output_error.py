@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import require_x64
+from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
@@ -103,23 +104,28 @@ def refine(
             f"band {band} rad/s and a loop exclude each other: leave the band out, a noise model "
             'weights each frequency by its noise (noise="auto")'
         )
-    _keep_freed_memory(max(one.samples for one in records))
+    longest = max(one.samples for one in records)
+    _keep_freed_memory(longest)
     near = isinstance(model, Fit)
     if isinstance(model, Fit):
         model, free, tied = _continued(model, free, tied)
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
     base = _base(model, parameters, priors)
-    terms = tuple(_term(model, one, hold, band, loop) for one in records)
-    problem = _with_units(OutputError(base, terms, _fixed_zeros(model, parameters)))
     if noise == "auto" and loop is not None:
         noise = AutoRegressive()  # a loop shapes its noise by more poles than a few zeros follow
-    if noise is None:
-        descent = descend_by_turns(problem, max_steps)
-    else:
-        descent = descend_with_noise(problem, noise, max_steps, near=near)
-    check_priors(base, descent.solution)
-    return assess_output_error(descent, records)
+    with one_blas_thread() if longest <= _SHORT else contextlib.nullcontext():
+        terms = tuple(_term(model, one, hold, band, loop) for one in records)
+        problem = _with_units(OutputError(base, terms, _fixed_zeros(model, parameters)))
+        if noise is None:
+            descent = descend_by_turns(problem, max_steps)
+        else:
+            descent = descend_with_noise(problem, noise, max_steps, near=near)
+        check_priors(base, descent.solution)
+        return assess_output_error(descent, records)
+
+
+_SHORT = 200_000  # samples, up to which a second thread of BLAS waits about as long as it works
 
 
 def _checked(record: Record | Sequence[Record], max_steps: int) -> list[Record]:

@@ -137,7 +137,8 @@ def project_records(
         basis = orthonormal(own[0] if len(own) == 1 else np.concatenate(own, axis=2))
         mine = slopes[:, :, : rescale.size] * rescale
         rows, flat = mine.reshape(-1, rescale.size), basis.reshape(-1, basis.shape[2])
-        left = np.reshape(rows - flat @ (flat.T @ rows), mine.shape)
+        # Series are rows in memory: so are their products.
+        left = (rows.T - (rows.T @ flat) @ flat.T).T.reshape(mine.shape)
         projected.append(Projected(np.asarray(misfit), left, basis))
         at += states
     return projected
@@ -148,8 +149,9 @@ def reduced_rows(
 ) -> Reduced:
     """Slopes, misfit, noise and output in one orthonormal basis of the slopes of all records."""
     every = projected[0].slopes.shape[2]
-    stacked = np.concatenate([one.slopes.reshape(-1, every) for one in projected])
-    basis, root = orthogonal_factors(np.concatenate([stacked, np.zeros((every, every))]))
+    stacked = [one.slopes.reshape(-1, every).T for one in projected]
+    stacked = np.concatenate([*stacked, np.zeros((every, every))], axis=1)
+    basis, root = orthogonal_factors(stacked.T)
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
     for one, term in zip(projected, terms, strict=True):
         flat = basis[at : at + one.misfit.size]
