@@ -73,7 +73,7 @@ def euler_from_quaternion(
 
 @jax.custom_jvp
 def _angles(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    return arctan2(y, x)
+    return jnp.asarray(arctan2(y, x))
 
 
 @_angles.defjvp
