@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxquad._xla import sincos
+from jaxquad._xla import arctan2, sincos
 
 
 def euler_rates_matrix(euler: Float[Array, " 3 *ensemble"]) -> Float[Array, " 3 3 *ensemble"]:
@@ -66,13 +66,20 @@ def euler_from_quaternion(
     """ZYX Euler angles in rad of a unit `quaternion`, with a finite gradient at every attitude."""
     w, x, y, z = quaternion
     limit = 1 - jnp.finfo(quaternion.dtype).eps  # arcsin has an infinite slope at 1
-    return jnp.stack(
-        [
-            jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-            jnp.arcsin(jnp.clip(2 * (w * y - z * x), -limit, limit)),
-            jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        ]
-    )
+    sine = jnp.clip(2 * (w * y - z * x), -limit, limit)
+    ahead = [1 - 2 * (x * x + y * y), jnp.sqrt((1 - sine) * (1 + sine)), 1 - 2 * (y * y + z * z)]
+    return _angles(jnp.stack([2 * (w * x + y * z), sine, 2 * (w * z + x * y)]), jnp.stack(ahead))
+
+
+@jax.custom_jvp
+def _angles(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    return jnp.asarray(arctan2(y, x))
+
+
+@_angles.defjvp
+def _angles_jvp(primals, tangents):
+    (y, x), (dy, dx) = primals, tangents
+    return _angles(y, x), (x * dy - y * dx) / (x * x + y * y)
 
 
 def quaternion_derivative(

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+import numpy as np
+from jaxtyping import Array, Int, PyTree
 
 from jaxquad._xla import as_one_kernel, scan_on_device, why_no_device_kernels
 
@@ -186,15 +187,27 @@ def in_chunks(
     """
     theirs, common = eqx.partition(given, own)
     members = jax.tree.leaves(theirs)[0].shape[-1]
-    most = chunk or most_at_once()
-    if members <= most:
+    size = _chunk_size(members, chunk or most_at_once())
+    if members <= size:
         return function(given)
-    number = -(-members // most)
-    size = -(-members // (number * _VECTOR)) * _VECTOR
-    split = jax.tree.map(lambda x: _split(x, -(-members // size), size), theirs)
-    # Within a map nothing can be merged with the forward pass, so no barriers are needed.
+    firsts = np.minimum(np.arange(0, members, size), members - size)  # the last two may overlap
+    few = jax.tree.map(lambda x: _split(x, len(firsts), size), theirs)
+    # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
     run = jax.checkpoint(lambda x: function(eqx.combine(x, common)), prevent_cse=False)
-    return jax.tree.map(lambda x: _joined(x, size, members), jax.lax.map(run, split))
+
+    def put(room: PyTree, now: tuple[Array, PyTree]) -> tuple[PyTree, None]:
+        first, few = now
+        return jax.tree.map(lambda whole, x: _placed(whole, x, first), room, run(few)), None
+
+    shapes = jax.eval_shape(run, jax.tree.map(lambda x: x[0], few))
+    room = jax.tree.map(lambda x: _room(x, size, members), shapes)
+    return jax.lax.scan(put, room, (jnp.asarray(firsts), few))[0]
+
+
+def _chunk_size(members: int, most: int) -> int:
+    """Of equal chunks, whole vectors of members long; all members where they fit one chunk."""
+    number = -(-members // most)
+    return members if number == 1 else -(-members // (number * _VECTOR)) * _VECTOR
 
 
 def most_at_once() -> int:
@@ -203,17 +216,21 @@ def most_at_once() -> int:
 
 
 def _split(x: Array, number: int, size: int) -> Array:
-    """[number, ..., size], the last member repeated where there are too few."""
-    missing = number * size - x.shape[-1]
-    x = jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, axis=-1)], axis=-1)
-    return jnp.moveaxis(x.reshape(*x.shape[:-1], number, size), -2, 0)
+    """[number, ..., size], of which the last are the last of all."""
+    first = x[..., : (number - 1) * size].reshape(*x.shape[:-1], number - 1, size)
+    whole = jnp.concatenate([first, x[..., None, -size:]], axis=-2)
+    return jnp.moveaxis(whole, -2, 0)
 
 
-def _joined(x: Array, size: int, members: int) -> Array:
-    if x.ndim < 2 or x.shape[-1] != size:
+def _room(x: jax.ShapeDtypeStruct, size: int, members: int) -> Array:
+    """For the results of all members: joined at the end, they would be written twice."""
+    if len(x.shape) < 1 or x.shape[-1] != size:
         raise ValueError(
-            f"a result has the shape {x.shape[1:]}, but the {size} members of a chunk belong on "
+            f"a result has the shape {x.shape}, but the {size} members of a chunk belong on "
             "its last axis: return what each member gives, and nothing that they share"
         )
-    x = jnp.moveaxis(x, 0, -2)
-    return x.reshape(*x.shape[:-2], -1)[..., :members]
+    return jnp.zeros((*x.shape[:-1], members), x.dtype)
+
+
+def _placed(whole: Array, part: Array, first: Int[Array, ""]) -> Array:
+    return jax.lax.dynamic_update_slice_in_dim(whole, part, first, whole.ndim - 1)

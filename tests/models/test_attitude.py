@@ -122,6 +122,21 @@ def test_euler_angles_survive_the_quaternion_and_have_a_gradient_everywhere():
     np.testing.assert_allclose(slope[..., 0], 2 * np.eye(3, 4, k=1), atol=1e-15)
 
 
+def test_euler_angles_and_their_slopes_are_those_of_the_arctangent():
+    def written(q):
+        w, x, y, z = q
+        roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return jnp.stack([roll, jnp.arcsin(2 * (w * y - z * x)), yaw])
+
+    quaternion = jax.random.normal(jax.random.key(2), (4, 1000))
+    quaternion = quaternion / jnp.linalg.norm(quaternion, axis=0, keepdims=True)
+    slopes = lambda f: jax.jit(jax.jacfwd(lambda s: f(quaternion * s)))(1.0)
+    back = lambda f: jax.jit(jax.grad(lambda q: jnp.sum(jnp.sin(f(q)))))(quaternion)
+    for of in (lambda f: f(quaternion), slopes, back):
+        np.testing.assert_allclose(of(euler_from_quaternion), of(written), rtol=1e-10, atol=1e-14)
+
+
 def test_a_free_asymmetric_body_keeps_its_angular_momentum_and_energy():
     quaternion, rate = tumble(Attitude(INERTIA), RATE, 0.002)
     assert np.ptp(np.asarray(rate), axis=0).max() > 4  # it does tumble
