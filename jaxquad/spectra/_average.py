@@ -1,11 +1,13 @@
 """Responses, coherence and errors from windowed transforms of one or several window lengths."""
 
+import functools as ft
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._leakage import cross_products, power_of, Rest, Slopes, without_leakage
+from ._leakage import cross_products, find_bias, Fit, power_of, Slopes, without_leakage
 from ._noise_root import noise_root
 
 
@@ -196,6 +198,10 @@ def _fit_spectra(
 _DEPENDENT = 1e-4  # share of an input's power below which it cannot be separated from the others
 
 
+# What leakage adds to the response, relative, and the standard error of that.
+Leakage = Float[np.ndarray, "2 frequencies outputs inputs"]
+
+
 class Averaged(NamedTuple):
     response: Complex[np.ndarray, "frequencies outputs inputs"]
     coherence: Float[np.ndarray, "frequencies outputs inputs"]
@@ -207,7 +213,7 @@ class Averaged(NamedTuple):
     share: Float[np.ndarray, "frequencies outputs inputs groups"]
     noise: Complex[np.ndarray, "frequencies outputs roots"]
     freedom: Float[np.ndarray, "frequencies outputs groups"]  # complex, of each length's noise
-    leakage: Float[np.ndarray, "2 frequencies outputs inputs"]  # relative bias, and its error
+    leakage: Callable[[], Leakage]  # found where it is asked for
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -256,7 +262,7 @@ def average(
         combined.share,
         noise,
         rest.freedom,
-        _leakage(rest, combined, power),
+        ft.partial(_leakage, rest.fits, combined, power),
     )
 
 
@@ -272,13 +278,14 @@ def _effect(
 
 
 def _leakage(
-    rest: Rest, combined: Combined, power: Float[np.ndarray, "frequencies outputs"]
-) -> Float[np.ndarray, "2 frequencies outputs inputs"]:
-    """What leakage adds to the response, relative, and the standard error of that."""
-    bias = np.abs(np.sum(rest.bias * combined.share, axis=3))
-    spread = np.sum(combined.share * np.sqrt(rest.doubt), axis=3)
+    fits: Sequence[Fit], combined: Combined, power: Float[np.ndarray, "frequencies outputs"]
+) -> Leakage:
+    bias, doubt = find_bias(fits, *combined.response.shape[1:])
+    added = np.abs(np.sum(bias * combined.share, axis=3))
+    spread = np.sum(combined.share * np.sqrt(doubt), axis=3)
     error = np.sqrt(power / 2)[:, :, None] * spread
-    return np.stack([bias, error]) / np.abs(combined.response)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([added, error]) / np.abs(combined.response)
 
 
 def _with_placeholders(

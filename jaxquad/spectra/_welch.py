@@ -130,7 +130,7 @@ def _transform_record(
     made = transform_tapers(
         columns, omega * record.dt, layout, tapers, detrend=welch.detrend, origin=float(origin)
     )
-    found, *slopes = ([np.asarray(part) for part in each] for each in made)
+    found, *slopes = made
     n, late = welch.integrators, welch.delay_samples(record)
     if not (n or late):
         return [found, *slopes]
@@ -384,7 +384,7 @@ def _remarks(
     remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     remarks += remarks_on_inputs(omega, found.input_coherence, first.input_names)
-    remarks += remarks_on_leakage(omega, found.leakage, error, names)
+    remarks += remarks_on_leakage(omega, found.leakage(), error, names)
     few = max(independent) < 3
     return remarks + ((Remark(_FEW.format(count=max(independent))),) if few else ())
 
