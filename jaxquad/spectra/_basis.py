@@ -27,6 +27,11 @@ class Basis(NamedTuple):
     slope: float  # coefficient of the ramp of slope 1
     inner: "Basis | None" = None  # that of the shorter blocks, if any
 
+    @property
+    def bands(self) -> tuple[tuple[int, int], ...]:
+        """The functions that each band adds, from the first to before the last."""
+        return tuple(zip((0, *self.ranks[:-1]), self.ranks, strict=True))
+
     def spin(self, angle: Float[np.ndarray, " _"]) -> Complex[np.ndarray, "_ rank"]:
         """Coefficients of exp(j angle n), n from the block's first sample."""
         return _spin(self.inner, self.samples, angle) @ self.weights

@@ -148,8 +148,8 @@ def _level_cost(
     if not level.holds(blocks, starts):
         return np.inf
     ranks = rank(level.many * lattice.block, angle)
-    # To fold a coefficient takes about as long as 20 products.
-    return len(starts) * blocks / level.many * (np.sum(ranks) + 20 * np.max(ranks))
+    # Two tapers, mostly; to fold a coefficient takes about as long as 80 products.
+    return len(starts) * blocks / level.many * (2 * np.sum(ranks) + 80 * np.max(ranks))
 
 
 def _merging_cost(lattice: Lattice, level: Level, angle: Float[np.ndarray, " _"]) -> float:

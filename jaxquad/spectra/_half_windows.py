@@ -6,6 +6,7 @@ mirror images of each other, and the imaginary part their differences: half the 
 blocks of samples that are even and odd themselves, coefficients are folded instead of samples.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -46,23 +47,27 @@ def fold_of(length: int, block: int, trends: int) -> Fold:
 def fold_blocks(
     fold: Fold,
     basis: Basis,
-    coefficients: Float[np.ndarray, "rank channels blocks"],
+    coefficients: Float[np.ndarray, "channels blocks rank"],
     starts: Sequence[int],  # in blocks
     ends: Float[np.ndarray, "2 channels windows"],  # first samples, and those after the last
 ) -> tuple[Columns, Columns]:
-    """Sums and differences of the coefficients of mirrored blocks, with their extras."""
-    rank, channels, _ = coefficients.shape
-    shape, x = (channels, len(starts), rank, fold.blocks), fold.extras
-    sums, differences = (np.empty((*shape[:2], x + rank * fold.blocks)) for _ in range(2))
-    mirrored = coefficients * basis.signs[:, None, None]
+    """Sums and differences of the coefficients of mirrored blocks, with their extras.
+
+    The columns of one band follow those of the bands below, block by block.
+    """
+    channels, _, rank = coefficients.shape
+    width = fold.extras + rank * fold.blocks
+    sums, differences = (np.empty((channels, len(starts), width)) for _ in range(2))
+    mirrored = coefficients * basis.signs
     right = fold.length // basis.samples // 2
     left = right if fold.first else right - 1
-    for run, first, step in _runs(starts):
-        into = (channels, run.stop - run.start, rank, fold.blocks)
-        behind = _windows(coefficients, first + right, step, into, 1)
-        before = _windows(mirrored, first + left, step, into, -1)
-        np.add(behind, before, out=sums[:, run, x:].reshape(into))
-        np.subtract(behind, before, out=differences[:, run, x:].reshape(into))
+    for (run, first, step), (low, high) in itertools.product(_runs(starts), basis.bands):
+        into = (channels, run.stop - run.start, fold.blocks, high - low)
+        behind = _windows(coefficients[:, :, low:high], first + right, step, into, 1)
+        before = _windows(mirrored[:, :, low:high], first + left, step, into, -1)
+        mine = slice(fold.extras + low * fold.blocks, fold.extras + high * fold.blocks)
+        np.add(behind, before, out=sums[:, run, mine].reshape(into))
+        np.subtract(behind, before, out=differences[:, run, mine].reshape(into))
     sums[:, :, 0], differences[:, :, 0] = ends[0] - ends[1], ends[0] + ends[1]
     if fold.trends:
         _find_trends(fold, basis, sums, differences)
@@ -82,17 +87,17 @@ def _runs(starts: Sequence[int]) -> list[tuple[slice, int, int]]:
 
 
 def _windows(
-    coefficients: Float[np.ndarray, "rank channels blocks"],
+    coefficients: Float[np.ndarray, "channels blocks rank"],
     first: int,
     step: int,
     shape: tuple[int, ...],
     direction: int,
-) -> Float[np.ndarray, "channels windows rank half"]:
+) -> Float[np.ndarray, "channels windows half rank"]:
     """A view of the blocks from `first` on, upwards or downwards, in windows."""
-    across, down, along = coefficients.strides
-    strides = (down, step * along, across, direction * along)
+    down, along, across = coefficients.strides
+    strides = (down, step * along, direction * along, across)
     view = np.lib.stride_tricks.as_strided
-    return view(coefficients[:, :, first:], shape, strides, writeable=False)
+    return view(coefficients[:, first:], shape, strides, writeable=False)
 
 
 def _weights(fold: Fold) -> Float[np.ndarray, " blocks"]:
@@ -108,14 +113,17 @@ def _middles(fold: Fold, basis: Basis) -> Float[np.ndarray, " blocks"]:
 
 def _find_trends(fold: Fold, basis: Basis, sums: Columns, differences: Columns) -> None:
     """Fill in the mean of each window and the slope, in units of its trend `_ramp`."""
-    n, x, weights, length = fold.blocks, fold.extras, _weights(fold), fold.length
+    weights, length, size = _weights(fold), fold.length, basis.ranks[0]
+    first = slice(fold.extras, fold.extras + size * fold.blocks, size)
+    second = slice(fold.extras + 1, fold.extras + 1 + size * fold.blocks, size)
     lacking, both = sums[:, :, 0], differences[:, :, 0]
-    total = sums[:, :, x : x + n] @ (basis.level * weights) + lacking / 2
+    total = sums[:, :, first] @ (basis.level * weights) + lacking / 2
     sums[:, :, 1] = differences[:, :, 1] = total / length
     if fold.trends < 2:
         return
-    ramp = np.concatenate([basis.level * weights * _middles(fold, basis), basis.slope * weights])
-    moment = differences[:, :, x : x + 2 * n] @ ramp - length / 4 * both + total / 2
+    moment = differences[:, :, first] @ (basis.level * weights * _middles(fold, basis))
+    moment += differences[:, :, second] @ (basis.slope * weights)
+    moment += total / 2 - length / 4 * both
     sums[:, :, 2] = differences[:, :, 2] = moment * 12 / (length * (length**2 - 1.0))
 
 
@@ -178,10 +186,20 @@ def _with_extras(
     ramp = -n * ends[0] + constant[0] / 2, slant + constant[1] / 2
     return [
         np.concatenate(
-            [np.stack([e, -c, -r][: fold.extras], axis=1), part.reshape(len(angle), -1)], axis=1
+            [np.stack([e, -c, -r][: fold.extras], axis=1), _in_bands(basis, np.swapaxes(part, 1, 2))],
+            axis=1,
         )
         for e, c, r, part in zip(ends, constant, ramp, parts, strict=True)
     ]
+
+
+def _in_bands(
+    basis: Basis, values: Float[np.ndarray, "*many blocks rank"]
+) -> Float[np.ndarray, "*many columns"]:
+    """The values of one band after the other, block by block."""
+    many, rank = values.shape[:-2], values.shape[-1]
+    parts = [values[..., low:high].reshape(*many, -1) for low, high in basis.bands if low < rank]
+    return np.concatenate(parts, axis=-1)
 
 
 def fold_samples(
@@ -200,7 +218,7 @@ def fold_samples(
         blocks = np.lib.stride_tricks.sliding_window_view(samples, basis.samples + 1, axis=2)
         found = blocks[:, :, :: basis.samples] @ basis.weights
         columns = np.zeros((*padded[:2], fold.extras + rank * fold.blocks))
-        columns[:, :, fold.extras :] = np.swapaxes(found, 2, 3).reshape(*padded[:2], -1)
+        columns[:, :, fold.extras :] = _in_bands(basis, found)
         folded.append(columns)
     return folded[0], folded[1]
 

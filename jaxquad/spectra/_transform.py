@@ -27,6 +27,8 @@ from ._window import window
 _SHORT = 128  # samples below which a window is summed directly
 _FULL = 0.7  # functions to a sample of a block, beyond which compression does not pay
 _AT_ONCE = 2**19  # samples of windows that lie anywhere
+_IN_CACHE = 2**16  # samples that are compressed at once
+_THIN = 256  # samples that show a constant well enough
 
 Angles = Float[np.ndarray, " frequencies"]
 Rows = Float[np.ndarray, "channels samples"]
@@ -218,72 +220,91 @@ def transform_tapers(
     plan = plan_transform(len(signals[0]), angles, windows, tapers, detrend)
     source = _Source(plan, signals, detrend)
     phase = np.exp(-1j * origin * plan.angle)[:, None] if origin else None
-    found = [[] for _ in tapers]
+    found = _empty_sums(plan, tapers)
     for number, turn in enumerate(plan.turns):
-        sums = _window_sums(plan, source, number, tapers)
-        turned = turn if phase is None else turn * phase
-        for mine, part in zip([f for f, t in zip(found, tapers) if t.first <= number], sums):
-            part *= turned[:, None]
-            part = part if plan.order is None else part[plan.order]
-            mine.append(np.swapaxes(part, 1, 2))
-    return found
+        mine = [k for k, each in enumerate(tapers) if each.first <= number]
+        sums = [found[k][number - tapers[k].first] for k in mine]
+        _fill_window_sums(plan, source, number, [tapers[k] for k in mine], sums)
+        for each in sums:
+            each *= (turn if phase is None else turn * phase)[:, None]
+    if plan.order is not None:
+        found = [[each[plan.order] for each in mine] for mine in found]
+    return [[np.swapaxes(each, 1, 2) for each in mine] for mine in found]
+
+
+_PAGES = 2**18  # complex numbers, from which on NumPy asks for large pages
+
+
+def _empty_sums(
+    plan: Plan, tapers: Sequence[Taper]
+) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
+    """Room for the sums of all windows, in one piece: memory in small pages takes as long to get
+    as half of the products."""
+    counts = [len(starts) for _, starts in plan.windows]
+    sizes = [(each.channels, many) for each in tapers for many in counts[each.first :]]
+    ends = np.cumsum([plan.angle.size * channels * many for channels, many in sizes])
+    room = np.empty(max(int(ends[-1]), min(_PAGES, 2 * int(ends[-1]))), complex)
+    parts = [
+        part.reshape(plan.angle.size, *size)
+        for part, size in zip(np.split(room[: ends[-1]], ends[:-1]), sizes, strict=True)
+    ]
+    return [[parts.pop(0) for _ in counts[each.first :]] for each in tapers]
 
 
 class _Source:
     """The samples of a record less a constant, and the coefficients of its blocks."""
 
     def __init__(self, plan: Plan, signals: Sequence[np.ndarray], detrend: str):
+        self._plan, self._detrend = plan, detrend
         self._columns = [np.asarray(each, float).T for each in signals]
-        # No trend is left of a constant, but its rounding errors would be.
-        thin = max(len(signals[0]) // 2048, 1)
-        keep = detrend == "none"
-        self._levels = [
-            np.zeros((len(each), 1)) if keep else np.mean(each[:, ::thin], axis=1, keepdims=True)
-            for each in self._columns
-        ]
-        self.detrend, self.channels = detrend, sum(map(len, self._columns))
-        self._plan = plan
+        self._levels = [_constant(each, detrend) for each in self._columns]
+        ends = np.cumsum([0, *map(len, self._columns)]).tolist()
+        self.channels, self._places = ends[-1], list(map(slice, ends[:-1], ends[1:]))
+
+    def _samples(self, where: slice, into: np.ndarray | None = None) -> np.ndarray:
+        """Those samples of all channels."""
+        views = [columns[:, where] for columns in self._columns]
+        if into is None:
+            into = np.empty((self.channels, views[0].shape[1]))
+        shape = into.shape[1:]
+        for place, view, level in zip(self._places, views, self._levels, strict=True):
+            constant = level.reshape(-1, *[1] * len(shape))
+            np.subtract(view.reshape(-1, *shape), constant, out=into[place])
+        return into
 
     @ft.cached_property
     def rows(self) -> Rows:
-        return self._less_levels(np.empty((self.channels, self._columns[0].shape[1])), 0)
-
-    def _less_levels(self, rows: np.ndarray, first: int) -> np.ndarray:
-        """Fill in the samples from `first` on."""
-        begin, shape = 0, rows.shape[1:]
-        size = int(np.prod(shape))
-        for columns, level in zip(self._columns, self._levels, strict=True):
-            part = columns[:, first : first + size].reshape(-1, *shape)
-            level = level.reshape(-1, *[1] * len(shape))
-            np.subtract(part, level, out=rows[begin : begin + len(columns)])
-            begin += len(columns)
-        return rows
+        return self._samples(slice(None))
 
     @ft.cached_property
-    def blocks(self) -> Float[np.ndarray, "channels blocks places"]:
-        """Blocks of samples, from one to another; a sample after the record's last is 0."""
+    def _posts(self) -> Float[np.ndarray, "channels ends"]:
+        """The samples where blocks begin, and that after the last block: 0 where there is none."""
         block, offset, count = self._plan.lattice
-        blocks = np.empty((self.channels, count, block + 1))
-        self._less_levels(blocks[:, :, :-1], offset)
-        blocks[:, :-1, -1], blocks[:, -1, -1] = blocks[:, 1:, 0], 0.0
-        after, begin = offset + block * count, 0
-        if after < self._columns[0].shape[1]:
-            for columns, level in zip(self._columns, self._levels, strict=True):
-                blocks[begin : begin + len(columns), -1, -1] = columns[:, after] - level[:, 0]
-                begin += len(columns)
-        return blocks
+        found = self._samples(slice(offset, offset + count * block + 1, block))
+        return np.pad(found, ((0, 0), (0, count + 1 - found.shape[1])))
 
     @ft.cached_property
-    def _coefficients(self) -> list[Float[np.ndarray, "rank channels blocks"]]:
-        plan, blocks = self._plan, self.blocks
-        flat = plan.bases[0].weights.T @ blocks.reshape(-1, blocks.shape[2]).T
-        found = [flat.reshape(-1, *blocks.shape[:2])]
+    def _coefficients(self) -> list[Float[np.ndarray, "channels blocks rank"]]:
+        plan = self._plan
+        found = [self._compressed(plan.bases[0])]
         for level, basis in zip(plan.levels[1:], plan.bases[1:], strict=True):
-            used = found[0][:, :, level.offset :]
-            count = used.shape[2] // level.many
-            apart = used[:, :, : count * level.many].reshape(*used.shape[:2], count, level.many)
-            flat = np.moveaxis(apart, 3, 0).reshape(-1, used.shape[1] * count)
-            found.append((basis.weights.T @ flat).reshape(-1, used.shape[1], count))
+            used = found[0][:, level.offset :]
+            count = used.shape[1] // level.many
+            together = used[:, : count * level.many].reshape(len(used), count, -1)
+            found.append(_products(together, basis))
+        return found
+
+    def _compressed(self, basis: Basis) -> Float[np.ndarray, "channels blocks rank"]:
+        """Block by block, a few at once, so that they stay in the processor's cache."""
+        block, offset, count = self._plan.lattice
+        posts, many = self._posts, max(_IN_CACHE // (block * self.channels), 1)
+        found = np.empty((self.channels, count, basis.signs.size))
+        for begin in range(0, count, many):
+            end = min(begin + many, count)
+            few = np.empty((self.channels, end - begin, block + 1))
+            self._samples(slice(offset + begin * block, offset + end * block), few[:, :, :-1])
+            few[:, :, -1] = posts[:, begin + 1 : end + 1]
+            found[:, begin:end] = _products(few, basis)
         return found
 
     def folded(self, part: Part) -> Iterator[tuple[np.ndarray, Columns, Columns]]:
@@ -299,11 +320,6 @@ class _Source:
         for few, segments in self.segments(part.fold.length, part.starts):
             yield part.places[few], *fold_samples(part.fold, plan.bases[0], segments)
 
-    @ft.cached_property
-    def _posts(self) -> Float[np.ndarray, "channels ends"]:
-        """The samples where blocks begin, and that after the last block."""
-        return np.concatenate([self.blocks[:, :, 0], self.blocks[:, -1:, -1]], axis=1)
-
     def segments(
         self, length: int, starts: Sequence[int]
     ) -> Iterator[tuple[slice, Float[np.ndarray, "channels windows samples"]]]:
@@ -312,7 +328,24 @@ class _Source:
         many = max(_AT_ONCE // (length * self.channels), 1)
         for begin in range(0, len(starts), many):
             few = slice(begin, begin + many)
-            yield few, _without_trend(views[:, np.array(starts[few])], self.detrend)
+            yield few, _without_trend(views[:, np.array(starts[few])], self._detrend)
+
+
+def _constant(
+    columns: Float[np.ndarray, "_ samples"], detrend: str
+) -> Float[np.ndarray, " _"]:
+    """Near each channel's mean: no trend is left of it, but its rounding errors would be."""
+    if detrend == "none":
+        return np.zeros(len(columns))
+    return np.mean(columns[:, :: max(columns.shape[1] // _THIN, 1)], axis=1)
+
+
+def _products(
+    blocks: Float[np.ndarray, "channels blocks places"], basis: Basis
+) -> Float[np.ndarray, "channels blocks rank"]:
+    # A product with few rows is quicker than one with few columns.
+    flat = basis.weights.T @ blocks.reshape(-1, blocks.shape[2]).T
+    return np.ascontiguousarray(flat.T).reshape(*blocks.shape[:2], -1)
 
 
 def _without_trend(
@@ -327,17 +360,19 @@ def _without_trend(
     return segments
 
 
-def _window_sums(
-    plan: Plan, source: _Source, number: int, tapers: Sequence[Taper]
-) -> list[Complex[np.ndarray, "frequencies channels windows"]]:
+def _fill_window_sums(
+    plan: Plan,
+    source: _Source,
+    number: int,
+    tapers: Sequence[Taper],
+    sums: Sequence[Complex[np.ndarray, "frequencies _ windows"]],
+) -> None:
     """Those of one length behind each taper, with phases from the middle of a window."""
     length, starts = plan.windows[number]
-    mine = [each for each in tapers if each.first <= number]
-    sums = [np.empty((plan.angle.size, each.channels, len(starts)), complex) for each in mine]
     for part in plan.parts[number]:
         for places, *halves in source.folded(part):
             whole = len(places) == len(starts)
-            for found, tables, taper in zip(sums, part.tables, mine, strict=True):
+            for found, tables, taper in zip(sums, part.tables, tapers, strict=True):
                 into = found if whole else np.empty((*found.shape[:2], len(places)), complex)
                 _apply_tables(tables, [each[: taper.channels] for each in halves], into)
                 if not whole:
@@ -346,10 +381,9 @@ def _window_sums(
     if served < plan.angle.size:
         above = plan.angle[served:]
         for few, segments in source.segments(length, starts):
-            for found, taper in zip(sums, mine, strict=True):
+            for found, taper in zip(sums, tapers, strict=True):
                 tapered = segments[: taper.channels] * window(taper.shape, length)
                 found[served:, :, few] = _fourier_sums(tapered, above)
-    return sums
 
 
 def _apply_tables(
