@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
+_SEEN = 1e-7  # of a residual: the square is below rounding
 _WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well adds nothing
 
 
@@ -57,25 +58,39 @@ def without_leakage(
     response: Complex[np.ndarray, "frequencies outputs inputs"],
     slopes: Sequence[Slopes],
     overlap: Float[np.ndarray, "windows windows"],
+    resolved: Bool[np.ndarray, "groups frequencies"],
 ) -> Rest:
     """Outputs less all that inputs and leakage explain, one window length after the other.
 
-    `windows` are the inputs and the outputs of each length. A length with too few windows for its
+    `windows` are the inputs and the outputs of each length, which is looked at where it is
+    `resolved`: from a frequency on, and the first everywhere. A length with too few windows for its
     leakage keeps it, as noise; its slopes do not matter.
     """
     found, first = [], 0
-    for given, derived in zip(windows, slopes, strict=True):
-        x, y, once, twice = (np.swapaxes(each, 1, 2) for each in (*given, *derived))
+    for given, derived, known in zip(windows, slopes, resolved, strict=True):
+        # What a window does not resolve lies below what it does, and has no weight.
+        few = slice(int(np.argmax(known)), None)
+        x, y, once, twice = (np.swapaxes(each[few], 1, 2) for each in (*given, *derived))
         inputs, count = x.shape[1:]
-        columns, both = x, y - response @ x
+        columns, both = x, y - response[few] @ x
         if shows_leakage(count, inputs):
             columns = np.concatenate([x, once[:, :inputs], twice], axis=1)
             both = np.concatenate([both, once[:, inputs:]], axis=1)
         mine = slice(first, first + count)
-        found.append(_least_squares(both, np.ascontiguousarray(columns), y.shape[1], overlap[mine, mine]))
+        columns = np.ascontiguousarray(columns)
+        found.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
         first += count
     *parts, fits = zip(*found, strict=True)
-    return Rest(*(np.stack(each, axis=-1) for each in parts), fits)
+    products, trace, freedom = (_padded(each, len(response)) for each in parts)
+    return Rest(products, np.where(trace > 0, trace, 1.0), np.maximum(freedom, 0.5), fits)
+
+
+def _padded(parts: Sequence[np.ndarray], frequencies: int) -> np.ndarray:
+    """Side by side, with zeros at the lowest frequencies that some lack."""
+    whole = np.zeros((frequencies, *parts[0].shape[1:], len(parts)), parts[0].dtype)
+    for k, part in enumerate(parts):
+        whole[frequencies - len(part) :, ..., k] = part
+    return whole
 
 
 def _least_squares(
@@ -89,18 +104,19 @@ def _least_squares(
     With P = P0 - q q^H the projection, P0 that of the common columns A, and O the overlap: the
     trace of P O, the degrees of freedom tr(P O)^2 / tr(P O P O).
     """
-    left, own = both[:, :outputs], both[:, outputs:]
+    own = both[:, outputs:]
     adjoint, across = np.conj(columns), np.swapaxes(columns, 1, 2)
-    solver = _solver(adjoint @ across)
+    gram = adjoint @ across
+    solver = _solver(gram)
     fitted = solver @ (adjoint @ np.swapaxes(both, 1, 2))
     rest = both - np.swapaxes(fitted, 1, 2) @ columns
-    # Once more, for the rounding of nearly dependent columns.
-    rest -= np.swapaxes(solver @ (adjoint @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
+    if _shows_rounding(gram, solver, both, rest):
+        rest -= np.swapaxes(solver @ (adjoint @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
     rest, q = rest[:, :outputs], np.ascontiguousarray(rest[:, outputs:])
     length, whole = (np.sqrt(_inner(part, part)) for part in (q, own))
     inverse = np.where(length > _WITHIN * whole, 1 / np.maximum(length, 1e-300), 0.0)
     q *= inverse[:, :, None]
-    along = np.vecdot(q, left[:, : q.shape[1]])
+    along = np.vecdot(q, rest[:, : q.shape[1]])
     if q.shape[1]:
         rest = rest - q * along[:, :, None]
     seen = _Seen.of(adjoint, columns, q, overlap)
@@ -117,6 +133,16 @@ def _solver(gram: Gram) -> Gram:
     inverse = 1 / np.maximum(np.sqrt(power), 1e-100)
     units = inverse[:, :, None] * inverse[:, None, :]
     return np.linalg.inv(gram * units + _RIDGE * np.eye(gram.shape[1])) * units
+
+
+def _shows_rounding(gram: Gram, solver: Gram, both: Rows, rest: Rows) -> bool:
+    """Whether nearly dependent columns leave a part of themselves in what is left.
+
+    It is orthogonal to all else, so its square counts.
+    """
+    least = np.real(np.diagonal(solver, axis1=1, axis2=2) * np.diagonal(gram, axis1=1, axis2=2))
+    part = 2e-16 * np.max(least, axis=1, keepdims=True) * np.sqrt(_inner(both, both))
+    return bool(np.any(part > _SEEN * np.sqrt(_inner(rest, rest))))
 
 
 class _Seen(NamedTuple):
@@ -195,7 +221,8 @@ def find_bias(
 ) -> tuple[Biases, Float[np.ndarray, "frequencies outputs inputs groups"]]:
     """What leakage adds to the response of each length, and its mean square under unit noise."""
     found = [_bias(fit, outputs, inputs) for fit in fits]
-    bias, doubt = (np.stack(each, axis=-1) for each in zip(*found, strict=True))
+    frequencies = max(len(fit.solver) for fit in fits)
+    bias, doubt = (_padded(each, frequencies) for each in zip(*found, strict=True))
     return bias, doubt
 
 
