@@ -42,7 +42,7 @@ def sample_basis(samples: int, angles: Sequence[float]) -> Basis:
     root = np.ones(samples + 1)
     root[[0, -1]] = np.sqrt(0.5)
     ramp = root * (np.arange(samples + 1) - samples / 2)
-    return _nested(None, samples, (root, ramp), np.ones(samples + 1), root, angles)
+    return _nested(None, samples, (root, ramp), np.ones((samples + 1, 1)), root, angles)
 
 
 def merged_basis(inner: Basis, many: int, angles: Sequence[float]) -> Basis:
@@ -71,22 +71,26 @@ def _nested(
     inner: Basis | None,
     samples: int,
     trends: tuple[Float[np.ndarray, " places"], Float[np.ndarray, " places"]],
-    signs: Float[np.ndarray, "along *across"],  # of the places, which mirror each other along it
+    signs: Float[np.ndarray, "along across"],  # of the places, which mirror each other along it
     root: Float[np.ndarray, " places"],
     angles: Sequence[float],
 ) -> Basis:
     """Orthonormal functions of one band after the other, even and odd ones apart."""
     norms = [float(np.linalg.norm(trend)) for trend in trends]
     halves = [_half(signs, sign) for sign in (1.0, -1.0)]
-    both = [half.T @ trend[:, None] / norm for half, trend, norm in zip(halves, trends, norms)]
-    columns, order, ranks = [half @ each for half, each in zip(halves, both)], [1.0, -1.0], []
+    both = [
+        half.T @ trend[:, None] / norm
+        for half, trend, norm in zip(halves, trends, norms, strict=True)
+    ]
+    columns = [half @ each for half, each in zip(halves, both, strict=True)]
+    order, ranks = [1.0, -1.0], []
     for angle in angles:
         nodes = int(angle * samples / 2) + 20  # of one sign: their mirror images add nothing
         grid = angle * np.cos(np.pi / 2 * np.arange(nodes) / nodes)
         middle = np.exp(-0.5j * grid * samples)[:, None]
         waves = (_spin(inner, samples, grid) * middle).T * root[:, None]
-        scale = np.linalg.norm(waves)
-        for k, part in enumerate((waves.real, waves.imag)):
+        scale = float(np.linalg.norm(waves))
+        for k, part in enumerate((np.real(waves), np.imag(waves))):
             new = _beyond(both[k], halves[k].T @ part, scale)
             both[k] = np.concatenate([both[k], new], axis=1)
             columns.append(halves[k] @ new)
@@ -97,7 +101,7 @@ def _nested(
 
 
 def _half(
-    signs: Float[np.ndarray, "along *across"], sign: float
+    signs: Float[np.ndarray, "along across"], sign: float
 ) -> Float[np.ndarray, "places half"]:
     """Orthonormal columns that span what is even (`sign` 1) or odd (-1), to the last digit."""
     number = np.arange(signs.size).reshape(signs.shape)

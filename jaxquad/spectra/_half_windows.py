@@ -128,11 +128,14 @@ def _find_trends(fold: Fold, basis: Basis, sums: Columns, differences: Columns) 
 
 
 class Table(NamedTuple):
-    """What turns the folded windows into their Fourier sums in one band of frequencies."""
+    """What turns the folded windows into their Fourier sums in one band of frequencies.
 
-    of_sums: Float[np.ndarray, "frequencies columns"]
-    of_differences: Float[np.ndarray, "frequencies columns"]
-    odd: bool  # the taper: the sums make the imaginary part
+    The rows of one taper follow those of the other.
+    """
+
+    of_sums: Float[np.ndarray, "rows columns"]
+    of_differences: Float[np.ndarray, "rows columns"]
+    odd: tuple[bool, ...]  # of each taper: the sums make the imaginary part
 
 
 def make_tables(
@@ -140,23 +143,24 @@ def make_tables(
     basis: Basis,
     bands: Sequence[Float[np.ndarray, " _"]],
     shapes: Sequence[str],
-) -> list[list[Table]]:
-    """One table to a band, for each taper. Phases count from the middle of a window."""
-    found = [[] for _ in shapes]
-    shift = 2 * np.pi / fold.length
+) -> tuple[Table, ...]:
+    """One table to a band, for all tapers. Phases count from the middle of a window."""
+    shift, found = 2 * np.pi / fold.length, []
     for angle, size in zip(bands, basis.ranks, strict=True):
-        grids = angle, angle + shift, angle - shift
+        grids, rows, odd = (angle, angle + shift, angle - shift), [], []
         plain, above, below = (_spins(fold, basis, each, size) for each in grids)
-        for mine, shape in zip(found, shapes, strict=True):
+        for shape in shapes:
             level, cosine, sine = waves(shape)  # about the first sample, where the angle is -pi
             raised = level * plain + cosine / 2 * (above + below)
             parts = np.real(raised), -np.imag(raised)
             if sine:  # cos(w n) sin(d n), which is odd, and sin(w n) sin(d n)
                 raised = sine / 2 * (above - below)
                 parts = np.real(raised), np.imag(raised)
-            end = level - cosine
-            mine.append(Table(*_with_extras(fold, basis, angle, parts, end), bool(sine)))
-    return found
+            rows.append(_with_extras(fold, basis, angle, parts, level - cosine))
+            odd.append(bool(sine))
+        of_sums, of_differences = (np.concatenate(each) for each in zip(*rows, strict=True))
+        found.append(Table(of_sums, of_differences, tuple(odd)))
+    return tuple(found)
 
 
 def _spins(
@@ -186,7 +190,10 @@ def _with_extras(
     ramp = -n * ends[0] + constant[0] / 2, slant + constant[1] / 2
     return [
         np.concatenate(
-            [np.stack([e, -c, -r][: fold.extras], axis=1), _in_bands(basis, np.swapaxes(part, 1, 2))],
+            [
+                np.stack([e, -c, -r][: fold.extras], axis=1),
+                _in_bands(basis, np.swapaxes(part, 1, 2)),
+            ],
             axis=1,
         )
         for e, c, r, part in zip(ends, constant, ramp, parts, strict=True)

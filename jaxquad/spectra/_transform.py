@@ -1,6 +1,7 @@
 """Fourier sums of tapered windows of several lengths, in NumPy: nothing is compiled."""
 
 import functools as ft
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from ._window import window
 
 _SHORT = 128  # samples below which a window is summed directly
 _FULL = 0.7  # functions to a sample of a block, beyond which compression does not pay
-_AT_ONCE = 2**19  # samples of windows that lie anywhere
+_AT_ONCE = 2**17  # samples of windows that lie anywhere
 _IN_CACHE = 2**16  # samples that are compressed at once
 _THIN = 256  # samples that show a constant well enough
 
@@ -43,6 +44,16 @@ class Taper(NamedTuple):
     first: int = 0
 
 
+def _present(tapers: Sequence[Taper], number: int) -> list[Taper]:
+    """Those that act on the windows of this number."""
+    return [each for each in tapers if each.first <= number]
+
+
+def _alike(tapers: Sequence[Taper]) -> list[list[Taper]]:
+    """Neighbours that act on the same channels: they share products."""
+    return [list(few) for _, few in itertools.groupby(tapers, key=lambda each: each.channels)]
+
+
 class Part(NamedTuple):
     """Windows of one length that are folded in the same way, with the tables of each taper."""
 
@@ -50,7 +61,7 @@ class Part(NamedTuple):
     fold: Fold
     level: int | None  # of the blocks that they are made of, if any
     starts: tuple[int, ...]  # in these blocks, or in samples
-    tables: tuple[tuple[Table, ...], ...]  # one to a band, for each taper
+    tables: tuple[tuple[Table, ...], ...]  # one to a band, for each set of `_alike` tapers
 
 
 class Plan(NamedTuple):
@@ -127,7 +138,9 @@ def _spread(windows: Windows) -> float:
     return 2 * np.pi / min((n for n, _ in windows if n >= _SHORT), default=1)
 
 
-def _bands(samples: int, omega: Angles, windows: Windows) -> tuple[Lattice, list[Float[np.ndarray, " _"]]]:
+def _bands(
+    samples: int, omega: Angles, windows: Windows
+) -> tuple[Lattice, list[Float[np.ndarray, " _"]]]:
     """Blocks of samples, and bands of the frequencies that compression serves."""
     long = [each for each in windows if each[0] >= _SHORT]
     if not long:
@@ -154,24 +167,26 @@ def _parts(
     length, starts = windows
     if length < _SHORT or not bands:
         return ()
-    shapes = [each.shape for each in tapers if each.first <= number]
+    shapes = [[each.shape for each in few] for few in _alike(_present(tapers, number))]
     on = np.array([lattice.holds(length, start) for start in starts])
     parts, where = [], np.flatnonzero(on)
     if where.size:
         blocks = [(starts[k] - lattice.offset) // lattice.block for k in where]
-        fitting = [k for k, each in enumerate(levels) if each.holds(length // lattice.block, blocks)]
+        fitting = [
+            k for k, each in enumerate(levels) if each.holds(length // lattice.block, blocks)
+        ]
         most = max(fitting, key=lambda k: levels[k].many)
         mine, basis = levels[most], bases[most]
         fold = fold_of(length, basis.samples, trends)
         first = tuple((block - mine.offset) // mine.many for block in blocks)
-        tables = make_tables(fold, basis, bands, shapes)
-        parts.append(Part(where, fold, most, first, tuple(map(tuple, tables))))
+        tables = tuple(make_tables(fold, basis, bands, few) for few in shapes)
+        parts.append(Part(where, fold, most, first, tables))
     astray = np.flatnonzero(~on)
     if astray.size:
         fold = fold_anywhere(length, lattice.block, trends)
-        tables = make_tables(fold, bases[0], bands, shapes)
+        tables = tuple(make_tables(fold, bases[0], bands, few) for few in shapes)
         first = tuple(starts[k] for k in astray)
-        parts.append(Part(astray, fold, None, first, tuple(map(tuple, tables))))
+        parts.append(Part(astray, fold, None, first, tables))
     return tuple(parts)
 
 
@@ -331,9 +346,7 @@ class _Source:
             yield few, _without_trend(views[:, np.array(starts[few])], self._detrend)
 
 
-def _constant(
-    columns: Float[np.ndarray, "_ samples"], detrend: str
-) -> Float[np.ndarray, " _"]:
+def _constant(columns: Float[np.ndarray, "_ samples"], detrend: str) -> Float[np.ndarray, " _"]:
     """Near each channel's mean: no trend is left of it, but its rounding errors would be."""
     if detrend == "none":
         return np.zeros(len(columns))
@@ -372,11 +385,16 @@ def _fill_window_sums(
     for part in plan.parts[number]:
         for places, *halves in source.folded(part):
             whole = len(places) == len(starts)
-            for found, tables, taper in zip(sums, part.tables, tapers, strict=True):
-                into = found if whole else np.empty((*found.shape[:2], len(places)), complex)
-                _apply_tables(tables, [each[: taper.channels] for each in halves], into)
-                if not whole:
-                    found[:, :, places] = into
+            made = sums
+            if not whole:
+                made = [np.empty((*each.shape[:2], len(places)), complex) for each in sums]
+            rest = iter(made)
+            for tables, few in zip(part.tables, _alike(tapers), strict=True):
+                mine = [each[: few[0].channels] for each in halves]
+                _apply_tables(tables, mine, [next(rest) for _ in few])
+            if not whole:
+                for found, each in zip(sums, made, strict=True):
+                    found[:, :, places] = each
     served = sum(map(len, plan.bands)) if plan.parts[number] else 0
     if served < plan.angle.size:
         above = plan.angle[served:]
@@ -389,19 +407,19 @@ def _fill_window_sums(
 def _apply_tables(
     tables: Sequence[Table],
     halves: Sequence[Columns],
-    into: Complex[np.ndarray, "frequencies channels windows"],
+    into: Sequence[Complex[np.ndarray, "frequencies channels windows"]],
 ) -> None:
     channels, windows, _ = halves[0].shape
     flat, begin = [each.reshape(channels * windows, -1) for each in halves], 0
     for table in tables:
-        end = begin + len(table.of_sums)
-        real, imag = (
-            (own @ part[:, : own.shape[1]].T).reshape(-1, channels, windows)
+        end = begin + len(table.of_sums) // len(into)
+        parts = (
+            (own @ part[:, : own.shape[1]].T).reshape(len(into), -1, channels, windows)
             for own, part in zip(table[:2], flat, strict=True)
         )
-        if table.odd:
-            real, imag = imag, real
-        into.real[begin:end], into.imag[begin:end] = real, imag
+        for each, odd, sums, differences in zip(into, table.odd, *parts, strict=True):
+            each.real[begin:end] = differences if odd else sums
+            each.imag[begin:end] = sums if odd else differences
         begin = end
 
 
@@ -416,6 +434,6 @@ def _fourier_sums(
     inner = np.exp(-1j * np.arange(block)[:, None] * angle)
     outer = np.exp(-1j * (np.arange(count)[:, None] * block - length / 2) * angle)
     # Real factors: a product of a real with a complex array would double the arithmetic.
-    parts = padded.reshape(-1, block) @ np.concatenate([inner.real, inner.imag], axis=1)
+    parts = padded.reshape(-1, block) @ np.hstack([np.real(inner), np.imag(inner)])
     real, imag = np.split(parts.reshape(*many, count, -1), 2, axis=3)
     return np.einsum("cwbf,bf->fcw", real + 1j * imag, outer)

@@ -286,7 +286,9 @@ def average_windows(
     method: Method,
 ) -> FrequencyResponse:
     """Response by averages over tapered windows of one or several lengths."""
-    members = (spectra,) if isinstance(spectra, Welch) else Composite.windowed(spectra, records, omega)
+    members = (
+        (spectra,) if isinstance(spectra, Welch) else Composite.windowed(spectra, records, omega)
+    )
     omega = frequencies_for(omega, records, members[0])
     segments = transform_records(records, omega, members, derivatives=2)
     channels = _channels(records[0], method)
