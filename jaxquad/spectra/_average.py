@@ -1,11 +1,13 @@
 """Responses, coherence and errors from windowed transforms of one or several window lengths."""
 
+import functools as ft
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._leakage import cross_products, power_of, Rest, Slopes, without_leakage
+from ._leakage import cross_products, find_bias, Fit, power_of, Slopes, without_leakage
 from ._noise_root import noise_root
 
 
@@ -60,10 +62,7 @@ def condition(
     from_z = products[:, :, z]
     solver = _inverse(from_z[..., x], size[..., z], size[..., x])
     response = np.swapaxes(solver @ from_z[..., y], 2, 3)
-    # The inverse power of what the instruments move of the inputs.
-    inverted = solver @ from_z[..., z] @ np.conj(np.swapaxes(solver, 2, 3))
-    least = np.maximum(_diagonal(inverted), _TINY)
-    moving = _inverse(inverted, np.sqrt(least), np.sqrt(least))
+    least, moving = _moving(solver, from_z, channels)
     explained = np.sum(np.conj(response) * (response @ np.swapaxes(moving, 2, 3)), axis=3).real
     total = whole[..., y]
     own = power_of(response) / least[:, :, None]
@@ -80,6 +79,23 @@ def condition(
         np.minimum(_diagonal(moving) / np.maximum(whole[..., x], _TINY), 1.0),
         np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0),
     )
+
+
+def _moving(
+    solver: Complex[np.ndarray, "groups frequencies inputs inputs"],
+    from_z: Complex[np.ndarray, "groups frequencies inputs channels"],
+    channels: Channels,
+) -> tuple[
+    Float[np.ndarray, "groups frequencies inputs"],
+    Complex[np.ndarray, "groups frequencies inputs inputs"],
+]:
+    """What the instruments move of the inputs, after the diagonal of its inverse."""
+    z, x, _ = channels.split(np.arange(from_z.shape[-1]))
+    if not channels.instruments:  # Rounding may make what is singular negative.
+        return np.maximum(np.abs(_diagonal(solver)), _TINY), from_z[..., x]
+    inverted = solver @ from_z[..., z] @ np.conj(np.swapaxes(solver, 2, 3))
+    least = np.maximum(_diagonal(inverted), _TINY)
+    return least, _inverse(inverted, np.sqrt(least), np.sqrt(least))
 
 
 def _inverse(
@@ -196,6 +212,10 @@ def _fit_spectra(
 _DEPENDENT = 1e-4  # share of an input's power below which it cannot be separated from the others
 
 
+# What leakage adds to the response, relative, and the standard error of that.
+Leakage = Float[np.ndarray, "2 frequencies outputs inputs"]
+
+
 class Averaged(NamedTuple):
     response: Complex[np.ndarray, "frequencies outputs inputs"]
     coherence: Float[np.ndarray, "frequencies outputs inputs"]
@@ -207,7 +227,7 @@ class Averaged(NamedTuple):
     share: Float[np.ndarray, "frequencies outputs inputs groups"]
     noise: Complex[np.ndarray, "frequencies outputs roots"]
     freedom: Float[np.ndarray, "frequencies outputs groups"]  # complex, of each length's noise
-    leakage: Float[np.ndarray, "2 frequencies outputs inputs"]  # relative bias, and its error
+    leakage: Callable[[], Leakage]  # found where it is asked for
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
@@ -232,12 +252,12 @@ def average(
     combined = combine(parts, scales, averages, resolved) if len(many) > 1 else single_length(parts)
     own_share = np.einsum("fig,gfi->fi", np.mean(combined.share, axis=1), parts.own_share)
     lost = ~(own_share >= _DEPENDENT)
-    parts, combined = _with_placeholders(np.any(lost, axis=1), parts, combined)
+    parts, combined = _with_placeholders(np.any(lost, axis=1), parts, combined, resolved)
     effect = _effect(parts.solver, transforms, channels)
     first = np.cumsum((0, *many[:-1]))
     gain = _unit_noise(effect, combined.share, overlap, first)
     windows = [channels.split(part)[1:] for part in transforms]
-    rest = without_leakage(windows, combined.response, slopes, overlap)
+    rest = without_leakage(windows, combined.response, slopes, overlap, resolved)
     weights = np.mean(combined.share, axis=2)
     trust = np.where(np.any(lost, axis=1), 1e-9, 1.0)[:, None, None]
     outputs = np.moveaxis(channels.split(_diagonal(sums))[2], 0, 2)
@@ -256,7 +276,7 @@ def average(
         combined.share,
         noise,
         rest.freedom,
-        _leakage(rest, combined, power),
+        ft.partial(_leakage, rest.fits, combined, power),
     )
 
 
@@ -272,17 +292,21 @@ def _effect(
 
 
 def _leakage(
-    rest: Rest, combined: Combined, power: Float[np.ndarray, "frequencies outputs"]
-) -> Float[np.ndarray, "2 frequencies outputs inputs"]:
-    """What leakage adds to the response, relative, and the standard error of that."""
-    bias = np.abs(np.sum(rest.bias * combined.share, axis=3))
-    spread = np.sum(combined.share * np.sqrt(rest.doubt), axis=3)
+    fits: Sequence[Fit], combined: Combined, power: Float[np.ndarray, "frequencies outputs"]
+) -> Leakage:
+    bias, doubt = find_bias(fits, *combined.response.shape[1:])
+    added = np.abs(np.sum(bias * combined.share, axis=3))
+    spread = np.sum(combined.share * np.sqrt(doubt), axis=3)
     error = np.sqrt(power / 2)[:, :, None] * spread
-    return np.stack([bias, error]) / np.abs(combined.response)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([added, error]) / np.abs(combined.response)
 
 
 def _with_placeholders(
-    lost: Bool[np.ndarray, " frequencies"], parts: Conditioned, combined: Combined
+    lost: Bool[np.ndarray, " frequencies"],
+    parts: Conditioned,
+    combined: Combined,
+    resolved: Bool[np.ndarray, "groups frequencies"],
 ) -> tuple[Conditioned, Combined]:
     """Finite placeholders where inputs cannot be separated; `average` marks them as nan."""
     if not np.any(lost):
@@ -292,7 +316,8 @@ def _with_placeholders(
         solver=np.where(gone, 0.0, parts.solver),
         multiple=np.where(lost[:, None], 0.0, parts.multiple),
     )
-    share = np.where(gone[..., None], 1 / combined.share.shape[-1], combined.share)
+    equal = (resolved / np.sum(resolved, axis=0)).T[:, None, None]
+    share = np.where(gone[..., None], equal, combined.share)
     response = np.where(gone, 1e-300, combined.response)
     return clean, Combined(response, np.where(gone, 0.0, combined.coherence), share)
 

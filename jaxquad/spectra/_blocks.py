@@ -1,18 +1,12 @@
-"""Tables of a two-level Fourier transform, made once on the host in NumPy."""
+"""Blocks of samples that windows of several lengths share, and windows made of whole blocks."""
 
 import functools as ft
 from collections.abc import Sequence
-from itertools import combinations_with_replacement
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
-
-from ._window import waves
-
-
-_TOLERANCE = 6e-14  # of a block's exponentials; leaves 2e-13 of the largest Fourier sum
-_BANDS = 3
+from jaxtyping import Float
 
 
 def rank(block: int, angle: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " _"]:
@@ -27,103 +21,12 @@ def rank(block: int, angle: Float[np.ndarray, " frequencies"]) -> Float[np.ndarr
 def band_edges(ranks: Float[np.ndarray, " frequencies"]) -> tuple[int, ...]:
     """Ends of up to three bands of ascending frequencies, each of which gets its own rank."""
     total = ranks.size
-    splits = [s + (total,) for s in combinations_with_replacement(range(1, total + 1), _BANDS - 1)]
-
-    def cost(ends: tuple[int, ...]) -> float:
-        counts = np.diff((0, *ends))
-        # Each function of a band is copied once a window, which costs about ten frequencies.
-        return sum(ranks[e - 1] * (n + 10) for e, n in zip(ends, counts, strict=True) if n)
-
-    return tuple(sorted(set(min(splits, key=cost))))
-
-
-def nested_basis(
-    block: int, angles: Sequence[float]
-) -> tuple[Float[np.ndarray, "block rank"], tuple[int, ...]]:
-    """Orthonormal columns whose first `ranks[i]` span all exp(-j w n) with |w| <= `angles[i]`.
-
-    The first two are the constant and the ramp.
-    """
-    place = np.arange(block) - (block - 1) / 2
-    basis = np.stack([np.ones(block), place], axis=1)
-    basis /= np.linalg.norm(basis, axis=0)
-    ranks = []
-    for angle in angles:
-        nodes = int(angle * block) + 32
-        grid = angle * np.sin(np.pi / 2 * (np.arange(nodes) + 0.5) / nodes)
-        phase = place[:, None] * grid
-        waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=1)
-        scale = np.linalg.norm(waves)
-        for _ in range(2):
-            waves -= basis @ (basis.T @ waves)
-        new, sizes, _ = np.linalg.svd(waves, full_matrices=False)
-        new = new[:, : min(np.count_nonzero(sizes > _TOLERANCE * scale), block - basis.shape[1])]
-        new -= basis @ (basis.T @ new)
-        basis = np.concatenate([basis, np.linalg.qr(new)[0]], axis=1)
-        ranks.append(basis.shape[1])
-    return basis, tuple(ranks)
-
-
-def window_tables(
-    length: int,
-    shape: str,
-    detrend: str,
-    bands: Sequence[Float[np.ndarray, " _"]],
-    basis: Float[np.ndarray, "block rank"],
-    ranks: Sequence[int],
-) -> list[Float[np.ndarray, "2 frequencies blocks_times_rank"]]:
-    """What turns the compressed blocks of a window into its Fourier sums, one table to a band.
-
-    Real and imaginary parts are separate; the taper and the removal of a trend are included.
-    """
-    tables = []
-    for angle, size in zip(bands, ranks, strict=True):
-        table = _tapered(length, shape, angle, basis[:, :size])
-        table = _without_trend(table, length, detrend, basis[:, :size])
-        flat = table.reshape(angle.size, -1)
-        tables.append(np.stack([np.real(flat), np.imag(flat)]))
-    return tables
-
-
-def _tapered(
-    length: int,
-    shape: str,
-    angle: Float[np.ndarray, " frequencies"],
-    basis: Float[np.ndarray, "block rank"],
-) -> Complex[np.ndarray, "frequencies blocks rank"]:
-    level, cosine, sine = waves(shape)
-    block = basis.shape[0]
-    inner = np.arange(block)
-    spins = np.exp(-1j * angle[:, None] * inner)
-    turn = 2 * np.pi * inner / length
-    weights = np.stack([np.ones(block), np.cos(turn), np.sin(turn)])
-    weighted = np.concatenate([basis * each[:, None] for each in weights], axis=1)
-    products = np.real(spins) @ weighted + 1j * (np.imag(spins) @ weighted)
-    plain, even, odd = np.split(products[:, None, :], 3, axis=2)
-    first = np.arange(0, length, block)
-    theta = (2 * np.pi * first / length)[None, :, None]
-    # cos(theta + turn), so that three products with the basis serve all blocks.
-    raised = level * plain - cosine * (np.cos(theta) * even - np.sin(theta) * odd)
-    raised = raised - sine * (np.sin(theta) * even + np.cos(theta) * odd) if sine else raised
-    return np.exp(-1j * angle[:, None] * first)[:, :, None] * raised
-
-
-def _without_trend(
-    table: Complex[np.ndarray, "frequencies blocks rank"],
-    length: int,
-    detrend: str,
-    basis: Float[np.ndarray, "block rank"],
-) -> Complex[np.ndarray, "frequencies blocks rank"]:
-    """Fourier sums less those of the trend, whose coefficients are linear in the samples too."""
-    shapes = {"none": 0, "constant": 1, "linear": 2}[detrend]
-    blocks, block = table.shape[1], basis.shape[0]
-    sample = np.arange(blocks * block)
-    for trend in (np.ones(sample.size), 2 * sample / (length - 1) - 1)[:shapes]:
-        inside = np.where(sample < length, trend, 0)
-        sums = np.tensordot(table, inside.reshape(blocks, block) @ basis, 2)
-        functional = trend.reshape(blocks, block) @ basis / np.sum(inside**2)
-        table = table - sums[:, None, None] * functional
-    return table
+    first, second = np.triu_indices(total)
+    ends = np.stack([first + 1, second + 1, np.full(first.size, total)])
+    counts = np.diff(ends, axis=0, prepend=0)
+    # Each function of a band is copied once a window, which costs about ten frequencies.
+    cost = np.sum(np.where(counts > 0, ranks[ends - 1] * (counts + 10), 0), axis=0)
+    return tuple(sorted(set(ends[:, np.argmin(cost)].tolist())))
 
 
 _BLOCKS = (32, 1024)  # samples to a block
@@ -178,6 +81,80 @@ def _cost(
         compressed += astray * blocks * lattice.block
         cost += len(starts) * blocks * 2 * np.sum(ranks)
     return cost + compressed * np.max(ranks)
+
+
+class Level(NamedTuple):
+    """So `many` blocks of a lattice taken together, from block `offset` on."""
+
+    many: int
+    offset: int
+
+    def holds(self, blocks: int, starts: Sequence[int]) -> bool:
+        """Whether windows of so many blocks that start there are made of whole ones."""
+        return blocks % self.many == 0 and all((s - self.offset) % self.many == 0 for s in starts)
+
+
+_LEVELS = 2  # of longer blocks, at most
+
+
+def choose_levels(
+    lattice: Lattice,
+    windows: Sequence[tuple[int, tuple[int, ...]]],
+    angle: Float[np.ndarray, " frequencies"],
+) -> tuple[Level, ...]:
+    """The single blocks, and the longer ones that need the fewest multiplications for all windows.
+
+    A long block takes fewer functions to a sample.
+    """
+    groups = []
+    for length, starts in windows:
+        on = [s for s in starts if lattice.holds(length, s)]
+        if on and angle.size:
+            first = [(s - lattice.offset) // lattice.block for s in on]
+            groups.append((length // lattice.block, first))
+    if not groups:
+        return (_SINGLE,)
+    steps = [np.gcd.reduce([blocks, *np.diff(first)]) for blocks, first in groups]
+    found = {
+        Level(many, first[0] % many)
+        for step, (_, first) in zip(steps, groups, strict=True)
+        for many in range(2, step + 1)
+        if step % many == 0
+    }
+    each = {
+        level: np.array([_level_cost(lattice, level, angle, *group) for group in groups])
+        for level in (_SINGLE, *found)
+    }
+    choices = [few for count in range(_LEVELS + 1) for few in combinations(sorted(found), count)]
+
+    def cost(levels: tuple[Level, ...]) -> float:
+        made = sum(_merging_cost(lattice, level, angle) for level in levels)
+        return made + np.sum(np.min([each[level] for level in (_SINGLE, *levels)], axis=0))
+
+    return (_SINGLE, *min(choices, key=cost))
+
+
+_SINGLE = Level(1, 0)
+
+
+def _level_cost(
+    lattice: Lattice,
+    level: Level,
+    angle: Float[np.ndarray, " _"],
+    blocks: int,
+    starts: Sequence[int],
+) -> float:
+    """Real multiplications for each channel, of folded windows."""
+    if not level.holds(blocks, starts):
+        return np.inf
+    ranks = rank(level.many * lattice.block, angle)
+    # Two tapers, mostly; to fold a coefficient takes about as long as 80 products.
+    return len(starts) * blocks / level.many * (2 * np.sum(ranks) + 80 * np.max(ranks))
+
+
+def _merging_cost(lattice: Lattice, level: Level, angle: Float[np.ndarray, " _"]) -> float:
+    one, all_ = (rank(many * lattice.block, angle[-1:])[0] for many in (1, level.many))
+    return lattice.count * one * (all_ + 10)
 
 
 def lattice_windows(

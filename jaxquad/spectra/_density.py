@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float
 
+from jaxquad._core import one_blas_thread
 from jaxquad.records import Record
 
 from ._checks import check_compatible
@@ -45,6 +46,7 @@ class SpectralDensity(eqx.Module):
         return self.names.index(name)
 
 
+@one_blas_thread()
 def spectral_density(
     record: Record | Sequence[Record],
     omega: Float[ArrayLike, " frequencies"] | None = None,

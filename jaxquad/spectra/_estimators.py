@@ -183,7 +183,8 @@ class Composite(eqx.Module):
     ) -> tuple[Welch, ...]:
         """One estimator for each window length, the longest first."""
         lengths = self.windows or self._lengths(records, omega)
-        return tuple(self._welch(length) for length in sorted(lengths, reverse=True))
+        make = self._welch
+        return tuple(make(length) for length in sorted(lengths, reverse=True))
 
     def _lengths(
         self, records: Sequence[Record], omega: Float[ArrayLike, " frequencies"] | None

@@ -11,14 +11,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
+_SEEN = 1e-7  # of a residual: the square is below rounding
 _WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well adds nothing
 
 
-Rows = Complex[np.ndarray, "frequencies windows _"]
+Rows = Complex[np.ndarray, "frequencies _ windows"]
+Gram = Complex[np.ndarray, "frequencies columns columns"]
 
 
 class Slopes(NamedTuple):
@@ -32,15 +34,13 @@ class Rest(NamedTuple):
     """What is left of the outputs' windows, with what noise does there, for each window length.
 
     `products` are the sums of `conj(a) b` of what is left, `trace` is the energy that unit noise
-    leaves, `bias` what the leakage adds to the response, and `doubt` the mean square of its error
-    under unit noise.
+    leaves, and `fits` are those of leakage.
     """
 
     products: Complex[np.ndarray, "frequencies outputs outputs groups"]
     trace: Float[np.ndarray, "frequencies outputs groups"]
     freedom: Float[np.ndarray, "frequencies outputs groups"]  # complex
-    bias: Complex[np.ndarray, "frequencies outputs inputs groups"]
-    doubt: Float[np.ndarray, "frequencies outputs inputs groups"]
+    fits: "tuple[Fit, ...]"
 
 
 def shows_leakage(windows: int, inputs: int) -> bool:
@@ -58,64 +58,76 @@ def without_leakage(
     response: Complex[np.ndarray, "frequencies outputs inputs"],
     slopes: Sequence[Slopes],
     overlap: Float[np.ndarray, "windows windows"],
+    resolved: Bool[np.ndarray, "groups frequencies"],
 ) -> Rest:
     """Outputs less all that inputs and leakage explain, one window length after the other.
 
-    `windows` are the inputs and the outputs of each length. A length with too few windows for its
+    `windows` are the inputs and the outputs of each length, which is looked at where it is
+    `resolved`: from a frequency on, and the first everywhere. A length with too few windows for its
     leakage keeps it, as noise; its slopes do not matter.
     """
-    found, first, gains = [], 0, np.swapaxes(response, 1, 2)
-    for (x, y), (once, twice) in zip(windows, slopes, strict=True):
-        count, inputs = x.shape[1:]
-        columns, own = x, np.zeros_like(y)
+    found, first = [], 0
+    for given, derived, known in zip(windows, slopes, resolved, strict=True):
+        # What a window does not resolve lies below what it does, and has no weight.
+        few = slice(int(np.argmax(known)), None)
+        x, y, once, twice = (np.swapaxes(each[few], 1, 2) for each in (*given, *derived))
+        inputs, count = x.shape[1:]
+        columns, both = x, y - response[few] @ x
         if shows_leakage(count, inputs):
-            columns = np.concatenate([x, once[:, :, :inputs], twice], axis=2)
-            own = once[:, :, inputs:]
+            columns = np.concatenate([x, once[:, :inputs], twice], axis=1)
+            both = np.concatenate([both, once[:, inputs:]], axis=1)
         mine = slice(first, first + count)
-        found.append(_least_squares(y - x @ gains, columns, own, overlap[mine, mine], inputs))
+        columns = np.ascontiguousarray(columns)
+        found.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
         first += count
-    return Rest(*(np.stack(each, axis=-1) for each in zip(*found, strict=True)))
+    *parts, fits = zip(*found, strict=True)
+    products, trace, freedom = (_padded(each, len(response)) for each in parts)
+    return Rest(products, np.where(trace > 0, trace, 1.0), np.maximum(freedom, 0.5), fits)
+
+
+def _padded(parts: Sequence[np.ndarray], frequencies: int) -> np.ndarray:
+    """Side by side, with zeros at the lowest frequencies that some lack."""
+    whole = np.zeros((frequencies, *parts[0].shape[1:], len(parts)), parts[0].dtype)
+    for k, part in enumerate(parts):
+        whole[frequencies - len(part) :, ..., k] = part
+    return whole
 
 
 def _least_squares(
-    left: Complex[np.ndarray, "frequencies windows outputs"],
-    columns: Complex[np.ndarray, "frequencies windows columns"],
-    own: Complex[np.ndarray, "frequencies windows outputs"],
+    both: Rows,
+    columns: Complex[np.ndarray, "frequencies columns windows"],
+    outputs: int,
     overlap: Float[np.ndarray, "windows windows"],
-    inputs: int,
-) -> tuple[np.ndarray, ...]:
-    """`Rest` of one length: each output on columns, the inputs first, and on its `own` column.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, "Fit"]:
+    """`Rest` of one length: each output on the columns, and on its own one behind it in `both`.
 
     With P = P0 - q q^H the projection, P0 that of the common columns A, and O the overlap: the
     trace of P O, the degrees of freedom tr(P O)^2 / tr(P O P O).
     """
-    adjoint = np.conj(np.swapaxes(columns, 1, 2))
-    solver = _solver(adjoint @ columns)
-    both = np.concatenate([left, own], axis=2)
-    fitted = solver @ (adjoint @ both)
-    both -= columns @ fitted
-    both -= columns @ (solver @ (adjoint @ both))  # for the rounding of nearly dependent columns
-    rest, q = np.split(both, 2, axis=2)
+    own = both[:, outputs:]
+    adjoint, across = np.conj(columns), np.swapaxes(columns, 1, 2)
+    gram = adjoint @ across
+    solver = _solver(gram)
+    fitted = solver @ (adjoint @ np.swapaxes(both, 1, 2))
+    rest = both - np.swapaxes(fitted, 1, 2) @ columns
+    if _shows_rounding(gram, solver, both, rest):
+        rest -= np.swapaxes(solver @ (adjoint @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
+    rest, q = rest[:, :outputs], np.ascontiguousarray(rest[:, outputs:])
     length, whole = (np.sqrt(_inner(part, part)) for part in (q, own))
     inverse = np.where(length > _WITHIN * whole, 1 / np.maximum(length, 1e-300), 0.0)
-    q = q * inverse[:, None]
-    along = np.einsum("fwo,fwo->fo", np.conj(q), left)
-    # The response took too much of the inputs: the first coefficients of what is left, less
-    # `through` times those to `own`.
-    taken, through = np.split(np.swapaxes(fitted[:, :inputs], 1, 2), 2, axis=1)
-    through = through * inverse[:, :, None]
+    q *= inverse[:, :, None]
+    along = np.vecdot(q, rest[:, : q.shape[1]])
+    if q.shape[1]:
+        rest = rest - q * along[:, :, None]
     seen = _Seen.of(adjoint, columns, q, overlap)
-    return (
-        cross_products(rest - q * along[:, None]),
-        *_noise_left(solver, seen, overlap),
-        through * along[:, :, None] - taken,
-        _noise_in_rows(solver[:, :inputs], through, seen),
-    )
+    trace, freedom = _noise_left(solver, seen, overlap)
+    if not q.shape[1]:
+        trace, freedom = (np.repeat(each, outputs, axis=1) for each in (trace, freedom))
+    products = np.conj(rest) @ np.swapaxes(rest, 1, 2)
+    return products, trace, freedom, Fit(solver, fitted, inverse, along, seen)
 
 
-def _solver(
-    gram: Complex[np.ndarray, "frequencies columns columns"],
-) -> Complex[np.ndarray, "frequencies columns columns"]:
+def _solver(gram: Gram) -> Gram:
     """The inverse of `gram`, with a ridge relative to the size of the columns."""
     power = np.real(np.diagonal(gram, axis1=1, axis2=2))
     inverse = 1 / np.maximum(np.sqrt(power), 1e-100)
@@ -123,77 +135,109 @@ def _solver(
     return np.linalg.inv(gram * units + _RIDGE * np.eye(gram.shape[1])) * units
 
 
+def _shows_rounding(gram: Gram, solver: Gram, both: Rows, rest: Rows) -> bool:
+    """Whether nearly dependent columns leave a part of themselves in what is left.
+
+    It is orthogonal to all else, so its square counts.
+    """
+    least = np.real(np.diagonal(solver, axis1=1, axis2=2) * np.diagonal(gram, axis1=1, axis2=2))
+    part = 2e-16 * np.max(least, axis=1, keepdims=True) * np.sqrt(_inner(both, both))
+    return bool(np.any(part > _SEEN * np.sqrt(_inner(rest, rest))))
+
+
 class _Seen(NamedTuple):
     """Products with the overlap O of the windows between the columns A and the rests q."""
 
-    aa: Complex[np.ndarray, "frequencies columns columns"]  # A^H O A
-    aa_twice: Complex[np.ndarray, "frequencies columns columns"]  # A^H O O A
-    aq: Complex[np.ndarray, "frequencies columns outputs"]  # A^H O q
-    qq: Float[np.ndarray, "frequencies outputs"]  # q^H O q, of each output
-    qq_twice: Float[np.ndarray, "frequencies outputs"]  # q^H O O q
+    aa: Gram  # A^H O A
+    aa_twice: Gram  # A^H O O A
+    aq: Complex[np.ndarray, "frequencies columns own"]  # A^H O q
+    qq: Float[np.ndarray, "frequencies own"]  # q^H O q, of each output
+    qq_twice: Float[np.ndarray, "frequencies own"]  # q^H O O q
 
     @classmethod
     def of(
         cls,
         adjoint: Complex[np.ndarray, "frequencies columns windows"],
-        columns: Complex[np.ndarray, "frequencies windows columns"],
-        q: Complex[np.ndarray, "frequencies windows outputs"],
+        columns: Complex[np.ndarray, "frequencies columns windows"],
+        q: Complex[np.ndarray, "frequencies own windows"],
         overlap: Float[np.ndarray, "windows windows"],
     ) -> "_Seen":
         a, rest = _weigh(overlap, columns), _weigh(overlap, q)
+        across = np.swapaxes(a, 1, 2)
         return cls(
-            adjoint @ a,
-            np.conj(np.swapaxes(a, 1, 2)) @ a,
-            adjoint @ rest,
+            adjoint @ across,
+            np.conj(a) @ across,
+            adjoint @ np.swapaxes(rest, 1, 2),
             _inner(q, rest),
             _inner(rest, rest),
         )
 
 
-_ROWS = 16  # windows taken at once: few others overlap them
+_FEW = 16  # windows taken at once: few others overlap them
 
 
-def _weigh(
-    overlap: Float[np.ndarray, "windows windows"],
-    columns: Rows,
-) -> Rows:
-    """The overlap of the windows times columns, in real arithmetic and near the diagonal only."""
-    parts = np.ascontiguousarray(columns).view(float)
-    weighed = np.empty_like(parts)
-    for first in range(0, len(overlap), _ROWS):
-        rows = slice(first, first + _ROWS)
-        near = np.flatnonzero(np.any(overlap[rows], axis=0))
+def _weigh(overlap: Float[np.ndarray, "windows windows"], rows: Rows) -> Rows:
+    """Rows times the overlap of the windows, near the diagonal only."""
+    flat = rows.reshape(-1, len(overlap))
+    weighed = np.empty_like(flat)
+    for first in range(0, len(overlap), _FEW):
+        few = slice(first, first + _FEW)
+        near = np.flatnonzero(np.any(overlap[few], axis=0))
         band = slice(near[0], near[-1] + 1)
-        np.matmul(overlap[rows, band], parts[:, band], out=weighed[:, rows])
-    return weighed.view(complex)
-
-
-def _noise_in_rows(
-    to_x: Complex[np.ndarray, "frequencies inputs columns"],
-    through: Complex[np.ndarray, "frequencies outputs inputs"],
-    seen: _Seen,
-) -> Float[np.ndarray, "frequencies outputs inputs"]:
-    """Mean square that unit noise makes in the inputs' coefficients less `through` times q's."""
-    plain = np.real(np.sum((to_x @ seen.aa) * np.conj(to_x), axis=2))
-    crossed = np.swapaxes(to_x @ seen.aq, 1, 2)
-    mixed = 2 * np.real(np.conj(through) * crossed)
-    own = power_of(through) * seen.qq[:, :, None]
-    return np.maximum(plain[:, None] - mixed + own, 0.0)
+        weighed[:, few] = flat[:, band] @ overlap[band, few].astype(complex)
+    return weighed.reshape(rows.shape)
 
 
 def _noise_left(
-    solver: Complex[np.ndarray, "frequencies columns columns"],
-    seen: _Seen,
-    overlap: Float[np.ndarray, "windows windows"],
-) -> tuple[Float[np.ndarray, "frequencies outputs"], Float[np.ndarray, "frequencies outputs"]]:
+    solver: Gram, seen: _Seen, overlap: Float[np.ndarray, "windows windows"]
+) -> tuple[Float[np.ndarray, "frequencies _"], Float[np.ndarray, "frequencies _"]]:
     """Trace and degrees of freedom of unit noise behind the projection."""
     once = solver @ seen.aa
-    left = np.trace(overlap) - np.trace(once, axis1=1, axis2=2).real
+    left = (np.trace(overlap) - np.trace(once, axis1=1, axis2=2).real)[:, None]
     square = np.sum(overlap**2) - 2 * _trace(solver, seen.aa_twice) + _trace(once, once)
-    crossed = seen.qq_twice - np.sum(np.conj(seen.aq) * (solver @ seen.aq), axis=1).real
-    trace = left[:, None] - seen.qq
-    freedom = trace**2 / (square[:, None] - 2 * crossed + seen.qq**2)
-    return trace, np.maximum(freedom, 0.5)
+    square = square[:, None]
+    if seen.qq.shape[1]:
+        crossed = seen.qq_twice - np.sum(np.conj(seen.aq) * (solver @ seen.aq), axis=1).real
+        left = left - seen.qq
+        square = square - 2 * crossed + seen.qq**2
+    return left, np.maximum(left**2 / square, 0.5)
+
+
+class Fit(NamedTuple):
+    """Least squares of the outputs on inputs and leakage in windows of one length."""
+
+    solver: Gram
+    fitted: Complex[np.ndarray, "frequencies columns both"]  # of the outputs, then of their slopes
+    inverse: Float[np.ndarray, "frequencies own"]  # of the size of q
+    along: Complex[np.ndarray, "frequencies own"]  # coefficients of q
+    seen: _Seen
+
+
+Biases = Complex[np.ndarray, "frequencies outputs inputs groups"]
+
+
+def find_bias(
+    fits: Sequence[Fit], outputs: int, inputs: int
+) -> tuple[Biases, Float[np.ndarray, "frequencies outputs inputs groups"]]:
+    """What leakage adds to the response of each length, and its mean square under unit noise."""
+    found = [_bias(fit, outputs, inputs) for fit in fits]
+    frequencies = max(len(fit.solver) for fit in fits)
+    bias, doubt = (_padded(each, frequencies) for each in zip(*found, strict=True))
+    return bias, doubt
+
+
+def _bias(fit: Fit, outputs: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
+    # The response took too much of the inputs: the first coefficients of what is left, less
+    # `through` times those to its own column.
+    taken, through = np.split(np.swapaxes(fit.fitted[:, :inputs], 1, 2), [outputs], axis=1)
+    through, to_x, seen = through * fit.inverse[:, :, None], fit.solver[:, :inputs], fit.seen
+    plain = np.real(np.sum((to_x @ seen.aa) * np.conj(to_x), axis=2))[:, None]
+    if not through.shape[1]:
+        return -taken, np.repeat(np.maximum(plain, 0.0), outputs, axis=1)
+    crossed = np.swapaxes(to_x @ seen.aq, 1, 2)
+    mixed = 2 * np.real(np.conj(through) * crossed)
+    own = power_of(through) * seen.qq[:, :, None]
+    return through * fit.along[:, :, None] - taken, np.maximum(plain - mixed + own, 0.0)
 
 
 def cross_products(
@@ -210,8 +254,7 @@ def power_of(x: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
 
 def _inner(a: Rows, b: Rows) -> Float[np.ndarray, "frequencies _"]:
     """The real part of `conj(a) b`, summed over the windows."""
-    parts = np.einsum("fwp,fwp->fp", a.view(float), b.view(float))
-    return parts[:, ::2] + parts[:, 1::2]
+    return np.vecdot(a.view(float), b.view(float))
 
 
 def _trace(

@@ -1,84 +1,119 @@
+"""Fourier sums of tapered windows of several lengths, in NumPy: nothing is compiled."""
+
 import functools as ft
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from jaxquad._core import require_x64
 
-from ._blocks import band_edges, choose_lattice, Lattice, nested_basis, rank, window_tables
+from ._basis import Basis, merged_basis, sample_basis
+from ._blocks import band_edges, choose_lattice, choose_levels, Lattice, Level, rank
+from ._half_windows import (
+    Columns,
+    Fold,
+    fold_anywhere,
+    fold_blocks,
+    fold_of,
+    fold_samples,
+    make_tables,
+    Table,
+)
 from ._window import window
 
 
 _SHORT = 128  # samples below which a window is summed directly
 _FULL = 0.7  # functions to a sample of a block, beyond which compression does not pay
+_AT_ONCE = 2**17  # samples of windows that lie anywhere
+_IN_CACHE = 2**16  # samples that are compressed at once
+_THIN = 256  # samples that show a constant well enough
+
+Angles = Float[np.ndarray, " frequencies"]
+Rows = Float[np.ndarray, "channels samples"]
+Windows = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts
 
 
-class WindowTables(eqx.Module):
-    """Tables that convert samples to the Fourier sums of all windows of one length."""
+class Taper(NamedTuple):
+    """A window's shape and what it acts on: so many of the channels, windows from `first` on."""
 
-    tables: tuple[Float[Array, "2 _ _"], ...]  # one to a band of the compressed blocks
-    taper: Float[Array, " window"]  # for the frequencies above the bands
-    turn: Complex[Array, "frequencies segments"]  # phase from the record's first sample
-    length: int = eqx.field(static=True)
-    starts: tuple[int, ...] = eqx.field(static=True)
+    shape: str
+    channels: int
+    first: int = 0
 
 
-class Plan(eqx.Module):
+def _present(tapers: Sequence[Taper], number: int) -> list[Taper]:
+    """Those that act on the windows of this number."""
+    return [each for each in tapers if each.first <= number]
+
+
+def _alike(tapers: Sequence[Taper]) -> list[list[Taper]]:
+    """Neighbours that act on the same channels: they share products."""
+    return [list(few) for _, few in itertools.groupby(tapers, key=lambda each: each.channels)]
+
+
+class Part(NamedTuple):
+    """Windows of one length that are folded in the same way, with the tables of each taper."""
+
+    places: Int[np.ndarray, " windows"]  # among the windows of this length
+    fold: Fold
+    level: int | None  # of the blocks that they are made of, if any
+    starts: tuple[int, ...]  # in these blocks, or in samples
+    tables: tuple[tuple[Table, ...], ...]  # one to a band, for each set of `_alike` tapers
+
+
+class Plan(NamedTuple):
     """Tables and layout of a transform; frequencies in ascending order of magnitude."""
 
-    windows: tuple[WindowTables, ...]
-    basis: Float[Array, "block rank"]
-    angle: Float[Array, " frequencies"]  # ascending in magnitude
-    ranks: tuple[int, ...] = eqx.field(static=True)  # of the bands
-    lattice: Lattice = eqx.field(static=True)
-    order: tuple[int, ...] | None = eqx.field(static=True)  # back to the caller's, if it differs
-    detrend: str = eqx.field(static=True)
+    lattice: Lattice
+    levels: tuple[Level, ...]
+    bases: tuple[Basis, ...]  # one for each level, the blocks of samples first
+    windows: Windows
+    parts: tuple[tuple[Part, ...], ...]  # for each length
+    turns: tuple[Complex[np.ndarray, "frequencies windows"], ...]  # phases of their middles
+    angle: Angles
+    bands: tuple[Angles, ...]  # the frequencies that compression serves
+    order: Int[np.ndarray, " frequencies"] | None  # back to the caller's, if it differs
 
 
 @ft.lru_cache(maxsize=12)
 def plan_transform(
     samples: int,
     angle: tuple[float, ...],  # rad per sample
-    windows: tuple[tuple[int, tuple[int, ...]], ...],
-    shape: str,
+    windows: Windows,
+    tapers: tuple[Taper, ...],
     detrend: str,
-    first: int = 0,
 ) -> Plan:
-    """The tables of a transform, cached: they depend on the layout of a record, not on samples.
-
-    Those of the windows from number `first` on, on the blocks of all of them.
-    """
+    """The tables of a transform, cached: they depend on the layout of a record, not on samples."""
     _check(samples, angle, windows, detrend)
     forward = np.argsort(np.abs(angle), kind="stable")
     omega = np.asarray(angle, float)[forward]
-    long = [each for each in windows if each[0] >= _SHORT]
-    lattice = choose_lattice(samples, long, np.abs(omega)) if long else Lattice(1, 0, samples)
-    bands, basis, ranks = _bands(lattice.block, omega, min([n for n, _ in long], default=1))
-    # Arrays made while JAX traces would not outlive the trace, and this plan is kept.
-    with jax.ensure_compile_time_eval():
-        made = tuple(
-            _window(n, starts, shape, detrend, omega, bands if n >= _SHORT else [], basis, ranks)
-            for n, starts in windows[first:]
-        )
-        straight = np.array_equal(forward, np.arange(omega.size))
-        order = None if straight else tuple(int(i) for i in np.argsort(forward))
-        return Plan(
-            made, jax.device_put(basis), jax.device_put(omega), ranks, lattice, order, detrend
-        )  # fmt: skip
+    lattice, bands = _bands(samples, omega, windows)
+    long = [each for each in windows if each[0] >= _SHORT] if bands else []
+    served = np.concatenate(bands) if bands else omega[:0]
+    levels = choose_levels(lattice, long, np.abs(served))
+    reach = [float(np.max(np.abs(band))) + _spread(windows) for band in bands]
+    bases = [sample_basis(lattice.block, reach)] if bands else []
+    bases += [merged_basis(bases[0], level.many, reach) for level in levels[1:]]
+    trends = ("none", "constant", "linear").index(detrend)
+    parts = [
+        _parts(number, each, lattice, levels, bases, bands, trends, tapers)
+        for number, each in enumerate(windows)
+    ]
+    turns = [
+        np.exp(-1j * omega[:, None] * (np.asarray(starts) + length / 2))
+        for length, starts in windows
+    ]
+    straight = np.array_equal(forward, np.arange(omega.size))
+    return Plan(
+        lattice, levels, tuple(bases), windows, tuple(parts), tuple(turns), omega, tuple(bands),
+        None if straight else np.argsort(forward),
+    )  # fmt: skip
 
 
-def _check(
-    samples: int,
-    angle: tuple[float, ...],
-    windows: tuple[tuple[int, tuple[int, ...]], ...],
-    detrend: str,
-) -> None:
+def _check(samples: int, angle: tuple[float, ...], windows: Windows, detrend: str) -> None:
     if detrend not in ("none", "constant", "linear"):
         raise ValueError(f"detrend is {detrend!r}: use none, constant or linear")
     if not angle or not np.all(np.abs(angle) <= np.pi):
@@ -98,52 +133,72 @@ def _check(
             )
 
 
+def _spread(windows: Windows) -> float:
+    """By which a raised cosine shifts frequencies: one cycle of the shortest window."""
+    return 2 * np.pi / min((n for n, _ in windows if n >= _SHORT), default=1)
+
+
 def _bands(
-    block: int, omega: Float[np.ndarray, " frequencies"], shortest: int
-) -> tuple[list[Float[np.ndarray, " _"]], Float[np.ndarray, "block rank"], tuple[int, ...]]:
-    """Bands of the frequencies that compression serves, their basis and the ranks."""
-    # A raised cosine shifts frequencies by one cycle to its window.
-    reach = np.abs(omega) + 2 * np.pi / shortest
-    ranks = rank(block, reach)
-    served = int(np.count_nonzero(ranks <= _FULL * block))
+    samples: int, omega: Angles, windows: Windows
+) -> tuple[Lattice, list[Float[np.ndarray, " _"]]]:
+    """Blocks of samples, and bands of the frequencies that compression serves."""
+    long = [each for each in windows if each[0] >= _SHORT]
+    if not long:
+        return Lattice(1, 0, samples), []
+    lattice = choose_lattice(samples, long, np.abs(omega))
+    ranks = rank(lattice.block, np.abs(omega) + _spread(windows))
+    served = int(np.count_nonzero(ranks <= _FULL * lattice.block))
     if not served:
-        return [], np.ones((block, 1)), ()
-    ends = band_edges(ranks[:served])
-    basis, sizes = nested_basis(block, [float(reach[end - 1]) for end in ends])
-    return np.split(omega[:served], ends[:-1]), basis, sizes
+        return lattice, []
+    return lattice, np.split(omega[:served], band_edges(ranks[:served])[:-1])
 
 
-def _window(
-    length: int,
-    starts: tuple[int, ...],
-    shape: str,
-    detrend: str,
-    omega: Float[np.ndarray, " frequencies"],
-    bands: list[Float[np.ndarray, " _"]],
-    basis: Float[np.ndarray, "block rank"],
-    ranks: Sequence[int],
-) -> WindowTables:
-    tables = window_tables(length, shape, detrend, bands, basis, ranks) if bands else []
-    turn = np.exp(-1j * omega[:, None] * np.asarray(starts, float))
-    taper = jax.device_put(window(shape, length))
-    return WindowTables(
-        tuple(jax.device_put(table) for table in tables),
-        taper,
-        jax.device_put(turn),
-        length,
-        starts,
-    )
+def _parts(
+    number: int,
+    windows: tuple[int, tuple[int, ...]],
+    lattice: Lattice,
+    levels: Sequence[Level],
+    bases: Sequence[Basis],
+    bands: Sequence[Float[np.ndarray, " _"]],
+    trends: int,
+    tapers: Sequence[Taper],
+) -> tuple[Part, ...]:
+    """Windows of whole blocks, of the longest blocks that suit them, and all others."""
+    length, starts = windows
+    if length < _SHORT or not bands:
+        return ()
+    shapes = [[each.shape for each in few] for few in _alike(_present(tapers, number))]
+    on = np.array([lattice.holds(length, start) for start in starts])
+    parts, where = [], np.flatnonzero(on)
+    if where.size:
+        blocks = [(starts[k] - lattice.offset) // lattice.block for k in where]
+        fitting = [
+            k for k, each in enumerate(levels) if each.holds(length // lattice.block, blocks)
+        ]
+        most = max(fitting, key=lambda k: levels[k].many)
+        mine, basis = levels[most], bases[most]
+        fold = fold_of(length, basis.samples, trends)
+        first = tuple((block - mine.offset) // mine.many for block in blocks)
+        tables = tuple(make_tables(fold, basis, bands, few) for few in shapes)
+        parts.append(Part(where, fold, most, first, tables))
+    astray = np.flatnonzero(~on)
+    if astray.size:
+        fold = fold_anywhere(length, lattice.block, trends)
+        tables = tuple(make_tables(fold, bases[0], bands, few) for few in shapes)
+        first = tuple(starts[k] for k in astray)
+        parts.append(Part(astray, fold, None, first, tables))
+    return tuple(parts)
 
 
 def transform_windows(
     signals: Float[np.ndarray, "samples channels"],
-    angle: Float[np.ndarray, " frequencies"],
-    windows: tuple[tuple[int, tuple[int, ...]], ...],
+    angle: Angles,
+    windows: Windows,
     *,
     shape: str = "hann",
     detrend: str = "constant",
     origin: float = 0.0,
-) -> list[Complex[Array, "frequencies segments channels"]]:
+) -> list[Complex[np.ndarray, "frequencies segments channels"]]:
     """Fourier sums of tapered windows of several lengths, at any frequencies at once.
 
     `sum_n taper[n] x[start + n] exp(-j angle (origin + start + n))`, one array for each pair
@@ -154,170 +209,231 @@ def transform_windows(
     above the Nyquist frequency, `PrecisionError` in 32 bits.
 
     Blocks of samples are compressed once, for all windows, to the few functions that these
-    frequencies can distinguish; each length is then a small matrix product. Accurate to about 2e-13
-    of the largest sum. Fast where lengths are multiples of a block: see `lattice_windows`.
+    frequencies can distinguish, and each window is folded about its middle; each length is then a
+    small matrix product. Accurate to about 2e-13 of the largest sum. Fast where lengths are
+    multiples of a block: see `lattice_windows`.
     """
     tapers = (Taper(shape, signals.shape[1]),)
     return transform_tapers((signals,), angle, windows, tapers, detrend=detrend, origin=origin)[0]
 
 
-class Taper(NamedTuple):
-    """A window's shape and what it acts on: so many of the channels, windows from `first` on."""
-
-    shape: str
-    channels: int
-    first: int = 0
-
-
 def transform_tapers(
     signals: tuple[Float[np.ndarray, "samples _"], ...],
-    angle: Float[np.ndarray, " frequencies"],
-    windows: tuple[tuple[int, tuple[int, ...]], ...],
+    angle: Angles,
+    windows: Windows,
     tapers: tuple[Taper, ...],
     *,
     detrend: str,
     origin: float,
-) -> list[list[Complex[Array, "frequencies segments _"]]]:
-    """`transform_windows` of signals side by side, for several tapers."""
+) -> list[list[Complex[np.ndarray, "frequencies segments _"]]]:
+    """`transform_windows` of signals side by side, for several tapers.
+
+    In memory, the windows of one channel are neighbours.
+    """
     require_x64("a transform")
-    angles, most = tuple(np.asarray(angle, float).tolist()), len(signals[0])
-    plans = tuple(
-        plan_transform(most, angles, windows, each.shape, detrend, each.first) for each in tapers
-    )
-    channels = tuple(each.channels for each in tapers)
-    columns = tuple(np.asarray(each, float) for each in signals)
-    return _transform(plans, channels, columns, np.asarray(origin, float))
+    angles = tuple(np.asarray(angle, float).tolist())
+    plan = plan_transform(len(signals[0]), angles, windows, tapers, detrend)
+    source = _Source(plan, signals, detrend)
+    phase = np.exp(-1j * origin * plan.angle)[:, None] if origin else None
+    found = _empty_sums(plan, tapers)
+    for number, turn in enumerate(plan.turns):
+        mine = [k for k, each in enumerate(tapers) if each.first <= number]
+        sums = [found[k][number - tapers[k].first] for k in mine]
+        _fill_window_sums(plan, source, number, [tapers[k] for k in mine], sums)
+        for each in sums:
+            each *= (turn if phase is None else turn * phase)[:, None]
+    if plan.order is not None:
+        found = [[each[plan.order] for each in mine] for mine in found]
+    return [[np.swapaxes(each, 1, 2) for each in mine] for mine in found]
 
 
-@ft.partial(jax.jit, static_argnums=1)
-def _transform(
-    plans: tuple[Plan, ...],
-    channels: tuple[int, ...],
-    signals: tuple[Float[Array, "samples _"], ...],
-    origin: Float[Array, ""],
-) -> list[list[Complex[Array, "frequencies segments _"]]]:
-    """All plans are of one layout: the compressed blocks serve each of them."""
-    plan = plans[0]
-    if plan.detrend != "none":  # No trend is left of a constant, but its rounding errors would be.
-        signals = tuple(each - jnp.mean(each, axis=0)[None, :] for each in signals)
-    lattice, rows = plan.lattice, jnp.concatenate([each.T for each in signals])
-    used = rows[:, lattice.offset : lattice.offset + lattice.count * lattice.block]
-    blocks = used.reshape(rows.shape[0], lattice.count, lattice.block) @ plan.basis
-    return [
-        _apply_plan(each, rows[:count], blocks[:count], origin)
-        for each, count in zip(plans, channels, strict=True)
+_PAGES = 2**18  # complex numbers, from which on NumPy asks for large pages
+
+
+def _empty_sums(
+    plan: Plan, tapers: Sequence[Taper]
+) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
+    """Room for the sums of all windows, in one piece: memory in small pages takes as long to get
+    as half of the products."""
+    counts = [len(starts) for _, starts in plan.windows]
+    sizes = [(each.channels, many) for each in tapers for many in counts[each.first :]]
+    ends = np.cumsum([plan.angle.size * channels * many for channels, many in sizes])
+    room = np.empty(max(int(ends[-1]), min(_PAGES, 2 * int(ends[-1]))), complex)
+    parts = [
+        part.reshape(plan.angle.size, *size)
+        for part, size in zip(np.split(room[: ends[-1]], ends[:-1]), sizes, strict=True)
     ]
+    return [[parts.pop(0) for _ in counts[each.first :]] for each in tapers]
 
 
-def _apply_plan(
-    plan: Plan,
-    rows: Float[Array, "channels samples"],
-    blocks: Float[Array, "channels blocks rank"],
-    origin: Float[Array, ""],
-) -> list[Complex[Array, "frequencies segments channels"]]:
-    sums = [_window_sums(plan, each, rows, blocks) for each in plan.windows]
-    phase = turn(origin * plan.angle)
-    turned = [
-        x * (each.turn * phase[:, None])[:, :, None]
-        for x, each in zip(sums, plan.windows, strict=True)
-    ]
-    if plan.order is None:
-        return turned
-    return [each[np.array(plan.order)] for each in turned]
+class _Source:
+    """The samples of a record less a constant, and the coefficients of its blocks."""
+
+    def __init__(self, plan: Plan, signals: Sequence[np.ndarray], detrend: str):
+        self._plan, self._detrend = plan, detrend
+        self._columns = [np.asarray(each, float).T for each in signals]
+        self._levels = [_constant(each, detrend) for each in self._columns]
+        ends = np.cumsum([0, *map(len, self._columns)]).tolist()
+        self.channels, self._places = ends[-1], list(map(slice, ends[:-1], ends[1:]))
+
+    def _samples(self, where: slice, into: np.ndarray | None = None) -> np.ndarray:
+        """Those samples of all channels."""
+        views = [columns[:, where] for columns in self._columns]
+        if into is None:
+            into = np.empty((self.channels, views[0].shape[1]))
+        shape = into.shape[1:]
+        for place, view, level in zip(self._places, views, self._levels, strict=True):
+            constant = level.reshape(-1, *[1] * len(shape))
+            np.subtract(view.reshape(-1, *shape), constant, out=into[place])
+        return into
+
+    @ft.cached_property
+    def rows(self) -> Rows:
+        return self._samples(slice(None))
+
+    @ft.cached_property
+    def _posts(self) -> Float[np.ndarray, "channels ends"]:
+        """The samples where blocks begin, and that after the last block: 0 where there is none."""
+        block, offset, count = self._plan.lattice
+        found = self._samples(slice(offset, offset + count * block + 1, block))
+        return np.pad(found, ((0, 0), (0, count + 1 - found.shape[1])))
+
+    @ft.cached_property
+    def _coefficients(self) -> list[Float[np.ndarray, "channels blocks rank"]]:
+        plan = self._plan
+        found = [self._compressed(plan.bases[0])]
+        for level, basis in zip(plan.levels[1:], plan.bases[1:], strict=True):
+            used = found[0][:, level.offset :]
+            count = used.shape[1] // level.many
+            together = used[:, : count * level.many].reshape(len(used), count, -1)
+            found.append(_products(together, basis))
+        return found
+
+    def _compressed(self, basis: Basis) -> Float[np.ndarray, "channels blocks rank"]:
+        """Block by block, a few at once, so that they stay in the processor's cache."""
+        block, offset, count = self._plan.lattice
+        posts, many = self._posts, max(_IN_CACHE // (block * self.channels), 1)
+        found = np.empty((self.channels, count, basis.signs.size))
+        for begin in range(0, count, many):
+            end = min(begin + many, count)
+            few = np.empty((self.channels, end - begin, block + 1))
+            self._samples(slice(offset + begin * block, offset + end * block), few[:, :, :-1])
+            few[:, :, -1] = posts[:, begin + 1 : end + 1]
+            found[:, begin:end] = _products(few, basis)
+        return found
+
+    def folded(self, part: Part) -> Iterator[tuple[np.ndarray, Columns, Columns]]:
+        """Places of windows, with the sums and differences of their halves."""
+        plan, block = self._plan, self._plan.lattice.block
+        if part.level is not None:
+            level, basis = plan.levels[part.level], plan.bases[part.level]
+            first = np.array(part.starts) * level.many + level.offset
+            ends = np.stack([self._posts[:, k] for k in (first, first + part.fold.length // block)])
+            found = self._coefficients[part.level]
+            yield part.places, *fold_blocks(part.fold, basis, found, part.starts, ends)
+            return
+        for few, segments in self.segments(part.fold.length, part.starts):
+            yield part.places[few], *fold_samples(part.fold, plan.bases[0], segments)
+
+    def segments(
+        self, length: int, starts: Sequence[int]
+    ) -> Iterator[tuple[slice, Float[np.ndarray, "channels windows samples"]]]:
+        """Windows without their trends, a few at once."""
+        views = np.lib.stride_tricks.sliding_window_view(self.rows, length, axis=1)
+        many = max(_AT_ONCE // (length * self.channels), 1)
+        for begin in range(0, len(starts), many):
+            few = slice(begin, begin + many)
+            yield few, _without_trend(views[:, np.array(starts[few])], self._detrend)
 
 
-def _window_sums(
-    plan: Plan,
-    window: WindowTables,
-    rows: Float[Array, "channels samples"],
-    blocks: Float[Array, "channels blocks rank"],
-) -> Complex[Array, "frequencies segments channels"]:
-    parts = []
-    if window.tables:
-        parts.append(_compressed_sums(plan, window, rows, blocks))
-    above = plan.angle[sum(table.shape[1] for table in window.tables) :]
-    if above.size:
-        cut = jnp.moveaxis(_slices(rows, window.starts, window.length), 2, 1)
-        tapered = _remove_trend(cut, plan.detrend) * window.taper[None, :, None]
-        parts.append(_fourier_sums(tapered, above))
-    return jnp.concatenate(parts)
+def _constant(columns: Float[np.ndarray, "_ samples"], detrend: str) -> Float[np.ndarray, " _"]:
+    """Near each channel's mean: no trend is left of it, but its rounding errors would be."""
+    if detrend == "none":
+        return np.zeros(len(columns))
+    return np.mean(columns[:, :: max(columns.shape[1] // _THIN, 1)], axis=1)
 
 
-def _compressed_sums(
-    plan: Plan,
-    window: WindowTables,
-    rows: Float[Array, "channels samples"],
-    blocks: Float[Array, "channels blocks rank"],
-) -> Complex[Array, "frequencies segments channels"]:
-    lattice = plan.lattice
-    count = -(-window.length // lattice.block)  # the last block may be cut short
-    on = [lattice.holds(window.length, start) for start in window.starts]
-    first = [(start - lattice.offset) // lattice.block for start in window.starts]
-    aligned = tuple(itertools.compress(first, on))
-    astray = tuple(start for start, yes in zip(window.starts, on, strict=True) if not yes)
-    own = _compress(plan, _slices(rows, astray, window.length)) if astray else None
-    sums = []
-    for table, size in zip(window.tables, plan.ranks, strict=True):
-        cut = [_slices(blocks[:, :, :size], aligned, count)] if aligned else []
-        cut += [own[..., :size]] if own is not None else []
-        flat = jnp.concatenate(cut).reshape(-1, count * size)
-        # One plain product of two matrices: XLA's general contraction takes a third longer.
-        both = table.reshape(-1, count * size) @ flat.T
-        sums.append(both.reshape(2, table.shape[1], len(on), -1))
-    real, imag = jnp.concatenate(sums, axis=1)
-    places = np.argsort(np.argsort(~np.array(on), kind="stable"))
-    joined = jax.lax.complex(real, imag)
-    return joined if all(on) or not any(on) else joined[:, places]
+def _products(
+    blocks: Float[np.ndarray, "channels blocks places"], basis: Basis
+) -> Float[np.ndarray, "channels blocks rank"]:
+    # A product with few rows is quicker than one with few columns.
+    flat = basis.weights.T @ blocks.reshape(-1, blocks.shape[2]).T
+    return np.ascontiguousarray(flat.T).reshape(*blocks.shape[:2], -1)
 
 
-def _compress(
-    plan: Plan, segments: Float[Array, "segments channels window"]
-) -> Float[Array, "segments channels blocks rank"]:
-    """Blocks of windows that do not lie on whole blocks of the record."""
-    block = plan.lattice.block
-    padding = -segments.shape[2] % block
-    whole = jnp.pad(segments, ((0, 0), (0, 0), (0, padding)))
-    return whole.reshape(*segments.shape[:2], -1, block) @ plan.basis
-
-
-def _slices(
-    values: Float[Array, "channels places *rest"], starts: tuple[int, ...], length: int
-) -> Float[Array, "segments channels length *rest"]:
-    # Contiguous slices: a gather of indices is several times slower, a stack slow to compile.
-    cut = lambda start: jax.lax.dynamic_slice_in_dim(values, start, length, axis=1)
-    return jax.vmap(cut)(np.array(starts))
-
-
-def turn(angle: Float[Array, "*shape"]) -> Complex[Array, "*shape"]:
-    """`exp(-j angle)`, in the precision of `angle`."""
-    return jax.lax.complex(jnp.cos(angle), -jnp.sin(angle))
-
-
-def _remove_trend(
-    segments: Float[Array, "segments window channels"], detrend: str
-) -> Float[Array, "segments window channels"]:
+def _without_trend(
+    segments: Float[np.ndarray, "channels windows samples"], detrend: str
+) -> Float[np.ndarray, "channels windows samples"]:
     if detrend == "none":
         return segments
-    centred = segments - jnp.mean(segments, axis=1, keepdims=True)
-    if detrend == "constant":
-        return centred
-    ramp = jnp.linspace(-1.0, 1.0, segments.shape[1], dtype=segments.dtype)
-    slope = jnp.einsum("n,snc->sc", ramp, centred) / jnp.sum(ramp**2)
-    return centred - ramp[None, :, None] * slope[:, None, :]
+    segments = segments - np.mean(segments, axis=2, keepdims=True)
+    if detrend == "linear":
+        ramp = np.linspace(-1.0, 1.0, segments.shape[2])
+        segments -= (segments @ ramp / np.sum(ramp**2))[:, :, None] * ramp
+    return segments
+
+
+def _fill_window_sums(
+    plan: Plan,
+    source: _Source,
+    number: int,
+    tapers: Sequence[Taper],
+    sums: Sequence[Complex[np.ndarray, "frequencies _ windows"]],
+) -> None:
+    """Those of one length behind each taper, with phases from the middle of a window."""
+    length, starts = plan.windows[number]
+    for part in plan.parts[number]:
+        for places, *halves in source.folded(part):
+            whole = len(places) == len(starts)
+            made = sums
+            if not whole:
+                made = [np.empty((*each.shape[:2], len(places)), complex) for each in sums]
+            rest = iter(made)
+            for tables, few in zip(part.tables, _alike(tapers), strict=True):
+                mine = [each[: few[0].channels] for each in halves]
+                _apply_tables(tables, mine, [next(rest) for _ in few])
+            if not whole:
+                for found, each in zip(sums, made, strict=True):
+                    found[:, :, places] = each
+    served = sum(map(len, plan.bands)) if plan.parts[number] else 0
+    if served < plan.angle.size:
+        above = plan.angle[served:]
+        for few, segments in source.segments(length, starts):
+            for found, taper in zip(sums, tapers, strict=True):
+                tapered = segments[: taper.channels] * window(taper.shape, length)
+                found[served:, :, few] = _fourier_sums(tapered, above)
+
+
+def _apply_tables(
+    tables: Sequence[Table],
+    halves: Sequence[Columns],
+    into: Sequence[Complex[np.ndarray, "frequencies channels windows"]],
+) -> None:
+    channels, windows, _ = halves[0].shape
+    flat, begin = [each.reshape(channels * windows, -1) for each in halves], 0
+    for table in tables:
+        end = begin + len(table.of_sums) // len(into)
+        parts = (
+            (own @ part[:, : own.shape[1]].T).reshape(len(into), -1, channels, windows)
+            for own, part in zip(table[:2], flat, strict=True)
+        )
+        for each, odd, sums, differences in zip(into, table.odd, *parts, strict=True):
+            each.real[begin:end] = differences if odd else sums
+            each.imag[begin:end] = sums if odd else differences
+        begin = end
 
 
 def _fourier_sums(
-    segments: Float[Array, "segments window channels"], angle: Float[Array, " frequencies"]
-) -> Complex[Array, "frequencies segments channels"]:
+    segments: Float[np.ndarray, "channels windows samples"], angle: Angles
+) -> Complex[np.ndarray, "frequencies channels windows"]:
     """Two levels, within short blocks and over the blocks, so that few exponentials are needed."""
-    count, window, channels = segments.shape
-    block = max(int(np.sqrt(window)), 1)
-    blocks = -(-window // block)
-    padded = jnp.pad(segments, ((0, 0), (0, blocks * block - window), (0, 0)))
-    parts = padded.reshape(count, blocks, block, channels)
-    inner = angle[:, None] * jnp.arange(block, dtype=angle.dtype)[None, :]
-    outer = angle[:, None] * jnp.arange(0, blocks * block, block, dtype=angle.dtype)[None, :]
+    *many, length = segments.shape
+    block = max(int(np.sqrt(length)), 1)
+    count = -(-length // block)
+    padded = np.pad(segments, ((0, 0), (0, 0), (0, count * block - length)))
+    inner = np.exp(-1j * np.arange(block)[:, None] * angle)
+    outer = np.exp(-1j * (np.arange(count)[:, None] * block - length / 2) * angle)
     # Real factors: a product of a real with a complex array would double the arithmetic.
-    real = jnp.einsum("sbnc,fn->sbfc", parts, jnp.cos(inner))
-    imag = jnp.einsum("sbnc,fn->sbfc", parts, jnp.sin(inner))
-    return jnp.einsum("sbfc,fb->fsc", jax.lax.complex(real, -imag), turn(outer))
+    parts = padded.reshape(-1, block) @ np.hstack([np.real(inner), np.imag(inner)])
+    real, imag = np.split(parts.reshape(*many, count, -1), 2, axis=3)
+    return np.einsum("cwbf,bf->fcw", real + 1j * imag, outer)

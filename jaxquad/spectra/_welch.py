@@ -96,7 +96,9 @@ def _tapers(
 def _joined(
     parts: Sequence[Complex[np.ndarray, "frequencies _ channels"]],
 ) -> Complex[np.ndarray, "frequencies windows channels"]:
-    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+    # Windows stay neighbours in memory.
+    rows = [np.swapaxes(part, 1, 2) for part in parts]
+    return np.swapaxes(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=2), 1, 2)
 
 
 def _layouts(
@@ -107,7 +109,8 @@ def _layouts(
     A single window keeps its length to the sample; several take lengths that share blocks of
     samples, because their exact lengths do not matter.
     """
-    lengths = tuple(member.length(records) for member in members)
+    # By way of the class: a method bound to a module takes as long to make as a product.
+    lengths = tuple(Welch.length(member, records) for member in members)
     samples = [record.samples - members[0].integrators for record in records]
     overlap = members[0].overlap
     if len(members) == 1:
@@ -130,10 +133,10 @@ def _transform_record(
     made = transform_tapers(
         columns, omega * record.dt, layout, tapers, detrend=welch.detrend, origin=float(origin)
     )
-    found, *slopes = ([np.asarray(part) for part in each] for each in made)
-    n, late = welch.integrators, welch.delay_samples(record)
+    n, late = welch.integrators, Welch.delay_samples(welch, record)
     if not (n or late):
-        return [found, *slopes]
+        return made
+    found, *slopes = made
     angle = omega * record.dt
     factor = np.ones((omega.size, len(record.names)), complex)
     first = len(record.input_names)
@@ -144,7 +147,7 @@ def _transform_record(
 
 def _columns(record: Record, welch: Welch) -> tuple[Float[np.ndarray, "samples _"], ...]:
     """Inputs, outputs, references; the outputs differenced and earlier by the delay."""
-    n, late = welch.integrators, welch.delay_samples(record)
+    n, late = welch.integrators, Welch.delay_samples(welch, record)
     outputs = np.diff(record.outputs, n, axis=0)
     if late:
         outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
@@ -177,7 +180,7 @@ def check_spectrum(
     first = records[0]
     names = first.input_names + (first.reference_names if method == "joint" else ())
     largest = check_excitation(records, method)
-    gain = coefficients(welch.shape)[0] * welch.length(records)
+    gain = coefficients(welch.shape)[0] * Welch.length(welch, records)
     for name, level in zip(names, np.sqrt(power), strict=False):
         lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[first.names.index(name)]))
         if lost.size:
@@ -195,7 +198,7 @@ def frequencies_for(
         return welch.default_omega(records)
     check_band(omega, records[0].dt)
     omega = np.asarray(omega, dtype=float)
-    seconds = welch.length(records) * records[0].dt
+    seconds = Welch.length(welch, records) * records[0].dt
     lowest = 2 * np.pi / seconds
     if omega[0] < 0.999 * lowest:
         raise ValueError(
@@ -283,7 +286,9 @@ def average_windows(
     method: Method,
 ) -> FrequencyResponse:
     """Response by averages over tapered windows of one or several lengths."""
-    members = (spectra,) if isinstance(spectra, Welch) else spectra.windowed(records, omega)
+    members = (
+        (spectra,) if isinstance(spectra, Welch) else Composite.windowed(spectra, records, omega)
+    )
     omega = frequencies_for(omega, records, members[0])
     segments = transform_records(records, omega, members, derivatives=2)
     channels = _channels(records[0], method)
@@ -384,7 +389,7 @@ def _remarks(
     remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     remarks += remarks_on_inputs(omega, found.input_coherence, first.input_names)
-    remarks += remarks_on_leakage(omega, found.leakage, error, names)
+    remarks += remarks_on_leakage(omega, found.leakage(), error, names)
     few = max(independent) < 3
     return remarks + ((Remark(_FEW.format(count=max(independent))),) if few else ())
 

@@ -1,8 +1,12 @@
 import numpy as np
 import pytest
 
+from jaxquad.records import Record
+from jaxquad.spectra import Composite, Welch
+from jaxquad.spectra._basis import merged_basis, sample_basis
 from jaxquad.spectra._blocks import lattice_windows
-from jaxquad.spectra._transform import transform_windows
+from jaxquad.spectra._transform import plan_transform, Taper, transform_tapers, transform_windows
+from jaxquad.spectra._welch import transform_records
 from jaxquad.spectra._window import segment_starts, window
 
 
@@ -119,6 +123,107 @@ def test_sums_on_a_lattice_equal_those_term_by_term():
     for (length, starts), sums in zip(windows, found, strict=True):
         expected = direct_sums(x, np.array([0.01, 0.2]), length, starts)
         assert_sums(np.asarray(sums), expected, 1e-12)
+
+
+def test_functions_on_blocks_are_even_or_odd_and_span_the_band():
+    single = sample_basis(120, [0.02, 0.3])
+    longer = merged_basis(single, 5, [0.02, 0.3])
+    waves = np.exp(1j * np.multiply.outer(np.linspace(-0.3, 0.3, 77), np.arange(121)))
+    values = single.weights / np.where(np.arange(121) % 120, 1.0, 0.5)[:, None]
+    assert np.array_equal(values[::-1], values * single.signs)
+    np.testing.assert_allclose(waves @ single.weights @ values.T, waves, atol=1e-12)
+    # Of a longer block, by way of the coefficients of the shorter ones.
+    mirrored = longer.weights.reshape(5, single.signs.size, -1)[::-1] * single.signs[:, None]
+    assert np.array_equal(mirrored.reshape(longer.weights.shape), longer.weights * longer.signs)
+    np.testing.assert_allclose(
+        longer.weights.T @ longer.weights, np.eye(longer.signs.size), atol=1e-12
+    )
+    for basis in (single, longer):
+        grid = np.linspace(-0.3, 0.3, 77)
+        # A wave has the energy of its samples, the two at the ends counting half.
+        energy = np.sum(np.abs(basis.spin(grid)) ** 2, axis=1)
+        np.testing.assert_allclose(energy, basis.samples, rtol=1e-12)
+
+
+# Windows of 8, 6 and 5 blocks of 125 samples, whose steps are 4, 3 and 5 of these.
+SHARED = (
+    (1000, (0, 500, 1000, 1500, 2000)), (750, (0, 375, 750, 1125, 1500, 2250)), (625, (0, 1250)),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("samples", [3000, 3001, 3119])
+@pytest.mark.parametrize("detrend", ["none", "constant", "linear"])
+def test_windows_of_shared_blocks_equal_those_term_by_term_behind_each_derivative(samples, detrend):
+    x = np.random.default_rng(1).standard_normal((samples, 3)) + 3.0
+    angle, tapers = (
+        np.geomspace(0.004, 0.3, 9),
+        (Taper("hann", 3), Taper("hann'", 3, 1), Taper("hann''", 2)),
+    )
+    made = transform_tapers(
+        (x[:, :1], x[:, 1:]), angle, SHARED, tapers, detrend=detrend, origin=7.0
+    )
+    for taper, found in zip(tapers, made, strict=True):
+        for (length, starts), sums in zip(SHARED[taper.first :], found, strict=True):
+            part = x[:, : taper.channels]
+            expected = direct_sums(part, angle, length, starts, taper.shape, detrend, 7.0)
+            assert_sums(sums, expected, 1e-12)
+
+
+def test_long_blocks_serve_windows_that_they_divide():
+    windows = lattice_windows(60_000, (15_000, 10_000, 6000, 4000, 2500), 0.5, np.array([0.2]))
+    angle = tuple(np.geomspace(1e-3, 0.2, 100).tolist())
+    plan = plan_transform(60_000, angle, windows, (Taper("hann", 1),), "constant")
+    for (length, starts), parts in zip(windows, plan.parts, strict=True):
+        (part,) = parts
+        assert part.level is not None
+        block = plan.levels[part.level].many * plan.lattice.block
+        assert block > plan.lattice.block and length % block == 0
+        assert [start % block for start in starts] == [0] * len(starts)
+
+
+ESTIMATORS = [
+    Composite(windows=(9.0, 5.0, 3.3), overlap=0.5, detrend="linear"),
+    Composite(windows=(9.0, 5.0, 3.3), integrators=2, delay=0.11),
+    Welch(4.9, overlap=0.37, shape="hamming"),
+]
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_sums_of_several_records_equal_those_term_by_term(estimator):
+    rng, rate = np.random.default_rng(2), 100.0
+    shapes = [(size, count) for size in (2000, 1763) for count in (1, 2)]
+    u, y, v, z = (np.cumsum(rng.standard_normal(shape), axis=0) for shape in shapes)
+    records = [Record(np.arange(len(a)) / rate, a, b) for a, b in ((u, y), (v, z))]
+    omega = np.geomspace(2.0, 40.0, 11)
+    composite = isinstance(estimator, Composite)
+    members = estimator.windowed(records, omega) if composite else (estimator,)
+    segments = transform_records(records, omega, members, derivatives=2)
+    n, late, origin = estimator.integrators, round(estimator.delay * rate), 0
+    factor = np.exp(-1j * omega / rate * (late + n // 2)) / (1 - np.exp(-1j * omega / rate)) ** n
+    done = [0] * len(segments.groups)
+    for record in records:
+        inputs = record.inputs[n - n // 2 : record.samples - n // 2]
+        outputs = np.diff(record.outputs, n, axis=0)
+        outputs = np.vstack([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
+        columns = np.hstack([inputs, outputs])
+        longest = segments.groups[0][0]
+        for k, (length, starts) in enumerate(segments.groups):
+            local = [s - origin for s in starts if 0 <= s - origin <= len(columns) - length]
+            mine = slice(done[k], done[k] + len(local))
+            done[k] += len(local)
+            for order, sums in enumerate((segments.transforms[k], *segments.slopes[k])):
+                shape = estimator.shape + "'" * order
+                part = columns[:, : (3, 3, 1)[order]]
+                given = (part, omega / rate, length, local, shape, estimator.detrend, origin)
+                expected = direct_sums(*given)
+                if order == 0:
+                    expected[:, :, 1:] *= factor[:, None, None]
+                if sums.size:
+                    for channel in range(part.shape[1]):
+                        # Phases of 1500 rad, and a random walk far from 0.
+                        assert_sums(sums[:, mine, channel], expected[:, :, channel], 1e-11)
+        origin += record.samples + longest
+    assert done == [len(starts) for _, starts in segments.groups]
 
 
 @pytest.mark.parametrize(
