@@ -1,6 +1,7 @@
 """The linear loops of some axes of all members, and one axis from sample to sample, exactly."""
 
 import dataclasses
+import functools as ft
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxquad._core import ensemble_shape
+from jaxquad._xla import brief_options, Jit
 from jaxquad.control import LinearController, LinearisableController
 from jaxquad.models import LinearAxis, matrix_exponential, split_delay
 from jaxquad.records import AXES
@@ -142,7 +144,7 @@ def _places_of(
     return tuple(x.ravel() for x in np.indices(ensemble)) if ensemble else ()
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=brief_options)
 def _linearised(
     plant: LinearisablePlant,
     controller: LinearController | LinearisableController,

@@ -271,7 +271,7 @@ class _Runner(eqx.Module):
     def trace(self, z: np.ndarray) -> None:
         """Trace and lower the program of all evaluations, which the first one compiles."""
         multipliers = initial_multipliers(self.problem, self.limits, len(z))
-        evaluate_cost.lower(*self._given(z, np.ones(len(z), bool), False, multipliers))
+        evaluate_cost.begin(*self._given(z, np.ones(len(z), bool), False, multipliers))
 
     def evaluate(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
