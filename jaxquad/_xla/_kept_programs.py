@@ -49,7 +49,7 @@ class KeptPrograms:
         known = _known(args)
         with self._lock:
             if not ((folder / name).is_file() or known in self._programs or known in self._begun):
-                self._begun[known] = _lowered(self._function, options, args)
+                self._begun[known] = _lowered(self._function, name, options, args)
         return True
 
     def find(self, args: PyTree) -> "_Program | None":
@@ -73,8 +73,8 @@ class KeptPrograms:
             return None
         program = _read(folder / name) if (folder / name).is_file() else None
         if program is None:
-            lowered = begun or _lowered(self._function, options, args)
-            program = _Program(lowered.program.compile(), lowered.result)
+            lowered = begun or _lowered(self._function, name, options, args)
+            program = _compiled(name, lowered)
             _write(folder / name, program)
         return program
 
@@ -100,7 +100,26 @@ class _Program(NamedTuple):
         return jax.tree.map(lambda k: found[k], self.result)
 
 
-def _lowered(function: Callable[..., PyTree], options: dict, args: PyTree) -> _Lowered:
+def _compiled(name: str, lowered: _Lowered) -> _Program:
+    """Compiled here and now: what JAX takes from its own files cannot be written again."""
+    _remove_of_jax(name)
+    program = lowered.program.compile()
+    _remove_of_jax(name)
+    return _Program(program, lowered.result)
+
+
+def _remove_of_jax(name: str) -> None:
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    for path in Path(folder).glob(f"jit_{_stem(name)}-*") if folder else ():
+        path.unlink(missing_ok=True)
+
+
+def _stem(name: str) -> str:
+    """The name of a function whose program is kept in the file of that name."""
+    return name.removesuffix("-cache").replace("-", "_")
+
+
+def _lowered(function: Callable[..., PyTree], name: str, options: dict, args: PyTree) -> _Lowered:
     leaves, structure = jax.tree.flatten(args)
     result: list[PyTree] = []
 
@@ -111,7 +130,7 @@ def _lowered(function: Callable[..., PyTree], options: dict, args: PyTree) -> _L
         result.append(jax.tree.unflatten(shape, range(len(found))))
         return found
 
-    run.__name__ = function.__name__
+    run.__name__ = _stem(name)  # JAX's own files of a program begin with it
     arrays = [x for x in leaves if eqx.is_array(x)]
     program = jax.jit(run, compiler_options=options or None).lower(arrays)
     return _Lowered(program, result[0])
@@ -150,6 +169,14 @@ def _kind(leaf: object) -> object:
     if not eqx.is_array(leaf):
         return type(leaf), leaf
     known = jax.typeof(leaf)
+    return known.shape, known.dtype, known.weak_type
+
+
+def _written(leaf: object) -> object:
+    """The same in words, for a file's name."""
+    if not eqx.is_array(leaf):
+        return _kind(leaf)
+    known = jax.typeof(leaf)
     return known.shape, str(known.dtype), known.weak_type
 
 
@@ -161,7 +188,7 @@ def _name(function: Callable[..., PyTree], options: dict, args: PyTree) -> str |
     """The file of a program; None where what it is traced from is not known by its name."""
     settings = sorted((k, v) for k, v in jax.config.values.items() if "cache" not in k)
     told = sorted((k, v) for k, v in os.environ.items() if k.startswith(("XLA_", "JAXQUAD_K")))
-    kinds = jax.tree.map(_kind, args), thread_settings(), _switches()
+    kinds = jax.tree.map(_written, args), thread_settings(), _switches()
     what = kinds, sorted(options.items()), settings, told
     with io.BytesIO() as file:
         try:

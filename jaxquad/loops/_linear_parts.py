@@ -132,7 +132,9 @@ def linear_parts(
     places = _places_of(ensemble, member)
     dt, delay = loop.dt, loop.delay if loop.memory else None
     given = _linearised(plant, controller, delay, tuple(axes), places, states, dt)
-    return LinearParts(*given, loop.memory, dt), () if member is not None else ensemble
+    physical, sampled, late, ratio = given
+    parts = LinearParts(physical, sampled, late, ratio, loop.memory, dt)
+    return parts, () if member is not None else ensemble
 
 
 def _places_of(
