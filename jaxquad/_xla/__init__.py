@@ -19,6 +19,7 @@ from ._devices import (
     where_put as where_put,
 )
 from ._engine import (
+    brief_options as brief_options,
     compiler_options as compiler_options,
     Engine as Engine,
     engine as engine,

@@ -66,6 +66,12 @@ def _given() -> Path | None:
     return Path(folder) if folder else None
 
 
+def own_folder() -> Path | None:
+    """This process's folder of programs; None without `enable_compile_cache`."""
+    folder = _given()
+    return folder if folder is not None and _is_own(folder) else None
+
+
 def _is_own(folder: Path) -> bool:
     return folder.name.startswith(_OWN)
 
@@ -126,8 +132,8 @@ def share_programs() -> None:
 
     It does nothing without `enable_compile_cache`.
     """
-    own = _given()
-    if own is None or not _is_own(own):
+    own = own_folder()
+    if own is None:
         return
     for path in own.glob(_ENTRIES):
         with contextlib.suppress(OSError):  # It is there already, or the disk is full.

@@ -1,6 +1,7 @@
 """How loops are compiled where the library owns the outermost jit."""
 
 import functools as ft
+import os
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from jaxtyping import PyTree
 from jaxquad._core import is_concrete
 
 from ._accelerator import why_no_device_kernels
+from ._kept_programs import KeptPrograms
 from ._kernel import why_no_kernels
 from ._switch import Kernel, left_plain, plain_loops, set_kernel, warn_once
 
@@ -78,8 +80,14 @@ class Jit:
     is compiled plain, with a warning.
     """
 
-    def __init__(self, function: Callable[..., PyTree]):
+    def __init__(
+        self,
+        function: Callable[..., PyTree],
+        options: Callable[[], dict[str, Any]] | None = None,
+    ):
         ft.update_wrapper(self, function)
+        self._options = compiler_options if options is None else options
+        self._kept = KeptPrograms(function, self._options)
         self._name = function.__name__
         self._plain = eqx.filter_jit(function)
         self._function = function
@@ -87,7 +95,7 @@ class Jit:
 
     @ft.cached_property
     def _tuned(self) -> Callable[..., PyTree]:
-        options = compiler_options()
+        options = self._options()
         given: dict[str, Any] = {"compiler_options": options} if options else {}
         return eqx.filter_jit(self._function, **given)
 
@@ -95,11 +103,11 @@ class Jit:
         if not _is_outermost(args):
             return self._plain(*args)
         if _why_plain() is not None:
-            return self._tuned(*args)
+            return self._run(args)
         if self._failed and _shapes(args) in self._failed:
             return self._without_kernels(*args)
         try:
-            return self._tuned(*args)
+            return self._run(args)
         except eqx.EquinoxRuntimeError:  # raised by what runs: it did compile
             raise
         except jax.errors.JaxRuntimeError as error:
@@ -110,10 +118,19 @@ class Jit:
 
     def _without_kernels(self, *args: PyTree) -> PyTree:
         with plain_loops(True):
-            return self._tuned(*args)
+            return self._run(args)
+
+    def _run(self, args: PyTree) -> PyTree:
+        program = self._kept.find(args)
+        return self._tuned(*args) if program is None else program(args)
 
     def lower(self, *args: PyTree) -> PyTree:
         return (self._tuned if _is_outermost(args) else self._plain).lower(*args)
+
+    def begin(self, *args: PyTree) -> None:
+        """Trace and lower what the first call with such arguments will compile."""
+        if not self._kept.begin(args):
+            self.lower(*args)
 
 
 def compiler_options() -> dict[str, int]:
@@ -125,6 +142,31 @@ def compiler_options() -> dict[str, int]:
 
 
 _WIDEST = {"xla_cpu_prefer_vector_width": 512}  # bits; LLVM takes half of what a CPU can, unasked
+# Without XLA's own compiler of fused operations, and with less of LLVM's: that takes two thirds of
+# the time, and the derivatives of loops run as fast.
+_BRIEF = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+
+
+def brief_options() -> dict[str, Any]:
+    """`compiler_options()` for programs that take longer to compile than they run."""
+    if jax.default_backend() != "cpu":
+        return {}
+    return compiler_options() | {k: v for k, v in _BRIEF.items() if not _is_chosen(k) and _takes(k)}
+
+
+def _is_chosen(option: str) -> bool:
+    """Whether the user has a say in it, by the environment or by JAX's own settings."""
+    quickly = jax.config.values["jax_disable_most_optimizations"]
+    return option in os.environ.get("XLA_FLAGS", "") or (quickly and "level" in option)
+
+
+@ft.cache
+def _takes(option: str) -> bool:
+    try:
+        jax.jit(lambda: 0, compiler_options={option: _BRIEF[option]}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 @ft.cache

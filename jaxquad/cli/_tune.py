@@ -1,5 +1,4 @@
 import argparse
-import os
 
 from jaxquad.workflows import in_options, TuneSettings
 
@@ -59,19 +58,6 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print_json(found.content())
     return 0 if found.tuned.holds else NOT_TO_BE_FLOWN
-
-
-_EXTRA = "xla_backend_extra_options"
-
-
-def _keep_loops_rolled() -> None:
-    """Compile the programs of this process without unrolling loops, which takes a tenth less.
-
-    XLA knows this option by its environment only, before the first program, and for all of them.
-    """
-    given = os.environ.get("XLA_FLAGS", "")
-    if _EXTRA not in given:
-        os.environ["XLA_FLAGS"] = f"{given} --{_EXTRA}=xla_cpu_disable_loop_unrolling".strip()
 
 
 TUNE = Command(

@@ -1,5 +1,6 @@
 """Numbers and responses of linear loops, of all axes of all members at once."""
 
+import functools as ft
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
@@ -8,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
+
+from jaxquad._xla import brief_options, Jit
 
 from ._closed_loop import close, ClosedLoopMatrix, join, OpenLoop
 from ._linear_parts import axis_index, linear_parts, LinearParts
@@ -349,7 +352,7 @@ def _analyse_axis(
     return jax.tree.map(lambda x: x.reshape(ensemble + x.shape[1:]), found)
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=brief_options)
 def analyse_parts(parts: LinearParts, smoothing: float) -> LoopAnalysis:
     """The analysis of each loop, on a first axis."""
     if parts.count == 1:

@@ -1,6 +1,7 @@
 """The linear loops of some axes of all members, and one axis from sample to sample, exactly."""
 
 import dataclasses
+import functools as ft
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxquad._core import ensemble_shape
+from jaxquad._xla import brief_options, Jit
 from jaxquad.control import LinearController, LinearisableController
 from jaxquad.models import LinearAxis, matrix_exponential, split_delay
 from jaxquad.records import AXES
@@ -130,7 +132,9 @@ def linear_parts(
     places = _places_of(ensemble, member)
     dt, delay = loop.dt, loop.delay if loop.memory else None
     given = _linearised(plant, controller, delay, tuple(axes), places, states, dt)
-    return LinearParts(*given, loop.memory, dt), () if member is not None else ensemble
+    physical, sampled, late, ratio = given
+    parts = LinearParts(physical, sampled, late, ratio, loop.memory, dt)
+    return parts, () if member is not None else ensemble
 
 
 def _places_of(
@@ -142,7 +146,7 @@ def _places_of(
     return tuple(x.ravel() for x in np.indices(ensemble)) if ensemble else ()
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=brief_options)
 def _linearised(
     plant: LinearisablePlant,
     controller: LinearController | LinearisableController,

@@ -1,5 +1,6 @@
 """The cost of many designs at once, with its gradient; the history of its evaluations."""
 
+import functools as ft
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._core import as_array
-from jaxquad._xla import Jit
+from jaxquad._xla import brief_options, Jit
 from jaxquad.control import ObserverController
 
 from ._objective import Limit, Objective, soft, Worst
@@ -69,7 +70,7 @@ class CostResult(NamedTuple):
     beyond: tuple[Float[Array, "problems members"], ...]  # as levels: above 0, missed
 
 
-@Jit
+@ft.partial(Jit, options=brief_options)
 def evaluate_cost(
     z: Float[Array, "problems n"],
     on: Bool[Array, " problems"],

@@ -1,5 +1,6 @@
 """The flight of a design with all of its members, once, and its numbers by parts of the flight."""
 
+import functools as ft
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._core import as_array
-from jaxquad._xla import Devices, gathered, Jit
+from jaxquad._xla import brief_options, Devices, gathered, Jit
 from jaxquad.loops import Loop
 from jaxquad.simulation import (
     check_run,
@@ -78,7 +79,7 @@ def _greatest(values: Float[np.ndarray, "parts axes members"]) -> np.ndarray:
 Finished = tuple[dict[str, Array], list[dict[str, Array]], Bool[Array, "*ensemble"]]
 
 
-@Jit
+@ft.partial(Jit, options=brief_options)
 def _run(
     loop: Loop, scenario: Scenario, windows: tuple[Window, ...], devices: Devices | None = None
 ) -> Finished:

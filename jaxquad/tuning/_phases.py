@@ -271,14 +271,13 @@ class _Runner(eqx.Module):
     def trace(self, z: np.ndarray) -> None:
         """Trace and lower the program of all evaluations, which the first one compiles."""
         multipliers = initial_multipliers(self.problem, self.limits, len(z))
-        evaluate_cost.lower(*self._given(z, np.ones(len(z), bool), False, multipliers))
+        evaluate_cost.begin(*self._given(z, np.ones(len(z), bool), False, multipliers))
 
     def evaluate(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
     ) -> CostResult:
         """One evaluation of the problems that are on."""
-        result = evaluate_cost(*self._given(z, on, fly, multipliers))
-        return jax.tree.map(np.asarray, result)  # NumPy compiles nothing for what follows
+        return _on_host(evaluate_cost(*self._given(z, on, fly, multipliers)))
 
     def _given(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
@@ -293,11 +292,12 @@ class _Runner(eqx.Module):
         """What a descent calls: infinite where a step must not go."""
 
         def evaluate(z: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            result = self.evaluate(z, on, fly, multipliers)
+            running = evaluate_cost(*self._given(z, on, fly, multipliers))
+            refused = [bool(go) and bool(self.refusal(x)) for x, go in zip(z, on, strict=True)]
+            result = _on_host(running)
             if fly:  # limits must not buy themselves members that are unstable
                 lost = np.max(result.numbers["abscissa"], axis=1) >= 0
                 result = result._replace(value=np.where(lost, np.inf, result.value))
-            refused = [bool(go) and bool(self.refusal(x)) for x, go in zip(z, on, strict=True)]
             result = result._replace(value=np.where(refused, np.inf, result.value))
             self.memory.slowest = np.max(result.numbers["abscissa"], axis=1)
             self.progress.add(_evaluation(result, z, on, fly, self.progress.seconds))
@@ -392,6 +392,11 @@ class _Runner(eqx.Module):
             beyond = np.stack([np.max(x, axis=1) for x in result.beyond], axis=1)
             descent = descent._replace(z=z, gradient=np.asarray(result.gradient))
         return _Optimised(descent, multipliers, result, beyond, counts)
+
+
+def _on_host(result: CostResult) -> CostResult:
+    """Wait for it, in NumPy's arrays, which compile nothing for what follows."""
+    return jax.tree.map(np.asarray, result)
 
 
 class _Optimised(NamedTuple):

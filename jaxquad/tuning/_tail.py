@@ -1,16 +1,17 @@
 """The tail of an ensemble: thousands of members are searched, and limits kept on the worst."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._core import as_array, mark_members, on_host
+from jaxquad._xla import brief_options, Jit
 from jaxquad.ensembles import Members
 
 from ._certificate import Certificate
@@ -172,7 +173,7 @@ def _search(
 _LOST = 5.0  # nepers beyond a limit: the peak of a loop that is unstable, or as good as that
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=brief_options)
 def _levels(
     z: Float[Array, " n"],
     coordinates: Coordinates,

@@ -1,0 +1,139 @@
+"""Programs are found on the disk by what they would be traced from, and by nothing less."""
+
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxquad import LADRC
+from jaxquad._xla import _kept_programs
+from jaxquad._xla._kept_programs import KeptPrograms
+
+
+ARGUMENTS = LADRC(10.0, 30.0, 0.85, dt=0.002), jnp.arange(3.0)
+PROCESS = """
+import jax
+import jaxquad as jq
+
+jq.enable_x64()
+jq.enable_compile_cache()
+traced = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, _, fun_name="", **__: "trace" in event and traced.append(fun_name)
+)
+loop = jq.Loop(jq.DecoupledAxes([0.0468], [0.0552]), jq.LADRC(10.0, 30.0, 0.85))
+flight = jq.simulation.scenario(duration=0.5, dt=0.002, axes=1, reference=jq.simulation.Step(0.1))
+print(jq.simulate(loop, flight).angle.tobytes().hex())
+print(any("_run" in name for name in traced))
+"""
+
+
+class Foreign(eqx.Module):
+    gain: jax.Array
+
+
+@pytest.fixture
+def traced(monkeypatch, tmp_path):
+    """What was traced, by functions whose programs are kept in a folder of this test."""
+    monkeypatch.setattr(_kept_programs, "_folder", lambda: tmp_path)
+    return []
+
+
+def kept(traced):
+    def scaled(controller, values, power=2):
+        traced.append(power)
+        return {"values": controller.wc * values.astype(float) ** power, "wc": controller.wc}
+
+    return KeptPrograms(scaled, dict)
+
+
+def run(programs, arguments):
+    program = programs.find(arguments)
+    assert program is not None
+    return program(arguments)
+
+
+def test_a_program_is_found_again_without_tracing(traced):
+    first = run(kept(traced), ARGUMENTS)
+    again = run(kept(traced), ARGUMENTS)
+    assert traced == [2]
+    np.testing.assert_array_equal(first["values"], 10 * np.arange(3.0) ** 2)
+    assert first["wc"] == again["wc"] and np.array_equal(first["values"], again["values"])
+
+
+def test_what_was_begun_is_compiled_by_the_first_call(traced):
+    programs = kept(traced)
+    assert programs.begin(ARGUMENTS) and traced == [2]
+    assert run(programs, ARGUMENTS)["wc"] == 10.0 and traced == [2]
+    assert kept(traced).begin(ARGUMENTS) and traced == [2]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        (ARGUMENTS[0], jnp.arange(4.0)),
+        (ARGUMENTS[0], jnp.arange(3)),
+        (*ARGUMENTS, 3),
+        (LADRC(10.0, 30.0, 0.85, dt=0.004), ARGUMENTS[1]),
+    ],
+    ids=["shape", "type", "number", "setting"],
+)
+def test_a_program_is_for_what_it_was_traced_from(traced, other):
+    kept(traced).find(ARGUMENTS)
+    found = run(kept(traced), other)
+    assert len(traced) == 2
+    np.testing.assert_allclose(found["values"], 10.0 * np.asarray(other[1], float) ** traced[1])
+
+
+def test_numbers_of_arrays_are_given_to_the_same_program(traced):
+    kept(traced).find(ARGUMENTS)
+    other = LADRC(5.0, 30.0, 0.85, dt=0.002), jnp.ones(3)
+    assert run(kept(traced), other)["wc"] == 5.0
+    assert len(traced) == 1
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [(Foreign(jnp.ones(())), jnp.arange(3.0)), (*ARGUMENTS, lambda x: x), (*ARGUMENTS, kept)],
+    ids=["class", "function", "function with a name"],
+)
+def test_what_another_has_made_is_not_kept(traced, foreign, tmp_path):
+    assert kept(traced).find(foreign) is None and not kept(traced).begin(foreign)
+    assert not traced and not any(tmp_path.iterdir())
+
+
+def test_a_change_of_the_source_makes_another_name(monkeypatch):
+    name = lambda: _kept_programs._name(test_a_program_is_found_again_without_tracing, {}, ())
+    before = name()
+    monkeypatch.setattr(_kept_programs, "_makers", lambda: b"another source")
+    assert name() != before
+
+
+def test_a_damaged_file_is_compiled_anew(traced, tmp_path):
+    kept(traced).find(ARGUMENTS)
+    [path] = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.warns(UserWarning, match="compiled anew"):
+        assert run(kept(traced), ARGUMENTS)["wc"] == 10.0
+    assert run(kept(traced), ARGUMENTS)["wc"] == 10.0
+    assert len(traced) == 2
+
+
+def test_without_a_folder_no_program_is_kept():
+    assert KeptPrograms(lambda x: x, dict).find(ARGUMENTS) is None
+
+
+def test_a_second_process_traces_no_flight_and_flies_the_same(tmp_path):
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    environment = inherited | {"JAXQUAD_CACHE": str(tmp_path)}
+    fly = lambda: subprocess.run(
+        [sys.executable, "-W", "error", "-c", PROCESS],
+        env=environment, capture_output=True, text=True, check=True, timeout=100,
+    ).stdout.split()  # fmt: skip
+    (flown, first), (again, second) = fly(), fly()
+    assert flown == again and (first, second) == ("True", "False")
