@@ -23,6 +23,7 @@ from ._engine import (
     compiler_options as compiler_options,
     Engine as Engine,
     engine as engine,
+    hasty_options as hasty_options,
     Jit as Jit,
 )
 from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse

@@ -144,7 +144,8 @@ def compiler_options() -> dict[str, int]:
 _WIDEST = {"xla_cpu_prefer_vector_width": 512}  # bits; LLVM takes half of what a CPU can, unasked
 # Without XLA's own compiler of fused operations, and with less of LLVM's: that takes two thirds of
 # the time, and the derivatives of loops run as fast.
-_BRIEF = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+_EMITTERS = "xla_cpu_use_fusion_emitters"
+_BRIEF = {_EMITTERS: False, "xla_backend_optimization_level": 1}
 
 
 def brief_options() -> dict[str, Any]:
@@ -152,6 +153,12 @@ def brief_options() -> dict[str, Any]:
     if jax.default_backend() != "cpu":
         return {}
     return compiler_options() | {k: v for k, v in _BRIEF.items() if not _is_chosen(k) and _takes(k)}
+
+
+def hasty_options() -> dict[str, Any]:
+    """For programs without loops over time that run a few times: hardly any optimisation."""
+    level = {"xla_backend_optimization_level": 0}
+    return level if _is_chosen(_EMITTERS) or not _takes(_EMITTERS) else level | {_EMITTERS: False}
 
 
 def _is_chosen(option: str) -> bool:

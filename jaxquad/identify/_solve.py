@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jaxquad._core import (
     STALLED,
     TOLERANCE,
 )
-from jaxquad._xla import arctan2
+from jaxquad._xla import arctan2, hasty_options
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
 from ._evaluate import as_residuals, evaluate, Evaluation, Frame, start_each, take_apart
@@ -192,10 +192,12 @@ def _descend(
     )
 
 
-# A short descent takes less time than LLVM's optimisation of its program would.
-_QUICK: dict[str, Any] = {"compiler_options": {"xla_backend_optimization_level": 0}}
 _descend_long = eqx.filter_jit(_descend)
-_descend_by_solver = eqx.filter_jit(_descend, **_QUICK)
+
+
+@ft.cache
+def _descend_by_solver() -> Callable[..., Stop]:
+    return eqx.filter_jit(_descend, compiler_options=hasty_options())
 
 
 def _descend_short(
@@ -205,7 +207,7 @@ def _descend_short(
     max_steps: int,
 ) -> Stop:
     if solver is not None:
-        return _descend_by_solver(problem, jax.device_put(z0), solver, max_steps)
+        return _descend_by_solver()(problem, jax.device_put(z0), solver, max_steps)
     # `eqx.filter_jit` sorts the problem into arrays and others for half the time of the descent.
     frame, arrays = take_apart(problem)
     return _short_program(frame, max_steps)(z0, arrays)
@@ -216,7 +218,8 @@ def _short_program(frame: Frame, max_steps: int) -> Callable[[np.ndarray, list[N
     def run(z0: Float[Array, " parameters"], arrays: Sequence[Array]) -> Stop:
         return _descend(frame.filled(arrays), z0, None, max_steps)
 
-    return jax.jit(run, **_QUICK)
+    # A short descent takes less time than the optimisation of its program would.
+    return jax.jit(run, compiler_options=hasty_options())
 
 
 def least_squares(
