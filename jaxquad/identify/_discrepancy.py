@@ -1,11 +1,14 @@
 """What a model leaves unexplained of a response: its size, and what that does to the parameters.
 
 The logarithm of measurement over model is noise plus a discrepancy: a Gaussian process over the
-logarithm of frequency, with one amplitude for all response pairs: in rad of phase, and 0.6 of it
-in neper of magnitude. Amplitude and length follow from the restricted likelihood, which leaves out
-what the parameters can take up themselves.
+logarithm of frequency, with one amplitude for all response pairs: in rad of phase, and half of it
+in neper of magnitude. It walks at random and is drawn back to zero (Ornstein & Uhlenbeck), as lags,
+zeros and modes make it that are missing here and there, each near its own frequency. Smoother ones
+take what a band shows for a piece of a wider swing, most of which would be an error of the gain.
+Amplitude and length follow from the restricted likelihood, which leaves out what the parameters can
+take up themselves.
 Source: Kennedy & O'Hagan (2001), Bayesian calibration of computer models; Rasmussen & Williams
-(2006), Gaussian Processes for Machine Learning, eq. 2.45.
+(2006), Gaussian Processes for Machine Learning, sec. 4.2.1.
 """
 
 import functools as ft
@@ -22,13 +25,13 @@ from ._accuracy import Matrix, PriorRows, ResponseTerm, scaled_inverse
 from ._cost import Points
 
 
-LENGTHS = (0.5, 1.0, 2.0)  # in ln(omega); 0.69 is an octave
+LENGTHS = (1.0, 3.0, 9.0)  # in ln(omega); 2.3 is a decade
 MEAN = 0.05  # of the prior of the amplitude, neper
 _SHAPE = 1.5  # of that prior, a gamma distribution: errors far below its mean are few
-SHARES = np.array([0.6, 1.0])  # of the amplitude, in magnitude and in phase
-_NONE = 0.82  # the prior's mass at a discrepancy of zero
+SHARES = np.array([0.5, 1.0])  # of the amplitude, in magnitude and in phase
+_NONE = 0.85  # the prior's mass at a discrepancy of zero
 _AMPLITUDES = 16
-_RANK = 16  # of a kernel over a band of two decades: what is left of its variance is below 1 %
+_RANK = 16  # of a kernel over a band of two decades: 1 to 6 % of its variance is left, the fastest
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
 _FOLLOWS = 1.25  # factor by which such a width grows
 
@@ -38,11 +41,11 @@ Widths = Float[np.ndarray, " parameters"]
 
 @pytree_node
 class Discrepancy:
-    """How far a model is off beyond the noise, in rad of phase; 0.6 of it in neper of magnitude.
+    """How far a model is off beyond the noise, in rad of phase; half of it in neper of magnitude.
 
     **Attributes:**
 
-    - `amplitude`: root mean square of the posterior; 0.1 is 6 deg, and 6 % of magnitude.
+    - `amplitude`: root mean square of the posterior; 0.1 is 6 deg, and 5 % of magnitude.
     - `length`: over which it changes, in ln(omega).
     - `none`: the probability that the model is right.
     - `widths`: for each parameter what makes its interval as wide as it is: "noise", "data" (the
@@ -132,15 +135,10 @@ def kernel_basis(omega: bytes) -> Float[np.ndarray, "lengths frequencies rank"]:
     apart = np.abs(place[:, None] - place[None, :])
     roots = []
     for length in LENGTHS:
-        values, vectors = np.linalg.eigh(_matern(np.sqrt(5) * apart / length))
+        values, vectors = np.linalg.eigh(np.exp(-apart / length))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         roots.append(root[:, ::-1][:, :_RANK])
     return np.stack(roots)
-
-
-def _matern(distance: np.ndarray) -> np.ndarray:
-    """Matern's kernel of order 5/2: a discrepancy whose curvature is continuous."""
-    return (1 + distance + distance**2 / 3) * np.exp(-distance)
 
 
 def _restricted_likelihoods(

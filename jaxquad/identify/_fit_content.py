@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ._discrepancy import Discrepancy
+from ._discrepancy import Discrepancy, SHARES
 
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def _how_wide(fit: "Fit") -> str:
     found = fit.discrepancy
     if found is None:
         return ""
-    size, degrees = 100 * 0.6 * found.amplitude, np.degrees(found.amplitude)
+    size, degrees = 100 * SHARES[0] * found.amplitude, np.degrees(found.amplitude)
     text = f"95 % intervals count model error: {size:.2g} % of magnitude, {degrees:.2g} deg"
     text += " of phase"
     text += f" (probability of none: {100 * found.none:.0f} %)" if found.none > 0.05 else ""
