@@ -27,6 +27,7 @@ from ._engine import (
     Jit as Jit,
 )
 from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse
+from ._kept_programs import KeptPrograms as KeptPrograms
 from ._kernel import as_one_kernel as as_one_kernel, why_no_kernels as why_no_kernels
 from ._real_parts import (
     in_real_parts as in_real_parts,

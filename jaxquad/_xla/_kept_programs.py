@@ -14,7 +14,7 @@ import pickle
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType
@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import numpy as np
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jaxtyping import Array, PyTree
 
@@ -29,6 +30,9 @@ from jaxquad._core import thread_settings
 
 from ._compile_cache import own_folder
 from ._switch import device_kernels, plain_loops
+
+
+Numbers = Array | np.ndarray
 
 
 class KeptPrograms:
@@ -66,6 +70,28 @@ class KeptPrograms:
                 self._programs[known] = self._made(args, self._begun.pop(known, None), folder)
             return self._programs[known]
 
+    def of_arrays(
+        self, fill: Callable[[Sequence[Any]], PyTree]
+    ) -> Callable[[Sequence[Numbers]], PyTree]:
+        """`function` of the arguments that `fill` makes of arrays, by a program of these alone.
+
+        The arrays are in the order of the arguments' leaves.
+        """
+        function, programs = self._function, dict[tuple, _Program | None]()
+        options = self._options()
+        plain = jax.jit(lambda arrays: function(*fill(arrays)), compiler_options=options or None)
+
+        def run(arrays: Sequence[Numbers]) -> PyTree:
+            if _folder() is None:
+                return plain(arrays)
+            kinds = tuple(map(_kind, arrays))
+            if kinds not in programs:
+                programs[kinds] = self.find(_in_order(fill(arrays), arrays))
+            program = programs[kinds]
+            return plain(arrays) if program is None else program.of_arrays(arrays)
+
+        return run
+
     def _made(self, args: PyTree, begun: "_Lowered | None", folder: Path) -> "_Program | None":
         options = self._options()
         name = _name(self._function, options, args)
@@ -77,6 +103,13 @@ class KeptPrograms:
             program = _compiled(name, lowered)
             _write(folder / name, program)
         return program
+
+
+def _in_order(args: PyTree, arrays: Sequence[Numbers]) -> PyTree:
+    mine = [x for x in jax.tree.leaves(args) if eqx.is_array(x)]
+    if len(mine) != len(arrays) or any(x is not y for x, y in zip(mine, arrays, strict=True)):
+        raise ValueError("the arrays are not those of the arguments' leaves, in their order")
+    return args
 
 
 def _folder() -> Path | None:
@@ -96,7 +129,10 @@ class _Program(NamedTuple):
     result: PyTree
 
     def __call__(self, args: PyTree) -> PyTree:
-        found = self.run([x for x in jax.tree.leaves(args) if eqx.is_array(x)])
+        return self.of_arrays([x for x in jax.tree.leaves(args) if eqx.is_array(x)])
+
+    def of_arrays(self, arrays: Sequence[Numbers]) -> PyTree:
+        found = self.run(list(arrays))
         return jax.tree.map(lambda k: found[k], self.result)
 
 
@@ -199,6 +235,7 @@ def _name(function: Callable[..., PyTree], options: dict, args: PyTree) -> str |
     return f"traced-{function.__name__}-{digest.hexdigest()}-cache"
 
 
+_TRACERS = ("jax", "jaxlib", "numpy", "equinox", "optimistix", "lineax")
 _OURS = ("jaxquad", "jax", "jaxlib", "numpy", "equinox", "builtins", "collections", "copyreg")
 
 
@@ -227,6 +264,6 @@ def _makers() -> bytes:
     for path in sorted(source.rglob("*.py")):
         digest.update(f"{path.relative_to(source)} {path.stat().st_size} ".encode())
         digest.update(path.read_bytes())
-    versions = [version(name) for name in ("jax", "jaxlib", "numpy", "equinox")]
+    versions = [version(name) for name in _TRACERS]
     digest.update(repr((sys.version, versions)).encode())
     return digest.digest()

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxquad._xla import KeptPrograms
+
 from ._mixing import Mixing
 from ._parameters import Numbers
 from ._problem import misfits, Problem
@@ -39,7 +41,7 @@ def start_each(
     for z in places:
         z_all = np.array(problem.parameters.start)
         z_all[: z.size] = z
-        found.append([run(z_all, arrays) for run, arrays in programs])
+        found.append([run([z_all, *arrays]) for run, arrays in programs])
     return lambda: [_joined(parts, problem.parameters.start.size) for parts in found]
 
 
@@ -78,7 +80,7 @@ def _mixed(mixing: Mixing, part: np.ndarray, shape: tuple[int, ...]) -> np.ndarr
     return np.stack([np.real(turned), np.imag(turned)], axis=1).reshape(part.shape)
 
 
-Program = Callable[[np.ndarray, list[Numbers]], tuple[Array, Array]]
+Program = Callable[[list[Numbers]], tuple[Array, Array]]
 
 
 class _Same:
@@ -127,12 +129,16 @@ def _programs(same: _Same) -> list[tuple[Program, list[Numbers]]]:
 
 @ft.lru_cache(maxsize=128)
 def _program(frame: Frame) -> Program:
-    def run(z: Float[Array, " all"], arrays: Sequence[Array]):
-        problem = frame.filled(arrays)
+    return _SLOPES.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:])))
 
-        def along(change):
-            return jax.jvp(lambda z: misfits(z, problem), (z,), (change,))
 
-        return jax.vmap(along, out_axes=(None, 0))(jnp.eye(z.size, dtype=z.dtype))
+def _misfits_and_slopes(
+    z: Float[Array, " all"], problem: Problem
+) -> tuple[Float[Array, " residuals"], Float[Array, "all residuals"]]:
+    def along(change):
+        return jax.jvp(lambda z: misfits(z, problem), (z,), (change,))
 
-    return jax.jit(run)
+    return jax.vmap(along, out_axes=(None, 0))(jnp.eye(z.size, dtype=z.dtype))
+
+
+_SLOPES = KeptPrograms(_misfits_and_slopes, dict)

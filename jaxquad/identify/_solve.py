@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jaxquad._core import (
     STALLED,
     TOLERANCE,
 )
-from jaxquad._xla import arctan2, hasty_options
+from jaxquad._xla import arctan2, hasty_options, KeptPrograms
 from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
 
 from ._evaluate import as_residuals, evaluate, Evaluation, Frame, start_each, take_apart
@@ -197,7 +197,8 @@ _descend_long = eqx.filter_jit(_descend)
 
 @ft.cache
 def _descend_by_solver() -> Callable[..., Stop]:
-    return eqx.filter_jit(_descend, compiler_options=hasty_options())
+    given: dict[str, Any] = {"compiler_options": hasty_options()}
+    return eqx.filter_jit(_descend, **given)
 
 
 def _descend_short(
@@ -210,16 +211,20 @@ def _descend_short(
         return _descend_by_solver()(problem, jax.device_put(z0), solver, max_steps)
     # `eqx.filter_jit` sorts the problem into arrays and others for half the time of the descent.
     frame, arrays = take_apart(problem)
-    return _short_program(frame, max_steps)(z0, arrays)
+    return _short_program(frame, max_steps)([z0, *arrays])
 
 
 @ft.lru_cache(maxsize=128)
-def _short_program(frame: Frame, max_steps: int) -> Callable[[np.ndarray, list[Numbers]], Stop]:
-    def run(z0: Float[Array, " parameters"], arrays: Sequence[Array]) -> Stop:
-        return _descend(frame.filled(arrays), z0, None, max_steps)
+def _short_program(frame: Frame, max_steps: int) -> Callable[[list[Numbers]], Stop]:
+    return _DESCENTS.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:]), max_steps))
 
-    # A short descent takes less time than the optimisation of its program would.
-    return jax.jit(run, compiler_options=hasty_options())
+
+def _descend_by_default(z0: Float[Array, " parameters"], problem: Problem, max_steps: int) -> Stop:
+    return _descend(problem, z0, None, max_steps)
+
+
+# A short descent takes less time than the optimisation of its program would.
+_DESCENTS = KeptPrograms(_descend_by_default, hasty_options)
 
 
 def least_squares(

@@ -73,6 +73,28 @@ def test_what_was_begun_is_compiled_by_the_first_call(traced):
     assert kept(traced).begin(ARGUMENTS) and traced == [2]
 
 
+def filled(arrays):
+    """ARGUMENTS with other arrays."""
+    leaves, structure = jax.tree.flatten(ARGUMENTS)
+    given = iter(arrays)
+    return jax.tree.unflatten(structure, [next(given) if eqx.is_array(x) else x for x in leaves])
+
+
+@pytest.mark.parametrize("values", [np.arange(3.0), np.arange(5.0)], ids=["three", "five"])
+def test_a_program_of_arrays_alone_is_found_again(traced, values):
+    *own, _ = filter(eqx.is_array, jax.tree.leaves(ARGUMENTS))
+    first, again = (kept(traced).of_arrays(filled)([*own, values]) for _ in range(2))
+    assert traced == [2]
+    np.testing.assert_array_equal(first["values"], 10 * values**2)
+    assert np.array_equal(first["values"], again["values"])
+
+
+def test_arrays_out_of_order_are_refused(traced):
+    arrays = [*filter(eqx.is_array, jax.tree.leaves(ARGUMENTS))]
+    with pytest.raises(ValueError, match="in their order"):
+        kept(traced).of_arrays(lambda given: filled(given[::-1]))(arrays)
+
+
 @pytest.mark.parametrize(
     "other",
     [
