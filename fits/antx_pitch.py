@@ -45,8 +45,9 @@ def read_flights(folder: Path) -> tuple[jq.Record, jq.Record]:
     return prbs, sweep
 
 
-def late(fit: jq.identify.Fit) -> jq.identify.Combination:
-    return fit.derived(lambda model: model.lag + model.delay, "T + tau")
+def late(fit: jq.identify.Fit, *, model_error: bool = True) -> jq.identify.Combination:
+    total = lambda model: model.lag + model.delay
+    return fit.derived(total, "T + tau", model_error=model_error)
 
 
 def row(name: str, fit: jq.identify.Fit) -> str:

@@ -65,12 +65,13 @@ def test_gain_and_total_delay_are_those_of_the_flight(result):
 
 
 def test_members_differ_in_lag_delay_and_their_sum_as_the_fit_says(result, certificate):
-    """They trade off in the fit, and so do they in what is drawn from it."""
+    """By noise alone they trade off; what is drawn counts model error, correlated as in the fit."""
     lag, delay = (np.array(certificate["members"][name])[0] for name in ("lag", "delay"))
     known = result["identified"]
+    one, other, both = known["by_noise"]
+    assert (both**2 - one**2 - other**2) / (2 * one * other) < -0.5
     one, other, both = known["lag"][1], known["delay"][1], known["late"]["standard_error"]
     correlation = (both**2 - one**2 - other**2) / (2 * one * other)
-    assert correlation < 0
     # Draws are normal in the logarithms; the loop's delay is the fit's without half a hold.
     delay = delay + DT / 2
     chance = 3 / np.sqrt(lag.size)
