@@ -122,7 +122,7 @@ class FilteredPoint:
     prior_slopes: Float[np.ndarray, "priors parameters"]
     next_to: "FilteredPoint | None" = None  # a point so near that it has the same slopes
 
-    @ft.cached_property
+    @property
     def cost(self) -> float:
         """Half the sum of squares; infinite where something is not finite."""
         parts = [self.prior_misfits, *(one.misfit for one in self.records)]
