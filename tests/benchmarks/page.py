@@ -116,8 +116,9 @@ PRINTED = (
 HEAD = """\
 # Performance
 
-Made by `python tests/benchmarks/page.py` on an idle machine: {machine}. Peers run in the same
-minutes on the same machine, so read ratios; seconds move from machine to machine.
+Made by `python tests/benchmarks/page.py` on an idle machine: {machine}.
+Peers run in the same minutes on the same machine, so read ratios; seconds move from machine to
+machine.
 
 ## Time to the first answer
 
