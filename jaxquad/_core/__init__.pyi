@@ -63,4 +63,8 @@ from ._process import (
 )
 from ._pytree_node import pytree_node as pytree_node
 from ._stages import announce as announce, STAGES as STAGES
-from ._threads import map_in_threads as map_in_threads, thread_settings as thread_settings
+from ._threads import (
+    available_cores as available_cores,
+    map_in_threads as map_in_threads,
+    thread_settings as thread_settings,
+)

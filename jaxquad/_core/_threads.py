@@ -1,5 +1,6 @@
 """Threads beside that of a caller, which compute only what they would compute in its place."""
 
+import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -13,7 +14,7 @@ Found = TypeVar("Found")
 
 
 def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> list[Found]:
-    """`function` of each, two at a time, while the next ones are drawn from an iterator.
+    """`function` of each, on all cores, while the next ones are drawn from an iterator.
 
     One after the other where JAX is set differently for the caller's thread alone.
     """
@@ -27,9 +28,17 @@ def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -
     def run(each: Given) -> tuple[Found] | None:
         return (function(each),) if thread_settings() == settings else None
 
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(max(available_cores(), 2)) as pool:
         found = list(pool.map(run, remember()))
     return [function(x) if y is None else y[0] for x, y in zip(items, found, strict=True)]
+
+
+def available_cores() -> int:
+    """That this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS, Windows
+        return os.cpu_count() or 1
 
 
 def thread_settings() -> tuple[object, ...]:

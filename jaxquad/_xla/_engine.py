@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 from jaxquad._core import is_concrete
 
 from ._accelerator import why_no_device_kernels
-from ._kept_programs import KeptPrograms
+from ._kept_programs import KeptPrograms, kind_of
 from ._kernel import why_no_kernels
 from ._switch import Kernel, left_plain, plain_loops, set_kernel, warn_once
 
@@ -92,6 +92,7 @@ class Jit:
         self._plain = eqx.filter_jit(function)
         self._function = function
         self._failed: set[tuple] = set()
+        self._known: set[tuple] = set()
 
     @ft.cached_property
     def _tuned(self) -> Callable[..., PyTree]:
@@ -100,7 +101,7 @@ class Jit:
         return eqx.filter_jit(self._function, **given)
 
     def __call__(self, *args: PyTree) -> PyTree:
-        if not _is_outermost(args):
+        if not self.is_outermost(*args):
             return self._plain(*args)
         if _why_plain() is not None:
             return self._run(args)
@@ -125,7 +126,19 @@ class Jit:
         return self._tuned(*args) if program is None else program(args)
 
     def lower(self, *args: PyTree) -> PyTree:
-        return (self._tuned if _is_outermost(args) else self._plain).lower(*args)
+        return (self._tuned if self.is_outermost(*args) else self._plain).lower(*args)
+
+    def is_outermost(self, *args: PyTree) -> bool:
+        """Whether a call with such arguments is no part of another program."""
+        return _is_outermost(args)
+
+    def is_new(self, *args: PyTree) -> bool:
+        """Whether nobody has asked before for arguments that have the same program."""
+        kinds = kind_of(args)
+        if kinds in self._known:
+            return False
+        self._known.add(kinds)
+        return True
 
     def begin(self, *args: PyTree) -> None:
         """Trace and lower what the first call with such arguments will compile."""

@@ -50,7 +50,7 @@ class KeptPrograms:
         name = None if folder is None else _name(self._function, options, args)
         if folder is None or name is None:
             return False
-        known = _known(args)
+        known = kind_of(args)
         with self._lock:
             if not ((folder / name).is_file() or known in self._programs or known in self._begun):
                 self._begun[known] = _lowered(self._function, name, options, args)
@@ -64,7 +64,7 @@ class KeptPrograms:
         folder = _folder()
         if folder is None:
             return None
-        known = _known(args)
+        known = kind_of(args)
         with self._lock:
             if known not in self._programs:
                 self._programs[known] = self._made(args, self._begun.pop(known, None), folder)
@@ -172,7 +172,7 @@ def _lowered(function: Callable[..., PyTree], name: str, options: dict, args: Py
     return _Lowered(program, result[0])
 
 
-def _known(args: PyTree) -> tuple:
+def kind_of(args: PyTree) -> tuple:
     """What tells apart the programs of a process."""
     leaves, structure = jax.tree.flatten(args)
     return structure, tuple(map(_kind, leaves)), thread_settings(), _switches()

@@ -1,4 +1,3 @@
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -11,6 +10,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from jaxquad._core import (
     advance,
+    available_cores,
     begin,
     CONVERGED,
     decrement,
@@ -167,7 +167,7 @@ def _both_ways(model, omega):
 def _calls(batch: int, chunk: int, chunks: int) -> list[Int[np.ndarray, "chunks chunk"]]:
     """The members that each call solves, by chunks; the last are filled up with the last member."""
     places = _places(batch, chunk)
-    calls = max(-(-len(places) // chunks), min(len(places), os.cpu_count() or 1))
+    calls = max(-(-len(places) // chunks), min(len(places), available_cores()))
     return np.array_split(places, calls)
 
 
@@ -191,7 +191,7 @@ def _solve_calls(
     if len(calls) > 1:
         solve(calls[0][:0])  # of no chunk: compiled here, once for all threads
     # A program runs on one core.
-    with ThreadPoolExecutor(max_workers=min(len(calls), os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=min(len(calls), available_cores())) as pool:
         found = list(pool.map(solve, calls))
     return BatchSolution(*(np.concatenate(each)[:batch] for each in zip(*found, strict=True)))
 

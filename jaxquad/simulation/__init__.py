@@ -30,6 +30,7 @@ from ._hardware import (
 )
 from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
+from ._over_cores import over_cores as over_cores
 from ._over_devices import (
     loop_over_devices as loop_over_devices,
     over_devices as over_devices,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._core import as_float
-from jaxquad._xla import as_one_kernel, Devices, gathered, Jit
+from jaxquad._xla import as_one_kernel, Devices, Jit
 from jaxquad.loops import Loop
 
 from ._authority import Authority, find_authority, warn_beyond_authority
@@ -22,6 +22,7 @@ from ._flight_metrics import (
     window,
 )
 from ._metrics import Metrics, NUMBERS
+from ._over_cores import over_cores
 from ._over_devices import DeviceChoice, loop_over_devices, placed, Run
 from ._run import check_run, scan_loop
 from ._scenario import Scenario
@@ -108,7 +109,7 @@ def evaluate(
     place = window(len(scenario.reference), loop.dt, start=start, stop=stop, load_start=load_start)
     span = Window(*map(jnp.asarray, place))
     run, places = placed(loop, scenario, devices)
-    found, numbers = gathered(_run(*run, span, places))
+    found, numbers = over_cores(_run, run, (span,), places)
     warn_beyond_authority(found, scenario)
     return _metrics(numbers, place, loop.dt)
 

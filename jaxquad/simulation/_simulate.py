@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._core import align
-from jaxquad._xla import Devices, gathered, Jit
+from jaxquad._xla import Devices, Jit
 from jaxquad.loops import Loop
 from jaxquad.records import AXES, Record
 
 from ._authority import Authority, find_authority, warn_beyond_authority
 from ._memory import require_memory, size_of
+from ._over_cores import over_cores
 from ._over_devices import DeviceChoice, loop_over_devices, placed, Run
 from ._run import check_run, scan_loop
 from ._scenario import Scenario
@@ -118,10 +119,11 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     - `scenario`: what happens, see `jq.scenario`.
     - `devices`: compute a part of the members each; the result is the same, on the default device.
         None: those of this process, as many as have 32 members (4096 where they are no CPUs), or
-        those that the data were put on. A number: so many of them. A sequence of `jax.Device`:
-        those, of other processes too. A CPU is one device whatever its cores, which a loop uses one
-        of, until `jax.config.update("jax_num_cpu_devices", 2)`, before the first computation, makes
-        it two. After `jax.distributed.initialize` each process makes the same call of the whole
+        those that the data were put on; the cores of a CPU share 64 members or more, except within
+        `jax.jit` and its like, where a loop uses one core. A number: so many of them; 1 is one
+        core. A sequence of `jax.Device`: those, of other processes too. A CPU is one device,
+        until `jax.config.update("jax_num_cpu_devices", 2)`, before the first computation, makes it
+        two. After `jax.distributed.initialize` each process makes the same call of the whole
         ensemble with `devices=jax.devices()`, and gets all of its members.
 
     **Returns:** a `jq.simulation.Simulation` with all samples of all members.
@@ -133,7 +135,8 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     """
     check_run(loop, scenario)
     run, places = placed(loop, scenario, devices)
-    ((angle, *others), diverged), authority = gathered(_run(*run, places))
+    flown = over_cores(_run, run, (), places, check=_require_room)
+    ((angle, *others), diverged), authority = flown
     warn_beyond_authority(authority, scenario)
     time = _times(loop.dt, angle.shape[0], angle.dtype)
     measurement, command, saturated, signals = others
@@ -157,18 +160,25 @@ def _times(dt: float, samples: int, dtype: np.dtype) -> Float[Array, " samples"]
         return jax.device_put((dt * np.arange(samples)).astype(dtype))
 
 
+_Flown = tuple[tuple[PyTree, Bool[Array, "*ensemble"]], Authority | None]
+
+
 @Jit
-def _run(
-    loop: Loop, scenario: Scenario, devices: Devices | None = None
-) -> tuple[tuple[PyTree, Bool[Array, "*ensemble"]], Authority | None]:
+def _run(loop: Loop, scenario: Scenario, devices: Devices | None = None) -> _Flown:
     found = find_authority(loop.plant, loop.drive, loop.controller)
     stored, running = loop_over_devices(_store, (loop, scenario), None, devices)
+    result = (stored, ~running), found
+    _require_room(result)
+    return result
+
+
+def _require_room(result: PyTree) -> None:
+    (stored, _), _ = result
     samples, axes, *members = stored[0].shape
     what = f"a record of {samples} samples of {axes} axes of {math.prod(members)} members"
     require_memory(
         what, size_of(stored), "take jq.evaluate, which stores none, or jq.simulation.in_slices"
     )
-    return (stored, ~running), found
 
 
 def _store(run: Run, nothing: None) -> tuple[PyTree, Bool[Array, "*ensemble"]]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._core import as_array
-from jaxquad._xla import brief_options, Devices, gathered, Jit
+from jaxquad._xla import brief_options, Devices, Jit
 from jaxquad.loops import Loop
 from jaxquad.simulation import (
     check_run,
@@ -18,6 +18,7 @@ from jaxquad.simulation import (
     find_steps,
     FlightMetrics,
     loop_over_devices,
+    over_cores,
     placed,
     SampleResult,
     scan_loop,
@@ -53,7 +54,7 @@ def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = No
     parts = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
     windows = tuple(Window(*map(as_array, x)) for x in (whole, *parts))
     run, places = placed(loop, flight, devices)
-    numbers, each, diverged = gathered(_run(*run, windows, places))
+    numbers, each, diverged = over_cores(_run, run, (windows,), places)
     found = jax.tree.map(lambda x: np.asarray(x, float), (numbers, each))
     known, duration = _join(*found), (whole[1] + 1 - whole[0]) * dt
     known["activity_rate"] = known["activity"] / duration

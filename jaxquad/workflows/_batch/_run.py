@@ -1,9 +1,10 @@
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
+
+from jaxquad._core import available_cores
 
 from .._settings import IdentifySettings
 from ._jobs import (
@@ -91,7 +92,7 @@ def batch(
         if settings.scheduler is not None:
             done = perform_on_cluster(settings.scheduler, jobs, work)
         else:
-            done = perform_locally(jobs, work, settings.workers or _cores(), fleet.timeout)
+            done = perform_locally(jobs, work, settings.workers or available_cores(), fleet.timeout)
         try:
             for job, content in done:
                 fleet.answered(job, content)
@@ -184,10 +185,3 @@ class _Fleet:
         self.known[log] = row
         if self.listener is not None:
             self.listener(row)
-
-
-def _cores() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # macOS, Windows
-        return os.cpu_count() or 1
