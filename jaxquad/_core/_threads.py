@@ -1,12 +1,13 @@
 """Threads beside that of a caller, which compute only what they would compute in its place."""
 
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+
+from ._cores import available_cores
 
 
 Given = TypeVar("Given")
@@ -31,14 +32,6 @@ def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -
     with ThreadPoolExecutor(max(available_cores(), 2)) as pool:
         found = list(pool.map(run, remember()))
     return [function(x) if y is None else y[0] for x, y in zip(items, found, strict=True)]
-
-
-def available_cores() -> int:
-    """That this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # macOS, Windows
-        return os.cpu_count() or 1
 
 
 def thread_settings() -> tuple[object, ...]:

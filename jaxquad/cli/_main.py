@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import os
 import re
 import sys
 import warnings
@@ -43,7 +44,7 @@ _CODES = """exit codes:
   4  some logs of a batch failed, a design is not to be flown, or an excitation misses a guideline
   130  interrupted
 """
-_UNUSABLE, _INTERRUPTED = 2, 130
+_UNUSABLE, _INTERRUPTED, _CLOSED = 2, 130, 141
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,6 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.showwarning = _print_warning
         try:
             return options.run(options)
+        except BrokenPipeError:  # `jaxquad ... | head` has read enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _CLOSED
         except (ValueError, OSError) as error:
             code = NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE
             return _fail(in_options(str(error)), code)

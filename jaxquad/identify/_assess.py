@@ -26,7 +26,7 @@ from ._accuracy import (
     ResponseTerm,
     scaled_inverse,
 )
-from ._bounds import one_sided, one_sided_limit
+from ._bounds import apart_at_zero, inflation_at_zero, one_sided, one_sided_limit
 from ._cost import Points, Weights, widen_band
 from ._discrepancy import (
     describe_discrepancy,
@@ -42,6 +42,7 @@ from ._fit_remarks import (
     no_minimum,
     NO_MODEL,
     no_model,
+    remarks_on_bounds,
     remarks_on_discrepancy,
     remarks_on_fit,
     remarks_on_priors,
@@ -97,6 +98,7 @@ def assess(
     falls_aside = look_aside(problem, solution, _cost(blocks, prior), bread)
     halved = ft.partial(_one_sided, seen=seen, names=parameters.names, bounds=bounds)
     by_noise, covariance = halved(seen.by_noise), halved(seen.covariance)
+    pulled = _pulled_beyond(seen, parameters.names, bounds)
     plain = seen
     if counted.weights is not None:
         alone = problem.weighted(counted.weights, counted.mixings)
@@ -129,6 +131,7 @@ def assess(
             *_remarks_on_used(problem, frfs),
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
             *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
+            *remarks_on_bounds(pulled, verdict),
             *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
             *remarks_on_priors(prior.misfit, verdict, by_data, chi_squared=doubted),
             *remarks_on_discrepancy(discrepancy),
@@ -179,8 +182,13 @@ def _bounds(
     bounds, tangled = [], []
     curvature, names = scaled_inverse(seen.bread), problem.parameters.names
     for k in _possible_zeros(problem, solution, seen):
-        widths = seen.covariance[k, k], seen.by_noise[k, k]
-        both = [one_sided_limit(problem, solution, k, each / curvature[k, k]) for each in widths]
+        others = [j for j in solution.at_zero if j != k]
+        parts = seen.covariance, seen.by_noise
+        if others:
+            inflation = [inflation_at_zero(each, seen.bread, k, others) for each in parts]
+        else:
+            inflation = [float(each[k, k] / curvature[k, k]) for each in parts]
+        both = [one_sided_limit(problem, solution, k, each) for each in inflation]
         moved = _along(seen, k) * abs(both[0] / units[k])
         moved[[k, *(solution.at_zero if k in solution.at_zero else ())]] = 0.0
         if np.all(moved <= LIMIT):
@@ -220,13 +228,30 @@ def _with_tangled(
 def _one_sided(
     covariance: Matrix, seen: _Seen, names: tuple[str, ...], bounds: Sequence[Bound]
 ) -> Matrix:
-    step = -scaled_inverse(seen.bread) @ seen.gradient
-    for bound in bounds:
-        k = names.index(bound.name)
-        if bound.value:
-            continue
-        covariance = one_sided(covariance, k, float(step[k]))
+    covariance, steps = _at_zero(covariance, seen, names, bounds)
+    for k, step in steps.items():
+        covariance = one_sided(covariance, k, step)
     return covariance
+
+
+def _at_zero(
+    covariance: Matrix, seen: _Seen, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> tuple[Matrix, dict[int, float]]:
+    """The covariance without bounds, and where these parameters at zero would go without them."""
+    zeros = [names.index(bound.name) for bound in bounds if not bound.value]
+    if len(zeros) > 1:
+        return apart_at_zero(covariance, seen.bread, seen.gradient, zeros)
+    step = -scaled_inverse(seen.bread) @ seen.gradient
+    return covariance, {k: float(step[k]) for k in zeros}
+
+
+def _pulled_beyond(
+    seen: _Seen, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> dict[str, float]:
+    """How far beyond zero the data want parameters at zero, in random errors."""
+    covariance, steps = _at_zero(seen.by_noise, seen, names, bounds)
+    errors = {k: float(np.sqrt(max(covariance[k, k], 1e-300))) for k in steps}
+    return {names[k]: -step / errors[k] for k, step in steps.items()}
 
 
 class _Look(NamedTuple):
@@ -265,8 +290,12 @@ def discrepancy_at(
     """What the model leaves unexplained at a solution."""
     units = _units(solution)
     records = _records(problem, [each.frf for each in points], solution, units)
-    count = problem.parameters.count
-    return find_discrepancy(records, points, _prior_rows(solution, units), count)
+    count, prior = problem.parameters.count, _prior_rows(solution, units)
+    held = set()
+    if solution.at_zero:
+        gradient = gauss_newton(blocks_of(records), prior, count)[1]
+        held = {k for k in solution.at_zero if gradient[k] > 0}
+    return find_discrepancy(records, points, prior, [k for k in range(count) if k not in held])
 
 
 def _with_wider_band(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ._accuracy import Matrix, scaled_inverse
 from ._mixing import mix
@@ -220,3 +220,41 @@ def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
     moment = variance * max(1 - below * (hazard - below), 0.0)
     along = covariance[:, k] / variance
     return covariance + np.outer(along, along) * (moment - variance)
+
+
+def apart_at_zero(
+    covariance: Matrix, bread: Matrix, gradient: Float[np.ndarray, " parameters"], zeros: list[int]
+) -> tuple[Matrix, dict[int, float]]:
+    """Covariance and Gauss-Newton steps of parameters at zero, each while the others stay there.
+
+    Two lags at zero do the same to a response: without their bounds one could grow without limit
+    as the other becomes negative.
+    """
+    meat = bread @ covariance @ bread
+    free = np.setdiff1d(np.arange(len(bread)), zeros)
+    found, steps = np.zeros_like(covariance), dict[int, float]()
+    found[np.ix_(free, free)] = _sandwich(bread, meat, free)[0]
+    for k in zeros:
+        beside = np.append(free, k)
+        own, inverse = _sandwich(bread, meat, beside)
+        along = np.zeros(len(bread))
+        along[beside] = own[:, -1] / max(float(own[-1, -1]), 1e-300)
+        found += np.outer(along, along) * own[-1, -1]
+        steps[k] = -float(inverse[-1] @ gradient[beside])
+    return found, steps
+
+
+def inflation_at_zero(covariance: Matrix, bread: Matrix, k: int, others: Sequence[int]) -> float:
+    """The variance of parameter `k` over what the curvature says, while `others` stay at zero."""
+    some = np.append(np.setdiff1d(np.arange(len(bread)), [k, *others]), k)
+    own, inverse = _sandwich(bread, bread @ covariance @ bread, some)
+    return float(own[-1, -1] / inverse[-1, -1])
+
+
+Some = Float[np.ndarray, "some some"]
+
+
+def _sandwich(bread: Matrix, meat: Matrix, some: Int[np.ndarray, " some"]) -> tuple[Some, Some]:
+    """The covariance of some parameters while the others are held, and the inverse bread."""
+    inverse = scaled_inverse(bread[np.ix_(some, some)])
+    return inverse @ meat[np.ix_(some, some)] @ inverse, inverse

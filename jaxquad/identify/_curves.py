@@ -61,6 +61,8 @@ def step_response(
     - `ValueError`: the model has none of these forms, or `time` is not equally spaced from 0.
     """
     t, plant = np.asarray(time, float), linear_model(model)
+    if t.ndim != 1:
+        raise ValueError(f"time has the shape {t.shape}: give times in s, equally spaced from 0")
     steps = np.diff(t)
     if t.ndim != 1 or t.size < 2 or t[0] != 0 or not np.allclose(steps, steps[:1], rtol=1e-6):
         raise ValueError(
@@ -111,6 +113,8 @@ def fitted_response(
 ) -> ResponseBand:
     """The frequency response of a fit, as `Fit.response_band` says; as `fitted_step_response`."""
     grid = np.asarray(omega, float)
+    if grid.ndim != 1:
+        raise ValueError(f"omega has the shape {grid.shape}: give a list of frequencies in rad/s")
     value, slopes = _slopes(fit, lambda model: model_response(model, grid))
     relative = slopes / value
     reach = lambda part: _reach(fit, part(relative), covariance)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxquad._core import pytree_node
 
@@ -80,10 +80,16 @@ class _Seen(NamedTuple):
 
 
 def find_discrepancy(
-    records: Sequence[ResponseTerm], points: Sequence[Points], prior: PriorRows, count: int
+    records: Sequence[ResponseTerm],
+    points: Sequence[Points],
+    prior: PriorRows,
+    moving: Sequence[int],
 ) -> tuple[Mixture, Mixture]:
-    """The discrepancy of a fit, under the prior and under one of a larger mean."""
-    seen = _look(records, points, prior, count)
+    """The discrepancy of a fit, under the prior and under one of a larger mean.
+
+    `moving` are the parameters that can take up a misfit: not those that a bound holds against it.
+    """
+    seen = _look(records, points, prior, np.asarray(moving, int))
     lowest = np.log(0.1 * seen.smallest)
     amplitudes = np.exp(np.linspace(lowest, max(0.0, lowest + 1.4), _AMPLITUDES))
     likelihoods = _restricted_likelihoods(seen, np.concatenate([[0.0], amplitudes]))
@@ -92,15 +98,18 @@ def find_discrepancy(
 
 
 def _look(
-    records: Sequence[ResponseTerm], points: Sequence[Points], prior: PriorRows, count: int
+    records: Sequence[ResponseTerm],
+    points: Sequence[Points],
+    prior: PriorRows,
+    moving: Int[np.ndarray, " moving"],
 ) -> _Seen:
-    rows = np.concatenate([prior.slopes[:, :count], prior.misfit[:, None]], axis=1)
+    rows = np.concatenate([prior.slopes[:, moving], prior.misfit[:, None]], axis=1)
     whole, gains, along, errors = rows.T @ rows, [], [], []
     for record, counted in zip(records, points, strict=True):
         used = record.weights[..., 0] > 0
         error = np.maximum(record.error, 1e-7)
         inverse = np.where(used, error**-2 / counted.shared, 0.0)
-        columns = np.concatenate([record.slopes[..., :count], record.misfit[..., None]], axis=-1)
+        columns = np.concatenate([record.slopes[..., moving], record.misfit[..., None]], axis=-1)
         columns = np.where(used[..., None, None], columns, 0.0)
         weighted = (inverse[..., None, None] * columns).reshape(-1, len(whole))
         whole += weighted.T @ columns.reshape(-1, len(whole))

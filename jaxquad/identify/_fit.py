@@ -30,6 +30,7 @@ from ._cost import (
 from ._fit_remarks import DOUBT
 from ._make_fit import unfitted
 from ._mixing import Mixing, mixings_of
+from ._model_checks import require_model, require_model_response
 from ._origin import Options, Origin
 from ._parameters import Free, Parameters, select_parameters, Tie
 from ._problem import Condition, make_problem, Prior, Problem, require_priors
@@ -129,7 +130,10 @@ def fit(
     Source: docs/identification.md; Eq. (14) of the paper, as corrected in docs/equations.md.
     """
     require_x64("a fit")
+    require_model("fit", model)
     frfs = require_responses(frf)
+    if conditions is None:
+        require_model_response(model, frfs[0])
     check_options(cost, band, min_coherence, max_steps)
     options = Options(
         free, tied, cost, conditions, priors, band, min_coherence, starts, solver, max_steps

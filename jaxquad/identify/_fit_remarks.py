@@ -1,12 +1,14 @@
 """What a fit says about itself: runaway parameters, misfit, no minimum, no model."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
 from ._accuracy import Matrix
 from ._discrepancy import Discrepancy
 from ._problem import Problem
-from ._solve import Solution
+from ._solve import Solution, solution_at
 from ._verdict import Verdict, without_numbers
 
 
@@ -85,6 +87,24 @@ def no_model(names: tuple[str, ...], unexplained: float) -> Verdict:
     return without_numbers("no model", names, reason, *remedies)
 
 
+_BEYOND = 4.0  # random errors that a parameter at zero is pulled beyond it
+
+
+def remarks_on_bounds(pulled: Mapping[str, float], verdict: Verdict) -> list[str]:
+    """Remark on parameters at zero that the data want to have the other sign."""
+    known = {name: pull for name, pull in pulled.items() if name not in verdict.undetermined}
+    far = {name: pull for name, pull in known.items() if pull > _BEYOND}
+    if not far:
+        return []
+    names, free = " and ".join(far), ", ".join(f"jq.identify.Real({name!r})" for name in far)
+    return [
+        f"{names} came out as 0, and the data pull {'it' if len(far) == 1 else 'them'} beyond by "
+        f"{max(far.values()):.0f} random errors: start with the other sign, or let the sign change "
+        f"with {free}; where that cannot be, the model lacks something, or the time stamps of "
+        "input and output are shifted"
+    ]
+
+
 def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
     """Remark on a model that explains too little of the response for its intervals to be exact."""
     if not _LARGE < discrepancy.amplitude <= NO_MODEL:
@@ -98,12 +118,17 @@ def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
 
 def _opposite(problem: Problem, solution: Solution) -> str:
     """A hint where the model turns the wrong way at the lowest frequencies."""
+    hint = "; the phase is off by about 180 deg: try the other sign of the gain"
+    return hint if _is_opposite(problem, solution) else ""
+
+
+def _is_opposite(problem: Problem, solution: Solution) -> bool:
     for weights, misfit in zip(problem.weights, solution.sensitivity.misfits, strict=True):
         used = np.asarray(weights)[..., 0] > 0
         phases = np.abs(np.asarray(misfit)[..., 1][used])
         if phases.size and np.median(phases[: max(phases.size // 4, 1)]) > 2.5:
-            return "; the phase is off by about 180 deg: try the other sign of the gain"
-    return ""
+            return True
+    return False
 
 
 def remarks_on_priors(
@@ -142,6 +167,10 @@ def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " pa
 def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[str]:
     """Remarks on parameters that ran to zero or to infinity, as far as nothing bounds them."""
     names, lost = problem.parameters.names, verdict.undetermined
+    if verdict.kind == "no model" and _starts_opposite(problem, solution):
+        return [
+            "the phase at the start is off by about 180 deg: start with the other sign of the gain"
+        ]
     remarks = [
         f"{names[k]} ran to zero: leave it out, or let its sign change with "
         f"jq.identify.Real({names[k]!r})"
@@ -152,3 +181,8 @@ def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[str
         if problem.parameters.logarithmic[k] and names[k] in lost:
             remarks.append(f"{names[k]} ran to infinity: start from other values, or leave it out")
     return remarks
+
+
+def _starts_opposite(problem: Problem, solution: Solution) -> bool:
+    start = np.asarray(problem.parameters.start)[: solution.z.size]
+    return _is_opposite(problem, solution_at(problem, start))

@@ -150,6 +150,7 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
     tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
     every = _aliases_at(tried, hold, _COUNTS[-1])
     found = np.asarray(_evaluate(model, tried, every.omega))
+    _require_finite(found, tried, every.omega)
     terms = _Terms(tried, hold, every, found[: tried.size], found[tried.size :])
     best = terms.total(_COUNTS[-1], None)
     close = lambda *plan: bool(np.all(np.abs(terms.total(*plan) - best) <= _TOLERANCE * abs(best)))
@@ -158,6 +159,18 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
         if close(count, places := _places(tried, nodes)):
             return _aliases_at(omega, hold, count, tried[places])
     return _aliases_at(omega, hold, count)
+
+
+def _require_finite(
+    response: np.ndarray, omega: np.ndarray, others: Float[np.ndarray, " others"]
+) -> None:
+    bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
+    if bad.any():
+        first = np.concatenate([omega, np.ravel(others)])[int(np.argmax(bad))]
+        raise ValueError(
+            f"the response of the model is not finite at its starting values, first at {first:.4g} "
+            "rad/s: start from other values"
+        )
 
 
 def _is_numpy(x: Numbers) -> bool:

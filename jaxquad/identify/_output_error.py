@@ -14,6 +14,7 @@ from jaxquad.records import Record
 
 from ._fit import check_priors
 from ._known_loop import feedback_response, KnownController
+from ._model_checks import require_model
 from ._noise_model import ARMA, AutoRegressive, Noise
 from ._output_error_descent import descend_by_turns
 from ._output_error_noise import descend_with_noise
@@ -97,6 +98,8 @@ def refine(
     relaxation, errors corrected for coloured residuals); Ljung, System Identification, ch. 7.
     """
     require_x64("an output-error fit")
+    if isinstance(model, Record):
+        require_model("refine", model)
     records = _checked(record, max_steps)
     _check_noise(noise, band)
     if loop is not None and band is not None:
@@ -107,6 +110,8 @@ def refine(
     longest = max(one.samples for one in records)
     _keep_freed_memory(longest)
     near = isinstance(model, Fit)
+    if not near:
+        require_model("refine", model)
     if isinstance(model, Fit):
         model, free, tied = _continued(model, free, tied)
     model = with_arrays(model)

@@ -113,7 +113,11 @@ class Fit:
 
     def _place(self, name: str) -> int:
         if name not in self.names:
-            raise KeyError(f"no free parameter {name!r}: this fit has {', '.join(self.names)}")
+            raise KeyError(
+                f"no free parameter {name!r}: this fit has {', '.join(self.names)}; what is tied "
+                "to them, or follows from them, has its value and error by fit.derived(lambda "
+                "model: ...)"
+            )
         return self.names.index(name)
 
     def __call__(
@@ -123,23 +127,34 @@ class Fit:
         band: tuple[float, float] | None = None,
         hold: str | None = None,
     ) -> Verification:
-        """Simulate the model on a record and compare: `jq.verify(fit.model, record)`.
+        """Simulate the model on a record and compare: `jq.verify(fit, record)`.
 
         **Arguments:**
 
         - `record`: one that was not fitted.
-        - `band`, `hold`: as in `jq.verify`.
+        - `band`: (low, high) in rad/s, to compare within; by default `used_band`.
+        - `hold`: as in `jq.verify`.
 
         **Returns:** a `jq.identify.Verification`, with the simulated output.
 
         **Raises:** what `jq.verify` raises; UndeterminedError where nothing was fitted.
         """
         self._require_model("a simulation")
+        band = self.used_band if band is None else band
         return verify(self.model, record, band=band, hold=hold)
 
     def _require_model(self, what: str) -> None:
         if not self.verdict.fitted:
             raise UndeterminedError(f"{what} needs a fitted model: {self.verdict.summary}")
+
+    @property
+    def used_band(self) -> tuple[float, float] | None:
+        """The lowest and the highest frequency that the fit used, in rad/s; None if it is unknown.
+
+        A fit in the time domain, by `jq.refine`, has none.
+        """
+        known = self.origin is not None and self.verdict.fitted
+        return self.origin.band if known else None
 
     @property
     def poles(self) -> np.ndarray:
@@ -238,6 +253,11 @@ class Fit:
         """
         if not self.verdict.fitted:
             raise UndeterminedError(f"{name} has no value: {self.verdict.summary}")
+        if not callable(quantity):
+            raise ValueError(
+                f"quantity is {quantity!r}: give a function of the model, such as lambda model: "
+                "model.lag + model.delay; fit[name] and fit.interval(name) have single parameters"
+            )
         others = self.verdict.alternatives
         (value, gradient), *there = self._values_and_gradients(quantity, (self.values, *others))
         slope = gradient * self.units
@@ -316,6 +336,8 @@ class Fit:
         """
         if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"n is {n}: give a whole number of models, 1 or more")
+        if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+            raise ValueError(f"key is {key!r}: give a jax.random.key(0)")
         scores = jax.random.normal(key, (len(self.names), n))
         return draw_models(self, scores, hold_undetermined=hold_undetermined)
 
@@ -342,6 +364,12 @@ class Fit:
             found = run_shared(function, [(values, arrays) for values in places])
         except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
             found = [function(jnp.asarray(values), arrays) for values in places]
+        except TypeError as error:
+            if "scalar-output" not in str(error):
+                raise
+            raise ValueError(
+                "the quantity is an array: ask for each of its numbers, by a function of its own"
+            ) from error
         return [(float(value), np.asarray(gradient)) for value, gradient in found]
 
     def __str__(self) -> str:

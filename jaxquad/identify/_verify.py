@@ -1,4 +1,5 @@
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
@@ -125,6 +126,16 @@ def agreements(
     return agreement("", "", measured, simulated, weights), tuple(each)
 
 
+@runtime_checkable
+class _Fitted(Protocol):
+    """What `jq.fit` returns."""
+
+    model: PyTree
+
+    @property
+    def used_band(self) -> tuple[float, float] | None: ...
+
+
 _SIGNIFICANT = 3.0  # standard errors from which a starting transient is estimated
 
 
@@ -144,11 +155,12 @@ def verify(
 
     **Arguments:**
 
-    - `model`: a `jq.TransferFunction`, a `jq.StateSpace`, or a model with `transfer_function()` or
-        `state_space()`.
+    - `model`: a fit; or a `jq.TransferFunction`, a `jq.StateSpace`, or a model with
+        `transfer_function()` or `state_space()`.
     - `record`: with the model's inputs and outputs.
     - `band`: (low, high) in rad/s, to compare within: an integrating plant drifts on disturbances
-        that no model predicts.
+        that no model predicts. By default the band of the points that a fit used, and the whole
+        band for a model.
     - `hold`: how inputs run between their samples, "zero" (held) or "first" (straight); by default
         as the record says (`Record.hold`), straight where it does not. A model that was identified
         from a record of unknown hold has half of it in its delay: straight inputs suit it.
@@ -169,6 +181,8 @@ def verify(
     require_x64("a verification")
     if not isinstance(record, Record):
         raise ValueError(f"verify needs a jq.Record, not a {type(record).__name__}: see jq.read")
+    if isinstance(model, _Fitted):
+        model, band = model.model, model.used_band if band is None else band
     plant = linear_model(model)
     check_channels(plant, record)
     gain, shares = band_gain(band, record), _weights(weights, record)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Complex, Float
 from matplotlib.axes import Axes
 
-from ._labels import add_hertz, few_ticks, look_of, plain_ticks, Style
+from ._labels import add_hertz, few_ticks, look_of, plain_ticks, short_names, Style
 from ._panels import arrange, Given, legend_of, Panels, stacked, WIDTH
 from ._shown import (
     Channels,
@@ -207,7 +207,7 @@ def _draw_model(axes: Sequence[Axes], curve: _Curve, each: Modelled, k: int) -> 
         (axes[0], curve.magnitude, curve.decibels),
         (axes[1], curve.phase, curve.degrees),
     ):
-        if each.fit is not None:
+        if each.fit is not None and np.any(reach > 0):
             axis.fill_between(curve.omega, level - reach, level + reach, alpha=0.3, lw=0,
                               color=style["color"], label=f"{each.name}, 95 %")  # fmt: skip
         axis.plot(curve.omega, level, **style)
@@ -236,8 +236,8 @@ def _scale(axes: Sequence[Axes], first: _Curve, models: Sequence[_Curve]) -> Non
 def _label(
     axes: Sequence[Axes], channels: Channels, o: int, i: int, *, top: bool, bottom: bool
 ) -> None:
-    name, unit = channels.ratio(o, i), channels.unit(o, i)
-    size = f"|{name}|, dB" if name else "magnitude, dB"
+    unit = channels.unit(o, i)
+    size = _size(channels.ratio(o, i))
     texts = (f"{size}\n({unit})" if unit else size, "phase, deg", "coherence")
     for axis, text in zip(axes, texts, strict=False):
         axis.set_ylabel(text)
@@ -252,6 +252,19 @@ def _label(
         axes[-1].set_xlabel("frequency, rad/s")
     if top:
         add_hertz(axes[0])
+
+
+_LINE = 30  # letters that are as long as a panel is high
+
+
+def _size(ratio: str) -> str:
+    """The label of a magnitude, in two lines where the names are long."""
+    if not ratio:
+        return "magnitude, dB"
+    if len(ratio) <= _LINE:
+        return f"|{ratio}|, dB"
+    above, below = short_names(ratio.split(" / ", 1))
+    return f"|{above} /\n{below}|, dB"
 
 
 def _coherence_axis(axis: Axes) -> None:

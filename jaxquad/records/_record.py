@@ -448,5 +448,6 @@ def check_distinct(names: Sequence[str]) -> None:
     if twice:
         raise RecordError(
             f"the channel name {twice[0]!r} occurs {names.count(twice[0])} times among "
-            f"{', '.join(names)}: give each channel of the record a different name."
+            f"{', '.join(names)}: input, output and reference are different signals. Choose "
+            "another channel; if two signals have one name, give each a different name."
         )

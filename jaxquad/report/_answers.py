@@ -20,6 +20,7 @@ from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 from ._figure import Section
+from ._record import GOOD_TIC
 
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -155,7 +156,9 @@ def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -
         ]
         answers += [f"{each.name}: {each.value:.4g}." for each in fit.combinations]
     answers += [
-        f"What happens in {name}: predicted, TIC {c.tic:.3f}." for name, c in checks.items()
+        f"What happens in {name}: predicted, TIC {c.tic:.3f}."
+        for name, c in checks.items()
+        if c.tic < GOOD_TIC
     ]
     return answers or ["Nothing about this vehicle."]
 
@@ -178,6 +181,11 @@ def _cannot(
             "How the closed loop follows its reference, and which part of the response is "
             "feedback: no reference was recorded."
         )
+    lacks += [
+        f"What happens in {name}: the model does not predict it, TIC {c.tic:.3f}."
+        for name, c in checks.items()
+        if not c.tic < GOOD_TIC
+    ]
     if not checks:
         lacks.append("Whether the model predicts another flight: no second log was simulated.")
     return lacks
@@ -214,6 +222,14 @@ def next_flight(
         what = "No further flight of the same kind helps. " + _sentence(fit.verdict.remedies[0])
         return Flight(what, {}, [_sentence(each) for each in fit.verdict.remedies[1:]])
     wished = [f"Only if you need it: {_sweep([each], frf, record).what}" for each in poor]
+    failed = [name for name, c in checks.items() if not c.tic < GOOD_TIC]
+    if failed:
+        what = (
+            f"None before it is clear why the model does not predict {' and '.join(failed)}: "
+            "compare loading, battery and flight state of the two flights, then identify both "
+            "together."
+        )
+        return Flight(what, {}, wished)
     if checks:
         what = "None for this model: tune with it, then fly the tuned gains."
         return Flight(what, {}, [*(_sentence(each.why) for each in poor), *wished])

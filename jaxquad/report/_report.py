@@ -152,13 +152,16 @@ def fit_headline(fit: Fit, remarks: int) -> Headline:
 
 def _numbers(fit: Fit) -> str:
     units = fit.parameter_units or ("",) * len(fit.names)
-    rows = zip(fit.names, fit.values, fit.standard_errors, units, strict=True)
-    shown = [
-        f"{name} = {value:.4g} \u00b1 {1.96 * error:.2g} {unit}".rstrip()
-        for name, value, error, unit in rows
-    ]
+    shown = [_number(fit, *each) for each in zip(fit.names, fit.values, units, strict=True)]
     more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
     return f"{', '.join(shown[:6])}{more} (95 % intervals)"
+
+
+def _number(fit: Fit, name: str, value: float, unit: str) -> str:
+    low, high = fit.interval(name)
+    if name in (bound.name for bound in fit.verdict.bounds):
+        return f"{name} = {low:.2g} .. {high:.2g} {unit}".rstrip()
+    return f"{name} = {value:.4g} \u00b1 {(high - low) / 2:.2g} {unit}".rstrip()
 
 
 def check_headline(name: str, check: Verification, fit: Fit) -> Headline:

@@ -110,9 +110,15 @@ def check_band(omega: Float[ArrayLike, " frequencies"] | None, dt: float) -> Non
         raise ValueError(
             f"omega has shape {omega.shape}: give 1 to {_MOST_FREQUENCIES} frequencies in rad/s"
         )
-    if not (np.all(np.diff(omega) > 0) and omega[0] > 0 and omega[-1] < nyquist):
+    falls = np.flatnonzero(~(np.diff(omega) > 0))
+    if falls.size:
         raise ValueError(
-            f"the frequencies must increase, from above 0 to below the Nyquist frequency of "
+            f"the frequencies must increase, but {omega[falls[0]]:.4g} rad/s is followed by "
+            f"{omega[falls[0] + 1]:.4g} rad/s: sort them, each once"
+        )
+    if not (omega[0] > 0 and omega[-1] < nyquist):
+        raise ValueError(
+            f"the frequencies must lie above 0 and below the Nyquist frequency of "
             f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz); they run from "
             f"{omega.min():.4g} to {omega.max():.4g} rad/s"
         )

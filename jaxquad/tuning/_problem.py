@@ -231,7 +231,12 @@ def linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
 def decouple(plant: object) -> DecoupledAxes:
     """The plant near level flight, one axis at a time."""
     axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
-    assert isinstance(axes, DecoupledAxes)
+    if not isinstance(axes, DecoupledAxes):
+        raise ValueError(
+            f"a {type(plant).__name__} cannot be tuned: its members are a jq.DecoupledAxes or a "
+            "jq.Multirotor, whose linear loops a tune needs; jq.simulate, jq.evaluate, their "
+            "derivatives and jq.analyse take any plant"
+        )
     return axes
 
 

@@ -140,7 +140,9 @@ class Identification:
 
     def figures(self) -> dict[str, Panels]:
         """The figures by file name: Bode diagram, records, and the check on a second record."""
-        models = {"identified": self.fit} if self.fit.verdict.fitted else {}
+        stopped = self.fit.verdict.kind in ("no model", "no minimum")
+        name = f"{self.fit.verdict.kind}: where the fit stopped" if stopped else "identified"
+        models = {name: self.fit} if self.fit.verdict.fitted else {}
         others = {f"{name} estimate": self.responses[name] for name in list(self.responses)[1:]}
         with headless():
             figures = {
@@ -309,7 +311,7 @@ def model_formula(settings: IdentifySettings) -> str:
 
 
 def _checked(found: Identification) -> Verification | None:
-    """The second record simulated, within the band that was fitted."""
+    """The second record simulated, within the band of the points that the fit used."""
     settings = found.settings
     if settings.verify is None or not found.fit.verdict.fitted:
         return None
@@ -321,4 +323,4 @@ def _checked(found: Identification) -> Verification | None:
         reference=None,
     )
     [record] = read_records(Path(settings.verify), other)
-    return verify(found.fit.model, record, band=found.band)
+    return verify(found.fit, record)

@@ -29,7 +29,7 @@ class StoredResult(NamedTuple):
     settings: IdentifySettings
     log: Path
     hashes: tuple[str, ...]  # SHA-256 of the log, and of the record of a check
-    band: tuple[float, float]  # rad/s, that was fitted
+    band: tuple[float, float]  # rad/s, of the response
     more: tuple[Path, ...] = ()  # logs that were taken together with the first
 
     @property
@@ -46,6 +46,15 @@ class StoredResult(NamedTuple):
     def identifiable(self) -> bool:
         """Whether the record determines every parameter."""
         return _part(self.content, "fit").get("identifiable") is True
+
+    @property
+    def used_band(self) -> tuple[float, float]:
+        """The lowest and the highest frequency that the fit used, in rad/s."""
+        found = self.content.get("used_band_rad_per_s")
+        if not isinstance(found, list):  # a result of an earlier version
+            return self.band
+        low, high = map(float, found)
+        return low, high
 
     @property
     def values(self) -> dict[str, float]:

@@ -38,6 +38,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         "settings": found.settings.content(),
         "band_rad_per_s": found.band,
         "band_hz": [omega / (2 * np.pi) for omega in found.band],
+        "used_band_rad_per_s": found.fit.used_band,
         "derived": [each._asdict() for each in found.combinations],
         "provenance": origin.content(),
         **_content_beside(found),
@@ -199,8 +200,8 @@ def verify_result(
     - `result`: the folder of the result, its `result.json`, or what `load_result` returns.
     - `path`: the other log.
     - `changes`: settings that differ for this log (keys of `IdentifySettings`): another channel's
-      name, another part, another band. Otherwise its whole time is used, with the channels, the
-      rate and the band of the result.
+      name, another part, another band. Otherwise its whole time is used, with the channels and the
+      rate of the result, in the band of the points that its fit used.
 
     **Raises:** `UndeterminedError` (a ValueError) for a result without a model, `RecordError` for a
     log that cannot be used.
@@ -209,7 +210,9 @@ def verify_result(
     whole = {"start": None, "stop": None, "segments": (), "reference": None}
     settings = dataclasses.replace(stored.settings, **whole, band=None, band_rad=stored.band)
     changed = settings.changed(changes or {})
-    model, band = stored.model, changed.band_rad
+    model, band = stored.model, stored.used_band
+    if changed.band_rad != stored.band:
+        band = changed.band_rad
     if changed.band is not None:
         band = 2 * np.pi * changed.band[0], 2 * np.pi * changed.band[1]
     [record] = read_records(Path(path), changed)

@@ -37,6 +37,8 @@ _PHRASES = {
     r"(?:, or give the frequencies )?\(omega=\)": "",
     r"jq\.spectra\.LocalPolynomial\(\)": "--estimator local",
     r", or let its sign change with jq\.identify\.Real\([^)]*\)": " (--no-lag, --no-delay)",
+    r": start with the other sign, or let the sign change with jq\.identify\.Real\([^;]*; "
+    "where that cannot be, the model": ". A lag and a delay cannot be negative: the model",
     r"fit with a jq\.identify\.Prior or a second record, or ask for a determined combination":
         "fit without one of them (--no-lag, --no-delay), or fly again with more excitation",
     r", or raise global_order": "",
@@ -44,6 +46,7 @@ _PHRASES = {
     r"start from other values, or leave solver= at its default":
         "choose another band (--band) or a simpler model (--no-lag, --no-delay, fewer --poles)",
     r"start from other values": "choose another band (--band)",
+    r", (?:try many starts at once \(starts=20\)|or give starts=20)": "",
     r"as valid=\{[^}]*\}": "as --valid NAME=-20:20",
     r"try other starting values": "try another band (--band), or jaxquad identify --no-lag",
     r"Fit\.explain\(\)": "--explain",

@@ -49,3 +49,17 @@ def test_help_lists_designs_and_wrong_options_do_not_import_jax(tmp_path):
     )
     expected = [[line.split(), code, False] for line, code in LIGHT.items()]
     assert json.loads(answer.stdout) == expected
+
+
+def test_the_package_is_the_command_and_a_reader_may_stop_early():
+    command = [sys.executable, "-m", "jaxquad"]
+    version = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
+    assert version.stdout.startswith("jaxquad ")
+    with subprocess.Popen(
+        [*command, "design", "sweep", *SIGNAL[:-2], "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert b"Broken pipe" not in process.stderr.read()

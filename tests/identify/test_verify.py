@@ -181,3 +181,16 @@ def test_a_drift_does_not_pass_for_a_fast_transient_at_the_start():
     assert check.omitted == 1
     wander = (check.simulated - y)[:15]  # three lags
     assert np.ptp(wander) < 0.1 * np.std(check.measured - check.simulated)
+
+
+def test_a_fit_is_verified_in_the_band_that_it_used():
+    u, y = flight(noise=0.02)
+    fit = jq.fit(MODEL, jq.frequency_response(jq.Record(TIME, u, y, hold=DT)), band=(1.0, 30.0))
+    other, answer = flight(seed=1)
+    drift = jq.Record(TIME, other, answer + 10.0 * np.sin(0.3 * TIME), hold=DT)
+    low, high = fit.used_band
+    assert 1.0 <= low < 2.0 and 25.0 < high <= 30.0
+    check = jq.verify(fit, drift)
+    assert check.band == fit.used_band and check.fit_percent > 95
+    assert check.rms == fit(drift).rms == jq.verify(fit.model, drift, band=fit.used_band).rms
+    assert jq.verify(fit.model, drift).fit_percent < check.fit_percent - 5

@@ -79,3 +79,15 @@ def test_an_incoherent_band_is_named():
     found = answer_section(fitted(frf), quiet, None, {})
     assert any("incoherent" in text for text in found["cannot"])
     assert any("Only if you need it" in text for text in found["flight"].why)
+
+
+def test_a_flight_that_is_not_predicted_is_no_answer():
+    frf = response_of(TRUTH, error=0.005, seed=0)
+    fit, flown = fitted(frf), record()
+    other = dataclasses.replace(flown, outputs=np.roll(flown.outputs, 100, axis=0))
+    check = jq.verify(fit, other)
+    assert check.tic > 0.25
+    found = answer_section(fit, frf, flown, {"b": check})
+    assert not any("What happens in b" in text for text in found["can"])
+    assert any("What happens in b: the model does not predict it" in x for x in found["cannot"])
+    assert "why the model does not predict b" in found["flight"].what

@@ -36,7 +36,7 @@ def still(channel):
             r"of 157.1 rad/s .25 Hz.; they run from 5 to 200",
         ),
         (np.array([9.0, 5.0]), "the frequencies must increase"),
-        (np.array([0.0, 5.0]), "the frequencies must increase, from above 0"),
+        (np.array([0.0, 5.0]), "the frequencies must lie above 0"),
         (np.array([np.nan, 5.0]), "the frequencies must increase"),
         (np.array([0.2, 5.0]), "run from 0.2 to 5 rad/s, but the records hold one cycle of 0.6283"),
     ],

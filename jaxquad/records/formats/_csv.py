@@ -355,7 +355,10 @@ def _numbers(
             raise ReadError(
                 f"{place}: {what}. Correct or delete the row; write decimals with a point"
             ) from error
-        raise _BlankCell(f"{place}: the cell is blank. Fill it in, or delete the row") from error
+        raise _BlankCell(
+            f"{place}: the cell is blank. Fill it in, delete the row, or write nan and let gaps be "
+            "interpolated (max_gap=)"
+        ) from error
 
 
 def _is_number(cell: str) -> bool:

@@ -168,6 +168,11 @@ def load_signals(path: str | Path) -> Signals:
     Raises ReadError, and nothing else, where the file is missing, damaged or of another kind.
     Warns with RecordWarning of what was skipped.
     """
+    if not isinstance(path, str | Path):
+        raise ReadError(
+            f"{type(path).__name__} is no path of a file: a table in memory is read by "
+            "jq.records.from_dataframe, arrays by jq.Record(time, inputs, outputs)"
+        )
     signals = flattened(load_log(path))
     if not signals.arrays:
         raise ReadError(

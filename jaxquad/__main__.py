@@ -1,0 +1,8 @@
+"""`python -m jaxquad` is the command line `jaxquad`."""
+
+import sys
+
+from jaxquad.cli import main
+
+
+sys.exit(main())
