@@ -56,6 +56,7 @@ from ._members import (
 )
 from ._process import (
     enable_x64 as enable_x64,
+    keep_freed_memory as keep_freed_memory,
     one_blas_thread as one_blas_thread,
     PrecisionError as PrecisionError,
     require_float64 as require_float64,
@@ -63,4 +64,8 @@ from ._process import (
 )
 from ._pytree_node import pytree_node as pytree_node
 from ._stages import announce as announce, STAGES as STAGES
-from ._threads import map_in_threads as map_in_threads, thread_settings as thread_settings
+from ._threads import (
+    map_in_threads as map_in_threads,
+    map_where_large as map_where_large,
+    thread_settings as thread_settings,
+)

@@ -5,6 +5,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
+from jaxquad._core import pytree_node
+
 from ._window import coefficients
 
 
@@ -68,7 +70,8 @@ Places = Shaped[np.ndarray, " places"]
 _CHUNK = 512  # times taken at once, so that a long record fits the memory
 
 
-class ErrorCovariance(eqx.Module):
+@pytree_node
+class ErrorCovariance:
     """Covariance of the random errors of all responses of an estimate, stored as factors.
 
     The error of the response of output o to input i at frequency f is a sum over atoms of noise,

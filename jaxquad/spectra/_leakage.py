@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from jaxquad._core import map_where_large
+
 
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
 _SEEN = 1e-7  # of a residual: the square is below rounding
@@ -21,6 +23,7 @@ _WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well add
 
 Rows = Complex[np.ndarray, "frequencies _ windows"]
 Gram = Complex[np.ndarray, "frequencies columns columns"]
+Sizes = Float[np.ndarray, "frequencies _"]
 
 
 class Slopes(NamedTuple):
@@ -66,20 +69,23 @@ def without_leakage(
     `resolved`: from a frequency on, and the first everywhere. A length with too few windows for its
     leakage keeps it, as noise; its slopes do not matter.
     """
-    found, first = [], 0
-    for given, derived, known in zip(windows, slopes, resolved, strict=True):
+    ends = np.cumsum([0, *(x.shape[1] for x, _ in windows)])
+
+    def solve(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Fit]:
         # What a window does not resolve lies below what it does, and has no weight.
-        few = slice(int(np.argmax(known)), None)
-        x, y, once, twice = (np.swapaxes(each[few], 1, 2) for each in (*given, *derived))
+        few, mine = slice(int(np.argmax(resolved[k])), None), slice(ends[k], ends[k + 1])
+        x, y, once, twice = (np.swapaxes(each[few], 1, 2) for each in (*windows[k], *slopes[k]))
         inputs, count = x.shape[1:]
         columns, both = x, y - response[few] @ x
         if shows_leakage(count, inputs):
             columns = np.concatenate([x, once[:, :inputs], twice], axis=1)
             both = np.concatenate([both, once[:, inputs:]], axis=1)
-        mine = slice(first, first + count)
         columns = np.ascontiguousarray(columns)
-        found.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
-        first += count
+        return _least_squares(both, columns, y.shape[1], overlap[mine, mine])
+
+    # The shortest windows are the most: they come first, so that threads end at the same time.
+    numbers = sum(x.size + y.size for x, y in windows)
+    found = map_where_large(solve, range(len(windows))[::-1], numbers)[::-1]
     *parts, fits = zip(*found, strict=True)
     products, trace, freedom = (_padded(each, len(response)) for each in parts)
     return Rest(products, np.where(trace > 0, trace, 1.0), np.maximum(freedom, 0.5), fits)
@@ -93,6 +99,7 @@ def _padded(parts: Sequence[np.ndarray], frequencies: int) -> np.ndarray:
     return whole
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # each thread has its own
 def _least_squares(
     both: Rows,
     columns: Complex[np.ndarray, "frequencies columns windows"],
@@ -104,18 +111,18 @@ def _least_squares(
     With P = P0 - q q^H the projection, P0 that of the common columns A, and O the overlap: the
     trace of P O, the degrees of freedom tr(P O)^2 / tr(P O P O).
     """
-    own = both[:, outputs:]
     adjoint, across = np.conj(columns), np.swapaxes(columns, 1, 2)
     gram = adjoint @ across
     solver = _solver(gram)
     fitted = solver @ (adjoint @ np.swapaxes(both, 1, 2))
     rest = both - np.swapaxes(fitted, 1, 2) @ columns
-    if _shows_rounding(gram, solver, both, rest):
+    whole, left = _size(both), _size(rest)
+    if _shows_rounding(gram, solver, whole, left):
         rest -= np.swapaxes(solver @ (adjoint @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
-    rest, q = rest[:, :outputs], np.ascontiguousarray(rest[:, outputs:])
-    length, whole = (np.sqrt(_inner(part, part)) for part in (q, own))
-    inverse = np.where(length > _WITHIN * whole, 1 / np.maximum(length, 1e-300), 0.0)
-    q *= inverse[:, :, None]
+        left = _size(rest)
+    rest, q, length = rest[:, :outputs], rest[:, outputs:], left[:, outputs:]
+    inverse = np.where(length > _WITHIN * whole[:, outputs:], 1 / np.maximum(length, 1e-300), 0.0)
+    q = q * inverse[:, :, None]
     along = np.vecdot(q, rest[:, : q.shape[1]])
     if q.shape[1]:
         rest = rest - q * along[:, :, None]
@@ -135,14 +142,14 @@ def _solver(gram: Gram) -> Gram:
     return np.linalg.inv(gram * units + _RIDGE * np.eye(gram.shape[1])) * units
 
 
-def _shows_rounding(gram: Gram, solver: Gram, both: Rows, rest: Rows) -> bool:
+def _shows_rounding(gram: Gram, solver: Gram, whole: Sizes, left: Sizes) -> bool:
     """Whether nearly dependent columns leave a part of themselves in what is left.
 
     It is orthogonal to all else, so its square counts.
     """
     least = np.real(np.diagonal(solver, axis1=1, axis2=2) * np.diagonal(gram, axis1=1, axis2=2))
-    part = 2e-16 * np.max(least, axis=1, keepdims=True) * np.sqrt(_inner(both, both))
-    return bool(np.any(part > _SEEN * np.sqrt(_inner(rest, rest))))
+    part = 2e-16 * np.max(least, axis=1, keepdims=True) * whole
+    return bool(np.any(part > _SEEN * left))
 
 
 class _Seen(NamedTuple):
@@ -162,14 +169,13 @@ class _Seen(NamedTuple):
         q: Complex[np.ndarray, "frequencies own windows"],
         overlap: Float[np.ndarray, "windows windows"],
     ) -> "_Seen":
-        a, rest = _weigh(overlap, columns), _weigh(overlap, q)
-        across = np.swapaxes(a, 1, 2)
+        count = columns.shape[1]
+        weighed = _weigh(overlap, np.concatenate([columns, q], axis=1))
+        a, rest = weighed[:, :count], weighed[:, count:]
+        once = adjoint @ np.swapaxes(weighed, 1, 2)
+        twice = np.conj(a) @ np.swapaxes(a, 1, 2)
         return cls(
-            adjoint @ across,
-            np.conj(a) @ across,
-            adjoint @ np.swapaxes(rest, 1, 2),
-            _inner(q, rest),
-            _inner(rest, rest),
+            once[:, :, :count], twice, once[:, :, count:], _inner(q, rest), _inner(rest, rest)
         )
 
 
@@ -193,8 +199,9 @@ def _noise_left(
 ) -> tuple[Float[np.ndarray, "frequencies _"], Float[np.ndarray, "frequencies _"]]:
     """Trace and degrees of freedom of unit noise behind the projection."""
     once = solver @ seen.aa
-    left = (np.trace(overlap) - np.trace(once, axis1=1, axis2=2).real)[:, None]
-    square = np.sum(overlap**2) - 2 * _trace(solver, seen.aa_twice) + _trace(once, once)
+    left = (np.trace(overlap) - _trace(solver, seen.aa))[:, None]
+    across = np.conj(np.swapaxes(once, 1, 2))
+    square = np.sum(overlap**2) - 2 * _trace(solver, seen.aa_twice) + _trace(once, across)
     square = square[:, None]
     if seen.qq.shape[1]:
         crossed = seen.qq_twice - np.sum(np.conj(seen.aq) * (solver @ seen.aq), axis=1).real
@@ -252,13 +259,18 @@ def power_of(x: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     return np.real(x) ** 2 + np.imag(x) ** 2
 
 
-def _inner(a: Rows, b: Rows) -> Float[np.ndarray, "frequencies _"]:
+def _inner(a: Rows, b: Rows) -> Sizes:
     """The real part of `conj(a) b`, summed over the windows."""
     return np.vecdot(a.view(float), b.view(float))
+
+
+def _size(rows: Rows) -> Sizes:
+    return np.sqrt(_inner(rows, rows))
 
 
 def _trace(
     a: Complex[np.ndarray, "frequencies n n"], b: Complex[np.ndarray, "frequencies n n"]
 ) -> Float[np.ndarray, " frequencies"]:
-    """The real part of the trace of the product."""
-    return np.einsum("fab,fba->f", a, b).real
+    """The real part of the trace of the product of `a` with the adjoint of `b`."""
+    a, b = (np.ascontiguousarray(each).reshape(len(each), -1) for each in (a, b))
+    return _inner(a, b)

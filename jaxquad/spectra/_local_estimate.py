@@ -30,7 +30,6 @@ from ._local_fit import (
     window_slices,
 )
 from ._local_noise import (
-    BANDWIDTH,
     coloured_gain,
     error_covariance,
     multiple_coherence,
@@ -190,9 +189,8 @@ def estimate_local_polynomial(
     narrow = joint_fit(stack, inputs) if method == "joint" else stack
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
     edges = window_slices(grid, narrow_width, bins)
-    noise_freedom = smoothed(
-        grid, covariance_of_bands(*edges, narrow.freedom), narrow.freedom, BANDWIDTH
-    )
+    bands = covariance_of_bands(*edges, narrow.freedom)
+    noise_freedom = smoothed(grid, bands, narrow.freedom)
     sources = noise
     if method == "joint":
         sources = smooth_noise(grid, narrow_width, stack.scatter, stack.freedom)

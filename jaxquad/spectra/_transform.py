@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from jaxquad._core import require_x64
+from jaxquad._core import map_where_large, require_x64
 
 from ._basis import Basis, merged_basis, sample_basis
 from ._blocks import band_edges, choose_lattice, choose_levels, Lattice, Level, rank
@@ -236,12 +236,17 @@ def transform_tapers(
     source = _Source(plan, signals, detrend)
     phase = np.exp(-1j * origin * plan.angle)[:, None] if origin else None
     found = _empty_sums(plan, tapers)
-    for number, turn in enumerate(plan.turns):
+
+    def fill(number: int) -> None:
         mine = [k for k, each in enumerate(tapers) if each.first <= number]
         sums = [found[k][number - tapers[k].first] for k in mine]
         _fill_window_sums(plan, source, number, [tapers[k] for k in mine], sums)
+        turn = plan.turns[number] if phase is None else plan.turns[number] * phase
         for each in sums:
-            each *= (turn if phase is None else turn * phase)[:, None]
+            each *= turn[:, None]
+
+    # The shortest windows are the most: they come first, so that threads end at the same time.
+    map_where_large(fill, range(len(plan.turns))[::-1], sum(x.size for of in found for x in of))
     if plan.order is not None:
         found = [[each[plan.order] for each in mine] for mine in found]
     return [[np.swapaxes(each, 1, 2) for each in mine] for mine in found]
@@ -257,11 +262,11 @@ def _empty_sums(
     as half of the products."""
     counts = [len(starts) for _, starts in plan.windows]
     sizes = [(each.channels, many) for each in tapers for many in counts[each.first :]]
-    ends = np.cumsum([plan.angle.size * channels * many for channels, many in sizes])
-    room = np.empty(max(int(ends[-1]), min(_PAGES, 2 * int(ends[-1]))), complex)
+    ends = list(itertools.accumulate(plan.angle.size * channels * n for channels, n in sizes))
+    room = np.empty(max(ends[-1], min(_PAGES, 2 * ends[-1])), complex)
     parts = [
-        part.reshape(plan.angle.size, *size)
-        for part, size in zip(np.split(room[: ends[-1]], ends[:-1]), sizes, strict=True)
+        room[begin:end].reshape(plan.angle.size, *size)
+        for begin, end, size in zip([0, *ends[:-1]], ends, sizes, strict=True)
     ]
     return [[parts.pop(0) for _ in counts[each.first :]] for each in tapers]
 
@@ -275,6 +280,11 @@ class _Source:
         self._levels = [_constant(each, detrend) for each in self._columns]
         ends = np.cumsum([0, *map(len, self._columns)]).tolist()
         self.channels, self._places = ends[-1], list(map(slice, ends[:-1], ends[1:]))
+        parts = [part for each in plan.parts for part in each]
+        if any(part.level is not None for part in parts):
+            # Before any thread asks for them.
+            self._posts = self._block_ends()
+            self._coefficients = self._compressed_levels()
 
     def _samples(self, where: slice, into: np.ndarray | None = None) -> np.ndarray:
         """Those samples of all channels."""
@@ -291,15 +301,15 @@ class _Source:
     def rows(self) -> Rows:
         return self._samples(slice(None))
 
-    @ft.cached_property
-    def _posts(self) -> Float[np.ndarray, "channels ends"]:
+    def _block_ends(self) -> Float[np.ndarray, "channels ends"]:
         """The samples where blocks begin, and that after the last block: 0 where there is none."""
         block, offset, count = self._plan.lattice
-        found = self._samples(slice(offset, offset + count * block + 1, block))
-        return np.pad(found, ((0, 0), (0, count + 1 - found.shape[1])))
+        known = self._samples(slice(offset, offset + count * block + 1, block))
+        found = np.zeros((self.channels, count + 1))
+        found[:, : known.shape[1]] = known
+        return found
 
-    @ft.cached_property
-    def _coefficients(self) -> list[Float[np.ndarray, "channels blocks rank"]]:
+    def _compressed_levels(self) -> list[Float[np.ndarray, "channels blocks rank"]]:
         plan = self._plan
         found = [self._compressed(plan.bases[0])]
         for level, basis in zip(plan.levels[1:], plan.bases[1:], strict=True):
@@ -314,12 +324,15 @@ class _Source:
         block, offset, count = self._plan.lattice
         posts, many = self._posts, max(_IN_CACHE // (block * self.channels), 1)
         found = np.empty((self.channels, count, basis.signs.size))
-        for begin in range(0, count, many):
+
+        def compress(begin: int) -> None:
             end = min(begin + many, count)
             few = np.empty((self.channels, end - begin, block + 1))
             self._samples(slice(offset + begin * block, offset + end * block), few[:, :, :-1])
             few[:, :, -1] = posts[:, begin + 1 : end + 1]
             found[:, begin:end] = _products(few, basis)
+
+        map_where_large(compress, range(0, count, many), found.size)
         return found
 
     def folded(self, part: Part) -> Iterator[tuple[np.ndarray, Columns, Columns]]:
