@@ -64,8 +64,4 @@ from ._process import (
 )
 from ._pytree_node import pytree_node as pytree_node
 from ._stages import announce as announce, STAGES as STAGES
-from ._threads import (
-    map_in_threads as map_in_threads,
-    map_where_large as map_where_large,
-    thread_settings as thread_settings,
-)
+from ._threads import map_in_threads as map_in_threads, thread_settings as thread_settings

@@ -1,6 +1,6 @@
 """Threads beside that of a caller, which compute only what they would compute in its place."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -30,18 +30,6 @@ def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(run, remember()))
     return [function(x) if y is None else y[0] for x, y in zip(items, found, strict=True)]
-
-
-_WORTH = 2**16  # numbers, each a sum of about a hundred: less is made before a thread has begun
-
-
-def map_where_large(
-    function: Callable[[Given], Found], given: Sequence[Given], numbers: int
-) -> list[Found]:
-    """`map_in_threads` of what makes so many numbers in all, where threads save time."""
-    if len(given) < 2 or numbers < _WORTH:
-        return [function(each) for each in given]
-    return map_in_threads(function, given)
 
 
 def thread_settings() -> tuple[object, ...]:

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jaxquad._core import map_where_large
-
 
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
 _SEEN = 1e-7  # of a residual: the square is below rounding
@@ -69,23 +67,20 @@ def without_leakage(
     `resolved`: from a frequency on, and the first everywhere. A length with too few windows for its
     leakage keeps it, as noise; its slopes do not matter.
     """
-    ends = np.cumsum([0, *(x.shape[1] for x, _ in windows)])
-
-    def solve(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Fit]:
+    found, first = [], 0
+    for given, derived, known in zip(windows, slopes, resolved, strict=True):
         # What a window does not resolve lies below what it does, and has no weight.
-        few, mine = slice(int(np.argmax(resolved[k])), None), slice(ends[k], ends[k + 1])
-        x, y, once, twice = (np.swapaxes(each[few], 1, 2) for each in (*windows[k], *slopes[k]))
+        few = slice(int(np.argmax(known)), None)
+        x, y, once, twice = (np.swapaxes(each[few], 1, 2) for each in (*given, *derived))
         inputs, count = x.shape[1:]
         columns, both = x, y - response[few] @ x
         if shows_leakage(count, inputs):
             columns = np.concatenate([x, once[:, :inputs], twice], axis=1)
             both = np.concatenate([both, once[:, inputs:]], axis=1)
+        mine = slice(first, first + count)
         columns = np.ascontiguousarray(columns)
-        return _least_squares(both, columns, y.shape[1], overlap[mine, mine])
-
-    # The shortest windows are the most: they come first, so that threads end at the same time.
-    numbers = sum(x.size + y.size for x, y in windows)
-    found = map_where_large(solve, range(len(windows))[::-1], numbers)[::-1]
+        found.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
+        first += count
     *parts, fits = zip(*found, strict=True)
     products, trace, freedom = (_padded(each, len(response)) for each in parts)
     return Rest(products, np.where(trace > 0, trace, 1.0), np.maximum(freedom, 0.5), fits)
@@ -99,7 +94,6 @@ def _padded(parts: Sequence[np.ndarray], frequencies: int) -> np.ndarray:
     return whole
 
 
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # each thread has its own
 def _least_squares(
     both: Rows,
     columns: Complex[np.ndarray, "frequencies columns windows"],
@@ -111,10 +105,12 @@ def _least_squares(
     With P = P0 - q q^H the projection, P0 that of the common columns A, and O the overlap: the
     trace of P O, the degrees of freedom tr(P O)^2 / tr(P O P O).
     """
-    adjoint, across = np.conj(columns), np.swapaxes(columns, 1, 2)
-    gram = adjoint @ across
-    solver = _solver(gram)
-    fitted = solver @ (adjoint @ np.swapaxes(both, 1, 2))
+    count, near, adjoint = columns.shape[1], _near(overlap), np.conj(columns)
+    weighed = _weigh(near, columns)
+    # One product of all: many small ones take as long to begin as to make.
+    stacked = adjoint @ np.swapaxes(np.concatenate([columns, weighed, both], axis=1), 1, 2)
+    gram, solver = stacked[:, :, :count], _solver(stacked[:, :, :count])
+    fitted = solver @ stacked[:, :, 2 * count :]
     rest = both - np.swapaxes(fitted, 1, 2) @ columns
     whole, left = _size(both), _size(rest)
     if _shows_rounding(gram, solver, whole, left):
@@ -126,7 +122,7 @@ def _least_squares(
     along = np.vecdot(q, rest[:, : q.shape[1]])
     if q.shape[1]:
         rest = rest - q * along[:, :, None]
-    seen = _Seen.of(adjoint, columns, q, overlap)
+    seen = _Seen.of(stacked[:, :, count : 2 * count], weighed, q, near)
     trace, freedom = _noise_left(solver, seen, overlap)
     if not q.shape[1]:
         trace, freedom = (np.repeat(each, outputs, axis=1) for each in (trace, freedom))
@@ -164,33 +160,45 @@ class _Seen(NamedTuple):
     @classmethod
     def of(
         cls,
-        adjoint: Complex[np.ndarray, "frequencies columns windows"],
-        columns: Complex[np.ndarray, "frequencies columns windows"],
+        aa: Gram,
+        weighed: Complex[np.ndarray, "frequencies columns windows"],  # O A
         q: Complex[np.ndarray, "frequencies own windows"],
-        overlap: Float[np.ndarray, "windows windows"],
+        near: "Sequence[_Near]",
     ) -> "_Seen":
-        count = columns.shape[1]
-        weighed = _weigh(overlap, np.concatenate([columns, q], axis=1))
-        a, rest = weighed[:, :count], weighed[:, count:]
-        once = adjoint @ np.swapaxes(weighed, 1, 2)
-        twice = np.conj(a) @ np.swapaxes(a, 1, 2)
+        rest, count = _weigh(near, q), weighed.shape[1]
+        found = np.conj(weighed) @ np.swapaxes(np.concatenate([weighed, q], axis=1), 1, 2)
         return cls(
-            once[:, :, :count], twice, once[:, :, count:], _inner(q, rest), _inner(rest, rest)
+            aa, found[:, :, :count], found[:, :, count:], _inner(q, rest), _inner(rest, rest)
         )
 
 
 _FEW = 16  # windows taken at once: few others overlap them
 
 
-def _weigh(overlap: Float[np.ndarray, "windows windows"], rows: Rows) -> Rows:
-    """Rows times the overlap of the windows, near the diagonal only."""
-    flat = rows.reshape(-1, len(overlap))
-    weighed = np.empty_like(flat)
+class _Near(NamedTuple):
+    """The overlap of a few windows with those that overlap them."""
+
+    few: slice
+    others: slice
+    overlap: Complex[np.ndarray, "others few"]
+
+
+def _near(overlap: Float[np.ndarray, "windows windows"]) -> list[_Near]:
+    found = []
     for first in range(0, len(overlap), _FEW):
         few = slice(first, first + _FEW)
-        near = np.flatnonzero(np.any(overlap[few], axis=0))
-        band = slice(near[0], near[-1] + 1)
-        weighed[:, few] = flat[:, band] @ overlap[band, few].astype(complex)
+        places = np.flatnonzero(np.any(overlap[few], axis=0))
+        others = slice(places[0], places[-1] + 1)
+        found.append(_Near(few, others, overlap[others, few].astype(complex)))
+    return found
+
+
+def _weigh(near: Sequence[_Near], rows: Rows) -> Rows:
+    """Rows times the overlap of the windows."""
+    flat = rows.reshape(-1, rows.shape[2])
+    weighed = np.empty_like(flat)
+    for few, others, overlap in near:
+        weighed[:, few] = flat[:, others] @ overlap
     return weighed.reshape(rows.shape)
 
 

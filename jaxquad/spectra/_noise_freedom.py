@@ -80,11 +80,12 @@ def covariance_of_windows(
     All lengths see the same noise, each with its own resolution; `levels` are the standard errors
     that they contribute. `angle` is in rad per sample.
     """
-    total, angles = np.zeros((angle.size, angle.size)), tuple(angle.tolist())
-    shared = kept_if_few(_shared_power, angle.size)
-    for level, length in zip(levels.T, lengths, strict=True):
-        total += np.outer(level, level) * shared(shape, length, angles)
-    return total
+    angles, shared = tuple(angle.tolist()), kept_if_few(_shared_power, angle.size)
+    parts = (
+        shared(shape, length, angles) * level * level[:, None]
+        for level, length in zip(levels.T, lengths, strict=True)
+    )
+    return ft.reduce(np.add, parts)
 
 
 @ft.lru_cache(maxsize=12)

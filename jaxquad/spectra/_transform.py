@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from jaxquad._core import map_where_large, require_x64
+from jaxquad._core import require_x64
 
 from ._basis import Basis, merged_basis, sample_basis
 from ._blocks import band_edges, choose_lattice, choose_levels, Lattice, Level, rank
@@ -236,17 +236,12 @@ def transform_tapers(
     source = _Source(plan, signals, detrend)
     phase = np.exp(-1j * origin * plan.angle)[:, None] if origin else None
     found = _empty_sums(plan, tapers)
-
-    def fill(number: int) -> None:
+    for number, turn in enumerate(plan.turns):
         mine = [k for k, each in enumerate(tapers) if each.first <= number]
         sums = [found[k][number - tapers[k].first] for k in mine]
         _fill_window_sums(plan, source, number, [tapers[k] for k in mine], sums)
-        turn = plan.turns[number] if phase is None else plan.turns[number] * phase
         for each in sums:
-            each *= turn[:, None]
-
-    # The shortest windows are the most: they come first, so that threads end at the same time.
-    map_where_large(fill, range(len(plan.turns))[::-1], sum(x.size for of in found for x in of))
+            each *= (turn if phase is None else turn * phase)[:, None]
     if plan.order is not None:
         found = [[each[plan.order] for each in mine] for mine in found]
     return [[np.swapaxes(each, 1, 2) for each in mine] for mine in found]
@@ -280,11 +275,6 @@ class _Source:
         self._levels = [_constant(each, detrend) for each in self._columns]
         ends = np.cumsum([0, *map(len, self._columns)]).tolist()
         self.channels, self._places = ends[-1], list(map(slice, ends[:-1], ends[1:]))
-        parts = [part for each in plan.parts for part in each]
-        if any(part.level is not None for part in parts):
-            # Before any thread asks for them.
-            self._posts = self._block_ends()
-            self._coefficients = self._compressed_levels()
 
     def _samples(self, where: slice, into: np.ndarray | None = None) -> np.ndarray:
         """Those samples of all channels."""
@@ -301,7 +291,8 @@ class _Source:
     def rows(self) -> Rows:
         return self._samples(slice(None))
 
-    def _block_ends(self) -> Float[np.ndarray, "channels ends"]:
+    @ft.cached_property
+    def _posts(self) -> Float[np.ndarray, "channels ends"]:
         """The samples where blocks begin, and that after the last block: 0 where there is none."""
         block, offset, count = self._plan.lattice
         known = self._samples(slice(offset, offset + count * block + 1, block))
@@ -309,7 +300,8 @@ class _Source:
         found[:, : known.shape[1]] = known
         return found
 
-    def _compressed_levels(self) -> list[Float[np.ndarray, "channels blocks rank"]]:
+    @ft.cached_property
+    def _coefficients(self) -> list[Float[np.ndarray, "channels blocks rank"]]:
         plan = self._plan
         found = [self._compressed(plan.bases[0])]
         for level, basis in zip(plan.levels[1:], plan.bases[1:], strict=True):
@@ -324,15 +316,12 @@ class _Source:
         block, offset, count = self._plan.lattice
         posts, many = self._posts, max(_IN_CACHE // (block * self.channels), 1)
         found = np.empty((self.channels, count, basis.signs.size))
-
-        def compress(begin: int) -> None:
+        for begin in range(0, count, many):
             end = min(begin + many, count)
             few = np.empty((self.channels, end - begin, block + 1))
             self._samples(slice(offset + begin * block, offset + end * block), few[:, :, :-1])
             few[:, :, -1] = posts[:, begin + 1 : end + 1]
             found[:, begin:end] = _products(few, basis)
-
-        map_where_large(compress, range(0, count, many), found.size)
         return found
 
     def folded(self, part: Part) -> Iterator[tuple[np.ndarray, Columns, Columns]]:
