@@ -129,7 +129,7 @@ class ErrorCovariance:
                 "errors.between(pair, pair)"
             )
         effect, noise = np.asarray(self.effect), np.asarray(self.noise)
-        gain, power = np.sum(np.abs(effect) ** 2, axis=2), np.sum(np.abs(noise) ** 2, axis=2)
+        gain, power = (np.vecdot(each, each).real for each in (effect, noise))
         total = power[:, :, None] * gain[:, None, :]
         if self.sensitivity is None or self.drive is None:
             return total
