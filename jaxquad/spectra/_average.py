@@ -266,12 +266,14 @@ def average(
     noise = noise_root(omega, rest, outputs, weights * trust)
     power = np.sum(power_of(noise), axis=2)
     error = np.sqrt(power[:, :, None] * gain / 2) / np.abs(combined.response)
-    measured, gone = (combined.response, combined.coherence, error), lost[:, None, :]
+    response, coherence = combined.response, combined.coherence
     if np.any(lost):
-        pairs = zip(measured, (np.nan, 0.0, np.inf), strict=True)
-        measured = tuple(np.where(gone, none, each) for each, none in pairs)
+        none = (response, np.nan), (coherence, 0.0), (error, np.inf)
+        response, coherence, error = (np.where(lost[:, None, :], *pair[::-1]) for pair in none)
     return Averaged(
-        *measured,
+        response,
+        coherence,
+        error,
         _direct(sums, counts, combined, channels),
         np.einsum("fog,gfo->fo", weights, parts.multiple),
         own_share,

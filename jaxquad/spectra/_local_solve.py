@@ -92,8 +92,8 @@ def count_used(own: Own) -> Int[np.ndarray, " frequencies"]:
 
 def _slope(x: Outputs, y: Outputs) -> Complex[np.ndarray, "frequencies outputs"]:
     """The multiple of each column of `x` that is nearest to that of `y`."""
-    power = np.maximum(np.vecdot(x, x, axis=1).real, 1e-300)
-    return np.vecdot(x, y, axis=1) / power
+    x, y = (np.swapaxes(each, 1, 2) for each in (x, y))
+    return np.vecdot(x, y) / np.maximum(np.vecdot(x, x).real, 1e-300)
 
 
 def regressors(place: Places, u: Inputs, own: Own, order: int) -> Columns:
