@@ -57,6 +57,7 @@ from ._members import (
 )
 from ._process import (
     enable_x64 as enable_x64,
+    keep_freed_memory as keep_freed_memory,
     one_blas_thread as one_blas_thread,
     PrecisionError as PrecisionError,
     require_float64 as require_float64,

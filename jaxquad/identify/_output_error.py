@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import one_blas_thread, require_x64
+from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
 from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
@@ -108,7 +108,7 @@ def refine(
             'weights each frequency by its noise (noise="auto")'
         )
     longest = max(one.samples for one in records)
-    _keep_freed_memory(longest)
+    keep_freed_memory(8 * _HELD * longest)
     near = isinstance(model, Fit)
     if not near:
         require_model("refine", model)
@@ -148,15 +148,6 @@ def _checked(record: Record | Sequence[Record], max_steps: int) -> list[Record]:
 
 
 _HELD = 64  # numbers of each sample that a fit holds at a time
-_LARGEST = 24 << 20  # bytes
-
-
-def _keep_freed_memory(samples: int) -> None:
-    """Have glibc keep what arrays leave: to return it and to ask again is a tenth of a fit's time.
-
-    It keeps twice as much as the largest block that it was given back at once (mallopt(3)).
-    """
-    np.empty(min(8 * _HELD * samples, _LARGEST), np.uint8)
 
 
 def _check_noise(noise: Noise | None, band: tuple[float, float] | None) -> None:

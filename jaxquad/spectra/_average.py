@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._leakage import cross_products, find_bias, Fit, power_of, Slopes, without_leakage
+from ._leakage import find_bias, Fit, power_of, Slopes, without_leakage
 from ._noise_root import noise_root
 
 
@@ -222,7 +222,7 @@ class Averaged(NamedTuple):
     random_error: Float[np.ndarray, "frequencies outputs inputs"]
     direct_coherence: Float[np.ndarray, "frequencies outputs inputs"]
     multiple_coherence: Float[np.ndarray, "frequencies outputs"]
-    input_coherence: Float[np.ndarray, "frequencies inputs"]
+    own_share: Float[np.ndarray, "frequencies inputs"]  # of an input's power, nan without any
     effect: Complex[np.ndarray, "frequencies inputs windows"]
     share: Float[np.ndarray, "frequencies outputs inputs groups"]
     noise: Complex[np.ndarray, "frequencies outputs roots"]
@@ -233,6 +233,7 @@ class Averaged(NamedTuple):
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def average(
     transforms: tuple[Complex[np.ndarray, "frequencies _ channels"], ...],
+    sums: Complex[np.ndarray, "groups frequencies channels channels"],
     slopes: tuple[Slopes, ...],
     channels: Channels,
     omega: Float[np.ndarray, " frequencies"],
@@ -243,11 +244,12 @@ def average(
 ) -> Averaged:
     """One response from all window lengths, with the effect of noise in each window.
 
-    `averages` are the independent windows of each length less the inputs, and `slopes` the
-    transforms behind the derivatives of the windows.
+    `sums` are those of the products of `transforms` over windows, `averages` the independent
+    windows of each length less the inputs, and `slopes` the transforms behind the derivatives of
+    the windows.
     """
     many = tuple(part.shape[1] for part in transforms)
-    sums, counts = np.stack([cross_products(part) for part in transforms]), np.array(many, float)
+    counts = np.array(many, float)
     parts = condition(sums, channels, counts)
     combined = combine(parts, scales, averages, resolved) if len(many) > 1 else single_length(parts)
     own_share = np.einsum("fig,gfi->fi", np.mean(combined.share, axis=1), parts.own_share)
@@ -264,14 +266,17 @@ def average(
     noise = noise_root(omega, rest, outputs, weights * trust)
     power = np.sum(power_of(noise), axis=2)
     error = np.sqrt(power[:, :, None] * gain / 2) / np.abs(combined.response)
-    gone = lost[:, None, :]
+    response, coherence = combined.response, combined.coherence
+    if np.any(lost):
+        none = (response, np.nan), (coherence, 0.0), (error, np.inf)
+        response, coherence, error = (np.where(lost[:, None, :], *pair[::-1]) for pair in none)
     return Averaged(
-        np.where(gone, np.nan, combined.response),
-        np.where(gone, 0.0, combined.coherence),
-        np.where(gone, np.inf, error),
+        response,
+        coherence,
+        error,
         _direct(sums, counts, combined, channels),
         np.einsum("fog,gfo->fo", weights, parts.multiple),
-        1 - np.nan_to_num(own_share),
+        own_share,
         effect,
         combined.share,
         noise,

@@ -5,6 +5,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
+from jaxquad._core import pytree_node
+
 from ._window import coefficients
 
 
@@ -68,7 +70,8 @@ Places = Shaped[np.ndarray, " places"]
 _CHUNK = 512  # times taken at once, so that a long record fits the memory
 
 
-class ErrorCovariance(eqx.Module):
+@pytree_node
+class ErrorCovariance:
     """Covariance of the random errors of all responses of an estimate, stored as factors.
 
     The error of the response of output o to input i at frequency f is a sum over atoms of noise,
@@ -126,7 +129,7 @@ class ErrorCovariance(eqx.Module):
                 "errors.between(pair, pair)"
             )
         effect, noise = np.asarray(self.effect), np.asarray(self.noise)
-        gain, power = np.sum(np.abs(effect) ** 2, axis=2), np.sum(np.abs(noise) ** 2, axis=2)
+        gain, power = (np.vecdot(each, each).real for each in (effect, noise))
         total = power[:, :, None] * gain[:, None, :]
         if self.sensitivity is None or self.drive is None:
             return total

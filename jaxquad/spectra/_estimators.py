@@ -131,15 +131,20 @@ class Welch(eqx.Module):
 
         Below them, leakage through the window exceeds the random error of a good record.
         """
-        dt = records[0].dt
-        length = self.length(records)
+        # By way of the class: a method bound to a module takes as long to make as a product.
+        length, dt = Welch.length(self, records), records[0].dt
         if length <= 30:
             raise ValueError(
                 f"a window of {length} samples is too short for frequencies up to a tenth of the "
                 "sample rate: use a longer window (window_length=), or give the "
                 "frequencies (omega=)"
             )
-        return np.geomspace(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt), 100)
+        return _log_spaced(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt)).copy()
+
+
+@ft.lru_cache(maxsize=16)
+def _log_spaced(low: float, high: float) -> Float[np.ndarray, " frequencies"]:
+    return np.geomspace(low, high, 100)
 
 
 _LENGTHS = 5

@@ -5,7 +5,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from jaxquad._core import require_float64
+from jaxquad._core import pytree_node, require_float64
 
 from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
@@ -58,7 +58,8 @@ _METHODS = {
 }
 
 
-class FrequencyResponse(eqx.Module):
+@pytree_node
+class FrequencyResponse:
     """Measured frequency responses of every output to every input, with their random errors.
 
     With several inputs, responses are conditioned on the other inputs and `coherence` is partial.
@@ -93,7 +94,7 @@ class FrequencyResponse(eqx.Module):
     input_units: tuple[str, ...] = eqx.field(static=True, default=())  # empty where unknown
     output_units: tuple[str, ...] = eqx.field(static=True, default=())
 
-    def __check_init__(self):
+    def __post_init__(self):
         if not isinstance(self.omega, Array | np.ndarray):
             return
         require_float64("the frequency response", self.response)

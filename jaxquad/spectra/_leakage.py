@@ -21,6 +21,7 @@ _WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well add
 
 Rows = Complex[np.ndarray, "frequencies _ windows"]
 Gram = Complex[np.ndarray, "frequencies columns columns"]
+Sizes = Float[np.ndarray, "frequencies _"]
 
 
 class Slopes(NamedTuple):
@@ -104,22 +105,24 @@ def _least_squares(
     With P = P0 - q q^H the projection, P0 that of the common columns A, and O the overlap: the
     trace of P O, the degrees of freedom tr(P O)^2 / tr(P O P O).
     """
-    own = both[:, outputs:]
-    adjoint, across = np.conj(columns), np.swapaxes(columns, 1, 2)
-    gram = adjoint @ across
-    solver = _solver(gram)
-    fitted = solver @ (adjoint @ np.swapaxes(both, 1, 2))
+    count, near, adjoint = columns.shape[1], _near(overlap), np.conj(columns)
+    weighed = _weigh(near, columns)
+    # One product of all: many small ones take as long to begin as to make.
+    stacked = adjoint @ np.swapaxes(np.concatenate([columns, weighed, both], axis=1), 1, 2)
+    gram, solver = stacked[:, :, :count], _solver(stacked[:, :, :count])
+    fitted = solver @ stacked[:, :, 2 * count :]
     rest = both - np.swapaxes(fitted, 1, 2) @ columns
-    if _shows_rounding(gram, solver, both, rest):
+    whole, left = _size(both), _size(rest)
+    if _shows_rounding(gram, solver, whole, left):
         rest -= np.swapaxes(solver @ (adjoint @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
-    rest, q = rest[:, :outputs], np.ascontiguousarray(rest[:, outputs:])
-    length, whole = (np.sqrt(_inner(part, part)) for part in (q, own))
-    inverse = np.where(length > _WITHIN * whole, 1 / np.maximum(length, 1e-300), 0.0)
-    q *= inverse[:, :, None]
+        left = _size(rest)
+    rest, q, length = rest[:, :outputs], rest[:, outputs:], left[:, outputs:]
+    inverse = np.where(length > _WITHIN * whole[:, outputs:], 1 / np.maximum(length, 1e-300), 0.0)
+    q = q * inverse[:, :, None]
     along = np.vecdot(q, rest[:, : q.shape[1]])
     if q.shape[1]:
         rest = rest - q * along[:, :, None]
-    seen = _Seen.of(adjoint, columns, q, overlap)
+    seen = _Seen.of(stacked[:, :, count : 2 * count], weighed, q, near)
     trace, freedom = _noise_left(solver, seen, overlap)
     if not q.shape[1]:
         trace, freedom = (np.repeat(each, outputs, axis=1) for each in (trace, freedom))
@@ -135,14 +138,14 @@ def _solver(gram: Gram) -> Gram:
     return np.linalg.inv(gram * units + _RIDGE * np.eye(gram.shape[1])) * units
 
 
-def _shows_rounding(gram: Gram, solver: Gram, both: Rows, rest: Rows) -> bool:
+def _shows_rounding(gram: Gram, solver: Gram, whole: Sizes, left: Sizes) -> bool:
     """Whether nearly dependent columns leave a part of themselves in what is left.
 
     It is orthogonal to all else, so its square counts.
     """
     least = np.real(np.diagonal(solver, axis1=1, axis2=2) * np.diagonal(gram, axis1=1, axis2=2))
-    part = 2e-16 * np.max(least, axis=1, keepdims=True) * np.sqrt(_inner(both, both))
-    return bool(np.any(part > _SEEN * np.sqrt(_inner(rest, rest))))
+    part = 2e-16 * np.max(least, axis=1, keepdims=True) * whole
+    return bool(np.any(part > _SEEN * left))
 
 
 class _Seen(NamedTuple):
@@ -157,34 +160,45 @@ class _Seen(NamedTuple):
     @classmethod
     def of(
         cls,
-        adjoint: Complex[np.ndarray, "frequencies columns windows"],
-        columns: Complex[np.ndarray, "frequencies columns windows"],
+        aa: Gram,
+        weighed: Complex[np.ndarray, "frequencies columns windows"],  # O A
         q: Complex[np.ndarray, "frequencies own windows"],
-        overlap: Float[np.ndarray, "windows windows"],
+        near: "Sequence[_Near]",
     ) -> "_Seen":
-        a, rest = _weigh(overlap, columns), _weigh(overlap, q)
-        across = np.swapaxes(a, 1, 2)
+        rest, count = _weigh(near, q), weighed.shape[1]
+        found = np.conj(weighed) @ np.swapaxes(np.concatenate([weighed, q], axis=1), 1, 2)
         return cls(
-            adjoint @ across,
-            np.conj(a) @ across,
-            adjoint @ np.swapaxes(rest, 1, 2),
-            _inner(q, rest),
-            _inner(rest, rest),
+            aa, found[:, :, :count], found[:, :, count:], _inner(q, rest), _inner(rest, rest)
         )
 
 
 _FEW = 16  # windows taken at once: few others overlap them
 
 
-def _weigh(overlap: Float[np.ndarray, "windows windows"], rows: Rows) -> Rows:
-    """Rows times the overlap of the windows, near the diagonal only."""
-    flat = rows.reshape(-1, len(overlap))
-    weighed = np.empty_like(flat)
+class _Near(NamedTuple):
+    """The overlap of a few windows with those that overlap them."""
+
+    few: slice
+    others: slice
+    overlap: Complex[np.ndarray, "others few"]
+
+
+def _near(overlap: Float[np.ndarray, "windows windows"]) -> list[_Near]:
+    found = []
     for first in range(0, len(overlap), _FEW):
         few = slice(first, first + _FEW)
-        near = np.flatnonzero(np.any(overlap[few], axis=0))
-        band = slice(near[0], near[-1] + 1)
-        weighed[:, few] = flat[:, band] @ overlap[band, few].astype(complex)
+        places = np.flatnonzero(np.any(overlap[few], axis=0))
+        others = slice(places[0], places[-1] + 1)
+        found.append(_Near(few, others, overlap[others, few].astype(complex)))
+    return found
+
+
+def _weigh(near: Sequence[_Near], rows: Rows) -> Rows:
+    """Rows times the overlap of the windows."""
+    flat = rows.reshape(-1, rows.shape[2])
+    weighed = np.empty_like(flat)
+    for few, others, overlap in near:
+        weighed[:, few] = flat[:, others] @ overlap
     return weighed.reshape(rows.shape)
 
 
@@ -193,8 +207,9 @@ def _noise_left(
 ) -> tuple[Float[np.ndarray, "frequencies _"], Float[np.ndarray, "frequencies _"]]:
     """Trace and degrees of freedom of unit noise behind the projection."""
     once = solver @ seen.aa
-    left = (np.trace(overlap) - np.trace(once, axis1=1, axis2=2).real)[:, None]
-    square = np.sum(overlap**2) - 2 * _trace(solver, seen.aa_twice) + _trace(once, once)
+    left = (np.trace(overlap) - _trace(solver, seen.aa))[:, None]
+    across = np.conj(np.swapaxes(once, 1, 2))
+    square = np.sum(overlap**2) - 2 * _trace(solver, seen.aa_twice) + _trace(once, across)
     square = square[:, None]
     if seen.qq.shape[1]:
         crossed = seen.qq_twice - np.sum(np.conj(seen.aq) * (solver @ seen.aq), axis=1).real
@@ -252,13 +267,18 @@ def power_of(x: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     return np.real(x) ** 2 + np.imag(x) ** 2
 
 
-def _inner(a: Rows, b: Rows) -> Float[np.ndarray, "frequencies _"]:
+def _inner(a: Rows, b: Rows) -> Sizes:
     """The real part of `conj(a) b`, summed over the windows."""
     return np.vecdot(a.view(float), b.view(float))
+
+
+def _size(rows: Rows) -> Sizes:
+    return np.sqrt(_inner(rows, rows))
 
 
 def _trace(
     a: Complex[np.ndarray, "frequencies n n"], b: Complex[np.ndarray, "frequencies n n"]
 ) -> Float[np.ndarray, " frequencies"]:
-    """The real part of the trace of the product."""
-    return np.einsum("fab,fba->f", a, b).real
+    """The real part of the trace of the product of `a` with the adjoint of `b`."""
+    a, b = (np.ascontiguousarray(each).reshape(len(each), -1) for each in (a, b))
+    return _inner(a, b)

@@ -30,7 +30,6 @@ from ._local_fit import (
     window_slices,
 )
 from ._local_noise import (
-    BANDWIDTH,
     coloured_gain,
     error_covariance,
     multiple_coherence,
@@ -77,7 +76,7 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     boosted = left * fit.boost[:, None, :]
     boosted = _diagonal(boosted @ fit.scatter @ _adjoint(boosted))
     boost = np.sqrt(boosted / np.maximum(_diagonal(scatter), 1e-300))
-    gain = boost[:, :, None] ** 2 * np.sum(np.abs(effect) ** 2, axis=2)[:, None, :]
+    gain = boost[:, :, None] ** 2 * np.vecdot(effect, effect).real[:, None, :]
     power = through @ fit.power @ _adjoint(through)
     freedom = np.where(known, fit.freedom, 0.0)
     return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
@@ -115,7 +114,7 @@ def share_of_inputs(
     root = noise.root()[at]
     whole = left @ root
     of_inputs = left[:, :, :inputs] @ root[:, :inputs]
-    power = np.sum(np.abs(whole) ** 2, axis=2)
+    power = np.vecdot(whole, whole).real
     mine = np.sum(np.real(of_inputs * np.conj(whole)), axis=2)
     share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
     return np.repeat(share[:, :, None], inputs, axis=2)
@@ -190,9 +189,8 @@ def estimate_local_polynomial(
     narrow = joint_fit(stack, inputs) if method == "joint" else stack
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
     edges = window_slices(grid, narrow_width, bins)
-    noise_freedom = smoothed(
-        grid, covariance_of_bands(*edges, narrow.freedom), narrow.freedom, BANDWIDTH
-    )
+    bands = covariance_of_bands(*edges, narrow.freedom)
+    noise_freedom = smoothed(grid, bands, narrow.freedom)
     sources = noise
     if method == "joint":
         sources = smooth_noise(grid, narrow_width, stack.scatter, stack.freedom)

@@ -219,14 +219,16 @@ def local_fit(
         u, y = (values[:, :, each] * used[:, :, None] for each in (inputs, outputs))
         solve = solve_polynomial if shape == "polynomial" else solve_rational
         solution = solve(window.place, u, y, own, order)
-        excited = _excited(np.sum(np.abs(solution.effect) ** 2, axis=2), u, bins.largest[inputs])
+        excited = _excited(
+            np.vecdot(solution.effect, solution.effect).real, u, bins.largest[inputs]
+        )
         count = np.maximum(np.sum(used, axis=1), 1)[:, None, None]
         part = (*_padded(solution, excited, longest), products(u) / count)
         fields = fields or [np.empty((omega.size, *each.shape[1:]), each.dtype) for each in part]
         for field, each in zip(fields, part, strict=True):
             field[chunk] = each
     response, effect, boost, scatter, freedom, power = fields
-    gain = boost[:, :, None] ** 2 * np.sum(np.abs(effect) ** 2, axis=2)[:, None, :]
+    gain = boost[:, :, None] ** 2 * np.vecdot(effect, effect).real[:, None, :]
     return LocalFit(response, effect, boost, gain, first, scatter, freedom, power)
 
 

@@ -7,9 +7,9 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from ._error_covariance import ErrorCovariance
 from ._local_fit import Bins, LocalFit
+from ._noise_freedom import BANDWIDTH
 
 
-BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
 _UNLIKELY = 1e-4  # chance at which a residual counts as a misfit, or a line in the noise
 
 

@@ -53,7 +53,8 @@ def solve_rational(place: Places, u: Inputs, y: Outputs, own: Own, order: int) -
         one = y[:, :, o : o + 1]
         joined = _with_pole(place[:, :, None], columns, one, poles[:, None, o : o + 1])
         each.append(_least_squares(joined, one, count_used(own), inputs, order))
-    gain = np.stack([np.sum(np.abs(one.effect) ** 2, axis=(1, 2)) for one in each], axis=1)
+    gains = [np.sum(np.vecdot(one.effect, one.effect).real, axis=1) for one in each]
+    gain = np.stack(gains, axis=1)
     return Solution(
         np.concatenate([one.response for one in each], axis=1),
         each[0].effect,
@@ -91,8 +92,8 @@ def count_used(own: Own) -> Int[np.ndarray, " frequencies"]:
 
 def _slope(x: Outputs, y: Outputs) -> Complex[np.ndarray, "frequencies outputs"]:
     """The multiple of each column of `x` that is nearest to that of `y`."""
-    power = np.maximum(np.sum(np.abs(x) ** 2, axis=1), 1e-300)
-    return np.sum(np.conj(x) * y, axis=1) / power
+    x, y = (np.swapaxes(each, 1, 2) for each in (x, y))
+    return np.vecdot(x, y) / np.maximum(np.vecdot(x, x).real, 1e-300)
 
 
 def regressors(place: Places, u: Inputs, own: Own, order: int) -> Columns:

@@ -14,6 +14,7 @@ from ._window import leaked_power
 Grid = Float[np.ndarray, " frequencies"]
 Square = Float[np.ndarray, "frequencies frequencies"]
 Function = TypeVar("Function", bound=Callable)
+BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
 _FEW = 256  # frequencies, of which a square takes half a megabyte
 
 
@@ -22,22 +23,35 @@ def kept_if_few(function: Function, frequencies: int) -> Function:
     return function if frequencies <= _FEW else inspect.unwrap(function)
 
 
-def line_weights(place: Grid, weight: Grid, bandwidth: float) -> Square:
-    """Weights of the values in local straight lines along `place`; each row sums to one."""
+def kernels(omega: Grid) -> Float[np.ndarray, "3 frequencies frequencies"]:
+    """Weights of neighbours, times 1, the distance in ln(omega) and its square."""
+    return kept_if_few(_kernels, omega.size)(tuple(omega.tolist()))
+
+
+@ft.lru_cache(maxsize=4)
+def _kernels(omega: tuple[float, ...]) -> Float[np.ndarray, "3 frequencies frequencies"]:
+    place = np.log(omega)
     offset = place[None, :] - place[:, None]
-    kernel = weight[None, :] * np.exp(-0.5 * (offset / bandwidth) ** 2)
-    m0, m1, m2 = (np.sum(kernel * offset**k, axis=1)[:, None] for k in (0, 1, 2))
+    kernel = np.exp(-0.5 * (offset / BANDWIDTH) ** 2)
+    return np.stack([kernel, kernel * offset, kernel * offset**2])
+
+
+def _line_weights(omega: Grid, weight: Grid) -> Square:
+    """Weights of the values in local straight lines along ln(omega); each row sums to one."""
+    near = kernels(omega)
+    m0, m1, m2 = (near @ weight)[:, :, None]
     # A single frequency has no slope: the small term keeps the line flat there.
-    spread = m2 + 1e-3 * bandwidth**2 * m0 + 1e-300
-    return kernel * (spread - m1 * offset) / (spread * m0 - m1**2 + 1e-300)
+    spread = m2 + 1e-3 * BANDWIDTH**2 * m0 + 1e-300
+    size = spread * m0 - m1**2 + 1e-300
+    return (near[0] * (spread / size) - near[1] * (m1 / size)) * weight
 
 
-def smoothed(omega: Grid, covariance: Square, weight: Grid, bandwidth: float) -> Square:
+def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
     """Covariance of the logarithm of noise powers after smoothing along frequency.
 
     `covariance` is that of the single ones, each of `weight` complex degrees of freedom.
     """
-    lines = line_weights(np.log(omega), weight, bandwidth)
+    lines = _line_weights(omega, weight)
     return lines @ covariance @ lines.T
 
 
@@ -66,11 +80,12 @@ def covariance_of_windows(
     All lengths see the same noise, each with its own resolution; `levels` are the standard errors
     that they contribute. `angle` is in rad per sample.
     """
-    total, angles = np.zeros((angle.size, angle.size)), tuple(angle.tolist())
-    shared = kept_if_few(_shared_power, angle.size)
-    for level, length in zip(levels.T, lengths, strict=True):
-        total += np.outer(level, level) * shared(shape, length, angles)
-    return total
+    angles, shared = tuple(angle.tolist()), kept_if_few(_shared_power, angle.size)
+    parts = (
+        shared(shape, length, angles) * level * level[:, None]
+        for level, length in zip(levels.T, lengths, strict=True)
+    )
+    return ft.reduce(np.add, parts)
 
 
 @ft.lru_cache(maxsize=12)

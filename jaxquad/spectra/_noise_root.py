@@ -1,16 +1,12 @@
 """The covariance of the outputs' noise, from what is left of their windows."""
 
-import functools as ft
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Complex, Float
 
 from ._leakage import Rest
-from ._noise_freedom import kept_if_few
+from ._noise_freedom import kernels
 
 
-BANDWIDTH = 0.2  # of the noise's smoothing, in ln(omega)
 _FLOOR = 1e-26  # of the output's power: below it lies rounding
 
 Levels = Float[np.ndarray, "frequencies outputs groups"]
@@ -24,47 +20,36 @@ def noise_root(
     `outputs` are the outputs' own energies, and `weights` says how much a length counts.
     """
     freedom = rest.freedom
-    kernels = kept_if_few(_kernels, omega.size)(tuple(omega.tolist()))
+    near = kernels(omega)
     energy = np.real(np.einsum("foog->fog", rest.products))
     # The logarithm of a chi-squared variable is biased by digamma(f) - ln(f).
     low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
     levels = np.log(np.maximum(energy, _FLOOR * outputs + 1e-280) / rest.trace) - low
     level, weight = np.sum(weights * levels, axis=2), np.sum(weights * freedom, axis=2)
-    root = np.exp(_local_lines(kernels, level, weight) / 2)
+    root = np.exp(_local_lines(near, level, weight) / 2)
     if root.shape[1] == 1:
         return root[:, :, None].astype(complex)
     scale = np.sqrt(np.mean(weights, axis=1, keepdims=True) / (energy + 1e-280))
     unit = np.sum(np.conj(rest.products) * (scale[:, :, None] * scale[:, None]), axis=3)
-    return _hermitian_root(_coherency(kernels[0], unit), root)
-
-
-Kernel = Float[np.ndarray, "frequencies frequencies"]
-
-
-@ft.lru_cache(maxsize=4)
-def _kernels(omega: tuple[float, ...]) -> tuple[Kernel, Kernel, Kernel]:
-    """Weights of neighbours, times 1, the distance in ln(omega) and its square."""
-    place = np.log(omega)
-    offset = place[None, :] - place[:, None]
-    kernel = np.exp(-0.5 * (offset / BANDWIDTH) ** 2)
-    return kernel, kernel * offset, kernel * offset**2
+    return _hermitian_root(_coherency(near[0], unit), root)
 
 
 def _local_lines(
-    kernels: Sequence[Kernel],
+    near: Float[np.ndarray, "3 frequencies frequencies"],
     level: Float[np.ndarray, "frequencies outputs"],
     weight: Float[np.ndarray, "frequencies outputs"],
 ) -> Float[np.ndarray, "frequencies outputs"]:
     """Weighted local straight lines: a power law passes unchanged."""
-    both = np.hstack([weight, weight * level])
-    (m0, l0), (m1, l1), (m2, _) = (np.split(each @ both, 2, axis=1) for each in kernels)
+    outputs = weight.shape[1]
+    moments = near @ np.concatenate([weight, weight * level], axis=1)
+    (m0, m1, m2), (l0, l1, _) = moments[:, :, :outputs], moments[:, :, outputs:]
     # A single frequency has no slope: the small term keeps the line flat there.
     spread = m2 + 1e-9 * m0
     return (spread * l0 - m1 * l1) / (spread * m0 - m1**2)
 
 
 def _coherency(
-    kernel: Kernel,
+    kernel: Float[np.ndarray, "frequencies frequencies"],
     total: Complex[np.ndarray, "frequencies outputs outputs"],
 ) -> Complex[np.ndarray, "frequencies outputs outputs"]:
     """Correlation between the outputs' noise, of unit diagonal and positive semidefinite."""

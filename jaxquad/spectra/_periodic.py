@@ -12,7 +12,7 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance
 from ._estimators import Periodic
 from ._frequency_response import Distortion
-from ._local_noise import BANDWIDTH, smooth_noise
+from ._local_noise import smooth_noise
 from ._noise_freedom import smoothed
 from ._remarks import Remark
 
@@ -352,7 +352,7 @@ def _log_noise_covariance(
     omega: Float[np.ndarray, " frequencies"], fit: Averages, scatter: Scatter
 ) -> Float[np.ndarray, "frequencies frequencies"]:
     weight = np.where(fit.known, scatter.freedom, 1e-9)
-    return smoothed(omega, np.eye(omega.size) / scatter.freedom, weight, BANDWIDTH)
+    return smoothed(omega, np.eye(omega.size) / scatter.freedom, weight)
 
 
 def _distortion(

@@ -257,11 +257,11 @@ def _empty_sums(
     as half of the products."""
     counts = [len(starts) for _, starts in plan.windows]
     sizes = [(each.channels, many) for each in tapers for many in counts[each.first :]]
-    ends = np.cumsum([plan.angle.size * channels * many for channels, many in sizes])
-    room = np.empty(max(int(ends[-1]), min(_PAGES, 2 * int(ends[-1]))), complex)
+    ends = list(itertools.accumulate(plan.angle.size * channels * n for channels, n in sizes))
+    room = np.empty(max(ends[-1], min(_PAGES, 2 * ends[-1])), complex)
     parts = [
-        part.reshape(plan.angle.size, *size)
-        for part, size in zip(np.split(room[: ends[-1]], ends[:-1]), sizes, strict=True)
+        room[begin:end].reshape(plan.angle.size, *size)
+        for begin, end, size in zip([0, *ends[:-1]], ends, sizes, strict=True)
     ]
     return [[parts.pop(0) for _ in counts[each.first :]] for each in tapers]
 
@@ -295,8 +295,10 @@ class _Source:
     def _posts(self) -> Float[np.ndarray, "channels ends"]:
         """The samples where blocks begin, and that after the last block: 0 where there is none."""
         block, offset, count = self._plan.lattice
-        found = self._samples(slice(offset, offset + count * block + 1, block))
-        return np.pad(found, ((0, 0), (0, count + 1 - found.shape[1])))
+        known = self._samples(slice(offset, offset + count * block + 1, block))
+        found = np.zeros((self.channels, count + 1))
+        found[:, : known.shape[1]] = known
+        return found
 
     @ft.cached_property
     def _coefficients(self) -> list[Float[np.ndarray, "channels blocks rank"]]:

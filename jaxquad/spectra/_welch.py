@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Complex, Float
 
-from jaxquad._core import one_blas_thread, require_x64
+from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._average import average, Averaged, Channels
@@ -19,9 +19,8 @@ from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._leakage import power_of, shows_leakage, Slopes
+from ._leakage import cross_products, shows_leakage, Slopes
 from ._noise_freedom import covariance_of_windows, smoothed
-from ._noise_root import BANDWIDTH
 from ._nonlinearity import remarks_on_nonlinearity
 from ._remarks import Remark, Remarks
 from ._transform import Taper, transform_tapers
@@ -195,7 +194,7 @@ def frequencies_for(
 ) -> Float[np.ndarray, " frequencies"]:
     """`omega` or the default of `welch`, rad/s; `ValueError` where the window is too short."""
     if omega is None:
-        return welch.default_omega(records)
+        return Welch.default_omega(welch, records)
     check_band(omega, records[0].dt)
     omega = np.asarray(omega, dtype=float)
     seconds = Welch.length(welch, records) * records[0].dt
@@ -271,6 +270,7 @@ def remarks_on_leakage(
 
 
 Method = Literal["direct", "joint"]
+_HELD = 4  # numbers to each sample of a channel that an estimate holds at a time
 _CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
     "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
@@ -290,14 +290,16 @@ def average_windows(
         (spectra,) if isinstance(spectra, Welch) else Composite.windowed(spectra, records, omega)
     )
     omega = frequencies_for(omega, records, members[0])
+    keep_freed_memory(8 * _HELD * sum(record.samples * len(record.names) for record in records))
     segments = transform_records(records, omega, members, derivatives=2)
     channels = _channels(records[0], method)
     independent = _independent(records, segments.groups)
     check_windows(independent, segments, channels)
-    check_spectrum(omega, _excitation(segments, channels), records, members[0], method)
+    sums = np.stack([cross_products(part) for part in segments.transforms])
+    check_spectrum(omega, _excitation(sums, segments, channels), records, members[0], method)
     overlap = window_products(segments.groups, members[0].shape)
     found = average(
-        segments.transforms, segments.slopes, channels, omega, overlap,
+        segments.transforms, sums, segments.slopes, channels, omega, overlap,
         _scales(segments, members[0], records[0].dt), _resolved(segments, omega * records[0].dt),
         np.maximum(np.array(independent) - channels.inputs + 1, 0.5),
     )  # fmt: skip
@@ -309,9 +311,14 @@ def _channels(record: Record, method: Method) -> Channels:
     return Channels(len(record.input_names), len(record.output_names), instruments)
 
 
-def _excitation(segments: Segments, channels: Channels) -> Float[np.ndarray, "moving frequencies"]:
+def _excitation(
+    sums: Complex[np.ndarray, "groups frequencies channels channels"],
+    segments: Segments,
+    channels: Channels,
+) -> Float[np.ndarray, "moving frequencies"]:
     """Mean power of the inputs and of the instruments, in the longest windows."""
-    power = np.mean(power_of(segments.transforms[0]), axis=1).T
+    windows = len(segments.groups[0][1])
+    power = np.real(np.diagonal(sums[0], axis1=1, axis2=2)).T / windows
     first, last = channels.inputs, channels.inputs + channels.outputs
     return np.concatenate([power[:first], power[last : last + channels.instruments]])
 
@@ -352,7 +359,7 @@ def _result(
         omega, found.response, found.coherence, found.random_error,
         found.direct_coherence, found.multiple_coherence,
     )  # fmt: skip
-    grid, response, coherence, random_error, direct, multiple = jax.device_put(parts)
+    grid, response, coherence, random_error, direct, multiple = _on_device(parts)
     return FrequencyResponse(
         omega=grid,
         response=response,
@@ -376,6 +383,13 @@ def _result(
     )
 
 
+def _on_device(parts: Sequence[np.ndarray]) -> list[jax.Array]:
+    """Each once, in one go."""
+    once = {id(part): part for part in parts}
+    put = jax.device_put(once)
+    return [put[id(part)] for part in parts]
+
+
 def _remarks(
     records: Sequence[Record],
     omega: Float[np.ndarray, " frequencies"],
@@ -388,7 +402,8 @@ def _remarks(
     names, direct = (first.output_names, first.input_names), found.direct_coherence
     remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
-    remarks += remarks_on_inputs(omega, found.input_coherence, first.input_names)
+    shared = 1 - np.nan_to_num(found.own_share)
+    remarks += remarks_on_inputs(omega, shared, first.input_names)
     remarks += remarks_on_leakage(omega, found.leakage(), error, names)
     few = max(independent) < 3
     return remarks + ((Remark(_FEW.format(count=max(independent))),) if few else ())
@@ -404,4 +419,4 @@ def _log_noise_covariance(
     weights, freedom = np.mean(found.share, axis=(1, 2)), np.mean(found.freedom, axis=1)
     lengths = tuple(length for length, _ in segments.groups)
     single = covariance_of_windows(omega * dt, weights / np.sqrt(freedom), welch.shape, lengths)
-    return smoothed(omega, single, np.sum(weights * freedom, axis=1), BANDWIDTH)
+    return smoothed(omega, single, np.sum(weights * freedom, axis=1))
