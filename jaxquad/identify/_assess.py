@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxquad._core import on_host
+from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
 from ._accuracy import (
@@ -45,6 +47,7 @@ from ._fit_remarks import (
     remarks_on_bounds,
     remarks_on_discrepancy,
     remarks_on_fit,
+    remarks_on_growth,
     remarks_on_priors,
 )
 from ._held import remarks_on_hold
@@ -55,6 +58,7 @@ from ._origin import Origin
 from ._parameters import Place
 from ._problem import Problem
 from ._result import Fit
+from ._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._solve import same_responses, Solution
 from ._starts import look_aside, Minimum, remarks_on_minima
 from ._verdict import Bound, Verdict
@@ -132,6 +136,7 @@ def assess(
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
             *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
             *remarks_on_bounds(pulled, verdict),
+            *_remarks_on_growth(problem, solution, frfs),
             *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
             *remarks_on_priors(prior.misfit, verdict, by_data, chi_squared=doubted),
             *remarks_on_discrepancy(discrepancy),
@@ -315,6 +320,26 @@ def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> lis
     pairs = [(frf, mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
     parts = [frf.remarks_about(mine) for frf, mine in pairs]
     return list(dict.fromkeys(remark for part in parts for remark in part))
+
+
+def _remarks_on_growth(
+    problem: Problem, solution: Solution, frfs: Sequence[FrequencyResponse]
+) -> list[str]:
+    """Remark on a model that grows within the band of a direct estimate: no open loop does."""
+    model = solution.model
+    known = isinstance(model, HasStateSpace | HasTransferFunction | StateSpace | TransferFunction)
+    lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
+    if not known or lags or not any(frf.method == "direct" for frf in frfs):
+        return []
+    pairs = zip(frfs, problem.weights, strict=True)
+    used = [np.any(np.asarray(weights)[..., 0] > 0, axis=(1, 2)) for _, weights in pairs]
+    lowest = min(
+        float(np.asarray(frf.omega)[mine][0])
+        for frf, mine in zip(frfs, used, strict=True)
+        if mine.any()
+    )
+    growth = float(np.max(np.real(linear_model(on_host(model)).poles), initial=0.0))
+    return remarks_on_growth(growth) if growth > lowest else []
 
 
 def newton_step(

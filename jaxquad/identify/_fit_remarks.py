@@ -105,6 +105,15 @@ def remarks_on_bounds(pulled: Mapping[str, float], verdict: Verdict) -> list[str
     ]
 
 
+def remarks_on_growth(growth: float) -> list[str]:
+    """Remark on a pole of `growth` 1/s in the model of a direct estimate."""
+    return [
+        f"the model grows by e in {1 / growth:.2g} s (a pole at +{growth:.3g} rad/s), which no "
+        "record in open loop can do: a controller flew, and the direct estimate is biased towards "
+        "its -1/C; name an external reference (references=)"
+    ]
+
+
 def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
     """Remark on a model that explains too little of the response for its intervals to be exact."""
     if not _LARGE < discrepancy.amplitude <= NO_MODEL:

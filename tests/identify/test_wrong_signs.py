@@ -1,5 +1,7 @@
 """A start of the wrong sign ends at zero: the intervals count what is left, and it is said."""
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 import pytest
@@ -85,3 +87,12 @@ def test_a_gain_of_the_wrong_sign_is_told():
     fit = jq.fit(jq.LaggedIntegrator(-50.0, 0.05, 0.02), frf)
     assert not fit.identifiable
     assert any("start with the other sign of the gain" in remark for remark in fit.remarks)
+
+
+@pytest.mark.parametrize("method, said", [("direct", True), ("joint", False)])
+def test_a_model_that_grows_needs_a_reference(method, said):
+    grows = jq.TransferFunction([20.0], [1.0, -3.0])
+    frf = dataclasses.replace(response_of(grows, error=0.01, seed=0, omega=OMEGA), method=method)
+    start = jq.TransferFunction([15.0], [1.0, -2.0])
+    remarks = jq.fit(start, frf, free=["numerator[0]", "denominator[1]"]).remarks
+    assert any("a pole at +3" in remark for remark in remarks) == said
