@@ -75,7 +75,7 @@ class Problem:
     quantities: tuple[Condition, ...] = eqx.field(static=True)  # that a prior speaks of
     omega: tuple[Float[Numbers, " frequencies"], ...]
     measured: tuple[Complex[Numbers, "frequencies outputs inputs"], ...]
-    weights: tuple[Float[Numbers, "frequencies outputs inputs 2"], ...]
+    weights: tuple[Float[Numbers, "frequencies outputs inputs parts"], ...]  # two, or one of both
     known: Float[Numbers, "priors 2"]  # value, standard error
     aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
     silent: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True, default=())
@@ -281,7 +281,8 @@ def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residua
     triples = zip(_log_ratios(z, problem), problem.weights, problem.mixings, strict=True)
     parts = []
     for log, weight, mixing in triples:
-        scaled = (part * jnp.moveaxis(weight[..., k], 0, -1) for k, part in enumerate(log))
+        both = zip(log, (weight[..., 0], weight[..., -1]), strict=True)
+        scaled = (part * jnp.moveaxis(each, 0, -1) for part, each in both)
         parts += [part.reshape(-1) for part in mix_parts(mixing, *scaled)]
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 
