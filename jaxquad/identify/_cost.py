@@ -228,9 +228,7 @@ def _own_covariance(
     return (effect @ effect.conj().T) * (noise[mine, pair[0]] @ noise[mine, pair[0]].conj().T)
 
 
-def _are_independent(
-    errors: ErrorCovariance, source: int, mine: Int[np.ndarray, " used"]
-) -> bool:
+def _are_independent(errors: ErrorCovariance, source: int, mine: Int[np.ndarray, " used"]) -> bool:
     """Whether no atom of noise reaches two of the frequencies, so that they share none."""
     if errors.windows is not None or errors.sensitivity is not None:
         return False
