@@ -21,7 +21,17 @@ Value = Any  # an array, or the number of a literal
 def no_fuse(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     """`function(*args)` as a call that the CPU's compiler does not fuse with what is around it."""
     with set_xla_metadata(inlineable="false"):
-        return jax.jit(function)(*args)
+        return jax.jit(_fuse_within(function))(*args)
+
+
+def _fuse_within(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """The same function, in which `jnp.where` and its like, calls themselves, are fused again."""
+
+    def run(*args: PyTree) -> PyTree:
+        with set_xla_metadata(inlineable="true"):
+            return function(*args)
+
+    return run
 
 
 _COSTLY = {"exp", "log", "sin", "cos", "tan", "div", "atan2", "sqrt", "rsqrt", "pow", "tanh"}

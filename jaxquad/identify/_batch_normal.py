@@ -35,7 +35,7 @@ class Member(NamedTuple):
     """
 
     inverse: tuple[Numbers, Numbers]  # frequencies outputs inputs: 1 / measured, real, imaginary
-    weights: Numbers  # frequencies outputs inputs 2
+    weights: Numbers  # frequencies outputs inputs parts: one of both for single evaluation
     factor: tuple[Numbers, Numbers] | None  # frequencies frequencies outputs inputs, a `Mixing`'s
 
 
@@ -103,7 +103,7 @@ class _Single(NamedTuple):
     """What one member is fitted to, in the order in which normal equations take it."""
 
     measured: tuple[Array, Array]  # outputs inputs frequencies: real, imaginary
-    weights: Array  # 2 outputs inputs frequencies
+    weights: Array  # parts outputs inputs frequencies
     factor: tuple[Array, Array] | None  # outputs inputs frequencies frequencies
 
 

@@ -130,9 +130,9 @@ def least_coherence(given: float | None, cost: Cost, frf: FrequencyResponse) -> 
     """
     if given is not None:
         return given
-    weighs = isinstance(cost, MaximumLikelihood) and frf.method == "direct" and not frf.fed_back
-    coherent = np.count_nonzero(usable(frf, None, _COHERENT)) >= _ENOUGH
-    return _POOR if weighs and coherent else _COHERENT
+    if not (isinstance(cost, MaximumLikelihood) and frf.method == "direct" and not frf.fed_back):
+        return _COHERENT
+    return _POOR if np.count_nonzero(usable(frf, None, _COHERENT)) >= _ENOUGH else _COHERENT
 
 
 Range = tuple[float, float]
@@ -228,6 +228,14 @@ def _own_covariance(
     return (effect @ effect.conj().T) * (noise[mine, pair[0]] @ noise[mine, pair[0]].conj().T)
 
 
+def _are_independent(errors: ErrorCovariance, source: int, mine: Int[np.ndarray, " used"]) -> bool:
+    """Whether no atom of noise reaches two of the frequencies, so that they share none."""
+    if errors.windows is not None or errors.sensitivity is not None:
+        return False
+    reached = np.count_nonzero(np.asarray(errors.effect)[mine, source], axis=0)
+    return bool(np.max(reached, initial=0) <= 1)
+
+
 _ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as independent
 
 
@@ -238,6 +246,8 @@ def _shared_noise(
     shared, correlations = np.ones(used.shape), {}
     for o, i in np.ndindex(used.shape[1:]):
         mine = np.flatnonzero(used[:, o, i])
+        if _are_independent(frf.errors, i, mine):
+            continue
         covariance = _own_covariance(frf.errors, (o, i), mine)
         size = np.sqrt(np.maximum(np.real(np.diagonal(covariance)), 1e-300))
         turn = np.exp(-1j * np.angle(np.asarray(frf.response)[mine, o, i])) / size

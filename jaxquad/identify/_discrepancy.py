@@ -137,17 +137,48 @@ def _components(omega, used, inverse, columns) -> tuple[np.ndarray, np.ndarray]:
     return gains.reshape(lengths, -1), products.reshape(lengths, -1, width**2)
 
 
+_DENSE = 256  # frequencies, up to which whole kernels are made
+
+
 @ft.lru_cache(maxsize=16)
 def kernel_basis(omega: bytes) -> Float[np.ndarray, "lengths frequencies rank"]:
     """Roots of the kernels of all lengths at frequencies (the bytes of their array, rad/s)."""
     place = np.log(np.frombuffer(omega))
-    apart = np.abs(place[:, None] - place[None, :])
-    roots = []
-    for length in LENGTHS:
-        values, vectors = np.linalg.eigh(np.exp(-apart / length))
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        roots.append(root[:, ::-1][:, :_RANK])
-    return np.stack(roots)
+    apart = np.diff(np.sort(place))
+    by_inverse = place.size > _DENSE and np.min(apart) > 1e-9
+    root = _root_by_inverse if by_inverse else _root_of_kernel
+    return np.stack([root(place, length) for length in LENGTHS])
+
+
+def _root_of_kernel(
+    place: Float[np.ndarray, " frequencies"], length: float
+) -> Float[np.ndarray, "frequencies rank"]:
+    values, vectors = np.linalg.eigh(np.exp(-np.abs(place[:, None] - place[None, :]) / length))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root[:, ::-1][:, :_RANK]
+
+
+def _root_by_inverse(
+    place: Float[np.ndarray, " frequencies"], length: float
+) -> Float[np.ndarray, "frequencies rank"]:
+    """The same without the matrix.
+
+    Where an Ornstein-Uhlenbeck process is depends on its two neighbours alone, so the inverse of
+    its kernel has three diagonals.
+    """
+    from scipy.linalg import eigh_tridiagonal
+
+    order = np.argsort(place)
+    apart = np.diff(place[order]) / length
+    passed = -np.exp(-2 * apart) / np.expm1(-2 * apart)  # rho^2 / (1 - rho^2) between neighbours
+    beside = np.exp(-apart) / np.expm1(-2 * apart)
+    diagonal = 1 + np.concatenate([passed, [0.0]]) + np.concatenate([[0.0], passed])
+    values, vectors = eigh_tridiagonal(
+        diagonal, beside, select="i", select_range=(0, min(_RANK, place.size) - 1)
+    )
+    root = np.empty_like(vectors)
+    root[order] = vectors / np.sqrt(values)
+    return root
 
 
 def _restricted_likelihoods(

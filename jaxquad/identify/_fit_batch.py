@@ -43,11 +43,11 @@ from ._mixing import Mixing, mixings_of
 from ._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ._problem import make_problem
 from ._result import Fit
-from ._solve import solution_at, stopped_early
+from ._solve import once_if_alike, solution_at, stopped_early
 
 
 _CHUNK = 64  # fits side by side
-_CHUNK_OF_SINGLES = 16  # fits of which each is evaluated by itself
+_CHUNK_OF_SINGLES = 8  # fits of which each is evaluated by itself
 _CHUNKS = 8  # of one call
 
 
@@ -97,7 +97,10 @@ def solve_batch(
     omega, count = np.asarray(omega), len(omega)
     where = Batch(model, parameters, hold, _pad(omega), np.asarray(count))
     _check_pointwise(where, measured.shape[2:])
-    members = _members(np.asarray(measured), np.asarray(weights), mixings)
+    weights = np.asarray(weights)
+    if evaluates_singly(where):
+        weights = once_if_alike(weights)
+    members = _members(np.asarray(measured), weights, mixings)
     if start is None:
         start = np.broadcast_to(
             parameters.start[: parameters.count], (len(measured), parameters.count)
@@ -111,8 +114,9 @@ def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Mem
     # Points that do not count may hold anything, NaN included.
     with np.errstate(invalid="ignore"):
         inverse = _pad(np.where(used, 1 / np.where(used, measured, 1.0), 1.0), 1)
-    weights = np.array(_pad(weights, 1))
-    weights[:, measured.shape[1] :] = 0
+    weights = _pad(weights, 1)
+    if weights.shape[1] > measured.shape[1]:
+        weights[:, measured.shape[1] :] = 0
     shared = any(each is not None for each in mixings)
     factor = _factors(mixings, measured.shape, inverse.shape[1]) if shared else None
     return Member((np.real(inverse), np.imag(inverse)), weights, factor)
@@ -139,8 +143,10 @@ def _padded(size: int) -> int:
 
 
 def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
-    """Filled up with the last frequency."""
+    """Filled up with the last frequency; the array itself where it is full."""
     size = array.shape[axis]
+    if _padded(size) == size:
+        return array
     return np.take(array, np.minimum(np.arange(_padded(size)), size - 1), axis)
 
 

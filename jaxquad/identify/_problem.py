@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from jaxquad._core import as_array, on_host, pytree_node
+from jaxquad._core import on_host, pytree_node
 from jaxquad._xla import no_fuse
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
@@ -75,7 +75,7 @@ class Problem:
     quantities: tuple[Condition, ...] = eqx.field(static=True)  # that a prior speaks of
     omega: tuple[Float[Numbers, " frequencies"], ...]
     measured: tuple[Complex[Numbers, "frequencies outputs inputs"], ...]
-    weights: tuple[Float[Numbers, "frequencies outputs inputs 2"], ...]
+    weights: tuple[Float[Numbers, "frequencies outputs inputs parts"], ...]  # two, or one of both
     known: Float[Numbers, "priors 2"]  # value, standard error
     aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
     silent: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True, default=())
@@ -183,7 +183,12 @@ def _known(response: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
 
 def on_device(model: PyTree) -> PyTree:
     """The model with JAX's arrays in the place of NumPy's."""
-    return jax.tree.map(lambda x: as_array(x) if isinstance(x, np.ndarray) else x, model)
+    leaves, structure = jax.tree.flatten(model)
+    hosted = [k for k, leaf in enumerate(leaves) if isinstance(leaf, np.ndarray)]
+    # In one call: it takes as long as for a single array.
+    for k, array in zip(hosted, jax.device_put([leaves[k] for k in hosted]), strict=True):
+        leaves[k] = array
+    return jax.tree.unflatten(structure, leaves)
 
 
 def _silent_pairs(
@@ -281,7 +286,8 @@ def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residua
     triples = zip(_log_ratios(z, problem), problem.weights, problem.mixings, strict=True)
     parts = []
     for log, weight, mixing in triples:
-        scaled = (part * jnp.moveaxis(weight[..., k], 0, -1) for k, part in enumerate(log))
+        both = zip(log, (weight[..., 0], weight[..., -1]), strict=True)
+        scaled = (part * jnp.moveaxis(each, 0, -1) for part, each in both)
         parts += [part.reshape(-1) for part in mix_parts(mixing, *scaled)]
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 

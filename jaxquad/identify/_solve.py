@@ -15,8 +15,8 @@ from jaxquad._core import (
     STALLED,
     TOLERANCE,
 )
-from jaxquad._xla import arctan2, hasty_options, KeptPrograms
-from jaxquad.models import Entry, logarithmic_slopes, matrices_of, Split, StateSpace
+from jaxquad._xla import arctan2, hasty_options, KeptPrograms, no_fuse
+from jaxquad.models import Entry, factor_slopes, matrices_of, Split, StateSpace
 
 from ._evaluate import as_residuals, evaluate, Evaluation, Frame, start_each, take_apart
 from ._mixing import mix_parts
@@ -55,13 +55,16 @@ def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[No
     parameters, omega = problem.parameters, jnp.asarray(problem.omega[k])
     matrices = matrices_of(parameters.insert(problem.model, z))
     entries = [_entry(place.path) for place in parameters.places[: z.size]]
-    weights = Split(*jnp.moveaxis(jnp.asarray(problem.weights[k]), (0, 3), (3, 0)))
-    scale = jnp.asarray(parameters.slopes(z))
-    value, rows = logarithmic_slopes(matrices, omega, entries, scale, weights)
-    misfit = _logarithm(value, jnp.asarray(problem.measured[k]))
-    residual = [part * weight for part, weight in zip(misfit, weights, strict=True)]
+    value, slopes = factor_slopes(matrices, omega, entries, jnp.asarray(parameters.slopes(z)))
+    misfit = no_fuse(_logarithm, value, jnp.asarray(problem.measured[k]))
     mixing = problem.mixings[k]
-    mixed = mix_parts(mixing, *residual), mix_parts(mixing, *rows)
+    weights = jnp.moveaxis(jnp.asarray(problem.weights[k]), (0, 3), (3, 0))
+    if len(weights) == 1 and mixing is None and slopes.multiplies_sooner:
+        square = sum(jnp.sum((part * weights[0]) ** 2) for part in misfit)
+        return [Normal(0.5 * jnp.asarray(square), *slopes.normal_products(weights[0], misfit))]
+    both = Split(weights[0], weights[-1])
+    residual = [part * weight for part, weight in zip(misfit, both, strict=True)]
+    mixed = mix_parts(mixing, *residual), mix_parts(mixing, *slopes.multiply_out(both))
     return [_products(*each) for each in zip(*mixed, strict=True)]
 
 
@@ -145,10 +148,22 @@ def solve(
     if sum(each.size for each in problem.weights) * z0.size**2 < _SHORT:
         stop = _descend_short(problem.mixed(), z0, solver, max_steps)
     else:
-        stop = _descend_long(problem, jax.device_put(z0), solver, max_steps)
+        stop = _descend_long(_with_one_weight(problem), jax.device_put(z0), solver, max_steps)
     steps = int(stop.steps)
     message = "" if stop.converged else f"{_reason(stop.reason)} (after {steps} steps)"
     return solution_at(problem, np.asarray(stop.z), message, steps)
+
+
+def _with_one_weight(problem: Problem) -> Problem:
+    """Weights of magnitude and phase once, where they are alike and that saves arithmetic."""
+    if not _is_plain(problem) or any(each is not None for each in problem.mixings):
+        return problem
+    return problem.weighted([once_if_alike(np.asarray(each)) for each in problem.weights])
+
+
+def once_if_alike(weights: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points parts"]:
+    """Weights of magnitude and phase, on a last axis of one where they are alike."""
+    return weights[..., :1] if np.array_equal(weights[..., 0], weights[..., 1]) else weights
 
 
 def stopped_early(status: int, steps: int) -> str:

@@ -4,7 +4,7 @@ from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._connect import realise as realise, series as series, state_space as state_space
 from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
-from ._entry_slopes import Entry as Entry, logarithmic_slopes as logarithmic_slopes
+from ._entry_slopes import Entry as Entry, factor_slopes as factor_slopes
 from ._exponential import matrix_exponential as matrix_exponential
 from ._from_control import from_control as from_control
 from ._modes import Mode as Mode, modes as modes

@@ -119,24 +119,29 @@ _LEAST = 0.01  # of its column, that a diagonal element must be to do as a pivot
 
 def _invert_by_diagonal(matrix: Split) -> tuple[Split, Bool[Array, ""]]:
     """The inverse without a choice of pivots, and whether they all did."""
-    left = jnp.arange(len(matrix.real))[:, None]
 
     def step(k: Int[Array, ""], carry: tuple[Split, Array]) -> tuple[Split, Array]:
         table, sound = carry
-        column = _column(table, k)
-        size = column.real * column.real + column.imag * column.imag
-        largest = jnp.max(jnp.where(left >= k, size, 0), axis=0)
-        pivot = jax.lax.dynamic_index_in_dim(size, k, keepdims=False)
-        return _exchange_diagonal(table, column, k), sound & (pivot >= _LEAST**2 * largest)
+        table, will_do = no_fuse(_exchange_diagonal, table, k)
+        return table, sound & will_do
 
-    sound = jnp.ones(matrix.real.shape[2], bool)
-    found, sound = jax.lax.fori_loop(0, len(matrix.real), step, (matrix, sound))
+    sound, states = jnp.ones(matrix.real.shape[2], bool), len(matrix.real)
+    # Two steps at a time: the table goes from one place to another and back, without a copy.
+    found, sound = jax.lax.fori_loop(0, states, step, (matrix, sound), unroll=2)
     return found, jnp.all(sound)
 
 
-def _exchange_diagonal(table: Split, column: Split, k: Int[Array, ""]) -> Split:
+def _exchange_diagonal(
+    table: Split, k: Int[Array, ""]
+) -> tuple[Split, Bool[Array, " frequencies"]]:
+    """Unknown k against its own right side, and whether the diagonal element does as a pivot."""
+    number = jnp.arange(len(table.real))[:, None]
+    column = _column(table, k)
+    size = column.real * column.real + column.imag * column.imag
+    largest = jnp.max(jnp.where(number >= k, size, 0), axis=0)
+    pivot = jax.lax.dynamic_index_in_dim(size, k, keepdims=False)
     row = Split(*(jax.lax.dynamic_index_in_dim(part, k, keepdims=False) for part in table))
-    return _exchange(table, row, column, (jnp.arange(len(table.real)) == k)[:, None], k)
+    return _exchange(table, row, column, number == k, k), pivot >= _LEAST**2 * largest
 
 
 def _pivot_row(

@@ -9,6 +9,12 @@ import pytest
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
+from jaxquad.identify._discrepancy import (
+    _root_by_inverse,
+    _root_of_kernel,
+    kernel_basis,
+    LENGTHS,
+)
 
 
 TRUTH = jq.LaggedIntegrator(80.0, 0.06, 0.03)
@@ -137,3 +143,20 @@ def test_the_missing_term_is_found_and_a_right_model_is_left_alone(right, wrong)
     assert abs(found.best.values[-1] - 0.3) < 3 * found.best.standard_errors[-1]
     assert "d = 0." in found.summary and "lacks rate damping" in str(found)
     assert right[0].explain().best is None
+
+
+@pytest.mark.parametrize("count", [40, 257])
+def test_kernels_have_the_same_roots_with_and_without_a_matrix(count):
+    omega = np.random.default_rng(3).permutation(np.geomspace(0.6, 60.0, count))
+    found = kernel_basis(omega.tobytes())
+    for root, length in zip(found, LENGTHS, strict=True):
+        for make in (_root_of_kernel, _root_by_inverse):
+            one = make(np.log(omega), length)
+            np.testing.assert_allclose(one @ one.T, root @ root.T, atol=1e-10)
+
+
+def test_many_frequencies_may_hold_one_twice():
+    # The inverse of their kernel does not exist.
+    omega = np.append(np.geomspace(0.6, 60.0, 299), 60.0)
+    for root in kernel_basis(omega.tobytes()):
+        np.testing.assert_allclose(root[-2], root[-1], atol=1e-9)

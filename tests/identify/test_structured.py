@@ -9,6 +9,7 @@ import pytest
 import jaxquad as jq
 from jaxquad._core import normal_equations
 from jaxquad.identify import make_problem, problem_normal, residuals, select_parameters
+from jaxquad.models import Entry, factor_slopes, matrices_of, Split
 
 
 OMEGA = jnp.asarray(np.geomspace(0.2, 30.0, 12))
@@ -87,5 +88,43 @@ def test_equations_may_stand_in_any_order():
         entries = [f"F[{row}][0]", f"F[{row}][1]", f"G[{row}][0]", f"M[{row}][1]", "H1[0][1]"]
         made = problem(model, entries)
         normals.append(jax.jit(problem_normal)(made.parameters.start[: len(entries)], made))
+    for one, other in zip(*normals, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.max(np.abs(other)))
+
+
+def entry(name):
+    field, *index = name.replace("]", "").split("[")
+    return Entry(field, *(int(i) for i in (*index, "0")[:2]))
+
+
+@jax.jit
+def both_products(model, scale, weight, misfit):
+    """Gradient and Hessian without the slopes, and from the slopes."""
+    entries = [entry(name) for name in ENTRIES]
+    slopes = factor_slopes(matrices_of(model), OMEGA, entries, scale)[1]
+    rows = [part.reshape(len(scale), -1) for part in slopes.multiply_out(Split(weight, weight))]
+    parts = [(weight * part).reshape(-1) for part in misfit]
+    gradient = sum(row @ part for row, part in zip(rows, parts, strict=True))
+    return slopes.normal_products(weight, misfit), (gradient, sum(row @ row.T for row in rows))
+
+
+def test_products_of_slopes_need_no_slopes():
+    rng = np.random.default_rng(4)
+    scale, shape = jnp.asarray(rng.uniform(0.5, 2.0, len(ENTRIES))), (2, 2, OMEGA.size)
+    weight, *misfit = jnp.asarray(rng.standard_normal((3, *shape)))
+    for one, other in zip(*both_products(MODEL, scale, weight, Split(*misfit)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.max(np.abs(other)))
+
+
+@pytest.mark.slow
+def test_weights_may_be_one_for_magnitude_and_phase():
+    # Many entries in few columns and rows: their products are taken without the slopes.
+    entries = ["F[0][0]", "F[0][1]", "F[0][2]", "F[1][0]", "F[1][1]"]
+    entries += ["G[0][0]", "G[0][1]", "G[1][0]", "G[1][1]"]
+    made = problem(entries=entries)
+    one = [np.asarray(each)[..., :1] for each in made.weights]
+    z = made.parameters.start[: len(entries)]
+    pairs = [made.weighted(one), made.weighted([np.repeat(each, 2, axis=3) for each in one])]
+    normals = [jax.jit(problem_normal)(z, each) for each in pairs]
     for one, other in zip(*normals, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.max(np.abs(other)))
