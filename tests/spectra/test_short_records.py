@@ -36,7 +36,7 @@ def remarks(record):
 
 @pytest.mark.parametrize(("seconds", "seed"), [(0.8, 4), (1.6, 1)])
 def test_a_second_of_a_closed_loop_is_called_too_short(seconds, seed):
-    """Records of which some frequency is known at all: that is about every second one."""
+    """Of records that show any frequency at all, which are two of five."""
     [said] = remarks(closed_loop(seconds, seed))
     assert "at least 6" in said and "cycles of the lowest (at least 5)" in said
     assert "Record at least" in said
