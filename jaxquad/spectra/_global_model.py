@@ -24,7 +24,6 @@ _PER_PARAMETER = 6  # real equations
 _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
 _THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
 _PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
-_FEW = 3  # poles, up to which growing ones are tried mirrored, too
 _BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of the residual's power: in ln(omega), and bins a side at least
 
 Vector = Float[np.ndarray, " parameters"]
@@ -150,7 +149,7 @@ def global_models(
         Equations(lag / scale, u, own, bins.values[places, o])
         for o in range(outputs.start, outputs.stop)
     )
-    tasks = (_Task(equations, bins.omega[places], most, scale) for equations in each)
+    tasks = (_Task(equations, bins.omega[places], most) for equations in each)
     found = map_in_threads(_identify_kept, tasks)
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
@@ -180,12 +179,10 @@ Identified = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
 class _Task:
     """Equations to solve, equal to others of the same content."""
 
-    def __init__(
-        self, equations: Equations, omega: Float[np.ndarray, " bins"], most: int, scale: float
-    ):
-        self.identify = ft.partial(_identify, equations, omega, most, scale)
+    def __init__(self, equations: Equations, omega: Float[np.ndarray, " bins"], most: int):
+        self.identify = ft.partial(_identify, equations, omega, most)
         whole = b"".join(each.tobytes() for each in (*equations, omega))
-        self.content = hashlib.blake2b(whole).digest(), equations.own.shape, most, scale
+        self.content = hashlib.blake2b(whole).digest(), equations.own.shape, most
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Task) and self.content == other.content
@@ -204,11 +201,11 @@ def _identify_kept(task: _Task) -> Identified | None:
 
 
 def _identify(
-    equations: Equations, omega: Float[np.ndarray, " bins"], most: int, scale: float
+    equations: Equations, omega: Float[np.ndarray, " bins"], most: int
 ) -> Identified | None:
     """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
     every = _thin(len(omega), _TRIAL_BINS)
-    first = _choose(equations.pick(every), most, scale)
+    first = _choose(equations.pick(every), most)
     if first is None:
         return None
     noise = running_power(omega, _residual(equations, first), np.ones_like(omega))
@@ -216,7 +213,7 @@ def _identify(
     if np.max(noise) < _EVEN * np.min(noise):
         weight = np.full_like(noise, np.mean(weight))
     white = equations.weighted(weight)
-    chosen = _choose(white.pick(every), most, scale) if np.ptp(weight) > 0 else first
+    chosen = _choose(white.pick(every), most) if np.ptp(weight) > 0 else first
     if chosen is None:
         return None
     basis = _basis(white, len(chosen.denominator))
@@ -244,9 +241,15 @@ def _residual(equations: Equations, solved: Solved) -> Complex[np.ndarray, " bin
     return equations.y - basis.columns @ solved.linear / (basis.powers @ solved.denominator)
 
 
-def _choose(equations: Equations, most: int, scale: float) -> Solved | None:
-    """The solution of the order above the best one, where it was tried and leaves less."""
-    count = 2 * len(equations.y)
+def _choose(equations: Equations, most: int) -> Solved | None:
+    """The solution of the order above the best one, where it was tried and leaves less.
+
+    Descents begin at a linear estimate, and at the solution of the order below, so that no order
+    leaves more than a lower one. The noise draws the poles of linear estimates to the stability
+    limit or beyond it, from where few descents find back: those models can lack a lag of the plant,
+    for hundreds of the criterion.
+    """
+    count, below = 2 * len(equations.y), np.ones(1)
     best, above, least, worse = None, None, _information(_proportional(equations), 1, count), 0
     lowest, floor = least, _EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for order in _orders(most):
@@ -256,13 +259,12 @@ def _choose(equations: Equations, most: int, scale: float) -> Solved | None:
         basis = _basis(equations, order + 1)
         solved = _descend(equations, basis, _relax(equations, basis), _TRIAL)
         value = _information(solved.cost + 0.01 * floor, parameters, count)
-        # What mirrored poles find must not end the search: higher orders may find more.
+        # What the order below leads to must not end the search: higher orders may find more.
         worse, lowest = (0, value) if value < lowest else (worse + 1, lowest)
-        mirrored = _mirrored(solved.denominator, scale) if order <= _FEW else None
-        if mirrored is not None:
-            again = _descend(equations, basis, mirrored, _TRIAL)
-            solved = again if again.cost < solved.cost else solved
-            value = _information(solved.cost + 0.01 * floor, parameters, count)
+        again = _descend(equations, basis, np.pad(below, (0, order + 1 - below.size)), _TRIAL)
+        if again.cost < solved.cost:
+            solved, value = again, _information(again.cost + 0.01 * floor, parameters, count)
+        below = solved.denominator
         if value < least:
             best, above, least = solved, None, value
         elif above is None:
@@ -302,24 +304,6 @@ def _relax(equations: Equations, basis: "_Basis") -> Float[np.ndarray, " powers"
         weight = 1 / np.abs(solved.below)[:, None]
     assert best is not None
     return best.denominator
-
-
-def _mirrored(
-    denominator: Float[np.ndarray, " powers"], scale: float
-) -> Float[np.ndarray, " powers"] | None:
-    """The denominator with its growing poles mirrored into decaying ones; `None` without any.
-
-    The noise of the equations draws poles across the stability limit, from where few descents find
-    back: a model of few poles that ends there can lack a lag of the plant, for hundreds of the
-    criterion. Of many poles some are the noise's own.
-    """
-    lags = 1 + scale * np.roots(denominator[::-1])  # 1 / z of the poles: of growing ones below 1
-    growing = (np.abs(lags) < 1) & (lags != 0)
-    if not np.any(growing):
-        return None
-    lags[growing] = 1 / np.conj(lags[growing])
-    powers = np.real(np.poly((lags - 1) / scale))[::-1]
-    return np.pad(powers / np.linalg.norm(powers), (0, denominator.size - powers.size))
 
 
 def _null_vector(matrix: Float[np.ndarray, "rows columns"], first: int) -> Vector:
