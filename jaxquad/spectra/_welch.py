@@ -386,7 +386,8 @@ def _remarks(
     first, independent = records[0], _independent(records, groups)
     response, coherence, error = found.response, found.coherence, found.random_error
     names, direct = (first.output_names, first.input_names), found.direct_coherence
-    remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
+    measured = omega, response, error, coherence, direct
+    remarks = remarks_on_feedback(records, method, *measured, names)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     remarks += remarks_on_inputs(omega, found.input_coherence, first.input_names)
     remarks += remarks_on_leakage(omega, found.leakage(), error, names)
