@@ -21,12 +21,12 @@ class Share(NamedTuple):
     """Of the input's power at each frequency, that which the output's innovations make.
 
     Innovations are what the past of both signals does not predict. What both have in common at one
-    sample counts as the output's in `most`, because a plant takes time to answer, and as the
-    input's in `least`, because a logger may write an answer beside its cause.
+    sample counts as the output's in `output_first`, because a plant takes time to answer, and as
+    the input's in `input_first`, because a logger may write an answer beside its cause.
     """
 
-    most: Grid
-    least: Grid
+    output_first: Grid
+    input_first: Grid
 
 
 def share_from_output(records: Sequence[Signals], dt: float, omega: Grid) -> Share:
@@ -46,8 +46,12 @@ def share_from_output(records: Sequence[Signals], dt: float, omega: Grid) -> Sha
         if sum(x.shape[1] - _ORDER for x in slow) < _ENOUGH:
             continue
         found = _share_at(_products(slow), omega * dt * every)
-        best = found if np.median(found.most) > np.median(best.most) else best
+        best = max(best, found, key=_median)
     return best
+
+
+def _median(share: Share) -> float:
+    return float(np.median(share.output_first))
 
 
 def _decimations(dt: float, highest: float) -> Iterator[int]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from jaxquad.records import Record
 
 from ._checks import in_hertz
-from ._directed import share_from_output
+from ._directed import Share, share_from_output
 from ._error_covariance import ErrorCovariance
 from ._remarks import DOMINATED, EARLY, Remark
 
@@ -23,7 +23,7 @@ Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _CHANCE = 1.35e-3  # of calling the phase of any pair rising: 3 standard errors of a single slope
 _FALLS = 0.2  # rad over the top of the coherent band: less than an actuator's phase falls there
-_NEARLY_ALL, _MORE = 0.9, 0.5  # median shares of the input's power, at most and at least
+_NEARLY_ALL, _MORE = 0.9, 0.5  # median shares of the input's power, output first and input first
 _FEWEST = 8  # frequencies for a slope
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
 
@@ -171,19 +171,25 @@ def _remarks_on_phase(
     if slope is None:
         return []
     covariance = None if errors is None else ft.partial(errors.between, pair.place, pair.place)
-    if _is_rise(slope, pair.response, covariance, clear):
-        text = (_RISES if method == "direct" else _EARLY).format(lead=1e3 * slope.value)
-        return [Remark(text, pair.coherent, pair.names)]
+    rises = _is_rise(slope, pair.response, covariance, clear)
     if method == "joint":
-        return []
+        text = _EARLY.format(lead=1e3 * slope.value)
+        return [Remark(text, pair.coherent, pair.names)] if rises else []
+    share = _share_from_output(records, pair)
+    falls = slope.value * slope.span < -_FALLS
+    made = np.median(share.output_first) > _NEARLY_ALL
+    made = made and (not falls or np.median(share.input_first) > _MORE)
+    if rises:
+        text = _RISES.format(lead=1e3 * slope.value)
+        return [Remark(text, pair.coherent if made else pair.omega[slope.top], pair.names)]
+    text = _FED_BACK.format(share=100 * np.median(share.output_first), where="{where}")
+    return [Remark(text, pair.coherent, pair.names)] if made else []
+
+
+def _share_from_output(records: Sequence[Record], pair: _Pair) -> Share:
     o, i = pair.place
     signals = [np.stack([x.outputs[:, o], x.inputs[:, i]]) for x in records]
-    share = share_from_output(signals, records[0].dt, pair.coherent)
-    falls = slope.value * slope.span < -_FALLS
-    if np.median(share.most) <= _NEARLY_ALL or (falls and np.median(share.least) <= _MORE):
-        return []
-    text = _FED_BACK.format(share=100 * np.median(share.most), where="{where}")
-    return [Remark(text, pair.coherent, pair.names)]
+    return share_from_output(signals, records[0].dt, pair.coherent)
 
 
 _RISES = (

@@ -41,7 +41,8 @@ _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
-_DOMINATED = "feedback-dominated"
+_DOMINATED, _EARLY = "feedback-dominated", "the phase increases"  # as remarks begin
+_RECORD = "excite the axis (jaxquad design sweep), and record what excites it as the reference"
 EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
 _WIDER = "excite the axis (jq.sweep) over more than"  # as the remedy of `jq.fit` begins
 
@@ -161,6 +162,11 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
     remedies = [excite]
     if kind == "too few points":
         remedies += ["use longer windows (--estimator welch --window S)"]
+    elif kind == "no model" and any(each.startswith(_DOMINATED) for each in found.remarks):
+        named = [] if settings.reference else ["name the external reference (--reference)"]
+        remedies = [*named, _RECORD]
+    elif kind == "no model" and any(each.startswith(_EARLY) for each in found.remarks):
+        remedies = ["exchange --input and --output if they are swapped, or correct time stamps"]
     elif kind == "no model":
         remedies = [
             "fit the part of the band where it holds (--band, --band-rad)",
