@@ -22,7 +22,8 @@ Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _CHANCE = 1.35e-3  # of calling the phase of any pair rising: 3 standard errors of a single slope
-_FALLS = 0.2  # rad over the top of the coherent band: less than an actuator's phase falls there
+_FALLS = 0.35  # rad over the top of the coherent band: less than an actuator's phase falls there
+_LESS = 0.05  # power of 1/omega by which a lag's magnitude falls there
 _NEARLY_ALL, _MORE = 0.9, 0.5  # median shares of the input's power, output first and input first
 _FEWEST = 8  # frequencies for a slope
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
@@ -46,6 +47,7 @@ class _Slope(NamedTuple):
     value: float
     variance: float  # were their errors independent
     span: float  # rad/s
+    order: float  # of the magnitude: -1 where it falls as 1/omega
 
 
 def phase_rises(
@@ -82,7 +84,9 @@ def _slope_at_top(
     slope = float(pull @ level)
     scatter = np.sum(weight * (level - slope * centred) ** 2) / (len(top) - 2)
     variance = max(float(scatter), 1.0) / spread
-    return _Slope(top, pull, slope, float(variance), float(omega[top[-1]] - omega[top[0]]))
+    span = float(omega[top[-1]] - omega[top[0]])
+    order = np.polyfit(np.log(omega[top]), np.log(np.abs(response[top])), 1, w=np.sqrt(weight))[0]
+    return _Slope(top, pull, slope, float(variance), span, float(order))
 
 
 def _top(omega: Grid, good: Int[np.ndarray, " good"]) -> Int[np.ndarray, " top"] | None:
@@ -176,9 +180,7 @@ def _remarks_on_phase(
         text = _EARLY.format(lead=1e3 * slope.value)
         return [Remark(text, pair.coherent, pair.names)] if rises else []
     share = _share_from_output(records, pair)
-    falls = slope.value * slope.span < -_FALLS
-    made = np.median(share.output_first) > _NEARLY_ALL
-    made = made and (not falls or np.median(share.input_first) > _MORE)
+    made = _is_made_by_controller(pair, share)
     if rises:
         text = _RISES.format(lead=1e3 * slope.value)
         return [Remark(text, pair.coherent if made else pair.omega[slope.top], pair.names)]
@@ -187,9 +189,27 @@ def _remarks_on_phase(
 
 
 def _share_from_output(records: Sequence[Record], pair: _Pair) -> Share:
+    """At the coherent frequencies."""
     o, i = pair.place
     signals = [np.stack([x.outputs[:, o], x.inputs[:, i]]) for x in records]
     return share_from_output(signals, records[0].dt, pair.coherent)
+
+
+def _is_made_by_controller(pair: _Pair, share: Share) -> bool:
+    """Whether the output makes nearly all of the input at most of the coherent frequencies.
+
+    The same holds of a plant whose answer is logged beside its cause, as far as nothing else moves
+    either. It lags: where the output makes the input, its phase and magnitude fall. Where they do,
+    the input's past must follow the output's, too.
+    """
+    if np.median(share.output_first) <= _NEARLY_ALL:
+        return False
+    if np.median(share.input_first) > _MORE:
+        return True
+    level = np.zeros(pair.omega.size)
+    level[pair.coherence >= COHERENT] = share.output_first > _NEARLY_ALL
+    slope = _slope_at_top(pair.omega, pair.response, pair.error, level)
+    return slope is not None and slope.value * slope.span >= -_FALLS and slope.order >= -_LESS
 
 
 _RISES = (
@@ -207,8 +227,8 @@ _EARLY = (
 _FED_BACK = (
     f"{DOMINATED}: {{share:.0f}} % of the input's power (median) {{where}} comes from the output's "
     "own disturbances and noise: most of the response there is -1/C, that of the controller, and "
-    "not the plant's. Name the external reference; without one, excite the axis, and record what "
-    "excites it"
+    "not the plant's (one without any lag in this band would look alike). Name the external "
+    "reference; without one, excite the axis, and record what excites it"
 )
 
 

@@ -187,11 +187,11 @@ def fit_parts(
 
     Returns the fit too, with a remark where the gain differs between them. There are no parts for
     a misfit below three times the noise, for other models than the lagged integrator, and for a
-    response that feedback dominates: no part of it would be better.
+    response that feedback dominates or whose phase rises: no part of it would be better.
     """
     small = not found.chi_squared >= _MISFIT**2 or not isinstance(found.model, LaggedIntegrator)
-    dominated = any(_DOMINATED in remark for remark in frf.remarks)
-    if not found.verdict.fitted or small or dominated:
+    no_plant = any(remark.startswith((_DOMINATED, _EARLY)) for remark in frf.remarks)
+    if not found.verdict.fitted or small or no_plant:
         return found, {}
     used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
     low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
