@@ -212,7 +212,7 @@ def _remaining(below: float) -> float:
     from scipy.special import log_ndtr
 
     if below > _FAR:
-        return 2 / below**2 - 12 / below**4
+        return 2 / below**2 - 10 / below**4
     hazard = np.exp(-0.5 * below**2 - log_ndtr(-below)) / np.sqrt(2 * np.pi)
     return max(1 - below * (hazard - below), 0.0)
 
