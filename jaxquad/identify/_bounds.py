@@ -204,7 +204,7 @@ def _first_guess(local: _Local, k: int, wanted: float) -> float:
     return (np.sqrt(max(slope, 0.0) ** 2 + curvature * wanted) - max(slope, 0.0)) / curvature
 
 
-_FAR = 100.0  # standard deviations, beyond which the hazard's digits cancel
+_FAR = 50.0  # standard deviations, beyond which the hazard's digits cancel
 
 
 def _remaining(below: float) -> float:
@@ -212,7 +212,7 @@ def _remaining(below: float) -> float:
     from scipy.special import log_ndtr
 
     if below > _FAR:
-        return 2 / below**2 - 10 / below**4
+        return 2 / below**2 - 10 / below**4 + 74 / below**6
     hazard = np.exp(-0.5 * below**2 - log_ndtr(-below)) / np.sqrt(2 * np.pi)
     return max(1 - below * (hazard - below), 0.0)
 

@@ -1,5 +1,7 @@
 """Whether a controller or an excitation moved the input, from records without a reference."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -15,10 +17,15 @@ OMEGA = np.geomspace(2.0, 60.0, 50)
 LATE = 2  # samples, of the plant
 
 
-def rate_plant(dt=DT):
-    """20 / (s (0.03 s + 1)), held: numerator and denominator of powers of 1/z."""
-    numerator, denominator, _ = signal.cont2discrete(([20.0], [0.03, 1.0, 0.0]), dt)
-    return np.ravel(numerator), denominator
+def rate_plant():
+    """20 / (s (0.03 s + 1))."""
+    return held([0.03, 1.0, 0.0])
+
+
+def held(below):
+    """20 over a polynomial of s, of an input that is held: coefficients of powers of 1/z."""
+    found: Any = signal.cont2discrete(([20.0], below), DT)
+    return np.ravel(found[0]), np.asarray(found[1])
 
 
 def loop(controller, *, seed, gust=0.0, noise=0.0, sweep=0.0, delay=0):
@@ -29,13 +36,17 @@ def loop(controller, *, seed, gust=0.0, noise=0.0, sweep=0.0, delay=0):
     back, poles = controller
     back = np.concatenate([np.zeros(delay), back])
     r = sweep * signal.chirp(TIME, 0.3, TIME[-1], 12.0, method="logarithmic")
-    wind = gust * signal.lfilter([0.1], [1.0, -0.98], rng.standard_normal(SAMPLES))
+    wind = gust * filtered([0.1], [1.0, -0.98], rng.standard_normal(SAMPLES))
     loop = add(np.convolve(below, poles), np.convolve(above, back))
     assert np.all(np.abs(np.roots(loop)) < 1)
-    y = signal.lfilter(np.convolve(above, poles), loop, r + wind)
-    y += signal.lfilter(np.convolve(below, poles), loop, noise * rng.standard_normal(SAMPLES))
+    y = filtered(np.convolve(above, poles), loop, r + wind)
+    y += filtered(np.convolve(below, poles), loop, noise * rng.standard_normal(SAMPLES))
     references = r if sweep else None
-    return Record(TIME, r - signal.lfilter(back, poles, y), y, references)
+    return Record(TIME, r - filtered(back, poles, y), y, references)
+
+
+def filtered(above, below, x):
+    return np.asarray(signal.lfilter(above, below, x))
 
 
 def add(a, b):
@@ -46,7 +57,7 @@ def add(a, b):
 
 P = (np.array([0.25]), np.array([1.0]))
 PI = (np.array([0.25 + 0.5 * DT, -0.25]), np.array([1.0, -1.0]))
-BUTTER = signal.butter(2, 15.0, fs=1 / DT)
+BUTTER: Any = signal.butter(2, 15.0, fs=1 / DT)
 FILTERED = (0.25 * BUTTER[0], BUTTER[1])
 WELCH = Welch(10.0)
 
@@ -97,8 +108,8 @@ def excitation(name):
 def test_an_open_loop_is_none(name, noise, early):
     """Even where the logger writes an answer beside its cause, and nothing else moves either."""
     u = excitation(name)
-    numerator, denominator, _ = signal.cont2discrete(([20.0], [0.03, 1.06, 2.0]), DT)
-    y = signal.lfilter(np.ravel(numerator)[early:], denominator, u)
+    above, below = held([0.03, 1.06, 2.0])
+    y = filtered(above[early:], below, u)
     y += noise * np.std(y) * np.random.default_rng(6).standard_normal(SAMPLES)
     assert remarks_of(Record(TIME, u, y)) == []
 
@@ -107,9 +118,8 @@ def test_an_open_loop_is_none(name, noise, early):
 def test_an_output_before_its_input_is_named_with_the_time_that_explains_it(samples):
     flown = loop(P, seed=2, sweep=1.0, gust=0.02, noise=1e-3)
     shift = LATE + 3 + samples  # the plant's own lag is that of about three samples
-    early = Record(
-        TIME[:-shift], flown.inputs[:-shift], flown.outputs[shift:], flown.references[:-shift]
-    )
+    inputs, references = flown.inputs[:-shift], flown.references[:-shift]
+    early = Record(TIME[:-shift], inputs, flown.outputs[shift:], references)
     (remark,) = remarks_of(early, joint=True, starting="the phase increases")
     least = float(remark.split("at least ")[1].split(" ms")[0])
     assert 0.5 * samples * 10 < least < 10 * shift and "time stamps" in remark
