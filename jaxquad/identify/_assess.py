@@ -39,6 +39,8 @@ from ._discrepancy import (
 )
 from ._fit_remarks import (
     DOUBT,
+    fed_back,
+    is_fed_back,
     is_unfinished,
     MISFIT,
     no_minimum,
@@ -113,7 +115,10 @@ def assess(
     doubted = misfit if discrepancy.none < DOUBT else min(misfit, 1.0)
     step = newton_step(bread, gradient, solution.at_zero)
     decrement = 0.5 * float(gradient @ step)
-    if decrement > _NO_MINIMUM * max(cost, 1e-9) or is_unfinished(solution, step, seen.by_noise):
+    dominated, used = _count_dominated(problem, frfs)
+    if 2 * dominated > used:
+        verdict = by_data = fed_back(parameters.names, dominated, used)
+    elif decrement > _NO_MINIMUM * max(cost, 1e-9) or is_unfinished(solution, step, seen.by_noise):
         remedies = ("start from other values", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(
             parameters.names, decrement, cost, *remedies, message=solution.message
@@ -124,6 +129,17 @@ def assess(
         facts = _information(problem, solution, blocks, (covariance, by_noise), units)
         verdict, by_data = _identifiability(facts, prior, bounds)
         verdict = _with_wider_band(verdict, problem, frfs)
+
+    def of_model() -> list[str]:
+        return [
+            *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
+            *remarks_on_bounds(pulled, verdict),
+            *_remarks_on_growth(problem, solution, frfs),
+            *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
+            *remarks_on_priors(prior.misfit, verdict, by_data, chi_squared=doubted),
+            *remarks_on_discrepancy(discrepancy),
+        ]
+
     return make_fit(
         problem,
         solution,
@@ -134,12 +150,7 @@ def assess(
         remarks=(
             *_remarks_on_used(problem, frfs),
             *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
-            *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
-            *remarks_on_bounds(pulled, verdict),
-            *_remarks_on_growth(problem, solution, frfs),
-            *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
-            *remarks_on_priors(prior.misfit, verdict, by_data, chi_squared=doubted),
-            *remarks_on_discrepancy(discrepancy),
+            *(() if is_fed_back(verdict) else of_model()),
             *further,
         ),
         minima=minima,
@@ -312,6 +323,13 @@ def _with_wider_band(
     wider = widen_band(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights])
     remedies = (wider, *verdict.remedies) if wider else verdict.remedies
     return dataclasses.replace(verdict, remedies=remedies)
+
+
+def _count_dominated(problem: Problem, frfs: Sequence[FrequencyResponse]) -> tuple[int, int]:
+    """Points in use that show a controller, and all in use."""
+    used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
+    dominated = [mine & frf.of_controller for frf, mine in zip(frfs, used, strict=True)]
+    return sum(int(x.sum()) for x in dominated), sum(int(x.sum()) for x in used)
 
 
 def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> list[str]:

@@ -204,20 +204,30 @@ def _first_guess(local: _Local, k: int, wanted: float) -> float:
     return (np.sqrt(max(slope, 0.0) ** 2 + curvature * wanted) - max(slope, 0.0)) / curvature
 
 
+_FAR = 50.0  # standard deviations, beyond which the hazard's digits cancel
+
+
+def _remaining(below: float) -> float:
+    """Second moment of a standard normal distribution beyond `below`, about that point."""
+    from scipy.special import log_ndtr
+
+    if below > _FAR:
+        return 2 / below**2 - 10 / below**4 + 74 / below**6
+    hazard = np.exp(-0.5 * below**2 - log_ndtr(-below)) / np.sqrt(2 * np.pi)
+    return max(1 - below * (hazard - below), 0.0)
+
+
 def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
     """The covariance where parameter `k` is at zero, from that of an unconstrained fit.
 
     What is left of its normal distribution above zero has this second moment about zero, and what
     the other parameters make of it. `optimum` is where it would be without the bound.
     """
-    from scipy.special import log_ndtr
-
     variance = covariance[k, k]
     if not variance > 0:  # of a matrix that rounding left singular
         return covariance
     below = max(-optimum / np.sqrt(variance), 0.0)
-    hazard = np.exp(-0.5 * below**2 - log_ndtr(-below)) / np.sqrt(2 * np.pi)
-    moment = variance * max(1 - below * (hazard - below), 0.0)
+    moment = variance * _remaining(below)
     along = covariance[:, k] / variance
     return covariance + np.outer(along, along) * (moment - variance)
 

@@ -114,6 +114,27 @@ def remarks_on_growth(growth: float) -> list[str]:
     ]
 
 
+def fed_back(names: tuple[str, ...], dominated: int, used: int) -> Verdict:
+    """The verdict on a fit most of whose points show the controller."""
+    reason = (
+        f"{_FEEDBACK} {dominated} of the {used} points in use: they show -1/C, the inverse of the "
+        "controller, and not the plant"
+    )
+    remedies = (
+        "name the external reference (references=)",
+        "excite the axis (jq.sweep), and record what excites it as the reference",
+    )
+    return without_numbers("no model", names, reason, *remedies)
+
+
+_FEEDBACK = "feedback dominates"
+
+
+def is_fed_back(verdict: Verdict) -> bool:
+    """Whether feedback is why no model holds."""
+    return any(reason.startswith(_FEEDBACK) for reason in verdict.reasons)
+
+
 def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
     """Remark on a model that explains too little of the response for its intervals to be exact."""
     if not _LARGE < discrepancy.amplitude <= NO_MODEL:

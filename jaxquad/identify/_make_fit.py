@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, PyTree
 
 from ._accuracy import condition_number, cramer_rao, insensitivity, Matrix
 from ._discrepancy import Discrepancy
-from ._fit_remarks import runaways
+from ._fit_remarks import is_fed_back, runaways
 from ._identifiability import LIMIT
 from ._origin import Origin
 from ._parameters import Parameters
@@ -57,7 +57,7 @@ def make_fit(
     names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
     freedom = np.full(units.size, np.inf) if freedom is None else freedom
     verdict = _with_freedom(verdict, pooled_freedom(freedom, np.ones(units.size)))
-    if runaways(problem, solution, verdict):
+    if runaways(problem, solution, verdict) and not is_fed_back(verdict):
         verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
     physical, unbounded = _physical_covariance(covariance, units, names, verdict)
     with np.errstate(divide="ignore"):

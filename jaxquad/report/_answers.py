@@ -77,6 +77,11 @@ def _plain(fit: Fit, frf: FrequencyResponse) -> str:
     kind = fit.verdict.kind
     if kind == "too few points":
         return "This log excites the vehicle too little: nothing could be fitted to it."
+    if _is_of_controller(frf):
+        return (
+            "This log shows the controller, and not the vehicle: its input answers to its output. "
+            "Nothing about the vehicle can be read from it."
+        )
     if kind == "no model":
         return (
             "No model of this structure behaves like the vehicle in this log. Its numbers are not "
@@ -109,6 +114,12 @@ def _good(frf: FrequencyResponse) -> Bool[np.ndarray, " frequencies"]:
     return np.all(np.asarray(frf.coherence) >= COHERENT, axis=(1, 2))
 
 
+def _is_of_controller(frf: FrequencyResponse) -> bool:
+    """Whether most coherent points show -1/C, the inverse of the controller."""
+    good = _good(frf)
+    return bool(2 * np.sum(good & np.any(frf.of_controller, axis=(1, 2))) > np.sum(good))
+
+
 def _ends(frf: FrequencyResponse, where: Bool[np.ndarray, " frequencies"]) -> tuple[float, float]:
     omega = np.asarray(frf.omega)[where]
     return float(omega[0]), float(omega[-1])
@@ -139,7 +150,7 @@ def _loose(fit: Fit) -> list[int]:
 
 def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -> list[str]:
     good, answers = _good(frf), []
-    if good.any():
+    if good.any() and not _is_of_controller(frf):
         error = float(np.median(np.asarray(frf.random_error)[good]))
         answers.append(
             f"How {', '.join(frf.output_names)} answers to {', '.join(frf.input_names)} from "
@@ -174,6 +185,11 @@ def _cannot(
         name = fit.names[k]
         known = f"only to \u00b1 {100 * _reach(fit, k):.2g} % (95 %)"
         lacks.append(f"{name}: {known if fit.determined[k] else 'not by itself'}.")
+    if _is_of_controller(frf):
+        lacks.append(
+            f"How {', '.join(frf.output_names)} answers to {', '.join(frf.input_names)}: the "
+            "response is that of the controller, -1/C."
+        )
     lacks += [f"The response from {in_both(*band)}: incoherent." for band in poor_bands(frf)]
     lacks.append(f"Anything above {omega[-1] / (2 * np.pi):.3g} Hz: it was not estimated there.")
     if record is not None and not record.reference_names:
@@ -213,6 +229,8 @@ def next_flight(
     """
     poor = _needs_of_bands(frf)
     needs = _needs_of_parameters(fit, frf) if _is_usable(fit) else poor
+    if _is_of_controller(frf):
+        needs = [_Need(*_measured(frf), _LOUDER, _UNEXCITED)]
     if not fit.identifiable and not needs and not fit.verdict.remedies:
         low, high = _beyond(frf)
         needs = [_Need(low, high, _LOUDER, "the band of this record does not determine the model")]
@@ -235,6 +253,12 @@ def next_flight(
         return Flight(what, {}, [*(_sentence(each.why) for each in poor), *wished])
     found = _verification(frf, record)
     return found._replace(why=[*found.why, *wished])
+
+
+_UNEXCITED = (
+    "the controller moved the input of this log; record what excites the axis, and name it as the "
+    "reference"
+)
 
 
 def _sentence(text: str) -> str:

@@ -70,7 +70,7 @@ def _result(
     measured = omega, response, error, coherence, direct
 
     def remarks() -> tuple[Remark, ...]:
-        noted = remarks_on_feedback(method, *measured, names, found.errors)
+        noted = remarks_on_feedback(records, method, *measured, names, found.errors)
         if isinstance(found, LocalEstimate):  # periods show their own distortion
             noted += remarks_on_nonlinearity(records, omega, response, coherence, method)
             seconds = sum(record.duration for record in records)

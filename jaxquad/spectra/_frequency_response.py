@@ -9,7 +9,7 @@ from jaxquad._core import pytree_node, require_float64
 
 from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
-from ._remarks import Remark, remarks_on_used
+from ._remarks import points_dominated, Remark, remarks_on_used
 
 
 class Distortion(eqx.Module):
@@ -115,6 +115,12 @@ class FrequencyResponse:
         """Those of the remarks that concern the points in use, restricted to these, each once."""
         omega = np.asarray(self.omega)
         return remarks_on_used(self.remarks, omega, used, self.output_names, self.input_names)
+
+    @property
+    def of_controller(self) -> Bool[np.ndarray, "frequencies outputs inputs"]:
+        """Points that remarks name as dominated by feedback: there, the response is -1/C."""
+        names = self.output_names, self.input_names
+        return points_dominated(self.remarks, np.asarray(self.omega), *names)
 
     def relative_covariance(
         self, output: int = 0, input: int = 0

@@ -1,6 +1,7 @@
 """What a user of a response should know, with the frequencies and the pair that it is about."""
 
 import functools as ft
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -10,6 +11,8 @@ from ._checks import in_hertz
 
 
 Pair = tuple[str, str]  # output, input
+DOMINATED = "feedback-dominated"  # as remarks begin on coherence that a controller made
+EARLY = "the phase increases with frequency"  # and on an output that comes before its input
 
 
 class Remark(str):
@@ -106,3 +109,21 @@ def remarks_on_used(
         part = remark.within(omega[mine]) if np.any(mine) else None
         kept += [] if part is None else [part]
     return tuple(dict.fromkeys(kept))
+
+
+def points_dominated(
+    remarks: Sequence[Remark],
+    omega: Float[np.ndarray, " frequencies"],
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+) -> Bool[np.ndarray, "frequencies outputs inputs"]:
+    """Points that remarks name as dominated by feedback."""
+    found = np.zeros((omega.size, len(outputs), len(inputs)), bool)
+    for remark in remarks:
+        if not remark.startswith(DOMINATED) or not isinstance(remark, Remark):
+            continue
+        here = np.isin(omega, remark.omega)
+        pairs = [remark.pair] if remark.pair else itertools.product(outputs, inputs)
+        for output, source in pairs:
+            found[here, outputs.index(output), inputs.index(source)] = True
+    return found

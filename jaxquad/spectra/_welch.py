@@ -400,7 +400,8 @@ def _remarks(
     first, independent = records[0], _independent(records, groups)
     response, coherence, error = found.response, found.coherence, found.random_error
     names, direct = (first.output_names, first.input_names), found.direct_coherence
-    remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
+    measured = omega, response, error, coherence, direct
+    remarks = remarks_on_feedback(records, method, *measured, names)
     remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
     shared = 1 - np.nan_to_num(found.own_share)
     remarks += remarks_on_inputs(omega, shared, first.input_names)

@@ -41,7 +41,8 @@ _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
-_DOMINATED = "feedback-dominated"
+_DOMINATED, _EARLY = "feedback-dominated", "the phase increases"  # as remarks begin
+_RECORD = "excite the axis (jaxquad design sweep), and record what excites it as the reference"
 EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
 _WIDER = "excite the axis (jq.sweep) over more than"  # as the remedy of `jq.fit` begins
 
@@ -161,6 +162,11 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
     remedies = [excite]
     if kind == "too few points":
         remedies += ["use longer windows (--estimator welch --window S)"]
+    elif kind == "no model" and any(each.startswith(_DOMINATED) for each in found.remarks):
+        named = [] if settings.reference else ["name the external reference (--reference)"]
+        remedies = [*named, _RECORD]
+    elif kind == "no model" and any(each.startswith(_EARLY) for each in found.remarks):
+        remedies = ["exchange --input and --output if they are swapped, or correct time stamps"]
     elif kind == "no model":
         remedies = [
             "fit the part of the band where it holds (--band, --band-rad)",
@@ -181,11 +187,11 @@ def fit_parts(
 
     Returns the fit too, with a remark where the gain differs between them. There are no parts for
     a misfit below three times the noise, for other models than the lagged integrator, and for a
-    response that feedback dominates: no part of it would be better.
+    response that feedback dominates or whose phase rises: no part of it would be better.
     """
     small = not found.chi_squared >= _MISFIT**2 or not isinstance(found.model, LaggedIntegrator)
-    dominated = any(_DOMINATED in remark for remark in frf.remarks)
-    if not found.verdict.fitted or small or dominated:
+    no_plant = any(remark.startswith((_DOMINATED, _EARLY)) for remark in frf.remarks)
+    if not found.verdict.fitted or small or no_plant:
         return found, {}
     used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
     low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()

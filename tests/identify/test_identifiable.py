@@ -108,6 +108,36 @@ def test_a_variance_below_zero_by_rounding_is_left_alone():
     np.testing.assert_array_equal(one_sided(covariance, 0, -1.0), covariance)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("below", [49.0, 51.0, 1e4, 1e8])
+def test_an_optimum_far_below_zero_leaves_the_tail_of_an_exponential_distribution(below):
+    """Its second moment is 2 / below^2 to first order, and nothing overflows on the way."""
+    [[variance]] = one_sided(np.array([[4.0]]), 0, -2.0 * below)
+    assert variance == pytest.approx(8.0 / below**2 - 40.0 / below**4 + 296.0 / below**6, rel=1e-6)
+
+
+def controller_at(share):
+    """A response that a remark calls the controller's at its lowest frequencies."""
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.05, 0.03), error=0.02, seed=1)
+    omega = np.asarray(frf.omega)
+    pair = frf.output_names[0], frf.input_names[0]
+    remark = jq.spectra.Remark(
+        "feedback-dominated: {where}", omega[: round(share * omega.size)], pair
+    )
+    return dataclasses.replace(frf, remarks=(remark,))
+
+
+def test_a_response_that_is_mostly_the_controllers_has_no_model():
+    """However well one fits: no other structure is advised."""
+    start = jq.LaggedIntegrator(8.0, 0.05, 0.03)
+    verdict = (fit := jq.fit(start, controller_at(0.7), cost=ML)).verdict
+    assert verdict.kind == "no model" and not fit.determined.any()
+    assert "21 of the 30 points in use" in verdict.reasons[0] and "-1/C" in verdict.reasons[0]
+    assert "references=" in verdict.remedies[0] and len(verdict.remedies) == 2
+    assert len(fit.remarks) == 1
+    assert jq.fit(start, controller_at(0.3), cost=ML).identifiable
+
+
 def test_a_prior_that_only_the_model_error_reconciles_with_the_record_is_suspected():
     truth = jq.LaggedIntegrator(60.0, 0.04, 0.015)
     frf = response_of(truth, error=0.003, seed=0)

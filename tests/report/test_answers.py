@@ -69,6 +69,18 @@ def test_what_no_flight_tells_apart_asks_for_no_flight():
     assert any("J_x" in text for text in answer_section(fit, frf, None, {})["cannot"])
 
 
+def test_a_log_of_feedback_alone_answers_nothing_about_the_vehicle():
+    frf = response_of(TRUTH, error=0.005, seed=0)
+    said = jq.spectra.Remark("feedback-dominated: {where}", np.asarray(frf.omega))
+    hover = dataclasses.replace(frf, remarks=(said,))
+    found = answer_section(fitted(hover), hover, record(), {})
+    assert "the controller, and not the vehicle" in found["plain"]
+    assert found["can"] == ["Nothing about this vehicle."]
+    assert any("-1/C" in text for text in found["cannot"])
+    assert found["flight"].what.startswith("Sweep the channel")
+    assert "reference" in " ".join(found["flight"].why)
+
+
 def test_an_incoherent_band_is_named():
     frf = response_of(TRUTH, error=0.005, seed=0)
     omega = np.asarray(frf.omega)

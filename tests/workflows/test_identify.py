@@ -140,6 +140,41 @@ def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
         verify_result(stored, noise)
 
 
+def write_hover(path):
+    """Gusts on q' = 20 u behind a lag of 30 ms, and u = -0.25 q - 0.5 integral of q."""
+    rng, q, slow, turned, gust, rows = np.random.default_rng(0), 0.0, 0.0, 0.0, 0.0, []
+    for step in range(4000):
+        seen = q + 0.01 * rng.standard_normal()
+        turned += 0.01 * seen
+        u = -0.25 * seen - 0.5 * turned
+        rows.append((0.01 * step, u, seen))
+        gust = 0.98 * gust + 0.2 * rng.standard_normal()
+        slow += 0.28 * (u - slow)
+        q += 0.01 * 20 * (slow + gust)
+    np.savetxt(path, rows, fmt="%.6f", delimiter=",", header="t,u,q", comments="")
+    return path
+
+
+@pytest.mark.parametrize("more", [[], ["--poles", "2", "--zeros", "1"]], ids=["lag", "poles"])
+def test_a_hover_without_a_reference_is_no_plant(more, tmp_path, capsys):
+    log = write_hover(tmp_path / "hover.csv")
+    words = ["identify", str(log), "--input", "u", "--output", "q", "--out", str(tmp_path)]
+    assert main([*words, *more]) == 3
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "! feedback-dominated: " in printed and "feedback dominates" in printed
+    assert "to resolve it: name the external reference (--reference)" in printed
+    assert "higher order" not in printed and "another band" not in printed
+    assert "Nothing about this vehicle." in (tmp_path / "report.html").read_text()
+
+
+def test_swapped_channels_are_asked_about(log, tmp_path, capsys, recwarn):
+    swapped = {"input": "q", "output": "M=right-left", "band": (0.5, 6), "integrators": 1}
+    found = identify(log, IdentifySettings(**swapped))
+    assert not found.fit.identifiable
+    assert any("are swapped" in each for each in found.fit.remarks)
+    assert not any("overflow" in str(each.message) for each in recwarn)
+
+
 @pytest.mark.parametrize("text", ["[1]", "{}", "no json", '{"fit": {}, "settings": {}}'])
 def test_a_file_that_is_no_result_is_refused(tmp_path, text):
     (tmp_path / "result.json").write_text(text)
