@@ -142,19 +142,52 @@ def global_models(
     """
     reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
     places = _thin(reach, _MOST_BINS)
-    lag = np.exp(-1j * dt * bins.omega[places]) - 1
-    scale = float(np.abs(lag[-1])) / 2
-    u, own = bins.values[places, inputs], _own(bins.record[places], bins.records)
-    each = (
-        Equations(lag / scale, u, own, bins.values[places, o])
-        for o in range(outputs.start, outputs.stop)
+    scale = float(np.abs(np.exp(-1j * dt * bins.omega[places[-1]]) - 1)) / 2
+    tasks = (
+        _Task(_equations(bins, places, inputs, output, scale, dt), bins.omega[places], most)
+        for output in range(outputs.start, outputs.stop)
     )
-    tasks = (_Task(equations, bins.omega[places], most) for equations in each)
     found = map_in_threads(_identify_kept, tasks)
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
         for one in found
     ]
+
+
+def weighted_model(
+    model: GlobalModel,
+    bins: Bins,
+    inputs: slice,
+    output: int,
+    most: int,
+    noise: Float[np.ndarray, " places"],
+) -> GlobalModel | None:
+    """The model of the same bins that count by `noise`, the output's power at the model's places.
+
+    What the first model leaves can hide response: where it fits the loud bins alone, what it leaves
+    of the others counts as their noise, and they never matter.
+    """
+    places, scale = model.places, model.scale
+    equations = _equations(bins, places, inputs, output, scale, model.dt)
+    weight, every = 1 / np.sqrt(noise), _thin(places.size, _TRIAL_BINS)
+    chosen = _choose(equations.weighted(weight).pick(every), most)
+    if chosen is None:
+        return None
+    found = _settle(equations, bins.omega[places], weight, chosen)
+    return GlobalModel(*found[:2], scale, model.dt, places, *found[2:], model.reach)
+
+
+def _equations(
+    bins: Bins,
+    places: Int[np.ndarray, " places"],
+    inputs: slice,
+    output: int,
+    scale: float,
+    dt: float,
+) -> Equations:
+    lag = np.exp(-1j * dt * bins.omega[places]) - 1
+    own = _own(bins.record[places], bins.records)
+    return Equations(lag / scale, bins.values[places, inputs], own, bins.values[places, output])
 
 
 def highest_modelled(highest: float) -> float:
@@ -203,7 +236,7 @@ def _identify_kept(task: _Task) -> Identified | None:
 def _identify(
     equations: Equations, omega: Float[np.ndarray, " bins"], most: int
 ) -> Identified | None:
-    """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
+    """A model whose bins count by what a first one leaves."""
     every = _thin(len(omega), _TRIAL_BINS)
     first = _choose(equations.pick(every), most)
     if first is None:
@@ -214,8 +247,17 @@ def _identify(
         weight = np.full_like(noise, np.mean(weight))
     white = equations.weighted(weight)
     chosen = _choose(white.pick(every), most) if np.ptp(weight) > 0 else first
-    if chosen is None:
-        return None
+    return None if chosen is None else _settle(equations, omega, weight, chosen)
+
+
+def _settle(
+    equations: Equations,
+    omega: Float[np.ndarray, " bins"],
+    weight: Float[np.ndarray, " bins"],
+    chosen: Solved,
+) -> Identified:
+    """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
+    white = equations.weighted(weight)
     basis = _basis(white, len(chosen.denominator))
     solved = _descend(white, basis, chosen.denominator, _SETTLED)
     fixed = basis.largest(solved.denominator)

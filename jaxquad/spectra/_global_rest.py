@@ -6,7 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._global_model import global_models, GlobalModel, highest_modelled
+from jaxquad._core import map_in_threads
+
+from ._global_model import global_models, GlobalModel, highest_modelled, weighted_model
 from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_noise import Noise, SharedErrors
 
@@ -81,6 +83,13 @@ def subtract_models(
     """Fit a model of order up to `most` to each moved channel, and take it off; 0 for none."""
     none = (None,) * (moved.stop - moved.start)
     models = global_models(bins, sources, moved, highest, dt, most) if most else none
+    return take_off(bins, sources, moved, models)
+
+
+def take_off(
+    bins: Bins, sources: slice, moved: slice, models: Sequence[GlobalModel | None]
+) -> Rest:
+    """The bins without what `models` explain of the moved channels."""
     values = np.array(bins.values)
     for channel, model in enumerate(models, start=moved.start):
         if model is None:
@@ -89,6 +98,40 @@ def subtract_models(
             rows = slice(start, min(start + _PIECE, model.reach))
             values[rows, channel] -= model.at_bins(bins, sources, rows)[0]
     return Rest(bins._replace(values=values), tuple(models), sources, moved)
+
+
+def response_left(
+    rest: Rest, omega: Grid, half_width: Grid, fit: LocalFit
+) -> Float[np.ndarray, " moved"]:
+    """The most that a model leaves in any window, to what the local `fit` leaves of it; or 0.
+
+    Noise is 1 to 6. More is response, or a transient, that the local fit follows.
+    """
+    first, last = window_slices(omega, half_width, rest.bins)
+    running = np.cumsum(np.abs(rest.bins.values[:, rest.moved]) ** 2, axis=0)
+    running = np.concatenate([np.zeros((1, running.shape[1])), running])
+    power = (running[last] - running[first]) / np.maximum(last - first, 1)[:, None]
+    noise = np.real(np.diagonal(fit.scatter, axis1=1, axis2=2))
+    known = (fit.freedom > 0)[:, None] & (noise > 0)
+    known = known & np.array([model is not None for model in rest.models])
+    return np.max(np.where(known, power / np.where(known, noise, 1.0), 0.0), axis=0)
+
+
+def weighted_models(
+    rest: Rest, bins: Bins, which: Bool[np.ndarray, " moved"], noise: Noise, most: int
+) -> list[GlobalModel | None]:
+    """The models, `which` of them fitted to the `bins` again, which now count by the `noise`."""
+
+    def fit_again(c: int) -> GlobalModel | None:
+        model = rest.models[c]
+        if model is None or not which[c]:
+            return model
+        omega, channel = bins.omega[model.places], rest.moved.start + c
+        power = noise._replace(power=noise.power[:, c : c + 1]).power_at(omega)[:, 0]
+        power = np.where(omega > noise.omega[-1], model.noise, power)
+        return weighted_model(model, bins, rest.sources, channel, most, power) or model
+
+    return map_in_threads(fit_again, range(len(rest.models)))
 
 
 def model_slopes(

@@ -13,9 +13,12 @@ from ._global_rest import (
     end_of,
     highest_looked_at,
     left_moving,
+    response_left,
     Rest,
     shared_errors,
     subtract_models,
+    take_off,
+    weighted_models,
 )
 from ._local_fit import (
     Bins,
@@ -185,7 +188,7 @@ def estimate_local_polynomial(
     furthest = _furthest(grid, narrow_width, most, options)
     bins = bins.up_to(max(furthest, highest_looked_at(omega[-1], grid)))
     rest = subtract_models(bins, *whole, omega[-1], records[0].dt, options.global_order)
-    stack = _fit_narrow(grid, narrow_width, rest, inputs, order)
+    rest, stack = _repair_models(grid, narrow_width, rest, bins, inputs, options)
     narrow = joint_fit(stack, inputs) if method == "joint" else stack
     noise = smooth_noise(grid, narrow_width, narrow.scatter, narrow.freedom)
     edges = window_slices(grid, narrow_width, bins)
@@ -326,6 +329,38 @@ def _fit_narrow(grid: Grid, width: Grid, rest: Rest, inputs: int, order: int) ->
     fit = _fit_widened(grid, width, respond)
     fit = _smaller_residual(fit, respond(grid, width, "rational"))
     return rest.without_followed(grid, width, order, fit)
+
+
+_MISSED = 100.0  # ratio of what a model leaves to the noise, from which it misses the response
+_REPAIRS, _BETTER = 2, 0.1  # the most, and how little of that ratio a better model leaves
+
+
+def _repair_models(
+    grid: Grid, width: Grid, rest: Rest, bins: Bins, inputs: int, options: LocalPolynomial
+) -> tuple[Rest, LocalFit]:
+    """What better models leave where those of `rest` miss the response, and the narrow fits of it.
+
+    A model can fit the loud bins alone: what it leaves of the quiet ones counts as their noise, and
+    they never matter. It may be many times the response there, which biases the local fits. The
+    better models' bins count by the noise of the local fits.
+    """
+    stack = _fit_narrow(grid, width, rest, inputs, options.order)
+    left = response_left(rest, grid, width, stack)
+    for _ in range(_REPAIRS):
+        if not np.any(left > _MISSED):
+            break
+        noise = smooth_noise(grid, width, stack.scatter, stack.freedom)
+        models = weighted_models(rest, bins, left > _MISSED, noise, options.global_order)
+        trial = take_off(bins, rest.sources, rest.moved, models)
+        fit = _fit_narrow(grid, width, trial, inputs, options.order)
+        better = response_left(trial, grid, width, fit) < _BETTER * left
+        if not np.any(better):
+            break
+        kept = [new if b else old for b, old, new in zip(better, rest.models, models, strict=True)]
+        rest = take_off(bins, rest.sources, rest.moved, kept)
+        stack = _fit_narrow(grid, width, rest, inputs, options.order)
+        left = response_left(rest, grid, width, stack)
+    return rest, stack
 
 
 def _smaller_residual(polynomial: LocalFit, rational: LocalFit) -> LocalFit:
