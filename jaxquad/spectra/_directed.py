@@ -73,7 +73,7 @@ def _without_trend(x: Signals) -> Signals:
     return x - np.mean(x, axis=1, keepdims=True) - slope[:, None] * time
 
 
-def _decimated(x: Signals, every: int) -> Signals:
+def _decimated(x: Signals, every: int) -> Float[np.ndarray, "2 fewer"]:
     """Every so many samples, of what lies below half the new rate."""
     if every == 1:
         return x

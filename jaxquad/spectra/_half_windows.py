@@ -94,7 +94,7 @@ def _windows(
     step: int,
     shape: tuple[int, ...],
     direction: int = 1,
-) -> Float[np.ndarray, "channels windows half rank"]:
+) -> Float[np.ndarray, "channels windows half taken"]:
     """A view of the blocks from the `first` block and function on, upwards or downwards."""
     down, along, across = coefficients.strides
     strides = (down, step * along, direction * along, across)
