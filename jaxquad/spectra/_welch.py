@@ -19,10 +19,10 @@ from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
+from ._invariance import remarks_on_linearity
 from ._leakage import power_of, shows_leakage, Slopes
 from ._noise_freedom import covariance_of_windows, smoothed
 from ._noise_root import BANDWIDTH
-from ._nonlinearity import remarks_on_nonlinearity
 from ._remarks import Remark, Remarks
 from ._transform import Taper, transform_tapers
 from ._window import coefficients, segment_starts
@@ -387,7 +387,7 @@ def _remarks(
     response, coherence, error = found.response, found.coherence, found.random_error
     names, direct = (first.output_names, first.input_names), found.direct_coherence
     remarks = remarks_on_feedback(method, omega, response, error, coherence, direct, names)
-    remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
+    remarks += remarks_on_linearity(records, omega, response, coherence, method)
     remarks += remarks_on_inputs(omega, found.input_coherence, first.input_names)
     remarks += remarks_on_leakage(omega, found.leakage(), error, names)
     few = max(independent) < 3
