@@ -18,8 +18,8 @@ from ._checks import (
 from ._estimators import Composite, JointInputOutput, LocalPolynomial, Periodic, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
+from ._invariance import remarks_on_linearity
 from ._local_estimate import estimate_local_polynomial, LocalEstimate
-from ._nonlinearity import remarks_on_nonlinearity
 from ._periodic import estimate_periodic, PeriodicEstimate
 from ._remarks import Remark, Remarks
 from ._welch import average_windows
@@ -72,7 +72,7 @@ def _result(
     def remarks() -> tuple[Remark, ...]:
         noted = remarks_on_feedback(records, method, *measured, names, found.errors)
         if isinstance(found, LocalEstimate):  # periods show their own distortion
-            noted += remarks_on_nonlinearity(records, omega, response, coherence, method)
+            noted += remarks_on_linearity(records, omega, response, coherence, method)
             seconds = sum(record.duration for record in records)
             sharp = np.isfinite(response) & (error <= _SHARP) & (coherence >= _COHERENT)
             noted += _remarks_on_length(seconds, np.asarray(omega), np.any(sharp, axis=(1, 2)))

@@ -30,34 +30,27 @@ Grid = Float[np.ndarray, " frequencies"]
 Bins = Float[np.ndarray, " bins"]
 
 
-def remarks_on_nonlinearity(
+def remarks_on_harmonics(
     records: Sequence[Record],
+    tones: Sequence[Tone],
+    i: int,
     omega: Grid,
     response: Complex[np.ndarray, "frequencies outputs inputs"],
     coherence: Float[np.ndarray, "frequencies outputs inputs"],
-    method: Literal["direct", "joint"],
 ) -> tuple[Remark, ...]:
-    """Remarks on pairs whose residual holds harmonics of a sweep.
-
-    Nothing is said of inputs that are no sweep. In the joint estimate, the references sweep.
-    """
+    """Remarks on outputs whose residual holds harmonics of input `i`, whose parts are `tones`."""
     first, remarks = records[0], []
     chance = _CHANCE / (len(_HARMONICS) * response.shape[1] * response.shape[2])
-    for i, source in enumerate(first.input_names):
-        tones = [_tone_of(record, i, method) for record in records]
-        if any(tone is None for tone in tones):
+    for o, output in enumerate(first.output_names):
+        used = np.isfinite(response[:, o]).all(axis=1) & (coherence[:, o, i] >= _COHERENT)
+        if np.sum(used) < 8:
             continue
-        for o, output in enumerate(first.output_names):
-            used = np.isfinite(response[:, o]).all(axis=1) & (coherence[:, o, i] >= _COHERENT)
-            if np.sum(used) < 8:
-                continue
-            found = [
-                _harmonics(record, tone, omega[used], response[used][:, o], (o, i))
-                for record, tone in zip(records, tones, strict=True)
-                if tone is not None
-            ]
-            text = _describe([part for part in found if part is not None], chance)
-            remarks += [Remark(text, omega[used], (output, source))] if text else []
+        found = [
+            _harmonics(record, tone, omega[used], response[used][:, o], (o, i))
+            for record, tone in zip(records, tones, strict=True)
+        ]
+        text = _describe([part for part in found if part is not None], chance)
+        remarks += [Remark(text, omega[used], (output, first.input_names[i]))] if text else []
     return tuple(remarks)
 
 
@@ -96,9 +89,20 @@ _FEWEST = 6.0  # cycles of a sweep
 _ACTIVE = 0.1  # of the largest amplitude
 
 
+def tones_of(
+    records: Sequence[Record], i: int, method: Literal["direct", "joint"]
+) -> list[Tone] | None:
+    """Of each record, the input's part at the frequency of a sweep, with its phase.
+
+    `None` unless all inputs, or in the joint estimate all references, sweep.
+    """
+    tones = [_tone_of(record, i, method) for record in records]
+    found = [tone for tone in tones if tone is not None]
+    return found if len(found) == len(tones) else None
+
+
 def _tone_of(record: Record, i: int, method: Literal["direct", "joint"]) -> Tone | None:
-    """The input's part at the frequency of a sweep, with its phase; `None` without a sweep."""
-    count = _fast_length(record.samples)
+    count = fast_length(record.samples)
     source = record.inputs[:count, i] if method == "direct" else record.references[:count, i]
     swept = phase_of_sweep(source)
     if swept is None:
@@ -221,7 +225,7 @@ def _harmonics(
     band = slice(*np.searchsorted(grid, [omega[0], omega[-1]]).tolist())
     if band.stop - band.start < 3 * _TRANSIENT:
         return None
-    plant = _interpolated(grid[band], omega, response)
+    plant = interpolated(grid[band], omega, response)
     u, y = (
         np.fft.rfft(x[:count], axis=0)[band] for x in (record.inputs, record.outputs[:, output])
     )
@@ -230,7 +234,7 @@ def _harmonics(
     columns = np.stack([y - np.sum(plant * u, axis=1), *(plant[:, source] * w for w in waves)])
     sharp = columns - _smooth(columns)
     left, seen = sharp[0], sharp[1:]
-    noise = np.maximum(_local_mean(np.abs(left) ** 2, band.start), 1e-300)
+    noise = np.maximum(local_mean(np.abs(left) ** 2, band.start), 1e-300)
     weight = np.maximum(np.sum(np.abs(seen) ** 2 / noise, axis=1), 1e-300)
     return Harmonics(np.sum(np.conj(seen) * left / noise, axis=1) / weight, weight)
 
@@ -248,14 +252,14 @@ def _smooth(
     return np.concatenate([first, inner, last], axis=1)
 
 
-def _fast_length(samples: int) -> int:
+def fast_length(samples: int) -> int:
     """The longest length of at most `samples` with a fast Fourier transform."""
     from scipy.fft import next_fast_len
 
     return next(n for n in range(samples, 0, -1) if next_fast_len(n, real=True) == n)
 
 
-def _interpolated(
+def interpolated(
     grid: Bins, omega: Grid, response: Complex[np.ndarray, "frequencies inputs"]
 ) -> Complex[np.ndarray, "bins inputs"]:
     """Smooth in magnitude and phase along log frequency."""
@@ -265,7 +269,7 @@ def _interpolated(
     return np.exp(CubicSpline(np.log(omega), logs)(np.log(grid)))
 
 
-def _local_mean(power: Bins, first: int) -> Bins:
+def local_mean(power: Bins, first: int) -> Bins:
     place = np.arange(power.size)
     reach = np.maximum(_NEAREST, (_NEAR * (first + place)).astype(int))
     low, high = np.maximum(place - reach, 0), np.minimum(place + reach + 1, power.size)

@@ -19,9 +19,9 @@ from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
+from ._invariance import remarks_on_linearity
 from ._leakage import cross_products, shows_leakage, Slopes
 from ._noise_freedom import covariance_of_windows, smoothed
-from ._nonlinearity import remarks_on_nonlinearity
 from ._remarks import Remark, Remarks
 from ._transform import Taper, transform_tapers
 from ._window import coefficients, segment_starts
@@ -402,7 +402,7 @@ def _remarks(
     names, direct = (first.output_names, first.input_names), found.direct_coherence
     measured = omega, response, error, coherence, direct
     remarks = remarks_on_feedback(records, method, *measured, names)
-    remarks += remarks_on_nonlinearity(records, omega, response, coherence, method)
+    remarks += remarks_on_linearity(records, omega, response, coherence, method)
     shared = 1 - np.nan_to_num(found.own_share)
     remarks += remarks_on_inputs(omega, shared, first.input_names)
     remarks += remarks_on_leakage(omega, found.leakage(), error, names)
