@@ -25,8 +25,8 @@ from ._remarks import Remark
 
 
 _COHERENT, _FEWEST = 0.6, 8  # of points between which the response is interpolated
-_CLEAR_STATIC, _CLEAR_CHANGE = 5.0, 6.0  # in standard errors; linear records reached 3 and 5
-_SMALLEST = 0.02  # change of the gain from which a remark is made
+_CLEAR = 6.0  # standard errors from which a remark is made; linear records reached 3.3 and 4.4
+_SMALLEST = 0.05  # change of the gain from which a remark is made
 _APART_STATIC, _APART_CHANGE = 0.005, 0.1  # share of a signal that no local linear model explains
 
 Method = Literal["direct", "joint"]
@@ -305,7 +305,7 @@ def _gains(
     added = left.added[:, columns]
     found = _factors(left, added)
     clear = found.size()
-    if clear < _CLEAR_STATIC or clear < 2 * _factors(left, 1j * added).size():
+    if clear < _CLEAR or clear < 2 * _factors(left, 1j * added).size():
         return _Gains()
     powers = [_POWER[column] for column in columns]
     mean = [np.sum(x**power * v**2) / np.sum(v**2) for power in powers]
@@ -394,7 +394,7 @@ def _change(left: _LeftOver, omega: Grid, method: Method) -> str:
     columns = np.hstack([left.added[:, 3:], 1j * left.added[:, 3:]])
     kept = _independent(left, columns)
     found = _factors(left, columns @ kept)
-    if found.size() <= _CLEAR_CHANGE:
+    if found.size() <= _CLEAR:
         return ""
     # Of t, from -1 to 1, the mean in the second half is 1 more than that in the first.
     gains = np.stack([np.ones_like(left.slope), left.slope], axis=1)
