@@ -9,7 +9,7 @@ from jaxquad._core import pytree_node, require_float64
 
 from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance
-from ._remarks import points_dominated, Remark, Remarks, remarks_on_used
+from ._remarks import points_dominated, Remark, remarks_on_used
 
 
 class Distortion(eqx.Module):
@@ -82,7 +82,7 @@ class FrequencyResponse:
     method: Literal["direct", "joint"] = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
-    remarks: Remarks | Sequence[Remark] = eqx.field(static=True, default=())
+    remarks: Sequence[Remark] = eqx.field(static=True, default=())
     integrators: int = eqx.field(static=True, default=0)  # removed before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float, Int, Real
 
 from jaxquad.records import Record
 
@@ -133,8 +133,8 @@ def _moved_by(moving: Columns, u: Spectrum) -> Spectrum:
 
 
 def _basis(
-    moving: Columns, record: Int[np.ndarray, " bins"], place: Float[np.ndarray, " bins"]
-) -> Columns:
+    moving: Columns, record: Int[np.ndarray, " bins"], place: Real[np.ndarray, " bins"]
+) -> Complex[np.ndarray, "bins functions"]:
     """Orthonormal columns: what moves, and a transient of each record, times smooth functions."""
     span = max(float(np.ptp(place)), 1e-300)
     smooth = (2 * (place - np.mean(place)) / span)[:, None] ** np.arange(_POWERS)
@@ -192,7 +192,7 @@ def _without_linear(
     record: Int[np.ndarray, " bins"],
     moving: Columns,
     residual: Spectrum,
-    added: Columns,
+    added: Complex[np.ndarray, "bins looked_for"],
     slope: Complex[np.ndarray, " frequencies"],
 ) -> _LeftOver | None:
     found, both = [], np.column_stack([residual, added])

@@ -267,8 +267,10 @@ def power_of(x: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     return np.real(x) ** 2 + np.imag(x) ** 2
 
 
-def _inner(a: Rows, b: Rows) -> Sizes:
-    """The real part of `conj(a) b`, summed over the windows."""
+def _inner(
+    a: Complex[np.ndarray, "*rows terms"], b: Complex[np.ndarray, "*rows terms"]
+) -> Float[np.ndarray, "*rows"]:
+    """The real part of `conj(a) b`, summed over the last axis."""
     return np.vecdot(a.view(float), b.view(float))
 
 
