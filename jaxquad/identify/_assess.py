@@ -350,13 +350,13 @@ def _remarks_on_growth(
     if not known or lags or not any(frf.method == "direct" for frf in frfs):
         return []
     pairs = zip(frfs, problem.weights, strict=True)
-    used = [np.any(np.asarray(weights)[..., 0] > 0, axis=(1, 2)) for _, weights in pairs]
-    lowest = min(
-        float(np.asarray(frf.omega)[mine][0])
-        for frf, mine in zip(frfs, used, strict=True)
-        if mine.any()
-    )
-    growth = float(np.max(np.real(linear_model(on_host(model)).poles), initial=0.0))
+    used = [
+        np.asarray(frf.omega)[np.any(np.asarray(w)[..., 0] > 0, axis=(1, 2))] for frf, w in pairs
+    ]
+    omega = np.concatenate(used)
+    lowest, highest = float(np.min(omega)), float(np.max(omega))
+    poles = linear_model(on_host(model)).poles
+    growth = float(np.max(np.real(poles[np.abs(poles) < highest]), initial=0.0))
     return remarks_on_growth(growth) if growth > lowest else []
 
 

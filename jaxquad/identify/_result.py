@@ -211,7 +211,7 @@ class Fit:
         return plain_content(fit_content(self))
 
     def interval(self, name: str, *, model_error: bool = True) -> tuple[float, float]:
-        """The 95 % interval of one parameter.
+        """The 95 % interval of one parameter; of one that keeps its sign, what has that sign.
 
         **Arguments:**
 
@@ -226,7 +226,11 @@ class Fit:
                 return min(0.0, limit), max(0.0, limit)
         errors = self.standard_errors if model_error else self.noise_standard_errors
         reach = reach_of_interval(float(self.degrees_of_freedom[k])) * errors[k]
-        return float(self.values[k] - reach), float(self.values[k] + reach)
+        low, high = float(self.values[k] - reach), float(self.values[k] + reach)
+        if not (self.determined[k] and self.parameters.logarithmic[k]):
+            return low, high
+        # It keeps its sign.
+        return (max(low, 0.0), high) if self.values[k] >= 0 else (low, min(high, 0.0))
 
     def derived(
         self,
