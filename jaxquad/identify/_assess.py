@@ -15,7 +15,6 @@ from jaxquad.spectra import FrequencyResponse
 from ._accuracy import (
     Block,
     blocks_of,
-    calibrated_covariance,
     degrees_of_freedom,
     fitted_noise,
     gauss_newton,
@@ -28,12 +27,8 @@ from ._accuracy import (
     ResponseTerm,
     scaled_inverse,
 )
-from ._bounds import apart_at_zero, inflation_at_zero, one_sided, one_sided_limit
 from ._cost import Points, Weights, widen_band
 from ._discrepancy import (
-    describe_discrepancy,
-    Discrepancy,
-    discrepancy_effect,
     find_discrepancy,
     Mixture,
 )
@@ -53,13 +48,24 @@ from ._fit_remarks import (
     remarks_on_priors,
 )
 from ._held import remarks_on_hold
-from ._identifiability import assess_identifiability, Information, LIMIT
+from ._identifiability import assess_identifiability, Information
 from ._make_fit import Costs, Estimate, make_fit
 from ._mixing import Mixing
 from ._origin import Origin
 from ._parameters import Place
 from ._problem import Problem
 from ._result import Fit
+from ._seen import (
+    bounds_of,
+    halved,
+    prior_rows,
+    pulled_beyond,
+    records_of,
+    see,
+    Seen,
+    units_of,
+    with_tangled,
+)
 from ._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._solve import same_responses, Solution
 from ._starts import look_aside, Minimum, remarks_on_minima
@@ -93,42 +99,30 @@ def assess(
     """
     parameters, count = problem.parameters, problem.parameters.count
     frfs = [each.frf for each in counted.points]
-    units = _units(solution)
-    seen = _see(problem, counted, solution, units)
-    bounds, tangled = _bounds(problem, solution, seen, units)
+    units = units_of(solution)
+    seen = see(problem, frfs, counted.found, solution, units)
+    bounds, tangled = bounds_of(problem, solution, seen, units)
     if tangled:
-        units = _with_tangled(units, seen, tangled)
-        seen = _see(problem, counted, solution, units)
+        units = with_tangled(units, seen, tangled)
+        seen = see(problem, frfs, counted.found, solution, units)
     records, blocks, prior = seen.records, seen.blocks, seen.prior
     bread, gradient, noise, discrepancy = seen.bread, seen.gradient, seen.noise, seen.discrepancy
     falls_aside = look_aside(problem, solution, _cost(blocks, prior), bread)
-    halved = ft.partial(_one_sided, seen=seen, names=parameters.names, bounds=bounds)
-    by_noise, covariance = halved(seen.by_noise), halved(seen.covariance)
-    pulled = _pulled_beyond(seen, parameters.names, bounds)
+    cut = ft.partial(halved, seen=seen, names=parameters.names, bounds=bounds)
+    by_noise, covariance = cut(seen.by_noise), cut(seen.covariance)
+    pulled = pulled_beyond(seen, parameters.names, bounds)
     plain = seen
     if counted.weights is not None:
         alone = problem.weighted(counted.weights, counted.mixings)
-        plain = _look(_records(alone, frfs, solution, units), prior, count)
+        plain = _look(records_of(alone, frfs, solution, units), prior, count)
     costs = _costs(plain.blocks, prior, plain.bread, plain.noise)
     cost, misfit = costs.cost, costs.chi_squared
     # Few points of their own noise reach a large misfit by chance: both have to say so.
     doubted = misfit if discrepancy.none < DOUBT else min(misfit, 1.0)
     step = newton_step(bread, gradient, solution.at_zero)
     decrement = 0.5 * float(gradient @ step)
-    dominated, used = _count_dominated(problem, frfs)
-    if 2 * dominated > used:
-        verdict = by_data = fed_back(parameters.names, dominated, used)
-    elif decrement > _NO_MINIMUM * max(cost, 1e-9) or is_unfinished(solution, step, seen.by_noise):
-        remedies = ("start from other values", "try many starts at once (starts=20)")
-        verdict = by_data = no_minimum(
-            parameters.names, decrement, cost, *remedies, message=solution.message
-        )
-    elif discrepancy.amplitude > NO_MODEL:
-        verdict = by_data = no_model(parameters.names, discrepancy.amplitude)
-    else:
-        facts = _information(problem, solution, blocks, (covariance, by_noise), units)
-        verdict, by_data = _identifiability(facts, prior, bounds)
-        verdict = _with_wider_band(verdict, problem, frfs)
+    facts = _information(problem, solution, blocks, (covariance, by_noise), units)
+    verdict, by_data = _judge(problem, solution, seen, facts, bounds, step, cost)
 
     def of_model() -> list[str]:
         return [
@@ -159,115 +153,30 @@ def assess(
     )
 
 
-class _Seen(NamedTuple):
-    """Derivatives and errors at a solution, by changes relative to some units."""
-
-    records: list[ResponseTerm]
-    blocks: list[Block]
-    prior: PriorRows
-    bread: Matrix
-    gradient: Float[np.ndarray, " parameters"]
-    noise: Noise
-    by_noise: Matrix
-    covariance: Matrix
-    discrepancy: Discrepancy
-
-
-def _see(
-    problem: Problem, counted: Counted, solution: Solution, units: Float[np.ndarray, " all"]
-) -> _Seen:
-    count = problem.parameters.count
-    records = _records(problem, [each.frf for each in counted.points], solution, units)
-    blocks, prior = blocks_of(records), _prior_rows(solution, units)
-    bread, gradient = gauss_newton(blocks, prior, count)
-    noise = noise_effect(records, blocks, prior, count)
-    by_noise = calibrated_covariance(bread, noise)
-    effect = discrepancy_effect(records, count)
-    discrepancy, added = describe_discrepancy(counted.found, bread, by_noise, effect)
-    covariance = by_noise + added
-    return _Seen(records, blocks, prior, bread, gradient, noise, by_noise, covariance, discrepancy)
-
-
-def _bounds(
-    problem: Problem, solution: Solution, seen: _Seen, units: Float[np.ndarray, " all"]
-) -> tuple[tuple[Bound, ...], list[int]]:
-    """The limits of parameters that may be zero, and those at zero that are mixed up with others.
-
-    That is where another one would change by too much if this one had a value up to its limit.
-    """
-    bounds, tangled = [], []
-    curvature, names = scaled_inverse(seen.bread), problem.parameters.names
-    for k in _possible_zeros(problem, solution, seen):
-        others = [j for j in solution.at_zero if j != k]
-        parts = seen.covariance, seen.by_noise
-        if others:
-            inflation = [inflation_at_zero(each, seen.bread, k, others) for each in parts]
-        else:
-            inflation = [float(each[k, k] / curvature[k, k]) for each in parts]
-        both = [one_sided_limit(problem, solution, k, each) for each in inflation]
-        moved = _along(seen, k) * abs(both[0] / units[k])
-        moved[[k, *(solution.at_zero if k in solution.at_zero else ())]] = 0.0
-        if np.all(moved <= LIMIT):
-            bounds.append(Bound(names[k], float(np.asarray(solution.values)[k]), *both))
-        elif k in solution.at_zero:
-            tangled.append(k)
-    return tuple(bounds), tangled
-
-
-_ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
-
-
-def _possible_zeros(problem: Problem, solution: Solution, seen: _Seen) -> list[int]:
-    """Parameters that keep their sign, at zero or so near it that the data allow it."""
-    count = problem.parameters.count
-    near = np.sqrt(np.diagonal(seen.covariance)) * _ONE_SIDED > 1
-    near &= np.array(problem.parameters.logarithmic[:count])
-    near[list(solution.at_zero)] = True
-    return np.flatnonzero(near & (np.diagonal(seen.bread) > 0)).tolist()
-
-
-def _along(seen: _Seen, k: int) -> Float[np.ndarray, " parameters"]:
-    """How far the others go with a change of parameter k, all relative to their units."""
-    return np.abs(seen.covariance[:, k] / seen.covariance[k, k])
-
-
-def _with_tangled(
-    units: Float[np.ndarray, " all"], seen: _Seen, tangled: Sequence[int]
-) -> Float[np.ndarray, " all"]:
-    """Units of parameters at zero that count as much as the parameter they are mixed up with."""
-    units = units.copy()
-    for k in tangled:
-        units[k] /= np.max(np.delete(_along(seen, k), tangled), initial=1e-300)
-    return units
-
-
-def _one_sided(
-    covariance: Matrix, seen: _Seen, names: tuple[str, ...], bounds: Sequence[Bound]
-) -> Matrix:
-    covariance, steps = _at_zero(covariance, seen, names, bounds)
-    for k, step in steps.items():
-        covariance = one_sided(covariance, k, step)
-    return covariance
-
-
-def _at_zero(
-    covariance: Matrix, seen: _Seen, names: tuple[str, ...], bounds: Sequence[Bound]
-) -> tuple[Matrix, dict[int, float]]:
-    """The covariance without bounds, and where these parameters at zero would go without them."""
-    zeros = [names.index(bound.name) for bound in bounds if not bound.value]
-    if len(zeros) > 1:
-        return apart_at_zero(covariance, seen.bread, seen.gradient, zeros)
-    step = -scaled_inverse(seen.bread) @ seen.gradient
-    return covariance, {k: float(step[k]) for k in zeros}
-
-
-def _pulled_beyond(
-    seen: _Seen, names: tuple[str, ...], bounds: Sequence[Bound]
-) -> dict[str, float]:
-    """How far beyond zero the data want parameters at zero, in random errors."""
-    covariance, steps = _at_zero(seen.by_noise, seen, names, bounds)
-    errors = {k: float(np.sqrt(max(covariance[k, k], 1e-300))) for k in steps}
-    return {names[k]: -step / errors[k] for k, step in steps.items()}
+def _judge(
+    problem: Problem,
+    solution: Solution,
+    seen: Seen,
+    facts: Information,
+    bounds: tuple[Bound, ...],
+    step: Float[np.ndarray, " parameters"],
+    cost: float,
+) -> tuple[Verdict, Verdict]:
+    """What data and priors determine together, and what the data determine alone."""
+    names, frfs = problem.parameters.names, [each.frf for each in seen.records]
+    decrement = 0.5 * float(seen.gradient @ step)
+    dominated, used = _count_dominated(problem, frfs)
+    if 2 * dominated > used:
+        verdict = fed_back(names, dominated, used)
+    elif decrement > _NO_MINIMUM * max(cost, 1e-9) or is_unfinished(solution, step, seen.by_noise):
+        remedies = ("start from other values", "try many starts at once (starts=20)")
+        verdict = no_minimum(names, decrement, cost, *remedies, message=solution.message)
+    elif seen.discrepancy.amplitude > NO_MODEL:
+        verdict = no_model(names, seen.discrepancy.amplitude)
+    else:
+        both, by_data = identifiability_of(facts, seen.prior, bounds)
+        return _with_wider_band(both, problem, frfs), by_data
+    return verdict, verdict
 
 
 class _Look(NamedTuple):
@@ -304,9 +213,9 @@ def discrepancy_at(
     problem: Problem, points: Sequence[Points], solution: Solution
 ) -> tuple[Mixture, Mixture]:
     """What the model leaves unexplained at a solution."""
-    units = _units(solution)
-    records = _records(problem, [each.frf for each in points], solution, units)
-    count, prior = problem.parameters.count, _prior_rows(solution, units)
+    units = units_of(solution)
+    records = records_of(problem, [each.frf for each in points], solution, units)
+    count, prior = problem.parameters.count, prior_rows(solution, units)
     held = set()
     if solution.at_zero:
         gradient = gauss_newton(blocks_of(records), prior, count)[1]
@@ -374,43 +283,6 @@ def newton_step(
     return step
 
 
-def _units(solution: Solution) -> Float[np.ndarray, " all"]:
-    """What relative changes are relative to: the value, or the change that shows of one at zero.
-
-    Relative to itself, a lag at zero would look as if it had no effect, while in truth it trades
-    off with the delay.
-    """
-    units = np.asarray(solution.slopes).copy()
-    units[list(solution.at_zero)] = solution.units_at_zero
-    return units
-
-
-def _rescale(solution: Solution, units: Float[np.ndarray, " all"]) -> Float[np.ndarray, " all"]:
-    """From derivatives by z to derivatives by changes relative to `units`."""
-    slopes = np.asarray(solution.slopes)
-    return np.where(slopes == 0, 1.0, units / np.where(slopes == 0, 1.0, slopes))
-
-
-def _records(
-    problem: Problem,
-    frfs: Sequence[FrequencyResponse],
-    solution: Solution,
-    units: Float[np.ndarray, " all"],
-) -> list[ResponseTerm]:
-    scale, parts = _rescale(solution, units), solution.sensitivity
-    weights = [np.asarray(each) for each in problem.weights]
-    misfits = [np.asarray(each) for each in parts.misfits]
-    slopes = [np.asarray(each) * scale for each in parts.slopes]
-    terms = zip(frfs, misfits, slopes, weights, problem.mixings, strict=True)
-    return [ResponseTerm(*each, problem.parameters.count) for each in terms]
-
-
-def _prior_rows(solution: Solution, units: Float[np.ndarray, " all"]) -> PriorRows:
-    derivatives = solution.sensitivity
-    slopes = np.asarray(derivatives.prior_slopes) * _rescale(solution, units)
-    return PriorRows(np.asarray(derivatives.prior_misfits), slopes)
-
-
 def _information(
     problem: Problem,
     solution: Solution,
@@ -427,12 +299,12 @@ def _information(
         names=tuple(place.name for place in places),
         values=np.asarray(solution.values),
         units=units,
-        order=_ranks(places),
+        order=ranks_of(places),
         same=ft.partial(same_responses, problem, solution),
     )
 
 
-def _identifiability(
+def identifiability_of(
     facts: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
 ) -> tuple[Verdict, Verdict]:
     """What data and priors determine together, and what the data determine alone."""
@@ -446,7 +318,7 @@ def _identifiability(
     ), assess_identifiability(facts, bounds)
 
 
-def _ranks(places: Sequence[Place]) -> tuple[int, ...]:
+def ranks_of(places: Sequence[Place]) -> tuple[int, ...]:
     """Each parameter's place in the model's own order."""
     ordered = sorted(places, key=lambda place: (place.leaf, place.index))
     return tuple(ordered.index(place) for place in places)

@@ -162,7 +162,7 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
 
 
 def _require_finite(
-    response: np.ndarray, omega: np.ndarray, others: Float[np.ndarray, " others"]
+    response: np.ndarray, omega: np.ndarray, others: Float[Numbers, "..."]
 ) -> None:
     bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
     if bad.any():

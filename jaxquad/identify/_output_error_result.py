@@ -20,19 +20,14 @@ from ._accuracy import (
     projected_noise,
     scaled_inverse,
 )
-from ._assess import (
-    _identifiability,
-    _prior_rows,
-    _ranks,
-    _rescale,
-    _units,
-)
+from ._assess import identifiability_of, ranks_of
 from ._fit_remarks import is_unfinished, no_minimum, no_model, remarks_on_priors, runaways
 from ._identifiability import Information
 from ._make_fit import Costs, Estimate, make_fit
 from ._output_error_descent import Descent, RecordNoise, with_fixed_slopes
 from ._output_error_problem import evaluate_misfits, Evaluation, OutputError, RecordTerm
 from ._result import Fit
+from ._seen import prior_rows, rescale, units_of
 from ._verdict import Verdict
 
 
@@ -194,9 +189,9 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     """Costs, bounds, covariance and identifiability at the solution."""
     problem, solution = descent.problem, descent.solution
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
-    units, rescale = _units(solution), _rescale(solution, _units(solution))
-    projected = project_records(descent, descent.found, rescale[:count])
-    prior = _prior_rows(solution, units)
+    units, scale = units_of(solution), rescale(solution, units_of(solution))
+    projected = project_records(descent, descent.found, scale[:count])
+    prior = prior_rows(solution, units)
     reduced = reduced_rows(projected, problem.terms, count)
     bread, gradient, noise = gauss_newton(reduced, prior, count)
     rows = sum(int(np.sum(term.counted)) for term in problem.terms)
@@ -246,12 +241,12 @@ def _verdict(
     """What data and priors determine; fixed parameters are looked at for names alone."""
     problem, solution, count = descent.problem, descent.solution, len(covariance)
     free = prior._replace(slopes=prior.slopes[:, :count])
-    found = _identifiability(_information(descent, reduced, covariance, units), free)
+    found = identifiability_of(_information(descent, reduced, covariance, units), free)
     if units.size == count or not any(verdict.undetermined for verdict in found):
         return found
-    projected = project_records(descent, with_fixed_slopes(descent), _rescale(solution, units))
+    projected = project_records(descent, with_fixed_slopes(descent), rescale(solution, units))
     reduced = reduced_rows(projected, problem.terms, count)
-    return _identifiability(_information(descent, reduced, covariance, units), prior)
+    return identifiability_of(_information(descent, reduced, covariance, units), prior)
 
 
 def _information(
@@ -268,7 +263,7 @@ def _information(
         names=tuple(place.name for place in places),
         values=np.asarray(descent.solution.values)[:count],
         units=units[:count],
-        order=_ranks(places),
+        order=ranks_of(places),
         same=ft.partial(_same, descent),
     )
 

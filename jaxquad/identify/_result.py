@@ -153,8 +153,7 @@ class Fit:
 
         A fit in the time domain, by `jq.refine`, has none.
         """
-        known = self.origin is not None and self.verdict.fitted
-        return self.origin.band if known else None
+        return None if self.origin is None or not self.verdict.fitted else self.origin.band
 
     @property
     def poles(self) -> np.ndarray:

@@ -1,0 +1,179 @@
+"""What the derivatives at a solution say: errors of the parameters, and limits of those at zero."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxquad.spectra import FrequencyResponse
+
+from ._accuracy import (
+    Block,
+    blocks_of,
+    calibrated_covariance,
+    gauss_newton,
+    Matrix,
+    Noise,
+    noise_effect,
+    PriorRows,
+    ResponseTerm,
+    scaled_inverse,
+)
+from ._bounds import apart_at_zero, inflation_at_zero, one_sided, one_sided_limit
+from ._discrepancy import describe_discrepancy, Discrepancy, discrepancy_effect, Mixture
+from ._identifiability import LIMIT
+from ._problem import Problem
+from ._solve import Solution
+from ._verdict import Bound
+
+
+class Seen(NamedTuple):
+    """Derivatives and errors at a solution, by changes relative to some units."""
+
+    records: list[ResponseTerm]
+    blocks: list[Block]
+    prior: PriorRows
+    bread: Matrix
+    gradient: Float[np.ndarray, " parameters"]
+    noise: Noise
+    by_noise: Matrix
+    covariance: Matrix
+    discrepancy: Discrepancy
+
+
+def see(
+    problem: Problem,
+    frfs: Sequence[FrequencyResponse],
+    found: tuple[Mixture, Mixture],
+    solution: Solution,
+    units: Float[np.ndarray, " all"],
+) -> Seen:
+    """All of it, with the discrepancy `found`; changes are relative to `units`."""
+    count = problem.parameters.count
+    records = records_of(problem, frfs, solution, units)
+    blocks, prior = blocks_of(records), prior_rows(solution, units)
+    bread, gradient = gauss_newton(blocks, prior, count)
+    noise = noise_effect(records, blocks, prior, count)
+    by_noise = calibrated_covariance(bread, noise)
+    effect = discrepancy_effect(records, count)
+    discrepancy, added = describe_discrepancy(found, bread, by_noise, effect)
+    covariance = by_noise + added
+    return Seen(records, blocks, prior, bread, gradient, noise, by_noise, covariance, discrepancy)
+
+
+def bounds_of(
+    problem: Problem, solution: Solution, seen: Seen, units: Float[np.ndarray, " all"]
+) -> tuple[tuple[Bound, ...], list[int]]:
+    """The limits of parameters that may be zero, and those at zero that are mixed up with others.
+
+    That is where another one would change by too much if this one had a value up to its limit.
+    """
+    bounds, tangled = [], []
+    curvature, names = scaled_inverse(seen.bread), problem.parameters.names
+    for k in _possible_zeros(problem, solution, seen):
+        others = [j for j in solution.at_zero if j != k]
+        parts = seen.covariance, seen.by_noise
+        if others:
+            inflation = [inflation_at_zero(each, seen.bread, k, others) for each in parts]
+        else:
+            inflation = [float(each[k, k] / curvature[k, k]) for each in parts]
+        both = [one_sided_limit(problem, solution, k, each) for each in inflation]
+        moved = _along(seen, k) * abs(both[0] / units[k])
+        moved[[k, *(solution.at_zero if k in solution.at_zero else ())]] = 0.0
+        if np.all(moved <= LIMIT):
+            bounds.append(Bound(names[k], float(np.asarray(solution.values)[k]), *both))
+        elif k in solution.at_zero:
+            tangled.append(k)
+    return tuple(bounds), tangled
+
+
+_ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
+
+
+def _possible_zeros(problem: Problem, solution: Solution, seen: Seen) -> list[int]:
+    """Parameters that keep their sign, at zero or so near it that the data allow it."""
+    count = problem.parameters.count
+    near = np.sqrt(np.diagonal(seen.covariance)) * _ONE_SIDED > 1
+    near &= np.array(problem.parameters.logarithmic[:count])
+    near[list(solution.at_zero)] = True
+    return np.flatnonzero(near & (np.diagonal(seen.bread) > 0)).tolist()
+
+
+def _along(seen: Seen, k: int) -> Float[np.ndarray, " parameters"]:
+    """How far the others go with a change of parameter k, all relative to their units."""
+    return np.abs(seen.covariance[:, k] / seen.covariance[k, k])
+
+
+def with_tangled(
+    units: Float[np.ndarray, " all"], seen: Seen, tangled: Sequence[int]
+) -> Float[np.ndarray, " all"]:
+    """Units of parameters at zero that count as much as the parameter they are mixed up with."""
+    units = units.copy()
+    for k in tangled:
+        units[k] /= np.max(np.delete(_along(seen, k), tangled), initial=1e-300)
+    return units
+
+
+def halved(
+    covariance: Matrix, seen: Seen, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> Matrix:
+    covariance, steps = _at_zero(covariance, seen, names, bounds)
+    for k, step in steps.items():
+        covariance = one_sided(covariance, k, step)
+    return covariance
+
+
+def _at_zero(
+    covariance: Matrix, seen: Seen, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> tuple[Matrix, dict[int, float]]:
+    """The covariance without bounds, and where these parameters at zero would go without them."""
+    zeros = [names.index(bound.name) for bound in bounds if not bound.value]
+    if len(zeros) > 1:
+        return apart_at_zero(covariance, seen.bread, seen.gradient, zeros)
+    step = -scaled_inverse(seen.bread) @ seen.gradient
+    return covariance, {k: float(step[k]) for k in zeros}
+
+
+def pulled_beyond(seen: Seen, names: tuple[str, ...], bounds: Sequence[Bound]) -> dict[str, float]:
+    """How far beyond zero the data want parameters at zero, in random errors."""
+    covariance, steps = _at_zero(seen.by_noise, seen, names, bounds)
+    errors = {k: float(np.sqrt(max(covariance[k, k], 1e-300))) for k in steps}
+    return {names[k]: -step / errors[k] for k, step in steps.items()}
+
+
+def units_of(solution: Solution) -> Float[np.ndarray, " all"]:
+    """What relative changes are relative to: the value, or the change that shows of one at zero.
+
+    Relative to itself, a lag at zero would look as if it had no effect, while in truth it trades
+    off with the delay.
+    """
+    units = np.asarray(solution.slopes).copy()
+    units[list(solution.at_zero)] = solution.units_at_zero
+    return units
+
+
+def rescale(solution: Solution, units: Float[np.ndarray, " all"]) -> Float[np.ndarray, " all"]:
+    """From derivatives by z to derivatives by changes relative to `units`."""
+    slopes = np.asarray(solution.slopes)
+    return np.where(slopes == 0, 1.0, units / np.where(slopes == 0, 1.0, slopes))
+
+
+def records_of(
+    problem: Problem,
+    frfs: Sequence[FrequencyResponse],
+    solution: Solution,
+    units: Float[np.ndarray, " all"],
+) -> list[ResponseTerm]:
+    scale, parts = rescale(solution, units), solution.sensitivity
+    weights = [np.asarray(each) for each in problem.weights]
+    misfits = [np.asarray(each) for each in parts.misfits]
+    slopes = [np.asarray(each) * scale for each in parts.slopes]
+    terms = zip(frfs, misfits, slopes, weights, problem.mixings, strict=True)
+    return [ResponseTerm(*each, problem.parameters.count) for each in terms]
+
+
+def prior_rows(solution: Solution, units: Float[np.ndarray, " all"]) -> PriorRows:
+    derivatives = solution.sensitivity
+    slopes = np.asarray(derivatives.prior_slopes) * rescale(solution, units)
+    return PriorRows(np.asarray(derivatives.prior_misfits), slopes)
