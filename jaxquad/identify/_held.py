@@ -161,9 +161,7 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
     return _aliases_at(omega, hold, count)
 
 
-def _require_finite(
-    response: np.ndarray, omega: np.ndarray, others: Float[Numbers, "..."]
-) -> None:
+def _require_finite(response: np.ndarray, omega: np.ndarray, others: Float[Numbers, "..."]) -> None:
     bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
     if bad.any():
         first = np.concatenate([omega, np.ravel(others)])[int(np.argmax(bad))]

@@ -29,7 +29,9 @@ class Share(NamedTuple):
     input_first: Grid
 
 
-def share_from_output(records: Sequence[Signals], dt: float, omega: Grid) -> Share:
+def share_from_output(
+    records: Sequence[Float[np.ndarray, "2 _samples"]], dt: float, omega: Grid
+) -> Share:
     """The directed share of Geweke (1982); zero where the records are too short for a model.
 
     At which sample rate innovations tell a loop's directions apart depends on its noise: of several
@@ -59,7 +61,7 @@ def _decimations(dt: float, highest: float) -> Iterator[int]:
     yield from dict.fromkeys(ratios)
 
 
-def _standardised(records: Sequence[Signals]) -> list[Signals]:
+def _standardised(records: Sequence[Float[np.ndarray, "2 _samples"]]) -> list[Signals]:
     """Without offset and trend, in units of the standard deviation."""
     flat = [_without_trend(x) for x in records]
     squares = sum(np.einsum("cs,cs->c", x, x) for x in flat)
@@ -81,7 +83,7 @@ def _decimated(x: Signals, every: int) -> Float[np.ndarray, "2 fewer"]:
     return np.fft.irfft(np.fft.rfft(x[:, : count * every])[:, : count // 2 + 1], count)
 
 
-def _products(records: Sequence[Signals]) -> Float[np.ndarray, "lags lags"]:
+def _products(records: Sequence[Float[np.ndarray, "2 _samples"]]) -> Float[np.ndarray, "lags lags"]:
     """Mean products of the present and past samples of both, with white noise of rounding."""
     total = sum(_sums_of_products(x) for x in records)
     total = total / sum(x.shape[1] - _ORDER for x in records)
