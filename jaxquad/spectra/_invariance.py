@@ -222,19 +222,21 @@ def _blocks(moving: Columns) -> list[Int[np.ndarray, " block"]]:
     return np.split(np.arange(power.size), np.searchsorted(excited, ends))
 
 
-_SMOOTH = 0.1  # in ln(omega)
+_SMOOTH, _ALONE = 0.1, 1e-6  # in ln(omega); of its square, to the scatter of points nearby
 
 
 def _log_slope(
     omega: Grid, response: Complex[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, " frequencies"]:
-    """dlnG/dln(omega), by straight lines through the points nearby."""
+    """dlnG/dln(omega), by straight lines through the points nearby; 0 where there are none."""
     place = np.log(omega)
     logs = np.log(np.abs(response)) + 1j * np.unwrap(np.angle(response))
     offset = place - place[:, None]
     kernel = np.exp(-0.5 * (offset / _SMOOTH) ** 2)
     m0, m1, m2 = (np.sum(kernel * offset**k, axis=1) for k in range(3))
-    return (m0 * ((kernel * offset) @ logs) - m1 * (kernel @ logs)) / (m0 * m2 - m1**2)
+    spread, pull = m0 * m2 - m1**2, m0 * ((kernel * offset) @ logs) - m1 * (kernel @ logs)
+    alone = spread <= _ALONE * (m0 * _SMOOTH) ** 2
+    return np.where(alone, 0.0, pull / np.where(alone, 1.0, spread))
 
 
 class _Factors(NamedTuple):
