@@ -361,7 +361,7 @@ _PLACES = 64  # samples compared first
 _EXACT = 1e-9  # of the largest value
 
 
-def period_of(signals: Sequence[Float[np.ndarray, "samples sources"]]) -> int:
+def period_of(signals: Sequence[Float[np.ndarray, "_samples sources"]]) -> int:
     """Samples of the shortest period with which all signals repeat exactly; 0 without one.
 
     Every signal holds two whole periods at least.
