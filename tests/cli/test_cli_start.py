@@ -51,12 +51,13 @@ def test_help_lists_designs_and_wrong_options_do_not_import_jax(tmp_path):
     assert json.loads(answer.stdout) == expected
 
 
-def test_the_package_is_the_command_and_a_reader_may_stop_early():
+def test_the_package_is_the_command_and_a_reader_may_stop_early(tmp_path):
     command = [sys.executable, "-m", "jaxquad"]
     version = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     assert version.stdout.startswith("jaxquad ")
     with subprocess.Popen(
-        [*command, "design", "sweep", *SIGNAL[:-2], "--json"],
+        [*command, "design", "sweep", *SIGNAL, "--json"],
+        cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     ) as process:
