@@ -309,6 +309,9 @@ def _compared(
     return both, FilterVerdict(text, flown, reason, switched(flown), alone, shared)
 
 
+_BELIEVED = 0.5  # share of plants on which the loop that flew has to be stable
+
+
 def _judge(
     stages: Sequence[Stage],
     settings: AutopilotSettings,
@@ -322,6 +325,13 @@ def _judge(
         beyond.append(
             f"the command's noise on another axis is {shared.noise:.2f} of what flew, above "
             f"{settings.noise:g}"
+        )
+    if beyond and flown.stable < _BELIEVED:
+        return "cannot tell", (
+            f"this log cannot tell: the loop flew, but with the gains that flew it is stable on "
+            f"{100 * flown.stable:.1f} % only of the plants that the log leaves open, so most of "
+            "these are not the vehicle. Fly more excitation on this axis (a chirp of the rate "
+            "set-point, or strong and quick stick)"
         )
     if beyond:
         return "not to be flown", (
