@@ -396,7 +396,7 @@ def _change(left: _LeftOver, omega: Grid, method: Method) -> str:
     columns = np.hstack([left.added[:, 3:], 1j * left.added[:, 3:]])
     kept = _independent(left, columns)
     found = _factors(left, columns @ kept)
-    if found.size() <= _CLEAR:
+    if not found.size() > _CLEAR:
         return ""
     # Of t, from -1 to 1, the mean in the second half is 1 more than that in the first.
     gains = np.stack([np.ones_like(left.slope), left.slope], axis=1)
