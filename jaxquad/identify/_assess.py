@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import on_host
 from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
@@ -264,7 +263,7 @@ def _remarks_on_growth(
     ]
     omega = np.concatenate(used)
     lowest, highest = float(np.min(omega)), float(np.max(omega))
-    poles = linear_model(on_host(model)).poles
+    poles = linear_model(model).poles
     growth = float(np.max(np.real(poles[np.abs(poles) < highest]), initial=0.0))
     return remarks_on_growth(growth) if growth > lowest else []
 

@@ -26,13 +26,14 @@ _COHERENT = 0.6  # of points between which the response is interpolated
 
 Signal = Float[np.ndarray, " samples"]
 Tone = Complex[np.ndarray, " samples"]
+Tones = Sequence[Complex[np.ndarray, " _samples"]]
 Grid = Float[np.ndarray, " frequencies"]
 Bins = Float[np.ndarray, " bins"]
 
 
 def remarks_on_harmonics(
     records: Sequence[Record],
-    tones: Sequence[Tone],
+    tones: Tones,
     i: int,
     omega: Grid,
     response: Complex[np.ndarray, "frequencies outputs inputs"],
@@ -91,7 +92,7 @@ _ACTIVE = 0.1  # of the largest amplitude
 
 def tones_of(
     records: Sequence[Record], i: int, method: Literal["direct", "joint"]
-) -> list[Tone] | None:
+) -> Tones | None:
     """Of each record, the input's part at the frequency of a sweep, with its phase.
 
     `None` unless all inputs, or in the joint estimate all references, sweep.
