@@ -52,7 +52,7 @@ from ._make_fit import Costs, Estimate, make_fit
 from ._mixing import Mixing
 from ._origin import Origin
 from ._parameters import Place
-from ._problem import Problem
+from ._problem import on_device, Problem
 from ._result import Fit
 from ._seen import (
     bounds_of,
@@ -263,7 +263,7 @@ def _remarks_on_growth(
     ]
     omega = np.concatenate(used)
     lowest, highest = float(np.min(omega)), float(np.max(omega))
-    poles = linear_model(model).poles
+    poles = linear_model(on_device(model)).poles
     growth = float(np.max(np.real(poles[np.abs(poles) < highest]), initial=0.0))
     return remarks_on_growth(growth) if growth > lowest else []
 
