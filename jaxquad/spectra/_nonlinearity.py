@@ -90,9 +90,7 @@ _FEWEST = 6.0  # cycles of a sweep
 _ACTIVE = 0.1  # of the largest amplitude
 
 
-def tones_of(
-    records: Sequence[Record], i: int, method: Literal["direct", "joint"]
-) -> Tones | None:
+def tones_of(records: Sequence[Record], i: int, method: Literal["direct", "joint"]) -> Tones | None:
     """Of each record, the input's part at the frequency of a sweep, with its phase.
 
     `None` unless all inputs, or in the joint estimate all references, sweep.
