@@ -328,9 +328,9 @@ def _judge(
         )
     if beyond and flown.stable < _BELIEVED:
         return "cannot tell", (
-            f"this log cannot tell: the loop flew, but with the gains that flew it is stable on "
-            f"{100 * flown.stable:.1f} % only of the plants within the error bars, so most of these "
-            "are not the vehicle. Fly more excitation on this axis (a chirp of the rate "
+            "this log cannot tell: the loop flew, but with the gains that flew it is stable on "
+            f"{100 * flown.stable:.1f} % only of the plants within the error bars, so most of "
+            "these are not the vehicle. Fly more excitation on this axis (a chirp of the rate "
             "set-point, or strong and quick stick)"
         )
     if beyond:
