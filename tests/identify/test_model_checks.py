@@ -84,9 +84,9 @@ def test_swapped_arguments_are_told():
 def test_questions_that_a_fit_cannot_answer_are_refused(response):
     fit = jq.fit(jq.LaggedIntegrator(70.0, 0.05, 0.04), response)
     with pytest.raises(ValueError, match="key is 0: give a jax.random.key"):
-        fit.ensemble(3, 0)
+        fit.ensemble(3, 0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="quantity is 'lag': give a function of the model"):
-        fit.derived("lag")
+        fit.derived("lag")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="the quantity is an array: ask for each"):
         fit.derived(lambda model: jnp.stack([model.lag, model.delay]))
     with pytest.raises(ValueError, match="give a list of frequencies in rad/s"):

@@ -188,6 +188,7 @@ def test_a_fit_is_verified_in_the_band_that_it_used():
     fit = jq.fit(MODEL, jq.frequency_response(jq.Record(TIME, u, y, hold=DT)), band=(1.0, 30.0))
     other, answer = flight(seed=1)
     drift = jq.Record(TIME, other, answer + 10.0 * np.sin(0.3 * TIME), hold=DT)
+    assert fit.used_band is not None
     low, high = fit.used_band
     assert 1.0 <= low < 2.0 and 25.0 < high <= 30.0
     check = jq.verify(fit, drift)
