@@ -353,9 +353,13 @@ def _repair_models(
         models = weighted_models(rest, bins, left > _MISSED, noise, options.global_order)
         trial = take_off(bins, rest.sources, rest.moved, models)
         fit = _fit_narrow(grid, width, trial, inputs, options.order)
-        better = response_left(trial, grid, width, fit) < _BETTER * left
+        after = response_left(trial, grid, width, fit)
+        better = after < _BETTER * left
         if not np.any(better):
             break
+        if np.all(better | (left <= _MISSED)):
+            rest, stack, left = trial, fit, after
+            continue
         kept = [new if b else old for b, old, new in zip(better, rest.models, models, strict=True)]
         rest = take_off(bins, rest.sources, rest.moved, kept)
         stack = _fit_narrow(grid, width, rest, inputs, options.order)
