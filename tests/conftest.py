@@ -14,6 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import equinox as eqx
 import jax
+import jaxtyping
 import psutil
 import pytest
 
@@ -89,3 +90,12 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no measured data at {folder}: set JAXQUAD_DATA to the folder that holds it")
     return folder
+
+
+@pytest.fixture
+def without_type_checks():
+    """As in use: the tests check the types of all arguments, a user's Python does not."""
+    before = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", before)

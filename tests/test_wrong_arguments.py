@@ -3,20 +3,13 @@
 from types import SimpleNamespace
 from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 
 import jaxquad as jq
 
 
-@pytest.fixture(autouse=True)
-def without_type_checks():
-    """As in use: the tests check the types of all arguments, a user's Python does not."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
+pytestmark = pytest.mark.usefixtures("without_type_checks")
 
 
 PLANT = jq.DecoupledAxes([0.05], [0.05])

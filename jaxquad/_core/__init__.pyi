@@ -18,7 +18,6 @@ from ._checks import (
     require_vector as require_vector,
     whole_samples as whole_samples,
 )
-from ._cores import available_cores as available_cores
 from ._files import write_file as write_file
 from ._gains import (
     broadcast_gain as broadcast_gain,
@@ -66,6 +65,7 @@ from ._process import (
 from ._pytree_node import pytree_node as pytree_node
 from ._stages import announce as announce, STAGES as STAGES
 from ._threads import (
+    available_cores as available_cores,
     map_in_threads as map_in_threads,
     thread_settings as thread_settings,
 )

@@ -1,13 +1,9 @@
 """Threads beside that of a caller, which compute only what they would compute in its place."""
 
+import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
-
-import jax
-import jax.numpy as jnp
-
-from ._cores import available_cores
 
 
 Given = TypeVar("Given")
@@ -34,8 +30,19 @@ def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -
     return [function(x) if y is None else y[0] for x, y in zip(items, found, strict=True)]
 
 
+def available_cores() -> int:
+    """That this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS, Windows
+        return os.cpu_count() or 1
+
+
 def thread_settings() -> tuple[object, ...]:
     """Of JAX, those that change numbers or raise, and that a `with` can set for one thread."""
+    import jax  # Batches and usage errors ask for cores without it.
+    import jax.numpy as jnp
+
     config = jax.config  # makes its attributes while it is imported, which no type checker sees
     return (
         jnp.result_type(float),

@@ -229,7 +229,7 @@ class Fit:
         if not (self.determined[k] and self.parameters.logarithmic[k]):
             return low, high
         # It keeps its sign.
-        return (max(low, 0.0), high) if self.values[k] >= 0 else (low, min(high, 0.0))
+        return (low, min(high, 0.0)) if np.signbit(self.values[k]) else (max(low, 0.0), high)
 
     def derived(
         self,

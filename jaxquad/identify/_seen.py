@@ -118,6 +118,7 @@ def with_tangled(
 def halved(
     covariance: Matrix, seen: Seen, names: tuple[str, ...], bounds: Sequence[Bound]
 ) -> Matrix:
+    """The covariance with what the bounds of parameters at zero cut off taken away."""
     covariance, steps = _at_zero(covariance, seen, names, bounds)
     for k, step in steps.items():
         covariance = one_sided(covariance, k, step)
@@ -165,6 +166,7 @@ def records_of(
     solution: Solution,
     units: Float[np.ndarray, " all"],
 ) -> list[ResponseTerm]:
+    """Misfits and slopes of each response, by changes relative to `units`."""
     scale, parts = rescale(solution, units), solution.sensitivity
     weights = [np.asarray(each) for each in problem.weights]
     misfits = [np.asarray(each) for each in parts.misfits]
@@ -174,6 +176,7 @@ def records_of(
 
 
 def prior_rows(solution: Solution, units: Float[np.ndarray, " all"]) -> PriorRows:
+    """Those of the priors, likewise."""
     derivatives = solution.sensitivity
     slopes = np.asarray(derivatives.prior_slopes) * rescale(solution, units)
     return PriorRows(np.asarray(derivatives.prior_misfits), slopes)

@@ -21,6 +21,7 @@ from ._simulated import (
     Motions,
     unknown_motions,
 )
+from ._verdict import UndeterminedError, Verdict
 
 
 class Agreement(eqx.Module):
@@ -131,6 +132,7 @@ class _Fitted(Protocol):
     """What `jq.fit` returns."""
 
     model: PyTree
+    verdict: Verdict
 
     @property
     def used_band(self) -> tuple[float, float] | None: ...
@@ -174,6 +176,7 @@ def verify(
     **Raises:**
 
     - `ValueError`: a model of other channels, or one that is too unstable to be simulated.
+    - `UndeterminedError`, a `ValueError`: a fit that fitted nothing.
     - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
 
     Source: Tischler & Remple, sec. 14.2, time-domain verification.
@@ -182,6 +185,8 @@ def verify(
     if not isinstance(record, Record):
         raise ValueError(f"verify needs a jq.Record, not a {type(record).__name__}: see jq.read")
     if isinstance(model, _Fitted):
+        if not model.verdict.fitted:
+            raise UndeterminedError(f"a verification needs a model: {model.verdict.summary}")
         model, band = model.model, model.used_band if band is None else band
     plant = linear_model(model)
     check_channels(plant, record)

@@ -159,7 +159,7 @@ def _numbers(fit: Fit) -> str:
 
 def _number(fit: Fit, name: str, value: float, unit: str) -> str:
     low, high = fit.interval(name)
-    if name in (bound.name for bound in fit.verdict.bounds):
+    if low == 0 or high == 0:  # it keeps its sign: no symmetrical interval
         return f"{name} = {low:.2g} .. {high:.2g} {unit}".rstrip()
     return f"{name} = {value:.4g} \u00b1 {(high - low) / 2:.2g} {unit}".rstrip()
 

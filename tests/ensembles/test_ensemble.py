@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 from jaxtyping import ArrayLike
@@ -418,15 +417,6 @@ def test_what_cannot_be_is_refused(what):
 def test_empty_laws_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-@pytest.fixture
-def without_type_checks():
-    """As in use: the tests check the types of all arguments, a user's Python does not."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 def test_what_belongs_to_the_loop_is_refused_in_an_ensemble(without_type_checks):

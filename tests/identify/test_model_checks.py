@@ -4,7 +4,6 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 from synthetic import response_of
@@ -12,13 +11,7 @@ from synthetic import response_of
 import jaxquad as jq
 
 
-@pytest.fixture(autouse=True)
-def without_type_checks():
-    """As in use: the tests check the types of all arguments, a user's Python does not."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
+pytestmark = pytest.mark.usefixtures("without_type_checks")
 
 
 TRUTH = jq.LaggedIntegrator(80.0, 0.06, 0.03)

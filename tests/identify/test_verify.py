@@ -195,3 +195,12 @@ def test_a_fit_is_verified_in_the_band_that_it_used():
     assert check.band == fit.used_band and check.fit_percent > 95
     assert check.rms == fit(drift).rms == jq.verify(fit.model, drift, band=fit.used_band).rms
     assert jq.verify(fit.model, drift).fit_percent < check.fit_percent - 5
+
+
+def test_a_fit_that_fitted_nothing_is_not_verified():
+    rng = np.random.default_rng(0)
+    still = jq.Record(TIME, rng.standard_normal(TIME.size), rng.standard_normal(TIME.size))
+    fit = jq.fit(MODEL, jq.frequency_response(still))
+    assert not fit.verdict.fitted
+    with pytest.raises(jq.identify.UndeterminedError, match="a verification needs a model"):
+        jq.verify(fit, still)

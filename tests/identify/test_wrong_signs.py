@@ -96,3 +96,14 @@ def test_a_model_that_grows_needs_a_reference(method, said):
     start = jq.TransferFunction([15.0], [1.0, -2.0])
     remarks = jq.fit(start, frf, free=["numerator[0]", "denominator[1]"]).remarks
     assert any("a pole at +3" in remark for remark in remarks) == said
+
+
+def test_an_interval_keeps_the_sign_of_its_parameter():
+    """Also where a negative one came out as 0, and where it is too loose for a limit."""
+    fit = fitted(0, Zero(6.0, 0.5, 0.7, 5.0))
+    values = np.where(np.array(fit.names) == "zero", -0.0, fit.values)
+    values = np.where(np.array(fit.names) == "zeta", 0.001, values)
+    verdict = dataclasses.replace(fit.verdict, bounds=())
+    moved = dataclasses.replace(fit, values=values, verdict=verdict)
+    assert moved.interval("zero")[0] < 0 == moved.interval("zero")[1]
+    assert moved.interval("zeta")[0] == 0 < moved.interval("zeta")[1]

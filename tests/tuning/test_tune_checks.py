@@ -5,7 +5,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 from tuning_case import ensemble, equivalent, flight, loop, objective
@@ -54,15 +53,6 @@ def test_what_does_not_fit_is_refused_with_what_to_give(case):
     options, message = REFUSED[case]
     with pytest.raises(ValueError, match=message):
         run(**options)
-
-
-@pytest.fixture
-def without_type_checks():
-    """As in use: the tests check the types of all arguments, a user's Python does not."""
-    before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 WRONG: dict[str, tuple[Any, str]] = {
