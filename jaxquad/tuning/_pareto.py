@@ -16,13 +16,15 @@ from ._certificate import Certificate
 from ._certify import certify
 from ._cost import Progress, stack_copies
 from ._design_result import DesignResult, DesignSummary, front_point, summarise_design
+from ._drawn import draw_or_take, tighten
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty
 from ._parameters import build_design, Coordinates, select_coordinates
 from ._phases import find_bounds, Solution, solve
 from ._problem import DeviceChoice, make_problem, TimeSpan
 from ._quantities import QUANTITIES
-from ._tune import draw_or_take, judge_descent, require_kinds, stabilising_rate, tighten
+from ._requirements import require_kinds
+from ._tune import judge_descent, stabilising_rate
 from ._verdict import Verdict
 
 

@@ -1,50 +1,36 @@
+"""Gains tuned by gradient through the closed loops of an ensemble, with a certificate."""
+
 import dataclasses
 import functools as ft
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from jaxquad._core import as_array, on_host
+from jaxquad._core import as_array
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
 from jaxquad.loops import Loop
-from jaxquad.simulation import find_steps, Scenario
+from jaxquad.simulation import Scenario
 
 from ._beside import begin_evaluating, Beside, evaluate_beside
 from ._certificate import Certificate, lag_remark
 from ._certify import certify_beside
 from ._cost import Listener, Progress, stack_copies
-from ._evaluate_design import certified_members, flying_loop
-from ._flown import fly
-from ._gauss_newton import GaussNewton, require_squares
+from ._drawn import draw_or_take, Job, make_search, pose_problem, tighten
+from ._evaluate_design import certified_members
+from ._gauss_newton import GaussNewton
 from ._lbfgs import LBFGS
-from ._objective import Limit, Objective, Worst
-from ._parameters import build_design, select_coordinates
+from ._objective import Limit, Objective
+from ._parameters import build_design, Coordinates, select_coordinates
 from ._phases import find_bounds, go_on, Solution, solve
-from ._problem import (
-    DeviceChoice,
-    linear_loops,
-    make_problem,
-    Problem,
-    require_same_rate,
-    TimeSpan,
-)
-from ._quantities import QUANTITIES
-from ._tail import (
-    certified_beyond,
-    FlightSearch,
-    GUARDS,
-    is_kept_by_flights,
-    is_kept_by_loops,
-    prepare_search,
-    Search,
-    SLICE,
-    take_members,
-)
+from ._problem import DeviceChoice, Problem, TimeSpan
+from ._requirements import require_fresh, require_kinds, require_steps
+from ._tail import certified_beyond, prepare_search, Search
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
 from ._verdict import Bound, judge_convergence, Verdict
 
@@ -134,67 +120,152 @@ def tune(
     objective = Objective() if objective is None else objective
     method = LBFGS() if method is None else method
     require_kinds(loop, ensemble, scenario, objective, limits, method)
-    key = jax.random.key(0) if key is None else key
-    span, watched = TimeSpan.of(objective), Progress(progress, listener)
+    key, watched = jax.random.key(0) if key is None else key, Progress(progress, listener)
+    job = Job(loop, ensemble, scenario, tuple(limits), TimeSpan.of(objective), devices, key)
     coordinates = select_coordinates(loop.controller, free)
     drawn = draw_or_take(loop, ensemble, members, key)
-    _require_fresh(fresh, drawn, peers)
-    search = _search(
-        loop, ensemble, drawn, scenario, limits, reserve=reserve, starts=starts, key=key, span=span,
-        size=fresh if isinstance(fresh, int) else _SIZE, devices=devices,
-    )  # fmt: skip
-    if search is None or search.flights is None:
-        problem = make_problem(loop.controller, drawn, scenario, span=span, devices=devices)
-    else:
-        problem = search.flights.problem(search.flights.guards)
-    limited = _draw_limited(loop, ensemble, limits, key)
-    if limited is not None:
-        problem = dataclasses.replace(problem, limited=linear_loops(limited, devices))
+    require_fresh(fresh, drawn, peers)
+    size = fresh if isinstance(fresh, int) else _SIZE
+    search = make_search(job, drawn, reserve=reserve, starts=starts, size=size)
+    problem = pose_problem(job, drawn, search)
     require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
-    begun = scatter_starts(coordinates.start, starts, scatter, seed=0)
+    certifier = _make_certifier(job, coordinates, watched, fresh, peers or {})
     tightened = tuple(tighten(limit, reserve) for limit in limits)
-    certified = fresh is not None and not (isinstance(ensemble, Members) and isinstance(fresh, int))
-    others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh or 0)
-    beside = ft.partial(
-        evaluate_beside, loop, others, scenario, peers=peers or {}, begun=loop.controller,
-        members=count, span=span, devices=devices,
-    )  # fmt: skip
-    first: list[Callable[[], Beside]] = []
-
-    def prepare() -> None:
-        if search is not None:
-            prepare_search(search, coordinates, coordinates.start)
 
     def traced() -> None:
-        if certified:
-            first.append(begin_evaluating(lambda: beside(key), devices, before=prepare))
+        if certifier is not None:
+            certifier.begin(search)
 
     solution = solve(
-        coordinates, problem, begun, stack_copies(objective, starts),
-        stack_copies(tightened, starts), method=method, rate=stabilising_rate(objective),
-        progress=watched, search=search, traced=traced,
+        coordinates, problem, scatter_starts(coordinates.start, starts, scatter, seed=0),
+        stack_copies(objective, starts), stack_copies(tightened, starts), method=method,
+        rate=stabilising_rate(objective), progress=watched, search=search, traced=traced,
     )  # fmt: skip
-    best, seconds, certificate, certificates = _best(solution), watched.seconds, None, 0
-    if certified:
+    best, seconds = _best(solution), watched.seconds
+    certified = _certify(certifier, solution, best, search if isinstance(fresh, int) else None)
+    return _tuned(job, coordinates, problem, certified, best, watched, seconds)
 
-        def judge(solution: Solution, key: Key[Array, ""], found: Beside) -> Certificate:
-            watched.say("certificate on fresh members ...")
-            design = build_design(coordinates, as_array(solution.z[best]))
-            return certify_beside(
-                loop.with_controller(design), others, scenario, found, limits=limits,
-                linear_members=None, key=key, span=span, name="tuned", devices=devices,
-            )  # fmt: skip
 
-        certificate, certificates = judge(solution, key, first[0]()), 1
-        if search is not None and isinstance(ensemble, Ensemble) and isinstance(fresh, int):
-            redraw = ft.partial(certified_members, loop, ensemble, flown=fresh)
-            again = lambda solution, key: judge(solution, key, beside(key))
-            solution, certificate, certificates, more = _certify_until_kept(
-                solution, certificate, again, redraw, search, best, key
-            )
-            seconds += more
+_SIZE = 256  # flights in a slice
+_CERTIFICATES = 3  # at most
+_AGAIN = 0xCE57  # folded into the key of certificates after the first
+
+
+class _Certifier:
+    """Certificates of a design, each on members of its own, beside peers and the start."""
+
+    def __init__(
+        self,
+        job: Job,
+        coordinates: Coordinates,
+        watched: Progress,
+        others: Ensemble | Members,
+        count: int,
+        peers: Mapping[str, PyTree],
+    ):
+        self.job, self.others, self.count = job, others, count
+        self._coordinates, self._watched = coordinates, watched
+        self._beside = ft.partial(
+            evaluate_beside, job.loop, others, job.scenario, peers=peers,
+            begun=job.loop.controller, members=count, span=job.span, devices=job.devices,
+        )  # fmt: skip
+        self._first: Callable[[], Beside] | None = None
+
+    def begin(self, search: Search | None) -> None:
+        """Begin, in a thread, with what the search needs and what stands beside the design."""
+
+        def prepare() -> None:
+            if search is not None:
+                prepare_search(search, self._coordinates, self._coordinates.start)
+
+        key, devices = self.job.key, self.job.devices
+        self._first = begin_evaluating(lambda: self._beside(key), devices, before=prepare)
+
+    def first(self, z: Float[np.ndarray, " n"]) -> Certificate:
+        """On members of the job's key."""
+        assert self._first is not None
+        return self._judge(z, self.job.key, self._first())
+
+    def again(self, z: Float[np.ndarray, " n"], key: Key[Array, ""]) -> Certificate:
+        """On members of another key."""
+        return self._judge(z, key, self._beside(key))
+
+    def members(self, key: Key[Array, ""]) -> list[Members]:
+        """Those of the certificate of that key; of an ensemble."""
+        assert isinstance(self.others, Ensemble)
+        return certified_members(self.job.loop, self.others, key, flown=self.count)
+
+    def _judge(self, z: Float[np.ndarray, " n"], key: Key[Array, ""], found: Beside) -> Certificate:
+        self._watched.say("certificate on fresh members ...")
+        job, design = self.job, build_design(self._coordinates, as_array(z))
+        return certify_beside(
+            job.loop.with_controller(design), self.others, job.scenario, found,
+            limits=job.limits, linear_members=None, key=key, span=job.span, name="tuned",
+            devices=job.devices,
+        )  # fmt: skip
+
+
+def _make_certifier(
+    job: Job,
+    coordinates: Coordinates,
+    watched: Progress,
+    fresh: int | Members | None,
+    peers: Mapping[str, PyTree],
+) -> _Certifier | None:
+    """`None` where no certificate is asked for, or nothing is left to draw it from."""
+    if isinstance(fresh, Members):
+        return _Certifier(job, coordinates, watched, fresh, 0, peers)
+    if fresh is None or isinstance(job.ensemble, Members):
+        return None
+    return _Certifier(job, coordinates, watched, job.ensemble, fresh, peers)
+
+
+class _Certified(NamedTuple):
+    """Where the descents ended, and what holds there on other members."""
+
+    solution: Solution
+    certificate: Certificate | None
+    certificates: int  # how many were made
+    seconds: float  # of descents between them
+
+
+def _certify(
+    certifier: _Certifier | None, solution: Solution, best: int, search: Search | None
+) -> _Certified:
+    """A certificate; and where it has members beyond a limit, tune on these and certify again.
+
+    Without a `search` there is one certificate.
+    """
+    if certifier is None:
+        return _Certified(solution, None, 0, 0.0)
+    found = _Certified(solution, certifier.first(solution.z[best]), 1, 0.0)
+    own = certifier.job.key
+    while search is not None and found.certificates < _CERTIFICATES:
+        assert found.certificate is not None
+        worst = certified_beyond(found.certificate, certifier.members(own))
+        if not worst.added:
+            break
+        began = time.perf_counter()
+        solution = go_on(found.solution, worst, search, best)
+        seconds = found.seconds + time.perf_counter() - began
+        own = jax.random.fold_in(certifier.job.key, _AGAIN + found.certificates)
+        certificate = certifier.again(solution.z[best], own)
+        found = _Certified(solution, certificate, found.certificates + 1, seconds)
+    return found
+
+
+def _tuned(
+    job: Job,
+    coordinates: Coordinates,
+    problem: Problem,
+    certified: _Certified,
+    best: int,
+    watched: Progress,
+    seconds: float,
+) -> Tuned:
+    solution, certificate = certified.solution, certified.certificate
     tuned = build_design(coordinates, as_array(solution.z[best]))
-    found = _limit_results(limits, solution, best)
+    found = _limit_results(job.limits, solution, best)
     bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
     convergence = judge_descent(solution, best, bounds, found)
     if certificate is not None:
@@ -212,116 +283,10 @@ def tune(
         minima=distinct_optima(solution, coordinates),
         evaluations=int(solution.evaluations[best]),
         stabilising=int(solution.stabilising[best]),
-        tail=solution.tail._replace(certificates=certificates),
+        tail=solution.tail._replace(certificates=certified.certificates),
         history=tuple(watched.history),
-        seconds=seconds,
+        seconds=seconds + certified.seconds,
         remarks=tuple(_remarks(tuned, problem, solution, best, found)),
-    )
-
-
-_WIDE = 256
-_CERTIFICATES = 3  # at most
-_AGAIN = 0xCE57  # folded into the key of certificates after the first
-
-
-def _certify_until_kept(
-    solution: Solution,
-    certificate: Certificate,
-    judge: Callable[[Solution, Key[Array, ""]], Certificate],
-    redraw: Callable[[Key[Array, ""]], list[Members]],
-    search: Search,
-    best: int,
-    key: Key[Array, ""],
-) -> tuple[Solution, Certificate, int, float]:
-    """Where certified members are beyond a limit, tune on these, too, and certify on others.
-
-    Also returns how many certificates there are, and how long that tuning took, in s.
-    """
-    seconds, number, own = 0.0, 1, key
-    for number in range(1, _CERTIFICATES + 1):
-        if number == _CERTIFICATES:
-            break
-        worst = certified_beyond(certificate, redraw(own))
-        if not worst.added:
-            break
-        began = time.perf_counter()
-        solution = go_on(solution, worst, search, best)
-        seconds += time.perf_counter() - began
-        own = jax.random.fold_in(key, _AGAIN + number)
-        certificate = judge(solution, own)
-    return solution, certificate, number, seconds
-
-
-def draw_or_take(
-    loop: Loop, ensemble: Ensemble | Members, count: int, key: Key[Array, ""]
-) -> Members:
-    """`count` members of an ensemble, or the members that were given."""
-    if isinstance(ensemble, Ensemble):
-        return ensemble.draw(loop, count, key)
-    require_same_rate(loop, ensemble)
-    return ensemble
-
-
-def _draw_limited(
-    loop: Loop, ensemble: Ensemble | Members, limits: Sequence[Limit], key: Key[Array, ""]
-) -> Members | None:
-    """More members where there are limits of the linear loop, whose worst case is in a corner."""
-    linear = any(QUANTITIES[limit.quantity].linear for limit in limits)
-    if isinstance(ensemble, Members) or not linear:
-        return None
-    return ensemble.draw(loop, _WIDE, jax.random.fold_in(key, 1))
-
-
-_FIRST = 2  # folded into the key of the first slice of loops that is searched
-_FLOWN = 0xF17E  # and of the first slice of flights
-_GUARDING = 0x6A2D  # of those that fly for limits alone
-_SIZE = 256  # flights in a slice
-_MARGIN = 0.01  # of the reserve, what is left once the worst of a search are tuned on
-
-
-def _search(
-    loop: Loop,
-    ensemble: Ensemble | Members,
-    drawn: Members,
-    scenario: Scenario,
-    limits: Sequence[Limit],
-    *,
-    reserve: float,
-    starts: int,
-    key: Key[Array, ""],
-    span: TimeSpan,
-    size: int,
-    devices: DeviceChoice,
-) -> Search | None:
-    """Members to search for those beyond limits, and the limits that those found have to keep."""
-    if isinstance(ensemble, Members) or not any(isinstance(x.over, Worst) for x in limits):
-        return None
-    fresh = lambda own, count: ensemble.fresh(loop, count, jax.random.fold_in(key, own))
-
-    def fly_around(controller: PyTree, members: Members) -> dict[str, np.ndarray]:
-        around = flying_loop(controller, members)
-        return fly(around, members.flight(scenario), span, devices).numbers
-
-    def problem(guards: Members) -> Problem:
-        flown = take_members([drawn, guards], [
-            *((0, k) for k in range(drawn.size)), *((1, k) for k in range(guards.size))
-        ])  # fmt: skip
-        assert flown is not None
-        return make_problem(
-            loop.controller, flown, scenario, span=span, devices=devices, counted=drawn.size
-        )
-
-    flights = FlightSearch(
-        lambda k: fresh(_FLOWN + k, size), fly_around, problem, fresh(_GUARDING, GUARDS), size
-    )
-    loops = ft.cache(lambda k: linear_loops(fresh(_FIRST + k, SLICE), devices))
-    aimed = [tighten(x, min(reserve, _MARGIN) if isinstance(x.over, Worst) else reserve)
-             for x in limits]  # fmt: skip
-    return Search(
-        loops if any(map(is_kept_by_loops, limits)) else None,
-        flights if any(map(is_kept_by_flights, limits)) else None,
-        stack_copies(tuple(limits), starts),
-        stack_copies(tuple(aimed), starts),
     )
 
 
@@ -329,17 +294,6 @@ def stabilising_rate(objective: Objective) -> float:
     """The abscissa in 1/s that every member is brought to before anything is flown."""
     knees = [float(p.knee) for p in objective.penalties if p.quantity == "abscissa"]
     return min([*knees, -0.1]) if knees else -0.5
-
-
-def tighten(limit: Limit, reserve: float) -> Limit:
-    """The limit with a reserve; raise ValueError for one outside of 0 <= reserve < 1."""
-    if not 0 <= reserve < 1:
-        raise ValueError(
-            f"reserve is {reserve}: give the share by which limits are tightened, as 0.03"
-        )
-    share = limit.sign * np.sign(np.asarray(limit.bound)) * reserve
-    name = "at_least" if limit.at_most is None else "at_most"
-    return Limit(limit.quantity, **{name: on_host(limit.bound) * (1 - share)}, over=limit.over)
 
 
 def _best(solution: Solution) -> int:
@@ -412,63 +366,3 @@ def _remarks(
         remark = lag_remark(controller, problem.linear.delay, problem.linear.axes.lag)
         if remark is not None:
             yield remark
-
-
-def require_kinds(
-    loop: object,
-    ensemble: object,
-    scenario: object,
-    objective: object,
-    limits: object,
-    method: object,
-) -> None:
-    """Raise ValueError for an argument of another kind, and for limits on no sum of squares."""
-    if not isinstance(loop, Loop):
-        raise ValueError(
-            f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...), whose "
-            "controller is the start"
-        )
-    if not isinstance(ensemble, Ensemble | Members):
-        raise ValueError(
-            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
-            "jq.ensembles.Members of it"
-        )
-    if not isinstance(scenario, Scenario):
-        raise ValueError(
-            f"scenario is a {type(scenario).__name__}: give jq.scenario(duration=..., ...)"
-        )
-    if not isinstance(objective, Objective):
-        name = type(objective).__name__
-        raise ValueError(f"objective is a {name}: give jq.Objective(terms={{'itae': 1.0}}, ...)")
-    if not isinstance(limits, Sequence) or not all(isinstance(x, Limit) for x in limits):
-        raise ValueError(f"limits are {limits}: give a list, as [jq.Limit('overshoot', at_most=5)]")
-    if not isinstance(method, LBFGS | GaussNewton):
-        raise ValueError(f"method is {method!r}: give jq.tuning.LBFGS() or jq.tuning.GaussNewton()")
-    if isinstance(method, GaussNewton):
-        require_squares(objective, limits)
-
-
-def _require_fresh(fresh: object, drawn: Members, peers: Mapping[str, PyTree] | None) -> None:
-    """Raise ValueError for members that are tuned on, and for a peer of the design's name."""
-    if "tuned" in (peers or {}):
-        raise ValueError("a peer has the name 'tuned' of the design itself: rename it")
-    if isinstance(fresh, Members):
-        data = [np.asarray(jax.random.key_data(x.keys)) for x in (fresh, drawn)]
-        mine, theirs = ({tuple(row) for row in x} for x in data)
-        if mine & theirs:
-            raise ValueError(
-                f"{len(mine & theirs)} of the fresh members are those that are tuned on: a "
-                "certificate needs others, as ensemble.fresh(loop, 256, key) draws them"
-            )
-
-
-def require_steps(problem: Problem, wanted: frozenset[str]) -> None:
-    """Raise ValueError for an overshoot where there is no step."""
-    if "overshoot" not in wanted:
-        return
-    steps = find_steps(problem.flight.reference, problem.parts)
-    if not np.any(np.asarray(steps.known & (steps.target != steps.before))):
-        raise ValueError(
-            "overshoot is wanted, but the reference makes no step from event to event: give a "
-            "scenario with one, and its times as Objective(events=...)"
-        )
