@@ -20,9 +20,10 @@ from ._drawn import draw_or_take, tighten
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty
 from ._parameters import build_design, Coordinates, select_coordinates
-from ._phases import find_bounds, Solution, solve
+from ._phases import Solution, solve
 from ._problem import DeviceChoice, make_problem, TimeSpan
 from ._quantities import QUANTITIES
+from ._refusal import find_bounds
 from ._requirements import require_kinds
 from ._tune import judge_descent, stabilising_rate
 from ._verdict import Verdict

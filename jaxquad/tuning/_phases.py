@@ -1,21 +1,19 @@
 """Stabilise, then optimise: all problems in lockstep, limits by an augmented Lagrangian."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxquad._core import as_array
-from jaxquad.control import ObserverController
 from jaxquad.ensembles import Members
 
 from ._cost import (
     CostResult,
-    count_members,
     evaluate_cost,
     Evaluation,
     Multipliers,
@@ -25,9 +23,11 @@ from ._cost import (
 )
 from ._gauss_newton import GaussNewton, minimise_squares
 from ._lbfgs import Descent, Evaluate, LBFGS, minimise, Pairs
+from ._multipliers import initial_multipliers, MET, Rounds, update_multipliers
 from ._objective import Limit, Objective
-from ._parameters import build_design, Coordinates
+from ._parameters import Coordinates
 from ._problem import Problem
+from ._refusal import find_refusal
 from ._tail import (
     Beyond,
     half_of_reserve,
@@ -38,73 +38,6 @@ from ._tail import (
     SEARCHES,
     Tail,
 )
-from ._verdict import Bound
-
-
-MET = 2e-3  # beyond a limit, as a level: 0.2 %
-_STIFFNESS, _STIFFER = 4.0, 4.0
-_STALLED = 0.9  # of what a limit was missed by before: it falls no further
-_AS_GOOD = 1.05  # of the least miss: of rounds that miss limits so nearly alike, the cost decides
-
-
-def initial_multipliers(problem: Problem, limits: Sequence[Limit], problems: int) -> Multipliers:
-    """Before anything is known of the limits."""
-    sizes = [count_members(problem, limit) for limit in limits]
-    values = tuple(as_array(np.zeros((problems, size))) for size in sizes)
-    return Multipliers(values, as_array(np.full((problems, len(sizes)), _STIFFNESS)))
-
-
-def update_multipliers(
-    result: CostResult,
-    multipliers: Multipliers,
-    before: Float[np.ndarray, "problems limits"],
-    on: Bool[np.ndarray, " problems"],
-) -> tuple[Multipliers, Float[np.ndarray, "problems limits"]]:
-    """The next multipliers of problems that are `on`, and how far each limit is missed.
-
-    A limit becomes stiffer where it is missed by more than a quarter of what it was `before`.
-    """
-    keep, values, most = np.asarray(on)[:, None], [], []
-    stiffness = np.asarray(multipliers.stiffness)
-    for k, beyond in enumerate(map(np.asarray, result.beyond)):
-        old = np.asarray(multipliers.values[k])
-        raised = np.maximum(old + stiffness[:, k : k + 1] * beyond, 0)
-        values.append(as_array(np.where(keep, raised, old)))
-        most.append(beyond.max(axis=1))
-    missed = np.stack(most, axis=1)
-    slow = missed > np.maximum(0.25 * before, MET)
-    stiffer = np.where(slow & keep, _STIFFER, 1.0) * stiffness
-    return Multipliers(tuple(values), as_array(stiffer)), missed
-
-
-class Rounds:
-    """Where each round of multipliers ended, and whether another one is worth it."""
-
-    def __init__(self) -> None:
-        self.points: list[Float[np.ndarray, "problems n"]] = []
-        self.costs: list[Float[np.ndarray, " problems"]] = []
-        self.missed: list[Float[np.ndarray, " problems"]] = []
-
-    def add(self, z: np.ndarray, cost: np.ndarray, beyond: np.ndarray) -> None:
-        self.points.append(np.array(z))
-        self.costs.append(np.asarray(cost))
-        self.missed.append(np.maximum(beyond, 0).sum(axis=1))
-
-    @property
-    def stalled(self) -> Bool[np.ndarray, " problems"]:
-        """Which problems miss limits by more than 2 %, and came no nearer to them in two rounds."""
-        if len(self.missed) < 3:
-            return np.zeros(len(self.points[0]), bool)
-        least, last, now = np.min(self.missed[:-2], axis=0), *self.missed[-2:]
-        return (now > 10 * MET) & (np.minimum(last, now) > _STALLED * least)
-
-    def best(self) -> Float[np.ndarray, "problems n"]:
-        """The last round's end where it meets the limits, else the one that misses them least."""
-        missed, costs = np.stack(self.missed), np.stack(self.costs)
-        near = missed <= _AS_GOOD * missed.min(axis=0)
-        chosen = np.argmin(np.where(near, costs, np.inf), axis=0)
-        chosen = np.where(missed[-1] <= 2 * MET, len(missed) - 1, chosen)
-        return np.stack([self.points[r][k] for k, r in enumerate(chosen)])
 
 
 _ROUNDS = 8  # of multipliers
@@ -405,50 +338,6 @@ class _Optimised(NamedTuple):
     result: CostResult
     beyond: Float[np.ndarray, "problems limits"]
     counts: Int[np.ndarray, " problems"]
-
-
-def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
-    """Why the controller at `z` cannot be built or must not be flown; empty if it can."""
-    controller = build_design(coordinates, as_array(z))
-    for part in _iter_modules(controller):
-        try:
-            _check_again(part)
-        except ValueError as error:
-            return str(error)
-    if not isinstance(controller, ObserverController):
-        return ""
-    return controller.observer_instability() or controller.observer_slowness()
-
-
-_NEAR, _FLAT = 0.02, 1e-3  # nepers to a bound, and the slope per neper that pushes against it
-
-
-def find_bounds(
-    coordinates: Coordinates, z: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]
-) -> tuple[Bound, ...]:
-    """The numbers that could lower the cost if the controller allowed them a small step more."""
-    found, values = [], coordinates.values(z)
-    for k, name in enumerate(values):
-        step = np.zeros_like(z)
-        step[k] = -_NEAR * np.sign(gradient[k])
-        if abs(gradient[k]) > _FLAT and (why := find_refusal(coordinates, z + step)):
-            found.append(Bound(name, values[name], why))
-    return tuple(found)
-
-
-def _check_again(module: eqx.Module) -> None:
-    """Raise ValueError where the module would refuse to be built with the values it has."""
-    for kind in type(module).__mro__:
-        if "__check_init__" in vars(kind):
-            vars(kind)["__check_init__"](module)
-
-
-def _iter_modules(tree: PyTree) -> Iterator[eqx.Module]:
-    """`tree` and the modules in it."""
-    if isinstance(tree, eqx.Module):
-        yield tree
-        for part in vars(tree).values():
-            yield from _iter_modules(part)
 
 
 def _require_finite(result: CostResult, able: np.ndarray) -> None:

@@ -27,8 +27,9 @@ from ._gauss_newton import GaussNewton
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective
 from ._parameters import build_design, Coordinates, select_coordinates
-from ._phases import find_bounds, go_on, Solution, solve
+from ._phases import go_on, Solution, solve
 from ._problem import DeviceChoice, Problem, TimeSpan
+from ._refusal import find_bounds
 from ._requirements import require_fresh, require_kinds, require_steps
 from ._tail import certified_beyond, prepare_search, Search
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned

@@ -27,8 +27,8 @@ from tuning_case import ensemble, EVENTS, flight, loop, objective, STARTS  # noq
 
 import jaxquad as jq  # noqa: E402
 from jaxquad.tuning._cost import evaluate_cost, SMOOTHING, stack_copies, Subproblem  # noqa: E402
+from jaxquad.tuning._multipliers import initial_multipliers  # noqa: E402
 from jaxquad.tuning._parameters import select_coordinates  # noqa: E402
-from jaxquad.tuning._phases import initial_multipliers  # noqa: E402
 from jaxquad.tuning._problem import linear_loops, make_problem, TimeSpan  # noqa: E402
 from jaxquad.tuning._tail import WorstLoops  # noqa: E402
 
