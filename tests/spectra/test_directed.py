@@ -114,6 +114,19 @@ def test_an_open_loop_is_none(name, noise, early):
     assert remarks_of(Record(TIME, u, y)) == []
 
 
+@pytest.mark.parametrize(("start", "damping", "seed"), [(0.05, 0.3, 4), (0.2, 0.2, 5)])
+def test_a_quiet_mode_that_is_sampled_slowly_is_none(start, damping, seed):
+    """Below its resonance it lags hardly, and its answers seem to move the input."""
+    plant: Any = signal.cont2discrete(([1.0], [1 / 40**2, 2 * damping / 40, 1.0]), DT)
+    u = signal.chirp(TIME, start, TIME[-1], 24.0, method="logarithmic")
+    y = filtered(np.ravel(plant[0]), plant[1], u)
+    y += 10**-2.5 * np.std(y) * np.random.default_rng(seed).standard_normal(SAMPLES)
+    found = frequency_response(
+        Record(TIME, u, y), np.geomspace(0.35, 120.0, 60), estimator=Welch(20.0)
+    )
+    assert not [each for each in found.remarks if each.startswith("feedback-dominated")]
+
+
 @pytest.mark.parametrize("samples", [3, 8])
 def test_an_output_before_its_input_is_named_with_the_time_that_explains_it(samples):
     flown = loop(P, seed=2, sweep=1.0, gust=0.02, noise=1e-3)
