@@ -163,19 +163,29 @@ def _as_zero(problem: Problem, solution: Solution, low: Sequence[int]) -> Soluti
     return marked._replace(values=at.values, model=at.model)
 
 
-def one_sided_limit(problem: Problem, solution: Solution, k: int, inflation: float) -> float:
+def one_sided_limits(
+    problem: Problem, solution: Solution, k: int, inflations: Sequence[float]
+) -> tuple[list[float], float]:
     """Where a parameter that may be zero leaves its one-sided 95 % interval, in its own unit.
 
     **Arguments:**
 
     - `problem`, `solution`: with the parameter at zero, or at so small a value that it might be.
     - `k`: which parameter.
-    - `inflation`: its variance over what the curvature of the cost says.
+    - `inflations`: its variance over what the curvature of the cost says, one for each limit.
 
-    **Returns:** the limit, with the parameter's sign; infinite where the cost does not rise so far.
+    **Returns:** the limits, with the parameter's sign, infinite where the cost does not rise so
+    far; and how far beyond zero the cost would be lowest, without a sign.
     """
-    local, z = _look(problem, solution), np.asarray(solution.z)
-    wanted = _RISE * inflation
+    local, unit = _look(problem, solution), float(np.asarray(solution.slopes)[k])
+    slope, curvature = _rise_from(local, k)
+    limits = [unit * _limit(problem, solution, local, k, _RISE * each) for each in inflations]
+    return limits, abs(unit) * slope / curvature
+
+
+def _limit(problem: Problem, solution: Solution, local: _Local, k: int, wanted: float) -> float:
+    """By which factor parameter `k` grows until the cost has risen by what is wanted."""
+    z = np.asarray(solution.z)
 
     def rise(times: float) -> float:
         at = z.copy()
@@ -193,15 +203,21 @@ def one_sided_limit(problem: Problem, solution: Solution, k: int, inflation: flo
             times = np.sqrt(low * min(high, 100 * low))
     else:
         times = times if np.isfinite(high) else np.inf
-    return float(np.asarray(solution.slopes)[k] * times)
+    return float(times)
 
 
 def _first_guess(local: _Local, k: int, wanted: float) -> float:
     """By the slope and the curvature at zero, over the value at which these are known."""
+    slope, curvature = _rise_from(local, k)
+    return (np.sqrt(slope**2 + curvature * wanted) - slope) / curvature
+
+
+def _rise_from(local: _Local, k: int) -> tuple[float, float]:
+    """Slope and curvature of the profile, over the value at which these are known."""
     jacobian = local.jacobian
     slope = float(jacobian[:, k] @ local.residual)
     curvature = 1 / max(float(scaled_inverse(jacobian.T @ jacobian)[k, k]), 1e-300)
-    return (np.sqrt(max(slope, 0.0) ** 2 + curvature * wanted) - max(slope, 0.0)) / curvature
+    return max(slope, 0.0), curvature
 
 
 _FAR = 50.0  # standard deviations, beyond which the hazard's digits cancel

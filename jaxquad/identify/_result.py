@@ -30,7 +30,14 @@ from ._origin import Origin
 from ._parameters import Parameters
 from ._simulated import linear_model
 from ._starts import Minimum
-from ._verdict import Combination, pooled_freedom, reach_of_interval, UndeterminedError, Verdict
+from ._verdict import (
+    Combination,
+    pooled_freedom,
+    reach_of_interval,
+    UndeterminedError,
+    USUAL,
+    Verdict,
+)
 from ._verify import Verification, verify
 
 
@@ -209,22 +216,29 @@ class Fit:
         """All numbers as JSON holds them, as in `result.json`: None for what is not finite."""
         return plain_content(fit_content(self))
 
-    def interval(self, name: str, *, model_error: bool = True) -> tuple[float, float]:
+    def interval(
+        self, name: str, *, level: float | int = USUAL, model_error: bool = True
+    ) -> tuple[float, float]:
         """The 95 % interval of one parameter; of one that keeps its sign, what has that sign.
 
         **Arguments:**
 
         - `name`: of the parameter.
+        - `level`: the share of such intervals that hold the truth: 0.9 for 90 %. That of a
+            parameter at zero ends at a one-sided limit.
         - `model_error`: count what the model's structure leaves unexplained, as
             `standard_errors` do; False for the measured noise alone.
+
+        **Raises:** KeyError for a name that the fit does not have, ValueError for a level that
+        does not lie between 0 and 1.
         """
         k = self._place(name)
         for bound in self.verdict.bounds:
             if bound.name == name:
-                limit = bound.limit if model_error else bound.noise_limit
+                limit = bound.limit_at(level, model_error=model_error)
                 return min(0.0, limit), max(0.0, limit)
         errors = self.standard_errors if model_error else self.noise_standard_errors
-        reach = reach_of_interval(float(self.degrees_of_freedom[k])) * errors[k]
+        reach = reach_of_interval(float(self.degrees_of_freedom[k]), level) * errors[k]
         low, high = float(self.values[k] - reach), float(self.values[k] + reach)
         if not (self.determined[k] and self.parameters.logarithmic[k]):
             return low, high

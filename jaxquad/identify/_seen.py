@@ -20,7 +20,7 @@ from ._accuracy import (
     ResponseTerm,
     scaled_inverse,
 )
-from ._bounds import apart_at_zero, inflation_at_zero, one_sided, one_sided_limit
+from ._bounds import apart_at_zero, inflation_at_zero, one_sided, one_sided_limits
 from ._discrepancy import describe_discrepancy, Discrepancy, discrepancy_effect, Mixture
 from ._identifiability import LIMIT
 from ._problem import Problem
@@ -78,11 +78,12 @@ def bounds_of(
             inflation = [inflation_at_zero(each, seen.bread, k, others) for each in parts]
         else:
             inflation = [float(each[k, k] / curvature[k, k]) for each in parts]
-        both = [one_sided_limit(problem, solution, k, each) for each in inflation]
-        moved = _along(seen, k) * abs(both[0] / units[k])
+        (limit, by_noise), beyond = one_sided_limits(problem, solution, k, inflation)
+        moved = _along(seen, k) * abs(limit / units[k])
         moved[[k, *(solution.at_zero if k in solution.at_zero else ())]] = 0.0
         if np.all(moved <= LIMIT):
-            bounds.append(Bound(names[k], float(np.asarray(solution.values)[k]), *both))
+            value = float(np.asarray(solution.values)[k])
+            bounds.append(Bound(names[k], value, limit, by_noise, beyond))
         elif k in solution.at_zero:
             tangled.append(k)
     return tuple(bounds), tangled

@@ -16,20 +16,33 @@ class UndeterminedError(ValueError):
     """A number was asked for that the record does not determine; a ValueError."""
 
 
-def reach_of_interval(degrees_of_freedom: float) -> float:
-    """How many standard errors reach from the middle of a 95 % interval to its end.
+USUAL = 0.95  # level of an interval
+
+
+def reach_of_interval(degrees_of_freedom: float, level: float | int = USUAL) -> float:
+    """How many standard errors reach from the middle of an interval to its end.
 
     **Arguments:**
 
     - `degrees_of_freedom`: of the noise estimate behind the standard errors; infinite where the
         noise is known.
+    - `level`: the share of intervals that hold the truth.
 
-    **Returns:** the 97.5 % point of Student's t.
+    **Returns:** the point of Student's t with half of 1 - `level` above it, 97.5 % by default.
     """
     # Imported here: scipy.special takes a tenth of the time of `import jaxquad`.
-    from scipy.special import stdtrit
+    from scipy.special import ndtri, stdtrit
 
-    return 1.96 if np.isinf(degrees_of_freedom) else float(stdtrit(degrees_of_freedom, 0.975))
+    _require_level(level)
+    if not np.isinf(degrees_of_freedom):
+        return float(stdtrit(degrees_of_freedom, 0.5 + level / 2))
+    return 1.96 if level == USUAL else float(ndtri(0.5 + level / 2))
+
+
+def _require_level(level: float | int) -> None:
+    is_number = isinstance(level, float | int | np.number) and not isinstance(level, bool)
+    if not (is_number and 0 < level < 1):
+        raise ValueError(f"level is {level!r}: give a share between 0 and 1, 0.9 for 90 %")
 
 
 def pooled_freedom(
@@ -51,7 +64,11 @@ class Combination(NamedTuple):
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval."""
-        reach = reach_of_interval(self.degrees_of_freedom) * self.standard_error
+        return self.interval_at(USUAL)
+
+    def interval_at(self, level: float | int) -> tuple[float, float]:
+        """The interval that holds the truth in this share of all flights, 0.9 for 90 %."""
+        reach = reach_of_interval(self.degrees_of_freedom, level) * self.standard_error
         return self.value - reach, self.value + reach
 
     def __str__(self) -> str:
@@ -69,6 +86,23 @@ class Bound(NamedTuple):
     value: float
     limit: float  # of the one-sided 95 % interval, with what the model leaves unexplained
     noise_limit: float  # likewise, by the measured noise alone
+    beyond: float  # how far on the other side of zero the cost would be lowest
+
+    def limit_at(self, level: float | int, *, model_error: bool = True) -> float:
+        """The limit of a one-sided interval of another level, for instance 0.9.
+
+        The cost rises as the square of the distance from its minimum, which may lie beyond zero;
+        how steeply is known from the 95 % limit.
+        """
+        from scipy.special import ndtri
+
+        _require_level(level)
+        limit = self.limit if model_error else self.noise_limit
+        if level == USUAL:
+            return limit
+        reach, minimum = abs(limit - self.value), self.beyond
+        rise = (max(ndtri(level), 0.0) / ndtri(USUAL)) ** 2 * reach * (reach + 2 * minimum)
+        return float(self.value + np.copysign(np.sqrt(minimum**2 + rise) - minimum, limit))
 
     def __str__(self) -> str:
         side = "below" if self.limit >= 0 else "above"

@@ -368,3 +368,17 @@ def test_a_lag_that_may_be_zero_has_one_verdict_from_every_start(seed):
         np.testing.assert_allclose(other.values, first.values, rtol=1e-5)
         np.testing.assert_allclose(other.interval("gain"), first.interval("gain"), rtol=1e-5)
         np.testing.assert_allclose(other.verdict.bounds[0].limit, bound.limit, rtol=0.02)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_limit_of_another_level_is_where_the_cost_has_risen_by_as_much(seed, monkeypatch):
+    """The profile is searched to 2 % of its rise: to 1 % of the limit."""
+    frf = response_of(jq.LaggedIntegrator(80.0, 1e-9, 0.02), error=0.05, seed=seed)
+    start = jq.LaggedIntegrator(70.0, 0.03, 0.02)
+    fit = jq.fit(start, frf, free=("gain", "lag"), cost=ML)
+    for level, score in ((0.68, 0.4677), (0.9, 1.2816), (0.999, 3.0902)):
+        monkeypatch.setattr("jaxquad.identify._bounds._RISE", score**2)
+        (bound,) = jq.fit(start, frf, free=("gain", "lag"), cost=ML).verdict.bounds
+        for model_error, limit in ((True, bound.limit), (False, bound.noise_limit)):
+            low, high = fit.interval("lag", level=level, model_error=model_error)
+            assert low == 0 and high == pytest.approx(limit, rel=0.02)

@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 import pytest
+from scipy.stats import t as student_t
 from synthetic import response_of
 
 import jaxquad as jq
@@ -107,3 +108,26 @@ def test_an_interval_keeps_the_sign_of_its_parameter():
     moved = dataclasses.replace(fit, values=values, verdict=verdict)
     assert moved.interval("zero")[0] < 0 == moved.interval("zero")[1]
     assert moved.interval("zeta")[0] == 0 < moved.interval("zeta")[1]
+    assert moved.interval("zeta", level=0.99)[0] == 0
+
+
+@pytest.mark.parametrize("model_error", [True, False])
+@pytest.mark.parametrize("freedom", [9.0, np.inf])
+def test_an_interval_of_another_level_reaches_as_far_as_students_t(freedom, model_error):
+    fit = fitted(0, Zero(6.0, 0.5, 0.7, 5.0))
+    fit = dataclasses.replace(fit, degrees_of_freedom=np.full(4, freedom))
+    errors = fit.standard_errors if model_error else fit.noise_standard_errors
+    for level in (0.5, 0.9, 0.99):
+        reach = student_t(freedom).ppf(0.5 + level / 2) * errors[0]
+        wanted = fit["gain"] - reach, fit["gain"] + reach
+        assert fit.interval("gain", level=level, model_error=model_error) == pytest.approx(wanted)
+    derived = fit.derived(lambda model: model.gain, model_error=model_error)
+    assert derived.interval_at(0.99) == pytest.approx(wanted, rel=1e-6)
+
+
+@pytest.mark.parametrize("level", [0, 1, 95, -0.5, np.nan, True])
+def test_a_level_that_is_no_share_is_refused(level):
+    fit = fitted(0, Zero(6.0, 0.5, 0.7, 5.0))
+    for name in ("gain", "zero"):
+        with pytest.raises(ValueError, match="level is .*: give a share between 0 and 1"):
+            fit.interval(name, level=level)
