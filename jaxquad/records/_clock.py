@@ -118,11 +118,14 @@ def check_uniform(time: Times) -> None:
     if worst > JITTER:
         step = np.diff(time)
         i = int(np.abs(step - np.median(step)).argmax())
+        missing = step[i] > longest_step(time)
+        gap = "; as rows are missing, state there how long a gap may be (max_gap=, in s)"
         raise RecordError(
             f"time is not uniformly sampled: the time stamps lie up to {worst:.3g} samples off a "
             f"uniform grid (limit {JITTER}); the most unusual step is {step[i]:.6g} s at "
             f"t = {time[i]:.6g} s, the median step {np.median(step):.6g} s. "
-            f"Resample the record with jq.read(..., sample_rate=) or jq.records.resample."
+            "Resample it with jq.read(..., sample_rate=), jq.Record.from_dataframe(..., "
+            f"sample_rate=) or jq.records.resample{gap if missing else ''}."
         )
 
 

@@ -46,6 +46,17 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
     return f"there is no channel {name!r}.{guess} The channels are: {listed(known)}."
 
 
+def choose_range(it: str) -> str:
+    """Advice to leave a part of the data out."""
+    return f"Choose a range without {it} (start=, stop=) in jq.read, or cut the arrays"
+
+
+def mend_holes(it: str) -> str:
+    """Advice where values are missing."""
+    gaps = "let gaps up to some length in s be interpolated (max_gap=)"
+    return f"{choose_range(it)}, or {gaps}."
+
+
 def listed(names: Iterable[str]) -> str:
     """The names, separated by commas; of many, the first 40."""
     names = list(names)

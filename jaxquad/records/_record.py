@@ -19,7 +19,7 @@ from ._clock import (
     PER_SECOND,
     TimeUnit,
 )
-from ._errors import RecordError, RecordWarning, unknown_name
+from ._errors import mend_holes, RecordError, RecordWarning, unknown_name
 from ._repair import as_float64, check_ranges, repair_values, Valid
 
 
@@ -393,9 +393,8 @@ def _check_channels(record: Record) -> None:
         if bad.size:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
-                f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s. "
-                f"Choose a range without them (start=, stop=), or let gaps up to some "
-                f"length in s be interpolated (max_gap=)."
+                f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s"
+                f"{_longest_hole(record.time, np.isfinite(values))}. {mend_holes('them')}"
             )
         largest = float(np.max(np.abs(values)))
         if largest and not _SMALLEST <= largest <= 1 / _SMALLEST:
@@ -411,6 +410,13 @@ def _check_channels(record: Record) -> None:
                 RecordWarning,
                 stacklevel=4,
             )
+
+
+def _longest_hole(time: np.ndarray, good: np.ndarray) -> str:
+    """How far apart the good neighbours of a hole are; nothing where it reaches an end."""
+    if not (good[0] and good[-1]):
+        return ""
+    return f", the longest gap {np.max(np.diff(time[good])):.4g} s"
 
 
 def _as_names(names: Names, letter: str, count: int) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from ._clock import (
     nonuniformity,
     scatters,
 )
-from ._errors import RecordError, RecordWarning
+from ._errors import choose_range, mend_holes, RecordError, RecordWarning
 from ._repair import as_float64, longest_gap
 
 
@@ -109,14 +109,13 @@ def _raise_for_break(channel: Channel, index: int, max_gap: float | int | None) 
         i = index + int(np.isfinite(pair[0]))
         raise RecordError(
             f"channel {channel.name!r} is {channel.values[i]} at sample {i}, "
-            f"t = {channel.time[i]:.6g} s. Choose a range without it (start=, stop=), "
-            f"or let gaps up to some length in s be interpolated (max_gap=)."
+            f"t = {channel.time[i]:.6g} s. {mend_holes('it')}"
         )
     longest = longest_gap(channel.time, max_gap)
     raise RecordError(
         f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
         f"t = {left:.6g} s to {right:.6g} s (limit {1e3 * longest:.4g} ms). "
-        f"Choose a range without it (start=, stop=), or allow it, by its length in s (max_gap=)."
+        f"{choose_range('it')}, or allow it, by its length in s (max_gap=)."
     )
 
 

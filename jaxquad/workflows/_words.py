@@ -29,7 +29,9 @@ _PHRASES = {
     r", jq\.records\.channels\b": "",
     r"name inputs, outputs and references yourself": "name them (--input, --output, --reference)",
     r" \(jq\.Record, jq\.read\)": "",
-    r"jq\.read\(\.\.\., sample_rate=\) or jq\.records\.resample": "--rate",
+    r"jq\.read\(\.\.\., sample_rate=\), jq\.Record\.from_dataframe\([^)]*\) or "
+    r"jq\.records\.resample": "--rate",
+    r" in jq\.read, or cut the arrays": "",
     r" \(estimator=jq\.spectra\.LocalPolynomial\(\)\)": " (without --reference)",
     r"select other channels with jq\.records\.select, or ": "",
     r"pick channels with jq\.records\.select": "name one channel each with --input and --output",

@@ -91,10 +91,15 @@ def spoilt(values, value):
         ),
         (dict(time=spoilt(TIME, np.nan)), "time stamp 20 is nan"),
         (dict(time=np.delete(TIME, 50), inputs=U[1:], outputs=Y[1:]), "step is 0.04 s at t = 0.98"),
-        (dict(time=TIME**1.01), "up to .* samples off a uniform.*jq.read.*jq.records.resample"),
+        (
+            dict(time=np.delete(TIME, 50), inputs=U[1:], outputs=Y[1:], max_gap=1.0),
+            r"jq.Record.from_dataframe\(.*\) or .*resample; as rows are missing, .* \(max_gap=",
+        ),
+        (dict(time=TIME**1.01), r"up to .* samples off a uniform.*jq.read.*jq.records.resample\.$"),
         (
             dict(inputs=spoilt(U, np.nan)),
-            "channel 'u' holds 2 NaN and 0 inf, the first at t = 0.4 s",
+            "channel 'u' holds 2 NaN and 0 inf, the first at t = 0.4 s, the longest gap 0.04 s. .* "
+            r"\(start=, stop=\) in jq.read, or cut the arrays, or let gaps .* \(max_gap=\)",
         ),
         (
             dict(outputs=spoilt(Y, -np.inf)),
