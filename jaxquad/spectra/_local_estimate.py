@@ -254,8 +254,8 @@ def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:
         return ()
     text = (
         "no response {where}: the fit there leaves more than ten times the noise nearby, as beside "
-        "a mode that rings or a narrow line in the noise. Record longer, and 3 to 10 s of rest at "
-        "the end"
+        "a mode that rings or a line (a tone, as of a rotor or the mains). Record longer, and "
+        "3 to 10 s of rest at the end"
     )
     return (Remark(text, omega),)
 
@@ -265,7 +265,8 @@ def _remark_on_ringing(omega: Grid) -> tuple[Remark, ...]:
         return ()
     text = (
         "the output still moves when the record ends, and a global model leaves more than ten "
-        "times the noise {where}: a mode that rings there is mistaken for response. Record 3 to "
-        "10 s of rest at the end, sweep wider, or raise global_order"
+        "times the noise {where}: a mode that rings there, or a line (a tone, as of a rotor or the "
+        "mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider, or "
+        "raise global_order; leave the frequencies of a line out"
     )
     return (Remark(text, omega),)
