@@ -1,6 +1,7 @@
 """From a log of a simulated PX4 to its parameters: what is tuned, refused, and written."""
 
 import json
+from types import SimpleNamespace
 
 import blackbox_rows
 import blackbox_writer
@@ -14,6 +15,7 @@ from scipy import signal
 from jaxquad.cli import main
 from jaxquad.control.autopilots import betaflight_loop, px4_loop
 from jaxquad.workflows import AutopilotSettings, SettingsError
+from jaxquad.workflows._autopilot._proposal import AutopilotProposal
 
 
 VEHICLE = Vehicle()
@@ -96,7 +98,33 @@ def test_other_gains_than_those_of_the_log_are_noticed(tmp_path, capsys):
     assert main(["autopilot", str(path), "--axis", "roll", "--out", str(tmp_path / "out")]) == 3
     written = sorted(each.name for each in (tmp_path / "out").iterdir())
     assert written == ["autopilot.html", "autopilot.json", "proposal_revert.params"]
-    assert "this log cannot tell" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "this log cannot tell" in text and text.count("not the one that flew") == 1
+
+
+POOR = "not identifiable from this record: coherence reaches 0.6 at 0 of 100 frequencies"
+AGAIN = "the loop of these gains is not the one that flew: 31 % off"
+
+
+class PoorFit(SimpleNamespace):
+    verdict = SimpleNamespace(summary=POOR)
+
+    def __str__(self):
+        return f"NOT {POOR}"
+
+
+@pytest.mark.parametrize("verdict", [f"this log cannot tell: {POOR}; fly a chirp", AGAIN])
+def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict):
+    """Of stand-ins: such fits and loops were printed of a measured flight, each sentence twice."""
+    flown = SimpleNamespace(version=(4, 2), axis=0, firmware="betaflight", unmodelled=(), old={})
+    found = object.__new__(AutopilotProposal)
+    vars(found).update(
+        kind="cannot tell", verdict=verdict, flown=flown, stages=(), throttle=None, filters=None,
+        identification=SimpleNamespace(fit=PoorFit()), reproduction=SimpleNamespace(verdict=AGAIN),
+    )  # fmt: skip
+    text = str(found)
+    assert text.count(AGAIN) == text.count(POOR) == 1
+    assert ("cannot tell: it does not determine the plant" in text) == (POOR in verdict)
 
 
 RATE, LAG, GAIN, LATE = 1000, 0.025, 60.0, 3  # Hz, s, deg/s^2 per pidsum, samples

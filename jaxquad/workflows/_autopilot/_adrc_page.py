@@ -55,6 +55,8 @@ def adrc_page(found: "ADRCAutopilot", origin: Provenance) -> PilotPage:
 def _headlines(found: "ADRCAutopilot") -> list[Headline]:
     headlines = [Headline(*VERDICTS[found.kind], found.verdict)]
     for throttle, each in found.reproductions.items():
+        if each.verdict in found.verdict:
+            continue
         flew = each.kind == "flown"
         word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
         level = "good" if flew else "warn" if each.kind == "unknown" else "bad"

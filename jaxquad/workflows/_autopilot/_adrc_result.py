@@ -243,11 +243,12 @@ class ADRCAutopilot:
             lines.append(f"  adrc_b0_law = {schedule.law}, hover {100 * schedule.hover:.0f} %")
         lines += [f"  not modelled: {each}" for each in self.flown.unmodelled]
         lines += ["", str(self.plant)] if self.plant is not None else []
-        lines += [""] if self.reproductions else []
-        lines += [
+        again = [
             f"flown loop at {x:.2f} throttle: {each.verdict}"
             for x, each in self.reproductions.items()
+            if each.verdict not in self.verdict
         ]
+        lines += ["", *again] if again else []
         if self.proposal is not None:
             lines += ["", self.proposal.table()]
         if self.new:

@@ -75,11 +75,12 @@ VERDICTS = {
 
 def _headlines(found: "AutopilotProposal") -> list[Headline]:
     headlines = [Headline(*VERDICTS[found.kind], found.verdict)]
-    if found.reproduction is not None:
-        flew = found.reproduction.kind == "flown"
+    again = found.reproduction
+    if again is not None and again.verdict not in found.verdict:
+        flew = again.kind == "flown"
         word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
         level = "good" if flew else "bad"
-        headlines.append(Headline(level, word, found.reproduction.verdict))
+        headlines.append(Headline(level, word, again.verdict))
     if found.filters is not None:
         level = "good" if found.filters.flown else "warn"
         headlines.append(Headline(level, "FILTERS", found.filters.text))

@@ -207,8 +207,9 @@ class AutopilotProposal:
         lines += [f"  not modelled: {each}" for each in flown.unmodelled]
         plant = "plant up to the gyro's filters, in the firmware's units"
         lines += ["", f"{plant}:\n{self.identification.fit}"]
-        if self.reproduction is not None:
-            lines += ["", f"flown loop: {self.reproduction.verdict}"]
+        again = self.reproduction
+        if again is not None and again.verdict not in self.verdict:
+            lines += ["", f"flown loop: {again.verdict}"]
         if self.stages:
             lines += ["", _stage_table(self.stages)]
         if self.throttle is not None:
@@ -222,7 +223,13 @@ class AutopilotProposal:
             lines += ["", f"thrust curve: {curve.text}"]
             if curve.change is not None:
                 lines += ["", change_table([curve.change]).rstrip()]
-        return "\n".join([*lines, "", self.verdict])
+        return "\n".join([*lines, "", self._verdict_below_the_plant])
+
+    @property
+    def _verdict_below_the_plant(self) -> str:
+        """The verdict, without what was just said of the plant."""
+        fit = self.identification.fit.verdict
+        return self.verdict.replace(fit.summary, "it does not determine the plant (above)")
 
 
 _WAYS = ("what flew", "a third of the way", "all of it")
