@@ -254,7 +254,7 @@ class GainOverThrottle(eqx.Module):
             raise ValueError(f"hover is {hover}: give the throttle at hover, above 0 and up to 1")
         self._require_lag()
         factor = _DEGREES[self.output_unit]
-        value, error, freedom = self._b0_at(hover)[1:]
+        value, error, freedom = self._b0_at(hover)[1:4]
         b0 = Combination("b0", factor * value, factor * error, freedom)
         grid = np.linspace(self.low.min(), self.high.max(), 41)
         measured = self.b0_over(grid).value / value

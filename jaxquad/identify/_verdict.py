@@ -60,6 +60,7 @@ class Combination(NamedTuple):
     value: float
     standard_error: float
     degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard error
+    unit: str = ""  # where it is known
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -73,8 +74,9 @@ class Combination(NamedTuple):
 
     def __str__(self) -> str:
         low, high = self.interval
+        unit = f" {self.unit}" if self.unit else ""
         return (
-            f"{self.name} = {self.value:.5g} +- {self.standard_error:.2g} "
+            f"{self.name} = {self.value:.5g} +- {self.standard_error:.2g}{unit} "
             f"(std. error; 95 %: {low:.5g} .. {high:.5g})"
         )
 

@@ -165,7 +165,10 @@ def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -
             for k, name in enumerate(fit.names)
             if fit.determined[k] and _reach(fit, k) <= _LOOSE
         ]
-        answers += [f"{each.name}: {each.value:.4g}." for each in fit.combinations]
+        answers += [
+            f"{each.name}: {each.value:.4g}{f' {each.unit}' if each.unit else ''}."
+            for each in fit.combinations
+        ]
     answers += [
         f"What happens in {name}: predicted, TIC {c.tic:.3f}."
         for name, c in checks.items()

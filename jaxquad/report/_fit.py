@@ -29,10 +29,7 @@ def parameter_section(
     rows = [_parameter(fit, k) for k in range(len(fit.names))]
     rows += [[*_estimate(each), *[_DASH] * (len(heads) - 4 - bool(units))] for each in derived]
     if units:
-        dashes = [_DASH] * len(derived)
-        rows = [
-            [name, each, *rest] for (name, *rest), each in zip(rows, [*units, *dashes], strict=True)
-        ]
+        rows = _with_units(rows, [*units, *(each.unit or _DASH for each in derived)])
     return {
         "table": Table("Identified parameters", heads, rows),
         "bounds": [f"{bound:g}" for bound in _BOUNDS],
@@ -161,7 +158,16 @@ def _combinations(fit: Fit) -> Table | None:
     if not fit.combinations:
         return None
     heads = ("combination", "value", "std. error", "95 % interval")
-    return Table("Combinations that are determined", heads, [*map(_estimate, fit.combinations)])
+    rows = [_estimate(each) for each in fit.combinations]
+    if fit.parameter_units:
+        heads = ("combination", "unit", *heads[1:])
+        rows = _with_units(rows, [each.unit or _DASH for each in fit.combinations])
+    return Table("Combinations that are determined", heads, rows)
+
+
+def _with_units(rows: Sequence[list[str | Cell]], units: Sequence[str]) -> list[list[str | Cell]]:
+    """Rows with a unit behind each name."""
+    return [[name, each, *rest] for (name, *rest), each in zip(rows, units, strict=True)]
 
 
 def _directions(fit: Fit) -> Table | None:

@@ -1,6 +1,7 @@
 """Responses and fits of an identification, over the whole band and over parts of it."""
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxquad._core import announce
 from jaxquad.identify import (
     CoherenceWeighted,
+    Combination,
     Fit,
     fit,
     fit_transfer_function,
@@ -147,7 +149,7 @@ def total_delay(model: Model) -> Float[Array, ""]:
 
 
 def sums_of(settings: IdentifySettings) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:
-    """The quantities that are shown beside the parameters."""
+    """The quantities that are shown beside the parameters, all in s."""
     both = settings.poles is None and settings.lag and settings.delay
     return {"lag + delay": total_delay} if both else {}
 
@@ -249,4 +251,17 @@ def with_units(fit: Fit, record: Record) -> Fit:
         fit.model, fit.names,
         output=output or record.output_names[0], input=source or record.input_names[0],
     )  # fmt: skip
-    return dataclasses.replace(fit, parameter_units=units)
+    known = dict(zip(fit.names, units, strict=True))
+    combinations = tuple(each._replace(unit=_unit_of_sum(each, known)) for each in fit.combinations)
+    verdict = dataclasses.replace(fit.verdict, combinations=combinations)
+    return dataclasses.replace(fit, parameter_units=units, verdict=verdict)
+
+
+_TERM = r"(?:[\d.]+ )?(\S+)"  # of a sum: `lag`, `2 lag`
+
+
+def _unit_of_sum(sum_of: Combination, units: Mapping[str, str]) -> str:
+    """The unit that all parameters in a sum have; empty for products, and where there is none."""
+    terms = [re.fullmatch(_TERM, term) for term in re.split(r" [+-] ", sum_of.name)]
+    found = {units.get(term[1], "") if term else "" for term in terms}
+    return found.pop() if len(terms) > 1 and len(found) == 1 else ""

@@ -125,9 +125,12 @@ class Identification:
     def combinations(self) -> tuple[Combination, ...]:
         """The sum of lag and delay, where the record determines it."""
         try:
-            return tuple(self.fit.derived(q, name) for name, q in sums_of(self.settings).items())
+            return tuple(map(self._sum, sums_of(self.settings)))
         except UndeterminedError:
             return ()
+
+    def _sum(self, name: str) -> Combination:
+        return self.fit.derived(sums_of(self.settings)[name], name)._replace(unit="s")
 
     @property
     def beside(self) -> dict[str, str]:
@@ -177,9 +180,7 @@ class Identification:
             parts += [f"\n{compare_fits(self.fits, sums)}"]
         elif self.fit.verdict.fitted:
             parts += [
-                _text_or_reason(lambda n=name, q=quantity: self.fit.derived(q, n))
-                for name, quantity in sums.items()
-                if name not in known
+                _text_or_reason(ft.partial(self._sum, name)) for name in sums if name not in known
             ]
         if self.parts:
             parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, sums)}"]

@@ -1,6 +1,8 @@
 """`jq.workflows.identify` gives in Python what the command line gives, and can be made again."""
 
+import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -70,6 +72,7 @@ def test_numbers_and_figures_are_at_hand_without_a_folder(found):
     assert found.fit.model.gain == found.fit.values[0]
     [total] = found.combinations
     assert total.value == pytest.approx(found.fit.values[1] + found.fit.values[2])
+    assert total.unit == "s" and "s (std. error" in str(total) and str(total) in str(found)
     assert list(found.figures()) == ["record.png", "bode.png"]
     assert found.formula == "q / M = K e^(-delay s) / (s (lag s + 1))"
 
@@ -101,6 +104,12 @@ def test_a_result_is_made_again_from_its_settings(found, folder, log, tmp_path):
         identify_again(folder, log=moved)
 
 
+def test_the_sum_of_lag_and_delay_has_its_unit_in_the_report(folder):
+    page = (folder / "report.html").read_text()
+    row = re.search(r"<bdi>lag \+ delay</bdi></th>(.*?)</tr>", page, re.S)
+    assert row and re.sub(r"<[^>]+>", " ", row[1]).split()[0] == "s"
+
+
 def test_a_stored_model_is_that_of_the_fit(found, folder):
     stored = load_result(folder / "result.json")
     assert stored.band == pytest.approx(found.band) and stored.doubts == ()
@@ -126,6 +135,27 @@ def test_a_narrow_band_is_named_in_options():
     remedies = _fits.with_remedies(few, IdentifySettings()).verdict.remedies
     advice = "excite the axis (jaxquad design sweep) over more than 5 to 8 rad/s"
     assert remedies[0].startswith(advice)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("lag + delay", "s"),
+        ("lag - 2 delay", "s"),
+        ("gain + lag", ""),
+        ("gain lag", ""),
+        ("x + lag", ""),
+    ],
+)
+def test_a_sum_has_the_unit_of_all_its_terms(name, unit):
+    truth = jq.LaggedIntegrator(8.0, 0.05, 0.03)
+    fit = jq.fit(truth, response_of(truth, omega=np.geomspace(1.0, 30.0, 40)))
+    verdict = dataclasses.replace(
+        fit.verdict, combinations=(jq.identify.Combination(name, 1.0, 0.1),)
+    )
+    record = jq.Record(np.arange(16.0) / 10, np.arange(16.0), np.arange(16.0))
+    [found] = _fits.with_units(dataclasses.replace(fit, verdict=verdict), record).combinations
+    assert found.unit == unit and f"0.1{unit and ' '}{unit} (std. error" in str(found)
 
 
 def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
