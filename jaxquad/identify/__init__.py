@@ -24,6 +24,7 @@ from ._curves import (
     step_response as step_response,
     StepBand as StepBand,
 )
+from ._derived import Tied as Tied
 from ._discrepancy import Discrepancy as Discrepancy
 from ._draw_models import (
     check_drawable as check_drawable,

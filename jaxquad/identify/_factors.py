@@ -1,5 +1,6 @@
 """A fitted transfer function as gain, zeros and poles with their standard errors."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,7 +9,9 @@ from jaxtyping import Complex, Float
 
 from jaxquad.models import TransferFunction
 
+from ._derived import propagate
 from ._identifiability import LIMIT
+from ._parameters import number_at
 from ._result import Fit
 from ._verdict import Combination, UndeterminedError
 
@@ -127,19 +130,20 @@ def factors(fit: Fit) -> Factors:
         raise UndeterminedError(f"no factors, for no coefficient is determined: {advice}")
     spread = _Spread(fit.relative_covariance, fit.verdict.exact, fit.identifiable)
     above, below = (np.asarray(c) for c in (model.numerator, model.denominator))
+    known = _slopes_of_numbers(fit)
     gain_slope = (
-        _slopes(fit, "numerator", 1)[0] / below[0]
-        - above[0] / below[0] ** 2 * (_slopes(fit, "denominator", 1)[0])
+        _slopes(known, "numerator", 1)[0] / below[0]
+        - above[0] / below[0] ** 2 * (_slopes(known, "denominator", 1)[0])
     )
-    late = _slopes(fit, "delay", 1)[0]
+    late = _slopes(known, "delay", 1)[0]
     integrators = _integrators(fit, below)
     gain = *spread.given(float(above[0] / below[0]), gain_slope), fit.freedom_of(gain_slope)
     return Factors(
         gain=Combination("gain", *gain),
-        zeros=_factored(above, _slopes(fit, "numerator", above.size), spread),
+        zeros=_factored(above, _slopes(known, "numerator", above.size), spread),
         poles=_factored(
             below[: below.size - integrators],
-            _slopes(fit, "denominator", below.size - integrators),
+            _slopes(known, "denominator", below.size - integrators),
             spread,
         ),
         integrators=integrators,
@@ -147,14 +151,24 @@ def factors(fit: Fit) -> Factors:
     )
 
 
-def _slopes(fit: Fit, leaf: str, count: int) -> Float[np.ndarray, "coefficients parameters"]:
-    """Derivatives of coefficients by the relative changes of the free parameters."""
-    rows = np.zeros((count, len(fit.names)))
-    for k, name in enumerate(fit.names):
+Slopes = Mapping[str, Float[np.ndarray, " parameters"]]
+
+
+def _slopes_of_numbers(fit: Fit) -> Slopes:
+    """Derivatives of free and tied numbers by the relative changes of the free ones."""
+    free = dict(zip(fit.names, np.diag(fit.units), strict=True))
+    ties = fit.parameters.ties
+    return free | {place.name: propagate(fit, number_at(place)).slope for place, _ in ties}
+
+
+def _slopes(known: Slopes, leaf: str, count: int) -> Float[np.ndarray, "coefficients parameters"]:
+    """Of the coefficients in one field of the model."""
+    rows = np.zeros((count, len(next(iter(known.values())))))
+    for name, slope in known.items():
         where, _, index = name.partition("[")
         row = int(index.rstrip("]") or 0)
         if where == leaf and row < count:
-            rows[row, k] = fit.units[k]
+            rows[row] = slope
     return rows
 
 

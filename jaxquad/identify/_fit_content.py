@@ -1,9 +1,11 @@
 """A fit as text, and as the content of `result.json`."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from ._derived import Tied
 from ._discrepancy import Discrepancy, SHARES
 
 
@@ -25,31 +27,40 @@ def fit_table(fit: "Fit") -> str:
 _MARK = " *"  # behind the name of a parameter that is not determined
 
 
+class _Row(NamedTuple):
+    """A parameter in the table."""
+
+    name: str
+    unit: str
+    value: str
+    error: str
+    interval: str
+    beside: str  # what the noise alone says
+    percents: str  # Cramer-Rao bound and insensitivity
+    determined: bool
+
+    @property
+    def label(self) -> str:
+        return self.name if self.determined else f"{self.name}{_MARK}"
+
+
 def _parameters(fit: "Fit") -> list[str]:
-    marks = np.where(fit.determined, "", _MARK)
-    names = [f"{name}{mark}" for name, mark in zip(fit.names, marks, strict=True)]
-    width = max(9, *map(len, names))
-    units = fit.parameter_units or ("",) * len(names)
-    wide = max(map(len, units))
-    heads = (f"{'parameter':<{width}}", *([f"{'unit':<{max(4, wide)}}"] if wide else []))
-    heads = (*heads, f"{'value':>11}", f"{'std. error':>10}")
+    tied = fit.tied
+    rows = [*(_free(fit, k) for k in range(len(fit.names))), *(_of_tied(fit, t) for t in tied)]
+    width = max(9, *(len(row.label) for row in rows))
+    wide = max(len(row.unit) for row in rows)
     apart = fit.discrepancy is not None
-    heads = (*heads, f"{'95 % interval':>23}", *([_BESIDE] if apart else []))
-    heads = (*heads, f"{'CR %':>7}", f"{'insens. %':>9}")
-    heads += () if fit.identifiable else (f"{'stopped at':>11}",)
-    lines = [" ".join(heads)]
-    for k, name in enumerate(names):
-        low, high = fit.interval(fit.names[k])
-        value, interval = f"{fit.values[k]:.5g}", f"{low:.5g} .. {high:.5g}"
-        stopped = "" if fit.determined[k] else value
-        if stopped:
-            value, interval = "-", "not determined"
-        cells = [f"{units[k]:<{max(4, wide)}}"] if wide else []
-        cells += [f"{value:>11}", f"{fit.standard_errors[k]:10.2g}", f"{interval:>23}"]
-        cells += [_by_noise(fit, k)] if apart else []
-        percent = f"{fit.cramer_rao[k]:7.2f}", f"{fit.insensitivity[k]:9.2f}"
-        cells += percent if np.isfinite(fit.insensitivity[k]) else (f"{'-':>7}", f"{'-':>9}")
-        lines.append(" ".join([f"{name:<{width}}", *cells, f"{stopped:>11}"]).rstrip())
+    lines = [_heads(fit, width, wide)]
+    for row in rows:
+        value, interval, stopped = row.value, row.interval, ""
+        if not row.determined:
+            value, interval, stopped = "-", "not determined", row.value
+        cells = [f"{row.unit:<{max(4, wide)}}"] if wide else []
+        cells += [f"{value:>11}", row.error, f"{interval:>23}", *([row.beside] if apart else [])]
+        lines.append(
+            " ".join([f"{row.label:<{width}}", *cells, row.percents, f"{stopped:>11}"]).rstrip()
+        )
+    lines += _ties(tied)
     if apart:
         lines.append(_how_wide(fit))
     if not fit.identifiable:
@@ -58,6 +69,44 @@ def _parameters(fit: "Fit") -> list[str]:
     return lines
 
 
+def _heads(fit: "Fit", width: int, wide: int) -> str:
+    heads = [f"{'parameter':<{width}}", *([f"{'unit':<{max(4, wide)}}"] if wide else [])]
+    heads += [f"{'value':>11}", f"{'std. error':>10}", f"{'95 % interval':>23}"]
+    heads += [_BESIDE] if fit.discrepancy is not None else []
+    heads += [f"{'CR %':>7}", f"{'insens. %':>9}"]
+    return " ".join([*heads, *([] if fit.identifiable else [f"{'stopped at':>11}"])])
+
+
+def _free(fit: "Fit", k: int) -> _Row:
+    low, high = fit.interval(fit.names[k])
+    known = np.isfinite(fit.insensitivity[k])
+    return _Row(
+        fit.names[k],
+        fit.parameter_units[k] if fit.parameter_units else "",
+        f"{fit.values[k]:.5g}",
+        f"{fit.standard_errors[k]:10.2g}",
+        f"{low:.5g} .. {high:.5g}",
+        _by_noise(fit, k),
+        f"{fit.cramer_rao[k]:7.2f} {fit.insensitivity[k]:9.2f}" if known else _NO_PERCENTS,
+        bool(fit.determined[k]),
+    )
+
+
+def _of_tied(fit: "Fit", tied: Tied) -> _Row:
+    intervals = (tied.interval(), tied.interval(model_error=False))
+    both, alone = (f"{low:.5g} .. {high:.5g}" for low, high in intervals)
+    beside = f"{alone:>23} {'tied':>6}" if tied.determined else " " * len(_BESIDE)
+    number = f"{tied.value:.5g}", f"{tied.standard_error:10.2g}"
+    return _Row(tied.name, "", *number, both, beside, _NO_PERCENTS, tied.determined)
+
+
+def _ties(tied: Sequence[Tied]) -> list[str]:
+    """What each tied parameter follows."""
+    texts = [f"{each.name} to {', '.join(each.follows) or 'fixed numbers'}" for each in tied]
+    return [f"tied: {'; '.join(texts)}"] if texts else []
+
+
+_NO_PERCENTS = f"{'-':>7} {'-':>9}"
 _INDIVIDUALLY = "this record does not determine it individually"
 _NOT_DETERMINED = {
     "no minimum": "not determined, because the fit found no minimum",
@@ -135,6 +184,7 @@ def fit_content(fit: "Fit") -> dict[str, object]:
     return {
         **known,
         "parameters": [_parameter(fit, k) for k in range(len(fit.names))],
+        "tied": [_tied_content(each) for each in fit.tied],
         "combinations": [
             combination._asdict() | {"interval_95": combination.interval}
             for combination in fit.combinations
@@ -166,6 +216,19 @@ def _parameter(fit: "Fit", k: int) -> dict[str, object]:
         "width": None if fit.discrepancy is None else fit.discrepancy.widths[k],
         "cramer_rao_percent": fit.cramer_rao[k],
         "insensitivity_percent": fit.insensitivity[k],
+    }
+
+
+def _tied_content(tied: Tied) -> dict[str, object]:
+    return {
+        "name": tied.name,
+        "tied_to": tied.follows,
+        "value": tied.value,
+        "standard_error": tied.standard_error,
+        "determined": tied.determined,
+        "interval_95": tied.interval(),
+        "noise_standard_error": tied.noise_standard_error,
+        "noise_interval_95": tied.interval(model_error=False),
     }
 
 

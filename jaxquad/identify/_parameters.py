@@ -130,6 +130,16 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
     return rebuilt()
 
 
+def number_at(place: Place) -> Callable[[PyTree], Float[Array, ""]]:
+    """The function that picks this number of a model."""
+
+    def pick(model: PyTree) -> Float[Array, ""]:
+        leaves = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+        return jnp.asarray(leaves[place.leaf]).reshape(-1)[place.index]
+
+    return pick
+
+
 def name_places(model: PyTree) -> list[Place]:
     """Every floating-point number of a model: `lag`, `numerator[0]`, `axis.inertia[2]`."""
     leaves, structure = jax.tree.flatten(model)

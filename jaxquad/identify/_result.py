@@ -1,6 +1,6 @@
 """An identified model with its doubts: values, errors, covariance, verdict."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Key, PyTree
 
 from jaxquad._core import plain_content, pytree_node
-from jaxquad._xla import run_shared
 from jaxquad.records import Record
 
 from ._accuracy import Matrix
@@ -20,6 +19,7 @@ from ._curves import (
     ResponseBand,
     StepBand,
 )
+from ._derived import derive, Tied, tied_parameters
 from ._discrepancy import Discrepancy
 from ._draw_models import draw_models, known_covariance
 from ._explain import explain_misfit, Explanation
@@ -39,9 +39,6 @@ from ._verdict import (
     Verdict,
 )
 from ._verify import Verification, verify
-
-
-_ROUNDING = 1e-12  # of a variance, to those that cancel in it
 
 
 @pytree_node
@@ -122,8 +119,8 @@ class Fit:
         if name not in self.names:
             raise KeyError(
                 f"no free parameter {name!r}: this fit has {', '.join(self.names)}; what is tied "
-                "to them, or follows from them, has its value and error by fit.derived(lambda "
-                "model: ...)"
+                "to them is in fit.tied, and what follows from them has its value and error by "
+                "fit.derived(lambda model: ...)"
             )
         return self.names.index(name)
 
@@ -245,6 +242,11 @@ class Fit:
         # It keeps its sign.
         return (low, min(high, 0.0)) if np.signbit(self.values[k]) else (max(low, 0.0), high)
 
+    @property
+    def tied(self) -> tuple[Tied, ...]:
+        """The parameters that follow from others (`tied=` of `jq.fit`), with their errors."""
+        return tied_parameters(self)
+
     def derived(
         self,
         quantity: Callable[[PyTree], Float[Array, ""]],
@@ -275,24 +277,7 @@ class Fit:
                 f"quantity is {quantity!r}: give a function of the model, such as lambda model: "
                 "model.lag + model.delay; fit[name] and fit.interval(name) have single parameters"
             )
-        others = self.verdict.alternatives
-        (value, gradient), *there = self._values_and_gradients(quantity, (self.values, *others))
-        slope = gradient * self.units
-        differs = any(abs(other - value) > 1e-6 * abs(value) for other, _ in there)
-        if differs or self._changes_undetermined(slope):
-            lost = ", ".join(self.verdict.undetermined)
-            raise UndeterminedError(
-                f"{name} depends on what this record does not determine ({lost}): fit with a "
-                "jq.identify.Prior or a second record, or ask for a determined combination"
-            )
-        covariance = self.relative_covariance if model_error else self.relative_noise_covariance
-        variance = float(slope @ covariance @ slope)
-        if variance < _ROUNDING * float(np.abs(slope) @ np.abs(covariance) @ np.abs(slope)):
-            raise UndeterminedError(
-                f"the standard error of {name} is lost in the rounding of those of "
-                f"{', '.join(self.names)}, which are many times as large: fix one of them"
-            )
-        return Combination(name, value, float(np.sqrt(variance)), self.freedom_of(slope))
+        return derive(self, quantity, name, model_error=model_error)
 
     def bands(self) -> Bands:
         """The same parameters from the lower and from the upper half of the band.
@@ -357,37 +342,6 @@ class Fit:
             raise ValueError(f"key is {key!r}: give a jax.random.key(0)")
         scores = jax.random.normal(key, (len(self.names), n))
         return draw_models(self, scores, hold_undetermined=hold_undetermined)
-
-    def _changes_undetermined(self, slope: Float[np.ndarray, " parameters"]) -> bool:
-        """Whether a quantity of this `slope` changes where the responses do not."""
-        verdict = self.verdict
-        along_null = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
-        on_curved = [slope[self.names.index(name)] != 0 for name in verdict.curved]
-        return bool(np.any(along_null) or any(on_curved))
-
-    def _values_and_gradients(
-        self,
-        quantity: Callable[[PyTree], Float[Array, ""]],
-        places: Sequence[Float[np.ndarray, " n"]],
-    ) -> list[tuple[float, Float[np.ndarray, " n"]]]:
-        """Of a quantity at several physical values of the free parameters."""
-        arrays, rest = eqx.partition(self.model, eqx.is_inexact_array)
-
-        def of_values(x, arrays):
-            return quantity(self.parameters.replace(eqx.combine(arrays, rest), x))
-
-        function = jax.value_and_grad(of_values)
-        try:
-            found = run_shared(function, [(values, arrays) for values in places])
-        except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
-            found = [function(jnp.asarray(values), arrays) for values in places]
-        except TypeError as error:
-            if "scalar-output" not in str(error):
-                raise
-            raise ValueError(
-                "the quantity is an array: ask for each of its numbers, by a function of its own"
-            ) from error
-        return [(float(value), np.asarray(gradient)) for value, gradient in found]
 
     def __str__(self) -> str:
         return fit_table(self)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad.identify import Combination, factors, Fit, UndeterminedError
+from jaxquad.identify import Combination, factors, Fit, Tied, UndeterminedError
 from jaxquad.models import TransferFunction
 
 from ._page import Cell, Table
@@ -30,6 +30,7 @@ def parameter_section(
     rows += [[*_estimate(each), *[_DASH] * (len(heads) - 4 - bool(units))] for each in derived]
     if units:
         rows = _with_units(rows, [*units, *(each.unit or _DASH for each in derived)])
+    rows += [_tied(fit, each, len(heads)) for each in fit.tied]
     return {
         "table": Table("Identified parameters", heads, rows),
         "bounds": [f"{bound:g}" for bound in _BOUNDS],
@@ -54,6 +55,17 @@ def _parameter(fit: Fit, k: int) -> list[str | Cell]:
     percents = zip((fit.cramer_rao[k], fit.insensitivity[k]), _BOUNDS, strict=True)
     shares = [_marked(f"{x:.2f}" if np.isfinite(x) else "", bool(x > most)) for x, most in percents]
     return [*cells, *_by_noise(fit, k), *shares, *stopped]
+
+
+def _tied(fit: Fit, tied: Tied, columns: int) -> list[str | Cell]:
+    """A row of a parameter that follows from others."""
+    low, high = tied.interval()
+    name = f"{tied.name}, tied to {', '.join(tied.follows) or 'fixed numbers'}"
+    cells = [Cell(name), *([_DASH] if fit.parameter_units else []), f"{tied.value:.5g}"]
+    cells += [f"{tied.standard_error:.2g}", f"{low:.5g} .. {high:.5g}"]
+    if not tied.determined:
+        cells[-3:] = ["", cells[-2], "not determined"]
+    return [*cells, *[_DASH] * (columns - len(cells))]
 
 
 def _by_noise(fit: Fit, k: int) -> list[str]:

@@ -1,5 +1,7 @@
 """Tied parameters, and bands of single response pairs."""
 
+from typing import cast
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -47,6 +49,42 @@ def test_a_derived_quantity_moves_with_what_is_tied():
     fit = jq.fit(START, response_of(TRUTH, seed=0), free=FREE, tied=TIED, cost=ML)
     apart = fit.derived(lambda m: m.gains[0] - m.gains[1])
     assert apart.standard_error == pytest.approx(2 * fit.standard_errors[0], rel=1e-9)
+
+
+def test_what_is_tied_is_shown_with_its_value_and_error():
+    fit = jq.fit(START, response_of(TRUTH, seed=0), free=FREE, tied=TIED, cost=ML)
+    [tied] = fit.tied
+    assert tied.value == -fit["gains[0]"] and tied.follows == ("gains[0]",) and tied.determined
+    assert tied.standard_error == pytest.approx(fit.standard_errors[0], rel=1e-9)
+    for level, model_error in ((0.95, True), (0.95, False), (0.8, True)):
+        low, high = fit.interval("gains[0]", level=level, model_error=model_error)
+        found = tied.interval(level=level, model_error=model_error)
+        assert found == pytest.approx((-high, -low), rel=1e-9)
+    [head, *rows] = str(fit).splitlines()
+    assert rows[3].split()[:3] == ["gains[1]", f"{tied.value:.5g}", f"{tied.standard_error:.2g}"]
+    assert head.index("width") - 1 == rows[3].index("tied") - 2
+    assert rows[4] == "tied: gains[1] to gains[0]"
+    [stored] = cast(list, fit.to_dict()["tied"])
+    assert stored["name"] == "gains[1]" and stored["tied_to"] == ["gains[0]"]
+    assert stored["interval_95"] == pytest.approx(tied.interval())
+
+
+def test_what_follows_an_undetermined_parameter_is_not_determined():
+    """Of L K_t / J_x the record shows the product alone."""
+    truth = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.05)
+    frf, tied = response_of(truth, seed=0), {"L": lambda model: 2 * model.K_t}
+    fit = jq.fit(truth, frf, free=("K_t", "J_x"), tied=tied, cost=ML)
+    assert not fit.tied[0].determined and fit.tied[0].standard_error == np.inf
+    row = next(line for line in str(fit).splitlines() if line.startswith("L *"))
+    assert "not determined" in row and row.split()[-1] == f"{fit.tied[0].value:.5g}"
+
+
+def test_the_gain_of_a_transfer_function_moves_with_what_is_tied():
+    servo = jq.TransferFunction([900.0], [1.0, 36.0, 900.0])
+    tied = {"numerator[0]": lambda servo: servo.denominator[2]}
+    free = ("denominator[1]", "denominator[2]")
+    fit = jq.fit(servo, response_of(servo, seed=0), free=free, tied=tied, cost=ML)
+    assert jq.identify.factors(fit).gain.standard_error == pytest.approx(fit.standard_errors[1])
 
 
 def test_without_free_all_but_the_tied_numbers_are_free():
