@@ -77,7 +77,13 @@ def _is_number(x: object) -> bool:
     return isinstance(x, int | float) and not isinstance(x, bool)
 
 
-def as_frequencies(omega: Frequencies) -> Float[Array, "..."]:
+def as_frequencies(omega: Frequencies) -> Float[Array, " frequencies"]:
+    """Frequencies as a row of floats; a number by itself is one frequency."""
+    omega = as_floats(omega)
+    return omega if omega.ndim else omega[None]
+
+
+def as_floats(omega: Frequencies) -> Float[Array, "..."]:
     """Frequencies as an array of floats; floats keep their precision."""
     omega = jnp.asarray(omega)
     return omega if eqx.is_inexact_array(omega) else omega.astype(float)

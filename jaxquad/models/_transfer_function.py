@@ -21,7 +21,7 @@ from jaxquad._core import (
 )
 
 from ._pade import check_order, pade_coefficients, require_package
-from ._protocols import as_frequencies, Frequencies
+from ._protocols import as_floats, as_frequencies, Frequencies
 from ._units import Scale, unit
 
 
@@ -73,7 +73,7 @@ def _namespace(*numbers: Array | np.ndarray):
 
 def imaginary(omega: Frequencies) -> Complex[Array, "..."]:
     """s = j omega, in the precision of `omega`; whole numbers become floats."""
-    omega = as_frequencies(omega)
+    omega = as_floats(omega)
     return jax.lax.complex(jnp.zeros_like(omega), omega)
 
 
@@ -148,7 +148,7 @@ class TransferFunction(eqx.Module):
 
     def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """The response at `omega` in rad/s, in units of output per input."""
-        return self(imaginary(omega))[:, None, None]
+        return self(imaginary(as_frequencies(omega)))[:, None, None]
 
     def __mul__(self, other: "TransferFunction") -> "TransferFunction":
         """The two in series; their delays add."""
@@ -270,7 +270,7 @@ class LaggedIntegrator(eqx.Module):
 
     def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """Response at `omega` in rad/s."""
-        s = imaginary(omega)
+        s = imaginary(as_frequencies(omega))
         gain, lag, delay = (x.astype(s.dtype) for x in (self.gain, self.lag, self.delay))
         return (gain * jnp.exp(-delay * s) / ((lag * s + 1) * s**self.integrators))[:, None, None]
 
@@ -332,7 +332,7 @@ class AttitudeAxis(eqx.Module):
 
     def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """Angle over input, rad/V, at `omega` in rad/s; infinite at 0."""
-        s = imaginary(omega)
+        s = imaginary(as_frequencies(omega))
         lever, inertia, lag, delay, damping = (
             x.astype(s.dtype)
             for x in (self.L * self.K_t, self.J_x, self.lag, self.delay, self.K_af)

@@ -162,11 +162,11 @@ _POINTS = 300
 def frequencies_of(
     measured: list[Measured],
     modelled: list[Modelled],
-    omega: Float[np.ndarray, " frequencies"] | None,
+    omega: Float[np.ndarray, "..."] | None,
 ) -> Float[np.ndarray, " frequencies"]:
     """Where models are drawn, in rad/s: as given, over what was measured, or about their poles."""
     if omega is not None:
-        return np.asarray(omega, float)
+        return np.atleast_1d(omega)
     spans = [np.asarray(each.frf.omega)[[0, -1]] for each in measured]
     spans = spans or [_span(each.model) for each in modelled]
     return np.geomspace(min(x[0] for x in spans), max(x[1] for x in spans), _POINTS)

@@ -3,7 +3,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
 from jaxquad.records import Record
 
@@ -104,11 +104,10 @@ def _ends(record: Record, step: int) -> tuple[np.ndarray, np.ndarray]:
     return np.min(thin, axis=1), np.max(thin, axis=1)
 
 
-def check_band(omega: Float[ArrayLike, " frequencies"] | None, dt: float) -> None:
+def check_band(omega: Float[np.ndarray, "..."] | None, dt: float) -> None:
     """Raise `ValueError` for frequencies that no record at this rate can have."""
     if omega is None:
         return
-    omega = np.asarray(omega, dtype=float)
     nyquist = np.pi / dt
     if omega.ndim != 1 or not 0 < omega.size <= _MOST_FREQUENCIES:
         raise ValueError(

@@ -136,7 +136,7 @@ Estimator = Welch | Composite | LocalPolynomial | Periodic | JointInputOutput
 
 def frequency_response(
     record: Record | Sequence[Record],
-    omega: Float[ArrayLike, " frequencies"] | None = None,
+    omega: Float[ArrayLike, " frequencies"] | float | int | None = None,
     *,
     estimator: Estimator | None = None,
 ) -> FrequencyResponse:
@@ -146,8 +146,8 @@ def frequency_response(
 
     - `record`: one `Record`, or several with the same channels and sample rate, which are taken
         together.
-    - `omega`: frequencies in rad/s, increasing; by default 100 log-spaced ones from two cycles of
-        the longest record to a tenth of the sample rate (the excited lines with
+    - `omega`: frequencies in rad/s, increasing, or a single one; by default 100 log-spaced ones
+        from two cycles of the longest record to a tenth of the sample rate (the excited lines with
         `jq.spectra.Periodic`).
     - `estimator`: one of `jq.spectra.LocalPolynomial`, `Composite`, `Welch`, `Periodic` and
         `JointInputOutput`. By default local polynomials, by the joint input-output method where the
@@ -174,7 +174,8 @@ def frequency_response(
     records = [record] if isinstance(record, Record) else list(record)
     check_compatible(records)
     check_distinct(records)
-    check_band(omega, records[0].dt)
+    grid = None if omega is None else np.atleast_1d(np.asarray(omega, float))
+    check_band(grid, records[0].dt)
     if estimator is None:
         estimator = JointInputOutput() if records[0].reference_names else LocalPolynomial()
     method = "direct"
@@ -186,7 +187,6 @@ def frequency_response(
     if isinstance(estimator, JointInputOutput):
         check_references(records)
         method, estimator = "joint", estimator.spectra
-    grid = None if omega is None else np.asarray(omega, float)
     if isinstance(estimator, LocalPolynomial):
         return _by_polynomial(records, grid, estimator, method)
     if isinstance(estimator, Periodic):

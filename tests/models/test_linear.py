@@ -8,8 +8,10 @@ from scipy import signal
 from jaxquad.models import (
     AttitudeAxis,
     free_responses,
+    LaggedIntegrator,
     sample_rational,
     simulate_linear,
+    StateSpace,
     TransferFunction,
 )
 
@@ -225,3 +227,20 @@ def test_the_difference_equation_gives_the_simulated_samples(name, delay, hold):
     found = signal.lfilter(np.asarray(sampled.above), denominator, late)
     expected = np.asarray(simulate_linear(plant, u, DT, hold=hold))
     np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        LaggedIntegrator(8.0, 0.05, 0.03),
+        TransferFunction([1.0, 2.0], [1.0, 0.5, 4.0], 0.1),
+        AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.05),
+        StateSpace([[-1.0]], [[1.0]], [[1.0]]),
+    ],
+    ids=lambda model: type(model).__name__,
+)
+def test_a_number_is_one_frequency(model):
+    for omega in (3, 3.0, np.float64(3.0)):
+        np.testing.assert_array_equal(
+            model.frequency_response(omega), model.frequency_response([3.0])
+        )
