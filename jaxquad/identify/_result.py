@@ -109,11 +109,19 @@ class Fit:
         return np.where(unbounded, np.inf, np.sqrt(np.diagonal(self.noise_covariance)))
 
     def __getitem__(self, name: str) -> float:
-        """The value of one parameter: `fit["gain"]`. Raises KeyError for a name it does not have.
+        """The value of one parameter: `fit["gain"]`; `fit.interval(name)` has its error.
 
-        `fit.interval(name)` has its error.
+        **Raises:** KeyError for a name that the fit does not have, UndeterminedError (a ValueError)
+        where the record does not determine the parameter: `values` has where the solver stopped.
         """
-        return float(self.values[self._place(name)])
+        k = self._place(name)
+        if not self.determined[k]:
+            left = "where the solver stopped" if self.verdict.fitted else "the starting value"
+            raise UndeterminedError(
+                f"{name} has no value of its own: {self.verdict.summary}; {left} is "
+                f"fit.values[{k}], for comparison alone"
+            )
+        return float(self.values[k])
 
     def _place(self, name: str) -> int:
         if name not in self.names:

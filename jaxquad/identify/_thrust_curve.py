@@ -340,11 +340,12 @@ class GainOverThrottle(eqx.Module):
         if not self._knows_lag:
             both = [str(each) for each in self.fit.combinations]
             return "lag and delay not determined separately" + (f" ({both[0]})" if both else "")
-        lag, delay = (_half(*self.fit.interval(name)) for name in ("lag", "delay"))
-        return (
-            f"lag {1e3 * self.fit['lag']:.2f} +- {1e3 * lag:.2g} ms, "
-            f"delay {1e3 * self.fit['delay']:.2f} +- {1e3 * delay:.2g} ms (95 %)"
-        )
+        known = [name for name in ("lag", "delay") if name not in self.fit.verdict.undetermined]
+        times = [
+            f"{name} {1e3 * self.fit[name]:.2f} +- {1e3 * _half(*self.fit.interval(name)):.2g} ms"
+            for name in known
+        ]
+        return f"{', '.join(times)} (95 %){'' if 'delay' in known else ', delay not determined'}"
 
     def _curve_in_words(self) -> list[str]:
         curve, line = self.curve, self._line()

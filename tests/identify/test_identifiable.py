@@ -335,6 +335,16 @@ def test_a_combination_whose_error_is_a_third_of_its_size_is_not_determined(nois
         assert found.standard_error <= 0.3 * abs(found.value)
 
 
+def test_a_value_that_the_record_does_not_determine_is_not_given_by_its_name():
+    truth = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.05)
+    fit = jq.fit(truth, response_of(truth, seed=0), free=("K_t", "J_x", "lag"), cost=ML)
+    assert fit["lag"] == fit.values[2]
+    for k, name in enumerate(("K_t", "J_x")):
+        said = rf"{name} has no value of its own: .*only L K_t / J_x.* fit.values\[{k}\]"
+        with pytest.raises(jq.identify.UndeterminedError, match=said):
+            fit[name]
+
+
 NARROW = np.geomspace(1.0, 6.0, 30)
 
 
