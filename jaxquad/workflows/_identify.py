@@ -182,10 +182,24 @@ class Identification:
             parts += [
                 _text_or_reason(ft.partial(self._sum, name)) for name in sums if name not in known
             ]
+        parts += _on_negative_gain(self.fit, self.frf)
         if self.parts:
             parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, sums)}"]
         parts += [f"\n{title}:\n{text}" for title, text in self.beside.items()]
         return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
+
+
+def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:
+    """What to check where the output moves against the input; that is no fault of the fit."""
+    above = [name == "gain" or name.startswith("numerator[") for name in fit.names]
+    if not np.all(fit.determined[above] & (fit.values[above] < 0)):
+        return []
+    source, output = frf.input_names[0], frf.output_names[0]
+    return [
+        f"the gain is negative: when {source} rises, {output} falls. If it should rise, check the "
+        f"signs of both channels and of the axis; jaxquad tune needs a positive gain "
+        "(--input NAME=-CHANNEL)"
+    ]
 
 
 def _text_or_reason(made: Callable[[], object]) -> str:

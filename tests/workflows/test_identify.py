@@ -13,6 +13,7 @@ import jaxquad as jq
 from jaxquad.cli import main
 from jaxquad.workflows import (
     _fits,
+    _identify,
     identify,
     identify_again,
     IdentifySettings,
@@ -195,6 +196,18 @@ def test_a_hover_without_a_reference_is_no_plant(more, tmp_path, capsys):
     assert "to resolve it: name the external reference (--reference)" in printed
     assert "higher order" not in printed and "another band" not in printed
     assert "Nothing about this vehicle." in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("gain", "said"), [(-8.0, ["the gain is negative: when u0 rises, y0 falls."]), (8.0, [])]
+)
+def test_a_negative_gain_is_told_with_what_to_check(gain, said):
+    """As many conventions have it: the elevator's trailing edge down, the nose down."""
+    frf = response_of(jq.LaggedIntegrator(gain, 0.05, 0.03), omega=np.geomspace(1.0, 30.0, 40))
+    fit = jq.fit(jq.LaggedIntegrator(gain / 2, 0.05, 0.03), frf)
+    assert [text[:46] for text in _identify._on_negative_gain(fit, frf)] == said
+    turns = dataclasses.replace(fit, names=("numerator[0]", "numerator[1]", "delay"))
+    assert _identify._on_negative_gain(turns, frf) == []  # of a zero in the right half plane
 
 
 def test_swapped_channels_are_asked_about(log, tmp_path, capsys, recwarn):
