@@ -157,7 +157,8 @@ def _require_single_loop(ensemble: "Ensemble", loop: Loop) -> VariablePlant:
         raise ValueError(
             f"the loop's plant is a {type(plant).__name__}, but an ensemble needs a "
             "jq.DecoupledAxes or jq.models.Multirotor. For an identified model use "
-            "jq.Ensemble(jq.ensembles.Posterior(fit, ...)). For a plant of your own draw its "
+            "jq.Ensemble(jq.ensembles.Posterior(fit, ...)), with plant= for one of your own. To "
+            "fly any other plant, draw its "
             "arrays yourself, with the members on the last axis and fields made by "
             "jq.loops.per_member, and fly them with jq.evaluate(jq.Loop(plant, ...), scenario)"
         )

@@ -10,7 +10,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import as_float, is_zero, on_host, require_all_positive, require_positive
-from jaxquad.identify import check_drawable, draw_models, Fit, known_covariance, UndeterminedError
+from jaxquad.identify import (
+    check_drawable,
+    draw_models,
+    Fit,
+    HasTransferFunction,
+    known_covariance,
+    UndeterminedError,
+)
 from jaxquad.models import (
     AttitudeAxis,
     DecoupledAxes,
@@ -35,8 +42,8 @@ def make_plant(
 
     **Arguments:**
 
-    - `model`: a `jq.models.AttitudeAxis`, a `jq.LaggedIntegrator`, or a `jq.TransferFunction` of
-        that form.
+    - `model`: a `jq.models.AttitudeAxis`, a `jq.LaggedIntegrator`, a `jq.TransferFunction` of that
+        form, or an own model whose method `transfer_function()` returns one.
     - `believed`: the inertia in kg m^2 that belongs to the gain b = KT / J, if the model has none.
 
     **Returns:**
@@ -64,10 +71,11 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
             )
     if isinstance(model, AttitudeAxis):
         return lambda m: _of_axis(m, believed, lagging=not is_zero(model.lag))
-    if not isinstance(model, LaggedIntegrator | TransferFunction):
+    if not isinstance(model, TransferFunction | HasTransferFunction):
         raise ValueError(
             f"a {type(model).__name__} cannot be converted into a plant: give plant=, a "
-            "function of the model that returns (jq.DecoupledAxes(...), delay in s)"
+            "function of the model that returns (jq.DecoupledAxes(...), delay in s), or give the "
+            "model a method transfer_function() that returns K / (s (lag s + 1)) to the rate"
         )
     if believed is None:
         raise ValueError(
@@ -76,7 +84,10 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
         )
     if isinstance(model, LaggedIntegrator):
         return _of_integrator(model, believed)
-    return _of_transfer_function(model, believed)
+    if isinstance(model, TransferFunction):
+        return _of_transfer_function(model, believed)
+    build = _of_transfer_function(model.transfer_function(), believed)
+    return lambda m: build(m.transfer_function())
 
 
 def _given(plant: Given, believed: ArrayLike | None) -> Build:
@@ -208,8 +219,8 @@ class Posterior(eqx.Module):
         """**Arguments:**
 
         - `fit`: of a `jq.models.AttitudeAxis`, a `jq.LaggedIntegrator` (b = K, from the command to
-            rate or angle in rad), a `jq.TransferFunction` of that form, or, with `plant`, of any
-            other model.
+            rate or angle in rad), a `jq.TransferFunction` of that form, an own model whose
+            `transfer_function()` is one, or, with `plant`, of any other model.
         - `recorded_dt`: needed where the record did not say how long its input is held
             (`Record.hold`): the sample interval in s if it is held from sample to sample, None if
             it is not held. Half of a hold that the fit does not model is in the identified delay

@@ -77,7 +77,11 @@ from ._problem import (
 )
 from ._reduce import reduce_structure as reduce_structure, Reduction as Reduction
 from ._result import Fit as Fit
-from ._simulated import integrate_plant as integrate_plant, linear_model as linear_model
+from ._simulated import (
+    HasTransferFunction as HasTransferFunction,
+    integrate_plant as integrate_plant,
+    linear_model as linear_model,
+)
 from ._solve import least_squares as least_squares, problem_normal as problem_normal
 from ._starts import (
     Minimum as Minimum,

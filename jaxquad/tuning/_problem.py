@@ -234,7 +234,8 @@ def decouple(plant: object) -> DecoupledAxes:
     if not isinstance(axes, DecoupledAxes):
         raise ValueError(
             f"a {type(plant).__name__} cannot be tuned: its members are a jq.DecoupledAxes or a "
-            "jq.Multirotor, whose linear loops a tune needs; jq.simulate, jq.evaluate, their "
+            "jq.Multirotor, whose linear loops a tune needs. Of a fitted model of your own "
+            "jq.ensembles.Posterior(fit, plant=...) makes them; jq.simulate, jq.evaluate, their "
             "derivatives and jq.analyse take any plant"
         )
     return axes

@@ -60,6 +60,20 @@ def transfer_function_fit():
     return jq.fit(start, frf, cost=ML, free=("numerator", "denominator[0]", "delay"))
 
 
+class Rotor(eqx.Module):
+    """A model of a user's own, with the numbers of `sharp_fit`."""
+
+    gain: float
+    lag: float
+    late: float
+
+    def transfer_function(self):
+        return jq.TransferFunction([self.gain], [self.lag, 1.0, 0.0], self.late)
+
+    def frequency_response(self, omega):
+        return self.transfer_function().frequency_response(omega)
+
+
 def gain_of(drawn):
     return np.asarray(drawn.L * drawn.K_t / drawn.J_x)
 
@@ -283,6 +297,16 @@ def test_a_transfer_function_and_a_lagged_integrator_give_the_same_plants():
     assert np.mean(ours.plant.gain) == pytest.approx(fits[0].values[0], rel=1e-3)
 
 
+def test_a_model_of_ones_own_with_such_a_transfer_function_is_drawn_like_it():
+    frf = response_of(INTEGRATOR, error=0.01, seed=0, omega=WIDE)
+    fits = sharp_fit(), jq.fit(Rotor(280.0, 0.02, 0.02), frf, cost=ML)
+    ours, theirs = (posterior_of(fit, believed=0.05).draw(1024, KEY) for fit in fits)
+    for name in ("torque_gain", "lag"):
+        a, b = (getattr(members.plant, name) for members in (ours, theirs))
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+    np.testing.assert_allclose(ours.delay, theirs.delay, rtol=1e-6)
+
+
 @pytest.mark.parametrize("integrators", [1, 2])
 @pytest.mark.parametrize("lag", [0.016, 0.0])
 def test_models_of_the_same_response_make_the_same_plant(integrators, lag):
@@ -350,7 +374,8 @@ class Pendulum(eqx.Module):
 
 
 def test_any_other_model_is_drawn_by_a_function_of_it():
-    with pytest.raises(ValueError, match="a Pendulum cannot be converted.*: give plant="):
+    said = "a Pendulum cannot be converted.*: give plant=.* or give .* a method transfer_function"
+    with pytest.raises(ValueError, match=said):
         make_plant(Pendulum(jnp.asarray(0.09)), believed=1.0)
 
     def plant(model):
