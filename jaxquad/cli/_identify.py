@@ -3,10 +3,11 @@
 import argparse
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxquad.records import require_file
+from jaxquad.records import parse_mix, require_file
 from jaxquad.workflows import default_folder, IdentifySettings, in_options
 
 from ._options import (
@@ -121,6 +122,7 @@ def _identify(options: argparse.Namespace) -> int:
     given = settings_of(options, IdentifySettings)
     for path in options.file:
         _require_log(path)
+    _require_used_units(vars(options).get("units", ()), given)
     if given.verify:
         require_file(given.verify)
     start_computing()
@@ -133,6 +135,18 @@ def _identify(options: argparse.Namespace) -> int:
             print(f"{proposal}\n", flush=True)
     found = identify(options.file if several else first, settings, proposal=proposal)
     return _finish(options, found, options.out or default_folder(first))
+
+
+def _require_used_units(typed: Sequence[str], settings: IdentifySettings) -> None:
+    """Raise ValueError for a unit of another channel than those that were named."""
+    if settings.input is None:  # the log proposes them
+        return
+    texts = (settings.input, settings.output, settings.reference)
+    names = [name for text in texts if text for name in parse_mix(text)]
+    for name in (each.partition("=")[0].strip() for each in typed):
+        if name not in names:
+            used = ", ".join(names)
+            raise ValueError(f"--unit names {name!r}, but the channels in use are {used}")
 
 
 def _require_log(path: Path) -> None:
@@ -251,10 +265,11 @@ def _verify(options: argparse.Namespace) -> int:
             print(f"! {doubt}")
         print(check)
         if options.out:
-            options.out.parent.mkdir(parents=True, exist_ok=True)
+            picture = options.out if options.out.suffix else options.out.with_suffix(".png")
+            picture.parent.mkdir(parents=True, exist_ok=True)
             with headless():
-                compare(check, title=options.file.name).figure.savefig(options.out, dpi=130)
-            print(options.out)
+                compare(check, title=options.file.name).figure.savefig(picture, dpi=130)
+            print(picture)
     if options.json:
         known = {"identifiable": stored.identifiable, "verdict": stored.summary}
         print_json(known | verification_content(check))

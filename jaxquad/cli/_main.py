@@ -16,6 +16,7 @@ from ._autopilot import AUTOPILOT
 from ._batch import BATCH
 from ._design import DESIGN
 from ._identify import CHANNELS, DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
+from ._options import check_out
 from ._progress import shown_stages
 from ._tune import TUNE
 
@@ -57,6 +58,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     **Returns:** the exit code, see `jaxquad --help`.
     """
     words = sys.argv[1:] if argv is None else list(argv)
+    try:
+        return _run(words)
+    except BrokenPipeError:  # `jaxquad ... | head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _CLOSED
+    except OSError as error:
+        return _fail(_in_words(error), _UNUSABLE)
+    except ValueError as error:
+        code = NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE
+        return _fail(in_options(str(error)), code)
+    except KeyboardInterrupt:
+        print("jaxquad: interrupted", file=sys.stderr)
+        return _INTERRUPTED
+
+
+def _run(words: Sequence[str]) -> int:
     if not words:
         print(_WAY, end="")
         return 0
@@ -66,17 +83,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings(), shown_stages(options):
         warnings.simplefilter("always", RecordWarning)
         warnings.showwarning = _print_warning
-        try:
-            return options.run(options)
-        except BrokenPipeError:  # `jaxquad ... | head` has read enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return _CLOSED
-        except (ValueError, OSError) as error:
-            code = NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE
-            return _fail(in_options(str(error)), code)
-        except KeyboardInterrupt:
-            print("jaxquad: interrupted", file=sys.stderr)
-            return _INTERRUPTED
+        check_out(options)
+        return options.run(options)
+
+
+def _in_words(error: OSError) -> str:
+    """What the system could not do: `out/a.png: no space left on device`."""
+    if not error.strerror:
+        return str(error)
+    return f"{error.filename or 'what is printed'}: {error.strerror.lower()}"
 
 
 def _is_undetermined(error: Exception) -> bool:

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -69,6 +70,25 @@ def add_log_option(declared: argparse.ArgumentParser) -> None:
 def add_out(declared: Group, default: str) -> None:
     text = f"where to write; by default {default}"
     declared.add_argument("--out", type=Path, metavar="FOLDER", help=text)
+    declared.set_defaults(out_is_folder=True)
+
+
+def check_out(options: argparse.Namespace) -> None:
+    """Raise ValueError where --out cannot be written, before anything is computed for it."""
+    out: Path | None = getattr(options, "out", None)
+    if out is None:
+        return
+    folder = getattr(options, "out_is_folder", False)
+    if out.is_dir() and not folder:
+        raise ValueError(f"--out is {out}, which is a folder: name a file in it")
+    if out.exists() and not (out.is_dir() or out.is_file() and not folder):
+        raise ValueError(f"--out is {out}, which is no {'folder' if folder else 'regular file'}")
+    beside = [out, *out.parents] if folder else out.absolute().parents
+    place = next((each for each in beside if each.exists()), Path())
+    if not place.is_dir():
+        raise ValueError(f"--out is {out}, but {place} is a file: name another folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise ValueError(f"--out is {out}, but nothing may be written to {place}")
 
 
 def add_force(declared: Group) -> None:
@@ -136,7 +156,17 @@ def add_settings(
         how |= {"type": kind.read, "metavar": kind.metavar, "choices": kind.choices}
         how |= {"nargs": kind.words} if kind.words > 1 else {}
         how |= {"action": "append"} if kind.repeated else {}
+        how |= {"action": _Once} if key in ("input", "output", "reference") else {}
         group.add_argument(option.flag, **how)
+
+
+class _Once(argparse.Action):
+    """A channel that is named twice would silently be the second one."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        if self.dest in namespace:
+            raise argparse.ArgumentError(self, "given twice: one input moves one output at a time")
+        setattr(namespace, self.dest, values)
 
 
 def given_settings(options: argparse.Namespace, settings: Settings) -> dict[str, object]:

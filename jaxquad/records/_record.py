@@ -390,6 +390,12 @@ def _check_channels(record: Record) -> None:
             )
     for name, values in zip(record.names, _each_channel(record), strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size == values.size:
+            raise RecordError(
+                f"channel {name!r} holds no usable number: all {values.size} samples are "
+                f"{values[0]}, or out of the range that it was given (valid=). Check that it was "
+                "logged, or choose another channel."
+            )
         if bad.size:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "

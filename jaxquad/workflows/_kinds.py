@@ -114,7 +114,10 @@ def _mix(value: object) -> str:
     text = mix_text(value) if isinstance(value, Mapping) else value
     if not isinstance(text, str):
         raise ValueError('give a channel, or a weighted sum such as "roll=-m1+0.5*m2"')
-    parse_mix(text)
+    try:
+        parse_mix(text)
+    except ValueError as error:
+        raise ValueError(str(error).removeprefix(f"{text!r}: ")) from error
     return text
 
 

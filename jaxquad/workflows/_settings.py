@@ -360,6 +360,11 @@ class IdentifySettings(Settings):
         """Raise SettingsError for what would change nothing beside the others."""
         if self.zeros and self.poles is None:
             raise SettingsError("`zeros` is for a transfer function: say its `poles`, too")
+        if self.poles is not None and self.zeros > self.poles + self.integrators:
+            raise SettingsError(
+                f"`zeros` is {self.zeros}, above {self.poles} `poles` and {self.integrators} "
+                "`integrators`: take as many zeros as these at most"
+            )
         if self.poles is not None and not self.lag:
             raise SettingsError(
                 "`lag` is for a model of gain, lag and delay: leave it out, or leave `poles` out"

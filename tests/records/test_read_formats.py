@@ -249,5 +249,5 @@ def test_folders_fifos_and_empty_files_are_refused(tmp_path):
     for name, said in (("empty", "the file is empty"), ("pipe", "not a regular file")):
         with pytest.raises(ReadError, match=said):
             channels(tmp_path / f"{name}.bin")
-    with pytest.raises(ReadError, match="neither the first bytes nor the name"):
+    with pytest.raises(ReadError, match="folder is a folder, and no bag of ROS 2"):
         channels(tmp_path / "folder")

@@ -212,6 +212,8 @@ def _choose_reader(path: Path) -> Reader:
     by_name = (reader for reader in READERS.values() if suffix in reader.suffixes)
     reader = next(by_content, None) or next(by_name, None)
     if reader is None:
+        if path.is_dir():
+            raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
         known = ", ".join(each for reader in READERS.values() for each in reader.suffixes)
         ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
         raise ReadError(

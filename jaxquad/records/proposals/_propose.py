@@ -112,8 +112,8 @@ def propose(path: str | Path, *, axis: str | None = None) -> Proposal:
     if log.vehicle not in _SETUPS:
         raise RecordError(
             f"{path}: not a log of a known autopilot ({', '.join(_SETUPS)}), so the meaning of its "
-            f"channels is unknown. List them (jaxquad channels, jq.records.channels) and name "
-            f"inputs, outputs and references yourself."
+            f"channels is unknown. jaxquad identify takes it all the same: list them (jaxquad "
+            f"channels, jq.records.channels) and name inputs, outputs and references yourself."
         )
     try:
         return complete(str(path), log, _SETUPS[log.vehicle](log, axis))
