@@ -246,4 +246,15 @@ def _derived(fit: Fit, quantity: Quantity, name: str) -> str:
 
 
 def _plus_minus(value: float, error: float) -> str:
-    return f"{value:.5g} +- {error:.2g}"
+    """With the digits that the error supports, two of its own: `284 +- 15`, `0.0164 +- 0.0022`."""
+    if not (np.isfinite(error) and error > 0):
+        return f"{value:.5g} +- {error:.2g}"
+    last = 1 - int(np.floor(np.log10(float(f"{error:.1e}"))))  # decimal that is shown
+    if not 0 <= last <= 6:
+        return f"{value:.{max(_digits(value) + last, 1)}g} +- {error:.2g}"
+    return f"{value:.{last}f} +- {error:.{last}f}"
+
+
+def _digits(value: float) -> int:
+    """Before the decimal point; negative for zeros behind it."""
+    return 1 + int(np.floor(np.log10(abs(value)))) if value else 1

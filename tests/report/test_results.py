@@ -9,6 +9,7 @@ from synthetic import OMEGA, response_of
 
 import jaxquad as jq
 from jaxquad.report import compare_fits, write_json, write_results
+from jaxquad.report._fit import _plus_minus
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -74,10 +75,24 @@ def test_fits_stand_side_by_side_and_what_is_missing_says_so(fit):
     late = {"lag + delay": lambda model: model.lag + model.delay}
     head, joint, direct, note = compare_fits({"joint": fit, "direct": nothing}, late).splitlines()
     assert head.split() == "gain lag delay lag + delay misfit / error".split()
-    assert f"{fit.values[0]:.5g} +- {fit.standard_errors[0]:.2g}" in joint
-    assert str(f"{fit.derived(late['lag + delay']).value:.5g}") in joint
+    total = fit.derived(late["lag + delay"])
+    assert _plus_minus(fit.values[0], fit.standard_errors[0]) in joint
+    assert _plus_minus(total.value, total.standard_error) in joint
     assert direct.split() == ["direct", "not", "identifiable"]
     assert note == "(+- one standard error)"
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (284.0213, 14.95, "284 +- 15"), (277.05, 1.996, "277.1 +- 2.0"),
+        (0.0164092, 0.00219, "0.0164 +- 0.0022"), (-16.84, 0.0996, "-16.84 +- 0.10"),
+        (1032400.0, 2.4e5, "1.03e+06 +- 2.4e+05"), (8.1234e-9, 3.1e-11, "8.123e-09 +- 3.1e-11"),
+        (0.0, 0.0032, "0.0000 +- 0.0032"), (1.5, 0.0, "1.5 +- 0"), (1.5, np.inf, "1.5 +- inf"),
+    ],
+)  # fmt: skip
+def test_a_value_has_the_digits_that_its_error_supports(value, error, text):
+    assert _plus_minus(value, error) == text
 
 
 def test_where_nothing_was_fitted_there_is_no_number(tmp_path, frf):
