@@ -23,7 +23,9 @@ from ._progress import add_quiet
 
 NOT_TO_BE_FLOWN = 4
 _WORDS = """(A member is one plant that the record leaves possible; fresh ones were not tuned on.
-Linear loops are members without the limit of the command: more of them are analysed than flown.)"""
+Linear loops are members without the limit of the command: more of them are analysed than flown.
+ladrc.wc and ladrc.wo are the bandwidths of controller and observer in rad/s; map.values are ln b0
+from the least inertia of the schedule to the greatest, b0 in rad/s^2 per unit of command.)"""
 
 
 def _add(declared: argparse.ArgumentParser) -> None:

@@ -128,8 +128,8 @@ def study_throttle(
     """The gain over the throttle, where the log holds at least two levels of it."""
     if not proposal.setup.throttle:
         return ThrottleVerdict(
-            "gains hold near the throttle of the log, which does not hold it: log it, and fly two "
-            "or three levels between 0.2 and 0.8 for gains that hold at each of them"
+            "it is not in the log, so the gains hold near what was flown: log it, and fly two or "
+            "three levels between 0.2 and 0.8 for gains that hold at each of them"
         )
     parameter = _flown_parameter(flown)
     try:

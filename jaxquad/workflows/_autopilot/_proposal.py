@@ -235,6 +235,11 @@ class AutopilotProposal:
 _WAYS = ("what flew", "a third of the way", "all of it")
 
 
+_OF_STAGES = """(fresh plants: drawn from what the log leaves possible, not tuned on; Ms and
+resonance: peaks of |S| and of the response to the set-point; torque: how far a torque moves the
+rate, noise: that of the command, both over those of what flew)"""
+
+
 def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> list[str]:
     lines = [f"throttle: {throttle.text}"]
     if throttle.gains is None:
@@ -255,4 +260,4 @@ def _stage_table(stages: tuple[Stage, ...]) -> str:
             f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
             f"  {stage.crossover / (2 * np.pi):8.1f} Hz {stage.rejection:8.2f} {stage.noise:7.2f}"
         )
-    return "\n".join(rows)
+    return "\n".join([*rows, _OF_STAGES])
