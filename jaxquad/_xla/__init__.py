@@ -28,7 +28,11 @@ from ._engine import (
 )
 from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse
 from ._kept_programs import KeptPrograms as KeptPrograms
-from ._kernel import as_one_kernel as as_one_kernel, why_no_kernels as why_no_kernels
+from ._kernel import (
+    as_one_kernel as as_one_kernel,
+    most_numbers as most_numbers,
+    why_no_kernels as why_no_kernels,
+)
 from ._real_parts import (
     in_real_parts as in_real_parts,
     NotInRealPartsError as NotInRealPartsError,

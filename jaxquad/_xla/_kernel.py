@@ -6,6 +6,7 @@ internal to XLA, so they are used only where the installed version is known to t
 goes in is bounded; all else is compiled as any other program.
 """
 
+import sys
 from collections.abc import Callable
 
 import jax
@@ -18,9 +19,11 @@ from ._switch import device_kernels, is_off, warn_once
 
 
 try:
+    from ._kernel_limits import WIDEST
     from ._marks import enter, leave
 except (ImportError, AttributeError) as error:  # JAX's interfaces to its compiler may move.
     enter = leave = None
+    WIDEST = sys.maxsize
     _MISSING = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
 else:
     _MISSING = None
@@ -54,6 +57,11 @@ def why_no_kernels() -> str | None:
         warn_once(_MISSING)
         return _MISSING
     return why_not_trusted()
+
+
+def most_numbers() -> int:
+    """Of an array in a kernel's arithmetic; where there are no kernels, any number."""
+    return WIDEST - 1 if why_no_kernels() is None else sys.maxsize
 
 
 def _marked(mark: jax.extend.core.Primitive) -> Callable[[Array], Array]:

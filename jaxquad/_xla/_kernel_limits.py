@@ -105,7 +105,7 @@ _BRANCHES = {"case", "if"}
 _NARROW = 128  # numbers that XLA never divides among threads
 # The most numbers of any other operation: XLA hands longer sums to a library, which a kernel cannot
 # call, and all wider arithmetic takes three times as long to compile as in a plain loop.
-_WIDEST = 4096
+WIDEST = 4096
 # Operations of one kernel: the time to compile them grows faster than their number. With 6800, most
 # of them wide, it can be four times that of a plain loop; narrow ones compile faster than plain.
 _MOST_OPERATIONS, _MOST_WIDE = 12_000, 6_000
@@ -150,7 +150,7 @@ def _count(name: str, functions: Mapping[str, Op], known: dict[str, _Counts]) ->
     if name in known:
         return known[name]
     count = wide = 0
-    for op in _operations(functions[name]):
+    for op in operations_in(functions[name]):
         if op.name == "func.call":
             more, wider = _count(text(op, "callee"), functions, known)
             count, wide = count + more, wide + wider
@@ -163,12 +163,12 @@ def _count(name: str, functions: Mapping[str, Op], known: dict[str, _Counts]) ->
     return known[name]
 
 
-def _operations(parent: Op) -> Iterator[Op]:
+def operations_in(parent: Op) -> Iterator[Op]:
     for region in parent.regions:
         for block in region:
             for op in block:
                 yield op.operation
-                yield from _operations(op.operation)
+                yield from operations_in(op.operation)
 
 
 def _fits(op: Op) -> bool:
@@ -179,7 +179,7 @@ def _fits(op: Op) -> bool:
         return False  # A branch's only result is divided among threads.
     if kind in _MOVES:
         return True
-    return all(size_of(value.type) < _WIDEST for value in (*op.operands, *op.results))
+    return all(size_of(value.type) < WIDEST for value in (*op.operands, *op.results))
 
 
 def size_of(kind: ir.Type) -> int:

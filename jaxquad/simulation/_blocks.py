@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
-from jaxquad._xla import as_one_kernel, scan_on_device, why_no_device_kernels
+from jaxquad._xla import as_one_kernel, most_numbers, scan_on_device, why_no_device_kernels
 
 from ._delay import Queue
 from ._guard import KEPT
@@ -161,7 +161,7 @@ def run_ensemble(
     - `signals`: [samples, ...], of which `now` is one sample.
     - `own`: True for the arrays of (parts, signals) that have the members on their last axis; a
         tree like these, or the top of one.
-    - `chunk`: members at a time; None is 128 on a CPU.
+    - `chunk`: members at a time; None is 128 on a CPU, or as many as a kernel holds.
 
     **Raises:** ValueError for a result that does not have the members on its last axis.
     """
@@ -174,6 +174,7 @@ def run_ensemble(
         return scan_members(advance, carry, signals, count, members)
 
     theirs = (True, own)
+    chunk = chunk or most_at_once(carry, jax.tree.leaves(carry)[0].shape[-1])
     return in_chunks(lambda x: as_one_kernel(loop, x), (carry, (parts, signals)), theirs, chunk)
 
 
@@ -210,9 +211,13 @@ def _chunk_size(members: int, most: int) -> int:
     return members if number == 1 else -(-members // (number * _VECTOR)) * _VECTOR
 
 
-def most_at_once() -> int:
-    """Members of a chunk."""
-    return _CHUNK if jax.default_backend() == "cpu" else sys.maxsize
+def most_at_once(carry: PyTree = None, members: int = 1) -> int:
+    """Members of a chunk: as many as a kernel holds of the widest array in the `carry` of all."""
+    if jax.default_backend() != "cpu":
+        return sys.maxsize
+    theirs = [x.size for x in jax.tree.leaves(carry) if x.shape[-1:] == (members,)]
+    fitting = most_numbers() * members // max(theirs, default=members) // _VECTOR * _VECTOR
+    return min(_CHUNK, fitting) or _CHUNK
 
 
 def _split(x: Array, number: int, size: int) -> Array:

@@ -87,7 +87,8 @@ def scan_loop(
     To be jitted by the caller, after `check_run`.
     """
     given, ensemble = (loop, scenario, accumulator), ensemble_shape(loop, scenario)
-    if len(ensemble) != 1 or ensemble[0] <= most_at_once():
+    most = _most_at_once(given, ensemble)
+    if len(ensemble) != 1 or ensemble[0] <= most:
         return _run(given, ensemble)
     arrays, rest = eqx.partition(given, eqx.is_array)
 
@@ -95,16 +96,33 @@ def scan_loop(
         given = eqx.combine(arrays, rest)
         return _run(given, ensemble_shape(*given[:2]))
 
-    return in_chunks(run, arrays, mark_members(given, ensemble))
+    return in_chunks(run, arrays, mark_members(given, ensemble), most)
 
 
-def _run(
-    given: tuple[Loop, Scenario, Accumulator], ensemble: tuple[int, ...]
-) -> tuple[PyTree, PyTree, Bool[Array, "*ensemble"]]:
+_Given = tuple[Loop, Scenario, Accumulator]
+_FEW = 16  # members that are one chunk
+
+
+def _most_at_once(given: _Given, ensemble: tuple[int, ...]) -> int:
+    if math.prod(ensemble) <= _FEW:
+        return _FEW
+    carry, total = jax.eval_shape(lambda: _begin(given, ensemble)[1])
+    return most_at_once((carry._replace(queue=None), total), ensemble[-1])
+
+
+def _begin(given: _Given, ensemble: tuple[int, ...]) -> tuple[LoopStep, tuple[Carry, PyTree]]:
+    """What runs the loop, and its carry before the first sample."""
     loop, scenario, accumulator = given
     step = make_step(loop, ensemble)
     state, like = _at_rest(loop.plant, scenario, ensemble)
-    carry = (step.begin(state, like), accumulator.begin(like))
+    return step, (step.begin(state, like), accumulator.begin(like))
+
+
+def _run(
+    given: _Given, ensemble: tuple[int, ...]
+) -> tuple[PyTree, PyTree, Bool[Array, "*ensemble"]]:
+    step, carry = _begin(given, ensemble)
+    _, scenario, accumulator = given
     arrays, rest = eqx.partition((step, carry, scenario, accumulator), eqx.is_array)
     carried, stored = as_one_kernel(ft.partial(_scan, rest), arrays)
     return carried[1], stored, carried[0].running

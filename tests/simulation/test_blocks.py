@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxquad._xla import sincos
+from jaxquad._xla._switch import plain_loops
 from jaxquad.control import LADRC
 from jaxquad.loops import Loop, per_member
 from jaxquad.models import DecoupledAxes
@@ -21,7 +22,7 @@ from jaxquad.simulation import (
     simulate,
     Step,
 )
-from jaxquad.simulation._blocks import in_chunks, scan_in_blocks
+from jaxquad.simulation._blocks import in_chunks, most_at_once, scan_in_blocks
 
 
 MEMBERS, SAMPLES, TAG = 150, 131, "xla_cpu_small_call"
@@ -106,6 +107,22 @@ def test_what_all_members_share_is_no_result_of_chunks():
     given = {"each": jnp.arange(300.0), "all": jnp.ones(128)}
     with pytest.raises(ValueError, match="members of a chunk belong on its last axis"):
         in_chunks(count, given, {"each": True, "all": False})
+
+
+def test_wide_arrays_make_smaller_chunks_which_are_kernels():
+    """At 128 members a kernel cannot hold 4 x 4 sums of three axes, nor the run be fast."""
+    sums, shared = jnp.ones((4, 4, 3, MEMBERS)), jnp.ones((99, 99))
+    assert most_at_once((sums, shared), MEMBERS) == 80
+    assert [most_at_once(jnp.ones((n, MEMBERS)), MEMBERS) for n in (31, 256, 257)] == [
+        128,
+        128,
+        128,
+    ]
+    with plain_loops(True):
+        assert most_at_once(sums, MEMBERS) == 128
+    step = lambda x, _, now: (jnp.tanh(x * now), None)
+    run = jax.jit(lambda x: run_ensemble(step, x, (), SIGNAL, own=False)[0])
+    assert TAG in run.lower(sums).as_text()
 
 
 @pytest.mark.parametrize("count", [1, 128, 131, 1009])
