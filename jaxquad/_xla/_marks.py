@@ -6,7 +6,7 @@ from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
-from ._kernel_limits import ATTRIBUTE, hold_in_kernel, Op, text, why_not
+from ._kernel_limits import ATTRIBUTE, hold_in_kernel, Op, operations_in, text, why_not
 from ._kernel_parts import in_parts
 from ._switch import note, warn_once
 
@@ -39,7 +39,7 @@ def _tag(ctx: mlir.LoweringRuleContext, x: ir.Value) -> list[ir.Value]:
     try:
         call = _owner(x)
         if _is_plain_call(call) and _is_for_one_cpu(whole):
-            for found in (call, *_forward_passes(call)):
+            for found in (call, *_forward_passes(call, whole)):
                 _make_kernel(found, whole)
     except Exception as error:  # The compiler's interfaces have changed: do without the kernel.
         warn_once(f"JAX {jax.__version__} cannot mark a kernel ({type(error).__name__}: {error})")
@@ -50,12 +50,17 @@ def _owner(x: ir.Value) -> Op | ir.Block:
     return getattr(x.owner, "operation", x.owner)
 
 
-def _forward_passes(call: Op) -> Iterator[Op]:
-    """The calls whose results a call takes, without their marks where nothing else was asked of."""
-    for operand in call.operands:
-        owner = _owner(operand)
-        if _is_plain_call(owner):
-            yield owner
+def _forward_passes(call: Op, whole: mlir.ModuleContext) -> Iterator[Op]:
+    """The calls whose results a call takes, without their marks where nothing else was asked of.
+
+    What is in a function takes them as its arguments; its forward pass is in one written before.
+    """
+    owners = [_owner(operand) for operand in call.operands]
+    yield from filter(_is_plain_call, owners)
+    alone = isinstance(whole.axis_context, mlir.ShardingContext)  # then all functions are for one
+    if alone and any(isinstance(owner, ir.Block) for owner in owners):
+        before = [op for f in whole.module.body.operations for op in operations_in(f)]
+        yield from filter(_is_plain_call, before)
 
 
 def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:

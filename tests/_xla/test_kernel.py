@@ -73,6 +73,16 @@ def test_both_passes_of_a_gradient_are_kernels():
     assert text.count(TAG) == 2
 
 
+def test_both_passes_are_kernels_where_each_is_in_a_function_of_its_own():
+    """Nothing asks for the forward pass's result there, nor does its reverse see where it is."""
+    last = jax.jit(lambda x, p: as_one_kernel(lambda x, p: march(turn, x, p), x, p)[-1])
+    slope = jax.jit(jax.grad(lambda x, p: jnp.sum(last(x, p)), argnums=(0, 1)))
+    assert slope.lower(START, GAIN).as_text().count(TAG) == 2
+    expected = jax.grad(lambda x, p: jnp.sum(march(turn, x, p)[-1]), argnums=(0, 1))(START, GAIN)
+    for one, other in zip(slope(START, GAIN), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
 class Foreign:
     """Steps that a kernel cannot hold."""
 
