@@ -62,7 +62,8 @@ def enable_compile_cache() -> Path | None:
 
 
 def _given() -> Path | None:
-    folder = jax.config.values["jax_compilation_cache_dir"]
+    # `jax.config.values` copies all settings, and every run of a program asks.
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     return Path(folder) if folder else None
 
 

@@ -82,7 +82,8 @@ class Cost(Protocol):
         ...
 
 
-class CoherenceWeighted(eqx.Module):
+@pytree_node
+class CoherenceWeighted:
     """The cost of Eq. (14), `paper_cost`, summed over the responses (CIFER's).
 
     An average cost below 100 is acceptable, below 50 very good. It has no noise model: its
@@ -99,7 +100,8 @@ class CoherenceWeighted(eqx.Module):
         return np.stack([root * unit for unit in units], axis=-1)
 
 
-class MaximumLikelihood(eqx.Module):
+@pytree_node
+class MaximumLikelihood:
     """The likelihood of Gaussian noise: squared logarithm of the ratio over its random error.
 
     The random error is taken relative to the model: relative to the measurement, points that came
@@ -259,10 +261,11 @@ def _shared_noise(
     return shared, correlations
 
 
-def _in_band(frf: FrequencyResponse, band: Band) -> Bool[np.ndarray, "frequencies outputs inputs"]:
+def _in_band(
+    frf: FrequencyResponse, band: Band
+) -> Bool[np.ndarray, " frequencies #outputs #inputs"]:
     if not isinstance(band, Mapping):
-        one = _between(frf, band)
-        return np.broadcast_to(one[:, None, None], frf.response.shape)
+        return _between(frf, band)[:, None, None]
     inside = np.ones(frf.response.shape, dtype=bool)
     for pair, limits in band.items():
         if pair not in (pairs := _pairs(frf)):

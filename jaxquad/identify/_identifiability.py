@@ -208,7 +208,7 @@ def _assess(information: Information) -> Verdict:
     root = information.root[:, :count]
     # All rows of `right` are wanted, and of the other factor none.
     _, singular, right = np.linalg.svd(root, full_matrices=len(root) < count)
-    singular = np.pad(singular, (0, count - len(singular)))
+    singular = np.concatenate([singular, np.zeros(count - len(singular))])
     exact = singular <= _FLOOR * singular[0]
     null = right[exact | (singular * LIMIT < 1)]
     null = _sparse(null) if len(null) else null

@@ -222,7 +222,7 @@ def _at(
     """Contribution of unit noise at these places to the errors, by group of atoms."""
     effect = np.asarray(errors.effect)
     if errors.windows is None:
-        return effect[:, None, :, places]
+        return effect[:, None, :, places[0] : places[-1] + 1]
     seen = errors.windows.at(places)
     turned = np.exp(-1j * np.asarray(errors.omega)[:, None] * places[None, :])
     ends = np.cumsum(errors.counts or (effect.shape[2],))
