@@ -58,6 +58,7 @@ from ._noise_model import (
     Noise as Noise,
     NoiseModel as NoiseModel,
 )
+from ._normal import problem_normal as problem_normal
 from ._output_error import refine as refine
 from ._parameters import (
     Free as Free,
@@ -82,7 +83,7 @@ from ._simulated import (
     integrate_plant as integrate_plant,
     linear_model as linear_model,
 )
-from ._solve import least_squares as least_squares, problem_normal as problem_normal
+from ._solve import least_squares as least_squares
 from ._starts import (
     Minimum as Minimum,
     solve_from_many as solve_from_many,

@@ -26,6 +26,7 @@ from ._accuracy import (
     ResponseTerm,
     scaled_inverse,
 )
+from ._aside import look_aside
 from ._cost import Points, Weights, widen_band
 from ._discrepancy import (
     find_discrepancy,
@@ -67,7 +68,7 @@ from ._seen import (
 )
 from ._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._solve import same_responses, Solution
-from ._starts import look_aside, Minimum, remarks_on_minima
+from ._starts import Minimum, remarks_on_minima
 from ._verdict import Bound, Verdict
 
 
@@ -106,7 +107,8 @@ def assess(
         seen = see(problem, frfs, counted.found, solution, units)
     records, blocks, prior = seen.records, seen.blocks, seen.prior
     bread, gradient, noise, discrepancy = seen.bread, seen.gradient, seen.noise, seen.discrepancy
-    falls_aside = look_aside(problem, solution, _cost(blocks, prior), bread)
+    here = _cost(blocks, prior)
+    falls_aside = look_aside(problem, solution.z, here, bread, solution.aside)
     cut = ft.partial(halved, seen=seen, names=parameters.names, bounds=bounds)
     by_noise, covariance = cut(seen.by_noise), cut(seen.covariance)
     pulled = pulled_beyond(seen, parameters.names, bounds)
@@ -237,7 +239,7 @@ def _count_dominated(problem: Problem, frfs: Sequence[FrequencyResponse]) -> tup
     """Points in use that show a controller, and all in use."""
     used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
     dominated = [mine & frf.of_controller for frf, mine in zip(frfs, used, strict=True)]
-    return sum(int(x.sum()) for x in dominated), sum(int(x.sum()) for x in used)
+    return int(sum(map(np.count_nonzero, dominated))), int(sum(map(np.count_nonzero, used)))
 
 
 def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> list[str]:
@@ -253,9 +255,10 @@ def _remarks_on_growth(
 ) -> list[str]:
     """Remark on a model that grows within the band of a direct estimate: no open loop does."""
     model = solution.model
-    known = isinstance(model, HasStateSpace | HasTransferFunction | StateSpace | TransferFunction)
     lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
-    if not known or lags or not any(frf.method == "direct" for frf in frfs):
+    if lags or not any(frf.method == "direct" for frf in frfs):
+        return []
+    if not isinstance(model, StateSpace | TransferFunction | HasStateSpace | HasTransferFunction):
         return []
     pairs = zip(frfs, problem.weights, strict=True)
     used = [

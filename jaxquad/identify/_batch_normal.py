@@ -23,9 +23,9 @@ from jaxquad.models import evaluate_response, StateSpace
 
 from ._held import held
 from ._mixing import Mixing
+from ._normal import problem_normal
 from ._parameters import Numbers, Parameters, Place
 from ._problem import Problem, unchanged
-from ._solve import problem_normal
 
 
 class Member(NamedTuple):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import KeptPrograms
+from jaxquad._xla import hasty_options, KeptPrograms
 
 from ._mixing import Mixing
 from ._parameters import Numbers
@@ -69,7 +69,7 @@ def as_residuals(
 
 
 def _in_line(values: Float[np.ndarray, "frequencies outputs inputs 2"]) -> np.ndarray:
-    return np.moveaxis(values, (3, 0), (0, 3)).reshape(-1)
+    return values.transpose(3, 1, 2, 0).reshape(-1)
 
 
 def _mixed(mixing: Mixing, part: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -123,22 +123,35 @@ def take_apart(problem: PyTree) -> tuple[Frame, list[Numbers]]:
 
 @ft.lru_cache(maxsize=8)
 def _programs(same: _Same) -> list[tuple[Program, list[Numbers]]]:
-    pairs = [take_apart(part) for part in same.problem.parts()]
-    return [(_program(frame), arrays) for frame, arrays in pairs]
+    parts = [(has_few_slopes(part), *take_apart(part)) for part in same.problem.parts()]
+    return [(_program(frame, few), arrays) for few, frame, arrays in parts]
 
 
 @ft.lru_cache(maxsize=128)
-def _program(frame: Frame) -> Program:
-    return _SLOPES.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:])))
+def _program(frame: Frame, few: bool) -> Program:
+    kept = _OF_FEW if few else _OF_MANY
+    return kept.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:])))
 
 
-def _misfits_and_slopes(
+_FEW = 2000  # points times parameters: a tenth of a ms
+
+
+def has_few_slopes(problem: Problem) -> bool:
+    """Whether all slopes take less time than the optimisation of their program would."""
+    points = sum(each.size for each in problem.measured)
+    return points * problem.parameters.start.size <= _FEW
+
+
+def misfits_and_slopes(
     z: Float[Array, " all"], problem: Problem
 ) -> tuple[Float[Array, " residuals"], Float[Array, "all residuals"]]:
+    """Those of an `Evaluation`, in JAX."""
+
     def along(change):
         return jax.jvp(lambda z: misfits(z, problem), (z,), (change,))
 
     return jax.vmap(along, out_axes=(None, 0))(jnp.eye(z.size, dtype=z.dtype))
 
 
-_SLOPES = KeptPrograms(_misfits_and_slopes, dict)
+_OF_FEW = KeptPrograms(misfits_and_slopes, hasty_options)
+_OF_MANY = KeptPrograms(misfits_and_slopes, dict)

@@ -66,13 +66,13 @@ class Parameters:
 
     def values(self, z: Float[Numbers, " n"]) -> Float[Numbers, " n"]:
         """Physical values of the first parameters."""
-        n, xp = z.shape[0], _namespace(z)
+        n, xp = z.shape[0], namespace_of(z)
         with np.errstate(over="ignore"):
             return self.scale[:n] * xp.where(np.array(self.logarithmic[:n]), xp.exp(z), z)
 
     def slopes(self, z: Float[Numbers, " n"]) -> Float[Numbers, " n"]:
         """Derivatives of the physical values with respect to `z`."""
-        n, xp = z.shape[0], _namespace(z)
+        n, xp = z.shape[0], namespace_of(z)
         ones = xp.ones_like(z)
         with np.errstate(over="ignore"):
             return self.scale[:n] * xp.where(np.array(self.logarithmic[:n]), xp.exp(z), ones)
@@ -83,7 +83,7 @@ class Parameters:
 
     def replace(self, model: PyTree, values: Float[Numbers, " n"]) -> PyTree:
         """The model with other physical values of its first `n` parameters."""
-        model, xp = with_values(model, self.places[: values.shape[0]], values), _namespace(values)
+        model, xp = with_values(model, self.places[: values.shape[0]], values), namespace_of(values)
         for place, tie in self.ties:
             value = xp.asarray(tie(model))
             if value.shape != ():
@@ -94,7 +94,8 @@ class Parameters:
         return model
 
 
-def _namespace(x: Numbers):
+def namespace_of(x: Numbers):
+    """The module whose functions take `x`: NumPy, or `jax.numpy`."""
     return np if isinstance(x, np.ndarray) else jnp
 
 
@@ -109,7 +110,7 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
             whole[k] = leaf
         return jax.tree.unflatten(structure, whole)
 
-    if _namespace(values) is np:
+    if namespace_of(values) is np:
         leaves = [np.array(leaf) if is_concrete(leaf) else leaf for leaf in leaves]
         if all(isinstance(leaf, np.ndarray) for leaf in leaves):
             for place, value in zip(places, values, strict=True):
@@ -118,7 +119,7 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
     for leaf in {place.leaf for place in places}:
         mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
         index = np.array([places[k].index for k in mine])
-        if isinstance(leaves[leaf], np.ndarray) and _namespace(values) is np:
+        if isinstance(leaves[leaf], np.ndarray) and namespace_of(values) is np:
             leaves[leaf].reshape(-1)[index] = values[mine]
             continue
         if leaves[leaf].size == 1:  # a scatter takes ten times as long to trace

@@ -90,9 +90,14 @@ class Problem:
                 mask[pair] = True
         return masks
 
+    @property
+    def is_single(self) -> bool:
+        """Whether it is one record, and nothing else."""
+        return len(self.omega) == 1 and not self.quantities
+
     def parts(self) -> list["Problem"]:
         """Problems of one record each, and one of the priors, for what no weight matters to."""
-        if len(self.omega) == 1 and not self.quantities:
+        if self.is_single:
             return [self.weighted(())]
         none = dataclasses.replace(
             self,
@@ -185,6 +190,8 @@ def on_device(model: PyTree) -> PyTree:
     """The model with JAX's arrays in the place of NumPy's."""
     leaves, structure = jax.tree.flatten(model)
     hosted = [k for k, leaf in enumerate(leaves) if isinstance(leaf, np.ndarray)]
+    if not hosted:
+        return model
     # In one call: it takes as long as for a single array.
     for k, array in zip(hosted, jax.device_put([leaves[k] for k in hosted]), strict=True):
         leaves[k] = array
@@ -283,13 +290,17 @@ def prior_misfits(z: Float[Numbers, " n"], problem: Problem) -> Float[Array, " p
 
 def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
     """All weighted misfits in one vector: half its squared norm is what the solver lowers."""
-    triples = zip(_log_ratios(z, problem), problem.weights, problem.mixings, strict=True)
     parts = []
-    for log, weight, mixing in triples:
-        both = zip(log, (weight[..., 0], weight[..., -1]), strict=True)
-        scaled = (part * jnp.moveaxis(each, 0, -1) for part, each in both)
-        parts += [part.reshape(-1) for part in mix_parts(mixing, *scaled)]
+    for k, log in enumerate(_log_ratios(z, problem)):
+        parts += [part.reshape(-1) for part in weigh_parts(problem, k, *log)]
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
+
+
+def weigh_parts(problem: Problem, k: int, magnitude: Part, phase: Part) -> tuple[Part, Part]:
+    """Misfits of record `k`, or slopes of them, as the residuals count them."""
+    weight = problem.weights[k]
+    both = zip((magnitude, phase), (weight[..., 0], weight[..., -1]), strict=True)
+    return mix_parts(problem.mixings[k], *(p * jnp.moveaxis(each, 0, -1) for p, each in both))
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:

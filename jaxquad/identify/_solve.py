@@ -1,96 +1,30 @@
+"""The least-squares solvers of fits, and all derivatives where they stop."""
+
 import functools as ft
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxquad._core import (
-    Normal,
-    normal_equations,
-    RUNNING,
-    STALLED,
-    TOLERANCE,
+from jaxquad._core import Normal, RUNNING, STALLED, TOLERANCE
+from jaxquad._xla import hasty_options, KeptPrograms
+
+from ._aside import costs_aside
+from ._evaluate import (
+    evaluate,
+    Evaluation,
+    Frame,
+    has_few_slopes,
+    misfits_and_slopes,
+    take_apart,
 )
-from jaxquad._xla import arctan2, hasty_options, KeptPrograms, no_fuse
-from jaxquad.models import Entry, factor_slopes, matrices_of, Split, StateSpace
-
-from ._evaluate import as_residuals, evaluate, Evaluation, Frame, start_each, take_apart
-from ._mixing import mix_parts
+from ._normal import is_plain, problem_normal
 from ._parameters import Numbers
-from ._problem import prior_misfits, Problem, residuals, unchanged
-
-
-def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:
-    """Cost, gradient and Gauss-Newton Hessian of the residuals of a fit.
-
-    For a plain `jq.StateSpace` with nothing tied, slopes are products of the resolvent's columns
-    and rows, at a quarter of the cost of differentiation; any other model is differentiated.
-
-    **Arguments:**
-
-    - `z`: the free parameters as the solver sees them.
-    - `problem`: of `jq.identify.make_problem`.
-    """
-    if not _is_plain(problem):
-        return normal_equations(residuals, z, problem)
-    parts = [part for k in range(len(problem.omega)) for part in _record(z, problem, k)]
-    if problem.quantities:
-        parts.append(normal_equations(prior_misfits, z, problem))
-    return ft.reduce(lambda a, b: jax.tree.map(jnp.add, a, b), parts)
-
-
-def _is_plain(problem: Problem) -> bool:
-    """Whether slopes are products of the resolvent's columns and rows."""
-    plain = type(problem.model) is StateSpace and not problem.parameters.ties
-    plain = plain and all(each is None for each in problem.aliases) and not any(problem.silent)
-    return plain and all(condition is unchanged for condition in problem.conditions)
-
-
-def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[Normal]:
-    """Of one record, magnitude and phase apart: side by side they would have to be copied."""
-    parameters, omega = problem.parameters, jnp.asarray(problem.omega[k])
-    matrices = matrices_of(parameters.insert(problem.model, z))
-    entries = [_entry(place.path) for place in parameters.places[: z.size]]
-    value, slopes = factor_slopes(matrices, omega, entries, jnp.asarray(parameters.slopes(z)))
-    misfit = no_fuse(_logarithm, value, jnp.asarray(problem.measured[k]))
-    mixing = problem.mixings[k]
-    weights = jnp.moveaxis(jnp.asarray(problem.weights[k]), (0, 3), (3, 0))
-    if len(weights) == 1 and mixing is None and slopes.multiplies_sooner:
-        square = sum(jnp.sum((part * weights[0]) ** 2) for part in misfit)
-        return [Normal(0.5 * jnp.asarray(square), *slopes.normal_products(weights[0], misfit))]
-    both = Split(weights[0], weights[-1])
-    residual = [part * weight for part, weight in zip(misfit, both, strict=True)]
-    mixed = mix_parts(mixing, *residual), mix_parts(mixing, *slopes.multiply_out(both))
-    return [_products(*each) for each in zip(*mixed, strict=True)]
-
-
-def _products(
-    residual: Float[Array, "outputs inputs frequencies"],
-    slopes: Float[Array, "parameters outputs inputs frequencies"],
-) -> Normal:
-    r, rows = residual.reshape(-1), slopes.reshape(len(slopes), -1)
-    return Normal(0.5 * jnp.sum(r**2), rows @ r, rows @ rows.T)
-
-
-def _logarithm(value: Split, measured: Complex[Array, "frequencies outputs inputs"]) -> Split:
-    """`ln|T/T^|` and the wrapped phase of `T/T^` in rad."""
-    there = jnp.moveaxis(measured, 0, -1)
-    real, imag = jnp.real(there), jnp.imag(there)
-    a = value.real * real + value.imag * imag
-    b = value.imag * real - value.real * imag
-    power = real * real + imag * imag
-    size = (value.real * value.real + value.imag * value.imag) / power
-    return Split(0.5 * jnp.log(size), jnp.asarray(arctan2(b, a)))
-
-
-def _entry(name: str) -> Entry:
-    field, *index = name.replace("]", "").split("[")
-    row, column = (int(i) for i in (*index, "0")[:2])
-    return Entry(field, row, column)
+from ._problem import Problem, residuals
 
 
 _SHORT = 3e4  # residuals times parameters squared: a few ms for a whole descent
@@ -109,7 +43,7 @@ class Solution(NamedTuple):
     """Where the solver stopped, why, and the derivatives there."""
 
     z: Float[np.ndarray, " parameters"]
-    model: PyTree  # with NumPy's arrays
+    model: PyTree  # with arrays of NumPy or of JAX
     values: Float[np.ndarray, " all"]  # physical, of free and then fixed parameters
     slopes: Float[np.ndarray, " all"]  # of the physical values with respect to z
     message: str
@@ -118,6 +52,7 @@ class Solution(NamedTuple):
     sensitivity: Sensitivity
     at_zero: tuple[int, ...] = ()  # parameters at their bound, where z stands for next to nothing
     units_at_zero: tuple[float, ...] = ()  # changes of them that show
+    aside: Float[np.ndarray, " sides"] | None = None  # costs to either side, if they are known
 
 
 class Stop(NamedTuple):
@@ -146,17 +81,23 @@ def solve(
 ) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
     if sum(each.size for each in problem.weights) * z0.size**2 < _SHORT:
+        if solver is None and problem.is_single and has_few_slopes(problem):
+            return _solve_at_once(problem.mixed(), z0, max_steps)
         stop = _descend_short(problem.mixed(), z0, solver, max_steps)
     else:
         stop = _descend_long(_with_one_weight(problem), jax.device_put(z0), solver, max_steps)
+    return solution_at(problem, np.asarray(stop.z), *_message_and_steps(stop))
+
+
+def _message_and_steps(stop: Stop) -> tuple[str, int]:
+    """Why the solver stopped before a minimum, if it did, and after how many steps."""
     steps = int(stop.steps)
-    message = "" if stop.converged else f"{_reason(stop.reason)} (after {steps} steps)"
-    return solution_at(problem, np.asarray(stop.z), message, steps)
+    return "" if stop.converged else f"{_reason(stop.reason)} (after {steps} steps)", steps
 
 
 def _with_one_weight(problem: Problem) -> Problem:
     """Weights of magnitude and phase once, where they are alike and that saves arithmetic."""
-    if not _is_plain(problem) or any(each is not None for each in problem.mixings):
+    if not is_plain(problem) or any(each is not None for each in problem.mixings):
         return problem
     return problem.weighted([once_if_alike(np.asarray(each)) for each in problem.weights])
 
@@ -189,9 +130,8 @@ def _sensitivity(problem: Problem, found: Evaluation) -> Sensitivity:
     for measured in problem.measured:
         shape, size = (2, *measured.shape[1:], len(measured)), 2 * measured.size
         mine = slice(start, start + size)
-        misfits.append(np.moveaxis(found.misfits[mine].reshape(shape), (0, 3), (3, 0)))
-        rows = found.slopes[:, mine].reshape(-1, *shape)
-        slopes.append(np.moveaxis(rows, (0, 1, 4), (4, 3, 0)))
+        misfits.append(found.misfits[mine].reshape(shape).transpose(3, 1, 2, 0))
+        slopes.append(found.slopes[:, mine].reshape(-1, *shape).transpose(4, 2, 3, 1, 0))
         start += size
     return Sensitivity(misfits, slopes, found.misfits[start:], found.slopes[:, start:].T)
 
@@ -240,6 +180,51 @@ def _descend_by_default(z0: Float[Array, " parameters"], problem: Problem, max_s
 
 # A short descent takes less time than the optimisation of its program would.
 _DESCENTS = KeptPrograms(_descend_by_default, hasty_options)
+
+
+class _Found(NamedTuple):
+    """Where a descent stopped, and what a `Solution` says of that point."""
+
+    stop: Stop
+    model: list[Numbers]  # its arrays
+    values: Float[Numbers, " all"]
+    slopes: Float[Numbers, " all"]  # of the values
+    misfits: Float[Numbers, " residuals"]
+    sensitivity: Float[Numbers, "all residuals"]
+    aside: Float[Numbers, " sides"]  # costs
+
+
+def _solve_at_once(
+    problem: Problem, z0: Float[np.ndarray, " parameters"], max_steps: int
+) -> Solution:
+    """All of a solution by one program: to run one more takes as long as what it computes."""
+    frame, arrays = take_apart(problem)
+    stop, leaves, *rest = _whole_program(frame, max_steps)([z0, *arrays])
+    message, steps = _message_and_steps(stop)
+    model = take_apart(problem.model)[0].filled(leaves)
+    z, values, slopes, *found, aside = map(np.asarray, (stop.z, *rest))
+    derivatives = _sensitivity(problem, Evaluation(*found))
+    solution = Solution(z, model, values, slopes, message, not message, steps, derivatives)
+    return solution._replace(aside=aside)
+
+
+@ft.lru_cache(maxsize=128)
+def _whole_program(frame: Frame, max_steps: int) -> Callable[[list[Numbers]], _Found]:
+    return _SOLUTIONS.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:]), max_steps))
+
+
+def _find_by_default(z0: Float[Array, " parameters"], problem: Problem, max_steps: int) -> _Found:
+    """For problems of a single record."""
+    stop, parameters = _descend(problem, z0, None, max_steps), problem.parameters
+    z = jnp.concatenate([stop.z, parameters.start[z0.size :]])
+    values = parameters.values(z)
+    model = parameters.replace(problem.model, values[: z0.size])
+    found = misfits_and_slopes(z, problem)
+    aside = costs_aside(stop.z, problem, *found)
+    return _Found(stop, take_apart(model)[1], values, parameters.slopes(z), *found, aside)
+
+
+_SOLUTIONS = KeptPrograms(_find_by_default, hasty_options)
 
 
 def least_squares(
@@ -323,16 +308,3 @@ def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> 
             return False
         start += old.size
     return True
-
-
-def start_costs(
-    problem: Problem, places: Sequence[Float[np.ndarray, " parameters"]]
-) -> Callable[[], list[float]]:
-    """The sums of squares at values of the free parameters; what is returned waits for them."""
-    found = start_each(problem, places)
-
-    def costs() -> list[float]:
-        with np.errstate(invalid="ignore", over="ignore"):
-            return [float(np.sum(as_residuals(problem, each.misfits) ** 2)) for each in found()]
-
-    return costs

@@ -1,6 +1,5 @@
 """Local minima: many starting points, solved side by side, and where each of them ended."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,17 +19,10 @@ from jaxquad._core import (
     TOLERANCE,
 )
 
-from ._accuracy import Matrix
+from ._normal import problem_normal
 from ._parameters import Numbers, Parameters
 from ._problem import Problem, residuals
-from ._solve import (
-    least_squares,
-    problem_normal,
-    Solution,
-    solution_at,
-    start_costs,
-    stopped_early,
-)
+from ._solve import least_squares, Solution, solution_at, stopped_early
 
 
 MINIMUM = "minimum"
@@ -240,7 +232,6 @@ def _kind(status: int, left: float, cost: float, curvature: float) -> str:
     return MINIMUM if curvature > 1e-9 else FLAT
 
 
-_ASIDE = 0.05  # longest relative step of the test for a saddle
 _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
@@ -264,20 +255,3 @@ def remarks_on_minima(
             "more, or over a wider band, to know which is right"
         )
     return remarks
-
-
-def look_aside(
-    problem: Problem, solution: Solution, here: float, bread: Matrix
-) -> Callable[[], bool]:
-    """Whether the cost is lower a small step to either side along the weakest direction.
-
-    Both costs are begun at once; what is returned waits for them.
-    """
-    size = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
-    values, vectors = np.linalg.eigh(bread / np.outer(size, size))
-    weakest = vectors[:, 0] / size
-    step = np.sqrt(1e-2 * max(here, 1e-12) / max(values[0], 1e-12))
-    step = min(step, _ASIDE / max(np.max(np.abs(weakest)), 1e-300))
-    sides = [solution.z + sign * step * weakest for sign in (1, -1)]
-    costs = start_costs(problem, sides)
-    return lambda: min(costs()) < here * (1 - 1e-6) - 1e-12
