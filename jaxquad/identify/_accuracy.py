@@ -110,7 +110,7 @@ def noise_effect(
     records: Sequence[ResponseTerm], blocks: list[Block], prior: PriorRows, count: int
 ) -> Noise:
     """The responses' errors, with all their correlation, seen through weights and slopes."""
-    data = np.sum([_through_fit(record) for record in records], axis=0)
+    data = sum(map(_through_fit, records), np.zeros((count, count)))
     cost = sum(block.expected for block in blocks)
     return Noise(data, prior.slopes[:, :count].T @ prior.slopes[:, :count], cost)
 

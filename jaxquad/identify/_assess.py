@@ -75,10 +75,12 @@ from ._verdict import Bound, Verdict
 class Counted(NamedTuple):
     """How the points of a fit count: as the noise says, and with what the model does not explain.
 
-    `weights` are those by the noise alone, where those of the problem have a floor on the error.
+    `records` are at the solution, by changes relative to its own units. `weights` are those by the
+    noise alone, where those of the problem have a floor on the error.
     """
 
     points: Sequence[Points]
+    records: list[ResponseTerm]
     weights: Sequence[Weights] | None
     mixings: Sequence[Mixing | None] | None
     found: tuple[Mixture, Mixture]
@@ -100,11 +102,11 @@ def assess(
     parameters, count = problem.parameters, problem.parameters.count
     frfs = [each.frf for each in counted.points]
     units = units_of(solution)
-    seen = see(problem, frfs, counted.found, solution, units)
+    seen = see(counted.records, counted.found, solution, units)
     bounds, tangled = bounds_of(problem, solution, seen, units)
     if tangled:
         units = with_tangled(units, seen, tangled)
-        seen = see(problem, frfs, counted.found, solution, units)
+        seen = see(records_of(problem, frfs, solution, units), counted.found, solution, units)
     records, blocks, prior = seen.records, seen.blocks, seen.prior
     bread, gradient, noise, discrepancy = seen.bread, seen.gradient, seen.noise, seen.discrepancy
     here = _cost(blocks, prior)
@@ -210,13 +212,19 @@ def _cost(blocks: list[Block], prior: PriorRows | None = None) -> float:
     return data if prior is None else data + float(np.sum(prior.misfit**2))
 
 
-def discrepancy_at(
+def records_at(
     problem: Problem, points: Sequence[Points], solution: Solution
+) -> list[ResponseTerm]:
+    """The responses at a solution, by changes relative to its own units."""
+    frfs = [each.frf for each in points]
+    return records_of(problem, frfs, solution, units_of(solution))
+
+
+def discrepancy_at(
+    records: list[ResponseTerm], points: Sequence[Points], solution: Solution
 ) -> tuple[Mixture, Mixture]:
     """What the model leaves unexplained at a solution."""
-    units = units_of(solution)
-    records = records_of(problem, [each.frf for each in points], solution, units)
-    count, prior = problem.parameters.count, prior_rows(solution, units)
+    count, prior = solution.z.size, prior_rows(solution, units_of(solution))
     held = set()
     if solution.at_zero:
         gradient = gauss_newton(blocks_of(records), prior, count)[1]

@@ -45,7 +45,7 @@ class _Local(NamedTuple):
         """The change of each `z` that stands out from the scatter of the residuals."""
         freedom = max(self.residual.size - self.jacobian.shape[1], 1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.sqrt(self.cost / freedom) / np.linalg.norm(self.jacobian, axis=0)
+            return np.sqrt(self.cost / freedom) / np.sqrt(np.sum(self.jacobian**2, axis=0))
 
 
 def solve_within_bounds(
@@ -85,11 +85,10 @@ def settle_at_bounds(
 
 def _above_underflow(problem: Problem, solution: Solution) -> Solution:
     """The same where a value is a number that its slopes can be seen at."""
-    z, count = np.array(solution.z), problem.parameters.count
-    logarithmic = np.array(problem.parameters.logarithmic[:count])
+    z, count = solution.z, problem.parameters.count
     least = np.asarray(problem.parameters.start)[:count] - _SMALLEST
-    lost = logarithmic & (z < least)
-    return _at(problem, np.where(lost, least, z), solution) if np.any(lost) else solution
+    lost = (z < least) & problem.parameters.logarithmic[:count]
+    return _at(problem, np.where(lost, least, z), solution) if lost.any() else solution
 
 
 def _look(problem: Problem, solution: Solution) -> _Local:
@@ -109,9 +108,9 @@ def _look(problem: Problem, solution: Solution) -> _Local:
 
 def _near_zero(problem: Problem, local: _Local) -> list[int]:
     """Parameters that keep their sign, and could grow a hundred times without being seen."""
-    logarithmic = np.array(problem.parameters.logarithmic[: problem.parameters.count])
     shown = local.shown
-    return np.flatnonzero(logarithmic & np.isfinite(shown) & (shown > 1 / _NEAR)).tolist()
+    far = np.isfinite(shown) & (shown > 1 / _NEAR)
+    return np.flatnonzero(far & problem.parameters.logarithmic[: shown.size]).tolist()
 
 
 def _one_sided_step(local: _Local, low: Sequence[int]) -> Point:

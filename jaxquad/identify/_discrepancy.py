@@ -93,7 +93,8 @@ def find_discrepancy(
     lowest = np.log(0.1 * seen.typical)
     amplitudes = np.exp(np.linspace(lowest, max(0.0, lowest + 1.4), _AMPLITUDES))
     likelihoods = _restricted_likelihoods(seen, np.concatenate([[0.0], amplitudes]))
-    one, other = (_mix(likelihoods, amplitudes, mean) for mean in (MEAN, _OTHER * MEAN))
+    relative = np.exp(likelihoods - np.max(likelihoods))
+    one, other = (_mix(relative, amplitudes, mean) for mean in (MEAN, _OTHER * MEAN))
     return one, other
 
 
@@ -205,12 +206,14 @@ def _restricted_likelihoods(
     return -0.5 * (grown + volume + rest)
 
 
-def _mix(likelihoods: np.ndarray, amplitudes: np.ndarray, mean: float) -> Mixture:
-    """The posterior under a mass at zero, and a gamma distribution above it."""
+def _mix(relative: np.ndarray, amplitudes: np.ndarray, mean: float) -> Mixture:
+    """The posterior under a mass at zero, and a gamma distribution above it.
+
+    `relative` are the likelihoods over the largest of them.
+    """
     cell = amplitudes * np.log(amplitudes[1] / amplitudes[0])
     density = cell * amplitudes ** (_SHAPE - 1) * np.exp(-_SHAPE * amplitudes / mean)
-    density *= (1 - _NONE) / max(float(np.sum(density)), 1e-300) / len(likelihoods)
-    relative = np.exp(likelihoods - np.max(likelihoods))
+    density *= (1 - _NONE) / max(float(np.sum(density)), 1e-300) / len(relative)
     none, some = _NONE * relative[0, 0], relative[:, 1:] * density
     total = none + np.sum(some)
     return Mixture(np.sum(some * amplitudes**2, axis=1) / total, float(none / total))

@@ -10,7 +10,7 @@ from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ._assess import assess, Counted, discrepancy_at
+from ._assess import assess, Counted, discrepancy_at, records_at
 from ._bounds import settle_at_bounds, solve_within_bounds
 from ._cost import (
     Band,
@@ -267,7 +267,8 @@ def _solve_with_floor(
 
     Only where it does leave something: for a right model a floor costs efficiency.
     """
-    found, cost, lifted = discrepancy_at(problem, points, solution), options.cost, False
+    records, cost, lifted = records_at(problem, points, solution), options.cost, False
+    found = discrepancy_at(records, points, solution)
     for _ in range(rounds if found[0].none < DOUBT else 0):
         raised = [_with_floor(each, found[0].amplitude) for each in points]
         weights = _weights(cost, raised, _ratios(solution))
@@ -276,11 +277,13 @@ def _solve_with_floor(
         problem, lifted = _weighted(problem, cost, raised, weights), True
         solution = solve_within_bounds(problem, solution.z, options.solver, options.max_steps)
         _check_finite(solution)
-        found = discrepancy_at(problem, points, solution)
+        records = records_at(problem, points, solution)
+        found = discrepancy_at(records, points, solution)
     if not lifted:
-        return problem, solution, Counted(points, None, None, found)
+        return problem, solution, Counted(points, records, None, None, found)
     plain = _weights(cost, points, _ratios(solution))
-    return problem, solution, Counted(points, plain, _mixings(cost, points, plain), found)
+    mixings = _mixings(cost, points, plain)
+    return problem, solution, Counted(points, records, plain, mixings, found)
 
 
 def _with_floor(points: Points, floor: float) -> Points:

@@ -26,7 +26,7 @@ from jaxquad._xla import Jit
 from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ._assess import assess, Counted, discrepancy_at
+from ._assess import assess, Counted, discrepancy_at, records_at
 from ._batch_normal import Batch, Evaluate, evaluates_singly, Member, normal_equations_of
 from ._cost import (
     Cost,
@@ -289,8 +289,9 @@ class BatchFit(eqx.Module):
         problem = problem.weighted([self.weights[k]], mixings)
         message = "" if self.converged[k] else stopped_early(STALLED, steps)
         solution = solution_at(problem, self.z[k], message, steps)
-        found = discrepancy_at(problem, [points], solution)
-        return assess(problem, Counted([points], None, None, found), solution)
+        records = records_at(problem, [points], solution)
+        found = discrepancy_at(records, [points], solution)
+        return assess(problem, Counted([points], records, None, None, found), solution)
 
     def __str__(self) -> str:
         lost = int(np.sum(~self.converged))

@@ -136,8 +136,8 @@ def remarks_on_hold(
     return []
 
 
-def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
-    """As many aliases and as few nodes as a model's response needs; None without a hold.
+def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
+    """As many aliases and as few nodes as a model's response needs, whose input was held.
 
     **Arguments:**
 
@@ -145,8 +145,6 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases | None:
     - `frf`: the measured response that they are compared with.
     """
     hold, omega = hold_of(frf), np.asarray(frf.omega)
-    if not hold:
-        return None
     tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
     every = _aliases_at(tried, hold, _COUNTS[-1])
     found = np.asarray(_evaluate(model, tried, every.omega))

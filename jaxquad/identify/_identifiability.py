@@ -215,11 +215,7 @@ def _assess(information: Information) -> Verdict:
     imprecise = _imprecise(information)
     lost = np.any(null, axis=0) | imprecise
     null = _with_causes(null, information.covariance, imprecise)
-    sure = _sparse(right[exact]) if np.any(exact) else null[:0]
-    information = information._replace(
-        covariance=_with_null_variance(information.covariance, right[exact])
-    )
-    groups = [_analyse_group(null, sure, block, information) for block in _group_members(null)]
+    groups = _analyse_groups(null, right[exact], information)
     names = information.names
     undetermined = tuple(names[k] for k in np.flatnonzero(lost))
     return Verdict(
@@ -284,6 +280,20 @@ def _with_null_variance(covariance: np.ndarray, exact: np.ndarray) -> np.ndarray
     """Covariance with a large variance along exact null directions; a pseudo-inverse has none."""
     keep = np.eye(len(covariance)) - exact.T @ exact
     return keep @ covariance @ keep + 1e4 * exact.T @ exact
+
+
+def _analyse_groups(
+    null: Float[np.ndarray, "null parameters"],
+    exact: Float[np.ndarray, "exact parameters"],
+    information: Information,
+) -> list[_Group]:
+    """One for all parameters that share null directions."""
+    if not len(null):
+        return []
+    sure = _sparse(exact) if len(exact) else exact
+    covariance = _with_null_variance(information.covariance, exact)
+    information = information._replace(covariance=covariance)
+    return [_analyse_group(null, sure, block, information) for block in _group_members(null)]
 
 
 def _analyse_group(

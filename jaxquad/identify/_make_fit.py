@@ -111,6 +111,9 @@ def _physical_covariance(
 
     A pseudo-inverse shows no variance along a null direction: there it is unbounded.
     """
+    if not verdict.undetermined:
+        bounded = np.zeros(len(names), dtype=bool)
+        return _in_units(relative, slopes, bounded), bounded
     rows = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
     hidden = [row for row in np.array(rows) if row @ relative @ row < (0.5 * LIMIT) ** 2]
     lost = np.array([name in verdict.undetermined for name in names])

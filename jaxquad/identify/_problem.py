@@ -13,7 +13,7 @@ from jaxquad._xla import no_fuse
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
-from ._held import Aliases, evaluate_sampled, plan_aliases
+from ._held import Aliases, evaluate_sampled, hold_of, plan_aliases
 from ._mixing import mix_parts, Mixing, unmixed
 from ._parameters import find_place, Numbers, Parameters
 
@@ -172,13 +172,15 @@ def make_problem(
         weights=tuple(np.zeros(shape) for shape in shapes),
         mixings=(None,) * len(shapes),
         known=np.asarray(numbers, dtype=float).reshape(-1, 2),
-        aliases=tuple(
-            plan_aliases(each(on_host(model)), frf) for each, frf in zip(taken, frfs, strict=True)
-        ),
+        aliases=tuple(_plan(model, *each) for each in zip(taken, frfs, strict=True)),
         silent=tuple(
             _silent_pairs(model, parameters, *each) for each in zip(taken, frfs, strict=True)
         ),
     )
+
+
+def _plan(model: PyTree, condition: Condition, frf: FrequencyResponse) -> Aliases | None:
+    return plan_aliases(condition(on_host(model)), frf) if hold_of(frf) else None
 
 
 def _known(response: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:

@@ -43,15 +43,13 @@ class Seen(NamedTuple):
 
 
 def see(
-    problem: Problem,
-    frfs: Sequence[FrequencyResponse],
+    records: list[ResponseTerm],
     found: tuple[Mixture, Mixture],
     solution: Solution,
     units: Float[np.ndarray, " all"],
 ) -> Seen:
     """All of it, with the discrepancy `found`; changes are relative to `units`."""
-    count = problem.parameters.count
-    records = records_of(problem, frfs, solution, units)
+    count = solution.z.size
     blocks, prior = blocks_of(records), prior_rows(solution, units)
     bread, gradient = gauss_newton(blocks, prior, count)
     noise = noise_effect(records, blocks, prior, count)
