@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
+from jaxquad._core import pytree_node
 from jaxquad.models import evaluate_response, imaginary
 from jaxquad.spectra import FrequencyResponse
 
@@ -20,7 +21,8 @@ _TOLERANCE = 1e-8  # of the response, to which they are chosen
 Numbers = Array | np.ndarray
 
 
-class Aliases(eqx.Module):
+@pytree_node
+class Aliases:
     """How the response of a held input follows from a model's own at other frequencies.
 
     Held for h seconds each, the samples u[k] give a plant G the sampled response
@@ -183,7 +185,8 @@ def _evaluate(model, omega, others):
     return evaluate_response(model, jnp.concatenate([omega, others]))
 
 
-class _Terms(eqx.Module):
+@pytree_node
+class _Terms:
     """A model's response at some frequencies and at all of their aliases."""
 
     omega: Float[np.ndarray, " frequencies"]

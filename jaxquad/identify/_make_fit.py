@@ -112,8 +112,8 @@ def _physical_covariance(
     A pseudo-inverse shows no variance along a null direction: there it is unbounded.
     """
     if not verdict.undetermined:
-        bounded = np.zeros(len(names), dtype=bool)
-        return _in_units(relative, slopes, bounded), bounded
+        none = np.zeros(len(names), dtype=bool)
+        return _in_units(relative, slopes, none), none
     rows = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
     hidden = [row for row in np.array(rows) if row @ relative @ row < (0.5 * LIMIT) ** 2]
     lost = np.array([name in verdict.undetermined for name in names])
@@ -128,7 +128,8 @@ def _in_units(
 ) -> Matrix:
     """A covariance of relative changes in physical units, nan where it is unbounded."""
     physical = relative * np.outer(slopes, slopes)
-    physical[unbounded, :] = physical[:, unbounded] = np.nan
+    if unbounded.any():
+        physical[unbounded, :] = physical[:, unbounded] = np.nan
     return physical
 
 

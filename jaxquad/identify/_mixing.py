@@ -10,9 +10,10 @@ import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from ._cost import Points, Weights
 
@@ -32,6 +33,7 @@ class Mixing(NamedTuple):
 
     factor: Square
     correlation: Square
+    idle: Bool[np.ndarray, ""] | None = None  # whether nothing is mixed, if programs are to ask
 
 
 def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mixing | None, ...]:
@@ -42,7 +44,7 @@ def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mi
 def _mixing(points: Points, weights: Weights) -> Mixing | None:
     if not points.correlations:
         return None
-    factor, correlation = (np.array(each) for each in unmixed(points.used.shape))
+    factor, correlation = (np.array(each) for each in unmixed(points.used.shape)[:2])
     for (o, i), shared in points.correlations.items():
         mine = np.flatnonzero(points.used[:, o, i])
         # A floor on the error is the points' own.
@@ -52,7 +54,7 @@ def _mixing(points: Points, weights: Weights) -> Mixing | None:
         root = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(whole))
         factor[o, i][np.ix_(mine, mine)] = root
         correlation[o, i][np.ix_(mine, mine)] = shared
-    return Mixing(factor, correlation)
+    return Mixing(factor, correlation, np.array(False))
 
 
 @ft.lru_cache(maxsize=8)
@@ -60,7 +62,8 @@ def unmixed(shape: tuple[int, ...]) -> Mixing:
     """The mixing of (frequencies, outputs, inputs) that share no noise: identities."""
     count, outputs, inputs = shape
     identity = np.eye(count, dtype=complex)
-    return Mixing(*np.broadcast_to(identity, (2, outputs, inputs, count, count)))
+    each = np.broadcast_to(identity, (outputs, inputs, count, count))
+    return Mixing(each, each, np.array(True))
 
 
 def mix(
@@ -109,4 +112,10 @@ def mix_parts(
         return real, imag
     c, s = jnp.real(mixing.factor), jnp.imag(mixing.factor)
     turn = lambda matrix, part: jnp.einsum("oifg,...oig->...oif", matrix, part)
-    return turn(c, real) - turn(s, imag), turn(s, real) + turn(c, imag)
+
+    def turned(real: Array, imag: Array) -> tuple[Array, Array]:
+        return turn(c, real) - turn(s, imag), turn(s, real) + turn(c, imag)
+
+    if mixing.idle is None:
+        return turned(real, imag)
+    return jax.lax.cond(mixing.idle, lambda *same: same, turned, real, imag)

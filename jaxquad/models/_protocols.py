@@ -73,7 +73,7 @@ def with_arrays(model: PyTree) -> PyTree:
 def _is_number(x: object) -> bool:
     """Whether JAX would not take it for a parameter, although it is a number."""
     if isinstance(x, np.ndarray | np.generic | jax.Array):
-        return bool(jnp.issubdtype(x.dtype, jnp.integer))
+        return x.dtype.kind in "iu"
     return isinstance(x, int | float) and not isinstance(x, bool)
 
 

@@ -9,8 +9,11 @@ from scipy.optimize import least_squares
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
+from jaxquad.identify import make_problem, residuals, select_parameters
+from jaxquad.identify._cost import points_of, usable
 from jaxquad.identify._gauss_newton import DampedGaussNewton
-from jaxquad.identify._solve import least_squares as minimum_of
+from jaxquad.identify._mixing import mixings_of
+from jaxquad.identify._solve import least_squares as minimum_of, solve
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -48,6 +51,39 @@ def decay(z, data):
 
 
 DATA = 2 * np.exp(-0.7 * np.linspace(0.0, 2.0, 8)) + 0.05 * np.cos(9 * np.arange(8))
+
+
+def test_a_fit_to_one_record_is_one_program_and_it_mixes_what_shares_noise():
+    omega, compiled = OMEGA[::2], []
+
+    def listen(event: str, duration_secs: float, **facts: str | int):
+        if "backend_compile" in event:
+            compiled.append(facts.get("fun_name"))
+
+    frfs = [response_of(TRUTH, correlation=c, seed=0, omega=omega) for c in (0.0, 0.6)]
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        fits = [jq.fit(START, frf) for frf in frfs]
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert len(compiled) == 1
+    # NumPy, which mixes for itself, sees nothing left to save where the program stopped.
+    assert all(fit.newton_decrement < 1e-10 * fit.cost for fit in fits)
+    assert fits[1].cost != pytest.approx(fits[0].cost, rel=0.1)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6], ids=["independent", "shared"])
+def test_costs_aside_of_a_minimum_are_a_hundredth_above_its_own(correlation):
+    frf = response_of(TRUTH, error=0.002, correlation=correlation, seed=0)
+    points, cost = points_of([frf], [usable(frf, None, 0.6)]), jq.identify.MaximumLikelihood()
+    weights = [cost.weights(points[0], np.ones(frf.response.shape))]
+    problem = make_problem(START, select_parameters(START, None), [frf])
+    problem = problem.weighted(weights, mixings_of(points, weights))
+    found = solve(problem, np.asarray(problem.parameters.start), None, 256)
+    here = np.sum(np.asarray(residuals(jnp.asarray(found.z), problem)) ** 2)
+    assert found.aside is not None
+    # The cost is a parabola but for the curvature of the response.
+    np.testing.assert_allclose(found.aside, 1.01 * here, rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -105,6 +105,13 @@ def test_a_stationary_point_that_is_no_minimum_says_so():
     assert abs(abs(best.values[0] - 1.0) - 1.0) < 1e-6
 
 
+def test_a_fit_that_stays_on_a_saddle_says_so():
+    at, free = Folded(jnp.asarray(1.0)), (jq.identify.Real("b"),)
+    fit = jq.fit(at, constant_response(), free=free)
+    assert fit.values == [1.0]
+    assert any("no minimum: the cost falls to one side" in remark for remark in fit.remarks)
+
+
 @pytest.mark.slow
 def test_a_stop_at_a_wall_says_so_and_is_not_converged():
     problem = problem_of(Walled(jnp.asarray(1.0)), constant_response(), (jq.identify.Real("b"),))
