@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxquad._core import solve_definite
+
 from ._accuracy import Matrix
 from ._evaluate import as_residuals, start_each
 from ._parameters import namespace_of, Numbers
@@ -67,8 +69,31 @@ def _sides(
     """A small step from `z` to either side along the weakest direction of `bread`."""
     xp = namespace_of(z)
     size = xp.sqrt(xp.maximum(xp.diagonal(bread), 1e-300))
-    values, vectors = xp.linalg.eigh(bread / (size[:, None] * size[None]))
-    weakest = vectors[:, 0] / size
-    step = xp.sqrt(1e-2 * xp.maximum(here, 1e-12) / xp.maximum(values[0], 1e-12))
+    weakest, curvature = _weakest(bread / (size[:, None] * size[None]))
+    weakest = weakest / size
+    step = xp.sqrt(1e-2 * xp.maximum(here, 1e-12) / xp.maximum(curvature, 1e-12))
     step = xp.minimum(step, _LONGEST / xp.maximum(xp.max(xp.abs(weakest)), 1e-300))
     return xp.stack([z + step * weakest, z - step * weakest])
+
+
+_RIDGE = 1e-12  # of a matrix with ones on its diagonal, so that it has an inverse
+
+
+def _weakest(
+    matrix: Float[Numbers, "parameters parameters"],
+) -> tuple[Float[Numbers, " parameters"], Float[Numbers, ""]]:
+    """The eigenvector of the smallest eigenvalue, and that value."""
+    if isinstance(matrix, np.ndarray):
+        values, vectors = np.linalg.eigh(matrix)
+        return vectors[:, 0], values[0]
+    # A kept program that calls LAPACK crashes in a process that has not traced it. So: the 32nd
+    # power of the inverse, in whose columns nothing is left but the weakest direction.
+    unit = jnp.eye(len(matrix), dtype=matrix.dtype)
+    ridged = jnp.broadcast_to((matrix + _RIDGE * unit)[..., None], (*matrix.shape, len(matrix)))
+    inverse = solve_definite(ridged, unit)[0]
+    power = inverse / jnp.trace(inverse)
+    for _ in range(5):
+        power = power @ power
+    column = power[:, jnp.argmax(jnp.diagonal(power))]
+    vector = column / jnp.sqrt(column @ column)
+    return vector, vector @ matrix @ vector
