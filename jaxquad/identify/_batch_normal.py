@@ -37,6 +37,7 @@ class Member(NamedTuple):
     inverse: tuple[Numbers, Numbers]  # frequencies outputs inputs: 1 / measured, real, imaginary
     weights: Numbers  # frequencies outputs inputs parts: one of both for single evaluation
     factor: tuple[Numbers, Numbers] | None  # frequencies frequencies outputs inputs, a `Mixing`'s
+    across: tuple[Numbers, Numbers] | None = None  # frequencies pairs pairs, of several pairs
 
 
 class Batch(NamedTuple):
@@ -105,25 +106,30 @@ class _Single(NamedTuple):
     measured: tuple[Array, Array]  # outputs inputs frequencies: real, imaginary
     weights: Array  # parts outputs inputs frequencies
     factor: tuple[Array, Array] | None  # outputs inputs frequencies frequencies
+    across: tuple[Array, Array] | None  # frequencies pairs pairs
 
 
 def _lay_out(member: Member) -> _Single:
     """With the members first: transposed once, not at each evaluation."""
     measured = jnp.moveaxis(1 / jax.lax.complex(*member.inverse), (3, 0), (0, 3))
     weights = jnp.moveaxis(member.weights, (4, 3, 0), (0, 1, 4))
-    factor = None
+    factor = across = None
     if member.factor is not None:
         real, imag = (jnp.moveaxis(x, (4, 0, 1), (0, 3, 4)) for x in member.factor)
         factor = real, imag
-    return _Single((jnp.real(measured), jnp.imag(measured)), weights, factor)
+    if member.across is not None:
+        real, imag = (jnp.moveaxis(x, -1, 0) for x in member.across)
+        across = real, imag
+    return _Single((jnp.real(measured), jnp.imag(measured)), weights, factor, across)
 
 
 def _problem_of_one(batch: Batch, member: _Single) -> Problem:
     mixing = None
     if member.factor is not None:
         factor = jax.lax.complex(*member.factor)
+        across = None if member.across is None else jax.lax.complex(*member.across)
         # Traced, in the place of NumPy's arrays; correlations matter to nothing here.
-        mixing = Mixing(factor, factor)  # pyright: ignore[reportArgumentType]
+        mixing = Mixing(factor, factor, across, across)  # pyright: ignore[reportArgumentType]
     return Problem(
         model=batch.model,
         parameters=batch.parameters,
@@ -147,6 +153,8 @@ def _fits_a_kernel(z: Array, member: Member) -> bool:
     wide = member.weights[0].size // 2
     if member.factor is not None:
         wide *= len(z) + 1
+    if member.across is not None:
+        wide *= member.across[0].shape[1]
     return wide < _WIDEST and len(z) <= _MOST_PARAMETERS
 
 
@@ -160,7 +168,7 @@ def _accumulate(
     """The scalar products of all columns, frequency by frequency."""
     columns_at = ft.partial(_columns_at, batch, z, omega, member)
     if member.factor is not None:
-        columns_at = _mix(columns_at, omega, count, member.factor, len(z) + 1)
+        columns_at = _mix(columns_at, omega, count, member, len(z) + 1)
     pairs = _lower(len(z) + 1)
 
     def add(k, total):
@@ -185,10 +193,12 @@ def _mix(
     columns_at: Callable[[Array], list[Column]],
     omega: Array,
     count: Int[Array, ""],
-    factor: tuple[Numbers, Numbers],
+    member: Member,
     columns: int,
 ) -> Callable[[Array], list[Column]]:
-    """The same columns with points that share noise taken together, by a triangular factor."""
+    """The same columns with points that share noise taken together, by triangular factors."""
+    factor, across = member.factor, member.across
+    assert factor is not None
     shape = (omega.size, columns, *factor[0].shape[2:])
     zero = jnp.zeros(shape, omega.dtype), jnp.zeros(shape, omega.dtype)
 
@@ -207,9 +217,25 @@ def _mix(
 
         zero = jnp.zeros(shape[1:], omega.dtype), jnp.zeros(shape[1:], omega.dtype)
         real, imag = jax.lax.fori_loop(0, k + 1, add, zero)
+        if across is not None:
+            here = [jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in across]
+            real, imag = _turn_pairs(here[0], here[1], real, imag)
         return [(real[n], imag[n]) for n in range(columns)]
 
     return mixed_at
+
+
+def _turn_pairs(
+    c: Float[Array, "pairs pairs members"],
+    s: Float[Array, "pairs pairs members"],
+    real: Float[Array, "columns outputs inputs members"],
+    imag: Float[Array, "columns outputs inputs members"],
+) -> tuple[Array, Array]:
+    """Products of matrices and vectors, members last."""
+    shape, flat = real.shape, (real.shape[0], 1, -1, real.shape[-1])
+    a, b, c, s = real.reshape(flat), imag.reshape(flat), c[None], s[None]
+    turned = jnp.sum(c * a - s * b, axis=2), jnp.sum(s * a + c * b, axis=2)
+    return turned[0].reshape(shape), turned[1].reshape(shape)
 
 
 def _two_indices(array: Numbers, k: Array, g: Array) -> Array:
@@ -227,6 +253,10 @@ def _at_all_frequencies(batch: Batch, z: Array, member: Member) -> Normal:
     if member.factor is not None:
         factor = jax.lax.complex(*member.factor)
         mixed = jnp.einsum("fgoib,cgoib->cfoib", factor, jax.lax.complex(real, imag))
+        if member.across is not None:
+            flat = mixed.reshape(*mixed.shape[:2], -1, mixed.shape[-1])
+            turned = jnp.einsum("fpqb,cfqb->cfpb", jax.lax.complex(*member.across), flat)
+            mixed = turned.reshape(mixed.shape)
         real, imag = jnp.real(mixed), jnp.imag(mixed)
     points = [part.reshape(len(columns), -1, z.shape[1]) for part in (real, imag)]
     return _assemble(_products(jnp.concatenate(points, axis=1)))

@@ -55,7 +55,8 @@ class Points:
     Neighbouring frequencies share part of their noise: `shared` is the sum of |rho|^2 of a point's
     error with those of all points used, so that `1 / shared` of it is the point's own.
     `correlations` has the complex rho of the points used of each pair that shares noise, by
-    (output, input).
+    (output, input). `between` has that of the pairs at each frequency, output by output, where
+    they share noise; of points that are not used, the identity.
     """
 
     frf: FrequencyResponse
@@ -65,6 +66,7 @@ class Points:
     correlations: Mapping[tuple[int, int], Complex[np.ndarray, "used used"]] = eqx.field(
         default_factory=dict
     )
+    between: Complex[np.ndarray, "frequencies pairs pairs"] | None = None
 
 
 @runtime_checkable
@@ -215,8 +217,28 @@ def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[P
     found = []
     for frf, mask in zip(frfs, used, strict=True):
         shared, correlations = _shared_noise(frf, mask)
-        found.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations))
+        between = _between_pairs(frf, mask)
+        found.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations, between))
     return found
+
+
+def _between_pairs(
+    frf: FrequencyResponse, used: Mask
+) -> Complex[np.ndarray, "frequencies pairs pairs"] | None:
+    """As in `Points`: correlations of the errors relative to the response."""
+    if used[0].size == 1:
+        return None
+    errors = frf.errors
+    covariance = type(errors).at_each_frequency(errors)
+    mine, count = used.reshape(len(used), -1), used[0].size
+    size = np.sqrt(np.maximum(np.real(np.diagonal(covariance, axis1=1, axis2=2)), 1e-300))
+    response = np.where(used, np.asarray(frf.response), 1.0).reshape(len(used), -1)
+    turn = np.exp(-1j * np.angle(response)) / size
+    both = mine[:, :, None] & mine[:, None, :] & ~np.eye(count, dtype=bool)
+    whole = turn[:, :, None] * covariance * np.conj(turn)[:, None, :]
+    correlation = np.where(both, whole, np.eye(count, dtype=complex))
+    shared = np.sum(np.real(correlation) ** 2 + np.imag(correlation) ** 2, axis=2)
+    return correlation if np.any(shared > _ALONE) else None
 
 
 def _own_covariance(

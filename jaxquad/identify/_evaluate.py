@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxquad._xla import hasty_options, KeptPrograms
 
-from ._mixing import Mixing
+from ._mixing import mix_complex, Mixing
 from ._parameters import Numbers
 from ._problem import misfits, Problem
 
@@ -76,7 +76,7 @@ def _mixed(mixing: Mixing, part: np.ndarray, shape: tuple[int, ...]) -> np.ndarr
     count, outputs, inputs, _ = shape
     both = part.reshape(-1, 2, outputs, inputs, count)
     joined = np.moveaxis(both[:, 0] + 1j * both[:, 1], 0, -1)
-    turned = np.moveaxis(mixing.factor @ joined, -1, 0)
+    turned = np.moveaxis(mix_complex(mixing, joined), -1, 0)
     return np.stack([np.real(turned), np.imag(turned)], axis=1).reshape(part.shape)
 
 

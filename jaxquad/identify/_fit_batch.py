@@ -118,8 +118,11 @@ def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Mem
     if weights.shape[1] > measured.shape[1]:
         weights[:, measured.shape[1] :] = 0
     shared = any(each is not None for each in mixings)
-    factor = _factors(mixings, measured.shape, inverse.shape[1]) if shared else None
-    return Member((np.real(inverse), np.imag(inverse)), weights, factor)
+    parts = np.real(inverse), np.imag(inverse)
+    if not shared:
+        return Member(parts, weights, None)
+    given = measured.shape, inverse.shape[1]
+    return Member(parts, weights, _factors(mixings, *given), _across(mixings, *given))
 
 
 def _factors(
@@ -134,6 +137,22 @@ def _factors(
         factor = factor if mixing is None else np.moveaxis(mixing.factor, (0, 1), (2, 3))
         real[k, :count, :count], imag[k, :count, :count] = np.real(factor), np.imag(factor)
     return real, imag
+
+
+def _across(
+    mixings: Mixings, shape: tuple[int, ...], length: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Likewise of the pairs at each frequency, where there are several."""
+    batch, count, outputs, inputs = shape
+    pairs = outputs * inputs
+    if pairs == 1:
+        return None
+    whole = np.zeros((batch, length, pairs, pairs), complex)
+    whole[:] = np.eye(pairs)
+    for row, mixing in zip(whole, mixings, strict=True):
+        if mixing is not None and mixing.across is not None:
+            row[:count] = mixing.across
+    return np.real(whole), np.imag(whole)
 
 
 def _padded(size: int) -> int:

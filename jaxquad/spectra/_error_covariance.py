@@ -134,8 +134,7 @@ class ErrorCovariance:
         if self.sensitivity is None or self.drive is None:
             return total
         slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
-        both = np.tensordot(effect[:, :, : drive.shape[1]], np.conj(drive), axes=(2, 1))
-        both = np.einsum("finc,foc,foin->foi", both, noise, np.conj(slope), optimize=True)
+        both = np.sum(_with_parameters(self) * np.conj(slope), axis=3)
         flat = drive.reshape(len(drive), -1)
         moved = slope @ (0.5 * np.real(flat @ np.conj(flat).T))
         own = np.sum(moved * np.conj(slope), axis=3)
@@ -172,6 +171,34 @@ class ErrorCovariance:
         moved = mine @ (0.5 * np.real(flat @ np.conj(flat).T)) @ its.conj().T
         return total + moved + 0.5 * (local[0] @ its.conj().T + mine @ local[-1].conj().T)
 
+    def at_each_frequency(self) -> Complex[np.ndarray, "frequencies pairs pairs"]:
+        """Covariance E[dT dT^H] of all pairs (output, input), output by output."""
+        noise = np.asarray(self.noise)
+        shape = (len(noise), noise.shape[1] * np.shape(self.effect)[1])
+        spread = noise @ np.conj(np.swapaxes(noise, 1, 2))
+        if self.windows is None and self.share is None:
+            effect = np.asarray(self.effect)
+            gain = effect @ np.conj(np.swapaxes(effect, 1, 2))
+            total = spread[:, :, None, :, None] * gain[:, None, :, None, :]
+        else:
+            share = _share(self)
+            total = np.zeros((*shape, shape[1]), complex)
+            for atoms in _chunks(self):
+                seen = np.einsum("foig,fgit->foit", share, _at(self, atoms))
+                seen = seen.reshape(*shape, -1)
+                total += seen @ np.conj(np.swapaxes(seen, 1, 2))
+            total = total.reshape(-1, *2 * share.shape[1:3]) * spread[:, :, None, :, None]
+        total = total.reshape(*shape, -1)
+        if self.sensitivity is None or self.drive is None:
+            return total
+        slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
+        both = _with_parameters(self).reshape(*shape, -1)
+        slope, flat = slope.reshape(*shape, -1), drive.reshape(len(drive), -1)
+        adjoint = np.conj(np.swapaxes(slope, 1, 2))
+        moved = slope @ (0.5 * np.real(flat @ np.conj(flat).T)) @ adjoint
+        mixed = 0.5 * (both @ adjoint)
+        return total + moved + mixed + np.conj(np.swapaxes(mixed, 1, 2))
+
     def pair(self, output: int, input: int) -> "ErrorCovariance":
         """That of a single response."""
         o, i, slope = slice(output, output + 1), slice(input, input + 1), self.sensitivity
@@ -199,6 +226,15 @@ def _moved(
         return None
     slope = np.asarray(errors.sensitivity)
     return np.real(np.tensordot(slope, columns.conj(), axes=((0, 1, 2), (0, 1, 2))))
+
+
+def _with_parameters(
+    errors: ErrorCovariance,
+) -> Complex[np.ndarray, "frequencies outputs inputs parameters"]:
+    """Twice the covariance of what atoms do to each response with the real parameters."""
+    effect, drive = np.asarray(errors.effect), np.asarray(errors.drive)
+    both = np.tensordot(effect[:, :, : drive.shape[1]], np.conj(drive), axes=(2, 1))
+    return np.einsum("finc,foc->foin", both, np.asarray(errors.noise), optimize=True)
 
 
 def _share(errors: ErrorCovariance) -> Float[np.ndarray, "frequencies outputs inputs groups"]:

@@ -112,7 +112,9 @@ def _set_up(
     windows = make_windows(omega, bins, options, inputs)
     looked_at = highest_looked_at(omega[-1], windows.grid)
     bins = bins.up_to(max(windows.furthest(options.width), looked_at))
-    return Setup(bins, windows, inputs, outputs, options.order, options.global_order, method)
+    is_open = method == "direct" and not records[0].reference_names
+    orders = options.order, options.global_order
+    return Setup(bins, windows, inputs, outputs, *orders, method, is_open)
 
 
 def _choose(

@@ -10,6 +10,7 @@ from ._local_fit import Bins, LocalFit
 from ._noise_freedom import BANDWIDTH
 
 
+_WIDE = 2.0  # bandwidth of the correlations between outputs in open loop, in ln(omega)
 _UNLIKELY = 1e-4  # chance at which a residual counts as a misfit, or a line in the noise
 
 
@@ -48,12 +49,15 @@ def smooth_noise(
     half_width: Float[np.ndarray, " frequencies"],
     scatter: Complex[np.ndarray, "frequencies outputs outputs"],
     freedom: Float[np.ndarray, " frequencies"],
+    *,
+    open_loop: bool = False,
 ) -> Noise:
     """Smooth residual covariances, each of `freedom` complex degrees of freedom, along frequency.
 
     Powers are smoothed by local lines in log-log, corrected for the bias of the logarithm of a
     chi-squared variable; correlations by positive weights, so that they stay positive semidefinite.
-    Residuals larger than chance allows are left out.
+    Residuals larger than chance allows are left out. Outputs in `open_loop` are correlated as in a
+    wide band, as far as the narrow ones agree with it.
     """
     from scipy.special import digamma, gammaincinv
 
@@ -76,8 +80,27 @@ def smooth_noise(
         smooth = np.where(isolated[:, None], np.stack(nearest, axis=1), smooth)
     freedom = np.where(known, freedom, 0.0)
     windows = 1 + np.sqrt(np.pi) * BANDWIDTH * omega / half_width
-    correlation = _correlation(place, scatter, raw, freedom)
+    correlation = _correlation(place, scatter, raw, freedom, BANDWIDTH)
+    if open_loop and raw.shape[1] > 1:
+        wide = _correlation(place, scatter, raw, freedom * windows, _WIDE)
+        correlation = _drawn_together(correlation, wide, freedom * windows)
     return Noise(omega, np.exp(smooth), correlation, freedom * windows)
+
+
+def _drawn_together(
+    narrow: Complex[np.ndarray, "frequencies outputs outputs"],
+    wide: Complex[np.ndarray, "frequencies outputs outputs"],
+    freedom: Float[np.ndarray, " frequencies"],
+) -> Complex[np.ndarray, "frequencies outputs outputs"]:
+    """Correlations between the wide and the narrow ones, whose differences are partly chance.
+
+    Source: James and Stein (1961); a complex correlation r of n complex degrees of freedom has the
+    variance (1 - |r|^2) / n.
+    """
+    found = np.sum(freedom[:, None, None] * np.abs(narrow - wide) ** 2)
+    chance = np.sum((1 - np.abs(wide) ** 2)[freedom > 0])
+    share = max(0.0, 1 - chance / max(float(found), 1e-300))
+    return wide + share * (narrow - wide)
 
 
 def _local_lines(
@@ -99,9 +122,10 @@ def _correlation(
     scatter: Complex[np.ndarray, "frequencies outputs outputs"],
     power: Float[np.ndarray, "frequencies outputs"],
     weight: Float[np.ndarray, " frequencies"],
+    bandwidth: float,
 ) -> Complex[np.ndarray, "frequencies outputs outputs"]:
     offset = place[None, :] - place[:, None]
-    kernel = weight[None, :] * np.exp(-0.5 * (offset / BANDWIDTH) ** 2)
+    kernel = weight[None, :] * np.exp(-0.5 * (offset / bandwidth) ** 2)
     size = np.sqrt(power)
     normal = np.where(weight[:, None, None] > 0, scatter, 0) / (size[:, :, None] * size[:, None, :])
     mixed = np.einsum("fg,gop->fop", kernel, normal) + 1e-12 * np.eye(power.shape[1])

@@ -31,6 +31,7 @@ class Setup(NamedTuple):
     order: int  # of the local polynomials
     global_order: int  # the most
     method: Method
+    open_loop: bool  # no references are known, and none is asked for
 
     @property
     def whole(self) -> tuple[slice, slice]:
@@ -98,13 +99,14 @@ def fit_narrow(setup: Setup, highest: float, dt: float) -> Narrow:
     rest = subtract_models(setup.bins, *setup.whole, highest, dt, setup.global_order)
     rest, moved = _repair_models(setup, rest)
     plant = setup.plant(moved)
-    noise = _noise_of(setup.windows, plant)
+    noise = _noise_of(setup.windows, plant, open_loop=setup.open_loop)
     sources = _noise_of(setup.windows, moved) if setup.method == "joint" else noise
     return Narrow(rest, moved, plant, noise, sources)
 
 
-def _noise_of(windows: Windows, fit: LocalFit) -> Noise:
-    return smooth_noise(windows.grid, windows.narrow, fit.scatter, fit.freedom)
+def _noise_of(windows: Windows, fit: LocalFit, *, open_loop: bool = False) -> Noise:
+    spread = fit.scatter, fit.freedom
+    return smooth_noise(windows.grid, windows.narrow, *spread, open_loop=open_loop)
 
 
 def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
