@@ -92,14 +92,14 @@ def _drawn_together(
     wide: Complex[np.ndarray, "frequencies outputs outputs"],
     freedom: Float[np.ndarray, " frequencies"],
 ) -> Complex[np.ndarray, "frequencies outputs outputs"]:
-    """Correlations between the wide and the narrow ones, whose differences are partly chance.
+    """The wide correlations where the narrow ones differ from them by chance.
 
-    Source: James and Stein (1961); a complex correlation r of n complex degrees of freedom has the
-    variance (1 - |r|^2) / n.
+    Towards the narrow ones as the squared differences grow to twice what chance makes. A complex
+    correlation r of n complex degrees of freedom has the variance (1 - |r|^2) / n.
     """
     found = np.sum(freedom[:, None, None] * np.abs(narrow - wide) ** 2)
     chance = np.sum((1 - np.abs(wide) ** 2)[freedom > 0])
-    share = max(0.0, 1 - chance / max(float(found), 1e-300))
+    share = np.clip(found / max(float(chance), 1e-300) - 1, 0.0, 1.0)
     return wide + share * (narrow - wide)
 
 
