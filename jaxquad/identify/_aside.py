@@ -85,7 +85,7 @@ def _weakest(
     """The eigenvector of the smallest eigenvalue, and that value."""
     if isinstance(matrix, np.ndarray):
         values, vectors = np.linalg.eigh(matrix)
-        return vectors[:, 0], values[0]
+        return vectors[:, 0], np.asarray(values[0])
     # A kept program that calls LAPACK crashes in a process that has not traced it. So: the 32nd
     # power of the inverse, in whose columns nothing is left but the weakest direction.
     unit = jnp.eye(len(matrix), dtype=matrix.dtype)

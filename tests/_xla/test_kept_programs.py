@@ -19,6 +19,7 @@ ARGUMENTS = LADRC(10.0, 30.0, 0.85, dt=0.002), jnp.arange(3.0)
 PROCESS = """
 import jax
 import jaxquad as jq
+from synthetic import response_of
 
 jq.enable_x64()
 jq.enable_compile_cache()
@@ -29,7 +30,9 @@ jax.monitoring.register_event_duration_secs_listener(
 loop = jq.Loop(jq.DecoupledAxes([0.0468], [0.0552]), jq.LADRC(10.0, 30.0, 0.85))
 flight = jq.simulation.scenario(duration=0.5, dt=0.002, axes=1, reference=jq.simulation.Step(0.1))
 print(jq.simulate(loop, flight).angle.tobytes().hex())
-print(any("_run" in name for name in traced))
+axis = jq.LaggedIntegrator(280.0, 0.016, 0.011)
+print(jq.fit(axis, response_of(axis, seed=0)).values.tobytes().hex())
+print(*(any(each in name for name in traced) for each in ("_run", "_find")))
 """
 
 
@@ -150,12 +153,15 @@ def test_without_a_folder_no_program_is_kept():
     assert KeptPrograms(lambda x: x, dict).find(ARGUMENTS) is None
 
 
-def test_a_second_process_traces_no_flight_and_flies_the_same(tmp_path):
+def test_a_second_process_traces_neither_flight_nor_fit_and_finds_the_same(tmp_path):
     inherited = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
-    environment = inherited | {"JAXQUAD_CACHE": str(tmp_path)}
-    fly = lambda: subprocess.run(
+    environment = inherited | {
+        "JAXQUAD_CACHE": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)
+    }  # fmt: skip
+    compute = lambda: subprocess.run(
         [sys.executable, "-W", "error", "-c", PROCESS],
         env=environment, capture_output=True, text=True, check=True, timeout=100,
     ).stdout.split()  # fmt: skip
-    (flown, first), (again, second) = fly(), fly()
-    assert flown == again and (first, second) == ("True", "False")
+    (*found, flown, fitted), (*again, flown_again, fitted_again) = compute(), compute()
+    assert found == again
+    assert flown == fitted == "True" and flown_again == fitted_again == "False"

@@ -81,7 +81,7 @@ def test_costs_aside_of_a_minimum_are_a_hundredth_above_its_own(correlation):
     problem = problem.weighted(weights, mixings_of(points, weights))
     found = solve(problem, np.asarray(problem.parameters.start), None, 256)
     here = np.sum(np.asarray(residuals(jnp.asarray(found.z), problem)) ** 2)
-    assert found.aside is not None
+    assert found.aside is not None  # else NumPy would have to look
     # The cost is a parabola but for the curvature of the response.
     np.testing.assert_allclose(found.aside, 1.01 * here, rtol=1e-3)
 
