@@ -1,6 +1,7 @@
 """Result files that can be parsed, and fits side by side."""
 
 import json
+from typing import cast
 
 import equinox as eqx
 import numpy as np
@@ -9,7 +10,8 @@ from synthetic import OMEGA, response_of
 
 import jaxquad as jq
 from jaxquad.report import compare_fits, write_json, write_results
-from jaxquad.report._fit import _plus_minus
+from jaxquad.report._fit import _plus_minus, parameter_section
+from jaxquad.report._page import Cell, Table
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -93,6 +95,17 @@ def test_fits_stand_side_by_side_and_what_is_missing_says_so(fit):
 )  # fmt: skip
 def test_a_value_has_the_digits_that_its_error_supports(value, error, text):
     assert _plus_minus(value, error) == text
+
+
+def test_a_tied_parameter_is_a_row_of_the_page(frf):
+    tied = {"delay": lambda model: 0.7 * model.lag}
+    fit = jq.fit(TRUTH, frf, free=("gain", "lag"), tied=tied)
+    table = cast(Table, parameter_section(fit, [], {})["table"])
+    assert len(table.rows) == 3 and {len(row) for row in table.rows} == {len(table.heads)}
+    name, value, error, interval, *_ = table.rows[2]
+    assert cast(Cell, name).text == "delay, tied to lag"
+    assert value == f"{fit.tied[0].value:.5g}"
+    assert error == f"{0.7 * fit.standard_errors[1]:.2g}" and " .. " in str(interval)
 
 
 def test_where_nothing_was_fitted_there_is_no_number(tmp_path, frf):
