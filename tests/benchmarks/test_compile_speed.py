@@ -1,0 +1,71 @@
+"""Compiling `evaluate` and its gradient: seconds of the processor, with and without options.
+
+    python -m pytest tests/benchmarks/test_compile_speed.py -o addopts= -s
+
+Ten seconds at 2 ms of a three-axis rig under three LADRC, and of three axes under an adaptive LADRC
+with least squares; one loop and 48 inertias. Nothing is read from a cache. The options are those
+that `jq.tune` compiles with, which a `jax.jit` of your own takes too. What was traced once is not
+traced again.
+"""
+
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxquad._xla import brief_options
+from jaxquad.control import AdaptiveLADRC, certainty_equivalence, LADRC, RecursiveInertia
+from jaxquad.loops import Loop
+from jaxquad.models import DecoupledAxes, quanser_hover
+from jaxquad.simulation import evaluate, MotorDrive, Pulse, Saturation, scenario, Step
+
+
+jax.config.update("jax_enable_x64", True)
+
+KT, J0 = 0.0468, 0.0552
+HAPPENS = scenario(
+    duration=10.0, axes=3, reference=Step(np.radians(4.0)), disturbance=Pulse(0.01, width=1.0, at=5)
+)
+GAINS = (jnp.full(3, 10.0), jnp.full(3, 30.0), jnp.full(3, KT / J0))
+
+
+def rig(gains, inertia):
+    plant = eqx.tree_at(lambda p: p.attitude.inertia, quanser_hover(), inertia)
+    return Loop(plant, LADRC(*gains), drive=MotorDrive(plant.allocation))
+
+
+def adaptive(gains, inertia):
+    chart = certainty_equivalence(KT, J0, span=(0.5, 3.0), knots=6)
+    law = AdaptiveLADRC(LADRC(*gains), RecursiveInertia(jnp.full(3, KT), np.full(3, J0)), chart)
+    return Loop(DecoupledAxes([KT] * 3, inertia, lag=[0.005] * 3), law, drive=Saturation(20.0))
+
+
+def spent(function):
+    began = time.process_time()
+    found = function()
+    return time.process_time() - began, found
+
+
+@pytest.mark.parametrize("members", [1, 48])
+@pytest.mark.parametrize("make", [rig, adaptive])
+def test_a_gradient(make, members):
+    spread = np.geomspace(0.7, 1.5, members) if members > 1 else np.ones(())
+    inertia = jnp.asarray(np.multiply.outer([J0, J0, 2 * J0], spread))
+    cost = lambda gains, inertia: jnp.mean(evaluate(make(gains, inertia), HAPPENS).itae)
+    functions = {"value": cost, "gradient": jax.value_and_grad(cost)}
+    for name, options in (("XLA's own", None), ("brief", brief_options())):
+        for what, function in functions.items():
+            program = jax.jit(function, compiler_options=options)
+            tracing, lowered = spent(lambda p=program: p.lower(GAINS, inertia))
+            compiling, compiled = spent(lowered.compile)
+            run = lambda c=compiled: jax.block_until_ready(c(GAINS, inertia))
+            least = min(spent(run)[0] for _ in range(5))
+            print(
+                f"\n{make.__name__} x {members}, {what}, {name} options: traced in {tracing:.1f} "
+                f"s, compiled in {compiling:.1f} s, runs in {1e3 * least:.1f} ms",
+                end="",
+            )
+            assert np.isfinite(jax.tree.leaves(run())[0])
