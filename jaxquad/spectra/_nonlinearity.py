@@ -258,14 +258,23 @@ def fast_length(samples: int) -> int:
     return next(n for n in range(samples, 0, -1) if next_fast_len(n, real=True) == n)
 
 
+_BEYOND = 1.0  # neper, of the points between which a response is interpolated
+
+
 def interpolated(
     grid: Bins, omega: Grid, response: Complex[np.ndarray, "frequencies inputs"]
 ) -> Complex[np.ndarray, "bins inputs"]:
-    """Smooth in magnitude and phase along log frequency."""
+    """Smooth in magnitude and phase along log frequency.
+
+    Across a wide gap a spline may leave its points by hundreds of nepers, so it is held near them.
+    """
     from scipy.interpolate import CubicSpline
 
-    logs = np.log(np.abs(response)) + 1j * np.unwrap(np.angle(response), axis=0)
-    return np.exp(CubicSpline(np.log(omega), logs)(np.log(grid)))
+    size, angle = np.log(np.abs(response)), np.unwrap(np.angle(response), axis=0)
+    found = CubicSpline(np.log(omega), size + 1j * angle)(np.log(grid))
+    low, high = np.min(size, axis=0) - _BEYOND, np.max(size, axis=0) + _BEYOND
+    found.real = np.clip(found.real, low, high)
+    return np.exp(found)
 
 
 def local_mean(power: Bins, first: int) -> Bins:

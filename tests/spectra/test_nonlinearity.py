@@ -6,7 +6,7 @@ from scipy import signal
 
 from jaxquad.records import Record
 from jaxquad.spectra import frequency_response, JointInputOutput, Welch
-from jaxquad.spectra._nonlinearity import phase_of_sweep
+from jaxquad.spectra._nonlinearity import interpolated, phase_of_sweep
 
 
 DT, SAMPLES = 0.02, 3000
@@ -97,3 +97,11 @@ def test_a_signal_that_is_no_sweep_has_no_phase():
         assert phase_of_sweep(other) is None
     swept = phase_of_sweep(sweep())
     assert swept is not None and np.all(np.diff(swept.phase) >= 0)
+
+
+def test_a_response_is_interpolated_across_a_wide_gap_near_its_points():
+    omega = np.append(np.geomspace(0.21, 0.45, 16), 22.0)
+    size = np.append(np.linspace(0.11, 0.09, 14), [0.147, 0.140, 0.172])
+    grid = np.geomspace(0.21, 22.0, 500)
+    found = np.abs(interpolated(grid, omega, size.astype(complex)[:, None]))
+    assert np.all((found > 0.09 / np.e - 1e-9) & (found < 0.172 * np.e + 1e-9))
