@@ -97,7 +97,7 @@ def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch)
 
 
 def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silence, monkeypatch):
-    monkeypatch.setattr(_kernel_limits, "_WIDEST", 10**9)  # lets in what XLA cannot compile
+    monkeypatch.setattr(_kernel_limits, "WIDEST", 10**9)  # lets in what XLA cannot compile
     traced = []
 
     def totals(x):
