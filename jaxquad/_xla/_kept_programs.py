@@ -178,8 +178,13 @@ def kind_of(args: PyTree) -> tuple:
     return structure, tuple(map(_kind, leaves)), thread_settings(), _switches()
 
 
+_LAPACK = "lapack_"  # in the names of its functions, which only a process that traces them loads
+
+
 def _write(path: Path, program: _Program) -> None:
     """The folder is this process's own; others get the file whole."""
+    if _LAPACK in (program.run.as_text() or ""):
+        return
     arrays = program.run.in_tree.num_leaves
     try:
         content, *_ = serialize(program.run)

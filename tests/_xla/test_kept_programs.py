@@ -132,6 +132,17 @@ def test_what_another_has_made_is_not_kept(traced, foreign, tmp_path):
     assert not traced and not any(tmp_path.iterdir())
 
 
+def test_a_program_that_calls_lapack_is_not_kept(traced, tmp_path):
+    """In a process that has not traced it, its functions are not loaded, and it crashes."""
+
+    def eigenvalues(matrix):
+        return jnp.linalg.eigvalsh(matrix)
+
+    program = KeptPrograms(eigenvalues, dict).find((jnp.eye(2),))
+    assert program is not None and not any(tmp_path.iterdir())
+    np.testing.assert_array_equal(program((jnp.eye(2),)), [1.0, 1.0])
+
+
 def test_a_change_of_the_source_makes_another_name(monkeypatch):
     name = lambda: _kept_programs._name(test_a_program_is_found_again_without_tracing, {}, ())
     before = name()
