@@ -99,61 +99,82 @@ def assess(
 
     The fit gets the `further` remarks and its `origin`.
     """
-    parameters, count = problem.parameters, problem.parameters.count
-    frfs = [each.frf for each in counted.points]
+    frfs, count = [each.frf for each in counted.points], problem.parameters.count
+    seen, units, bounds = _see(problem, counted, solution)
+    here = _cost(seen.blocks, seen.prior)
+    falls_aside = look_aside(problem, solution.z, here, seen.bread, solution.aside)
+    costs = _costs_by_noise(problem, counted, solution, seen, units)
+    step = newton_step(seen.bread, seen.gradient, solution.at_zero)
+    cut = ft.partial(halved, seen=seen, names=problem.parameters.names, bounds=bounds)
+    by_noise, covariance = cut(seen.by_noise), cut(seen.covariance)
+    facts = _information(problem, solution, seen.blocks, (covariance, by_noise), units)
+    verdict, by_data = _judge(problem, solution, seen, facts, bounds, step, costs.cost)
+    decrement = 0.5 * float(seen.gradient @ step)
+    estimate = Estimate(seen.bread, covariance, by_noise, units[:count], verdict, decrement)
+    remarks = [
+        *_remarks_on_used(problem, frfs),
+        *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
+    ]
+    if not is_fed_back(verdict):
+        doubted = _doubted(seen, costs)
+        remarks += [
+            *remarks_on_fit(problem, solution, costs.cost, decrement, doubted, verdict),
+            *remarks_on_bounds(pulled_beyond(seen, problem.parameters.names, bounds), verdict),
+            *_remarks_on_growth(problem, solution, frfs),
+            *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
+            *remarks_on_priors(seen.prior.misfit, verdict, by_data, chi_squared=doubted),
+            *remarks_on_discrepancy(seen.discrepancy),
+        ]
+    return make_fit(
+        problem,
+        solution,
+        estimate,
+        costs,
+        points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in seen.blocks),
+        freedom=degrees_of_freedom(seen.records, seen.bread, seen.noise, count),
+        remarks=(*remarks, *further),
+        minima=minima,
+        discrepancy=seen.discrepancy,
+        origin=origin,
+    )
+
+
+def _see(
+    problem: Problem, counted: Counted, solution: Solution
+) -> tuple[Seen, Float[np.ndarray, " all"], tuple[Bound, ...]]:
+    """What the records say, by changes relative to units, and parameters that may be zero."""
     units = units_of(solution)
     seen = see(counted.records, counted.found, solution, units)
     bounds, tangled = bounds_of(problem, solution, seen, units)
     if tangled:
-        units = with_tangled(units, seen, tangled)
+        frfs, units = [each.frf for each in counted.points], with_tangled(units, seen, tangled)
         seen = see(records_of(problem, frfs, solution, units), counted.found, solution, units)
-    records, blocks, prior = seen.records, seen.blocks, seen.prior
-    bread, gradient, noise, discrepancy = seen.bread, seen.gradient, seen.noise, seen.discrepancy
-    here = _cost(blocks, prior)
-    falls_aside = look_aside(problem, solution.z, here, bread, solution.aside)
-    cut = ft.partial(halved, seen=seen, names=parameters.names, bounds=bounds)
-    by_noise, covariance = cut(seen.by_noise), cut(seen.covariance)
-    pulled = pulled_beyond(seen, parameters.names, bounds)
-    plain = seen
+    return seen, units, bounds
+
+
+def _costs_by_noise(
+    problem: Problem,
+    counted: Counted,
+    solution: Solution,
+    seen: Seen,
+    units: Float[np.ndarray, " all"],
+) -> Costs:
+    """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
+    plain, prior = seen, seen.prior
     if counted.weights is not None:
-        alone = problem.weighted(counted.weights, counted.mixings)
-        plain = _look(records_of(alone, frfs, solution, units), prior, count)
-    costs = _costs(plain.blocks, prior, plain.bread, plain.noise)
-    cost, misfit = costs.cost, costs.chi_squared
-    # Few points of their own noise reach a large misfit by chance: both have to say so.
-    doubted = misfit if discrepancy.none < DOUBT else min(misfit, 1.0)
-    step = newton_step(bread, gradient, solution.at_zero)
-    decrement = 0.5 * float(gradient @ step)
-    facts = _information(problem, solution, blocks, (covariance, by_noise), units)
-    verdict, by_data = _judge(problem, solution, seen, facts, bounds, step, cost)
+        alone, frfs = problem.weighted(counted.weights, counted.mixings), counted.points
+        records = records_of(alone, [each.frf for each in frfs], solution, units)
+        plain = _look(records, prior, problem.parameters.count)
+    return _costs(plain.blocks, prior, plain.bread, plain.noise)
 
-    def of_model() -> list[str]:
-        return [
-            *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
-            *remarks_on_bounds(pulled, verdict),
-            *_remarks_on_growth(problem, solution, frfs),
-            *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
-            *remarks_on_priors(prior.misfit, verdict, by_data, chi_squared=doubted),
-            *remarks_on_discrepancy(discrepancy),
-        ]
 
-    return make_fit(
-        problem,
-        solution,
-        Estimate(bread, covariance, by_noise, units[:count], verdict, decrement),
-        costs,
-        points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in blocks),
-        freedom=degrees_of_freedom(records, bread, noise, count),
-        remarks=(
-            *_remarks_on_used(problem, frfs),
-            *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
-            *(() if is_fed_back(verdict) else of_model()),
-            *further,
-        ),
-        minima=minima,
-        discrepancy=discrepancy,
-        origin=origin,
-    )
+def _doubted(seen: Seen, costs: Costs) -> float:
+    """The misfit that remarks are about.
+
+    Few points of their own noise reach a large one by chance: the discrepancy has to say so, too.
+    """
+    misfit = costs.chi_squared
+    return misfit if seen.discrepancy.none < DOUBT else min(misfit, 1.0)
 
 
 def _judge(
@@ -197,7 +218,6 @@ def _look(records: list[ResponseTerm], prior: PriorRows, count: int) -> _Look:
 
 
 def _costs(blocks: list[Block], prior: PriorRows, bread: Matrix, noise: Noise) -> Costs:
-    """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
     cost = _cost(blocks, prior)
     misfit = misfit_ratio(_cost(blocks), bread, noise)
     # A misfit beyond the noise is in no covariance of the noise.
