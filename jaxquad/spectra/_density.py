@@ -49,7 +49,7 @@ class SpectralDensity(eqx.Module):
 @one_blas_thread()
 def spectral_density(
     record: Record | Sequence[Record],
-    omega: Float[ArrayLike, " frequencies"] | None = None,
+    omega: Float[ArrayLike, " frequencies"] | float | int | None = None,
     *,
     welch: Welch | None = None,
 ) -> SpectralDensity:

@@ -190,13 +190,15 @@ def check_spectrum(
 
 
 def frequencies_for(
-    omega: Float[ArrayLike, " frequencies"] | None, records: Sequence[Record], welch: Welch
+    omega: Float[ArrayLike, " frequencies"] | float | int | None,
+    records: Sequence[Record],
+    welch: Welch,
 ) -> Float[np.ndarray, " frequencies"]:
     """`omega` or the default of `welch`, rad/s; `ValueError` where the window is too short."""
     if omega is None:
         return Welch.default_omega(welch, records)
+    omega = np.atleast_1d(np.asarray(omega, dtype=float))
     check_band(omega, records[0].dt)
-    omega = np.asarray(omega, dtype=float)
     seconds = Welch.length(welch, records) * records[0].dt
     lowest = 2 * np.pi / seconds
     if omega[0] < 0.999 * lowest:

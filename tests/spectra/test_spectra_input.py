@@ -49,6 +49,8 @@ def test_an_unusable_band_is_refused_with_its_limits(omega, message):
 def test_a_number_is_one_frequency():
     one, row = (frequency_response(RECORD, omega).response for omega in (8.0, np.array([8.0])))
     np.testing.assert_array_equal(one, row)
+    one, row = (spectral_density(RECORD, omega).density for omega in (8.0, np.array([8.0])))
+    np.testing.assert_array_equal(one, row)
 
 
 @pytest.mark.parametrize(
