@@ -183,10 +183,10 @@ _LAPACK = "lapack_"  # in the names of its functions, which only a process that 
 
 def _write(path: Path, program: _Program) -> None:
     """The folder is this process's own; others get the file whole."""
-    if _LAPACK in (program.run.as_text() or ""):
-        return
     arrays = program.run.in_tree.num_leaves
     try:
+        if _LAPACK in (program.run.as_text() or ""):
+            return
         content, *_ = serialize(program.run)
         path.write_bytes(pickle.dumps((content, arrays, program.result)))
     except Exception as error:  # JAX calls its own interface experimental

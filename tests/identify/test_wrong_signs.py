@@ -58,7 +58,7 @@ def test_the_advice_finds_the_truth():
 
 def test_a_lag_that_is_zero_is_no_wrong_sign():
     truth, remarks = jq.LaggedIntegrator(80.0, 1e-9, 0.03), []
-    for seed in range(4):
+    for seed in range(10):
         frf = response_of(truth, error=0.02, seed=seed, omega=OMEGA)
         remarks += jq.fit(jq.LaggedIntegrator(60.0, 0.02, 0.04), frf).remarks
     assert not remarks
