@@ -12,17 +12,17 @@ from jaxquad._core import map_in_threads
 
 from ._local_fit import Bins
 from ._rational_fit import (
+    columns_of,
     descend,
     Equations,
     EXACT,
     make_basis,
-    Powers,
-    regressors,
+    parts_of,
+    powers_of,
     relax,
     slopes_of,
     solve_linear,
     Solved,
-    stacked,
 )
 
 
@@ -65,19 +65,19 @@ class GlobalModel(NamedTuple):
     ) -> Complex[np.ndarray, "frequencies inputs"]:
         """B_i / A."""
         powers = self._powers(omega)
-        above = powers @ self._numerators(inputs).T
-        return above / (powers @ self.solved.denominator)[:, None]
+        above = self._numerators(inputs) @ powers
+        return (above / (self.solved.denominator @ powers)).T
 
     def response_slopes(
         self, omega: Float[np.ndarray, " frequencies"], inputs: int
     ) -> Complex[np.ndarray, "frequencies inputs parameters"]:
         """Derivatives of `response` with respect to the parameters."""
         powers, size = self._powers(omega), self.order + 1
-        below = (powers @ self.solved.denominator)[:, None]
+        powers = (powers / (self.solved.denominator @ powers)).T
         slopes = np.zeros((omega.size, inputs, self.drive.shape[0]), complex)
         for i in range(inputs):
-            slopes[:, i, i * size : (i + 1) * size] = powers / below
-        turned = -np.delete(powers, self.fixed, axis=1) / below
+            slopes[:, i, i * size : (i + 1) * size] = powers
+        turned = -np.delete(powers, self.fixed, axis=1)
         slopes[:, :, len(self.solved.linear) :] = (
             self.response(omega, inputs)[:, :, None] * turned[:, None, :]
         )
@@ -86,19 +86,20 @@ class GlobalModel(NamedTuple):
     def at_bins(self, bins: Bins, inputs: slice, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """The modelled output at some bins, and its derivatives with respect to the parameters."""
         powers = self._powers(bins.omega[rows])
-        u, own = bins.values[rows, inputs], _own(bins.record[rows], bins.records)
-        below = (powers @ self.solved.denominator)[:, None]
-        columns = regressors(powers, u, own) / below
-        output = columns @ self.solved.linear
-        turned = -np.delete(powers, self.fixed, axis=1) / below
-        return output, np.concatenate([columns, output[:, None] * turned], axis=1)
+        u, own = bins.values[rows, inputs].T, _own(bins.record[rows], bins.records)
+        powers /= self.solved.denominator @ powers
+        columns = columns_of(powers, u, own)
+        output = self.solved.linear @ columns
+        turned = -np.delete(powers, self.fixed, axis=0)
+        return output, np.concatenate([columns, output * turned]).T
 
     def _numerators(self, inputs: int) -> Float[np.ndarray, "inputs powers"]:
         return self.solved.linear[: inputs * (self.order + 1)].reshape(inputs, -1)
 
-    def _powers(self, omega: Float[np.ndarray, " frequencies"]) -> Powers:
-        x = (np.exp(-1j * omega * self.dt) - 1) / self.scale
-        return x[:, None] ** np.arange(self.order + 1)
+    def _powers(
+        self, omega: Float[np.ndarray, " frequencies"]
+    ) -> Complex[np.ndarray, "powers frequencies"]:
+        return powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
 
 
 def global_models(
@@ -161,7 +162,8 @@ def _equations(
 ) -> Equations:
     lag = np.exp(-1j * dt * bins.omega[places]) - 1
     own = _own(bins.record[places], bins.records)
-    return Equations(lag / scale, bins.values[places, inputs], own, bins.values[places, output])
+    u = np.ascontiguousarray(bins.values[places, inputs].T)
+    return Equations(lag / scale, u, own, bins.values[places, output])
 
 
 def highest_modelled(highest: float) -> float:
@@ -235,26 +237,20 @@ def _settle(
     basis = make_basis(white, len(chosen.denominator))
     solved = descend(white, basis, chosen.denominator, _SETTLED)
     fixed = basis.largest(solved.denominator)
-    slopes = stacked(slopes_of(basis, solved, fixed))
-    length = np.linalg.norm(slopes, axis=0)
+    slopes = parts_of(slopes_of(white, basis, solved, fixed))
+    length = np.linalg.norm(slopes, axis=1, keepdims=True)
     left, size, right = np.linalg.svd(slopes / length, full_matrices=False)
     inverse = np.where(size > 1e-12 * size[0], 1 / np.maximum(size, 1e-300), 0.0)
-    drive = _complex(left) @ (right * inverse[:, None]) / length
-    follow = np.conj(_complex(left))
-    taken = np.sum(np.abs(follow) ** 2, axis=1) / 2
-    noise = running_power(omega, _residual(equations, solved), 1 - taken)
-    return solved, fixed, drive.T * weight, follow, noise
-
-
-def _complex(stacked: Float[np.ndarray, "parts columns"]) -> Complex[np.ndarray, "rows columns"]:
-    """Columns whose products with the noise have as their real part those of the `stacked` ones."""
-    rows = len(stacked) // 2
-    return stacked[:rows] - 1j * stacked[rows:]
+    follow = right.view(complex)
+    drive = (left * inverse / length) @ np.conj(follow)
+    taken = np.sum(np.abs(follow) ** 2, axis=0) / 2
+    noise = running_power(omega, solved.left / weight, 1 - taken)
+    return solved, fixed, drive * weight, follow.T, noise
 
 
 def _residual(equations: Equations, solved: Solved) -> Complex[np.ndarray, " bins"]:
     basis = make_basis(equations, len(solved.denominator))
-    return equations.y - basis.columns @ solved.linear / (basis.powers @ solved.denominator)
+    return equations.y - solved.linear @ basis.columns / (solved.denominator @ basis.powers)
 
 
 def _choose(equations: Equations, most: int) -> Solved | None:
@@ -306,8 +302,8 @@ def _proportional(equations: Equations) -> float:
     return solve_linear(equations, make_basis(equations, 1), np.ones(1)).cost
 
 
-def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "bins records"]:
-    return (record[:, None] == np.arange(records)).astype(float)
+def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "records bins"]:
+    return (record == np.arange(records)[:, None]).astype(float)
 
 
 def running_power(
