@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import announce
+from jaxquad._core import announce, map_in_threads, one_blas_thread
 from jaxquad.identify import (
     CoherenceWeighted,
     Combination,
@@ -41,6 +41,7 @@ _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
+_SIDE_BY_SIDE = 10**6  # samples of all records up to which estimates share the memory
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
 _DOMINATED, _EARLY = "feedback-dominated", "the phase increases"  # as remarks begin
@@ -77,15 +78,22 @@ def _responses(
     filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
 ) -> list[FrequencyResponse]:  # fmt: skip
     """By each of the methods."""
-    band, frfs = _band(settings), []
+    band = _band(settings)
     omega = np.geomspace(*band, _POINTS) if band else None
     out = ", for the delay" if quick else f", {delay:.4g} s of delay taken out" if delay else ""
-    for method in methods:
-        announce(f"{'quick ' if quick else ''}{method} response{out}")
-        estimator = _estimator(settings, method, delay, quick=quick)
+    estimators = [_estimator(settings, method, delay, quick=quick) for method in methods]
+    plural = "s" if len(methods) > 1 else ""
+    announce(f"{'quick ' if quick else ''}{' and '.join(methods)} response{plural}{out}")
+
+    def estimate(estimator: Estimator) -> FrequencyResponse:
         frf = frequency_response(list(records), omega, estimator=estimator)
-        frfs.append(without_filters(frf, filters))
-    return frfs
+        return without_filters(frf, filters)
+
+    if sum(record.time.size for record in records) > _SIDE_BY_SIDE:
+        return [estimate(each) for each in estimators]
+    # The number of BLAS threads is the whole process's: no estimate may set it back for the other.
+    with one_blas_thread():
+        return map_in_threads(estimate, estimators)
 
 
 def _delay_of(found: Fit, records: tuple[Record, ...]) -> float:
