@@ -6,10 +6,10 @@ from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 
 from jaxquad._core import pytree_node
-from jaxquad.spectra import ErrorCovariance, FrequencyResponse
+from jaxquad.spectra import FrequencyResponse
 
 
 _COHERENT, _POOR = 0.6, 0.05  # least coherence: in general, and beside coherent points
@@ -241,25 +241,6 @@ def _between_pairs(
     return correlation if np.any(shared > _ALONE) else None
 
 
-def _own_covariance(
-    errors: ErrorCovariance, pair: tuple[int, int], mine: Int[np.ndarray, " used"]
-) -> Complex[np.ndarray, "used used"]:
-    """Of one pair's errors at some frequencies, up to a factor for each of them."""
-    if errors.windows is not None or errors.sensitivity is not None:
-        return errors.between(pair, pair)[np.ix_(mine, mine)]
-    # Without going through JAX, as `between` does: a batch asks this of a thousand responses.
-    effect, noise = np.asarray(errors.effect)[mine, pair[1]], np.asarray(errors.noise)
-    return (effect @ effect.conj().T) * (noise[mine, pair[0]] @ noise[mine, pair[0]].conj().T)
-
-
-def _are_independent(errors: ErrorCovariance, source: int, mine: Int[np.ndarray, " used"]) -> bool:
-    """Whether no atom of noise reaches two of the frequencies, so that they share none."""
-    if errors.windows is not None or errors.sensitivity is not None:
-        return False
-    reached = np.count_nonzero(np.asarray(errors.effect)[mine, source], axis=0)
-    return bool(np.max(reached, initial=0) <= 1)
-
-
 _ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as independent
 
 
@@ -267,12 +248,13 @@ def _shared_noise(
     frf: FrequencyResponse, used: Mask
 ) -> tuple[Ratio, dict[tuple[int, int], Complex[np.ndarray, "used used"]]]:
     """As in `Points`; correlations are those of the errors relative to the response."""
-    shared, correlations = np.ones(used.shape), {}
+    shared, correlations, errors = np.ones(used.shape), {}, frf.errors
     for o, i in np.ndindex(used.shape[1:]):
         mine = np.flatnonzero(used[:, o, i])
-        if _are_independent(frf.errors, i, mine):
+        # A bound method of an `eqx.Module` is made like a model.
+        if type(errors).independent(errors, i, mine):
             continue
-        covariance = _own_covariance(frf.errors, (o, i), mine)
+        covariance = type(errors).between(errors, (o, i), (o, i))[np.ix_(mine, mine)]
         size = np.sqrt(np.maximum(np.real(np.diagonal(covariance)), 1e-300))
         turn = np.exp(-1j * np.angle(np.asarray(frf.response)[mine, o, i])) / size
         correlation = turn[:, None] * covariance * turn.conj()

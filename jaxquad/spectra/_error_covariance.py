@@ -1,12 +1,14 @@
 import dataclasses
 import functools as ft
+from collections.abc import Iterator
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Complex, Float, Shaped
+from jaxtyping import Array, Complex, Float, Int
 
 from jaxquad._core import pytree_node
 
+from ._atoms import add_effects, Reach, reach_of, sums_of_products, times_drive
 from ._window import coefficients
 
 
@@ -65,9 +67,9 @@ def window_products(
 
 
 Numbers = Array | np.ndarray
-Places = Shaped[np.ndarray, " places"]
 
 _CHUNK = 512  # times taken at once, so that a long record fits the memory
+_ATOMS = 8192  # the same of atoms without windows
 
 
 @pytree_node
@@ -79,7 +81,9 @@ class ErrorCovariance:
         dT[f, o, i] = sum_a share[f, o, i, g(a)] effect[f, i, a] V[a, o](f)
 
     where atoms come in groups g of `counts` each. V[a, o] is the transform of the noise of output
-    o in window a of `windows`, or, without windows, independent noise of unit power. `noise[f]` is
+    o in window a of `windows`, or, without windows, independent noise of unit power: few atoms of
+    a record reach a frequency, and `effect[f]` is of those from number `first[f]` on, or from the
+    first one. `noise[f]` is
     the root of the outputs' noise covariance: cov(V[o], V[p]) = sum_c noise[f, o, c]
     conj(noise[f, p, c]). The full covariance matrix of 20 outputs and 10 inputs would fill
     gigabytes, but a fit needs only its product with a few columns.
@@ -88,17 +92,19 @@ class ErrorCovariance:
     frequencies share, add `sensitivity[f, o, i, p] Re(sum_ac drive[p, a, c] W[a, c])`, where
     V[a, o] = sum_c noise[f, o, c] W[a, c]: an effect that is linear in the real and the imaginary
     part of the noise apart. They need atoms without windows and `share`; `drive` is that of the
-    first atoms, and the others have none.
+    atoms `driven`, whose numbers rise, and the others have none.
     """
 
     omega: Float[Numbers, " frequencies"]  # rad/s
-    effect: Complex[Numbers, "frequencies inputs atoms"]
+    effect: Complex[Numbers, "frequencies inputs width"]
     noise: Complex[Numbers, "frequencies outputs roots"]
     share: Float[Numbers, "frequencies outputs inputs groups"] | None = None  # 1 without
     windows: Placement | None = None
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)  # one group without
     sensitivity: Complex[Numbers, "frequencies outputs inputs parameters"] | None = None
     drive: Complex[Numbers, "parameters driven roots"] | None = None
+    first: Int[Numbers, " frequencies"] | None = None
+    driven: Int[Numbers, " driven"] | None = None
 
     def project(
         self, columns: Complex[Numbers, "frequencies outputs inputs columns"]
@@ -107,95 +113,80 @@ class ErrorCovariance:
         columns, count = np.asarray(columns), columns.shape[3]
         weighted = columns.conj()[..., None, :] * _share(self)[..., None]  # f o i g p
         drawn = np.einsum("foigp,foc->figcp", weighted, np.asarray(self.noise))
-        total, moved = np.zeros((count, count)), _moved(self, columns)
-        for atoms in _chunks(self):
-            seen = _at(self, atoms)
-            frequencies, groups, inputs, places = seen.shape
-            seen = seen.reshape(-1, places).T
-            along = np.swapaxes(drawn, 1, 2).reshape(frequencies * groups * inputs, -1)
-            part = (seen @ along).reshape(places, -1, count)
-            if moved is not None and self.drive is not None:
-                drive = np.asarray(self.drive)[:, atoms[0] : atoms[-1] + 1]
-                part[: drive.shape[1]] += np.einsum("nac,np->acp", drive, moved)
+        parts = _by_atoms(self, drawn, columns) if self.windows is None else _by_times(self, drawn)
+        total = np.zeros((count, count))
+        for part in parts:
             part = part.reshape(-1, count)
             total += 0.5 * np.real(part.T @ part.conj())
         return total
 
     def variance(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
-        if self.windows is not None or self.share is not None:
+        if self.windows is not None:
             raise ValueError(
                 "the errors of overlapping windows are correlated: use the diagonal of "
                 "errors.between(pair, pair)"
             )
         effect, noise = np.asarray(self.effect), np.asarray(self.noise)
         gain, power = (np.vecdot(each, each).real for each in (effect, noise))
-        total = power[:, :, None] * gain[:, None, :]
+        total = power[:, :, None] * gain[:, None, :] * _share(self)[..., 0] ** 2
         if self.sensitivity is None or self.drive is None:
             return total
-        slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
+        slope = np.asarray(self.sensitivity)
         both = np.sum(_with_parameters(self) * np.conj(slope), axis=3)
-        flat = drive.reshape(len(drive), -1)
-        moved = slope @ (0.5 * np.real(flat @ np.conj(flat).T))
-        own = np.sum(moved * np.conj(slope), axis=3)
+        own = np.sum(slope @ _products_of_drives(self) * np.conj(slope), axis=3)
         return np.maximum(total + np.real(both + own), 0.0)
 
     def between(
         self, first: tuple[int, int], second: tuple[int, int]
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
         """Covariance E[dT dT^H] of two pairs (output, input) between all pairs of frequencies."""
-        noise, pairs = np.asarray(self.noise), (first,) if first == second else (first, second)
-        if self.windows is None and self.share is None:
-            seen = [np.asarray(self.effect)[:, i] for _, i in pairs]
+        noise, share = np.asarray(self.noise), _share(self)
+        pairs = (first,) if first == second else (first, second)
+        if self.windows is None:
+            effect = np.asarray(self.effect)
+            seen = [effect[:, i] * share[:, o, i] for o, i in pairs]
+            total = sums_of_products(seen[0], seen[-1], _reach(self))
         else:
-            atoms, share = _at(self, _places(self)), _share(self)
-            seen = [np.einsum("fgt,fg->ft", atoms[:, :, i], share[:, o, i]) for o, i in pairs]
-        one, other = seen[0], seen[-1]
-        shared = noise[:, first[0]] @ noise[:, second[0]].conj().T
-        total = (one @ other.conj().T) * shared
+            at = _at(self, self.windows.times)
+            seen = [np.einsum("fgt,fg->ft", at[:, :, i], share[:, o, i]) for o, i in pairs]
+            total = seen[0] @ seen[-1].conj().T
+        total *= noise[:, first[0]] @ noise[:, second[0]].conj().T
         if self.sensitivity is None or self.drive is None:
             return total
-        drive = np.asarray(self.drive)
         mine, its = (np.asarray(self.sensitivity)[:, o, i] for o, i in (first, second))
-        local = [
-            np.einsum(
-                "ft,ntc,fc->fn",
-                effect[:, : drive.shape[1]],
-                np.conj(drive),
-                noise[:, pair[0]],
-                optimize=True,
-            )
-            for effect, pair in zip(seen, pairs, strict=True)
-        ]
-        flat = drive.reshape(len(drive), -1)
-        moved = mine @ (0.5 * np.real(flat @ np.conj(flat).T)) @ its.conj().T
-        return total + moved + 0.5 * (local[0] @ its.conj().T + mine @ local[-1].conj().T)
+        both = [_with_parameters(self.pair(*each))[:, 0, 0] for each in pairs]
+        moved = mine @ _products_of_drives(self) @ its.conj().T
+        mixed = both[0] @ its.conj().T + mine @ both[-1].conj().T
+        return total + moved + 0.5 * mixed
+
+    def independent(self, input: int, rows: Int[np.ndarray, " some"]) -> bool:
+        """Whether no two of some frequencies share any noise in the responses to an input."""
+        if self.windows is not None or self.sensitivity is not None:
+            return False
+        first = None if self.first is None else np.asarray(self.first)[rows]
+        return reach_of(np.asarray(self.effect)[rows, input, None], first).disjoint()
 
     def at_each_frequency(self) -> Complex[np.ndarray, "frequencies pairs pairs"]:
         """Covariance E[dT dT^H] of all pairs (output, input), output by output."""
-        noise = np.asarray(self.noise)
-        shape = (len(noise), noise.shape[1] * np.shape(self.effect)[1])
+        noise, share = np.asarray(self.noise), _share(self)
+        shape = (len(noise), share.shape[1] * share.shape[2])
         spread = noise @ np.conj(np.swapaxes(noise, 1, 2))
-        if self.windows is None and self.share is None:
-            effect = np.asarray(self.effect)
-            gain = effect @ np.conj(np.swapaxes(effect, 1, 2))
-            total = spread[:, :, None, :, None] * gain[:, None, :, None, :]
+        if self.windows is None:
+            effect = share[:, :, :, 0, None] * np.asarray(self.effect)[:, None]
+            parts = iter((effect.reshape(*shape, -1),))
         else:
-            share = _share(self)
-            total = np.zeros((*shape, shape[1]), complex)
-            for atoms in _chunks(self):
-                seen = np.einsum("foig,fgit->foit", share, _at(self, atoms))
-                seen = seen.reshape(*shape, -1)
-                total += seen @ np.conj(np.swapaxes(seen, 1, 2))
-            total = total.reshape(-1, *2 * share.shape[1:3]) * spread[:, :, None, :, None]
+            seen = (_at(self, times) for times in _chunks(self))
+            parts = (np.einsum("foig,fgit->foit", share, e).reshape(*shape, -1) for e in seen)
+        total = sum(part @ np.conj(np.swapaxes(part, 1, 2)) for part in parts)
+        total = total.reshape(-1, *2 * share.shape[1:3]) * spread[:, :, None, :, None]
         total = total.reshape(*shape, -1)
         if self.sensitivity is None or self.drive is None:
             return total
-        slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
         both = _with_parameters(self).reshape(*shape, -1)
-        slope, flat = slope.reshape(*shape, -1), drive.reshape(len(drive), -1)
+        slope = np.asarray(self.sensitivity).reshape(*shape, -1)
         adjoint = np.conj(np.swapaxes(slope, 1, 2))
-        moved = slope @ (0.5 * np.real(flat @ np.conj(flat).T)) @ adjoint
+        moved = slope @ _products_of_drives(self) @ adjoint
         mixed = 0.5 * (both @ adjoint)
         return total + moved + mixed + np.conj(np.swapaxes(mixed, 1, 2))
 
@@ -218,22 +209,62 @@ class ErrorCovariance:
         return dataclasses.replace(self, effect=effect, sensitivity=turned)
 
 
-def _moved(
-    errors: ErrorCovariance, columns: Complex[np.ndarray, "frequencies outputs inputs columns"]
-) -> Float[np.ndarray, "parameters columns"] | None:
-    """What each real parameter adds to Re(sum of `conj(columns) dT`)."""
-    if errors.sensitivity is None or errors.drive is None:
-        return None
-    slope = np.asarray(errors.sensitivity)
-    return np.real(np.tensordot(slope, columns.conj(), axes=((0, 1, 2), (0, 1, 2))))
+def _reach(errors: ErrorCovariance) -> Reach:
+    return reach_of(np.asarray(errors.effect), errors.first)
+
+
+def _driven(errors: ErrorCovariance) -> Int[np.ndarray, " driven"]:
+    if errors.drive is None:
+        return np.zeros(0, int)
+    return np.arange(errors.drive.shape[1]) if errors.driven is None else np.asarray(errors.driven)
+
+
+def _by_atoms(
+    errors: ErrorCovariance,
+    drawn: Complex[np.ndarray, "frequencies inputs 1 roots columns"],
+    columns: Complex[np.ndarray, "frequencies outputs inputs columns"],
+) -> Iterator[Complex[np.ndarray, "atoms roots_columns"]]:
+    """What atoms of unit power do to Re(sum of `conj(columns) dT`), some atoms at a time."""
+    effect, reach, driven = np.asarray(errors.effect), _reach(errors), _driven(errors)
+    values, moved = drawn.reshape(*effect.shape[:2], -1), None
+    begin, end = int(np.min(reach.first)), int(np.max(reach.last))
+    if errors.sensitivity is not None and errors.drive is not None:
+        slope, drive = np.asarray(errors.sensitivity), np.asarray(errors.drive)
+        moved = np.real(np.tensordot(slope, columns.conj(), axes=((0, 1, 2), (0, 1, 2))))
+        begin, end = min(begin, int(driven[0])), max(end, int(driven[-1]) + 1)
+    for low in range(begin, end, _ATOMS):
+        part = np.zeros((min(_ATOMS, end - low), values.shape[2]), complex)
+        add_effects(part, low, effect, reach, values)
+        if moved is not None:
+            taken = slice(*np.searchsorted(driven, (low, low + len(part))))
+            both = np.einsum("nac,np->acp", drive[:, taken], moved)
+            part[driven[taken] - low] += both.reshape(len(both), part.shape[1])
+        yield part
+
+
+def _by_times(
+    errors: ErrorCovariance, drawn: Complex[np.ndarray, "frequencies inputs groups roots columns"]
+) -> Iterator[Complex[np.ndarray, "times roots_columns"]]:
+    """The same of the noise at the times that windows overlap."""
+    along = np.swapaxes(drawn, 1, 2).reshape(-1, drawn.shape[3] * drawn.shape[4])
+    for times in _chunks(errors):
+        seen = _at(errors, times)
+        yield seen.reshape(-1, seen.shape[3]).T @ along
+
+
+def _products_of_drives(errors: ErrorCovariance) -> Float[np.ndarray, "parameters parameters"]:
+    """Covariance of the real parameters."""
+    drive = np.ascontiguousarray(errors.drive)
+    parts = drive.reshape(len(drive), -1).view(drive.real.dtype)
+    return 0.5 * (parts @ parts.T)
 
 
 def _with_parameters(
     errors: ErrorCovariance,
 ) -> Complex[np.ndarray, "frequencies outputs inputs parameters"]:
     """Twice the covariance of what atoms do to each response with the real parameters."""
-    effect, drive = np.asarray(errors.effect), np.asarray(errors.drive)
-    both = np.tensordot(effect[:, :, : drive.shape[1]], np.conj(drive), axes=(2, 1))
+    drive = np.asarray(errors.drive)
+    both = times_drive(np.asarray(errors.effect), _reach(errors), _driven(errors), drive)
     return np.einsum("finc,foc->foin", both, np.asarray(errors.noise), optimize=True)
 
 
@@ -242,25 +273,19 @@ def _share(errors: ErrorCovariance) -> Float[np.ndarray, "frequencies outputs in
     return np.ones(shape) if errors.share is None else np.asarray(errors.share)
 
 
-def _places(errors: ErrorCovariance) -> Places:
-    """Where there is independent noise: times in s, or numbers of atoms."""
-    return np.arange(errors.effect.shape[2]) if errors.windows is None else errors.windows.times
-
-
-def _chunks(errors: ErrorCovariance) -> list[Places]:
-    places = _places(errors)
-    return [places[k : k + _CHUNK] for k in range(0, places.size, _CHUNK)]
+def _chunks(errors: ErrorCovariance) -> list[Float[np.ndarray, " times"]]:
+    assert errors.windows is not None
+    times = errors.windows.times
+    return [times[k : k + _CHUNK] for k in range(0, times.size, _CHUNK)]
 
 
 def _at(
-    errors: ErrorCovariance, places: Places
-) -> Complex[np.ndarray, "frequencies groups inputs places"]:
-    """Contribution of unit noise at these places to the errors, by group of atoms."""
-    effect = np.asarray(errors.effect)
-    if errors.windows is None:
-        return effect[:, None, :, places[0] : places[-1] + 1]
-    seen = errors.windows.at(places)
-    turned = np.exp(-1j * np.asarray(errors.omega)[:, None] * places[None, :])
+    errors: ErrorCovariance, times: Float[np.ndarray, " times"]
+) -> Complex[np.ndarray, "frequencies groups inputs times"]:
+    """Contribution of unit noise at these times to the errors, by group of windows."""
+    assert errors.windows is not None
+    effect, seen = np.asarray(errors.effect), errors.windows.at(times)
+    turned = np.exp(-1j * np.asarray(errors.omega)[:, None] * times[None, :])
     ends = np.cumsum(errors.counts or (effect.shape[2],))
     groups = zip(np.split(effect, ends[:-1], axis=2), np.split(seen, ends[:-1]), strict=True)
     return np.stack([part @ windows for part, windows in groups], axis=1) * turned[:, None, None]
@@ -280,6 +305,7 @@ def independent_errors(
     """
     share = np.sqrt(np.asarray(variance))
     count, outputs, inputs = share.shape
-    effect = np.eye(count * inputs, dtype=complex).reshape(count, inputs, count * inputs)
+    effect = np.broadcast_to(np.eye(inputs, dtype=complex), (count, inputs, inputs))
     noise = np.broadcast_to(np.eye(outputs, dtype=complex), (count, outputs, outputs))
-    return ErrorCovariance(np.asarray(omega), effect, noise, share[:, :, :, None])
+    first = inputs * np.arange(count)
+    return ErrorCovariance(np.asarray(omega), effect, noise, share[:, :, :, None], first=first)

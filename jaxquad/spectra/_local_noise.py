@@ -1,10 +1,12 @@
 """The outputs' noise along frequency, from the residuals of local fits."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from ._atoms import Reach, reach_of
 from ._error_covariance import ErrorCovariance
 from ._local_fit import Bins, LocalFit
 from ._noise_freedom import BANDWIDTH
@@ -165,7 +167,6 @@ _CHANCE = 1e-5  # of calling a residual a misfit
 _FALSE_ALARM = 1e-3  # chance that noise alone leaves any of a record's responses unresolved
 _HARMLESS = 1e-4  # share of the moved channel's power
 _FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
-_ATOMS, _PARAMETERS = 256, 16  # numbers of which those of the noise and the parameters are padded
 _UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
 
 
@@ -197,14 +198,16 @@ def error_covariance(
     size = np.sqrt(noise.power[at]) * scale / np.maximum(np.linalg.norm(root, axis=2), 1e-300)
     root = root * size[:, :, None]
     known = np.isfinite(fit.response[:, 0, 0])[:, None, None]
-    shared, driven = _on_common_bins(np.where(known, effect * back, 0.0), places, models)
-    kind = np.where(known, root, np.eye(*root.shape[1:]))
-    slopes = drive = None
-    if models is not None:
-        slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
-        slopes, drive = _on_common_atoms(slopes, models, driven)
-    shared[~known[:, 0, 0], :, 0] = _UNKNOWN
-    return ErrorCovariance(np.asarray(omega), shared, kind, sensitivity=slopes, drive=drive)
+    kind, effect = np.where(known, root, np.eye(*root.shape[1:])), np.where(known, effect * back, 0)
+    reach, unknown = reach_of(effect, fit.first), ~known[:, 0, 0]
+    effect = effect[:, :, : max(np.max(reach.last - reach.first), 1)].copy()
+    effect[unknown, :, 0] = _UNKNOWN
+    found = ErrorCovariance(np.asarray(omega), effect, kind, first=np.where(unknown, 0, fit.first))
+    if models is None:
+        return found
+    slopes = np.where(known[..., None], models.slopes * back[..., None], 0.0)
+    slopes, drive, driven = _on_common_atoms(slopes, models, reach, bins.omega.size)
+    return dataclasses.replace(found, sensitivity=slopes, drive=drive, driven=driven)
 
 
 def colour_of_noise(
@@ -329,55 +332,26 @@ def _misfit(
     return np.where(left > fdtri(*freedom, 1 - chance)[:, None], left, 1.0)
 
 
-def _on_common_bins(
-    effect: Complex[np.ndarray, "frequencies inputs window"],
-    places: Int[np.ndarray, "frequencies window"],
-    models: SharedErrors | None,
-) -> tuple[Complex[np.ndarray, "frequencies inputs atoms"], Int[np.ndarray, " driven"]]:
-    """The effects of all bins that have one, and the bins of the first atoms.
-
-    First come the bins whose noise disturbs the `models` too, then an atom for each of their
-    parameters, with zeros, then all other bins.
-    """
-    used = np.any(effect != 0, axis=1)
-    bins, atom = np.unique(places[used], return_inverse=True)
-    driven, spare = np.zeros(bins.size, bool), 0
-    if models is not None:
-        driven, spare = np.isin(bins, models.places), len(models.single)
-    column = np.where(driven, np.cumsum(driven), np.sum(driven) + spare + np.cumsum(~driven)) - 1
-    row, step = np.nonzero(used)
-    shared = np.zeros((*effect.shape[:2], _padded(bins.size + spare, _ATOMS)), complex)
-    shared[row, :, column[atom]] = effect[row, :, step]
-    return shared, bins[driven]
-
-
-def _padded(count: int, block: int) -> int:
-    """So few sizes that programs compiled for one record serve others."""
-    return max(-(-count // block), 1) * block
-
-
 def _on_common_atoms(
     slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"],
     models: SharedErrors,
-    driven: Int[np.ndarray, " driven"],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes by the parameters' errors of unit size, and their drive by the first atoms.
+    reach: Reach,
+    count: int,
+) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " driven"]]:
+    """Slopes by the parameters' errors of unit size, and their drive by atoms, with their numbers.
 
-    Bins that no local fit uses are one more atom for each parameter, with the same covariance.
+    The bins that no local fit uses are one more atom for each parameter, with the same covariance:
+    their numbers follow those of the `count` bins.
     """
-    parameters, roots = len(models.single), models.lines.shape[2]
     size = np.sqrt(0.5 * models.power())
     size = np.where(size > 0, size, 1.0)
-    mine = np.isin(models.places, driven)
+    mine = reach.reached(count)[models.places]
     values, vectors = np.linalg.eigh(_gram(models, ~mine) / np.outer(size, size))
-    count = _padded(driven.size + parameters, _ATOMS)
-    drive = np.zeros((_padded(parameters, _PARAMETERS), count, roots), complex)
-    drive[:parameters, : driven.size] = models.drive_at(np.flatnonzero(mine)) / size[:, None, None]
-    spare = slice(driven.size, driven.size + parameters)
-    drive[:parameters, spare, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
-    known = np.zeros((*slopes.shape[:3], len(drive)), complex)
-    known[..., :parameters] = slopes * size
-    return known, drive
+    drive = models.drive_at(np.flatnonzero(mine)) / size[:, None, None]
+    spare = np.zeros((size.size, size.size, drive.shape[2]), complex)
+    spare[:, :, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
+    driven = np.concatenate([models.places[mine], count + np.arange(size.size)])
+    return slopes * size, np.concatenate([drive, spare], axis=1), driven
 
 
 _TOGETHER = 1024  # bins whose drives are taken at a time: those of a long record are many

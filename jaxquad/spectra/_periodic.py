@@ -341,11 +341,8 @@ def _errors(
     kernel = np.where(fit.known[:, None, None], kernel, _UNKNOWN**2 * np.eye(inputs))
     values, vectors = np.linalg.eigh(kernel)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    effect = np.zeros((count, inputs, count, inputs), complex)
-    effect[np.arange(count), :, np.arange(count)] = root
-    effect = effect.reshape(count, inputs, -1)
     noise = np.where(fit.known[:, None, None], scatter.root, np.eye(scatter.root.shape[1]))
-    return ErrorCovariance(omega, effect, noise)
+    return ErrorCovariance(omega, root, noise, first=inputs * np.arange(count))
 
 
 def _log_noise_covariance(
