@@ -178,7 +178,9 @@ class ErrorCovariance:
         else:
             seen = (_at(self, times) for times in _chunks(self))
             parts = (np.einsum("foig,fgit->foit", share, e).reshape(*shape, -1) for e in seen)
-        total = sum(part @ np.conj(np.swapaxes(part, 1, 2)) for part in parts)
+        total = np.zeros((*shape, shape[1]), complex)
+        for part in parts:
+            total += part @ np.conj(np.swapaxes(part, 1, 2))
         total = total.reshape(-1, *2 * share.shape[1:3]) * spread[:, :, None, :, None]
         total = total.reshape(*shape, -1)
         if self.sensitivity is None or self.drive is None:
@@ -255,7 +257,7 @@ def _by_times(
 def _products_of_drives(errors: ErrorCovariance) -> Float[np.ndarray, "parameters parameters"]:
     """Covariance of the real parameters."""
     drive = np.ascontiguousarray(errors.drive)
-    parts = drive.reshape(len(drive), -1).view(drive.real.dtype)
+    parts = drive.reshape(len(drive), -1).view(float)  # real and imaginary ones in turn
     return 0.5 * (parts @ parts.T)
 
 

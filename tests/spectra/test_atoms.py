@@ -60,8 +60,8 @@ def plain_covariance(errors: ErrorCovariance) -> np.ndarray:
     slope = np.asarray(errors.sensitivity).reshape(count, -1)
     drive = np.asarray(errors.drive).reshape(PARAMETERS, -1)
     # A circular noise of unit power has parts of power one half; times j, it turns.
-    under_real = own + slope @ drive.real
-    under_imaginary = 1j * own - slope @ drive.imag
+    under_real = own + slope @ np.real(drive)
+    under_imaginary = 1j * own - slope @ np.imag(drive)
     rows = np.concatenate([under_real, under_imaginary], axis=1) / np.sqrt(2)
     return rows @ rows.conj().T
 
@@ -79,7 +79,7 @@ def test_all_forms_of_the_covariance_are_the_plain_one(errors):
     at_each = PLAIN[each, :, :, each].reshape(FREQUENCIES, OUTPUTS * INPUTS, -1)
     np.testing.assert_allclose(errors.at_each_frequency(), at_each, atol=1e-9)
     np.testing.assert_allclose(
-        errors.variance().reshape(FREQUENCIES, -1), np.diagonal(at_each, axis1=1, axis2=2).real
+        errors.variance().reshape(FREQUENCIES, -1), np.real(np.diagonal(at_each, axis1=1, axis2=2))
     )
 
 
@@ -97,7 +97,7 @@ def test_the_projection_is_the_variance_of_a_weighted_sum():
     columns[3, 1, 0], columns[69, 0, 2] = (1.0, 1j), (2.0, 2j)
     weights = columns[..., 0].reshape(-1)
     expected = weights.conj() @ PLAIN.reshape(weights.size, -1) @ weights
-    assert np.trace(ERRORS.project(columns)) == pytest.approx(expected.real, rel=1e-9)
+    assert np.trace(ERRORS.project(columns)) == pytest.approx(float(np.real(expected)), rel=1e-9)
 
 
 def test_frequencies_are_independent_where_no_atom_reaches_two():
