@@ -133,15 +133,8 @@ def test_neighbouring_frequencies_share_their_errors():
     found = draws("white noise")
     error = np.stack([np.asarray(each.response)[:, 0, 0] for each in found]) - PLANT
     shared = np.mean(error[:, 1:] * np.conj(error[:, :-1]), axis=0)
-    effect = [np.asarray(each.errors.effect)[:, 0] for each in found]
-    root = [np.abs(np.asarray(each.errors.noise)[:, 0, 0]) for each in found]
-    expected = np.mean(
-        [
-            np.sum(e[1:] * np.conj(e[:-1]), axis=1) * r[1:] * r[:-1]
-            for e, r in zip(effect, root, strict=True)
-        ],
-        axis=0,
-    )
+    claimed = [np.diagonal(each.errors.between((0, 0), (0, 0)), -1) for each in found]
+    expected = np.mean(claimed, axis=0)
     assert np.sum(shared).real / np.sum(expected).real == pytest.approx(1, abs=0.2)
 
 
