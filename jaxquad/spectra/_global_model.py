@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from jaxquad._core import map_in_threads
-
 from ._local_fit import Bins
 from ._rational_fit import (
     columns_of,
@@ -122,10 +120,9 @@ def global_models(
         _Task(_equations(bins, places, inputs, output, scale, dt), bins.omega[places], most)
         for output in range(outputs.start, outputs.stop)
     )
-    found = map_in_threads(_identify_kept, tasks)
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
-        for one in found
+        for one in map(_identify_kept, tasks)
     ]
 
 

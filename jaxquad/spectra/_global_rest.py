@@ -6,8 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from jaxquad._core import map_in_threads
-
 from ._global_model import global_models, GlobalModel, highest_modelled, weighted_model
 from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_noise import Noise, SharedErrors
@@ -131,7 +129,7 @@ def weighted_models(
         power = np.where(omega > noise.omega[-1], model.noise, power)
         return weighted_model(model, bins, rest.sources, channel, most, power) or model
 
-    return map_in_threads(fit_again, range(len(rest.models)))
+    return [fit_again(c) for c in range(len(rest.models))]
 
 
 def model_slopes(

@@ -1,6 +1,7 @@
 """Responses and fits of an identification, over the whole band and over parts of it."""
 
 import dataclasses
+import multiprocessing
 import re
 from collections.abc import Callable, Mapping, Sequence
 
@@ -89,7 +90,9 @@ def _responses(
         frf = frequency_response(list(records), omega, estimator=estimator)
         return without_filters(frf, filters)
 
-    if sum(record.time.size for record in records) > _SIDE_BY_SIDE:
+    # The workers of a batch have one core each.
+    alone = multiprocessing.parent_process() is None
+    if not alone or sum(record.time.size for record in records) > _SIDE_BY_SIDE:
         return [estimate(each) for each in estimators]
     # The number of BLAS threads is the whole process's: no estimate may set it back for the other.
     with one_blas_thread():
