@@ -83,10 +83,9 @@ class ErrorCovariance:
     where atoms come in groups g of `counts` each. V[a, o] is the transform of the noise of output
     o in window a of `windows`, or, without windows, independent noise of unit power: few atoms of
     a record reach a frequency, and `effect[f]` is of those from number `first[f]` on, or from the
-    first one. `noise[f]` is
-    the root of the outputs' noise covariance: cov(V[o], V[p]) = sum_c noise[f, o, c]
-    conj(noise[f, p, c]). The full covariance matrix of 20 outputs and 10 inputs would fill
-    gigabytes, but a fit needs only its product with a few columns.
+    first one. `noise[f]` is the root of the outputs' noise covariance: cov(V[o], V[p]) = sum_c
+    noise[f, o, c] conj(noise[f, p, c]). The full covariance matrix of 20 outputs and 10 inputs
+    would fill gigabytes, but a fit needs only its product with a few columns.
 
     Real parameters p that the same noise W[a, c] has disturbed, as those of a model that all
     frequencies share, add `sensitivity[f, o, i, p] Re(sum_ac drive[p, a, c] W[a, c])`, where
