@@ -14,8 +14,8 @@ _RELAXATIONS, _STEPS = 12, 20  # of Sanathanan and Koerner, of Gauss and Newton
 _NEAREST = 1e-9  # size of the denominator, to its largest, so that no pole falls onto a bin
 EXACT = 1e-20  # share of the output's power that is rounding
 _LEAST_CONDITION = 1e-13  # reciprocal, of normal equations
-_SINGULAR = 1e-14  # eigenvalue, to the largest, of a direction that is left alone
-_DEPENDENT = 1e-13  # the same of singular values
+_SAFE_CONDITION = 1e-10  # the same, from which on one solution leaves digits enough
+_DEPENDENT = 1e-13  # singular value, to the largest, of a direction that is left alone
 
 Vector = Float[np.ndarray, " parameters"]
 Rows = Float[np.ndarray, "rows parts"]
@@ -111,8 +111,9 @@ def relax(equations: Equations, basis: Basis) -> Float[np.ndarray, " powers"]:
 
 def _null_vector(span: "_Span", rows: Rows) -> Vector:
     """Coefficients of the rows, each of unit length, whose sum lies nearest to what is spanned."""
-    length, rest = _lengths(rows), span.without(rows)
-    return np.linalg.eigh(rest @ rest.T / np.outer(length, length))[1][:, 0] / length
+    length = _lengths(rows)
+    corner = _triangle(span.nearest(rows / length[:, None])[1])
+    return np.linalg.svd(corner)[2][-1] / length
 
 
 def descend(
@@ -129,7 +130,7 @@ def descend(
     floor = EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for _ in range(_STEPS):
         fixed = basis.largest(solved.denominator)
-        rows = span.without(parts_of(_turned(equations, basis, solved, fixed)))
+        _, rows = span.nearest(parts_of(_turned(equations, basis, solved, fixed)))
         step = np.insert(_least_squares(rows, parts_of(solved.left)), fixed, 0.0)
         trials = (_project(equations, basis, solved.denominator + step / 3**k) for k in range(6))
         better = next((each for each in trials if each[0].cost < solved.cost), None)
@@ -151,8 +152,11 @@ class _Span(NamedTuple):
     rows: Rows
     length: Vector
     factor: Float[np.ndarray, "parameters parameters"] | None
+    lossy: bool  # whether several values are solved for once more, as single ones always are
 
-    def coefficients(self, values: Rows | Parts) -> Float[np.ndarray, "*some parameters"]:
+    def coefficients(
+        self, values: Float[np.ndarray, "*some parts"]
+    ) -> Float[np.ndarray, "*some parameters"]:
         """Of the sums of rows that lie nearest to `values`."""
         from scipy.linalg.lapack import dpotrs  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -163,9 +167,16 @@ class _Span(NamedTuple):
         found, _ = dpotrs(self.factor, (right.T / self.length).T)
         return found.T / self.length
 
-    def without(self, values: Rows | Parts) -> Rows | Parts:
-        """`values` less what the rows span of them."""
-        return values - self.coefficients(values) @ self.rows
+    def nearest(
+        self, values: Float[np.ndarray, "*some parts"]
+    ) -> tuple[Float[np.ndarray, "*some parameters"], Float[np.ndarray, "*some parts"]]:
+        """The `coefficients`, and what they leave of `values`."""
+        found = self.coefficients(values)
+        rest = values - found @ self.rows
+        if values.ndim == 2 and not self.lossy:
+            return found, rest
+        more = self.coefficients(rest)
+        return found + more, rest - more @ self.rows
 
 
 def _span_of(rows: Rows) -> _Span:
@@ -176,10 +187,11 @@ def _span_of(rows: Rows) -> _Span:
     length = np.where(length > 0, length, 1.0)
     products /= np.outer(length, length)
     factor, failed = dpotrf(products)
+    condition = 0.0
     if not failed:
         condition, _ = dpocon(factor, np.max(np.sum(np.abs(products), axis=0)))
-        failed = condition < _LEAST_CONDITION
-    return _Span(rows, length, None if failed else factor)
+    known = factor if condition >= _LEAST_CONDITION else None
+    return _Span(rows, length, known, bool(condition < _SAFE_CONDITION))
 
 
 def solve_linear(
@@ -196,12 +208,8 @@ def _project(
     size = np.abs(below)
     below = np.where(size < _NEAREST * np.max(size), _NEAREST * np.max(size), below)
     span, y = _span_of(parts_of(basis.columns * (1 / below))), parts_of(equations.y)
-    first = span.coefficients(y)
-    left = y - first @ span.rows
-    # Once more, for the digits that the products of the rows have lost.
-    second = span.coefficients(left)
-    left = left - second @ span.rows
-    solved = Solved(denominator, first + second, below, left.view(complex), float(left @ left))
+    linear, left = span.nearest(y)
+    solved = Solved(denominator, linear, below, left.view(complex), float(left @ left))
     return solved, span
 
 
@@ -228,10 +236,18 @@ def slopes_of(
 
 def _least_squares(rows: Rows, values: Parts) -> Vector:
     """Coefficients of the sum of rows that lies nearest to `values`."""
-    length = _lengths(rows)
-    products = rows @ rows.T / np.outer(length, length)
-    right = rows @ values / length
-    return np.linalg.lstsq(products, right, rcond=_SINGULAR)[0] / length
+    joined = np.concatenate([rows, values[None]])
+    length = _lengths(joined)
+    triangle = _triangle(joined / length[:, None])
+    found = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=_DEPENDENT)[0]
+    return found * length[-1] / length[:-1]
+
+
+def _triangle(rows: Rows) -> Float[np.ndarray, "rows rows"]:
+    """R of the QR decomposition of the columns that the rows are; numpy's takes twice the time."""
+    from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
+
+    return np.triu(dgeqrf(rows.T, overwrite_a=True)[0][: len(rows)])
 
 
 def _lengths(rows: Rows) -> Vector:
