@@ -13,8 +13,7 @@ from jaxtyping import Complex, Float, Int
 _RELAXATIONS, _STEPS = 12, 20  # of Sanathanan and Koerner, of Gauss and Newton
 _NEAREST = 1e-9  # size of the denominator, to its largest, so that no pole falls onto a bin
 EXACT = 1e-20  # share of the output's power that is rounding
-_LEAST_CONDITION = 1e-13  # reciprocal, of normal equations
-_SAFE_CONDITION = 1e-10  # the same, from which on one solution leaves digits enough
+_LEAST_CONDITION = 1e-10  # reciprocal, of normal equations that leave digits enough
 _DEPENDENT = 1e-13  # singular value, to the largest, of a direction that is left alone
 
 Vector = Float[np.ndarray, " parameters"]
@@ -145,14 +144,14 @@ def descend(
 class _Span(NamedTuple):
     """What rows span, with the Cholesky factor of the products of these rows at unit length.
 
-    That takes a third of the time of a QR decomposition. Where it would lose too many digits there
-    is none, and the rows are decomposed.
+    That takes a third of the time of a QR decomposition, which there is where the products would
+    lose too many digits.
     """
 
     rows: Rows
     length: Vector
-    factor: Float[np.ndarray, "parameters parameters"] | None
-    lossy: bool  # whether several values are solved for once more, as single ones always are
+    factor: Float[np.ndarray, "parameters parameters"]  # of Cholesky, or R
+    orthonormal: Rows | None  # Q, with R
 
     def coefficients(
         self, values: Float[np.ndarray, "*some parts"]
@@ -160,9 +159,9 @@ class _Span(NamedTuple):
         """Of the sums of rows that lie nearest to `values`."""
         from scipy.linalg.lapack import dpotrs  # pyright: ignore[reportAttributeAccessIssue]
 
-        if self.factor is None:
-            unit = self.rows.T / self.length
-            return np.linalg.lstsq(unit, values.T, rcond=_DEPENDENT)[0].T / self.length
+        if self.orthonormal is not None:
+            along = self.orthonormal @ values.T
+            return np.linalg.lstsq(self.factor, along, rcond=_DEPENDENT)[0].T / self.length
         right = self.rows @ values.T
         found, _ = dpotrs(self.factor, (right.T / self.length).T)
         return found.T / self.length
@@ -170,10 +169,10 @@ class _Span(NamedTuple):
     def nearest(
         self, values: Float[np.ndarray, "*some parts"]
     ) -> tuple[Float[np.ndarray, "*some parameters"], Float[np.ndarray, "*some parts"]]:
-        """The `coefficients`, and what they leave of `values`."""
+        """The `coefficients`, and what they leave of `values`; of single ones to the last digit."""
         found = self.coefficients(values)
         rest = values - found @ self.rows
-        if values.ndim == 2 and not self.lossy:
+        if values.ndim == 2 or self.orthonormal is not None:
             return found, rest
         more = self.coefficients(rest)
         return found + more, rest - more @ self.rows
@@ -190,8 +189,18 @@ def _span_of(rows: Rows) -> _Span:
     condition = 0.0
     if not failed:
         condition, _ = dpocon(factor, np.max(np.sum(np.abs(products), axis=0)))
-    known = factor if condition >= _LEAST_CONDITION else None
-    return _Span(rows, length, known, bool(condition < _SAFE_CONDITION))
+    if condition < _LEAST_CONDITION:
+        return _decomposed(rows, length)
+    return _Span(rows, length, factor, None)
+
+
+def _decomposed(rows: Rows, length: Vector) -> _Span:
+    from scipy.linalg.lapack import dgeqrf, dorgqr  # pyright: ignore[reportAttributeAccessIssue]
+
+    qr, tau, *_ = dgeqrf((rows / length[:, None]).T, overwrite_a=True)
+    triangle = np.triu(qr[: len(rows)])
+    orthonormal, *_ = dorgqr(qr, tau, overwrite_a=True)
+    return _Span(rows, length, triangle, orthonormal.T)
 
 
 def solve_linear(
