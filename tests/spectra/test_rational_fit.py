@@ -82,9 +82,9 @@ def test_a_descent_leaves_no_more_than_it_began_with_and_reaches_the_noise():
 
 def test_the_last_digit_of_a_flight_does_not_choose_its_models(data):
     """Of an order above that of the vehicle: poles and zeros that cancel leave directions open."""
-    path, roles = data / "antx_pitch" / "antx_log3_prbs.npz", {"inputs": ["M"], "outputs": ["q"]}
+    path = data / "antx_pitch" / "antx_log3_prbs.npz"
     with pytest.warns(RecordWarning, match="gaps filled"):
-        flown = read(path, **roles, references=["x0"], sample_rate=250.0)
+        flown = read(path, inputs="M", outputs="q", references="x0", sample_rate=250.0)
     omega = np.geomspace(3.6, 119.0, 40)
     estimator = JointInputOutput(LocalPolynomial(integrators=1, delay=0.032))
     digit = np.finfo(float).eps * np.random.default_rng(0).integers(-1, 2, flown.outputs.shape)
