@@ -80,9 +80,11 @@ def movable(tree: PyTree, places: Devices | None) -> PyTree:
 
 
 def gathered(tree: PyTree) -> PyTree:
-    """The same, with arrays that lie on several devices brought to the default one."""
-    spread = lambda x: is_concrete_array(x) and len(x.devices()) > 1
-    return jax.tree.map(lambda x: _unbound(x) if spread(x) else x, tree)
+    """The results of one program, brought to the default device if they lie on several."""
+    first = next(filter(is_concrete_array, jax.tree.leaves(tree)), None)
+    if first is None or len(first.devices()) < 2:
+        return tree
+    return jax.tree.map(lambda x: _unbound(x) if is_concrete_array(x) else x, tree)
 
 
 def is_concrete_array(x: object) -> TypeGuard[jax.Array]:

@@ -10,15 +10,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
+from jax.interpreters import mlir
 from jaxtyping import PyTree
-
-from jaxquad._core import is_concrete
 
 from ._accelerator import why_no_device_kernels
 from ._kept_programs import KeptPrograms, kind_of
 from ._kernel import why_no_kernels
+from ._prepared import Prepared
 from ._switch import Kernel, left_plain, plain_loops, set_kernel, warn_once
 
 
@@ -88,49 +88,49 @@ class Jit:
         ft.update_wrapper(self, function)
         self._options = compiler_options if options is None else options
         self._kept = KeptPrograms(function, self._options)
+        self._prepared = Prepared(function, self._options)
         self._name = function.__name__
         self._plain = eqx.filter_jit(function)
-        self._function = function
         self._failed: set[tuple] = set()
         self._known: set[tuple] = set()
 
-    @ft.cached_property
-    def _tuned(self) -> Callable[..., PyTree]:
-        options = self._options()
-        given: dict[str, Any] = {"compiler_options": options} if options else {}
-        return eqx.filter_jit(self._function, **given)
-
     def __call__(self, *args: PyTree) -> PyTree:
-        if not self.is_outermost(*args):
+        leaves, structure = jax.tree.flatten(args)
+        if not _is_outermost(leaves):
             return self._plain(*args)
-        if _why_plain() is not None:
-            return self._run(args)
-        if self._failed and _shapes(args) in self._failed:
-            return self._without_kernels(*args)
+        run = lambda: self._run(args, leaves, structure)
+        if self._failed and _why_plain() is None and _shapes(args) in self._failed:
+            return _without_kernels(run)
         try:
-            return self._run(args)
+            return run()
         except eqx.EquinoxRuntimeError:  # raised by what runs: it did compile
             raise
         except jax.errors.JaxRuntimeError as error:
-            result = self._without_kernels(*args)  # If the kernel is not at fault, this raises too.
+            if _why_plain() is not None:
+                raise
+            result = _without_kernels(run)  # If the kernel is not at fault, this raises too.
             self._failed.add(_shapes(args))
             warn_once(f"{self._name} did not compile as one kernel ({_first_line(error)})")
             return result
 
-    def _without_kernels(self, *args: PyTree) -> PyTree:
-        with plain_loops(True):
-            return self._run(args)
-
-    def _run(self, args: PyTree) -> PyTree:
+    def _run(self, args: PyTree, leaves: list, structure: PyTree) -> PyTree:
         program = self._kept.find(args)
-        return self._tuned(*args) if program is None else program(args)
+        if program is not None:
+            return program(args)
+        try:
+            return self._prepared(leaves, structure)
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            if _RAISED not in str(error):
+                raise
+            return self._plain(*args)  # raises it with its own words, as equinox does
 
-    def lower(self, *args: PyTree) -> PyTree:
-        return (self._tuned if self.is_outermost(*args) else self._plain).lower(*args)
+    def lower(self, *args: PyTree) -> jax.stages.Lowered:
+        """What a call with such arguments, outside of other programs, compiles."""
+        return self._prepared.lower(*jax.tree.flatten(args))
 
     def is_outermost(self, *args: PyTree) -> bool:
         """Whether a call with such arguments is no part of another program."""
-        return _is_outermost(args)
+        return _is_outermost(jax.tree.leaves(args))
 
     def is_new(self, *args: PyTree) -> bool:
         """Whether nobody has asked before for arguments that have the same program."""
@@ -201,27 +201,33 @@ def _known() -> tuple[tuple[str, int], ...]:
     return tuple(_WIDEST.items())
 
 
-def _is_outermost(args: PyTree) -> bool:
+_RAISED = "_EquinoxRuntimeError: "  # in the message of what `eqx.error_if` has raised
+
+
+def _without_kernels(run: Callable[[], PyTree]) -> PyTree:
+    with plain_loops(True):
+        return run()
+
+
+def _is_outermost(leaves: list) -> bool:
     # Within another jit even a constant is traced.
-    arrays = filter(eqx.is_array, jax.tree.leaves(args))
-    constant = jnp.negative(_CONSTANT) if _probe is None else _probe.bind(_CONSTANT)
-    return is_concrete(constant) and all(map(is_concrete, arrays))
+    constant = jnp.negative(np.zeros(())) if _probe is None else _probe.bind()
+    return not any([isinstance(x, Tracer) for x in (constant, *leaves)])
 
 
 def _make_probe() -> Primitive | None:
     """A tenth of the price of the cheapest operation of `jax.numpy`; None where it cannot be."""
     probe = Primitive("probe")
-    probe.def_impl(lambda x: x)
-    probe.def_abstract_eval(lambda x: x)
+    probe.def_impl(lambda: False)
     try:
-        batching.defvectorized(probe)
-        mlir.register_lowering(probe, lambda ctx, x: [x])
+        probe.def_abstract_eval(lambda: ShapedArray((), np.dtype(bool)))
+        lowered = mlir.lower_fun(lambda: np.zeros((), bool), multiple_results=False)
+        mlir.register_lowering(probe, lowered)
     except AttributeError:  # a JAX without these rules, in which no loop is a kernel either
         return None
     return probe
 
 
-_CONSTANT = np.zeros(())
 _probe = _make_probe()
 
 

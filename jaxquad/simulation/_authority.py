@@ -120,13 +120,15 @@ def beyond_authority(found: Authority | None, scenario: Scenario) -> list[str]:
         return []
     torque = np.abs(np.asarray(scenario.disturbance))
     limits = (
-        (found.torque, "that the drive has: no controller holds the angle there"),
-        (found.forward, "that the motors give without turning backwards"),
+        (np.asarray(found.torque), "that the drive has: no controller holds the angle there"),
+        (np.asarray(found.forward), "that the motors give without turning backwards"),
     )
+    if all(torque.max(initial=0.0) <= limit.min(initial=np.inf) for limit, _ in limits):
+        return []
     messages = []
     for k, name in enumerate(axis_names(torque.shape[1])):
         for limit, what in limits:
-            least, asked = np.asarray(limit)[min(k, len(limit) - 1)], torque[:, k]
+            least, asked = limit[min(k, len(limit) - 1)], torque[:, k]
             asked = asked.reshape(asked.shape + (1,) * (least.ndim + 1 - asked.ndim))
             share = np.mean(asked > (1 + 1e-6) * least)
             if share:

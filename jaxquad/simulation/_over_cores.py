@@ -72,10 +72,12 @@ class _Part(NamedTuple):
 
 def _part(program: Jit, run: Run, further: tuple, devices: Devices | None) -> _Part | None:
     """None for an ensemble that is computed at once."""
-    cores, leaves = available_cores(), jax.tree.leaves(run)
+    cores = available_cores()
     alone = jax.default_backend() == "cpu" and not may_be_several(None)
-    many = any(np.shape(x)[-1:] >= (2 * _FEWEST,) for x in leaves)  # seen in less time than a shape
-    if devices is not None or not alone or not many or cores < 2:
+    if devices is not None or not alone or cores < 2:
+        return None
+    leaves = jax.tree.leaves(run)
+    if not any([_last_axis(x) >= 2 * _FEWEST for x in leaves]):  # seen sooner than an ensemble
         return None
     ensemble = ensemble_shape(*run)
     members, size = (1, *ensemble)[-1], len(run[1].reference) * math.prod(ensemble)
@@ -84,6 +86,11 @@ def _part(program: Jit, run: Run, further: tuple, devices: Devices | None) -> _P
     if width == members or size * width < _LEAST * members or keys:
         return None
     return _Part(members, width, own) if program.is_outermost(*run, *further) else None
+
+
+def _last_axis(x: object) -> int:
+    shape = getattr(x, "shape", ())
+    return shape[-1] if shape else 0
 
 
 def _is_key(x: jax.Array) -> bool:

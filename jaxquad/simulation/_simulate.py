@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxquad._core import align
+from jaxquad._core import align, pytree_node
 from jaxquad._xla import Devices, Jit
 from jaxquad.loops import Loop
 from jaxquad.records import AXES, Record
@@ -21,7 +21,8 @@ from ._scenario import Scenario
 from ._step import SampleResult
 
 
-class Simulation(eqx.Module):
+@pytree_node
+class Simulation:
     """What a simulated loop did, sample by sample.
 
     Where an angle exceeds the loop's `bound`, the member has `diverged`: it is held at that angle

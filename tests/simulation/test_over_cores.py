@@ -37,7 +37,7 @@ def calls(monkeypatch):
             seen.append((threading.get_ident(), found[0][0][0].shape[-1]))
             return found
 
-    monkeypatch.setattr(_simulate, "_run", Watched(program._function))
+    monkeypatch.setattr(_simulate, "_run", Watched(program.__wrapped__))
     return seen
 
 
