@@ -1,3 +1,4 @@
+import functools as ft
 from collections.abc import Callable
 from typing import cast, NamedTuple
 
@@ -60,6 +61,7 @@ def _rolled_runge_kutta(
     """
     spans = jax.tree.map(lambda x: _over(dt, x), state)
 
+    @ft.partial(jax.checkpoint, prevent_cse=False)
     def stage(carry: tuple[PyTree, PyTree], now: tuple[Array, Array]) -> tuple[PyTree, None]:
         (slope, total), (share, weight) = carry, now
         slope = derivative(jax.tree.map(lambda x, h, k: x + share * h * k, state, spans, slope))

@@ -3,9 +3,9 @@
     python -m pytest tests/benchmarks/test_compile_speed.py -o addopts= -s
 
 Ten seconds at 2 ms of a three-axis rig under three LADRC, and of three axes under an adaptive LADRC
-with least squares; one loop and 48 inertias. Nothing is read from a cache. The options are those
-that `jq.tune` compiles with, which a `jax.jit` of your own takes too. What was traced once is not
-traced again.
+with least squares; one loop and 48 inertias. Nothing is read from a cache. "brief" options are
+those of `jq.tune`, "light" ones those of docs/how_to.md for a `jax.jit` of your own. What was
+traced once is not traced again.
 """
 
 import time
@@ -29,6 +29,11 @@ KT, J0 = 0.0468, 0.0552
 HAPPENS = scenario(
     duration=10.0, axes=3, reference=Step(np.radians(4.0)), disturbance=Pulse(0.01, width=1.0, at=5)
 )
+LIGHT = {
+    "xla_backend_optimization_level": 2,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_prefer_vector_width": 512,
+}
 GAINS = (jnp.full(3, 10.0), jnp.full(3, 30.0), jnp.full(3, KT / J0))
 
 
@@ -56,7 +61,7 @@ def test_a_gradient(make, members):
     inertia = jnp.asarray(np.multiply.outer([J0, J0, 2 * J0], spread))
     cost = lambda gains, inertia: jnp.mean(evaluate(make(gains, inertia), HAPPENS).itae)
     functions = {"value": cost, "gradient": jax.value_and_grad(cost)}
-    for name, options in (("XLA's own", None), ("brief", brief_options())):
+    for name, options in (("XLA's own", None), ("brief", brief_options()), ("light", LIGHT)):
         for what, function in functions.items():
             program = jax.jit(function, compiler_options=options)
             tracing, lowered = spent(lambda p=program: p.lower(GAINS, inertia))
