@@ -95,7 +95,7 @@ def _finish(
     with stdout_for_json(options):
         print(in_options(str(found)), flush=True)
         path = found.write(folder_to_write(options, folder, "result.json", same, sources))
-        names = ", ".join(["report.html", *found.figures()])
+        names = ", ".join(["report.html", *found.figure_names])
         print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
     if options.json:
         print(path.read_text(), end="")

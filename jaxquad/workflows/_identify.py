@@ -4,6 +4,7 @@ import dataclasses
 import functools as ft
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,12 +21,10 @@ from jaxquad.identify import (
     Verification,
     verify,
 )
-from jaxquad.plot import bode, compare, headless, Panels, record_figure
 from jaxquad.records import (
     Proposal,
     Record,
 )
-from jaxquad.report import compare_fits
 from jaxquad.spectra import (
     FrequencyResponse,
 )
@@ -42,6 +41,10 @@ from ._fits import (
 from ._log import mix_of, propose_settings, read_logs, read_records
 from ._result_file import default_folder
 from ._settings import IdentifySettings
+
+
+if TYPE_CHECKING:
+    from jaxquad.plot import Panels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,22 +144,27 @@ class Identification:
         }
         return {title: str(each) for title, each in found.items() if each is not None}
 
-    def figures(self) -> dict[str, Panels]:
-        """The figures by file name: Bode diagram, records, and the check on a second record."""
+    @property
+    def figure_names(self) -> tuple[str, ...]:
+        """The names of the files of `figures()`, without drawing any."""
+        numbers = ("", *(f"_{k}" for k in range(2, len(self.records) + 1)))
+        records = [f"record{number}.png" for number in numbers]
+        return *records, "bode.png", *(() if self.check is None else ("verification.png",))
+
+    def figures(self) -> "dict[str, Panels]":
+        """The figures by file name: records, Bode diagram, and the check on a second record."""
+        from jaxquad.plot import bode, compare, headless, record_figure  # here: matplotlib is slow
+
         stopped = self.fit.verdict.kind in ("no model", "no minimum")
         name = f"{self.fit.verdict.kind}: where the fit stopped" if stopped else "identified"
         models = {name: self.fit} if self.fit.verdict.fitted else {}
         others = {f"{name} estimate": self.responses[name] for name in list(self.responses)[1:]}
         with headless():
-            figures = {
-                f"record{'' if k == 1 else f'_{k}'}.png": record_figure(record)
-                for k, record in enumerate(self.records, start=1)
-            }
-            figures["bode.png"] = bode(self.frf, others, models, title=self.title)
+            figures = [record_figure(record) for record in self.records]
+            figures += [bode(self.frf, others, models, title=self.title)]
             if self.check is not None:
-                title = Path(self.settings.verify or "").name
-                figures["verification.png"] = compare(self.check, title=title)
-        return figures
+                figures += [compare(self.check, title=Path(self.settings.verify or "").name)]
+        return dict(zip(self.figure_names, figures, strict=True))
 
     def write(self, folder: str | Path | None = None) -> Path:
         """Write `result.json`, `report.html` and the figures, by default to results/NAME.
@@ -168,6 +176,8 @@ class Identification:
         return write_identification(self, Path(folder or default_folder(self.path)))
 
     def __str__(self) -> str:
+        from jaxquad.report import compare_fits  # here: with the report comes matplotlib
+
         first, *others = map(str, self.records)
         record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
         frf = dataclasses.replace(self.frf, remarks=())  # the fit repeats what concerns it

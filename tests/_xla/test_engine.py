@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import jaxlib.version
 import numpy as np
 import pytest
 
@@ -84,6 +85,7 @@ def test_an_outermost_loop_has_the_compilers_options_and_others_have_none():
 def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch):
     here = compiler_options()
     assert engine().vector_bits == here["xla_cpu_prefer_vector_width"]
+    monkeypatch.setattr(_engine, "TESTED", ())
     monkeypatch.setattr(_engine, "_WIDEST", {"xla_of_another_age": 1})
     _engine._known.cache_clear()
     with pytest.warns(UserWarning, match="up to a tenth slower.*xla_of_another_age"):
@@ -94,6 +96,15 @@ def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch)
     monkeypatch.undo()
     _engine._known.cache_clear()
     assert compiler_options() == here
+
+
+def test_the_options_that_tested_versions_are_not_asked_about_are_taken(monkeypatch):
+    options = _engine._WIDEST | _engine._BRIEF
+    monkeypatch.setattr(_engine, "TESTED", (jaxlib.version.__version__,))
+    assert _engine._refusal({"xla_of_another_age": 1}) is None  # nobody asks
+    monkeypatch.setattr(_engine, "TESTED", ())
+    assert _engine._refusal(options) is None
+    assert "xla_of_another_age" in str(_engine._refusal({"xla_of_another_age": 1}))
 
 
 def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silence, monkeypatch):

@@ -74,7 +74,7 @@ def test_numbers_and_figures_are_at_hand_without_a_folder(found):
     [total] = found.combinations
     assert total.value == pytest.approx(found.fit.values[1] + found.fit.values[2])
     assert total.unit == "s" and "s (std. error" in str(total) and str(total) in str(found)
-    assert list(found.figures()) == ["record.png", "bode.png"]
+    assert list(found.figures()) == [*found.figure_names] == ["record.png", "bode.png"]
     assert found.formula == "q / M = K e^(-delay s) / (s (lag s + 1))"
 
 
