@@ -76,7 +76,7 @@ def settle_at_bounds(
         if not released:
             at = z.copy()
             at[low] += np.log(_AT_ZERO * shown[low])
-            return _as_zero(problem, _polished(problem, at, low, solution), low)
+            return _as_zero(problem, _polished(problem, at, low, solution)[0], low)
         change = step.copy()
         change[low] = np.log(np.maximum(step[low], _AT_ZERO) * shown[low])
         solution = solve(problem, z + change, solver, max_steps)
@@ -127,22 +127,23 @@ def _one_sided_step(local: _Local, low: Sequence[int]) -> Point:
 
 def _polished(
     problem: Problem, z: Point, held: Sequence[int], like: Solution, rounds: int = 3
-) -> Solution:
+) -> tuple[Solution, _Local]:
     """The optimum over the other parameters, from near it, by undamped Gauss-Newton steps."""
     free = np.setdiff1d(np.arange(z.size), held)
-    solution, local = _at(problem, z, like), None
+    solution = _at(problem, z, like)
+    local = _look(problem, solution)
     for _ in range(rounds):
-        local = _look(problem, solution)
         step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
         z = z.copy()
         z[free] += step
         moved = _at(problem, z, like)
-        if not _look(problem, moved).cost <= local.cost:
+        there = _look(problem, moved)
+        if not there.cost <= local.cost:
             break
-        solution = moved
+        solution, local = moved, there
         if np.max(np.abs(step), initial=0.0) < 1e-9:
             break
-    return solution
+    return solution, local
 
 
 def _at(problem: Problem, z: Point, like: Solution) -> Solution:
@@ -189,7 +190,7 @@ def _limit(problem: Problem, solution: Solution, local: _Local, k: int, wanted: 
     def rise(times: float) -> float:
         at = z.copy()
         at[k] += np.log(times)
-        return _look(problem, _polished(problem, at, [k], solution)).cost - local.cost
+        return _polished(problem, at, [k], solution)[1].cost - local.cost
 
     low, high, times = 1.0, np.inf, 1 + _first_guess(local, k, wanted)
     for _ in range(_EVALUATIONS):
