@@ -1,5 +1,6 @@
 """Ensembles on several cores of a CPU: what is found is that of one core."""
 
+import inspect
 import threading
 
 import equinox as eqx
@@ -37,7 +38,7 @@ def calls(monkeypatch):
             seen.append((threading.get_ident(), found[0][0][0].shape[-1]))
             return found
 
-    monkeypatch.setattr(_simulate, "_run", Watched(program.__wrapped__))
+    monkeypatch.setattr(_simulate, "_run", Watched(inspect.unwrap(program)))
     return seen
 
 
