@@ -16,10 +16,6 @@ class Reach(NamedTuple):
     first: Int[np.ndarray, " frequencies"]
     last: Int[np.ndarray, " frequencies"]
 
-    def pick(self, rows: Int[np.ndarray, " some"]) -> "Reach":
-        """That of some frequencies."""
-        return Reach(self.first[rows], self.last[rows])
-
     def reached(self, count: int) -> Bool[np.ndarray, " count"]:
         """Which of `count` atoms have an effect on any frequency."""
         edges = np.bincount(self.first, minlength=count + 1).astype(int)
