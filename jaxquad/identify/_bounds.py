@@ -133,6 +133,8 @@ def _polished(
     solution = _at(problem, z, like)
     local = _look(problem, solution)
     for _ in range(rounds):
+        if not (np.isfinite(local.cost) and np.all(np.isfinite(local.jacobian))):
+            break  # so far out that the model has no numbers
         step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
         z = z.copy()
         z[free] += step
@@ -190,7 +192,8 @@ def _limit(problem: Problem, solution: Solution, local: _Local, k: int, wanted: 
     def rise(times: float) -> float:
         at = z.copy()
         at[k] += np.log(times)
-        return _polished(problem, at, [k], solution)[1].cost - local.cost
+        cost = _polished(problem, at, [k], solution)[1].cost
+        return cost - local.cost if np.isfinite(cost) else np.inf
 
     low, high, times = 1.0, np.inf, 1 + _first_guess(local, k, wanted)
     for _ in range(_EVALUATIONS):
