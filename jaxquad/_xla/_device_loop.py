@@ -19,11 +19,11 @@ from jaxtyping import Array, PyTree
 
 from ._accelerator import Result, Scan, Step
 from ._forward_kernel import run_forward
+from ._kernel_memory import kept_avals
 from ._lanes import NotInLanes, NUMBERS
 from ._loop_kernels import (
     Flat,
     is_float,
-    kept_avals,
     Loop,
     reverse_in_lanes,
     size,
@@ -31,7 +31,7 @@ from ._loop_kernels import (
     step_in_lanes,
 )
 from ._reverse_kernel import holds_cotangents, run_reverse
-from ._switch import device_kernels, note, warn_once
+from ._switch import note, warn_once
 
 
 def scan_in_kernel(
@@ -40,8 +40,7 @@ def scan_in_kernel(
     """`scan(step, carry, signals)`; None, and a note for `engine()`, where no kernel holds it."""
     jaxpr, consts, result = _trace(step, carry, signals)
     first, now = jax.tree.leaves(carry), jax.tree.leaves(signals)
-    interpret = device_kernels.value == "interpret"
-    loop = Loop(jaxpr, len(consts), len(first), members, len(now[0]) if now else 0, interpret)
+    loop = Loop(jaxpr, len(consts), len(first), members, len(now[0]) if now else 0)
     reason = _why_not(loop)
     if reason is not None:
         note(f"a kernel of a GPU does not hold {reason}")
@@ -127,14 +126,14 @@ def _of_wanted(
 
 def _plain_tangents(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
     """Of (arguments, kept, tangents)."""
-    given, _, tangents = split(args, len(which), loop.carry)
+    given, _, tangents = split(args, len(which), len(kept_avals(loop)))
     function, some = _of_wanted(loop, scan, given, which)
     return jax.jvp(function, some, tangents)[1]
 
 
 def _plain_cotangents(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
     """Of (arguments, kept, cotangents)."""
-    given, _, cotangents = split(args, len(which), loop.carry)
+    given, _, cotangents = split(args, len(which), len(kept_avals(loop)))
     function, some = _of_wanted(loop, scan, given, which)
     return list(jax.vjp(function, *some)[1](cotangents))
 
@@ -224,7 +223,7 @@ def _loop_derivative(
 def _transpose(
     cotangents: Sequence, *args: Any, loop: Loop, scan: Scan, which: tuple[bool, ...]
 ) -> list:
-    known, _ = split(args, len(which) + loop.carry)
+    known, _ = split(args, len(which) + len(kept_avals(loop)))
     if all(isinstance(x, ad.Zero) for x in cotangents):
         return [None] * len(args)
     given = [not isinstance(x, ad.Zero) for x in cotangents]

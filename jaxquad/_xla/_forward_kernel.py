@@ -2,33 +2,26 @@
 
 from collections.abc import Sequence
 
-import jax
-import numpy as np
-from jax.experimental import pallas as pl
 from jaxtyping import Array
 
-from ._lanes import Lane
-from ._loop_kernels import (
-    blocks_of,
-    bounds,
-    call,
-    evaluated,
-    Flat,
+from ._cuda_text import statements
+from ._kernel_memory import (
+    assigned,
     kept_avals,
+    Lines,
     load_all,
-    Loop,
-    memory_type,
+    nested,
     out_like,
     pack,
-    Ref,
-    Shaped,
-    size,
-    spec_of,
-    split,
-    step_in_lanes,
+    rows_of,
+    run,
     store_all,
+    store_tiles,
+    tiles_of,
     unpack,
+    variables,
 )
+from ._loop_kernels import bounds, Flat, Loop, Shaped, size, split, step_in_lanes
 
 
 def run_forward(loop: Loop, *args: Array, keep: bool) -> Flat:
@@ -43,11 +36,17 @@ class _Forward:
         self.loop, self.keep = loop, keep
         self.consts, self.carry, self.signals = loop.avals
         self.stored = loop.results[1]
-        self.step = step_in_lanes(loop)
+        self.fixed = rows_of(loop, "fixed", self.consts)
+        self.begun = rows_of(loop, "begun", self.carry)
+        self.now = rows_of(loop, "now", self.signals)
+        self.last = rows_of(loop, "last", self.carry, all_wide=True)
+        self.left = rows_of(loop, "left", self.stored, all_wide=True)
+        self.kept = tiles_of(loop, "kept", loop.segments) if keep else []
 
     def run(self, args: Sequence[Array]) -> Flat:
         loop = self.loop
-        found = call(loop, self.kernel, self._packed(args), self._specs(), *self._outs())
+        given, made = [*self.fixed, *self.begun, *self.now], [*self.last, *self.left, *self.kept]
+        found = run(loop, self.lines(), (given, self._packed(args)), (made, self._outs()))
         last, left, kept = split(found, len(self.carry), len(self.stored))
         out = [unpack(loop, *pair) for pair in zip(last, self.carry, strict=True)]
         out += [unpack(loop, *pair, timed=True) for pair in zip(left, self.stored, strict=True)]
@@ -55,42 +54,33 @@ class _Forward:
 
     def _packed(self, args: Sequence[Array]) -> Flat:
         loop = self.loop
-        consts, carry, signals = split(args, len(self.consts), len(self.carry))
-        out = [pack(loop, *pair) for pair in zip(consts, self.consts, strict=True)]
-        out += [pack(loop, *pair, wide=True) for pair in zip(carry, self.carry, strict=True)]
+        still, signals = split(args, len(self.consts) + len(self.carry))
+        avals = [*self.consts, *self.carry]
+        out = [pack(loop, *pair) for pair in zip(still, avals, strict=True)]
         pairs = zip(signals, self.signals, strict=True)
         return [*out, *(pack(loop, *pair, timed=True) for pair in pairs)]
 
-    def _specs(self) -> list[pl.BlockSpec]:
-        specs = [spec_of(self.loop, x) for x in self.consts]
-        specs += [spec_of(self.loop, x, wide=True) for x in self.carry]
-        return [*specs, *(spec_of(self.loop, x, timed=True) for x in self.signals)]
-
-    def _outs(self) -> tuple[list[Shaped], list[pl.BlockSpec]]:
+    def _outs(self) -> list[Shaped]:
         loop = self.loop
-        rows = [((size(loop, x),), x) for x in self.carry]
-        rows += [((loop.count, size(loop, x)), x) for x in self.stored]
-        outs = [out_like(loop, *row, dtype=memory_type(x.dtype)) for row, x in rows]
-        outs += kept_avals(loop) if self.keep else []
-        return outs, [blocks_of(*x.shape[:-1]) for x in outs]
+        outs = [out_like(loop, size(loop, x), dtype=x.dtype) for x in self.carry]
+        outs += [out_like(loop, loop.count, size(loop, x), dtype=x.dtype) for x in self.stored]
+        return outs + (kept_avals(loop) if self.keep else [])
 
-    def kernel(self, *refs: Ref) -> None:
-        given, first, now, last, store, kept = split(
-            refs, len(self.consts), len(self.carry), len(self.signals), len(self.carry),
-            len(self.stored),
-        )  # fmt: skip
-        fixed = load_all(given, self.consts)
-
-        def sample(t: Lane, state: list[Lane]) -> list[Lane]:
-            out = evaluated(self.step, fixed, state, load_all(now, self.signals, t))
-            state, left = split(out, len(state))
-            store_all(store, left, t)
-            return state
-
-        def segment(k: Lane, state: list[Lane]) -> list[Lane]:
-            store_all(kept, state, k)
-            return jax.lax.fori_loop(*bounds(self.loop, k), sample, state)
-
-        body, count = (segment, self.loop.segments) if self.keep else (sample, self.loop.count)
-        state = load_all(first, self.carry)
-        store_all(last, jax.lax.fori_loop(np.int32(0), np.int32(count), body, state))
+    def lines(self) -> Lines:
+        loop = self.loop
+        loads, fixed = load_all(self.fixed)
+        begun, first = load_all(self.begun)
+        begins, state = variables(loop, "state", self.carry, first)
+        now, signals = load_all(self.now, time="t")
+        step, out = statements(step_in_lanes(loop), [*fixed, *state, *signals], "v")
+        after, left = split(out, len(state))
+        sample = [*now, *step, *store_all(self.left, left, "t"), *assigned(state, after)]
+        if self.keep:
+            each = nested("for (int t = first; t < end; ++t)", sample)
+            segment = [*bounds(loop), *store_tiles(self.kept, state, "segment"), *each]
+            samples = nested(
+                f"for (int segment = 0; segment < {loop.segments}; ++segment)", segment
+            )
+        else:
+            samples = nested(f"for (int t = 0; t < {loop.count}; ++t)", sample)
+        return [*loads, *begun, *begins, *samples, *store_all(self.last, state)]

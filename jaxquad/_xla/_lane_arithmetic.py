@@ -1,80 +1,109 @@
-"""Arithmetic between lanes that Triton compiles, with the nan of `jax.lax`."""
+"""Arithmetic between lanes as expressions of CUDA C, with the nan of `jax.lax`."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
 
-Lane = Any  # traced [block] or (), or a NumPy scalar
+Lane = Any  # traced (), or a NumPy scalar
+Expression = Callable[..., str]  # of the result's type, the equation's parameters, and operands
 lax = jax.lax
 
-
-def _bound(equation: JaxprEqn, *row: Lane) -> Lane:
-    return equation.primitive.bind(*row, **equation.params)
-
-
-def _larger(a: Lane, b: Lane) -> Lane:
-    # The maximum of Triton ignores a nan, which would hide a member that diverges.
-    return lax.select((a > b) | (a != a), a, b)
+TYPES = {
+    "bool": "bool", "float32": "float", "float64": "double", "int32": "int", "int64": "long long",
+    "uint32": "unsigned",
+}  # fmt: skip
+_FLOATS = ("float", "double")
 
 
-def _smaller(a: Lane, b: Lane) -> Lane:
-    return lax.select((a < b) | (a != a), a, b)
+def _between(sign: str) -> Expression:
+    return lambda kind, params, a, b: f"{a} {sign} {b}"
 
 
-def _clamp(_: JaxprEqn, low: Lane, x: Lane, high: Lane) -> Lane:
-    return lax.select(x < low, low, lax.select(x > high, high, x))
+def _function(name: str) -> Expression:
+    return lambda kind, params, *given: f"{name}({', '.join(given)})"
 
 
-def _select(_: JaxprEqn, which: Lane, *cases: Lane) -> Lane:
-    if which.dtype == bool:
-        return lax.select(which, cases[1], cases[0])
-    found = cases[0]
-    for k, case in enumerate(cases[1:], 1):
-        found = lax.select(which >= k, case, found)
-    return found
+def _picked(sign: str) -> Expression:
+    """The larger or the smaller; the maximum of CUDA would hide a member that is nan."""
+    return lambda kind, params, a, b: f"({a} {sign} {b} || {a} != {a}) ? {a} : {b}"
 
 
-def _round(equation: JaxprEqn, x: Lane) -> Lane:
-    away = jnp.sign(x) * jnp.floor(jnp.abs(x) + 0.5)
-    if equation.params["rounding_method"] == lax.RoundingMethod.AWAY_FROM_ZERO:
-        return away
-    halfway = jnp.abs(x) - jnp.floor(jnp.abs(x)) == 0.5
-    even = 2 * jnp.floor(away * 0.5) == away
-    return lax.select(halfway & ~even, away - jnp.sign(x), away)
+def _absolute(kind: str, params: dict, x: str) -> str:
+    return f"fabs({x})" if kind in _FLOATS else f"{x} < 0 ? -{x} : {x}"
 
 
-_AS_IN_TRITON = """
-    abs neg ceil floor exp exp2 expm1 log log1p sqrt square pow cbrt rsqrt sin cos tan asin acos
-    atan atan2 sinh cosh tanh asinh acosh atanh add sub mul div rem and or xor not eq ne gt ge lt le
-    add_any integer_pow logistic is_finite sign convert_element_type
+def _remainder(kind: str, params: dict, a: str, b: str) -> str:
+    return f"fmod({a}, {b})" if kind in _FLOATS else f"{a} % {b}"
+
+
+def _select(kind: str, params: dict, which: str, first: str, *cases: str) -> str:
+    for k, case in enumerate(cases, 1):
+        first = f"({which} >= {k} ? {case} : {first})"
+    return first
+
+
+def _round(kind: str, params: dict, x: str) -> str:
+    away = params["rounding_method"] == lax.RoundingMethod.AWAY_FROM_ZERO
+    return f"{'round' if away else 'rint'}({x})"
+
+
+def _converted(kind: str, params: dict, x: str) -> str:
+    return f"{x} != 0" if kind == "bool" else f"({kind}){x}"
+
+
+_SIGNS = {
+    "add": "+", "add_any": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|",
+    "xor": "^", "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
+}  # fmt: skip
+_SAME_IN_C = """
+    ceil floor exp exp2 expm1 log log1p sqrt cbrt sin cos tan asin acos atan atan2 sinh cosh tanh
+    asinh acosh atanh erf erfc
 """.split()
-_WRITTEN: dict[str, Callable[..., Lane]] = {
-    "max": lambda _, a, b: _larger(a, b),
-    "min": lambda _, a, b: _smaller(a, b),
-    "clamp": _clamp,
-    "select_n": _select,
+_WRITTEN: dict[str, Expression] = {
+    "abs": _absolute,
+    "clamp": lambda kind, params, low, x, high: (
+        f"{x} < {low} ? {low} : {x} > {high} ? {high} : {x}"
+    ),
+    "convert_element_type": _converted,
+    "integer_pow": lambda kind, params, x: f"integer_power<{params['y']}>({x})",
+    "is_finite": lambda kind, params, x: f"{x} - {x} == 0",
+    "logistic": lambda kind, params, x: f"1 / (1 + exp(-{x}))",
+    "max": _picked(">"),
+    "min": _picked("<"),
+    "neg": lambda kind, params, x: f"-{x}",
+    "not": lambda kind, params, x: f"!{x}" if kind == "bool" else f"~{x}",
+    "pow": lambda kind, params, x, y: f"pow({x}, ({kind}){y})",
+    "rem": _remainder,
     "round": _round,
+    "rsqrt": lambda kind, params, x: f"1 / sqrt({x})",
+    "select_n": _select,
+    "sign": lambda kind, params, x: f"{x} > 0 ? 1 : {x} < 0 ? -1 : {x}",
+    "square": lambda kind, params, x: f"{x} * {x}",
 }
-ARITHMETIC: dict[str, Callable[..., Lane]] = dict.fromkeys(_AS_IN_TRITON, _bound) | _WRITTEN
+EXPRESSIONS: dict[str, Expression] = (
+    {name: _between(sign) for name, sign in _SIGNS.items()}
+    | {name: _function(name) for name in _SAME_IN_C}
+    | _WRITTEN
+)
 
-_PAIRS: dict[str, Callable[[Lane, Lane], Lane]] = {
-    "reduce_sum": lambda a, b: a + b,
-    "reduce_prod": lambda a, b: a * b,
-    "reduce_max": lambda a, b: _larger(a, b),
-    "reduce_min": lambda a, b: _smaller(a, b),
-    "reduce_and": lambda a, b: a & b,
-    "reduce_or": lambda a, b: a | b,
+_PAIRS: dict[str, tuple[Callable, Callable]] = {
+    "reduce_sum": (np.add, lax.add),
+    "reduce_prod": (np.multiply, lax.mul),
+    "reduce_max": (np.maximum, lax.max),
+    "reduce_min": (np.minimum, lax.min),
+    "reduce_and": (np.bitwise_and, lax.bitwise_and),
+    "reduce_or": (np.bitwise_or, lax.bitwise_or),
 }
 
 
-def reduction(name: str) -> Callable[[Lane, Lane], Lane]:
+def pair(name: str, a: Lane, b: Lane) -> Lane:
     """What a reduction does with two numbers."""
-    return _PAIRS[name]
+    known = isinstance(a, np.generic) and isinstance(b, np.generic)
+    return _PAIRS[name][0 if known else 1](a, b)
 
 
 _KNOWN: dict[str, Callable[..., Any]] = {

@@ -229,15 +229,14 @@ def _cond(lanes: Lanes, equation: JaxprEqn, index: Cells, *args: Cells) -> list[
     found = branches[0]
     for k, branch in enumerate(branches[1:], 1):
         takes = choice if choice.dtype == bool else choice >= k
-        pick = ft.partial(_choose, lanes, takes)
+        pick = ft.partial(_choose, takes)
         found = [pick(new, old) for new, old in zip(branch, found, strict=True)]
     return found
 
 
-def _choose(lanes: Lanes, takes: Lane, new: Cells, old: Cells) -> Cells:
-    row = [(lanes.wide(takes), *map(lanes.wide, pair))
-           for pair in zip(new.reshape(-1), old.reshape(-1), strict=True)]  # fmt: skip
-    return cells_of([jax.lax.select(*x) for x in row], new.shape)
+def _choose(takes: Lane, new: Cells, old: Cells) -> Cells:
+    pairs = zip(new.reshape(-1), old.reshape(-1), strict=True)
+    return cells_of([jax.lax.select(takes, *pair) for pair in pairs], new.shape)
 
 
 @_rule("scan")
@@ -245,7 +244,7 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
     """A loop of a few iterations, one after the other."""
     params, length = equation.params, equation.params["length"]
     _require(length <= _LONGEST, f"a loop of {length} iterations within a sample")
-    n, m = params["num_consts"], params["num_carry"]
+    n, m = _counts(equation)
     consts, carry, xs = args[:n], list(args[n : n + m]), args[n + m :]
     stored: list[list[Cells]] = []
     order = range(length - 1, -1, -1) if params["reverse"] else range(length)
@@ -255,6 +254,17 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
         stored.append(out[m:])
     rows = stored[::-1] if params["reverse"] else stored
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
+
+
+def _counts(equation: JaxprEqn) -> tuple[int, int]:
+    """How many constants a scan has, and carries: its names for these differ between JAX versions.
+
+    What is scanned has one axis less in the body.
+    """
+    rank, body = lambda v: len(v.aval.shape), equation.params["jaxpr"].jaxpr
+    kept = lambda outer, inner: sum(rank(a) == rank(b) for a, b in zip(outer, inner, strict=True))
+    carry = kept(equation.outvars, body.outvars)
+    return kept(equation.invars, body.invars) - carry, carry
 
 
 def _keep_apart(lanes: Lanes, equation: JaxprEqn, axes: Sequence[int | np.integer]) -> None:

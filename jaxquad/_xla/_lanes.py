@@ -1,9 +1,10 @@
 """The arithmetic of one sample without its arrays: what a kernel on an accelerator can hold.
 
-A step is written for arrays [3, members] and the like. Triton, with which such kernels are made,
-has arithmetic on blocks of members, but no stacking, slicing or small products. Here every array
-becomes a NumPy array of *lanes*, the numbers of one block of members. The step's jaxpr is evaluated
-on these: what moves numbers is done while tracing, and only arithmetic between lanes remains.
+A step is written for arrays [3, members] and the like. A thread of a kernel has the numbers of one
+member, and keeps them in registers: there are no arrays to stack, slice or multiply. Here every
+array becomes a NumPy array of *lanes*, one number of that member each. The step's jaxpr is
+evaluated on these: what moves numbers is done while tracing, and only arithmetic between lanes
+remains.
 
 The members' axis is kept as one of length 1, so that axes have the same numbers in both. Where a
 sum over it is allowed, it stays undone: the result has each member's share of it.
@@ -14,20 +15,19 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from ._lane_arithmetic import ARITHMETIC, folded, reduction
+from ._lane_arithmetic import EXPRESSIONS, folded, pair, TYPES
 
 
-Lane = Any  # traced [block] or (), or a NumPy scalar
+Lane = Any  # traced (), or a NumPy scalar
 Cells = np.ndarray  # of lanes; the shape of an array whose members' axis has the length 1
 Shape = tuple[int, ...]
 Rule = Callable[..., Cells | list[Cells]]  # of (lanes, equation, cells of each argument)
 
-NUMBERS = [np.dtype(x) for x in ("bool", "float32", "float64", "int32", "int64", "uint32")]
+NUMBERS = [np.dtype(x) for x in TYPES]
 MOST_CELLS = 512  # of one array: a kernel keeps them in registers
 _MOST_OPERATIONS = 20_000  # between lanes; above, compiling takes minutes
 
@@ -37,13 +37,12 @@ class NotInLanes(Exception):
 
 
 class Lanes:
-    """Evaluates jaxprs for `members` in lanes of `block`, by `rules` for what is no arithmetic."""
+    """Evaluates jaxprs for `members` in lanes, by `rules` for what is no arithmetic."""
 
-    def __init__(self, members: int, block: int, rules: Mapping[str, Rule], *, leave_sums: bool):
-        self.members, self.block, self.rules = members, block, rules
+    def __init__(self, members: int, rules: Mapping[str, Rule], *, leave_sums: bool):
+        self.members, self.rules = members, rules
         self.leave_sums = leave_sums  # over the members: they stay undone
         self.count = 0
-        self._wide: dict[int, tuple[Lane, Lane]] = {}
 
     def small(self, shape: Shape) -> Shape:
         """The shape of the cells of an array."""
@@ -62,14 +61,6 @@ class Lanes:
             found = self._apply(equation, [read(v) for v in equation.invars])
             values.update(zip(equation.outvars, found, strict=True))
         return [read(v) for v in jaxpr.outvars]
-
-    def wide(self, lane: Lane) -> Lane:
-        """The lane with a number for each member."""
-        if np.ndim(lane) == 1:
-            return lane
-        if id(lane) not in self._wide:
-            self._wide[id(lane)] = lane, jnp.full(self.block, lane, lane.dtype)
-        return self._wide[id(lane)][1]
 
     def _literal(self, literal: Literal) -> Cells:
         kind = literal.aval.dtype  # pyright: ignore[reportAttributeAccessIssue]
@@ -94,9 +85,9 @@ class Lanes:
             # What has no derivative may have a cotangent without numbers, which nothing reads.
             if v.aval.dtype not in (*NUMBERS, jax.dtypes.float0):  # pyright: ignore[reportAttributeAccessIssue]
                 raise NotInLanes(f"{name} of {v.aval}")
-        if name in ARITHMETIC:
+        if name in EXPRESSIONS:
             shape = self.small(equation.outvars[0].aval.shape)  # pyright: ignore
-            return [self._arithmetic(ARITHMETIC[name], equation, args, shape)]
+            return [self._arithmetic(equation, args, shape)]
         if name not in self.rules:
             raise NotInLanes(f"{name} of {', '.join(str(v.aval) for v in equation.invars)}")
         found = self.rules[name](self, equation, *args)
@@ -106,21 +97,19 @@ class Lanes:
         closed = isinstance(jaxpr, ClosedJaxpr)
         return self.evaluate(*((jaxpr.jaxpr, jaxpr.consts) if closed else (jaxpr, ())), args)
 
-    def _arithmetic(
-        self, rule: Callable, equation: JaxprEqn, args: Sequence[Cells], shape: Shape
-    ) -> Cells:
+    def _arithmetic(self, equation: JaxprEqn, args: Sequence[Cells], shape: Shape) -> Cells:
         columns = [np.broadcast_to(x, shape).reshape(-1) for x in args]
         rows = zip(*columns, strict=True)
-        return cells_of([self._operation(rule, equation, row) for row in rows], shape)
+        return cells_of([self._operation(equation, row) for row in rows], shape)
 
-    def _operation(self, rule: Callable, equation: JaxprEqn, row: Sequence[Lane]) -> Lane:
+    def _operation(self, equation: JaxprEqn, row: Sequence[Lane]) -> Lane:
         known = folded(equation, row)
         if known is not None:
             return known
         self.count += 1
         if self.count > _MOST_OPERATIONS:
             raise NotInLanes(f"more than {_MOST_OPERATIONS} operations in a sample")
-        return rule(equation, *self._alike(row))
+        return equation.primitive.bind(*row, **equation.params)
 
     def fold(self, name: str, lanes: Sequence[Lane]) -> Lane:
         """The sum, the product, ... of some lanes, by halves."""
@@ -132,13 +121,7 @@ class Lanes:
 
     def pair(self, name: str, a: Lane, b: Lane) -> Lane:
         self.count += 1
-        return reduction(name)(*self._alike((a, b)))
-
-    def _alike(self, row: Sequence[Lane]) -> Sequence[Lane]:
-        """Lanes of one shape. Pallas does not compile arithmetic between literals alone."""
-        if any(np.ndim(x) for x in row) or all(isinstance(x, np.generic) for x in row):
-            return [self.wide(x) for x in row]
-        return row
+        return pair(name, a, b)
 
     def is_members(self, shape: Shape, axis: int | np.integer) -> bool:
         return shape[axis] == self.members

@@ -4,34 +4,38 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.experimental import pallas as pl
 from jaxtyping import Array
 
-from ._lanes import Lane
+from . import _kernel_memory
+from ._cuda_text import statements, type_of
+from ._kernel_memory import (
+    assigned,
+    Lines,
+    load_all,
+    load_tiles,
+    nested,
+    out_like,
+    pack,
+    Rows,
+    rows_of,
+    run,
+    store_all,
+    store_tiles,
+    tiles_of,
+    unpack,
+    variables,
+)
 from ._loop_kernels import (
-    BLOCK,
-    blocks_of,
     bounds,
-    call,
-    evaluated,
     Flat,
     is_float,
     is_wide,
-    load_all,
     Loop,
-    memory_type,
-    out_like,
-    pack,
-    Ref,
     reverse_in_lanes,
     Shaped,
     size,
-    spec_of,
     split,
     step_in_lanes,
-    store_all,
-    unpack,
 )
 
 
@@ -58,7 +62,7 @@ class _Reverse:
     """What goes into the kernel, and in which order."""
 
     def __init__(self, loop: Loop, which: tuple[bool, ...]):
-        self.loop = loop
+        self.loop, self.which = loop, which
         self.consts, self.carry, self.signals = loop.avals
         self.stored = [x for x in loop.results[1] if is_float(x.dtype) and is_wide(loop, x)]
         self.moving = [x for x in self.carry if is_float(x.dtype)]
@@ -67,11 +71,24 @@ class _Reverse:
         pick = lambda avals, flags: [x for x, flag in zip(avals, flags, strict=True) if flag]
         self.wanted_consts = pick(self.consts, wanted[0])
         self.wanted_signals = pick(self.signals, wanted[2])
-        self.step, self.back = step_in_lanes(loop), reverse_in_lanes(loop, which)
+        self.fixed = rows_of(loop, "fixed", self.consts)
+        self.now = rows_of(loop, "now", self.signals)
+        self.kept = tiles_of(loop, "kept", loop.segments)
+        self.felt = rows_of(loop, "felt", self.moving)
+        self.left = rows_of(loop, "left", self.stored)
+        self.to_fixed = rows_of(loop, "to_fixed", self.wanted_consts, all_wide=True)
+        self.to_carry = rows_of(loop, "to_carry", self.moving, all_wide=True)
+        self.to_now = rows_of(loop, "to_now", self.wanted_signals)
+        self.again = tiles_of(loop, "again", loop.segment)
 
     def run(self, args: Sequence[Array]) -> Flat:
-        found = call(self.loop, self.kernel, self._packed(args), self._specs(), *self._outs())
-        consts, carry, signals, _ = split(found, *self._counts())
+        given = [*self.fixed, *self.now, *self.kept, *self.felt, *self.left]
+        made = [*self.to_fixed, *self.to_carry, *self.to_now, *self.again]
+        args = self._packed(args)
+        found = run(self.loop, self.lines(), (given, args), (made, self._outs()))
+        consts, carry, signals, _ = split(
+            found, len(self.wanted_consts), len(self.moving), len(self.wanted_signals)
+        )
         out = [self._gathered(*pair) for pair in zip(consts, self.wanted_consts, strict=True)]
         floats = iter(zip(carry, self.moving, strict=True))
         for aval, wanted in zip(self.carry, self.wanted_carry, strict=True):
@@ -89,111 +106,97 @@ class _Reverse:
             return unpack(self.loop, x, aval, timed=timed)
         return jnp.sum(x, axis=-1).reshape(*x.shape[:timed], *aval.shape).astype(aval.dtype)
 
-    def _counts(self) -> tuple[int, int, int]:
-        return len(self.wanted_consts), len(self.moving), len(self.wanted_signals)
-
     def _packed(self, args: Sequence[Array]) -> Flat:
         loop = self.loop
         consts, _, signals, kept, last, left = split(
-            args, len(self.consts), len(self.carry), len(self.signals), len(self.carry),
+            args, len(self.consts), len(self.carry), len(self.signals), len(self.kept),
             len(self.moving),
         )  # fmt: skip
         floats = [x for x in loop.results[1] if is_float(x.dtype)]
         out = [pack(loop, *pair) for pair in zip(consts, self.consts, strict=True)]
         out += [pack(loop, *pair, timed=True) for pair in zip(signals, self.signals, strict=True)]
         out += kept
-        pairs = zip(last, self.moving, strict=True)
-        out += [pack(loop, *pair, wide=True, fill=0.0) for pair in pairs]
+        out += [pack(loop, *pair) for pair in zip(last, self.moving, strict=True)]
         pairs = (pair for pair in zip(left, floats, strict=True) if is_wide(loop, pair[1]))
-        return [*out, *(pack(loop, *pair, timed=True, fill=0.0) for pair in pairs)]
+        return [*out, *(pack(loop, *pair, timed=True) for pair in pairs)]
 
-    def _specs(self) -> list[pl.BlockSpec]:
+    def _outs(self) -> list[Shaped]:
         loop = self.loop
-        specs = [spec_of(loop, x) for x in self.consts]
-        specs += [spec_of(loop, x, timed=True) for x in self.signals]
-        specs += [blocks_of(loop.segments, size(loop, x)) for x in self.carry]
-        specs += [blocks_of(size(loop, x)) for x in self.moving]
-        return [*specs, *(spec_of(loop, x, timed=True) for x in self.stored)]
-
-    def _outs(self) -> tuple[list[Shaped], list[pl.BlockSpec]]:
-        loop = self.loop
-        rows = [(size(loop, x),) for x in (*self.wanted_consts, *self.moving)]
-        kinds = [x.dtype for x in (*self.wanted_consts, *self.moving)]
-        outs = [out_like(loop, *row, dtype=kind) for row, kind in zip(rows, kinds, strict=True)]
-        specs = [blocks_of(*row) for row in rows]
+        still = [*self.wanted_consts, *self.moving]
+        outs = [out_like(loop, size(loop, x), dtype=x.dtype) for x in still]
         for x in self.wanted_signals:
-            row = (loop.count, size(loop, x))
-            if is_wide(loop, x):
-                outs.append(out_like(loop, *row, dtype=x.dtype))
-                specs.append(blocks_of(*row))
-            else:  # one sum of each program
-                blocks = -(-loop.members // BLOCK)
-                outs.append(jax.ShapeDtypeStruct((*row, blocks), x.dtype))
-                specs.append(pl.BlockSpec((*row, 1), lambda i: (0, 0, i)))
-        for x in self.carry:  # of the samples of a segment
-            outs.append(out_like(loop, loop.segment, size(loop, x), dtype=memory_type(x.dtype)))
-            specs.append(blocks_of(loop.segment, size(loop, x)))
-        return outs, specs
+            last = loop.members if is_wide(loop, x) else -(-loop.members // _kernel_memory.WARP)
+            outs.append(jax.ShapeDtypeStruct((loop.count, size(loop, x), last), x.dtype))
+        return outs + [x.out(loop) for x in self.again]
 
-    def kernel(self, *refs: Ref) -> None:
+    def lines(self) -> Lines:
         loop = self.loop
-        given, now, kept, last, left, *outs = split(
-            refs, len(self.consts), len(self.signals), len(self.carry), len(self.moving),
-            len(self.stored), *self._counts(),
-        )  # fmt: skip
-        to_consts, to_carry, to_signals, scratch = outs
-        fixed = load_all(given, self.consts)
-        samples = lambda t: load_all(now, self.signals, t)
-        count = sum(size(loop, x) for x in self.moving)
+        loads, fixed = load_all(self.fixed)
+        felt, last = load_all(self.felt)
+        begins, moved = variables(loop, "moved", self.moving, last)
+        zeros = ["0"] * sum(size(loop, x) for x in self.wanted_consts)
+        sums_begin, sums = variables(loop, "sum", self.wanted_consts, zeros)
+        kept, first = load_tiles(self.kept, "segment")
+        state_begins, state = variables(loop, "state", self.carry, first)
+        segment = [
+            *bounds(loop), *kept, *state_begins,
+            *nested("for (int t = first; t < end - 1; ++t)", self._once_more(fixed, state)),
+            *store_tiles(self.again, state, "end - 1 - first"),
+            *nested("for (int t = end - 1; t >= first; --t)", self._back(fixed, moved, sums)),
+        ]  # fmt: skip
+        head = f"for (int segment = {loop.segments - 1}; segment >= 0; --segment)"
+        ends = [*store_all(self.to_carry, moved), *store_all(self.to_fixed, sums)]
+        return [*loads, *felt, *begins, *sums_begin, *nested(head, segment), *ends]
 
-        def forward(t: Lane, state: list[Lane]) -> list[Lane]:
-            out = evaluated(self.step, fixed, state, samples(t))
-            return out[: len(state)]
+    def _once_more(self, fixed: Lines, state: Lines) -> Lines:
+        """A sample of the forward pass, whose carry is written to memory."""
+        now, signals = load_all(self.now, time="t")
+        step, out = statements(step_in_lanes(self.loop), [*fixed, *state, *signals], "v")
+        written = store_tiles(self.again, state, "t - first")
+        return [*written, *now, *step, *assigned(state, out[: len(state)])]
 
-        def segment(i: Lane, sums: list[Lane]) -> list[Lane]:
-            k = np.int32(loop.segments - 1) - i
-            first, end = bounds(loop, k)
+    def _back(self, fixed: Lines, moved: Lines, sums: Lines) -> Lines:
+        """A sample of the reverse pass."""
+        again, state = load_tiles(self.again, "t - first")
+        now, signals = load_all(self.now, time="t")
+        left, stored = self._stored_cotangents()
+        given = [*fixed, *state, *signals, *moved, *stored]
+        step, out = statements(reverse_in_lanes(self.loop, self.which), given, "v")
+        to_fixed, before, to_now = split(out, len(sums), len(moved))
+        added = [f"{total} += {part};" for total, part in zip(sums, to_fixed, strict=True)]
+        return [*again, *now, *left, *step, *added, *assigned(moved, before), *self._to_now(to_now)]
 
-            def again(t: Lane, state: list[Lane]) -> list[Lane]:
-                store_all(scratch, state, t - first)
-                return forward(t, state)
-
-            def back(j: Lane, sums: list[Lane]) -> list[Lane]:
-                t = end - np.int32(1) - (j - first)
-                given = fixed, load_all(scratch, self.carry, t - first), samples(t)
-                parts = split(sums, count)
-                out = evaluated(self.back, *given, parts[0], self._stored_cotangents(left, t))
-                to_fixed, before, to_now = split(out, len(parts[1]), count)
-                self._store_signals(to_signals, to_now, t)
-                return [*before, *(a + b for a, b in zip(parts[1], to_fixed, strict=True))]
-
-            state = load_all(kept, self.carry, k)
-            state = jax.lax.fori_loop(first, end - np.int32(1), again, state)
-            store_all(scratch, state, end - np.int32(1) - first)
-            return jax.lax.fori_loop(first, end, back, sums)
-
-        cotangents = load_all(last, self.moving)
-        sums = [jnp.zeros(BLOCK, x.dtype) for x in self.wanted_consts for _ in range(size(loop, x))]
-        sums = jax.lax.fori_loop(
-            np.int32(0), np.int32(loop.segments), segment, [*cotangents, *sums]
-        )
-        store_all(to_carry, sums[: len(cotangents)])
-        store_all(to_consts, sums[len(cotangents) :])
-
-    def _stored_cotangents(self, left: Sequence[Ref], t: Lane) -> list[Lane]:
-        refs, out = iter(left), []
+    def _stored_cotangents(self) -> tuple[Lines, Lines]:
+        rows, lines, names = iter(self.left), [], []
         for x in self.loop.results[1]:
             if is_float(x.dtype) and is_wide(self.loop, x):
-                out += load_all([next(refs)], [x], t)
+                found = load_all([next(rows)], time="t")
+                lines += found[0]
+                names += found[1]
             elif is_float(x.dtype):  # `holds_cotangents`: these are zero
-                out += [jnp.zeros(BLOCK, x.dtype)] * size(self.loop, x)
-        return out
+                names += [f"({type_of(x.dtype)})0"] * size(self.loop, x)
+        return lines, names
 
-    def _store_signals(self, refs: Sequence[Ref], lanes: list[Lane], t: Lane) -> None:
-        parts = split(lanes, *(size(self.loop, x) for x in self.wanted_signals))
-        for ref, x, part in zip(refs, self.wanted_signals, parts, strict=False):
-            if is_wide(self.loop, x):
-                store_all([ref], part, t)
-                continue
-            for k, lane in enumerate(part):
-                ref[t, k, 0] = jnp.sum(lane)
+    def _to_now(self, names: Lines) -> Lines:
+        parts = split(names, *(row.count for row in self.to_now))
+        lines = []
+        for row, part in zip(self.to_now, parts, strict=False):
+            lines += row.store(part, "t") if row.wide else _shared(row, part)
+        return lines
+
+
+def _shared(row: Rows, names: Lines) -> Lines:
+    """What all members share gets a sum of each warp."""
+    warp = _kernel_memory.WARP
+    place = f"* ((members + {warp - 1}) / {warp}) + place / {warp}"
+    lines = []
+    for k, name in enumerate(names):
+        total = f"total_{row.name}_{k}"
+        halve = f"{total} += __shfl_down_sync(~0u, {total}, k);"
+        lines += [
+            f"auto {total} = is_member ? {name} : 0;",
+            f"for (int k = {warp // 2}; k > 0; k /= 2) {halve}",
+            f"if (is_member && place % {warp} == 0)",
+            f"    {row.name}[(t * {row.count} + {k}) {place}] = {total};",
+        ]
+    return lines

@@ -12,8 +12,7 @@ _VARIABLE = "JAXQUAD_KERNEL"
 
 # Part of what JAX tells compiled programs apart by: a change compiles them anew.
 plain_loops = jax.make_user_context(False)
-# "auto" makes kernels of a GPU where there is one. For tests without: "interpret" runs them by
-# Pallas' interpreter, "compile" makes them for another platform than the one that traces.
+# "auto" makes kernels of a GPU where there is one, "forced" everywhere: for tests without one.
 device_kernels = jax.make_user_context("auto")
 
 _said: dict[str, None] = {}

@@ -1,7 +1,6 @@
-"""A time loop as one kernel of an accelerator is the plain scan, in values and derivatives.
+"""A time loop as one kernel of a GPU is the plain scan, in values and derivatives.
 
-Pallas' interpreter runs the kernels here. Nothing was run on a GPU: that they become Triton's code
-for one is tested, not that it is fast.
+The kernels, in CUDA C, are compiled for the processor here.
 """
 
 import functools as ft
@@ -10,17 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cuda_on_host import for_cuda, run_on_host
 
 from jaxquad._xla import _device_trial, _switch, scan_on_device
 
 
-MEMBERS, SAMPLES = 70, 7  # a block and a part of one; segments of 3, 3 and 1
-QUICK = {"xla_backend_optimization_level": 0}  # interpreted kernels are long programs
+MEMBERS, SAMPLES = 150, 7  # a block and a part of one; segments of 3, 3 and 1
+QUICK = {"xla_backend_optimization_level": 0}
 
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     monkeypatch.setattr(_switch, "_said", {})
+    run_on_host(monkeypatch)
 
 
 def plain(step, carry, signals):
@@ -33,14 +34,9 @@ def kernel(step, carry, signals):
     return found
 
 
-def compiled(function, *args, mode="interpret"):
-    with _switch.device_kernels(mode):
+def compiled(function, *args):
+    with _switch.device_kernels("forced"):
         return jax.jit(function, compiler_options=QUICK)(*args)
-
-
-def for_cuda(function, *args):
-    with _switch.device_kernels("compile"):
-        return jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
 
 
 def spread(*shape, seed=0):
@@ -94,7 +90,7 @@ def test_a_gradient_is_two_kernels_of_a_gpu_and_no_loop_around_them(kind):
     args = [x.astype(kind) for x in given()]
     text = for_cuda(jax.grad(lambda *args: total(kernel, *args)[0], range(5)), *args)
     assert not _switch.left_plain()
-    assert text.count("gpu.triton") == 2
+    assert text.count("gpu.ptx") == 2
     assert "stablehlo.while" not in text
 
 
@@ -169,11 +165,11 @@ def test_each_operation_is_that_of_the_plain_scan():
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_each_operation_becomes_code_for_a_gpu(kind):
     text = for_cuda(ft.partial(every_operation, kernel), spread(2, MEMBERS).astype(kind))
-    assert text.count("gpu.triton") == 1
+    assert text.count("gpu.ptx") == 1
 
 
 def test_a_member_that_is_nan_stays_nan():
-    """The maximum and the minimum of Triton would drop it."""
+    """The maximum and the minimum of CUDA would drop it."""
     x = jnp.full((1, MEMBERS), jnp.nan)
     step = lambda x, now: (jnp.minimum(jnp.maximum(jnp.clip(x, 0, 1), now), now), None)
     out, _ = compiled(lambda x: kernel(step, x, jnp.ones(3)), x)
@@ -192,7 +188,7 @@ REFUSED = {
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_a_kernel_cannot_hold_is_left_to_the_plain_scan_and_said(what):
     run = lambda x: scan_on_device(lambda x, _: (REFUSED[what](x), None), x, ONES, MEMBERS, plain)
-    with _switch.device_kernels("interpret"):
+    with _switch.device_kernels("forced"):
         assert jax.eval_shape(run, spread(2, MEMBERS)) is None
     (said,) = _switch.left_plain()
     assert what in said
@@ -207,7 +203,7 @@ def test_without_a_gpu_no_loop_is_given_to_one():
 
 
 def trial():
-    with _switch.device_kernels("interpret"):
+    with _switch.device_kernels("forced"):
         return _device_trial.why_not_trusted.__wrapped__()
 
 

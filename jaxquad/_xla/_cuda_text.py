@@ -1,0 +1,77 @@
+"""Statements of CUDA C for a jaxpr of scalars."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
+
+from ._lane_arithmetic import EXPRESSIONS, TYPES
+
+
+# Of the operations that CUDA C has no sign and no function for.
+PRELUDE = """
+#define NOT_A_NUMBER __int_as_float(0x7fffffff)
+template <int N, typename T> __device__ T integer_power(T x) {
+    if constexpr (N < 0) return 1 / integer_power<-N>(x);
+    else if constexpr (N == 0) return 1;
+    else if constexpr (N % 2) return x * integer_power<N - 1>(x);
+    else return integer_power<N / 2>(x * x);
+}
+"""
+
+
+def type_of(kind: np.dtype) -> str:
+    """The type in C."""
+    return TYPES[kind.name]
+
+
+def number(value: Any, kind: np.dtype) -> str:
+    """A constant in C, to the last bit."""
+    if kind.kind == "b":
+        return "true" if value else "false"
+    if kind.kind in "iu":
+        return f"({type_of(kind)}){int(value)}LL"
+    x = float(value)
+    if np.isfinite(x):
+        text = x.hex()
+    else:
+        text = "NOT_A_NUMBER" if np.isnan(x) else "1e308 * 10" if x > 0 else "-1e308 * 10"
+    return f"({type_of(kind)})({text})"
+
+
+def statements(jaxpr: ClosedJaxpr, args: Sequence[str], prefix: str) -> tuple[list[str], list[str]]:
+    """The lines that compute a jaxpr of scalars, and what its results are called.
+
+    The arguments are called `args`; what is new begins with the `prefix`.
+    """
+    return _Writer(prefix).write(jaxpr, args)
+
+
+class _Writer:
+    def __init__(self, prefix: str):
+        self.prefix = prefix
+        self.lines: list[str] = []
+
+    def write(self, jaxpr: ClosedJaxpr, args: Sequence[str]) -> tuple[list[str], list[str]]:
+        body = jaxpr.jaxpr
+        names = dict(zip(body.invars, args, strict=True))
+        for v, value in zip(body.constvars, jaxpr.consts, strict=True):
+            names[v] = number(value, v.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+        for equation in body.eqns:
+            self._statement(equation, names)
+        return self.lines, [_name(v, names) for v in body.outvars]
+
+    def _statement(self, equation: JaxprEqn, names: dict[Var, str]) -> None:
+        given = [_name(v, names) for v in equation.invars]
+        [out] = equation.outvars
+        kind = type_of(out.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+        text = EXPRESSIONS[equation.primitive.name](kind, equation.params, *given)
+        names[out] = f"{self.prefix}{len(self.lines)}"
+        self.lines.append(f"const {kind} {names[out]} = {text};")
+
+
+def _name(v: Any, names: dict[Var, str]) -> str:
+    if isinstance(v, Literal):
+        return number(v.val, v.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+    return names[v]

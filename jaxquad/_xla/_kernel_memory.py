@@ -1,0 +1,193 @@
+"""Arrays as the kernels of a time loop see them, and the text of such a kernel."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ._cuda_text import PRELUDE, type_of
+from ._loop_kernels import Flat, is_wide, Loop, Shaped, size, split
+from ._nvrtc import launch
+
+
+BLOCK = 128  # threads that are started together
+WARP = 32  # threads that can add up their numbers
+Lines = list[str]
+
+
+def pack(loop: Loop, x: Array, aval: Shaped, *, timed: bool = False) -> Array:
+    """Members last, and the numbers of each member in one row."""
+    own = is_wide(loop, aval)
+    if own:
+        x = jnp.moveaxis(x, timed + aval.shape.index(loop.members), -1)
+    last = (loop.members,) if own else ()
+    x = x.reshape(*x.shape[:timed], size(loop, aval), *last)
+    return x.astype(memory_type(x.dtype))
+
+
+def unpack(loop: Loop, x: Array, aval: Shaped, *, timed: bool = False) -> Array:
+    """The array itself. What has no members' axis is that of the first member."""
+    shape = tuple(n for n in aval.shape if n != loop.members)
+    x = x.reshape(*x.shape[:timed], *shape, loop.members).astype(aval.dtype)
+    if not is_wide(loop, aval):
+        return x[..., 0]
+    return jnp.moveaxis(x, -1, timed + aval.shape.index(loop.members))
+
+
+def memory_type(kind: np.dtype) -> np.dtype:
+    return np.dtype(np.int32) if kind.kind == "b" else kind
+
+
+def out_like(loop: Loop, *lengths: int, dtype: np.dtype) -> Shaped:
+    return jax.ShapeDtypeStruct((*lengths, loop.members), memory_type(dtype))
+
+
+class Rows(NamedTuple):
+    """An array in memory: its name in a kernel, and how many numbers it has for each member."""
+
+    name: str
+    count: int
+    kind: np.dtype
+    wide: bool  # with a number for each member
+
+    def at(self, k: int, time: str | None = None) -> str:
+        """Its number `k` at a time, in C."""
+        row = f"{k}" if time is None else f"({time}) * {self.count} + {k}"
+        return f"{self.name}[{f'({row}) * members + member' if self.wide else row}]"
+
+    def load(self, time: str | None = None) -> tuple[Lines, Lines]:
+        """The lines that read it, and what its numbers are called."""
+        names = [f"{self.name}_{k}" for k in range(self.count)]
+        kind, test = type_of(self.kind), " != 0" if self.kind.kind == "b" else ""
+        lines = [f"const {kind} {name} = {self.at(k, time)}{test};" for k, name in enumerate(names)]
+        return lines, names
+
+    def store(self, names: Sequence[str], time: str | None = None) -> Lines:
+        pairs = enumerate(names)
+        return [f"if (is_member) {self.at(k, time)} = {name};" for k, name in pairs]
+
+    def parameter(self, access: str) -> str:
+        return f"{access}{type_of(memory_type(self.kind))} *__restrict__ {self.name}"
+
+
+def rows_of(
+    loop: Loop, prefix: str, avals: Sequence[Shaped], *, all_wide: bool = False
+) -> list[Rows]:
+    pairs = enumerate(avals)
+    wide = lambda x: all_wide or is_wide(loop, x)
+    return [Rows(f"{prefix}{k}", size(loop, x), np.dtype(x.dtype), wide(x)) for k, x in pairs]
+
+
+class Tile(NamedTuple):
+    """Numbers of one type of each carry of a loop at several times, for a kernel's own use.
+
+    In memory a block's threads are beside each other, and then a time's numbers: what a thread
+    reads at a time lies at fixed distances.
+    """
+
+    name: str
+    kind: np.dtype
+    places: tuple[int, ...]  # of these numbers among all of the carry
+    times: int
+
+    def out(self, loop: Loop) -> Shaped:
+        blocks = -(-loop.members // BLOCK)
+        shape = (blocks, self.times, len(self.places), BLOCK)
+        return jax.ShapeDtypeStruct(shape, memory_type(self.kind))
+
+    def load(self, time: str) -> tuple[Lines, dict[int, str]]:
+        """The lines that read it, and what the number at a place of the carry is called."""
+        names = {place: f"{self.name}_{place}" for place in self.places}
+        kind, test = type_of(self.kind), " != 0" if self.kind.kind == "b" else ""
+        lines = [
+            f"const {kind} {name} = {self.name}_now[{k * BLOCK}]{test};"
+            for k, name in enumerate(names.values())
+        ]
+        return [self._now("const ", time), *lines], names
+
+    def store(self, names: Sequence[str], time: str) -> Lines:
+        places = enumerate(self.places)
+        lines = [f"{self.name}_now[{k * BLOCK}] = {names[place]};" for k, place in places]
+        return [self._now("", time), *lines]
+
+    def _now(self, access: str, time: str) -> str:
+        kind = type_of(memory_type(self.kind))
+        first = f"(blockIdx.x * {self.times}LL + {time}) * {len(self.places) * BLOCK} + threadIdx.x"
+        return f"{access}{kind} *const {self.name}_now = {self.name} + {first};"
+
+    def parameter(self, access: str) -> str:
+        return f"{access}{type_of(memory_type(self.kind))} *__restrict__ {self.name}"
+
+
+def tiles_of(loop: Loop, prefix: str, times: int) -> list[Tile]:
+    kinds = [np.dtype(x.dtype) for x in loop.avals[1] for _ in range(size(loop, x))]
+    places = {kind: [k for k, each in enumerate(kinds) if each == kind] for kind in kinds}
+    return [Tile(f"{prefix}_{kind}", kind, tuple(k), times) for kind, k in places.items()]
+
+
+def kept_avals(loop: Loop) -> list[Shaped]:
+    """The carries at the first sample of every segment."""
+    return [x.out(loop) for x in tiles_of(loop, "kept", loop.segments)]
+
+
+def load_tiles(tiles: Sequence[Tile], time: str) -> tuple[Lines, Lines]:
+    """The lines that read a carry, and what its numbers are called."""
+    found = [tile.load(time) for tile in tiles]
+    names = {place: name for _, part in found for place, name in part.items()}
+    return [x for lines, _ in found for x in lines], [names[k] for k in sorted(names)]
+
+
+def store_tiles(tiles: Sequence[Tile], names: Sequence[str], time: str) -> Lines:
+    return [x for tile in tiles for x in tile.store(names, time)]
+
+
+def load_all(rows: Iterable[Rows], time: str | None = None) -> tuple[Lines, Lines]:
+    """The lines that read arrays, and what their numbers are called."""
+    found = [row.load(time) for row in rows]
+    return [x for lines, _ in found for x in lines], [x for _, names in found for x in names]
+
+
+def store_all(rows: Sequence[Rows], names: Sequence[str], time: str | None = None) -> Lines:
+    parts = split(names, *(row.count for row in rows))
+    return [x for row, part in zip(rows, parts, strict=False) for x in row.store(part, time)]
+
+
+def variables(
+    loop: Loop, prefix: str, avals: Sequence[Shaped], values: Sequence[str]
+) -> tuple[Lines, Lines]:
+    """Lines that make variables with these values, and what they are called."""
+    kinds = [type_of(x.dtype) for x in avals for _ in range(size(loop, x))]
+    made = [f"{prefix}{k}" for k in range(len(values))]
+    return [f"{c} {x} = {y};" for c, x, y in zip(kinds, made, values, strict=True)], made
+
+
+def assigned(names: Sequence[str], values: Sequence[str]) -> Lines:
+    """Of variables whose new values may be each other's old ones."""
+    held = [f"const auto next_{x} = {y};" for x, y in zip(names, values, strict=True)]
+    return [*held, *(f"{x} = next_{x};" for x in names)]
+
+
+def nested(head: str, lines: Iterable[str]) -> Lines:
+    return [f"{head} {{", *(f"    {x}" for x in lines), "}"]
+
+
+def run(
+    loop: Loop,
+    lines: Lines,
+    given: tuple[Sequence[Rows | Tile], Flat],
+    made: tuple[Sequence[Rows | Tile], Sequence[Shaped]],
+) -> Flat:
+    """What a kernel of these lines makes of arguments and writes to results."""
+    parameters = [x.parameter("const ") for x in given[0]] + [x.parameter("") for x in made[0]]
+    head = f'extern "C" __global__ void __launch_bounds__({BLOCK}) kernel({", ".join(parameters)})'
+    begin = [
+        f"const long long members = {loop.members};",
+        f"const long long place = (long long)blockIdx.x * {BLOCK} + threadIdx.x;",
+        "const bool is_member = place < members;",
+        "const long long member = is_member ? place : members - 1;",
+    ]
+    text = "\n".join([PRELUDE, *nested(head, [*begin, *lines]), ""])
+    return launch(text, "kernel", given[1], made[1], loop.members, BLOCK)

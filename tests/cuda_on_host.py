@@ -1,0 +1,79 @@
+"""Kernels in CUDA C compiled for the processor, one member after the other: tests without a GPU."""
+
+import ctypes
+import functools as ft
+import pathlib
+import shutil
+import subprocess
+import tempfile
+
+import jax
+import numpy as np
+import pytest
+
+from jaxquad._xla import _kernel_memory, _nvrtc, _switch
+
+
+_HOST = """
+#include <cmath>
+using namespace std;
+#define __global__
+#define __device__
+#define __launch_bounds__(n)
+static struct {{ int x; }} blockIdx, threadIdx;
+float __int_as_float(int) {{ return NAN; }}
+template <typename T> T __shfl_down_sync(unsigned, T x, int) {{ return x; }}
+{text}
+extern "C" void all(void **p) {{
+    for (int m = 0; m < {blocks} * {block}; ++m) {{
+        blockIdx.x = m / {block};
+        threadIdx.x = m % {block};
+        {name}({arguments});
+    }}
+}}
+"""
+
+
+def run_on_host(monkeypatch):
+    """Kernels of a GPU run here, from now on."""
+    if shutil.which("g++") is None:
+        pytest.skip("needs g++")
+    monkeypatch.setattr(_kernel_memory, "launch", _launch)
+    monkeypatch.setattr(_kernel_memory, "WARP", 1)
+
+
+def for_cuda(function, *args):
+    """What XLA for a GPU gets, with a word in place of what NVRTC makes."""
+    with pytest.MonkeyPatch.context() as patch, _switch.device_kernels("forced"):
+        patch.setattr(_kernel_memory, "launch", _nvrtc.launch)
+        patch.setattr(_nvrtc, "ptx_of", lambda text, capability: "made by NVRTC")
+        return jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
+
+
+def _launch(text, name, args, outs, threads, block):
+    def run(*arrays):
+        made = [np.full(x.shape, 77, x.dtype) for x in outs]
+        arrays = [np.ascontiguousarray(x) for x in arrays]
+        pointers = [x.ctypes.data for x in (*arrays, *made)]
+        function((ctypes.c_void_p * len(pointers))(*pointers))
+        return made
+
+    blocks = -(-threads // block)
+    function = _compiled(text, name, len(args) + len(outs), blocks, block)
+    return jax.pure_callback(run, outs, *args)
+
+
+@ft.lru_cache
+def _compiled(text, name, count, blocks, block):
+    kinds = text[text.index(f"{name}(") + len(name) + 1 :].split(")")[0].split(",")
+    pointers = [x.split("__restrict__")[0] for x in kinds]
+    assert len(pointers) == count
+    arguments = ", ".join(f"({kind})p[{k}]" for k, kind in enumerate(pointers))
+    whole = _HOST.format(text=text, name=name, arguments=arguments, blocks=blocks, block=block)
+    folder = pathlib.Path(tempfile.mkdtemp())
+    source, library = folder / "kernel.cpp", folder / "kernel.so"
+    source.write_text(whole)
+    # Without fused operations: the plain loop has none.
+    options = ["-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC"]
+    subprocess.run(["g++", *options, "-o", library, source], check=True)
+    return ctypes.CDLL(str(library)).all
