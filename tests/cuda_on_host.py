@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxquad._xla import _kernel_memory, _nvrtc, _switch
+from jaxquad._xla import _device_trial, _kernel_memory, _nvrtc, _switch
 
 
 _HOST = """
@@ -22,6 +22,7 @@ using namespace std;
 #define __launch_bounds__(n)
 static struct {{ int x; }} blockIdx, threadIdx;
 float __int_as_float(int) {{ return NAN; }}
+template <typename T> T __ldcs(const T *p) {{ return *p; }}
 template <typename T> T __shfl_down_sync(unsigned, T x, int) {{ return x; }}
 {text}
 extern "C" void all(void **p) {{
@@ -40,6 +41,7 @@ def run_on_host(monkeypatch):
         pytest.skip("needs g++")
     monkeypatch.setattr(_kernel_memory, "launch", _launch)
     monkeypatch.setattr(_kernel_memory, "WARP", 1)
+    monkeypatch.setattr(_device_trial, "ptx_of", lambda text, capability: "")
 
 
 def for_cuda(function, *args):

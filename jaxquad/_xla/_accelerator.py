@@ -1,4 +1,4 @@
-"""Whether an ensemble's time loop becomes one kernel on an accelerator. Loads no Pallas before."""
+"""Whether an ensemble's time loop becomes one kernel of a GPU. Loads nothing else before."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ def why_no_device_kernels() -> str | None:
 def _why_not_trusted() -> str | None:
     try:
         from ._device_trial import why_not_trusted
-    except (ImportError, AttributeError) as error:  # Pallas is experimental: it may move.
+    except (ImportError, AttributeError) as error:  # JAX's rules for primitives may move.
         reason = f"JAX {jax.__version__} lacks what kernels of a GPU are made with ({error})"
     else:
         reason = why_not_trusted()

@@ -18,6 +18,31 @@ template <int N, typename T> __device__ T integer_power(T x) {
     else if constexpr (N % 2) return x * integer_power<N - 1>(x);
     else return integer_power<N / 2>(x * x);
 }
+// A member that is nan stays nan: the maximum of CUDA would hide it.
+template <typename T> __device__ T larger(T a, T b) { return a > b || a != a ? a : b; }
+template <typename T> __device__ T smaller(T a, T b) { return a < b || a != a ? a : b; }
+#if __CUDA_ARCH__ >= 800
+template <> __device__ float larger(float a, float b) {
+    float c;
+    asm("max.NaN.f32 %0, %1, %2;" : "=f"(c) : "f"(a), "f"(b));
+    return c;
+}
+template <> __device__ float smaller(float a, float b) {
+    float c;
+    asm("min.NaN.f32 %0, %1, %2;" : "=f"(c) : "f"(a), "f"(b));
+    return c;
+}
+#endif
+// Memory on its way to a warp: `rows` of its numbers, each `apart` from the one before.
+template <typename T> __device__ void fetch(const T *first, int rows, int apart) {
+#ifdef __CUDA_ARCH__
+    constexpr int lines = sizeof(T) / 4, bytes = 128;
+    for (int k = threadIdx.x % 32; k < rows * lines; k += 32) {
+        const char *place = (const char *)(first + k / lines * apart) + k % lines * bytes;
+        asm volatile("prefetch.global.L1 [%0];" :: "l"(place));
+    }
+#endif
+}
 """
 
 

@@ -30,6 +30,7 @@ from ._loop_kernels import (
     split,
     step_in_lanes,
 )
+from ._nvrtc import CannotCompile
 from ._reverse_kernel import holds_cotangents, run_reverse
 from ._switch import note, warn_once
 
@@ -140,10 +141,18 @@ def _plain_cotangents(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, .
 
 def _primitive(name: str, kernel: Callable[..., Flat], plain: Callable[..., Flat]) -> Primitive:
     """Runs `kernel`, and differentiates and batches `plain`."""
+
+    def run(*args: Array, **params: Any) -> Flat:
+        try:
+            return kernel(*args, **params)
+        except CannotCompile as reason:
+            warn_once(f"NVRTC made no kernel of a loop ({reason})")
+            return plain(*args, **params)
+
     made = Primitive(name)
     made.multiple_results = True
-    made.def_impl(lambda *args, **params: jax.jit(ft.partial(kernel, **params))(*args))
-    mlir.register_lowering(made, mlir.lower_fun(kernel, multiple_results=True))
+    made.def_impl(lambda *args, **params: jax.jit(ft.partial(run, **params))(*args))
+    mlir.register_lowering(made, mlir.lower_fun(run, multiple_results=True))
 
     def derivative(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[Flat, Flat]:
         moved = tuple(ad.instantiate_zeros(x) for x in tangents)

@@ -103,10 +103,16 @@ class Tile(NamedTuple):
         names = {place: f"{self.name}_{place}" for place in self.places}
         kind, test = type_of(self.kind), " != 0" if self.kind.kind == "b" else ""
         lines = [
-            f"const {kind} {name} = {self.name}_now[{k * BLOCK}]{test};"
+            f"const {kind} {name} = __ldcs({self.name}_now + {k * BLOCK}){test};"
             for k, name in enumerate(names.values())
         ]
         return [self._now("const ", time), *lines], names
+
+    def fetch_before(self) -> Lines:
+        """Of the time before the one that was read, while that one is worked on."""
+        rows = len(self.places)
+        first = f"{self.name}_now - threadIdx.x % {WARP} - {rows * BLOCK}"
+        return [f"fetch({first}, {rows}, {BLOCK});"]
 
     def store(self, names: Sequence[str], time: str) -> Lines:
         places = enumerate(self.places)
@@ -138,6 +144,10 @@ def load_tiles(tiles: Sequence[Tile], time: str) -> tuple[Lines, Lines]:
     found = [tile.load(time) for tile in tiles]
     names = {place: name for _, part in found for place, name in part.items()}
     return [x for lines, _ in found for x in lines], [names[k] for k in sorted(names)]
+
+
+def fetch_before(tiles: Sequence[Tile]) -> Lines:
+    return [x for tile in tiles for x in tile.fetch_before()]
 
 
 def store_tiles(tiles: Sequence[Tile], names: Sequence[str], time: str) -> Lines:

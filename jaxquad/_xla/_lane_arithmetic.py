@@ -27,11 +27,6 @@ def _function(name: str) -> Expression:
     return lambda kind, params, *given: f"{name}({', '.join(given)})"
 
 
-def _picked(sign: str) -> Expression:
-    """The larger or the smaller; the maximum of CUDA would hide a member that is nan."""
-    return lambda kind, params, a, b: f"({a} {sign} {b} || {a} != {a}) ? {a} : {b}"
-
-
 def _absolute(kind: str, params: dict, x: str) -> str:
     return f"fabs({x})" if kind in _FLOATS else f"{x} < 0 ? -{x} : {x}"
 
@@ -65,15 +60,13 @@ _SAME_IN_C = """
 """.split()
 _WRITTEN: dict[str, Expression] = {
     "abs": _absolute,
-    "clamp": lambda kind, params, low, x, high: (
-        f"{x} < {low} ? {low} : {x} > {high} ? {high} : {x}"
-    ),
+    "clamp": lambda kind, params, low, x, high: f"smaller(larger({x}, {low}), {high})",
     "convert_element_type": _converted,
     "integer_pow": lambda kind, params, x: f"integer_power<{params['y']}>({x})",
     "is_finite": lambda kind, params, x: f"{x} - {x} == 0",
     "logistic": lambda kind, params, x: f"1 / (1 + exp(-{x}))",
-    "max": _picked(">"),
-    "min": _picked("<"),
+    "max": _function("larger"),
+    "min": _function("smaller"),
     "neg": lambda kind, params, x: f"-{x}",
     "not": lambda kind, params, x: f"!{x}" if kind == "bool" else f"~{x}",
     "pow": lambda kind, params, x, y: f"pow({x}, ({kind}){y})",

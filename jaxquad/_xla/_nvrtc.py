@@ -36,7 +36,6 @@ def launch(
 
     Its parameters are pointers to the arguments and then to the results.
     """
-    ptx = ptx_of(text, _capability())
     call = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", tuple(outs))
     one = np.int32(1)
     return list(
@@ -44,7 +43,7 @@ def launch(
             *args,
             name=name,
             kernel_type="ptx",
-            kernel_data=ptx,
+            kernel_data=ptx_of(text, capability()),
             grid_x=np.int32(-(-threads // block)),
             grid_y=one,
             grid_z=one,
@@ -56,7 +55,8 @@ def launch(
     )
 
 
-def _capability() -> str:
+def capability() -> str:
+    """What this machine's GPU can do, as 9.0."""
     try:
         return jax.devices("gpu")[0].compute_capability
     except RuntimeError:  # a program for another machine
@@ -74,9 +74,8 @@ def ptx_of(text: str, capability: str) -> str:
         options = [*_OPTIONS, f"--gpu-architecture=compute_{capability.replace('.', '')}"]
         array = (ctypes.c_char_p * len(options))(*(x.encode() for x in options))
         if nvrtc.nvrtcCompileProgram(program, len(options), array):
-            raise CannotCompile(
-                _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
-            )
+            log = _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
+            raise CannotCompile(next((x for x in log.splitlines() if "error" in x), log[:200]))
         return _read(nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX, program)
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))

@@ -10,6 +10,7 @@ from . import _kernel_memory
 from ._cuda_text import statements, type_of
 from ._kernel_memory import (
     assigned,
+    fetch_before,
     Lines,
     load_all,
     load_tiles,
@@ -158,6 +159,7 @@ class _Reverse:
     def _back(self, fixed: Lines, moved: Lines, sums: Lines) -> Lines:
         """A sample of the reverse pass."""
         again, state = load_tiles(self.again, "t - first")
+        again += nested("if (t > first)", fetch_before(self.again))
         now, signals = load_all(self.now, time="t")
         left, stored = self._stored_cotangents()
         given = [*fixed, *state, *signals, *moved, *stored]

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from cuda_on_host import for_cuda, run_on_host
 
-from jaxquad._xla import _device_trial, _switch, scan_on_device
+from jaxquad._xla import _device_trial, _kernel_memory, _nvrtc, _switch, scan_on_device
+from jaxquad._xla._nvrtc import CannotCompile
 
 
 MEMBERS, SAMPLES = 150, 7  # a block and a part of one; segments of 3, 3 and 1
@@ -107,7 +108,6 @@ MODES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 def test_other_derivatives_run_as_plain_scans(mode):
     x = jnp.asarray(0.7)
@@ -141,6 +141,8 @@ OPERATIONS = {
     "taken": lambda x: x * jax.lax.dynamic_slice(x, (1, 0), (1, MEMBERS)),
     "two products": lambda x: jnp.einsum("in,jn,ij->jn", x, x, jnp.asarray(ROWS, x.dtype)),
     "constants": lambda x: x + jnp.sqrt(jnp.full_like(x, 2.0)) ** 3,
+    "not finite": lambda x: jnp.where(x > 0.6, jnp.inf, jnp.where(x > 0.4, -jnp.inf, jnp.nan)),
+    "error function": jax.scipy.special.erf,
     "switch": lambda x: jax.lax.switch(2, [jnp.sin, jnp.cos, jnp.tan], x),
 }  # fmt: skip
 ROWS = np.array([[1.0, 2.0], [0.0, 3.0]])
@@ -154,7 +156,6 @@ def every_operation(scan, x):
     return scan(step, x, jnp.full(3, 0.1, x.dtype))
 
 
-@pytest.mark.slow
 def test_each_operation_is_that_of_the_plain_scan():
     x = spread(2, MEMBERS)
     found, expected = (compiled(ft.partial(every_operation, s), x) for s in (kernel, plain))
@@ -197,6 +198,23 @@ def test_what_a_kernel_cannot_hold_is_left_to_the_plain_scan_and_said(what):
 ONES = np.ones(2)
 
 
+def test_what_nvrtc_does_not_compile_runs_as_a_plain_scan_with_a_warning(monkeypatch):
+    def fails(*_):
+        raise CannotCompile("line 7: error")
+
+    monkeypatch.setattr(_kernel_memory, "launch", fails)
+    x = jnp.asarray(0.7)
+    with pytest.warns(UserWarning, match="line 7"):
+        found = compiled(jax.grad(ft.partial(squared, kernel)), x)
+    np.testing.assert_allclose(found, jax.grad(ft.partial(squared, plain))(x), rtol=1e-12)
+
+
+def test_without_nvrtc_it_is_said_what_brings_it(monkeypatch):
+    monkeypatch.setattr(_nvrtc, "_places", lambda: iter(["no such library"]))
+    with pytest.raises(CannotCompile, match="pip install"):
+        _nvrtc._library.__wrapped__()
+
+
 def test_without_a_gpu_no_loop_is_given_to_one():
     run = lambda x: scan_on_device(lambda x, _: (x, None), x, ONES, 1000, plain)
     assert jax.default_backend() == "gpu" or jax.eval_shape(run, spread(2, 1000)) is None
@@ -207,7 +225,6 @@ def trial():
         return _device_trial.why_not_trusted.__wrapped__()
 
 
-@pytest.mark.slow
 def test_kernels_are_compared_with_a_plain_loop_before_they_are_trusted(monkeypatch):
     said = []
     jax.jit(lambda x: said.append(trial()))(1.0)  # while another program is traced

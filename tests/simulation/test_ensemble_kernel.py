@@ -1,4 +1,4 @@
-"""Ensembles as kernels of an accelerator, by Pallas' interpreter: the plain loops' numbers."""
+"""Ensembles as kernels of a GPU, which are compiled for the processor here: the plain numbers."""
 
 import functools as ft
 
@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cuda_on_host import for_cuda, run_on_host
 
 from jaxquad._xla import _switch
 from jaxquad.control import LADRC
@@ -14,8 +15,8 @@ from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import evaluate, Pulse, run_ensemble, Saturation, scenario, simulate, Step
 
 
-MEMBERS = 70  # a block of a kernel, and a part of one
-QUICK = {"xla_backend_optimization_level": 0}  # interpreted kernels are long programs
+MEMBERS = 70  # one chunk, as all members are on a GPU
+QUICK = {"xla_backend_optimization_level": 0}
 GAINS = np.array([10.0, 30.0, 0.8478])
 
 
@@ -43,6 +44,7 @@ def stored(gains, delay):
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     monkeypatch.setattr(_switch, "_said", {})
+    run_on_host(monkeypatch)
 
 
 def in_mode(mode, function):
@@ -51,10 +53,9 @@ def in_mode(mode, function):
         return jax.jit(run, compiler_options=QUICK)(jnp.asarray(GAINS))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("run, delay", [(stored, 0.004), (measured, 0.0075)])
 def test_a_flight_and_its_gradient_are_those_of_the_plain_loop(run, delay):
-    found, expected = (in_mode(x, ft.partial(run, delay=delay)) for x in ("interpret", "auto"))
+    found, expected = (in_mode(x, ft.partial(run, delay=delay)) for x in ("forced", "auto"))
     assert not _switch.left_plain()
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
@@ -62,10 +63,8 @@ def test_a_flight_and_its_gradient_are_those_of_the_plain_loop(run, delay):
 
 @pytest.mark.parametrize("delay", [0.0, 0.0075])
 def test_a_flight_becomes_one_kernel_of_a_gpu(delay):
-    with _switch.device_kernels("compile"):
-        traced = jax.jit(lambda gains: measured(gains, delay)[0]).trace(jnp.asarray(GAINS))
-        text = traced.lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("gpu.triton") == 1
+    text = for_cuda(lambda gains: measured(gains, delay)[0], jnp.asarray(GAINS))
+    assert text.count("gpu.ptx") == 1
     assert "stablehlo.while" not in text
 
 
@@ -75,6 +74,4 @@ def test_an_ensemble_of_ones_own_becomes_one_kernel_of_a_gpu():
         return run_ensemble(step, x, (rate,), jnp.linspace(0.0, 1.0, 9), own=((True,), False))
 
     x = jnp.ones((2, MEMBERS))
-    with _switch.device_kernels("compile"):
-        text = jax.jit(run).trace(x, x).lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("gpu.triton") == 1
+    assert for_cuda(run, x, x).count("gpu.ptx") == 1
