@@ -41,14 +41,14 @@ def run_on_host(monkeypatch):
         pytest.skip("needs g++")
     monkeypatch.setattr(_kernel_memory, "launch", _launch)
     monkeypatch.setattr(_kernel_memory, "WARP", 1)
-    monkeypatch.setattr(_device_trial, "ptx_of", lambda text, capability: "")
+    monkeypatch.setattr(_device_trial, "ptx_of", lambda text, architecture: "")
 
 
 def for_cuda(function, *args):
     """What XLA for a GPU gets, with a word in place of what NVRTC makes."""
     with pytest.MonkeyPatch.context() as patch, _switch.device_kernels("forced"):
         patch.setattr(_kernel_memory, "launch", _nvrtc.launch)
-        patch.setattr(_nvrtc, "ptx_of", lambda text, capability: "made by NVRTC")
+        patch.setattr(_nvrtc, "ptx_of", lambda text, architecture: "made by NVRTC")
         return jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
 
 

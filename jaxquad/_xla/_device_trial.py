@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from ._accelerator import Scan, Step
 from ._cuda_text import PRELUDE
 from ._device_loop import scan_in_kernel
-from ._nvrtc import capability, ptx_of
+from ._nvrtc import architecture, ptx_of
 from ._switch import device_kernels
 
 
@@ -36,7 +36,7 @@ def why_not_trusted() -> str | None:
 
 def _largest_difference(mode: str) -> float:
     """Of values and derivatives, relative to the largest number of each array."""
-    ptx_of(PRELUDE, capability())  # raises what is wrong with NVRTC
+    ptx_of(PRELUDE, architecture())  # raises what is wrong with NVRTC
     with device_kernels(mode):
         return max(map(_difference, *_results()))
 

@@ -42,7 +42,8 @@ def engine(kernel: Kernel | None = None) -> Engine:
     on; with any other, a child process tries it once, and its answer is kept in the user's cache
     folder (not with `JAXQUAD_CACHE=off` in the environment). Loops with operations that a kernel
     cannot hold, or with too many or too large ones, are compiled plain. On an NVIDIA GPU the loop
-    of an ensemble of more than 512 members is one kernel.
+    of an ensemble of more than 512 members is one kernel, made by the NVRTC that `jax[cuda13]`
+    brings.
 
     Where `jq.simulate`, `jq.evaluate` and the like are called outside of `jax.jit`, a kernel that
     does not compile is compiled plain, with a warning. Within a `jax.jit` of your own that cannot

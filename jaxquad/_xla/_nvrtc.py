@@ -7,6 +7,7 @@ import ctypes
 import functools as ft
 import importlib.util
 import pathlib
+import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -22,7 +23,9 @@ _OPTIONS = (
     "--prec-sqrt=false",
     "--ftz=true",
 )
-_UNKNOWN = "9.0"  # the compute capability where no GPU tells its own
+# The version of PTX that came with an architecture. What is written for it runs on all later GPUs,
+# and with drivers that are older than NVRTC, which would refuse the version that NVRTC writes.
+_VERSIONS = {"75": "6.3", "80": "7.0"}
 
 
 class CannotCompile(Exception):
@@ -43,7 +46,7 @@ def launch(
             *args,
             name=name,
             kernel_type="ptx",
-            kernel_data=ptx_of(text, capability()),
+            kernel_data=ptx_of(text, architecture()),
             grid_x=np.int32(-(-threads // block)),
             grid_y=one,
             grid_z=one,
@@ -55,30 +58,32 @@ def launch(
     )
 
 
-def capability() -> str:
-    """What this machine's GPU can do, as 9.0."""
+def architecture() -> str:
+    """Of this machine's GPU, or one that it runs programs of; a late one where there is no GPU."""
     try:
-        return jax.devices("gpu")[0].compute_capability
+        turing = float(jax.devices("gpu")[0].compute_capability) < 8
     except RuntimeError:  # a program for another machine
-        return _UNKNOWN
+        turing = False
+    return "75" if turing else "80"
 
 
 @ft.lru_cache(maxsize=64)
-def ptx_of(text: str, capability: str) -> str:
+def ptx_of(text: str, architecture: str) -> str:
     """The PTX of a text in CUDA C. Raises `CannotCompile`."""
     nvrtc = _library()
     program = ctypes.c_void_p()
     source = text.encode()
     _require(nvrtc.nvrtcCreateProgram(ctypes.byref(program), source, None, 0, None, None))
     try:
-        options = [*_OPTIONS, f"--gpu-architecture=compute_{capability.replace('.', '')}"]
+        options = [*_OPTIONS, f"--gpu-architecture=compute_{architecture}"]
         array = (ctypes.c_char_p * len(options))(*(x.encode() for x in options))
         if nvrtc.nvrtcCompileProgram(program, len(options), array):
             log = _read(nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog, program)
             raise CannotCompile(next((x for x in log.splitlines() if "error" in x), log[:200]))
-        return _read(nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX, program)
+        ptx = _read(nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX, program)
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+    return re.sub(r"(?m)^\.version .*$", f".version {_VERSIONS[architecture]}", ptx)
 
 
 def _read(size_of: Callable, copy: Callable, program: ctypes.c_void_p) -> str:
