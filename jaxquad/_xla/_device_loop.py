@@ -66,6 +66,7 @@ def _trace(step: Step, carry: PyTree, signals: PyTree) -> tuple[ClosedJaxpr, lis
 
 
 _MOST_HELD = 128  # numbers between two samples: a thread has 255 registers
+_MOST_ARRAYS = 200  # a kernel has 4 kB of parameters, and the reverse one twice this and some more
 
 
 def _why_not(loop: Loop) -> str | None:
@@ -77,6 +78,8 @@ def _why_not(loop: Loop) -> str | None:
     held = sum(size(loop, x) for x in carry)
     if held > _MOST_HELD:
         return f"a carry of {held} numbers for each member"
+    if len(loop.given) + len(loop.out) > _MOST_ARRAYS:
+        return f"a step of more than {_MOST_ARRAYS} arrays"
     for x in (*loop.given, *loop.out):
         if x.dtype not in NUMBERS:
             return f"values of {x.dtype}"

@@ -228,7 +228,7 @@ def _cond(lanes: Lanes, equation: JaxprEqn, index: Cells, *args: Cells) -> list[
         return branches[min(max(int(choice), 0), len(branches) - 1)]
     found = branches[0]
     for k, branch in enumerate(branches[1:], 1):
-        takes = choice if choice.dtype == bool else choice >= k
+        takes = choice if choice.dtype == bool else jax.lax.ge(choice, choice.dtype.type(k))
         pick = ft.partial(_choose, takes)
         found = [pick(new, old) for new, old in zip(branch, found, strict=True)]
     return found

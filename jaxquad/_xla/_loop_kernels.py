@@ -18,8 +18,9 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
+from ._lane_arithmetic import EXPRESSIONS
 from ._lane_moves import RULES
-from ._lanes import as_cells, Cells, cells_of, Lane, Lanes
+from ._lanes import as_cells, Cells, cells_of, Lane, Lanes, NotInLanes
 
 
 T = TypeVar("T")
@@ -106,7 +107,11 @@ def in_lanes(loop: Loop, jaxpr: ClosedJaxpr, *, leave_sums: bool = False) -> Clo
         out = lanes.evaluate(jaxpr.jaxpr, jaxpr.consts, cells)
         return [lane for x in out for lane in _listed(x)]
 
-    return jax.make_jaxpr(flat)(*given)
+    made = jax.make_jaxpr(flat)(*given)
+    unknown = {x.primitive.name for x in made.jaxpr.eqns} - EXPRESSIONS.keys()
+    if unknown:
+        raise NotInLanes(f"{', '.join(sorted(unknown))} of a member's numbers")
+    return made
 
 
 def _listed(x: Cells) -> list[Lane]:

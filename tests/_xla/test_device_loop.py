@@ -58,6 +58,7 @@ def coupled(matrix, gain, carry, now):
     x = jax.lax.scan(substep, x, None, length=2)[0]
     x = jnp.where(stopped[None], x, jnp.concatenate([x[:1], jnp.flip(x[1:], 0)]))
     level = jax.lax.cond(index > 3, lambda a: a * 0.9, lambda a: a + jnp.max(x, axis=0), level)
+    level = jax.lax.switch(index % 3, [jnp.sin, jnp.cos, lambda a: a * a], level)
     stopped = stopped | (jnp.sum(x**2, axis=0) > 1.2)
     return (x, level, stopped), (jnp.linalg.norm(x, axis=0), jnp.max(reference))
 
@@ -196,6 +197,14 @@ def test_what_a_kernel_cannot_hold_is_left_to_the_plain_scan_and_said(what):
 
 
 ONES = np.ones(2)
+
+
+def test_a_step_of_too_many_arrays_is_left_to_the_plain_scan_and_said():
+    many = tuple(spread(MEMBERS) for _ in range(101))
+    run = lambda x: scan_on_device(lambda x, _: (x, None), x, ONES, MEMBERS, plain)
+    with _switch.device_kernels("forced"):
+        assert jax.eval_shape(run, many) is None
+    assert "more than 200 arrays" in _switch.left_plain()[0]
 
 
 def test_what_nvrtc_does_not_compile_runs_as_a_plain_scan_with_a_warning(monkeypatch):
