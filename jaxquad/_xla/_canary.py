@@ -23,7 +23,7 @@ from jaxtyping import Array
 from ._switch import plain_loops, warn_once
 
 
-TESTED = ("0.10.2",)  # versions of jaxlib
+TESTED = ("0.10.2", "0.12.0.1")  # versions of jaxlib
 _CHILD = "JAXQUAD_KERNEL_CANARY"  # set in the child, which has nobody to ask
 _SECONDS = 300.0
 

@@ -19,8 +19,10 @@ from jaxquad._xla import (
     _kernel_limits,
     _switch,
     as_one_kernel,
+    brief_options,
     compiler_options,
     engine,
+    hasty_options,
     Jit,
 )
 
@@ -98,13 +100,17 @@ def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch)
     assert compiler_options() == here
 
 
-def test_the_options_that_tested_versions_are_not_asked_about_are_taken(monkeypatch):
-    options = _engine._WIDEST | _engine._BRIEF
-    monkeypatch.setattr(_engine, "TESTED", (jaxlib.version.__version__,))
-    assert _engine._refusal({"xla_of_another_age": 1}) is None  # nobody asks
+def test_tested_versions_are_not_asked_about_options_and_get_those_that_they_know(monkeypatch):
+    options, unknown = _engine._WIDEST | _engine._BRIEF, {"xla_of_another_age": 1}
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(_engine, "TESTED", (jaxlib.version.__version__,))
+        assert _engine._refusal(unknown) is None  # nobody asks
+    given = brief_options() | hasty_options()
     monkeypatch.setattr(_engine, "TESTED", ())
-    assert _engine._refusal(options) is None
-    assert "xla_of_another_age" in str(_engine._refusal({"xla_of_another_age": 1}))
+    assert "xla_of_another_age" in str(_engine._refusal(unknown))
+    known = {k for k, v in options.items() if _engine._refusal({k: v}) is None}
+    assert set(given) == known >= {"xla_backend_optimization_level", *_engine._WIDEST}
 
 
 def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silence, monkeypatch):

@@ -31,7 +31,6 @@ HAPPENS = scenario(
 )
 LIGHT = {
     "xla_backend_optimization_level": 2,
-    "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_prefer_vector_width": 512,
 }
 GAINS = (jnp.full(3, 10.0), jnp.full(3, 30.0), jnp.full(3, KT / J0))
