@@ -134,7 +134,7 @@ def test_dates_and_durations_are_seconds_whatever_their_unit():
 
 def test_a_date_that_is_none_is_a_time_stamp_that_is_not_finite():
     stamps = np.datetime64("2026-05-04") + np.arange(500).astype("m8[ms]")
-    stamps[7] = np.datetime64("NaT")
+    stamps[7] = np.datetime64("NaT", "ms")
     with pytest.raises(RecordError, match="time stamp 7 is nan"):
         record(time=stamps)
 
