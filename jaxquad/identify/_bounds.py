@@ -187,6 +187,8 @@ def one_sided_limits(
 
 def _limit(problem: Problem, solution: Solution, local: _Local, k: int, wanted: float) -> float:
     """By which factor parameter `k` grows until the cost has risen by what is wanted."""
+    if not wanted > 0:  # of a variance that rounding left negative
+        return np.inf
     z = np.asarray(solution.z)
 
     def rise(times: float) -> float:

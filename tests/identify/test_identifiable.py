@@ -10,7 +10,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.identify._bounds import one_sided
+from jaxquad.identify._bounds import _polished, one_sided, one_sided_limits
 
 
 ML = jq.identify.MaximumLikelihood()
@@ -392,3 +392,18 @@ def test_a_limit_of_another_level_is_where_the_cost_has_risen_by_as_much(seed, m
         for model_error, limit in ((True, bound.limit), (False, bound.noise_limit)):
             low, high = fit.interval("lag", level=level, model_error=model_error)
             assert low == 0 and high == pytest.approx(limit, rel=0.02)
+
+
+def test_a_limit_that_rounding_hides_is_infinite_and_a_model_without_numbers_no_error(monkeypatch):
+    """A lag at zero beside a free delay may have a variance of -10, or reach 1e300 s."""
+    calls = []
+    watched = lambda *given: calls.append(given) or one_sided_limits(*given)
+    monkeypatch.setattr("jaxquad.identify._seen.one_sided_limits", watched)
+    frf = response_of(jq.LaggedIntegrator(80.0, 1e-9, 0.02), error=0.05, seed=0)
+    jq.fit(jq.LaggedIntegrator(70.0, 0.03, 0.02), frf, free=("gain", "lag"), cost=ML)
+    [(problem, solution, k, inflations)] = calls
+    limits, _ = one_sided_limits(problem, solution, k, (-10.0, np.nan, *inflations))
+    assert limits[:2] == [np.inf, np.inf] and 0 < limits[2] < 0.01
+    for far in (700.0, 800.0, np.inf):
+        z = np.where(np.arange(2) == k, far, solution.z)
+        assert not np.isfinite(_polished(problem, z, [k], solution)[1].cost)
