@@ -74,8 +74,10 @@ def _result(
         if isinstance(found, LocalEstimate):  # periods show their own distortion
             noted += remarks_on_linearity(records, omega, response, coherence, method)
             seconds = sum(record.duration for record in records)
-            sharp = np.isfinite(response) & (error <= _SHARP) & (coherence >= _COHERENT)
-            noted += _remarks_on_length(seconds, np.asarray(omega), np.any(sharp, axis=(1, 2)))
+            known = np.isfinite(response)
+            sharp = known & (error <= _SHARP) & (coherence >= _COHERENT)
+            used = np.any(sharp if sharp.any() else known, axis=(1, 2))
+            noted += _remarks_on_length(seconds, np.asarray(omega), used)
         return noted + found.remarks
 
     # Not jnp.asarray: it compiles a program for each new shape.
