@@ -29,10 +29,7 @@ KT, J0 = 0.0468, 0.0552
 HAPPENS = scenario(
     duration=10.0, axes=3, reference=Step(np.radians(4.0)), disturbance=Pulse(0.01, width=1.0, at=5)
 )
-LIGHT = {
-    "xla_backend_optimization_level": 2,
-    "xla_cpu_prefer_vector_width": 512,
-}
+LIGHT = {"xla_backend_optimization_level": 2, "xla_cpu_prefer_vector_width": 512}
 GAINS = (jnp.full(3, 10.0), jnp.full(3, 30.0), jnp.full(3, KT / J0))
 
 
