@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 import jaxquad as jq
+from jaxquad.spectra._estimate import _remarks_on_length
 
 
 DT = 0.004
@@ -42,11 +43,14 @@ def test_a_second_of_a_closed_loop_is_called_too_short(seconds, seed):
     assert "Record at least" in said
 
 
-@pytest.mark.parametrize(("seconds", "seed"), [(2.4, 1)])
-def test_a_band_of_a_single_resolution_is_too_narrow_in_a_short_record(seconds, seed):
-    """Seven cycles, but of two to five frequencies that the record does not tell apart."""
-    [said] = remarks(closed_loop(seconds, seed))
+def test_a_band_of_a_single_resolution_is_too_narrow_in_a_short_record():
+    """Seven cycles, but of frequencies that the record does not tell apart, as in 2.4 s."""
+    omega, spacing = np.geomspace(5.0, 150.0, 100), 2 * np.pi / 2.4
+    inside = lambda low, high: (omega > low * spacing) & (omega < high * spacing)
+    [said] = _remarks_on_length(2.4, omega, inside(7.0, 8.0))
     assert "at least 2)" in said and "cycles of the lowest (at least 10)" in said
+    assert not _remarks_on_length(2.4, omega, inside(7.0, 9.5))
+    assert not _remarks_on_length(2.4, omega, inside(10.0, 11.0))
 
 
 @pytest.mark.parametrize("seed", range(3))
