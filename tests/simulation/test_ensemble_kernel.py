@@ -53,7 +53,9 @@ def in_mode(mode, function):
         return jax.jit(run, compiler_options=QUICK)(jnp.asarray(GAINS))
 
 
-@pytest.mark.parametrize("run, delay", [(stored, 0.004), (measured, 0.0075)])
+@pytest.mark.parametrize(
+    "run, delay", [(stored, 0.004), pytest.param(measured, 0.0075, marks=pytest.mark.slow)]
+)
 def test_a_flight_and_its_gradient_are_those_of_the_plain_loop(run, delay):
     found, expected = (in_mode(x, ft.partial(run, delay=delay)) for x in ("forced", "auto"))
     assert not _switch.left_plain()

@@ -97,6 +97,7 @@ def test_a_second_tune_of_equal_shapes_compiles_nothing(caplog):
     assert not [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
 
 
+@pytest.mark.slow
 def test_the_optimum_is_the_one_that_scipy_finds():
     from scipy.optimize import minimize
 
