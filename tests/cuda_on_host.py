@@ -72,10 +72,10 @@ def _compiled(text, name, count, blocks, block):
     assert len(pointers) == count
     arguments = ", ".join(f"({kind})p[{k}]" for k, kind in enumerate(pointers))
     whole = _HOST.format(text=text, name=name, arguments=arguments, blocks=blocks, block=block)
-    folder = pathlib.Path(tempfile.mkdtemp())
-    source, library = folder / "kernel.cpp", folder / "kernel.so"
-    source.write_text(whole)
     # Without fused operations: the plain loop has none.
     options = ["-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC"]
-    subprocess.run(["g++", *options, "-o", library, source], check=True)
-    return ctypes.CDLL(str(library)).all
+    with tempfile.TemporaryDirectory() as folder:
+        source, library = pathlib.Path(folder, "kernel.cpp"), pathlib.Path(folder, "kernel.so")
+        source.write_text(whole)
+        subprocess.run(["g++", *options, "-o", library, source], check=True)
+        return ctypes.CDLL(str(library)).all
