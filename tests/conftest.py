@@ -11,6 +11,8 @@ from pathlib import Path
 
 # Many small matrices: threads would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# The workers of the tests fill the machine: commands share nothing but in tests of that.
+os.environ.setdefault("JAXQUAD_SECOND_PROCESS", "off")
 
 import equinox as eqx
 import jax

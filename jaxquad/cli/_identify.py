@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxquad.records import parse_mix, require_file
-from jaxquad.workflows import default_folder, IdentifySettings, in_options
+from jaxquad.workflows import (
+    default_folder,
+    IdentifySettings,
+    in_options,
+    open_again,
+    open_logs,
+)
 
 from ._options import (
     add_config,
@@ -23,6 +29,7 @@ from ._options import (
     Command,
     folder_to_write,
     given_settings,
+    open_beside,
     print_json,
     print_table,
     settings_of,
@@ -125,16 +132,15 @@ def _identify(options: argparse.Namespace) -> int:
     _require_used_units(vars(options).get("units", ()), given)
     if given.verify:
         require_file(given.verify)
-    start_computing()
-    from jaxquad.workflows import identify, propose_settings
+    opening = open_beside(options.file, open_logs, options.file, given)
+    from jaxquad.workflows import identify_opened
 
-    first, several = options.file[0], len(options.file) > 1
-    settings, proposal = propose_settings(first, given, several=several)
-    if proposal is not None:
+    opened = opening.get()
+    if opened.proposal is not None:
         with stdout_for_json(options):
-            print(f"{proposal}\n", flush=True)
-    found = identify(options.file if several else first, settings, proposal=proposal)
-    return _finish(options, found, options.out or default_folder(first))
+            print(f"{opened.proposal}\n", flush=True)
+    folder = options.out or default_folder(options.file[0])
+    return _finish(options, identify_opened(opened), folder)
 
 
 def _require_used_units(typed: Sequence[str], settings: IdentifySettings) -> None:
@@ -198,10 +204,10 @@ def _report(options: argparse.Namespace) -> int:
     from jaxquad.workflows import load_result
 
     stored = load_result(options.result)
-    start_computing()
-    from jaxquad.workflows import identify_again
+    opening = open_beside(stored.logs, open_again, stored, log=options.log)
+    from jaxquad.workflows import identify_opened
 
-    found = identify_again(stored, log=options.log)
+    found = identify_opened(opening.get())
     return _finish(options, found, options.out or stored.folder)
 
 

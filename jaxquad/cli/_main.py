@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from jaxquad._core import allowed_second_process
 from jaxquad.records import RecordWarning
 from jaxquad.workflows import in_options
 
@@ -80,7 +81,7 @@ def _run(words: Sequence[str]) -> int:
     options, unknown = make_parser().parse_known_args(words)
     if unknown:
         return _fail(_describe_unknown(options, unknown), _UNUSABLE)
-    with warnings.catch_warnings(), shown_stages(options):
+    with warnings.catch_warnings(), shown_stages(options), allowed_second_process():
         warnings.simplefilter("always", RecordWarning)
         warnings.showwarning = _print_warning
         check_out(options)

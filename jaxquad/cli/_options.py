@@ -3,13 +3,22 @@
 import argparse
 import contextlib
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TYPE_CHECKING, TypeVar
 
-from jaxquad._core import collect_seldom
+from jaxquad._core import (
+    announce,
+    beside,
+    collect_seldom,
+    has_second_process,
+    Later,
+    prepare_second_process,
+    start_second_process,
+)
 from jaxquad.workflows import (
     AutopilotSettings,
     BatchSettings,
@@ -18,6 +27,10 @@ from jaxquad.workflows import (
     IdentifySettings,
     TuneSettings,
 )
+
+
+if TYPE_CHECKING:
+    from jaxquad.workflows import OpenedLogs
 
 
 Run = Callable[[argparse.Namespace], int]
@@ -194,6 +207,36 @@ def start_computing() -> None:
 
     enable_x64()
     enable_compile_cache()
+
+
+_LARGEST = 32 << 20  # bytes of logs, which are in the memory of both processes
+
+
+def open_beside(
+    logs: Sequence[Path], opening: Callable[..., "OpenedLogs"], *args: Any, **named: Any
+) -> "Later[OpenedLogs]":
+    """Have a second process open `logs` while this one imports JAX; it helps from there on."""
+    sizes = [path.stat().st_size if path.is_file() else math.inf for path in logs]
+    if sum(sizes) <= _LARGEST:
+        start_second_process()
+    opened = beside(opening, *args, **named)
+    prepare_second_process(_prepare)
+    start_computing()
+    if has_second_process():
+        announce(f"reading {' and '.join(path.name for path in logs)}")
+    return opened
+
+
+def _prepare() -> None:
+    """What a second process will need: JAX, estimates and reports with matplotlib."""
+    start_computing()
+    import scipy.linalg.lapack
+    import scipy.special
+
+    from jaxquad.report import write_report
+    from jaxquad.workflows import identify
+
+    del identify, scipy, write_report
 
 
 @contextlib.contextmanager

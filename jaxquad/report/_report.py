@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxquad._core import write_file
+from jaxquad._core import beside as begin, Later, write_file
 from jaxquad.identify import Combination, Fit, MISFIT, Verification
 from jaxquad.models import Model
 from jaxquad.records import Record
@@ -26,6 +26,12 @@ from ._step import step_section
 if TYPE_CHECKING:
     from jaxquad.simulation import Simulation
     from jaxquad.tuning import Certificate, Tuned
+
+
+_ORDER = (
+    "answers", "step", "loop", "tuned", "response", "parameters", "identifiability",
+    "verification", "spectrum", "record", "provenance",
+)  # fmt: skip
 
 
 def write_report(
@@ -86,30 +92,23 @@ def write_report(
     remarks = remarks_of(fit, found)
     headlines = [fit_headline(fit, len(remarks))]
     headlines += [check_headline(name, check, fit) for name, check in found.items()]
-    gains = None
     if tuned is not None:
-        from ._tuned import tuned_section, verdict_headlines  # the room of tuning takes 0.2 s
+        from ._tuned import verdict_headlines  # the room of tuning takes 0.2 s
 
         headlines += verdict_headlines(tuned)
-        gains = tuned_section(tuned, flights or {})
     first = next(iter(frfs.values()))
     names = (first.output_names[0], first.input_names[0])
     channels = {*first.input_names, *first.output_names}
     flown = next((each for each in records.values() if channels <= {*each.names}), None)
-    shown = flown if spectrum is None else spectrum
+    drawn = {} if tuned is None else _begin_tuned(tuned, flights or {})
+    drawn |= _begin_drawn(fit, frfs, models, others or {}, records, flown, spectrum)
+    drawn |= {"verification": begin(check_section, found)} if found else {}
     sections = {
         "answers": answer_section(fit, first, next(iter(records.values()), None), found),
-        "step": None if flown is None else step_section(fit, first, flown),
-        "loop": None if flown is None else loop_section(first, flown),
-        "tuned": gains,
-        "response": response_section(frfs, models, others or {}),
         "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
         "identifiability": identifiability_section(fit),
-        "verification": check_section(found) if found else None,
-        "spectrum": None if shown is None else spectrum_section(first, shown),
-        "record": record_section(records) if records else None,
         "provenance": provenance_section(provenance) if provenance is not None else None,
-    }
+    } | {name: section.get() for name, section in drawn.items()}
     text = render_page(
         "report.html",
         title=f"{headlines[0].word}: {title or ' / '.join(names)}",
@@ -118,9 +117,39 @@ def write_report(
         headlines=headlines,
         remarks=remarks,
         formula=formula,
-        sections={name: section for name, section in sections.items() if section is not None},
+        sections={name: sections[name] for name in _ORDER if sections.get(name) is not None},
     )
     return write_file(path, text)
+
+
+def _begin_drawn(
+    fit: Fit,
+    frfs: Mapping[str, FrequencyResponse],
+    models: Mapping[str, Model],
+    others: Mapping[str, FrequencyResponse],
+    records: Mapping[str, Record],
+    flown: Record | None,
+    spectrum: Record | None,
+) -> dict[str, Later]:
+    """The sections with figures, which a second process draws where a command has one."""
+    first = next(iter(frfs.values()))
+    sections: dict[str, Later] = {"response": begin(response_section, frfs, models, others)}
+    if flown is not None:
+        sections["step"] = begin(step_section, fit, first, flown)
+        sections["loop"] = begin(loop_section, first, flown)
+    if (shown := flown if spectrum is None else spectrum) is not None:
+        sections["spectrum"] = begin(spectrum_section, first, shown)
+    if records:
+        sections["record"] = begin(record_section, records)
+    return sections
+
+
+def _begin_tuned(
+    tuned: "Tuned | Certificate", flights: "Mapping[str, Simulation]"
+) -> dict[str, Later]:
+    from ._tuned import tuned_section
+
+    return {"tuned": begin(tuned_section, tuned, flights)}
 
 
 def _models(

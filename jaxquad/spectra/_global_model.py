@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from jaxquad._core import beside
+
 from ._local_fit import Bins
 from ._rational_fit import (
     columns_of,
@@ -116,13 +118,14 @@ def global_models(
     reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
     places = _thin(reach, _MOST_BINS)
     scale = float(np.abs(np.exp(-1j * dt * bins.omega[places[-1]]) - 1)) / 2
-    tasks = (
+    tasks = [
         _Task(_equations(bins, places, inputs, output, scale, dt), bins.omega[places], most)
         for output in range(outputs.start, outputs.stop)
-    )
+    ]
+    models = [beside(_identify_kept, task) for task in tasks]
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
-        for one in map(_identify_kept, tasks)
+        for one in (each.get() for each in models)
     ]
 
 

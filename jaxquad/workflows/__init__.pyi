@@ -18,9 +18,16 @@ from ._demo import (
 from ._identify import (
     Identification as Identification,
     identify as identify,
+    identify_fit as identify_fit,
+    identify_opened as identify_opened,
 )
 from ._kinds import SettingsError as SettingsError
-from ._log import propose_settings as propose_settings
+from ._log import (
+    open_again as open_again,
+    open_logs as open_logs,
+    OpenedLogs as OpenedLogs,
+    propose_settings as propose_settings,
+)
 from ._result_file import (
     default_folder as default_folder,
     free_folder as free_folder,

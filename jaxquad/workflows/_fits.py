@@ -1,14 +1,23 @@
 """Responses and fits of an identification, over the whole band and over parts of it."""
 
 import dataclasses
+import functools as ft
 import multiprocessing
 import re
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import announce, map_in_threads, one_blas_thread
+from jaxquad._core import (
+    announce,
+    beside,
+    has_second_process,
+    Later,
+    map_in_threads,
+    one_blas_thread,
+)
 from jaxquad.identify import (
     CoherenceWeighted,
     Combination,
@@ -42,7 +51,7 @@ _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
-_SIDE_BY_SIDE = 10**6  # samples of all records up to which estimates share the memory
+LONG = 10**6  # samples of all records, above which estimates do not share the memory
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
 _DOMINATED, _EARLY = "feedback-dominated", "the phase increases"  # as remarks begin
@@ -51,52 +60,67 @@ EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or rec
 _WIDER = "excite the axis (jq.sweep) over more than"  # as the remedy of `jq.fit` begins
 
 
-def fit_responses(
+class Estimated(NamedTuple):
+    """The response to trust first and the fit to it; those of the other methods, by method."""
+
+    frf: FrequencyResponse
+    fit: Fit
+    others: Mapping[str, Later[FrequencyResponse]]
+
+
+def fit_best(
     records: tuple[Record, ...], methods: Sequence[str], settings: IdentifySettings,
     filters: Sequence[KnownFilter] = (),
-) -> tuple[dict[str, FrequencyResponse], dict[str, Fit]]:  # fmt: skip
-    """By each of the methods, the one to trust first: a response, and the fit to it.
+) -> Estimated:  # fmt: skip
+    """The fit to the first method's response, while the others' are estimated beside it.
 
     Taken out of the responses is the delay that a fit to a quick one finds; where the fit to the
     first one finds another, all are estimated again. Known `filters` of the output are divided out.
     """
     best, dt = methods[0], records[0].dt
     [quick] = _responses(records, [best], settings, filters, quick=True)
-    delay = _delay_of(_fitted(quick, settings), records)
+    unasked = dataclasses.replace(quick.get(), remarks=())  # to find them takes as long as the fit
+    delay = _delay_of(fit_response(unasked, settings), records)
     frfs = _responses(records, methods, settings, filters, delay)
     announce(f"fit to the {best} response")
-    found = _fitted(frfs[0], settings)
+    found = fit_response(frfs[0].get(), settings)
     other = _delay_of(found, records)
     if other and abs(other - delay) > _NEAR * dt:
         frfs = _responses(records, methods, settings, filters, other)
-        found = _fitted(frfs[0], settings)
-    fits = [found, *(_fitted(frf, settings) for frf in frfs[1:])]
-    return dict(zip(methods, frfs, strict=True)), dict(zip(methods, fits, strict=True))
+        found = fit_response(frfs[0].get(), settings)
+    return Estimated(frfs[0].get(), found, dict(zip(methods[1:], frfs[1:], strict=True)))
 
 
 def _responses(
     records: tuple[Record, ...], methods: Sequence[str], settings: IdentifySettings,
     filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
-) -> list[FrequencyResponse]:  # fmt: skip
-    """By each of the methods."""
+) -> list[Later[FrequencyResponse]]:  # fmt: skip
+    """By each of the methods; all but the first are ready later."""
     band = _band(settings)
     omega = np.geomspace(*band, _POINTS) if band else None
     out = ", for the delay" if quick else f", {delay:.4g} s of delay taken out" if delay else ""
-    estimators = [_estimator(settings, method, delay, quick=quick) for method in methods]
     plural = "s" if len(methods) > 1 else ""
     announce(f"{'quick ' if quick else ''}{' and '.join(methods)} response{plural}{out}")
-
-    def estimate(estimator: Estimator) -> FrequencyResponse:
-        frf = frequency_response(list(records), omega, estimator=estimator)
-        return without_filters(frf, filters)
-
+    given = [(_estimator(settings, each, delay, quick=quick), omega, filters) for each in methods]
+    estimate = ft.partial(_estimate, records)
     # The workers of a batch have one core each.
-    alone = multiprocessing.parent_process() is None
-    if not alone or sum(record.time.size for record in records) > _SIDE_BY_SIDE:
-        return [estimate(each) for each in estimators]
-    # The number of BLAS threads is the whole process's: no estimate may set it back for the other.
-    with one_blas_thread():
-        return map_in_threads(estimate, estimators)
+    alone = multiprocessing.parent_process() is None and not has_second_process()
+    if alone and sum(record.time.size for record in records) <= LONG:
+        # The BLAS threads are the whole process's: no estimate may set them back for the other.
+        with one_blas_thread():
+            return list(map(Later.known, map_in_threads(lambda each: estimate(*each), given)))
+    others = [beside(_estimate, records, *each) for each in given[1:]]
+    return [Later.known(estimate(*given[0])), *others]
+
+
+def _estimate(
+    records: tuple[Record, ...],
+    estimator: Estimator,
+    omega: Float[np.ndarray, " frequencies"] | None,
+    filters: Sequence[KnownFilter],
+) -> FrequencyResponse:
+    frf = frequency_response(list(records), omega, estimator=estimator)
+    return without_filters(frf, filters)
 
 
 def _delay_of(found: Fit, records: tuple[Record, ...]) -> float:
@@ -104,7 +128,7 @@ def _delay_of(found: Fit, records: tuple[Record, ...]) -> float:
     if not found.verdict.fitted:
         return 0.0
     dt, duration = records[0].dt, max(record.duration for record in records)
-    total = dt * round(float(total_delay(found.model)) / dt)
+    total = dt * round(sum(map(float, _late(found.model))) / dt)
     return total if 0 < total < _LONGEST * duration else 0.0
 
 
@@ -128,7 +152,7 @@ def _estimator(settings: IdentifySettings, method: str, delay: float, *, quick: 
     return JointInputOutput(estimator) if method == "joint" else estimator
 
 
-def _fitted(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
+def fit_response(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
     cost, n = _COSTS[settings.cost], settings.integrators
     if settings.poles is not None:
         return fit_transfer_function(
@@ -156,7 +180,12 @@ def _start(frf: FrequencyResponse, settings: IdentifySettings) -> LaggedIntegrat
 
 def total_delay(model: Model) -> Float[Array, ""]:
     """The sum of lag and delay, which a record determines better than either of them."""
-    return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
+    first, *others = _late(model)
+    return sum(others, first)
+
+
+def _late(model: Model) -> Sequence[Float[Array, ""]]:
+    return (model.delay,) if isinstance(model, TransferFunction) else (model.lag, model.delay)
 
 
 def sums_of(settings: IdentifySettings) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:

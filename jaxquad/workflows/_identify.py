@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, end_second_process, Later
 from jaxquad.identify import (
     Bands,
     Combination,
@@ -31,14 +31,16 @@ from jaxquad.spectra import (
 
 from ._fits import (
     EXCITE,
+    fit_best,
     fit_parts,
-    fit_responses,
+    fit_response,
     in_option_words,
+    LONG,
     sums_of,
     with_remedies,
     with_units,
 )
-from ._log import mix_of, propose_settings, read_logs, read_records
+from ._log import mix_of, open_logs, OpenedLogs, read_records
 from ._result_file import default_folder
 from ._settings import IdentifySettings
 
@@ -255,22 +257,26 @@ def identify(
         result.write("results/flight")
         ```
     """
-    found = _identify(path, settings, proposal, beside=True)
-    return dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
+    return identify_opened(open_logs(path, settings, proposal))
 
 
-def identify_fit(
-    path: str | Path | Sequence[str | Path], settings: IdentifySettings
-) -> Identification:
+def identify_opened(opened: OpenedLogs) -> Identification:
+    """Identify logs that are open, as `identify` does those of a path."""
+    found, others = _identify(opened, compare=True)
+    found = dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
+    return _with_others(found, others)
+
+
+def identify_fit(opened: OpenedLogs) -> Identification:
     """The estimate to trust and its fit alone, which are what a design needs."""
-    return _identify(path, settings, None, beside=False)
+    return _identify(opened)[0]
 
 
 def identify_plant(
     path: Path, settings: IdentifySettings, proposal: Proposal, filters: Sequence[KnownFilter]
 ) -> Identification:
     """Likewise, up to what the `filters` of the output were given; its remedies are flights."""
-    found = _identify(path, settings, proposal, beside=False, filters=filters)
+    found, _ = _identify(open_logs(path, settings, proposal), filters=filters)
     fits = {method: _with_remedy(each, EXCITE) for method, each in found.fits.items()}
     return dataclasses.replace(found, fits=fits)
 
@@ -285,30 +291,36 @@ def _with_remedy(found: Fit, remedy: str) -> Fit:
 
 
 def _identify(
-    path: str | Path | Sequence[str | Path],
-    settings: IdentifySettings | None,
-    proposal: Proposal | None,
-    *,
-    beside: bool,
-    filters: Sequence[KnownFilter] = (),
-) -> Identification:
-    """`beside` the estimate to trust, the direct one is fitted, too."""
-    path, *more = [Path(path)] if isinstance(path, str | Path) else map(Path, path)
-    if proposal is None:
-        given = settings or IdentifySettings()
-        settings, proposal = propose_settings(path, given, several=bool(more))
-    settings = settings or IdentifySettings()
-    records = read_logs((path, *more), settings)
+    opened: OpenedLogs, *, compare: bool = False, filters: Sequence[KnownFilter] = ()
+) -> tuple[Identification, Mapping[str, Later[FrequencyResponse]]]:
+    """The estimate to trust and its fit; the estimates to `compare` it with, by method."""
+    (path, *more), settings, proposal, records = opened
+    if sum(record.time.size for record in records) > LONG:
+        end_second_process()
     best, *others = ("joint", "direct") if settings.reference else ("direct",)
-    methods = (best, *(others if beside else ()))
-    responses, found = fit_responses(records, methods, settings, filters)
-    fits = {name: with_units(with_remedies(f, settings), records[0]) for name, f in found.items()}
+    methods = (best, *(others if compare else ()))
+    estimated = fit_best(records, methods, settings, filters)
+    fit = with_units(with_remedies(estimated.fit, settings), records[0])
     announce("fits to parts of the band")
-    fits[best], parts = fit_parts(fits[best], responses[best], settings)
-    fits = {name: in_option_words(each) for name, each in fits.items()}
-    return Identification(
+    fit, parts = fit_parts(fit, estimated.frf, settings)
+    responses, fits = {best: estimated.frf}, {best: in_option_words(fit)}
+    found = Identification(
         path, settings, records, responses, fits, parts, None, proposal, more=tuple(more)
     )
+    return found, estimated.others
+
+
+def _with_others(
+    found: Identification, others: Mapping[str, Later[FrequencyResponse]]
+) -> Identification:
+    """The estimates that are compared with the one to trust, and the fits to them."""
+    responses, fits = dict(found.responses), dict(found.fits)
+    for method, later in others.items():
+        announce(f"fit to the {method} response")
+        responses[method] = later.get()
+        fit = with_remedies(fit_response(responses[method], found.settings), found.settings)
+        fits[method] = in_option_words(with_units(fit, found.records[0]))
+    return dataclasses.replace(found, responses=responses, fits=fits)
 
 
 def _fitted_again(found: Identification) -> dict[str, Bands | Explanation | None]:

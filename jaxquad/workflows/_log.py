@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +18,10 @@ from jaxquad.records import (
     RecordError,
     Segment,
 )
+from jaxquad.report import sha256_of
 
 from ._kinds import mix_text, SettingsError
+from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
 
@@ -62,6 +65,68 @@ def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, 
     if len(spans) > 1:
         return {"segments": spans, "start": None, "stop": None}
     return dict(zip(("start", "stop"), spans[0], strict=True)) if spans else {}
+
+
+class OpenedLogs(NamedTuple):
+    """What `identify_opened` computes with: one log, or several of one vehicle, as records.
+
+    **Attributes:**
+
+    - `paths`: of the logs.
+    - `settings`: those given, with what the log proposes.
+    - `proposal`: where the log itself said what is input and output.
+    - `records`: one for each segment of each log.
+    """
+
+    paths: tuple[Path, ...]
+    settings: IdentifySettings
+    proposal: Proposal | None
+    records: tuple[Record, ...]
+
+
+def open_logs(
+    path: str | Path | Sequence[str | Path],
+    settings: IdentifySettings | None = None,
+    proposal: Proposal | None = None,
+) -> OpenedLogs:
+    """Read what `identify` takes, with the same arguments; it needs no JAX.
+
+    **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
+    ValueError for settings that do not go with it.
+    """
+    paths = (Path(path),) if isinstance(path, str | Path) else tuple(map(Path, path))
+    if proposal is None:
+        given = settings or IdentifySettings()
+        settings, proposal = propose_settings(paths[0], given, several=len(paths) > 1)
+    settings = settings or IdentifySettings()
+    return OpenedLogs(paths, settings, proposal, read_logs(paths, settings))
+
+
+def open_again(result: str | Path | StoredResult, *, log: str | Path | None = None) -> OpenedLogs:
+    """Read the logs of a stored result with its settings, see `identify_again`."""
+    stored = result if isinstance(result, StoredResult) else load_result(result)
+    paths = stored.logs
+    if log is not None:
+        paths = [Path(log) / path.name for path in paths] if len(paths) > 1 else [Path(log)]
+    verified = stored.settings.verify
+    files = [*paths, *([Path(verified)] if verified else [])]
+    for file, known in zip(files, stored.hashes, strict=True):
+        _check_unchanged(file, known)
+    return open_logs(list(paths), stored.settings)
+
+
+def _check_unchanged(path: Path, known: str) -> None:
+    try:
+        found = sha256_of(path)
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"{path}: the log is gone: give the place that it was moved to (--log)"
+        ) from error
+    if found != known:
+        raise ValueError(
+            f"{path}: this is not the log that was identified (SHA-256 {found[:12]}... instead of "
+            f"{known[:12]}...)"
+        )
 
 
 def read_logs(paths: Sequence[Path], settings: IdentifySettings) -> tuple[Record, ...]:

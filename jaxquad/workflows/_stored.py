@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, beside
 from jaxquad.identify import Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError
-from jaxquad.report import provenance, sha256_of, write_report, write_results
+from jaxquad.report import provenance, write_report, write_results
 
-from ._identify import Identification, identify, identify_fit
-from ._log import read_records
+from ._identify import Identification, identify_opened
+from ._log import open_again, read_records
 from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
@@ -45,7 +45,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         **_model_content(found),
     }
     path = write_results(folder, fit=found.fit, frf=found.frf, check=found.check, extra=extra)
-    _write_figures(found, folder)
+    drawn = beside(_write_figures, found, folder)
     others = {f"{name} estimate": found.responses[name] for name in list(found.responses)[1:]}
     write_report(
         folder / "report.html",
@@ -60,6 +60,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         formula=found.formula,
         beside=found.beside,
     )
+    drawn.get()
     return path
 
 
@@ -149,43 +150,7 @@ def identify_again(
 
     **Raises:** ValueError where a log is gone, or is not the same file by its SHA-256.
     """
-    return identify(*_unchanged_logs(result, log))
-
-
-def fit_again(
-    result: str | Path | StoredResult, *, log: str | Path | None = None
-) -> Identification:
-    """As `identify_again`, but only the estimate to trust and its fit."""
-    return identify_fit(*_unchanged_logs(result, log))
-
-
-def _unchanged_logs(
-    result: str | Path | StoredResult, log: str | Path | None
-) -> tuple[list[Path], IdentifySettings]:
-    """The logs of a stored result and its settings."""
-    stored = result if isinstance(result, StoredResult) else load_result(result)
-    paths = stored.logs
-    if log is not None:
-        paths = [Path(log) / path.name for path in paths] if len(paths) > 1 else [Path(log)]
-    verified = stored.settings.verify
-    files = [*paths, *([Path(verified)] if verified else [])]
-    for file, known in zip(files, stored.hashes, strict=True):
-        _check_unchanged(file, known)
-    return list(paths), stored.settings
-
-
-def _check_unchanged(path: Path, known: str) -> None:
-    try:
-        found = sha256_of(path)
-    except FileNotFoundError as error:
-        raise ValueError(
-            f"{path}: the log is gone: give the place that it was moved to (--log)"
-        ) from error
-    if found != known:
-        raise ValueError(
-            f"{path}: this is not the log that was identified (SHA-256 {found[:12]}... instead of "
-            f"{known[:12]}...)"
-        )
+    return identify_opened(open_again(result, log=log))
 
 
 def verify_result(

@@ -1,14 +1,14 @@
 """Tune a controller on an identified axis: from a result and settings to certified gains."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from jaxquad._core import announce, plain_content
+from jaxquad._core import announce, beside, plain_content
 from jaxquad.control import certainty_equivalence, LADRC, schedule_for_flight, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
@@ -18,7 +18,7 @@ from jaxquad.models import DecoupledAxes
 from jaxquad.plot import certificate_figure, convergence_figure, flight, headless
 from jaxquad.records import Record
 from jaxquad.report import provenance, write_json, write_report
-from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, simulate, Step
+from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, simulate, Simulation, Step
 from jaxquad.tuning import (
     describe_controller,
     Evaluation,
@@ -32,9 +32,9 @@ from jaxquad.tuning import (
     worst_flights,
 )
 
-from ._identify import Identification
+from ._identify import Identification, identify_fit
+from ._log import open_again
 from ._result_file import StoredResult
-from ._stored import fit_again
 from ._tune_settings import TuneSettings
 
 
@@ -95,13 +95,7 @@ class Tuning:
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
-        with headless():
-            figures = {"convergence.png": convergence_figure(tuned.history)}
-            if tuned.certificate is not None:
-                figures["certificate.png"] = certificate_figure(tuned.certificate)
-            figures["flight.png"] = flight(flights)
-        for file, panels in figures.items():
-            panels.figure.savefig(folder / file, dpi=130)
+        drawn = beside(_write_figures, folder, tuned, flights)
         write_report(
             folder / "report.html",
             fit=found.fit,
@@ -112,10 +106,21 @@ class Tuning:
             provenance=origin,
             formula=found.formula,
         )
-        return [folder / file for file in ("tuned.json", f"{name}.h", "report.html", *figures)]
+        return [folder / "tuned.json", folder / f"{name}.h", folder / "report.html", *drawn.get()]
 
     def __str__(self) -> str:
         return str(self.tuned)
+
+
+def _write_figures(folder: Path, tuned: Tuned, flights: Mapping[str, Simulation]) -> list[Path]:
+    with headless():
+        figures = {"convergence.png": convergence_figure(tuned.history)}
+        if tuned.certificate is not None:
+            figures["certificate.png"] = certificate_figure(tuned.certificate)
+        figures["flight.png"] = flight(flights)
+    for file, panels in figures.items():
+        panels.figure.savefig(folder / file, dpi=130)
+    return [folder / file for file in figures]
 
 
 def tune(
@@ -144,7 +149,9 @@ def tune(
     **Raises:** ValueError for an output whose unit is neither rad nor rad/s, and for a negative
     gain; `UndeterminedError` (a ValueError) where the record does not determine the plant.
     """
-    found = result if isinstance(result, Identification) else fit_again(result, log=log)
+    found = result
+    if not isinstance(found, Identification):
+        found = identify_fit(open_again(found, log=log))
     if not found.fit.verdict.fitted:
         raise UndeterminedError(found.fit.verdict.summary)
     record = found.records[0]

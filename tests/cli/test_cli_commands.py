@@ -252,7 +252,7 @@ def test_a_stage_that_takes_longer_than_a_second_is_a_line(more, said, demo, cap
             time.sleep(seconds)
         raise ValueError("enough")
 
-    monkeypatch.setattr("jaxquad.workflows.identify", identify_slowly)
+    monkeypatch.setattr("jaxquad.workflows.identify_opened", identify_slowly)
     words = ["identify", str(demo / "demo.csv"), "--input", "M", "--output", "q", "--json", *more]
     assert main(words) == 2
     printed = capsys.readouterr()

@@ -1,8 +1,11 @@
 """The commands of docs/measured.md, typed where the measured flights lie, and their answers."""
 
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from jaxquad.cli import main
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled_quickly")]
+DATE = re.compile(rb"20\d\d-\d\d-\d\d[T ]\d\d:\d\d(:\d\d\+00:00)?")
 PAGE = (ROOT / "docs" / "measured.md").read_text()
 COMMANDS = [
     shlex.split(block.replace("\\\n", " "))[1:]
@@ -42,6 +46,23 @@ def test_the_pitch_rig_has_its_gain_and_the_sum_of_lag_and_delay(identified):
     assert code == 0 and 270 < found["gain"] < 295
     assert 0.024 < found["lag"] + found["delay"] < 0.029  # s
     assert "joint" in printed and "direct" in printed and "lag + delay" in printed
+
+
+def test_a_second_process_changes_no_byte_of_a_result(data, tmp_path):
+    [words] = [words for words in COMMANDS if words[1].endswith("antx_log3_prbs.npz")]
+    printed, pages = [], []
+    for second in ("off", "on"):
+        told = os.environ | {"JAXQUAD_SECOND_PROCESS": second}
+        command = [sys.executable, "-m", "jaxquad", *words, "--out", str(tmp_path / "found")]
+        ran = subprocess.run(
+            [*command, "--force", "--quiet"], env=told, cwd=data, capture_output=True
+        )
+        assert ran.returncode == 0
+        files = sorted((tmp_path / "found").iterdir())
+        printed.append((ran.stdout, ran.stderr))
+        pages.append({each.name: DATE.sub(b"", each.read_bytes()) for each in files})
+    assert printed[0] == printed[1]
+    assert pages[0] == pages[1] and len(pages[0]) == 4
 
 
 @pytest.mark.parametrize(("file", "inertia"), [("log15", 1.1e-5), ("log15.npz", 1.3e-5)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 import re
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxquad.workflows import (
     identify_again,
     IdentifySettings,
     load_result,
+    open_logs,
     verify_result,
 )
 
@@ -65,6 +67,14 @@ def test_a_reference_that_moves_nothing_leaves_no_response_and_is_named(poles, t
     [remark] = found.frf.remarks
     assert "the references move the inputs too little" in remark
     assert remark in str(found)
+
+
+def test_what_two_processes_share_can_be_sent(log, found):
+    sent = lambda x: pickle.loads(pickle.dumps(x))
+    opened = sent(open_logs(log, found.settings))
+    assert opened.settings == found.settings and opened.paths == found.paths
+    np.testing.assert_array_equal(opened.records[0].inputs, found.records[0].inputs)
+    assert str(sent(found)) == str(found)
 
 
 def test_numbers_and_figures_are_at_hand_without_a_folder(found):

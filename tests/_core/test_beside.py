@@ -1,0 +1,104 @@
+"""A second process computes what this one would have, and its end loses nothing."""
+
+import os
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+from jaxquad._core import (
+    _beside,
+    allowed_second_process,
+    beside,
+    has_second_process,
+    Later,
+    prepare_second_process,
+    start_second_process,
+)
+
+
+@pytest.fixture
+def second(monkeypatch):
+    monkeypatch.delenv("JAXQUAD_SECOND_PROCESS")
+    monkeypatch.setattr(_beside, "available_cores", lambda: 2)
+    with allowed_second_process():
+        start_second_process()
+        assert _beside._second is not None
+        yield _beside._second
+
+
+def begun(function, *args):
+    """`beside`, once the other process has begun with it: from there on nobody else may."""
+    later = beside(function, *args)
+    assert _beside._second is not None
+    while later in _beside._second._waiting:
+        time.sleep(0.01)
+    return later
+
+
+def end_elsewhere(here):
+    """Where it is called."""
+    if os.getpid() != here:
+        os._exit(3)
+    return os.getpid()
+
+
+def scale(values, by):
+    return by * values
+
+
+def test_calls_are_made_in_another_process_in_their_order(second):
+    prepare_second_process(np.show_config)  # what it prints comes among no answers
+    there, scaled = begun(os.getpid), begun(scale, np.arange(3.0), 2)
+    assert there.get() == there.get() != os.getpid()
+    np.testing.assert_array_equal(scaled.get(), [0, 2, 4])
+
+
+def test_errors_and_warnings_come_where_the_result_is_asked_for(second):
+    wrong, warned = begun(int, "x"), begun(warnings.warn, "careful", UserWarning)
+    with pytest.raises(ValueError, match="invalid literal"):
+        wrong.get()
+    with pytest.warns(UserWarning, match="careful"):
+        warned.get()
+
+
+def test_who_waits_computes_what_nobody_has_begun(second):
+    long, last = begun(time.sleep, 0.3), beside(os.getpid)
+    long.get()
+    assert last.answer is not None and last.get() == os.getpid()
+
+
+def test_what_a_process_does_not_finish_is_computed_here(second):
+    lost, waiting = begun(end_elsewhere, os.getpid()), beside(os.getpid)
+    assert lost.get() == waiting.get() == os.getpid()
+    assert beside(scale, 2, by=3).get() == 6
+
+
+def test_what_cannot_be_sent_is_computed_here(second):
+    later = beside(lambda: 3)
+    second._feeding.join(10)
+    assert later.get() == 3
+
+
+def test_it_ends_with_the_command(second):
+    long = begun(time.sleep, 0.2)
+    _beside.end_second_process()
+    assert second._process.returncode is not None and not has_second_process()
+    assert long.get() is None and beside(os.getpid).get() == os.getpid()
+
+
+@pytest.mark.parametrize("why_not", ["one core", "off", "no command"])
+def test_without_one_a_result_is_computed_when_it_is_asked_for(why_not, monkeypatch):
+    monkeypatch.setattr(_beside, "available_cores", lambda: 1 + (why_not != "one core"))
+    monkeypatch.setenv("JAXQUAD_SECOND_PROCESS", "off" if why_not == "off" else "on")
+    if why_not == "no command":
+        start_second_process()
+    with allowed_second_process():
+        if why_not != "no command":
+            start_second_process()
+        assert not has_second_process()
+        asked = []
+        later = beside(asked.append, 1)
+        assert not asked and later.get() is None and later.get() is None and asked == [1]
+    assert Later.known(5).get() == 5
