@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jaxquad._core import start_second_process
 from jaxquad.records import parse_mix, require_file
 from jaxquad.workflows import (
     default_folder,
@@ -320,6 +321,7 @@ def _add_demo(declared: argparse.ArgumentParser) -> None:
 def _demo(options: argparse.Namespace) -> int:
     if options.flight:
         return _demo_flight(options)
+    start_second_process()
     start_computing()
     from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
 
@@ -340,11 +342,11 @@ def _demo_flight(options: argparse.Namespace) -> int:
     from jaxquad.workflows import find_demo_flight
 
     log, settings = find_demo_flight()  # before JAX: it may have nothing to compute
-    start_computing()
-    from jaxquad.workflows import identify
+    opening = open_beside([log], open_logs, log, settings)
+    from jaxquad.workflows import identify_opened
 
     folder = options.out or Path("results/demo_flight")
-    return _finish(options, identify(log, settings), folder, _NEXT_FLIGHT)
+    return _finish(options, identify_opened(opening.get()), folder, _NEXT_FLIGHT)
 
 
 DEMO = Command(

@@ -199,8 +199,9 @@ def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
 def start_computing() -> None:
     """JAX in 64 bits, and programs that are kept for the next call.
 
-    What a command can say without JAX it says before.
+    What a command can say without JAX it says before. A second process does the same.
     """
+    prepare_second_process(_prepare)
     collect_seldom()
     from jaxquad._core import enable_x64
     from jaxquad._xla import enable_compile_cache
@@ -220,7 +221,6 @@ def open_beside(
     if sum(sizes) <= _LARGEST:
         start_second_process()
     opened = beside(opening, *args, **named)
-    prepare_second_process(_prepare)
     start_computing()
     if has_second_process():
         announce(f"reading {' and '.join(path.name for path in logs)}")
