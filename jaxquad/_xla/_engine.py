@@ -89,6 +89,7 @@ class Jit:
         options: Callable[[], dict[str, Any]] | None = None,
     ):
         ft.update_wrapper(self, function)
+        self._function = function
         self._options = compiler_options if options is None else options
         self._kept = KeptPrograms(function, self._options)
         self._prepared = Prepared(function, self._options)
@@ -96,6 +97,11 @@ class Jit:
         self._plain = eqx.filter_jit(function)
         self._failed: set[tuple] = set()
         self._known: set[tuple] = set()
+
+    @ft.cached_property
+    def brief(self) -> "Jit":
+        """The same function, compiled with `brief_options`."""
+        return self if self._options is brief_options else Jit(self._function, brief_options)
 
     def __call__(self, *args: PyTree) -> PyTree:
         leaves, structure = jax.tree.flatten(args)
@@ -159,11 +165,14 @@ def compiler_options() -> dict[str, int]:
 
 _WIDEST = {"xla_cpu_prefer_vector_width": 512}  # bits; LLVM takes half of what a CPU can, unasked
 # Without XLA's own compiler of fused operations, and with less of LLVM's: that takes half of the
-# time, and the derivatives of loops run as fast. XLA 0.12 has no way around that compiler: it takes
-# loops no longer than 0.10 without it, and the first fit of a structure 0.9 s of processor more.
+# time, and the derivatives of loops run as fast. LLVM's highest level, 3, unrolls loops over 16 to
+# 64 members, which then take up to twice as long to compile and to run. XLA 0.12 has no way around
+# that compiler: it takes loops no longer than 0.10 without it, and the first fit of a structure
+# 0.9 s of processor more.
+_LEVEL = "xla_backend_optimization_level"
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 _WITHOUT = ("0.12.0.1",)  # of the versions that are not asked, those that do not know this option
-_BRIEF = {_EMITTERS: False, "xla_backend_optimization_level": 1}
+_BRIEF = {_EMITTERS: False, _LEVEL: 2}
 
 
 def brief_options() -> dict[str, Any]:
@@ -175,7 +184,7 @@ def brief_options() -> dict[str, Any]:
 
 def hasty_options() -> dict[str, Any]:
     """For programs without loops over time that run a few times: hardly any optimisation."""
-    level = {"xla_backend_optimization_level": 0}
+    level = {_LEVEL: 0}
     return level if _is_chosen(_EMITTERS) or not _takes(_EMITTERS) else level | {_EMITTERS: False}
 
 

@@ -17,6 +17,7 @@ from ._over_devices import Run
 
 
 _VECTOR, _FEWEST, _USUAL = 16, 32, 128  # members that are computed at once, and of a part
+_SINGLE, _SOME = 8, 64  # members up to which a loop is compiled as a single one, and briefly
 _MOST_PARTS = 64  # beyond which parts grow: each costs a call
 _LEAST = 2**15  # samples times members that make a thread worth its while
 _ALIGNED = 64  # bytes, for an array that JAX takes over without a copy
@@ -35,7 +36,11 @@ def over_cores(
     is worth it and nobody asked for devices; what a part shares with others comes from the first.
     `check` is given the shapes of the whole result before there is room for it.
     """
-    part = _part(program, run, further, devices)
+    part, members = None, _members(run)
+    if members >= 2 * _FEWEST:
+        part = _part(program, run, further, devices)
+    if _SINGLE < (members if part is None else part.width) <= _SOME:
+        program = program.brief
     if part is None:
         return gathered(program(*run, *further, devices))
     joined = _Joined(part, check)
@@ -76,16 +81,19 @@ def _part(program: Jit, run: Run, further: tuple, devices: Devices | None) -> _P
     alone = jax.default_backend() == "cpu" and not may_be_several(None)
     if devices is not None or not alone or cores < 2:
         return None
-    leaves = jax.tree.leaves(run)
-    if not any([_last_axis(x) >= 2 * _FEWEST for x in leaves]):  # seen sooner than an ensemble
-        return None
-    ensemble = ensemble_shape(*run)
+    leaves, ensemble = jax.tree.leaves(run), ensemble_shape(*run)
     members, size = (1, *ensemble)[-1], len(run[1].reference) * math.prod(ensemble)
     width, own = _width(members, cores), jax.tree.leaves(mark_members(run, ensemble))
     keys = any(mine and _is_key(x) for x, mine in zip(leaves, own, strict=True))
     if width == members or size * width < _LEAST * members or keys:
         return None
     return _Part(members, width, own) if program.is_outermost(*run, *further) else None
+
+
+def _members(run: Run) -> int:
+    """On the last axis; 1 for a single loop, which shows sooner than an ensemble."""
+    few = max(map(_last_axis, jax.tree.leaves(run))) <= _SINGLE
+    return 1 if few else (1, *ensemble_shape(*run))[-1]
 
 
 def _last_axis(x: object) -> int:

@@ -33,8 +33,12 @@ def calls(monkeypatch):
     program, seen = _simulate._run, []
 
     class Watched(Jit):
+        @property
+        def brief(self):
+            return self
+
         def __call__(self, *args):
-            found = program(*args)
+            found = program.brief(*args)
             seen.append((threading.get_ident(), found[0][0][0].shape[-1]))
             return found
 
@@ -123,6 +127,21 @@ def test_what_gains_nothing_is_computed_at_once(cores, calls, count, members, de
     cores(count)
     fly(members, devices=devices)
     assert calls == [(threading.get_ident(), members)]
+
+
+@pytest.mark.parametrize(
+    "members, briefly", [(1, False), (8, False), (9, True), (64, True), (65, False)]
+)
+def test_ensembles_of_some_members_are_compiled_briefly(members, briefly):
+    class Asked(Jit):
+        brief = property(lambda self: Asked(lambda *args: {"briefly": np.ones(1)}))
+
+        def __call__(self, *args):
+            return inspect.unwrap(self)(*args)
+
+    program = Asked(lambda *args: {})
+    run = loop(members, **({} if members > 1 else {"inertia": [0.0552]})), happens()
+    assert ("briefly" in _over_cores.over_cores(program, run, (), tuple(jax.devices()))) == briefly
 
 
 def test_a_short_flight_is_not_worth_a_thread(monkeypatch, calls):
