@@ -153,6 +153,7 @@ def _estimator(settings: IdentifySettings, method: str, delay: float, *, quick: 
 
 
 def fit_response(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
+    """The model of the settings, or K e^(-delay s) / (s^n (lag s + 1)), fitted to a response."""
     cost, n = _COSTS[settings.cost], settings.integrators
     if settings.poles is not None:
         return fit_transfer_function(

@@ -261,14 +261,24 @@ def identify(
 
 
 def identify_opened(opened: OpenedLogs) -> Identification:
-    """Identify logs that are open, as `identify` does those of a path."""
+    """Identify logs that are open, as `identify` does those of a path.
+
+    **Arguments:**
+
+    - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
+    """
     found, others = _identify(opened, compare=True)
     found = dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
     return _with_others(found, others)
 
 
 def identify_fit(opened: OpenedLogs) -> Identification:
-    """The estimate to trust and its fit alone, which are what a design needs."""
+    """The estimate to trust and its fit alone, which are what a design needs.
+
+    **Arguments:**
+
+    - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
+    """
     return _identify(opened)[0]
 
 
