@@ -1,5 +1,6 @@
 """Ensembles on several cores of a CPU: what is found is that of one core."""
 
+import functools as ft
 import inspect
 import threading
 
@@ -134,7 +135,9 @@ def test_what_gains_nothing_is_computed_at_once(cores, calls, count, members, de
 )
 def test_ensembles_of_some_members_are_compiled_briefly(members, briefly):
     class Asked(Jit):
-        brief = property(lambda self: Asked(lambda *args: {"briefly": np.ones(1)}))
+        @ft.cached_property
+        def brief(self):
+            return Asked(lambda *args: {"briefly": np.ones(1)})
 
         def __call__(self, *args):
             return inspect.unwrap(self)(*args)
