@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, IO, NamedTuple, ParamSpec, TypeVar
 
+from ._stages import STAGES
 from ._threads import available_cores
 
 
@@ -192,6 +193,7 @@ class _Second:
                     later.answer = answer
                     self._changed.notify_all()
         except Exception:  # whatever it was: where it happens again, the caller sees it
+            STAGES.debug("no second process from here on", exc_info=True)
             with self._changed:
                 self._waiting.extendleft([] if later is None else [later])
                 self._changed.notify_all()

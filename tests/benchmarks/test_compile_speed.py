@@ -5,7 +5,8 @@
 Ten seconds at 2 ms of a three-axis rig under three LADRC, and of three axes under an adaptive LADRC
 with least squares; one loop and 48 inertias. Nothing is read from a cache. "brief" options are
 those of `jq.tune`, "light" ones those of docs/how_to.md for a `jax.jit` of your own. What was
-traced once is not traced again.
+traced once is not traced again. Then `jq.evaluate` by itself, which chooses its options, beside the
+same under XLA's own in the same run: seconds by the clock.
 """
 
 import time
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import brief_options
+from jaxquad._xla import brief_options, compiler_options
 from jaxquad.control import AdaptiveLADRC, certainty_equivalence, LADRC, RecursiveInertia
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
@@ -70,3 +71,27 @@ def test_a_gradient(make, members):
                 end="",
             )
             assert np.isfinite(jax.tree.leaves(run())[0])
+
+
+@pytest.mark.parametrize("members", [1, 16, 32, 48, 64, 100])
+def test_an_evaluation_that_chooses_its_options(members):
+    spread = np.geomspace(0.7, 1.5, members) if members > 1 else np.ones(())
+    loop = rig(GAINS, jnp.asarray(np.multiply.outer([J0, J0, 2 * J0], spread)))
+    run = lambda: jax.block_until_ready(evaluate(loop, HAPPENS))
+    began = time.perf_counter()
+    first = run()
+    took = time.perf_counter() - began
+    arrays, rest = eqx.partition((loop, HAPPENS), eqx.is_array)
+    whole = lambda arrays: evaluate(*eqx.combine(arrays, rest))
+    program = jax.jit(whole, compiler_options=compiler_options())
+    plain = lambda: jax.block_until_ready(program(arrays))
+    np.testing.assert_allclose(plain().itae, first.itae, rtol=1e-9)
+    own, other = (1e3 * min(timed(call) for _ in range(8)) for call in (run, plain))
+    found = f"first call {took:.1f} s, then {own:.1f} ms; under XLA's own options {other:.1f} ms"
+    print(f"\nrig x {members}: {found}", end="")
+
+
+def timed(call):
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import pickle
 import time
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from log_writers import DataFlash
 
 import jaxquad as jq
+from jaxquad._core import _beside
 from jaxquad.cli import main
 from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
 
@@ -263,12 +265,39 @@ PLANT = ["--inertia", "0.01", "--limit", "0.2"]
 SMALL = ["--noise", "0.05", "--members", "8", "--fresh", "32", "--duration", "1.6"]
 
 
+@pytest.fixture
+def shared(monkeypatch):
+    """Commands have a second process, which can be sent all; whether each lived to its end."""
+    monkeypatch.setenv("JAXQUAD_SECOND_PROCESS", "on")
+    monkeypatch.setattr(_beside, "available_cores", lambda: 2)
+    add, end, ends = _beside._Second.add, _beside._Second.end, []
+
+    def send(second, later):
+        pickle.loads(pickle.dumps(later.call))  # also what this process will have computed
+        add(second, later)
+
+    def watch(second):
+        ends.append(second._feeding.is_alive())
+        end(second)
+
+    monkeypatch.setattr(_beside._Second, "add", send)
+    monkeypatch.setattr(_beside._Second, "end", watch)
+    return ends
+
+
+def test_a_second_process_takes_all_of_a_report(demo, shared, capsys, tmp_path):
+    assert main(["report", str(demo), "--out", str(tmp_path), "--quiet"]) == 0
+    assert shared == [True] and "report.html" in capsys.readouterr().out
+    assert (tmp_path / "bode.png").read_bytes() == (demo / "bode.png").read_bytes()
+
+
 @pytest.mark.slow
-def test_a_result_becomes_gains_with_a_certificate(demo, tmp_path, capsys):
+def test_a_result_becomes_gains_with_a_certificate(demo, shared, tmp_path, capsys):
     code = main(["tune", str(demo), *PLANT, *SMALL, "--out", str(tmp_path), "--json"])
     printed = json.loads(capsys.readouterr().out)
     # Whichever way it falls, the code says what the certificate says.
     assert code == (0 if printed["holds"] else 4)
+    assert shared == [True]
     assert printed["holds"] == printed["certificate"]["holds"] and printed["stabilised"]
     assert {"ladrc.wc", "ladrc.wo"} <= {name.partition("[")[0] for name in printed["values"]}
     assert printed["settings"]["inertia"] == 0.01
