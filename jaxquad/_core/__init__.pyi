@@ -8,6 +8,7 @@ from ._arrays import (
 )
 from ._beside import (
     allowed_second_process as allowed_second_process,
+    behind as behind,
     beside as beside,
     end_second_process as end_second_process,
     has_second_process as has_second_process,

@@ -51,14 +51,10 @@ class Answer(NamedTuple):
 class Later(Generic[Found]):
     """What a function will have returned when it is asked for."""
 
-    def __init__(self, call: Call, second: "_Second | None"):
+    def __init__(self, call: Call, second: "_Second | None", *, shared: bool = True):
         self.call, self._second = call, second
+        self.shared = shared  # whether the caller may compute it while it waits for another one
         self.answer: Answer | None = None
-
-    @property
-    def shared(self) -> bool:
-        """Whether the caller's process may compute it as well."""
-        return self._second is not None
 
     @classmethod
     def known(cls, found: Found) -> "Later[Found]":
@@ -97,6 +93,20 @@ def beside(
     return later
 
 
+def behind(
+    function: Callable[Given, Found], *args: Given.args, **named: Given.kwargs
+) -> Later[Found]:
+    """As `beside`, for what is wanted last: the second process takes it when the caller waits.
+
+    A caller that begins with what it wants first, and shares parts of it, would find the process
+    busy.
+    """
+    later: Later[Found] = Later(Call(function, args, named), _second, shared=False)
+    if _second is not None:
+        _second.hold(later)
+    return later
+
+
 def has_second_process() -> bool:
     """Whether `beside` has one."""
     return _second is not None
@@ -117,7 +127,7 @@ def start_second_process() -> None:
 def prepare_second_process(prepare: Callable[[], None]) -> None:
     """Have it call `prepare` next, a function of a module that imports what will be called."""
     if _second is not None:
-        _second.add(Later(Call(prepare, (), {}), None))
+        _second.add(Later(Call(prepare, (), {}), None, shared=False))
 
 
 @contextlib.contextmanager
@@ -143,6 +153,7 @@ def end_second_process() -> None:
 class _Second:
     def __init__(self):
         self._waiting: deque[Later] = deque()
+        self._held: list[Later] = []  # until the caller waits
         self._changed = threading.Condition()
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START.format(sys.path)],
@@ -160,17 +171,26 @@ class _Second:
             self._waiting.append(later)
             self._changed.notify_all()
 
+    def hold(self, later: Later) -> None:
+        with self._changed:
+            self._held.append(later)
+
     def claim(self, wanted: Later) -> Later | None:
         """What the caller computes while it waits: the result itself, or the last that waits."""
         with self._changed:
-            self._changed.wait_for(lambda: wanted.answer or self._mine())
+            self._waiting.extend(self._held)
+            self._held.clear()
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: wanted.answer or self._mine(wanted))
             if wanted.answer:
                 return None
-            mine = wanted if wanted in self._waiting else self._mine()[-1]
+            mine = self._mine(wanted)[-1]
             self._waiting.remove(mine)
             return mine
 
-    def _mine(self) -> list[Later]:
+    def _mine(self, wanted: Later) -> list[Later]:
+        if wanted in self._waiting:
+            return [wanted]
         return [each for each in self._waiting if each.shared]
 
     def end(self) -> None:

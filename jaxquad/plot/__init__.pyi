@@ -1,4 +1,4 @@
-from ._bode import bode as bode, coherence as coherence, COHERENT as COHERENT
+from ._bode import bode as bode, coherence as coherence
 from ._certificate import certificate_figure as certificate_figure
 from ._flight import flight as flight
 from ._histories import (
@@ -8,8 +8,9 @@ from ._histories import (
     record_figure as record_figure,
     ROWS as ROWS,
 )
-from ._labels import (
-    plain_ticks as plain_ticks,
+from ._labels import plain_ticks as plain_ticks
+from ._names import (
+    COHERENT as COHERENT,
     short_names as short_names,
     unit_label as unit_label,
     visible as visible,

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Complex, Float
 from matplotlib.axes import Axes
 
-from ._labels import add_hertz, few_ticks, look_of, plain_ticks, short_names, Style
+from ._labels import add_hertz, few_ticks, look_of, plain_ticks, Style
+from ._names import COHERENT, short_names
 from ._panels import arrange, Given, legend_of, Panels, stacked, WIDTH
 from ._shown import (
     Channels,
@@ -21,7 +22,6 @@ from ._shown import (
 )
 
 
-COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _MARKS = ["x", "+", "^", "s"]
 _COLUMN = 4.6  # inches, of one input of several
 

@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 
 from jaxquad.tuning import Certificate, QUANTITIES, Quantity
 
-from ._labels import draw_limit, marks, plain_ticks, raise_powers
+from ._labels import draw_limit, marks, plain_ticks
+from ._names import raise_powers
 from ._panels import arrange, Given, legend_of, Panels, stacked
 
 

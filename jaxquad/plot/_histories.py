@@ -7,7 +7,8 @@ from jaxtyping import ArrayLike, Float, Int
 
 from jaxquad.records import Record
 
-from ._labels import few_ticks, LINES, short_names, Style, unit_label, visible
+from ._labels import few_ticks, LINES, Style
+from ._names import short_names, unit_label, visible
 from ._panels import arrange, Given, legend_of, Panels, stacked
 
 

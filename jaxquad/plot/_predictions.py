@@ -20,7 +20,8 @@ from jaxquad.records import Record
 from jaxquad.spectra import estimate_step, StepResponse
 
 from ._histories import extremes
-from ._labels import few_ticks, look_of, Style, unit_label
+from ._labels import few_ticks, look_of, Style
+from ._names import unit_label
 from ._panels import arrange, Given, legend_of, Panels, stacked, WIDTH
 from ._shown import analysed, Channels, channels_shown, Measured, named, named_models, Thing
 

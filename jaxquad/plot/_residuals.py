@@ -12,8 +12,8 @@ from jaxquad.models import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
-from ._bode import COHERENT
-from ._labels import add_hertz, few_ticks, plain_ticks, unit_label
+from ._labels import add_hertz, few_ticks, plain_ticks
+from ._names import COHERENT, unit_label
 from ._panels import arrange, Given, Panels, stacked
 from ._shown import channels_shown, Measured
 

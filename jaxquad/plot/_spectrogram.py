@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from jaxquad.records import Record
 
-from ._labels import add_hertz, few_ticks, raise_powers, short_names, unit_label, visible
+from ._labels import add_hertz, few_ticks
+from ._names import raise_powers, short_names, unit_label, visible
 from ._panels import arrange, Given, Panels, stacked
 
 

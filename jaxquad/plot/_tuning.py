@@ -10,7 +10,8 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxquad.tuning import DesignResult, Evaluation, front_point, Pareto, QUANTITIES
 
-from ._labels import draw_limit, marks, plain_ticks, raise_powers, Style
+from ._labels import draw_limit, marks, plain_ticks, Style
+from ._names import raise_powers
 from ._panels import arrange, Given, legend_of, Panels, stacked
 
 

@@ -122,10 +122,11 @@ def global_models(
         _Task(_equations(bins, places, inputs, output, scale, dt), bins.omega[places], most)
         for output in range(outputs.start, outputs.stop)
     ]
-    models = [beside(_identify_kept, task) for task in tasks]
+    # A second process begins with the last; who waits for the first computes it.
+    models = [beside(_identify_kept, task) for task in reversed(tasks)]
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
-        for one in (each.get() for each in models)
+        for one in (each.get() for each in reversed(models))
     ]
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxquad._core import (
     announce,
-    beside,
+    behind,
     has_second_process,
     Later,
     map_in_threads,
@@ -109,7 +109,7 @@ def _responses(
         # The BLAS threads are the whole process's: no estimate may set them back for the other.
         with one_blas_thread():
             return list(map(Later.known, map_in_threads(lambda each: estimate(*each), given)))
-    others = [beside(_estimate, records, *each) for each in given[1:]]
+    others = [behind(_estimate, records, *each) for each in given[1:]]
     return [Later.known(estimate(*given[0])), *others]
 
 

@@ -178,7 +178,7 @@ class Identification:
         return write_identification(self, Path(folder or default_folder(self.path)))
 
     def __str__(self) -> str:
-        from jaxquad.report import compare_fits  # here: with the report comes matplotlib
+        from jaxquad.report import compare_fits  # here: with it come the templates of pages
 
         first, *others = map(str, self.records)
         record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxquad._core import announce, beside
 from jaxquad.identify import Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError
-from jaxquad.report import provenance, write_report, write_results
+from jaxquad.report import provenance, write_results
 
 from ._identify import Identification, identify_opened
 from ._log import open_again, read_records
@@ -46,6 +46,8 @@ def write_identification(found: Identification, folder: Path) -> Path:
     }
     path = write_results(folder, fit=found.fit, frf=found.frf, check=found.check, extra=extra)
     drawn = beside(_write_figures, found, folder)
+    from jaxquad.report import write_report  # here: with it comes matplotlib
+
     others = {f"{name} estimate": found.responses[name] for name in list(found.responses)[1:]}
     write_report(
         folder / "report.html",

@@ -10,6 +10,7 @@ import pytest
 from jaxquad._core import (
     _beside,
     allowed_second_process,
+    behind,
     beside,
     has_second_process,
     Later,
@@ -67,6 +68,22 @@ def test_who_waits_computes_what_nobody_has_begun(second):
     long, last = begun(time.sleep, 0.3), beside(os.getpid)
     long.get()
     assert last.answer is not None and last.get() == os.getpid()
+
+
+def test_what_is_wanted_last_is_held_until_the_caller_waits_and_is_no_work_for_it(second):
+    last, first = behind(os.getpid), begun(os.getpid)
+    while first.answer is None:
+        time.sleep(0.01)
+    assert last.answer is None
+    begun(time.sleep, 0.2).get()
+    while last.answer is None:
+        time.sleep(0.01)
+    assert last.get() == first.get() != os.getpid()
+
+
+def test_what_is_wanted_last_and_nobody_has_begun_is_computed_by_who_wants_it(second):
+    long, last = begun(time.sleep, 0.2), behind(os.getpid)
+    assert last.get() == os.getpid() and long.answer is None
 
 
 def test_what_a_process_does_not_finish_is_computed_here(second):
