@@ -14,13 +14,10 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._answers import answer_section
 from ._fit import identifiability_section, parameter_section
-from ._loop import loop_section
 from ._page import Headline, render_page
 from ._provenance import Provenance, provenance_section
-from ._record import check_section, GOOD_TIC, record_section
-from ._response import response_section
-from ._spectrum import spectrum_section
-from ._step import step_section
+from ._record import check_section, GOOD_TIC
+from ._sections import shown_of
 
 
 if TYPE_CHECKING:
@@ -48,6 +45,7 @@ def write_report(
     beside: Mapping[str, str] | None = None,
     tuned: "Tuned | Certificate | None" = None,
     flights: "Mapping[str, Simulation] | None" = None,
+    drawn: Mapping[str, object] | None = None,
     provenance: Provenance | None = None,
     title: str = "",
     formula: str = "",
@@ -75,6 +73,7 @@ def write_report(
     - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
     - `flights`: of these gains, by name, see `jaxquad.tuning.worst_flights`.
+    - `drawn`: what `draw_sections` of the same results returned, by which nothing is drawn twice.
     - `provenance`: where the result comes from, see `jaxquad.report.provenance`.
     - `title`: by default "output / input" of the first response.
     - `formula`: the model in words.
@@ -83,12 +82,8 @@ def write_report(
 
     **Raises:** ValueError for no response, and for `models` whose names no response has.
     """
-    frfs = {"response": frf} if isinstance(frf, FrequencyResponse) else dict(frf)
-    if not frfs:
-        raise ValueError("frf is empty: give the response that was fitted, or several by name")
-    records = {"record": record} if isinstance(record, Record) else dict(record or {})
+    shown = shown_of(fit, frf, models, others, record, spectrum)
     found = {"verification": checks} if isinstance(checks, Verification) else dict(checks or {})
-    models = _models(fit, frfs, models or {})
     remarks = remarks_of(fit, found)
     headlines = [fit_headline(fit, len(remarks))]
     headlines += [check_headline(name, check, fit) for name, check in found.items()]
@@ -96,19 +91,18 @@ def write_report(
         from ._tuned import verdict_headlines  # the room of tuning takes 0.2 s
 
         headlines += verdict_headlines(tuned)
-    first = next(iter(frfs.values()))
+    first = shown.first
     names = (first.output_names[0], first.input_names[0])
-    channels = {*first.input_names, *first.output_names}
-    flown = next((each for each in records.values() if channels <= {*each.names}), None)
-    drawn = {} if tuned is None else _begin_tuned(tuned, flights or {})
-    drawn |= _begin_drawn(fit, frfs, models, others or {}, records, flown, spectrum)
-    drawn |= {"verification": begin(check_section, found)} if found else {}
+    begun = {} if tuned is None else _begin_tuned(tuned, flights or {})
+    begun |= shown.begin() if drawn is None else {}
+    begun |= {"verification": begin(check_section, found)} if found else {}
     sections = {
-        "answers": answer_section(fit, first, next(iter(records.values()), None), found),
+        "answers": answer_section(fit, first, next(iter(shown.records.values()), None), found),
         "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
         "identifiability": identifiability_section(fit),
         "provenance": provenance_section(provenance) if provenance is not None else None,
-    } | {name: section.get() for name, section in drawn.items()}
+        **(drawn or {}),
+    } | {name: section.get() for name, section in begun.items()}
     text = render_page(
         "report.html",
         title=f"{headlines[0].word}: {title or ' / '.join(names)}",
@@ -122,45 +116,12 @@ def write_report(
     return write_file(path, text)
 
 
-def _begin_drawn(
-    fit: Fit,
-    frfs: Mapping[str, FrequencyResponse],
-    models: Mapping[str, Model],
-    others: Mapping[str, FrequencyResponse],
-    records: Mapping[str, Record],
-    flown: Record | None,
-    spectrum: Record | None,
-) -> dict[str, Later]:
-    """The sections with figures, which a second process draws where a command has one."""
-    first = next(iter(frfs.values()))
-    sections: dict[str, Later] = {"response": begin(response_section, frfs, models, others)}
-    if flown is not None:
-        sections["step"] = begin(step_section, fit, first, flown)
-        sections["loop"] = begin(loop_section, first, flown)
-    if (shown := flown if spectrum is None else spectrum) is not None:
-        sections["spectrum"] = begin(spectrum_section, first, shown)
-    if records:
-        sections["record"] = begin(record_section, records)
-    return sections
-
-
 def _begin_tuned(
     tuned: "Tuned | Certificate", flights: "Mapping[str, Simulation]"
 ) -> dict[str, Later]:
     from ._tuned import tuned_section
 
     return {"tuned": begin(tuned_section, tuned, flights)}
-
-
-def _models(
-    fit: Fit, frfs: Mapping[str, FrequencyResponse], models: Mapping[str, Model]
-) -> dict[str, Model]:
-    unknown = [name for name in models if name not in frfs]
-    if unknown:
-        raise ValueError(f"models of no response: {unknown}; the responses are {list(frfs)}")
-    if not fit.verdict.fitted:
-        return dict(models)
-    return {name: models.get(name, fit.model) for name in frfs}
 
 
 def fit_headline(fit: Fit, remarks: int) -> Headline:

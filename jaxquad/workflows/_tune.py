@@ -8,16 +8,15 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxquad._core import announce, beside, plain_content
+from jaxquad._core import announce, beside, Later, plain_content
 from jaxquad.control import certainty_equivalence, LADRC, schedule_for_flight, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
 from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
-from jaxquad.plot import certificate_figure, convergence_figure, flight, headless
 from jaxquad.records import Record
-from jaxquad.report import provenance, write_json, write_report
+from jaxquad.report import provenance, write_json
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, simulate, Simulation, Step
 from jaxquad.tuning import (
     describe_controller,
@@ -62,6 +61,7 @@ class Tuning:
     loop: Loop
     ensemble: Ensemble
     flight: Scenario
+    _drawn: Later[dict[str, object]]  # sections of the report, while it was tuned
 
     def content(self) -> dict[str, object]:
         """Gains, certificate and settings, for JSON."""
@@ -96,6 +96,8 @@ class Tuning:
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
         drawn = beside(_write_figures, folder, tuned, flights)
+        from jaxquad.report import write_report  # here: with it comes matplotlib
+
         write_report(
             folder / "report.html",
             fit=found.fit,
@@ -103,6 +105,7 @@ class Tuning:
             record=found.records[0],
             tuned=tuned,
             flights=flights,
+            drawn=self._drawn.get(),
             provenance=origin,
             formula=found.formula,
         )
@@ -112,7 +115,15 @@ class Tuning:
         return str(self.tuned)
 
 
+def _draw_axis(found: Identification) -> dict[str, object]:
+    from jaxquad.report import draw_sections  # here: with it comes matplotlib
+
+    return draw_sections(fit=found.fit, frf=found.frf, record=found.records[0])
+
+
 def _write_figures(folder: Path, tuned: Tuned, flights: Mapping[str, Simulation]) -> list[Path]:
+    from jaxquad.plot import certificate_figure, convergence_figure, flight, headless  # matplotlib
+
     with headless():
         figures = {"convergence.png": convergence_figure(tuned.history)}
         if tuned.certificate is not None:
@@ -204,8 +215,8 @@ def _tuned(
         delay=posterior.delay,
     )  # fmt: skip
     announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
-    flown = _flight(gain, dt, settings)
-    with ThreadPoolExecutor(1) as beside:
+    flown, drawn = _flight(gain, dt, settings), beside(_draw_axis, found)
+    with ThreadPoolExecutor(1) as thread:
         tuned = tune_controller(
             loop,
             ensemble,
@@ -218,9 +229,9 @@ def _tuned(
             peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
             key=jax.random.key(settings.seed),
             progress=progress,
-            listener=_once(lambda: beside.submit(_fly_nominal, loop, plant, flown)),
+            listener=_once(lambda: thread.submit(_fly_nominal, loop, plant, flown)),
         )
-    return Tuning(found, settings, tuned, loop, ensemble, flown)
+    return Tuning(found, settings, tuned, loop, ensemble, flown, drawn)
 
 
 def _once(begin: Callable[[], object]) -> Callable[[Evaluation], None]:

@@ -270,17 +270,21 @@ def shared(monkeypatch):
     """Commands have a second process, which can be sent all; whether each lived to its end."""
     monkeypatch.setenv("JAXQUAD_SECOND_PROCESS", "on")
     monkeypatch.setattr(_beside, "available_cores", lambda: 2)
-    add, end, ends = _beside._Second.add, _beside._Second.end, []
+    end, ends = _beside._Second.end, []
 
-    def send(second, later):
-        pickle.loads(pickle.dumps(later.call))  # also what this process will have computed
-        add(second, later)
+    def sent(take):
+        def send(second, later):
+            pickle.loads(pickle.dumps(later.call))  # also what this process will have computed
+            take(second, later)
+
+        return send
 
     def watch(second):
         ends.append(second._feeding.is_alive())
         end(second)
 
-    monkeypatch.setattr(_beside._Second, "add", send)
+    for name in ("add", "hold"):
+        monkeypatch.setattr(_beside._Second, name, sent(getattr(_beside._Second, name)))
     monkeypatch.setattr(_beside._Second, "end", watch)
     return ends
 

@@ -25,7 +25,7 @@ from html_pages import (
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.report import provenance, write_report
+from jaxquad.report import _sections, draw_sections, provenance, write_report
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +164,16 @@ def test_equal_results_give_equal_bytes(tmp_path, frf, fit, log):
     assert origin.date == "2026-01-02T03:04:05+00:00"
     pages = [write_report(tmp_path / name, fit=fit, frf=frf, provenance=origin) for name in "ab"]
     assert pages[0].read_bytes() == pages[1].read_bytes()
+
+
+def test_sections_that_were_drawn_before_are_not_drawn_again(
+    tmp_path, frf, fit, record, monkeypatch
+):
+    drawn, given = draw_sections(fit=fit, frf=frf, record=record), {"fit": fit, "frf": frf}
+    whole = write_report(tmp_path / "whole", **given, record=record)
+    monkeypatch.setattr(_sections, "begin", None)
+    parts = write_report(tmp_path / "parts", **given, record=record, drawn=drawn)
+    assert parts.read_bytes() == whole.read_bytes()
 
 
 def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):

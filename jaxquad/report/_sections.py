@@ -1,0 +1,95 @@
+"""The sections of a page that show a response and its record in figures."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from jaxquad._core import beside as begin, Later
+from jaxquad.identify import Fit
+from jaxquad.models import Model
+from jaxquad.records import Record
+from jaxquad.spectra import FrequencyResponse
+
+from ._loop import loop_section
+from ._record import record_section
+from ._response import response_section
+from ._spectrum import spectrum_section
+from ._step import step_section
+
+
+class Shown(NamedTuple):
+    """What is drawn of a fit, by name; `spectrum` is the record whose spectrum is."""
+
+    fit: Fit
+    frfs: Mapping[str, FrequencyResponse]
+    models: Mapping[str, Model]
+    others: Mapping[str, FrequencyResponse]
+    records: Mapping[str, Record]
+    spectrum: Record | None
+
+    @property
+    def first(self) -> FrequencyResponse:
+        """The first of the responses that were fitted."""
+        return next(iter(self.frfs.values()))
+
+    @property
+    def flown(self) -> Record | None:
+        """The first record with the channels of that response."""
+        channels = {*self.first.input_names, *self.first.output_names}
+        return next((each for each in self.records.values() if channels <= {*each.names}), None)
+
+    def begin(self) -> dict[str, Later]:
+        """Each section, which a second process draws where a command has one."""
+        first, flown = self.first, self.flown
+        sections: dict[str, Later] = {
+            "response": begin(response_section, self.frfs, self.models, self.others)
+        }
+        if flown is not None:
+            sections["step"] = begin(step_section, self.fit, first, flown)
+            sections["loop"] = begin(loop_section, first, flown)
+        if (record := flown if self.spectrum is None else self.spectrum) is not None:
+            sections["spectrum"] = begin(spectrum_section, first, record)
+        if self.records:
+            sections["record"] = begin(record_section, self.records)
+        return sections
+
+
+def shown_of(
+    fit: Fit,
+    frf: FrequencyResponse | Mapping[str, FrequencyResponse],
+    models: Mapping[str, Model] | None = None,
+    others: Mapping[str, FrequencyResponse] | None = None,
+    record: Record | Mapping[str, Record] | None = None,
+    spectrum: Record | None = None,
+) -> Shown:
+    """What `write_report` was given, by name. Raises ValueError as that does."""
+    frfs = {"response": frf} if isinstance(frf, FrequencyResponse) else dict(frf)
+    if not frfs:
+        raise ValueError("frf is empty: give the response that was fitted, or several by name")
+    records = {"record": record} if isinstance(record, Record) else dict(record or {})
+    return Shown(fit, frfs, _models(fit, frfs, models or {}), others or {}, records, spectrum)
+
+
+def _models(
+    fit: Fit, frfs: Mapping[str, FrequencyResponse], models: Mapping[str, Model]
+) -> dict[str, Model]:
+    unknown = [name for name in models if name not in frfs]
+    if unknown:
+        raise ValueError(f"models of no response: {unknown}; the responses are {list(frfs)}")
+    if not fit.verdict.fitted:
+        return dict(models)
+    return {name: models.get(name, fit.model) for name in frfs}
+
+
+def draw_sections(
+    *, fit: Fit, frf: FrequencyResponse, record: Record | None = None
+) -> dict[str, object]:
+    """The figures of `write_report`, for who has to wait for the rest of its page.
+
+    **Arguments:**
+
+    - `fit`, `frf`, `record`: as it is given them, and nothing else that is drawn but `tuned`.
+
+    **Returns:** what it takes as `drawn`.
+    """
+    shown = shown_of(fit, frf, record=record)
+    return {name: section.get() for name, section in shown.begin().items()}
