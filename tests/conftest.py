@@ -3,6 +3,7 @@ import contextlib
 import ctypes
 import gc
 import os
+import pickle
 import shutil
 import tempfile
 from importlib.metadata import version
@@ -101,3 +102,29 @@ def without_type_checks():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", before)
+
+
+@pytest.fixture
+def shared(monkeypatch):
+    """Commands have a second process, which can be sent all; whether each lived to its end."""
+    from jaxquad._core import _beside  # here: its types are checked from `pytest_configure` on
+
+    monkeypatch.setenv("JAXQUAD_SECOND_PROCESS", "on")
+    monkeypatch.setattr(_beside, "available_cores", lambda: 2)
+    end, ends = _beside._Second.end, []
+
+    def sent(take):
+        def send(second, later):
+            pickle.loads(pickle.dumps(later.call))  # also what this process will have computed
+            take(second, later)
+
+        return send
+
+    def watch(second):
+        ends.append(second._feeding.is_alive())
+        end(second)
+
+    for name in ("add", "hold"):
+        monkeypatch.setattr(_beside._Second, name, sent(getattr(_beside._Second, name)))
+    monkeypatch.setattr(_beside._Second, "end", watch)
+    return ends

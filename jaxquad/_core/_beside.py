@@ -154,6 +154,7 @@ class _Second:
     def __init__(self):
         self._waiting: deque[Later] = deque()
         self._held: list[Later] = []  # until the caller waits
+        self._idle = False  # then the first that waits is the process's
         self._changed = threading.Condition()
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START.format(sys.path)],
@@ -189,9 +190,8 @@ class _Second:
             return mine
 
     def _mine(self, wanted: Later) -> list[Later]:
-        if wanted in self._waiting:
-            return [wanted]
-        return [each for each in self._waiting if each.shared]
+        free = list(self._waiting)[self._idle :]
+        return [wanted] if wanted in free else [each for each in free if each.shared]
 
     def end(self) -> None:
         with self._changed:
@@ -220,7 +220,9 @@ class _Second:
 
     def _next(self) -> Later | None:
         with self._changed:
+            self._idle = True
             self._changed.wait_for(lambda: self._waiting or self._ended)
+            self._idle = False
             return None if self._ended else self._waiting.popleft()
 
 

@@ -1,5 +1,6 @@
 import argparse
 
+from jaxquad._core import prepare_second_process, start_second_process
 from jaxquad.records import require_file
 from jaxquad.workflows import AutopilotSettings, default_folder, in_options
 
@@ -40,7 +41,9 @@ def _add(declared: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     settings = settings_of(options, AutopilotSettings)
     require_file(options.file)
+    start_second_process()
     start_computing()
+    prepare_second_process(_prepare)
     from jaxquad.workflows import autopilot
 
     found = autopilot(options.file, settings)
@@ -53,6 +56,14 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print_json(found.content())
     return _EXIT.get(found.kind, 0)
+
+
+def _prepare() -> None:
+    """What a second process will need beyond `start_computing`: the laws of autopilots."""
+    import jaxquad.control.autopilots
+    from jaxquad.workflows import autopilot
+
+    del autopilot, jaxquad
 
 
 AUTOPILOT = Command(

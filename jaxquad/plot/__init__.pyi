@@ -1,5 +1,6 @@
 from ._bode import bode as bode, coherence as coherence
 from ._certificate import certificate_figure as certificate_figure
+from ._curves import Spectrum as Spectrum, StepBand as StepBand, ThrottleCurve as ThrottleCurve
 from ._flight import flight as flight
 from ._histories import (
     channels_of as channels_of,
@@ -21,10 +22,7 @@ from ._pilot import (
     balance_figure as balance_figure,
     filters_figure as filters_figure,
     spectra_figure as spectra_figure,
-    Spectrum as Spectrum,
-    StepBand as StepBand,
     steps_figure as steps_figure,
-    ThrottleCurve as ThrottleCurve,
 )
 from ._plane import nyquist as nyquist, pzmap as pzmap
 from ._predictions import compare as compare, step as step

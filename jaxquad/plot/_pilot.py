@@ -1,19 +1,17 @@
 """What a pilot looks at: filters and their delay, spectra before and after them, steps, terms."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxquad.control.autopilots import FilterChain
 from jaxquad.identify import GainBand
 
+from ._curves import Spectrum, StepBand, ThrottleCurve
 from ._labels import few_ticks, look_of, plain_ticks
 from ._panels import arrange, Given, legend_of, Panels, stacked
 
 
-Frequencies = Float[np.ndarray, " frequencies"]
 _POINTS = 200
 _LOWEST = 2.0  # Hz
 _HATCHES = (None, "....", "////", "xxxx", "----")  # of bands, for those who see no colours
@@ -49,13 +47,6 @@ def filters_figure(
     delay.set(xscale="log", ylabel="delay, ms", xlabel="frequency, Hz")
     delay.set_ylim(min(0.0, delay.get_ylim()[0]), None)
     return _finished(panels, (1.9, 1.6), title)
-
-
-class Spectrum(NamedTuple):
-    """A power spectral density, one-sided, per Hz."""
-
-    hertz: Frequencies
-    power: Frequencies
 
 
 def spectra_figure(
@@ -96,15 +87,6 @@ def spectra_figure(
     return _finished(panels, (2.0, 2.0), title)
 
 
-class StepBand(NamedTuple):
-    """Step responses of many plants: their median, and between which 95 % of them lie."""
-
-    time: Float[np.ndarray, " samples"]
-    middle: Float[np.ndarray, " samples"]
-    low: Float[np.ndarray, " samples"]
-    high: Float[np.ndarray, " samples"]
-
-
 def steps_figure(
     steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: Given = None,
     title: str = "",
@@ -133,13 +115,6 @@ def steps_figure(
     panel.set(xlabel="time, s", ylabel=label)
     panel.margins(x=0)
     return _finished(panels, (2.8,), title)
-
-
-class ThrottleCurve(NamedTuple):
-    """A quantity over the throttle of 0 to 1, as a firmware takes it."""
-
-    throttle: Float[np.ndarray, " points"]
-    value: Float[np.ndarray, " points"]
 
 
 def b0_figure(

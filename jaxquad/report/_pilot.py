@@ -4,26 +4,15 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaxquad._core import write_file
+from jaxquad._core import beside, write_file
 from jaxquad.control.autopilots import FilterChain
 from jaxquad.identify import GainBand
-from jaxquad.plot import (
-    b0_figure,
-    balance_figure,
-    filters_figure,
-    spectra_figure,
-    Spectrum,
-    StepBand,
-    steps_figure,
-    ThrottleCurve,
-)
+from jaxquad.plot import Spectrum, StepBand, ThrottleCurve
 
-from ._figure import embed_figure, Section
-from ._page import Cell, Headline, render_page, Table
+from ._page import Headline, render_page, Table
 from ._provenance import Provenance, provenance_section
 
 
-_SHOWN = (10.0, 50.0)  # Hz, of a table of delays
 Chains = Mapping[str, Sequence[FilterChain]]  # by the signal that they filter
 
 
@@ -95,13 +84,12 @@ def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
 
     **Returns:** the path.
     """
+    # The caller has compiled what filters are drawn from: it waits for them first.
+    begun = {name: beside(_draw, name, page) for name in ("noise", "steps", "b0", "balance")}
+    begun = {"filters": beside(_draw, "filters", page)} | begun
     sections = {
-        "changes": _changes(page),
-        "filters": _filters(page.filters),
-        "noise": _noise(page) if page.gyro else None,
-        "steps": _steps(page) if page.steps else None,
-        "b0": None if page.b0 is None else _b0(page.b0),
-        "balance": _balance(page) if page.terms or page.motors else None,
+        "changes": {"changes": page.changes, "stages": page.stages},
+        **{name: section.get() for name, section in begun.items()},
         "text": {"text": page.text} if page.text else None,
         "provenance": None if page.provenance is None else provenance_section(page.provenance),
     }
@@ -116,105 +104,7 @@ def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
     return write_file(path, text)
 
 
-def _changes(page: PilotPage) -> Section:
-    return {"changes": page.changes, "stages": page.stages}
+def _draw(name: str, page: PilotPage) -> object:
+    from ._pilot_sections import SECTIONS  # here: with them comes matplotlib
 
-
-def _filters(filters: Mapping[str, Chains]) -> Section:
-    drawn = {
-        f"{signal}, {design}": _passed(chains, signal)
-        for design, chains in filters.items()
-        for signal in chains
-    }
-    drawn = {name: chains for name, chains in drawn.items() if chains}
-    if not drawn:
-        return {"image": None, "tables": []}
-    image = embed_figure(
-        lambda: filters_figure(drawn),
-        alt=f"Magnitude and delay over the frequency of {', '.join(drawn)}.",
-        caption="Magnitude and phase delay; what filters the gyro filters the D term, too.",
-    )
-    tables = [_delays(design, chains) for design, chains in filters.items()]
-    return {"image": image, "tables": tables}
-
-
-def _passed(chains: Chains, signal: str) -> list[FilterChain]:
-    """All filters that a signal has passed: those of the gyro, too."""
-    names = list(chains)[: list(chains).index(signal) + 1]
-    return [each for name in names for each in chains[name] if each.filters]
-
-
-def _delays(design: str, chains: Chains) -> Table:
-    rows: list[list[str | Cell]] = []
-    for signal, group in chains.items():
-        total = [0.0] * len(_SHOWN)
-        for chain in group:
-            *shares, _ = chain.shares(_SHOWN)
-            for share in shares:
-                late = [float(x) for x in share.delay_ms]
-                total = [a + b for a, b in zip(total, late, strict=True)]
-                rows.append([Cell(share.name), signal, *(f"{x:.2f}" for x in late)])
-        rows.append([f"all of the {signal}'s", signal, *(f"{x:.2f}" for x in total)])
-    heads = ("filter", "of", *(f"delay at {x:g} Hz, ms" for x in _SHOWN))
-    return Table(f"Filters {design}, with their shares of the delay", heads, rows, texts=2)
-
-
-def _noise(page: PilotPage) -> Section:
-    image = embed_figure(
-        lambda: spectra_figure(page.gyro, page.derivative, unit=page.unit),
-        alt=f"Spectra of the gyro and of the D term: {', '.join(page.gyro)}.",
-        caption="Noise of the gyro, and what the D term makes of it; before the filters by the "
-        "gain that flew.",
-    )
-    return {"image": image, "text": page.noise}
-
-
-def _steps(page: PilotPage) -> Section:
-    image = embed_figure(
-        lambda: steps_figure(page.steps),
-        alt=f"Rate after a step of the set-point: {', '.join(page.steps)}; 95 % of the plants.",
-        caption="The logged rate after a step of 1 of the set-point, without feed-forward: median "
-        "and 95 % of the plants that the log leaves possible.",
-    )
-    rows = [[Cell(name), *_step_numbers(band)] for name, band in page.steps.items()]
-    heads = ("gains", "overshoot, %", "worst, %", "half way after, ms")
-    return {"image": image, "table": Table("Step responses", heads, rows)}
-
-
-def _step_numbers(band: StepBand) -> list[str]:
-    half = float(band.time[(band.middle >= 0.5).argmax()])
-    over = [100 * max(float(x.max()) - 1, 0.0) for x in (band.middle, band.high)]
-    return [f"{over[0]:.0f}", f"{over[1]:.0f}", f"{1e3 * half:.0f}"]
-
-
-def _b0(section: B0Section) -> Section:
-    levels = section.levels
-    image = embed_figure(
-        lambda: b0_figure(levels, section.taken, curve=section.curve),
-        alt=f"b0 over the throttle: of the log, and {', '.join(section.taken)}.",
-        caption="b0 over the throttle: gain / lag of the log with what it leaves uncertain, and "
-        "what the ADRC takes.",
-    )
-    rows: list[list[str | Cell]] = [
-        [f"{x:.2f}", f"{value:.0f}", f"{low:.0f} .. {high:.0f}"]
-        for x, value, low, high in zip(*levels, strict=True)
-    ]
-    heads = ("throttle", "gain / lag, deg/s^3", "95 %")
-    return {"image": image, "table": Table("Levels flown", heads, rows), "text": section.text}
-
-
-def _balance(page: PilotPage) -> Section:
-    image = None
-    if page.terms:
-        shown = ", ".join(f"{name} {value:.3g}" for name, value in page.terms.items())
-        image = embed_figure(
-            lambda: balance_figure(page.terms, unit=page.unit),
-            alt=f"Root mean squares of the terms: {shown} {page.unit}.",
-            caption=f"Root mean square of each term of the command in the log, {page.terms_are}; "
-            "the mean of I is left out.",
-        )
-    rows = [
-        [Cell(name), f"{100 * low:.2f}", f"{100 * high:.2f}"] for name, low, high in page.motors
-    ]
-    motors = Table("Motors at their limits", ("motor", "lowest, %", "highest, %"), rows)
-    return {"image": image, "motors": motors if rows else None}
+    return SECTIONS[name](page)

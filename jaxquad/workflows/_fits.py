@@ -96,8 +96,7 @@ def _responses(
     filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
 ) -> list[Later[FrequencyResponse]]:  # fmt: skip
     """By each of the methods; all but the first are ready later."""
-    band = _band(settings)
-    omega = np.geomspace(*band, _POINTS) if band else None
+    omega = grid_of(settings)
     out = ", for the delay" if quick else f", {delay:.4g} s of delay taken out" if delay else ""
     plural = "s" if len(methods) > 1 else ""
     announce(f"{'quick ' if quick else ''}{' and '.join(methods)} response{plural}{out}")
@@ -132,11 +131,12 @@ def _delay_of(found: Fit, records: tuple[Record, ...]) -> float:
     return total if 0 < total < _LONGEST * duration else 0.0
 
 
-def _band(settings: IdentifySettings) -> tuple[float, float] | None:
-    """In rad/s."""
+def grid_of(settings: IdentifySettings) -> Float[np.ndarray, " frequencies"] | None:
+    """Over the band of the settings, in rad/s; None is the default of `jq.frequency_response`."""
+    band = settings.band_rad
     if settings.band is not None:
-        return 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
-    return settings.band_rad
+        band = 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
+    return None if band is None else np.geomspace(*band, _POINTS)
 
 
 def _estimator(settings: IdentifySettings, method: str, delay: float, *, quick: bool) -> Estimator:

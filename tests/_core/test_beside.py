@@ -70,6 +70,13 @@ def test_who_waits_computes_what_nobody_has_begun(second):
     assert last.answer is not None and last.get() == os.getpid()
 
 
+def test_a_process_that_is_idle_gets_what_is_begun_even_if_it_is_asked_for_at_once(second):
+    begun(os.getpid).get()
+    while not second._idle:
+        time.sleep(0.01)
+    assert beside(os.getpid).get() != os.getpid()
+
+
 def test_what_is_wanted_last_is_held_until_the_caller_waits_and_is_no_work_for_it(second):
     last, first = behind(os.getpid), begun(os.getpid)
     while first.answer is None:

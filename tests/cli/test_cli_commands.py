@@ -2,7 +2,6 @@
 
 import json
 import logging
-import pickle
 import time
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from log_writers import DataFlash
 
 import jaxquad as jq
-from jaxquad._core import _beside
 from jaxquad.cli import main
 from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
 
@@ -263,30 +261,6 @@ def test_a_stage_that_takes_longer_than_a_second_is_a_line(more, said, demo, cap
 
 PLANT = ["--inertia", "0.01", "--limit", "0.2"]
 SMALL = ["--noise", "0.05", "--members", "8", "--fresh", "32", "--duration", "1.6"]
-
-
-@pytest.fixture
-def shared(monkeypatch):
-    """Commands have a second process, which can be sent all; whether each lived to its end."""
-    monkeypatch.setenv("JAXQUAD_SECOND_PROCESS", "on")
-    monkeypatch.setattr(_beside, "available_cores", lambda: 2)
-    end, ends = _beside._Second.end, []
-
-    def sent(take):
-        def send(second, later):
-            pickle.loads(pickle.dumps(later.call))  # also what this process will have computed
-            take(second, later)
-
-        return send
-
-    def watch(second):
-        ends.append(second._feeding.is_alive())
-        end(second)
-
-    for name in ("add", "hold"):
-        monkeypatch.setattr(_beside._Second, name, sent(getattr(_beside._Second, name)))
-    monkeypatch.setattr(_beside._Second, "end", watch)
-    return ends
 
 
 def test_a_second_process_takes_all_of_a_report(demo, shared, capsys, tmp_path):

@@ -1,11 +1,13 @@
 """From the log of an autopilot to parameters for it: read, identify, reproduce, tune."""
 
 import dataclasses
+import functools as ft
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, behind
 from jaxquad.control.autopilots import without_gyro_filters
 from jaxquad.identify import usable
 from jaxquad.loops import FlownLoop as Reproduction, reproduce_flight
@@ -17,6 +19,7 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
+from .._fits import grid_of
 from .._identify import Identification, identify_plant
 from .._kinds import SettingsError
 from .._log import propose_settings, read_records
@@ -79,13 +82,14 @@ def autopilot(
         return tune_adrc(path, asked, proposal, settings)
     announce("gains and filters that flew")
     flown, flight = _read_flight(path, asked, proposal, settings)
+    compared = behind(_flown_responses, path, asked, flown)
     found = identify_plant(path, asked, proposal, gyro_chains(flown.law))
     known = (settings, found, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
     if not found.fit.identifiable:
         return unsure(f"this log cannot tell: {found.fit.verdict.summary}; {_FLY}", None)
     announce("the flown loop again")
-    again = _reproduce(found, flown)
+    again = _reproduce(found, flown, compared.get())
     if again.kind != "flown":
         why = again.verdict
         return unsure(why if again.kind == "unknown" else f"this log cannot tell: {why}", again)
@@ -123,39 +127,65 @@ def _read_flight(
     return read_flown(path, proposal, settings, tracked), flight
 
 
-def _reproduce(found: Identification, flown: FlownAutopilot) -> Reproduction:
-    """The flown loop compared with the log."""
-    settings, [unit] = found.settings, found.records[0].output_units
-    if _INJECTED in (settings.input or ""):
-        return _reproduce_law(found, flown)
-    setpoint = _setpoint_of(found.records[0].output_names[0], flown)
+def _flown_responses(
+    path: Path, settings: IdentifySettings, flown: FlownAutopilot
+) -> tuple[FrequencyResponse, ...]:
+    """What the loop is compared with: from the set-point to the rate.
+
+    Where ArduPilot's chirp enters at the mixer, from the chirp to output, rate and set-point.
+    """
+    of = ft.partial(_response_of, path, settings)
+    if _is_injected(settings):
+        letter = AXES[flown.axis][0].upper()
+        names = (f"RATE.{letter}Out", f"RATE.{letter}", f"RATE.{letter}Des")
+        return tuple(of(input=_INJECTED, output=name, reference=None) for name in names)
+    setpoint = _setpoint_of(settings.output or "", flown)
     try:
         reference = None if settings.reference == setpoint else settings.reference
-        response = _response_of(found, input=setpoint, reference=reference)
+        return (of(input=setpoint, reference=reference),)
     except ValueError:  # the stick is the set-point in another unit: that one is external
-        response = _response_of(found, input=setpoint, reference=None)
+        return (of(input=setpoint, reference=None),)
+
+
+def _is_injected(settings: IdentifySettings) -> bool:
+    return _INJECTED in (settings.input or "")
+
+
+def _response_of(
+    path: Path, settings: IdentifySettings, **changed: str | None
+) -> FrequencyResponse:
+    """The response between other channels of the log, joint where there is a reference."""
+    settings = dataclasses.replace(settings, **changed)
+    estimator = JointInputOutput() if settings.reference else LocalPolynomial()
+    records = list(read_records(path, settings))
+    return frequency_response(records, grid_of(settings), estimator=estimator)
+
+
+def _reproduce(
+    found: Identification, flown: FlownAutopilot, responses: Sequence[FrequencyResponse]
+) -> Reproduction:
+    """The flown loop compared with the log."""
+    if _is_injected(found.settings):
+        return _reproduce_law(found, flown, *responses)
+    [response], [unit] = responses, found.records[0].output_units
     return reproduce_flight(
         found.fit, flown.law, response, unit="deg/s" if unit == "deg/s" else "rad/s",
         filters=gyro_chains(flown.law), axis=flown.axis,
     )  # fmt: skip
 
 
-def _response_of(found: Identification, **changed: str | None) -> FrequencyResponse:
-    """The response between other channels of the log, joint where there is a reference."""
-    records = read_records(found.path, dataclasses.replace(found.settings, **changed))
-    estimator = JointInputOutput() if changed["reference"] else LocalPolynomial()
-    return frequency_response(list(records), found.frf.omega, estimator=estimator)
+def _reproduce_law(
+    found: Identification,
+    flown: FlownAutopilot,
+    output: FrequencyResponse,
+    rate: FrequencyResponse,
+    setpoint: FrequencyResponse,
+) -> Reproduction:
+    """The law's output, of set-point and rate, from a chirp at the mixer.
 
-
-def _reproduce_law(found: Identification, flown: FlownAutopilot) -> Reproduction:
-    """Where ArduPilot's chirp enters at the mixer: the law's output, of set-point and rate.
-
-    From the chirp to all three. The noise of the rate is in the output, too, so that the error of
-    the latter counts alone.
+    The noise of the rate is in the output, too, so that the error of the latter counts alone.
     """
-    letter, [unit] = AXES[flown.axis][0].upper(), found.records[0].output_units
-    of = lambda name: _response_of(found, input=_INJECTED, output=name, reference=None)
-    output, rate, setpoint = map(of, (f"RATE.{letter}Out", f"RATE.{letter}", f"RATE.{letter}Des"))
+    [unit] = found.records[0].output_units
     omega, only = np.asarray(output.omega), lambda x: np.asarray(x)[:, 0, 0]
     ahead, back = law_responses(without_gyro_filters(flown.law), flown.axis, omega)
     factor = np.pi / 180 if unit == "deg/s" else 1.0
