@@ -99,7 +99,7 @@ def behind(
     """As `beside`, for what is wanted last: the second process takes it when the caller waits.
 
     A caller that begins with what it wants first, and shares parts of it, would find the process
-    busy.
+    busy. Of several, the last call is taken first.
     """
     later: Later[Found] = Later(Call(function, args, named), _second, shared=False)
     if _second is not None:
@@ -124,10 +124,14 @@ def start_second_process() -> None:
             _second = _Second()
 
 
-def prepare_second_process(prepare: Callable[[], None]) -> None:
-    """Have it call `prepare` next, a function of a module that imports what will be called."""
+def prepare_second_process(prepare: Callable[[], None], *, last: bool = False) -> None:
+    """Have it call `prepare` next, a function of a module that imports what will be called.
+
+    Or as `behind` does it, with `last`.
+    """
     if _second is not None:
-        _second.add(Later(Call(prepare, (), {}), None, shared=False))
+        take = _second.hold if last else _second.add
+        take(Later(Call(prepare, (), {}), None, shared=False))
 
 
 @contextlib.contextmanager
@@ -153,7 +157,7 @@ def end_second_process() -> None:
 class _Second:
     def __init__(self):
         self._waiting: deque[Later] = deque()
-        self._held: list[Later] = []  # until the caller waits
+        self._held: deque[Later] = deque()  # until the caller waits
         self._idle = False  # then the first that waits is the process's
         self._changed = threading.Condition()
         self._process = subprocess.Popen(
@@ -174,7 +178,7 @@ class _Second:
 
     def hold(self, later: Later) -> None:
         with self._changed:
-            self._held.append(later)
+            self._held.appendleft(later)
 
     def claim(self, wanted: Later) -> Later | None:
         """What the caller computes while it waits: the result itself, or the last that waits."""

@@ -202,6 +202,7 @@ def start_computing() -> None:
     What a command can say without JAX it says before. A second process does the same.
     """
     prepare_second_process(_prepare)
+    prepare_second_process(_prepare_figures, last=True)
     collect_seldom()
     from jaxquad._core import enable_x64
     from jaxquad._xla import enable_compile_cache
@@ -228,15 +229,20 @@ def open_beside(
 
 
 def _prepare() -> None:
-    """What a second process will need: JAX, estimates and reports with matplotlib."""
+    """What a second process will need first: JAX and estimates."""
     start_computing()
     import scipy.linalg.lapack
     import scipy.special
 
-    from jaxquad.report import write_report
     from jaxquad.workflows import identify
 
-    del identify, scipy, write_report
+    del identify, scipy
+
+
+def _prepare_figures() -> None:
+    from jaxquad.report import write_report  # with matplotlib
+
+    del write_report
 
 
 @contextlib.contextmanager

@@ -88,6 +88,17 @@ def test_what_is_wanted_last_is_held_until_the_caller_waits_and_is_no_work_for_i
     assert last.get() == first.get() != os.getpid()
 
 
+def test_of_what_is_wanted_last_the_last_call_is_taken_first_and_preparations_are_kept_back(second):
+    prepare_second_process(np.show_config, last=True)
+    earlier, later = behind(os.getpid), behind(os.getpid)
+    prepared = second._held[-1]
+    assert list(second._held) == [later, earlier, prepared] and prepared.answer is None
+    begun(os.getpid).get()
+    while prepared.answer is None:
+        time.sleep(0.01)
+    assert later.answer and earlier.answer and not second._held
+
+
 def test_what_is_wanted_last_and_nobody_has_begun_is_computed_by_who_wants_it(second):
     long, last = begun(time.sleep, 0.2), behind(os.getpid)
     assert last.get() == os.getpid() and long.answer is None
