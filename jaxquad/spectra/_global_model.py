@@ -2,7 +2,7 @@
 
 import functools as ft
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -130,14 +130,14 @@ def global_models(
     ]
 
 
-def weighted_model(
+def begin_weighted_model(
     model: GlobalModel,
     bins: Bins,
     inputs: slice,
     output: int,
     most: int,
     noise: Float[np.ndarray, " places"],
-) -> GlobalModel | None:
+) -> Callable[[], GlobalModel | None]:
     """The model of the same bins that count by `noise`, the output's power at the model's places.
 
     What the first model leaves can hide response: where it fits the loud bins alone, what it leaves
@@ -145,12 +145,26 @@ def weighted_model(
     """
     places, scale = model.places, model.scale
     equations = _equations(bins, places, inputs, output, scale, model.dt)
-    weight, every = 1 / np.sqrt(noise), _thin(places.size, _TRIAL_BINS)
+    begun = beside(_identify_weighted, equations, bins.omega[places], 1 / np.sqrt(noise), most)
+
+    def finish() -> GlobalModel | None:
+        found = begun.get()
+        if found is None:
+            return None
+        return GlobalModel(*found[:2], scale, model.dt, places, *found[2:], model.reach)
+
+    return finish
+
+
+def _identify_weighted(
+    equations: Equations,
+    omega: Float[np.ndarray, " bins"],
+    weight: Float[np.ndarray, " bins"],
+    most: int,
+) -> "Identified | None":
+    every = _thin(len(omega), _TRIAL_BINS)
     chosen = _choose(equations.weighted(weight).pick(every), most)
-    if chosen is None:
-        return None
-    found = _settle(equations, bins.omega[places], weight, chosen)
-    return GlobalModel(*found[:2], scale, model.dt, places, *found[2:], model.reach)
+    return None if chosen is None else _settle(equations, omega, weight, chosen)
 
 
 def _equations(

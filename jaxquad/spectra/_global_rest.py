@@ -1,12 +1,17 @@
 """Local fits of what global models leave, and the errors of both together."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._global_model import global_models, GlobalModel, highest_modelled, weighted_model
+from ._global_model import (
+    begin_weighted_model,
+    global_models,
+    GlobalModel,
+    highest_modelled,
+)
 from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_noise import Noise, SharedErrors
 
@@ -120,16 +125,20 @@ def weighted_models(
 ) -> list[GlobalModel | None]:
     """The models, `which` of them fitted to the `bins` again, which now count by the `noise`."""
 
-    def fit_again(c: int) -> GlobalModel | None:
-        model = rest.models[c]
-        if model is None or not which[c]:
-            return model
+    def begin(c: int, model: GlobalModel) -> Callable[[], GlobalModel | None]:
         omega, channel = bins.omega[model.places], rest.moved.start + c
         power = noise._replace(power=noise.power[:, c : c + 1]).power_at(omega)[:, 0]
         power = np.where(omega > noise.omega[-1], model.noise, power)
-        return weighted_model(model, bins, rest.sources, channel, most, power) or model
+        return begin_weighted_model(model, bins, rest.sources, channel, most, power)
 
-    return [fit_again(c) for c in range(len(rest.models))]
+    models = list(rest.models)
+    # As in `global_models`, a second process begins with the last.
+    begun = {
+        c: begin(c, m) for c, m in reversed([*enumerate(models)]) if m is not None and which[c]
+    }
+    for c, finish in reversed(begun.items()):
+        models[c] = finish() or models[c]
+    return models
 
 
 def model_slopes(
