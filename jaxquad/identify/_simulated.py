@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from jaxquad._xla import Jit
 from jaxquad.models import (
     explicit,
     free_responses,
@@ -285,7 +286,7 @@ def free_response(
     return jnp.concatenate([shifts, dot(bias, motions.slow), dot(start, motions.fast)], axis=2)
 
 
-@eqx.filter_jit
+@Jit
 def forced_and_free(
     plant: TransferFunction | StateSpace,
     motions: Motions,

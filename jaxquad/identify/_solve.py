@@ -83,9 +83,9 @@ def solve(
     if sum(each.size for each in problem.weights) * z0.size**2 < _SHORT:
         if solver is None and problem.is_single and has_few_slopes(problem):
             return _solve_at_once(problem.mixed(), z0, max_steps)
-        stop = _descend_short(problem.mixed(), z0, solver, max_steps)
+        stop = _descend_from(problem.mixed(), z0, solver, max_steps, short=True)
     else:
-        stop = _descend_long(_with_one_weight(problem), jax.device_put(z0), solver, max_steps)
+        stop = _descend_from(_with_one_weight(problem), z0, solver, max_steps, short=False)
     return solution_at(problem, np.asarray(stop.z), *_message_and_steps(stop))
 
 
@@ -147,39 +147,40 @@ def _descend(
     )
 
 
-_descend_long = eqx.filter_jit(_descend)
-
-
 @ft.cache
-def _descend_by_solver() -> Callable[..., Stop]:
-    given: dict[str, Any] = {"compiler_options": hasty_options()}
+def _descend_by_solver(*, short: bool) -> Callable[..., Stop]:
+    given: dict[str, Any] = {"compiler_options": hasty_options()} if short else {}
     return eqx.filter_jit(_descend, **given)
 
 
-def _descend_short(
+def _descend_from(
     problem: Problem,
     z0: Float[np.ndarray, " parameters"],
     solver: eqx.Module | None,
     max_steps: int,
+    *,
+    short: bool,
 ) -> Stop:
+    """A `short` descent takes less time than the optimisation of its program would."""
     if solver is not None:
-        return _descend_by_solver()(problem, jax.device_put(z0), solver, max_steps)
+        return _descend_by_solver(short=short)(problem, jax.device_put(z0), solver, max_steps)
     # `eqx.filter_jit` sorts the problem into arrays and others for half the time of the descent.
     frame, arrays = take_apart(problem)
-    return _short_program(frame, max_steps)([z0, *arrays])
+    return _descent(frame, max_steps, short)([z0, *arrays])
 
 
 @ft.lru_cache(maxsize=128)
-def _short_program(frame: Frame, max_steps: int) -> Callable[[list[Numbers]], Stop]:
-    return _DESCENTS.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:]), max_steps))
+def _descent(frame: Frame, max_steps: int, short: bool) -> Callable[[list[Numbers]], Stop]:
+    kept = _SHORT_DESCENTS if short else _LONG_DESCENTS
+    return kept.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:]), max_steps))
 
 
 def _descend_by_default(z0: Float[Array, " parameters"], problem: Problem, max_steps: int) -> Stop:
     return _descend(problem, z0, None, max_steps)
 
 
-# A short descent takes less time than the optimisation of its program would.
-_DESCENTS = KeptPrograms(_descend_by_default, hasty_options)
+_SHORT_DESCENTS = KeptPrograms(_descend_by_default, hasty_options)
+_LONG_DESCENTS = KeptPrograms(_descend_by_default, dict)
 
 
 class _Found(NamedTuple):
