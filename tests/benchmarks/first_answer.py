@@ -5,10 +5,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from resource import getrusage, RUSAGE_CHILDREN
 from typing import NamedTuple
+
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+from px4_flights import Vehicle, write_log
 
 
 ROOT = Path(__file__).parents[2]
@@ -17,6 +21,8 @@ LOG = DATA / "antx_pitch" / "antx_log3_prbs.npz"
 COMMAND = (str(Path(sys.executable).with_name("jaxquad")),)
 IDENTIFY = (*COMMAND, "identify", str(LOG), "--input", "M", "--output", "q", "--reference", "x0")
 IDENTIFY = (*IDENTIFY, "--rate", "250", "--unit", "q=rad/s", "--quiet", "--out", "antx")
+FLIGHT = "flight.ulg"
+AUTOPILOT = (*COMMAND, "autopilot", FLIGHT, "--axis", "roll", "--quiet")
 
 
 class Job(NamedTuple):
@@ -25,6 +31,7 @@ class Job(NamedTuple):
     name: str
     command: Sequence[str]
     after: Sequence[str] = ()
+    told: Mapping[str, str] = {}  # by the environment
 
 
 class Times(NamedTuple):
@@ -39,10 +46,16 @@ JOBS = (
     Job("`jaxquad --help`", (*COMMAND, "--help")),
     Job("`jaxquad identify`, report and figures", IDENTIFY),
     Job(
+        "the same in one process, `JAXQUAD_SECOND_PROCESS=off`",
+        IDENTIFY,
+        told={"JAXQUAD_SECOND_PROCESS": "off"},
+    ),
+    Job(
         "`jaxquad tune` on its result",
         (*COMMAND, "tune", "antx", "--inertia", "0.0552", "--limit", "1", "--quiet"),
         IDENTIFY,
     ),
+    Job("`jaxquad autopilot` on a simulated flight of 30 s", AUTOPILOT),
     Job("the README's main job", (sys.executable, str(ROOT / "fits" / "hover_roll.py"))),
 )
 
@@ -50,24 +63,29 @@ JOBS = (
 def measured(rounds: int) -> list[list[str]]:
     """Rows of the table: each job without compiled programs on disk, and with them."""
     jobs = [job for job in JOBS if LOG.is_file() or str(LOG) not in (*job.command, *job.after)]
-    return [_row(job, rounds) for job in jobs]
+    vehicle = Vehicle()
+    with tempfile.TemporaryDirectory() as folder:
+        flight = write_log(Path(folder) / FLIGHT, vehicle.fly(), vehicle.parameters)
+        return [_row(job, rounds, flight.read_bytes()) for job in jobs]
 
 
-def _row(job: Job, rounds: int) -> list[str]:
+def _row(job: Job, rounds: int, flight: bytes) -> list[str]:
     with tempfile.TemporaryDirectory() as cache:
         kept = {"XDG_CACHE_HOME": cache}  # where the command line keeps its programs
-        cold = _median([_run(job, {"JAXQUAD_CACHE": "off"}) for _ in range(rounds)])
-        _run(job, kept)
-        again = _median([_run(job, kept) for _ in range(rounds)])
+        cold = _median([_run(job, flight, {"JAXQUAD_CACHE": "off"}) for _ in range(rounds)])
+        _run(job, flight, kept)
+        again = _median([_run(job, flight, kept) for _ in range(rounds)])
     numbers = (cold.wall, cold.processor, again.wall, again.processor)
     return [job.name, *(f"{number:.2g}" if number < 10 else f"{number:.0f}" for number in numbers)]
 
 
-def _run(job: Job, told: dict[str, str]) -> Times:
+def _run(job: Job, flight: bytes, told: dict[str, str]) -> Times:
     # Modules are kept compiled, as after an installation.
     other = ("JAX_", "PYTHONDONTWRITEBYTECODE")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(other)} | told
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(other)}
+    environment |= {**told, **job.told}
     with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / FLIGHT).write_bytes(flight)
         if job.after:
             _process(job.after, folder, environment)
         return _process(job.command, folder, environment)
