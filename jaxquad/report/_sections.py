@@ -81,15 +81,21 @@ def _models(
 
 
 def draw_sections(
-    *, fit: Fit, frf: FrequencyResponse, record: Record | None = None
+    *,
+    fit: Fit,
+    frf: FrequencyResponse | Mapping[str, FrequencyResponse],
+    models: Mapping[str, Model] | None = None,
+    others: Mapping[str, FrequencyResponse] | None = None,
+    record: Record | Mapping[str, Record] | None = None,
+    spectrum: Record | None = None,
 ) -> dict[str, object]:
     """The figures of `write_report`, for who has to wait for the rest of its page.
 
-    **Arguments:**
+    **Arguments:** those of `write_report` that these figures show.
 
-    - `fit`, `frf`, `record`: as it is given them, and nothing else that is drawn but `tuned`.
+    **Returns:** what it takes as `drawn`, beside the same arguments.
 
-    **Returns:** what it takes as `drawn`.
+    **Raises:** ValueError as it does.
     """
-    shown = shown_of(fit, frf, record=record)
+    shown = shown_of(fit, frf, models, others, record, spectrum)
     return {name: section.get() for name, section in shown.begin().items()}

@@ -61,7 +61,8 @@ class Tuning:
     loop: Loop
     ensemble: Ensemble
     flight: Scenario
-    _drawn: Later[dict[str, object]]  # sections of the report, while it was tuned
+    # Sections of the report, drawn while it was tuned.
+    _drawn: Later[dict[str, object]] = dataclasses.field(repr=False, compare=False)
 
     def content(self) -> dict[str, object]:
         """Gains, certificate and settings, for JSON."""

@@ -81,7 +81,7 @@ def test_what_is_wanted_last_is_held_until_the_caller_waits_and_is_no_work_for_i
     last, first = behind(os.getpid), begun(os.getpid)
     while first.answer is None:
         time.sleep(0.01)
-    assert last.answer is None
+    assert last in second._held and last.answer is None
     begun(time.sleep, 0.2).get()
     while last.answer is None:
         time.sleep(0.01)

@@ -169,10 +169,10 @@ def test_equal_results_give_equal_bytes(tmp_path, frf, fit, log):
 def test_sections_that_were_drawn_before_are_not_drawn_again(
     tmp_path, frf, fit, record, monkeypatch
 ):
-    drawn, given = draw_sections(fit=fit, frf=frf, record=record), {"fit": fit, "frf": frf}
-    whole = write_report(tmp_path / "whole", **given, record=record)
+    given = {"fit": fit, "frf": frf, "record": record, "others": {"direct estimate": frf}}
+    drawn, whole = draw_sections(**given), write_report(tmp_path / "whole", **given)
     monkeypatch.setattr(_sections, "begin", None)
-    parts = write_report(tmp_path / "parts", **given, record=record, drawn=drawn)
+    parts = write_report(tmp_path / "parts", **given, drawn=drawn)
     assert parts.read_bytes() == whole.read_bytes()
 
 
