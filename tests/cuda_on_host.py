@@ -16,15 +16,25 @@ from jaxquad._xla import _device_trial, _kernel_memory, _nvrtc, _switch
 
 _HOST = """
 #include <cmath>
+#include <cstring>
 using namespace std;
 #define __global__
 #define __device__
-#define __launch_bounds__(n)
+#define __launch_bounds__(threads, blocks)
+#define __shared__
 static struct {{ int x; }} blockIdx, threadIdx;
-float __int_as_float(int) {{ return NAN; }}
+template <typename A, typename B> A as(B x) {{ A y; memcpy(&y, &x, sizeof x); return y; }}
+float __int_as_float(int x) {{ return as<float>(x); }}
+int __float_as_int(float x) {{ return as<int>(x); }}
+int __double2loint(double x) {{ return int(as<long long>(x)); }}
+int __double2hiint(double x) {{ return int(as<long long>(x) >> 32); }}
+double __hiloint2double(int high, int low) {{
+    return as<double>((long long)high << 32 | (unsigned)low);
+}}
 template <typename T> T __ldcs(const T *p) {{ return *p; }}
 template <typename T> T __shfl_down_sync(unsigned, T x, int) {{ return x; }}
 {text}
+long long shelf[1 << 15];
 extern "C" void all(void **p) {{
     for (int m = 0; m < {blocks} * {block}; ++m) {{
         blockIdx.x = m / {block};
@@ -52,7 +62,7 @@ def for_cuda(function, *args):
         return jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
 
 
-def _launch(text, name, args, outs, threads, block):
+def _launch(text, name, args, outs, threads, block, shared):
     def run(*arrays):
         made = [np.full(x.shape, 77, x.dtype) for x in outs]
         arrays = [np.ascontiguousarray(x) for x in arrays]

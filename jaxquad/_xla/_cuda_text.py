@@ -6,11 +6,14 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
+from ._cuda_shortcuts import shortened, Source
+from ._cuda_sincos import SINCOS
 from ._lane_arithmetic import EXPRESSIONS, TYPES
 
 
 # Of the operations that CUDA C has no sign and no function for.
-PRELUDE = """
+PRELUDE = (
+    """
 #define NOT_A_NUMBER __int_as_float(0x7fffffff)
 template <int N, typename T> __device__ T integer_power(T x) {
     if constexpr (N < 0) return 1 / integer_power<-N>(x);
@@ -21,7 +24,18 @@ template <int N, typename T> __device__ T integer_power(T x) {
 // A member that is nan stays nan: the maximum of CUDA would hide it.
 template <typename T> __device__ T larger(T a, T b) { return a > b || a != a ? a : b; }
 template <typename T> __device__ T smaller(T a, T b) { return a < b || a != a ? a : b; }
+// What passes a limit, in reverse; with one instruction less than a compiler finds.
+template <typename T> __device__ T within(T low, T x, T high, T then) {
+    return x > low && x < high ? then : 0;
+}
 #if __CUDA_ARCH__ >= 800
+template <> __device__ float within(float low, float x, float high, float then) {
+    float y;
+    asm("{ .reg .pred p; setp.gt.f32 p, %1, %2; setp.lt.and.f32 p, %1, %3, p; "
+        "selp.f32 %0, %4, 0f00000000, p; }"
+        : "=f"(y) : "f"(x), "f"(low), "f"(high), "f"(then));
+    return y;
+}
 template <> __device__ float larger(float a, float b) {
     float c;
     asm("max.NaN.f32 %0, %1, %2;" : "=f"(c) : "f"(a), "f"(b));
@@ -44,6 +58,8 @@ template <typename T> __device__ void fetch(const T *first, int rows, int apart)
 #endif
 }
 """
+    + SINCOS
+)
 
 
 def type_of(kind: np.dtype) -> str:
@@ -83,17 +99,39 @@ class _Writer:
         names = dict(zip(body.invars, args, strict=True))
         for v, value in zip(body.constvars, jaxpr.consts, strict=True):
             names[v] = number(value, v.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-        for equation in body.eqns:
-            self._statement(equation, names)
+        source = {v: equation for equation in body.eqns for v in equation.outvars}
+        for equation in _in_order(body.outvars, source):
+            self._statement(equation, names, source)
         return self.lines, [_name(v, names) for v in body.outvars]
 
-    def _statement(self, equation: JaxprEqn, names: dict[Var, str]) -> None:
-        given = [_name(v, names) for v in equation.invars]
+    def _statement(self, equation: JaxprEqn, names: dict[Var, str], source: Source) -> None:
+        name, given = shortened(equation, source)
         [out] = equation.outvars
         kind = type_of(out.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-        text = EXPRESSIONS[equation.primitive.name](kind, equation.params, *given)
+        text = EXPRESSIONS[name](kind, equation.params, *(_name(v, names) for v in given))
         names[out] = f"{self.prefix}{len(self.lines)}"
         self.lines.append(f"const {kind} {names[out]} = {text};")
+
+
+def _in_order(results: Sequence[Any], source: Source) -> list[JaxprEqn]:
+    """Each equation just before the first result that needs it.
+
+    A compiler keeps the order of a long text to some degree: numbers that are computed late are
+    held in registers for a shorter time.
+    """
+    found: dict[int, JaxprEqn] = {}
+    for v in results:
+        open_ = [source[v]] if isinstance(v, Var) and v in source else []
+        while open_:
+            given = shortened(open_[-1], source)[1]
+            needs = [source[x] for x in given if isinstance(x, Var) and x in source]
+            missing = [x for x in needs if id(x) not in found]
+            if missing:
+                open_.append(missing[0])
+            else:
+                equation = open_.pop()
+                found[id(equation)] = equation
+    return list(found.values())
 
 
 def _name(v: Any, names: dict[Var, str]) -> str:

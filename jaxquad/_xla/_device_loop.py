@@ -19,8 +19,9 @@ from jaxtyping import Array, PyTree
 
 from ._accelerator import Result, Scan, Step
 from ._forward_kernel import run_forward
-from ._kernel_memory import kept_avals
-from ._lanes import NotInLanes, NUMBERS
+from ._invariants import without_invariants
+from ._kernel_memory import BLOCK, kept_avals, memory_type
+from ._lanes import NotInLanes, NUMBERS, numbers
 from ._loop_kernels import (
     Flat,
     is_float,
@@ -32,6 +33,7 @@ from ._loop_kernels import (
 )
 from ._nvrtc import CannotCompile
 from ._reverse_kernel import holds_cotangents, run_reverse
+from ._segments import segments_of
 from ._switch import note, warn_once
 
 
@@ -40,8 +42,11 @@ def scan_in_kernel(
 ) -> Result | None:
     """`scan(step, carry, signals)`; None, and a note for `engine()`, where no kernel holds it."""
     jaxpr, consts, result = _trace(step, carry, signals)
+    jaxpr, consts = without_invariants(jaxpr, consts, members)
     first, now = jax.tree.leaves(carry), jax.tree.leaves(signals)
-    loop = Loop(jaxpr, len(consts), len(first), members, len(now[0]) if now else 0)
+    carried = sum(numbers(x.shape, members) * memory_type(x.dtype).itemsize for x in first)
+    segments = segments_of(len(now[0]) if now else 0, carried, members, BLOCK)
+    loop = Loop(jaxpr, len(consts), len(first), members, segments)
     reason = _why_not(loop)
     if reason is not None:
         note(f"a kernel of a GPU does not hold {reason}")

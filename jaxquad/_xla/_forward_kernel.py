@@ -41,7 +41,7 @@ class _Forward:
         self.now = rows_of(loop, "now", self.signals)
         self.last = rows_of(loop, "last", self.carry, all_wide=True)
         self.left = rows_of(loop, "left", self.stored, all_wide=True)
-        self.kept = tiles_of(loop, "kept", loop.segments) if keep else []
+        self.kept = tiles_of(loop, "kept", loop.segments.number) if keep else []
 
     def run(self, args: Sequence[Array]) -> Flat:
         loop = self.loop
@@ -79,7 +79,7 @@ class _Forward:
             each = nested("for (int t = first; t < end; ++t)", sample)
             segment = [*bounds(loop), *store_tiles(self.kept, state, "segment"), *each]
             samples = nested(
-                f"for (int segment = 0; segment < {loop.segments}; ++segment)", segment
+                f"for (int segment = 0; segment < {loop.segments.number}; ++segment)", segment
             )
         else:
             samples = nested(f"for (int t = 0; t < {loop.count}; ++t)", sample)

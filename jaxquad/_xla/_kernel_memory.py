@@ -11,6 +11,7 @@ from jaxtyping import Array
 from ._cuda_text import PRELUDE, type_of
 from ._loop_kernels import Flat, is_wide, Loop, Shaped, size, split
 from ._nvrtc import launch
+from ._segments import BLOCKS
 
 
 BLOCK = 128  # threads that are started together
@@ -85,13 +86,19 @@ class Tile(NamedTuple):
     """Numbers of one type of each carry of a loop at several times, for a kernel's own use.
 
     In memory a block's threads are beside each other, and then a time's numbers: what a thread
-    reads at a time lies at fixed distances.
+    reads at a time lies at fixed distances. What is `shared` is a block's own, and goes with it.
     """
 
     name: str
     kind: np.dtype
     places: tuple[int, ...]  # of these numbers among all of the carry
     times: int
+    shared: bool
+
+    @property
+    def size(self) -> int:
+        """Bytes of a block."""
+        return self.times * len(self.places) * BLOCK * memory_type(self.kind).itemsize
 
     def out(self, loop: Loop) -> Shaped:
         blocks = -(-loop.members // BLOCK)
@@ -103,10 +110,13 @@ class Tile(NamedTuple):
         names = {place: f"{self.name}_{place}" for place in self.places}
         kind, test = type_of(self.kind), " != 0" if self.kind.kind == "b" else ""
         lines = [
-            f"const {kind} {name} = __ldcs({self.name}_now + {k * BLOCK}){test};"
-            for k, name in enumerate(names.values())
+            f"const {kind} {name} = {self._read(k)}{test};" for k, name in enumerate(names.values())
         ]
         return [self._now("const ", time), *lines], names
+
+    def _read(self, k: int) -> str:
+        place = f"{self.name}_now + {k * BLOCK}"
+        return f"*({place})" if self.shared else f"__ldcs({place})"
 
     def fetch_before(self) -> Lines:
         """Of the time before the one that was read, while that one is worked on."""
@@ -121,22 +131,34 @@ class Tile(NamedTuple):
 
     def _now(self, access: str, time: str) -> str:
         kind = type_of(memory_type(self.kind))
-        first = f"(blockIdx.x * {self.times}LL + {time}) * {len(self.places) * BLOCK} + threadIdx.x"
+        place = time if self.shared else f"blockIdx.x * {self.times}LL + {time}"
+        first = f"({place}) * {len(self.places) * BLOCK} + threadIdx.x"
         return f"{access}{kind} *const {self.name}_now = {self.name} + {first};"
 
     def parameter(self, access: str) -> str:
         return f"{access}{type_of(memory_type(self.kind))} *__restrict__ {self.name}"
 
 
-def tiles_of(loop: Loop, prefix: str, times: int) -> list[Tile]:
+def tiles_of(loop: Loop, prefix: str, times: int, *, shared: bool = False) -> list[Tile]:
     kinds = [np.dtype(x.dtype) for x in loop.avals[1] for _ in range(size(loop, x))]
     places = {kind: [k for k, each in enumerate(kinds) if each == kind] for kind in kinds}
-    return [Tile(f"{prefix}_{kind}", kind, tuple(k), times) for kind, k in places.items()]
+    made = [Tile(f"{prefix}_{kind}", kind, tuple(k), times, shared) for kind, k in places.items()]
+    return sorted(made, key=lambda tile: -memory_type(tile.kind).itemsize)
+
+
+def declared(tiles: Sequence[Tile]) -> Lines:
+    """Where tiles that are shared lie, the largest numbers first, so that all are aligned."""
+    lines, first = ["extern __shared__ long long shelf[];"], 0
+    for tile in tiles:
+        kind = type_of(memory_type(tile.kind))
+        lines.append(f"{kind} *const {tile.name} = ({kind} *)((char *)shelf + {first});")
+        first += tile.size
+    return lines
 
 
 def kept_avals(loop: Loop) -> list[Shaped]:
     """The carries at the first sample of every segment."""
-    return [x.out(loop) for x in tiles_of(loop, "kept", loop.segments)]
+    return [x.out(loop) for x in tiles_of(loop, "kept", loop.segments.number)]
 
 
 def load_tiles(tiles: Sequence[Tile], time: str) -> tuple[Lines, Lines]:
@@ -189,10 +211,15 @@ def run(
     lines: Lines,
     given: tuple[Sequence[Rows | Tile], Flat],
     made: tuple[Sequence[Rows | Tile], Sequence[Shaped]],
+    shared: int = 0,
 ) -> Flat:
-    """What a kernel of these lines makes of arguments and writes to results."""
+    """What a kernel of these lines makes of arguments and writes to results.
+
+    Each block has some bytes of its own.
+    """
     parameters = [x.parameter("const ") for x in given[0]] + [x.parameter("") for x in made[0]]
-    head = f'extern "C" __global__ void __launch_bounds__({BLOCK}) kernel({", ".join(parameters)})'
+    bounds = f"__launch_bounds__({BLOCK}, {BLOCKS})"
+    head = f'extern "C" __global__ void {bounds} kernel({", ".join(parameters)})'
     begin = [
         f"const long long members = {loop.members};",
         f"const long long place = (long long)blockIdx.x * {BLOCK} + threadIdx.x;",
@@ -200,4 +227,4 @@ def run(
         "const long long member = is_member ? place : members - 1;",
     ]
     text = "\n".join([PRELUDE, *nested(head, [*begin, *lines]), ""])
-    return launch(text, "kernel", given[1], made[1], loop.members, BLOCK)
+    return launch(text, "kernel", given[1], made[1], loop.members, BLOCK, shared)

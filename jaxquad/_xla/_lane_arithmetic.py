@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import JaxprEqn
+from jax.extend.core import JaxprEqn, Primitive
 
 
 Lane = Any  # traced (), or a NumPy scalar
@@ -41,6 +41,12 @@ def _select(kind: str, params: dict, which: str, first: str, *cases: str) -> str
     return first
 
 
+def _quotient_of_choices(
+    kind: str, params: dict, over: str, n0: str, n1: str, under: str, d0: str, d1: str
+) -> str:
+    return f"{over} ? ({under} ? {n1} / {d1} : {n1} / {d0}) : ({under} ? {n0} / {d1} : {n0} / {d0})"
+
+
 def _round(kind: str, params: dict, x: str) -> str:
     away = params["rounding_method"] == lax.RoundingMethod.AWAY_FROM_ZERO
     return f"{'round' if away else 'rint'}({x})"
@@ -69,17 +75,31 @@ _WRITTEN: dict[str, Expression] = {
     "min": _function("smaller"),
     "neg": lambda kind, params, x: f"-{x}",
     "not": lambda kind, params, x: f"!{x}" if kind == "bool" else f"~{x}",
+    "quotient_of_choices": _quotient_of_choices,
     "pow": lambda kind, params, x, y: f"pow({x}, ({kind}){y})",
     "rem": _remainder,
     "round": _round,
     "rsqrt": lambda kind, params, x: f"1 / sqrt({x})",
     "select_n": _select,
     "sign": lambda kind, params, x: f"{x} > 0 ? 1 : {x} < 0 ? -1 : {x}",
+    "within": _function("within"),
     "square": lambda kind, params, x: f"{x} * {x}",
 }
+
+
+def _of_one_number(name: str) -> Primitive:
+    """An operation of lanes alone, which only CUDA C has a text for."""
+    made = Primitive(name)
+    made.def_abstract_eval(lambda x: x)
+    return made
+
+
+# In place of what a function does that names its argument so.
+FUNCTIONS = {"sincos": (_of_one_number("sine_of"), _of_one_number("cosine_of"))}
 EXPRESSIONS: dict[str, Expression] = (
     {name: _between(sign) for name, sign in _SIGNS.items()}
     | {name: _function(name) for name in _SAME_IN_C}
+    | {each.name: _function(each.name) for known in FUNCTIONS.values() for each in known}
     | _WRITTEN
 )
 

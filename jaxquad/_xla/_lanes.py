@@ -17,9 +17,9 @@ from typing import Any
 import jax
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 
-from ._lane_arithmetic import EXPRESSIONS, folded, pair, TYPES
+from ._lane_arithmetic import EXPRESSIONS, folded, FUNCTIONS, pair, TYPES
 
 
 Lane = Any  # traced (), or a NumPy scalar
@@ -77,8 +77,12 @@ class Lanes:
 
     def _apply(self, equation: JaxprEqn, args: list[Cells]) -> list[Cells]:
         name, params = equation.primitive.name, equation.params
-        if name in _CALLS:
-            return self.call(params[_CALLS[name]], args)
+        if name in CALLS:
+            called = params[CALLS[name]]
+            in_its_place = _known_function(called)
+            if in_its_place:
+                return [self._each(operation, *args) for operation in in_its_place]
+            return self.call(called, args)
         if name in _KEPT:
             return args
         for v in equation.outvars:
@@ -111,6 +115,10 @@ class Lanes:
             raise NotInLanes(f"more than {_MOST_OPERATIONS} operations in a sample")
         return equation.primitive.bind(*row, **equation.params)
 
+    def _each(self, operation: Primitive, x: Cells) -> Cells:
+        self.count += x.size
+        return cells_of([operation.bind(lane) for lane in x.reshape(-1)], x.shape)
+
     def fold(self, name: str, lanes: Sequence[Lane]) -> Lane:
         """The sum, the product, ... of some lanes, by halves."""
         while len(lanes) > 1:
@@ -127,6 +135,19 @@ class Lanes:
         return shape[axis] == self.members
 
 
+def _known_function(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[Primitive, ...]:
+    """What a kernel computes in place of a function, which tells its name first."""
+    first = jaxpr.eqns[0] if jaxpr.eqns else None
+    if first is None or first.primitive.name != "name":
+        return ()
+    return FUNCTIONS.get(first.params["name"], ())
+
+
+def numbers(shape: Shape, members: int) -> int:
+    """Those of one member in an array."""
+    return math.prod(n for n in shape if n != members)
+
+
 def cells_of(lanes: Sequence[Lane], shape: Shape) -> Cells:
     out = np.empty(len(lanes), object)
     for k, lane in enumerate(lanes):  # NumPy would look into what is assigned at once
@@ -139,7 +160,7 @@ def as_cells(x: Any) -> Cells:
     return x if isinstance(x, np.ndarray) and x.dtype == object else cells_of([x], ())
 
 
-_CALLS = {
+CALLS = {  # and where the called jaxpr is
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "checkpoint": "jaxpr",
     "remat2": "jaxpr",

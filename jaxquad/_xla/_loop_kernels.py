@@ -20,7 +20,8 @@ from jaxtyping import Array
 
 from ._lane_arithmetic import EXPRESSIONS
 from ._lane_moves import RULES
-from ._lanes import as_cells, Cells, cells_of, Lane, Lanes, NotInLanes
+from ._lanes import as_cells, Cells, cells_of, Lane, Lanes, NotInLanes, numbers
+from ._segments import Segments
 
 
 T = TypeVar("T")
@@ -29,13 +30,18 @@ Shaped = jax.ShapeDtypeStruct
 
 
 class Loop(NamedTuple):
-    """`count` samples of a step for `members`, which is a jaxpr of (consts, carry, now)."""
+    """Samples of a step for `members`, which is a jaxpr of (consts, carry, now)."""
 
     step: ClosedJaxpr
     consts: int
     carry: int
     members: int
-    count: int
+    segments: Segments
+
+    @property
+    def count(self) -> int:
+        """Samples."""
+        return self.segments.count
 
     @property
     def given(self) -> list[Shaped]:
@@ -59,15 +65,6 @@ class Loop(NamedTuple):
         carry, stored = split(self.out, self.carry)
         return carry, stored
 
-    @property
-    def segment(self) -> int:
-        """Samples between two carries that are kept."""
-        return math.isqrt(max(self.count - 1, 0)) + 1
-
-    @property
-    def segments(self) -> int:
-        return -(-self.count // self.segment)
-
 
 def _shaped(avals: Sequence[Any]) -> list[Shaped]:
     return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in avals]
@@ -90,7 +87,7 @@ def is_wide(loop: Loop, aval: Shaped) -> bool:
 
 def size(loop: Loop, aval: Shaped) -> int:
     """The numbers of one member."""
-    return math.prod(n for n in aval.shape if n != loop.members)
+    return numbers(aval.shape, loop.members)
 
 
 def in_lanes(loop: Loop, jaxpr: ClosedJaxpr, *, leave_sums: bool = False) -> ClosedJaxpr:
@@ -102,7 +99,7 @@ def in_lanes(loop: Loop, jaxpr: ClosedJaxpr, *, leave_sums: bool = False) -> Clo
         given += [jax.ShapeDtypeStruct((), aval.dtype)] * size(loop, aval)
 
     def flat(*args: Lane) -> list[Lane]:
-        parts = split(args, *(math.prod(shape) for shape in shapes))
+        parts = split(args, *map(math.prod, shapes))
         cells = [cells_of(part, shape) for part, shape in zip(parts, shapes, strict=False)]
         out = lanes.evaluate(jaxpr.jaxpr, jaxpr.consts, cells)
         return [lane for x in out for lane in _listed(x)]
@@ -154,8 +151,9 @@ def reverse_wanted(loop: Loop, which: tuple[bool, ...]) -> tuple[bool, ...]:
 
 def bounds(loop: Loop) -> list[str]:
     """The first sample of a segment, and the first after it."""
-    last = f"first + {loop.segment}"
+    length = loop.segments.length
+    last = f"first + {length}"
     return [
-        f"const int first = segment * {loop.segment};",
+        f"const int first = segment * {length};",
         f"const int end = {last} < {loop.count} ? {last} : {loop.count};",
     ]

@@ -33,11 +33,18 @@ class CannotCompile(Exception):
 
 
 def launch(
-    text: str, name: str, args: Sequence[Array], outs: Sequence[Any], threads: int, block: int
+    text: str,
+    name: str,
+    args: Sequence[Array],
+    outs: Sequence[Any],
+    threads: int,
+    block: int,
+    shared: int,
 ) -> list[Array]:
     """What the kernel `name` of a text in CUDA C writes to `outs`, [`block`] `threads` at a time.
 
-    Its parameters are pointers to the arguments and then to the results.
+    Its parameters are pointers to the arguments and then to the results. A block has so many bytes
+    that its threads share.
     """
     call = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", tuple(outs))
     one = np.int32(1)
@@ -53,7 +60,7 @@ def launch(
             block_x=np.int32(block),
             block_y=one,
             block_z=one,
-            shared_mem_bytes=np.int32(0),
+            shared_mem_bytes=np.int32(shared),
         )
     )
 

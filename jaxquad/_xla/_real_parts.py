@@ -241,8 +241,8 @@ _MOVES = set(
 _REAL = set(
     """
     abs add add_any and ceil clamp div eq exp exp2 expm1 floor ge gt integer_pow iota is_finite le
-    log log1p logistic lt max min mul ne neg not or pow reduce_max reduce_min round rsqrt sign sqrt
-    square sub tanh
+    log log1p logistic lt max min mul name ne neg not or pow reduce_max reduce_min round rsqrt sign
+    sqrt square sub tanh
     """.split()
 )
 _INLINED = {

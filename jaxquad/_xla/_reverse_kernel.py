@@ -10,6 +10,7 @@ from . import _kernel_memory
 from ._cuda_text import statements, type_of
 from ._kernel_memory import (
     assigned,
+    declared,
     fetch_before,
     Lines,
     load_all,
@@ -74,19 +75,22 @@ class _Reverse:
         self.wanted_signals = pick(self.signals, wanted[2])
         self.fixed = rows_of(loop, "fixed", self.consts)
         self.now = rows_of(loop, "now", self.signals)
-        self.kept = tiles_of(loop, "kept", loop.segments)
+        self.kept = tiles_of(loop, "kept", loop.segments.number)
         self.felt = rows_of(loop, "felt", self.moving)
         self.left = rows_of(loop, "left", self.stored)
         self.to_fixed = rows_of(loop, "to_fixed", self.wanted_consts, all_wide=True)
         self.to_carry = rows_of(loop, "to_carry", self.moving, all_wide=True)
         self.to_now = rows_of(loop, "to_now", self.wanted_signals)
-        self.again = tiles_of(loop, "again", loop.segment)
+        length, shared = loop.segments.length, loop.segments.are_shared
+        self.again = tiles_of(loop, "again", length, shared=shared)
+        self.shelf = self.again if shared else []
 
     def run(self, args: Sequence[Array]) -> Flat:
         given = [*self.fixed, *self.now, *self.kept, *self.felt, *self.left]
-        made = [*self.to_fixed, *self.to_carry, *self.to_now, *self.again]
-        args = self._packed(args)
-        found = run(self.loop, self.lines(), (given, args), (made, self._outs()))
+        made = [*self.to_fixed, *self.to_carry, *self.to_now, *(() if self.shelf else self.again)]
+        pairs = (given, self._packed(args)), (made, self._outs())
+        own = sum(tile.size for tile in self.shelf)
+        found = run(self.loop, self.lines(), *pairs, shared=own)
         consts, carry, signals, _ = split(
             found, len(self.wanted_consts), len(self.moving), len(self.wanted_signals)
         )
@@ -128,7 +132,7 @@ class _Reverse:
         for x in self.wanted_signals:
             last = loop.members if is_wide(loop, x) else -(-loop.members // _kernel_memory.WARP)
             outs.append(jax.ShapeDtypeStruct((loop.count, size(loop, x), last), x.dtype))
-        return outs + [x.out(loop) for x in self.again]
+        return outs if self.shelf else outs + [x.out(loop) for x in self.again]
 
     def lines(self) -> Lines:
         loop = self.loop
@@ -138,6 +142,7 @@ class _Reverse:
         zeros = ["0"] * sum(size(loop, x) for x in self.wanted_consts)
         sums_begin, sums = variables(loop, "sum", self.wanted_consts, zeros)
         kept, first = load_tiles(self.kept, "segment")
+        kept += nested("if (segment > 0)", fetch_before(self.kept)) if self.shelf else []
         state_begins, state = variables(loop, "state", self.carry, first)
         segment = [
             *bounds(loop), *kept, *state_begins,
@@ -145,9 +150,10 @@ class _Reverse:
             *store_tiles(self.again, state, "end - 1 - first"),
             *nested("for (int t = end - 1; t >= first; --t)", self._back(fixed, moved, sums)),
         ]  # fmt: skip
-        head = f"for (int segment = {loop.segments - 1}; segment >= 0; --segment)"
+        head = f"for (int segment = {loop.segments.number - 1}; segment >= 0; --segment)"
         ends = [*store_all(self.to_carry, moved), *store_all(self.to_fixed, sums)]
-        return [*loads, *felt, *begins, *sums_begin, *nested(head, segment), *ends]
+        shelf = declared(self.shelf) if self.shelf else []
+        return [*shelf, *loads, *felt, *begins, *sums_begin, *nested(head, segment), *ends]
 
     def _once_more(self, fixed: Lines, state: Lines) -> Lines:
         """A sample of the forward pass, whose carry is written to memory."""
@@ -159,7 +165,7 @@ class _Reverse:
     def _back(self, fixed: Lines, moved: Lines, sums: Lines) -> Lines:
         """A sample of the reverse pass."""
         again, state = load_tiles(self.again, "t - first")
-        again += nested("if (t > first)", fetch_before(self.again))
+        again += [] if self.shelf else nested("if (t > first)", fetch_before(self.again))
         now, signals = load_all(self.now, time="t")
         left, stored = self._stored_cotangents()
         given = [*fixed, *state, *signals, *moved, *stored]

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 
@@ -43,6 +44,7 @@ def sincos(
     1.4 units of rounding of 1, up to 1e9 rad (1e6 in single precision, where large angles need
     fused products and sums, as optimised code has them); nan beyond. Differentiable to any order.
     """
+    x = checkpoint_name(x, "sincos")  # by which a kernel of a GPU knows it
     x = jnp.where(jnp.abs(x) <= (1e6 if x.dtype == jnp.float32 else 1e9), x, jnp.nan)
     near, below = jnp.round(x * _PER_PI), jnp.floor(x * _PER_PI)
     return _sign(near) * _near(x, near), -_sign(below) * _near(x, below + 0.5)

@@ -11,8 +11,17 @@ import numpy as np
 import pytest
 from cuda_on_host import for_cuda, run_on_host
 
-from jaxquad._xla import _device_trial, _kernel_memory, _nvrtc, _switch, scan_on_device
+from jaxquad._xla import (
+    _device_trial,
+    _kernel_memory,
+    _nvrtc,
+    _segments,
+    _switch,
+    scan_on_device,
+    sincos,
+)
 from jaxquad._xla._nvrtc import CannotCompile
+from jaxquad._xla._segments import Segments, segments_of
 
 
 MEMBERS, SAMPLES = 150, 7  # a block and a part of one; segments of 3, 3 and 1
@@ -77,14 +86,110 @@ def given():
     return [spread(*size, seed=k) for k, size in enumerate(sizes)]
 
 
-def test_values_and_gradients_are_those_of_the_plain_scan():
+def have_memory(monkeypatch):
+    """That of a GPU which keeps every second carry, and shares its memory among threads."""
+    monkeypatch.setattr(_segments, "_memory", lambda: (10**9, 228 * 1024))
+
+
+@pytest.mark.parametrize("memory", ["little", "much"])
+def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
     """With respect to what members share and what they do not, at the start and in every sample."""
+    if memory == "much":
+        have_memory(monkeypatch)
     both = [jax.value_and_grad(ft.partial(total, scan), argnums=range(5), has_aux=True)
             for scan in (kernel, plain)]  # fmt: skip
     found, expected = (jax.tree.leaves(compiled(f, *given())) for f in both)
     assert not _switch.left_plain()
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-13)
+
+
+def test_carries_are_kept_as_often_as_a_quarter_of_the_memory_allows(monkeypatch):
+    count, carry, members, block = 5000, 140, 100_000, 128
+    assert segments_of(count, carry, members, block) == Segments(count, 71, False)  # no GPU
+    for room, expected in (
+        (400e9, Segments(count, 2, True)),
+        (100e9, Segments(count, 3, True)),
+        (50e9, Segments(count, 6, True)),
+        (40e9, Segments(count, 71, False)),  # 7 carries of a block take more than 113 kB
+    ):
+        monkeypatch.setattr(_segments, "_memory", lambda room=room: (int(room), 228 * 1024))
+        assert segments_of(count, carry, members, block) == expected
+    monkeypatch.setattr(_segments, "_memory", lambda: (10**12, 64 * 1024))
+    assert not segments_of(count, carry, members, block).are_shared  # not even two of them fit
+    assert segments_of(count, 40, members, block) == Segments(count, 2, True)
+
+
+def written(function, *args):
+    """The texts of its kernels, in CUDA C."""
+    texts = []
+    with pytest.MonkeyPatch.context() as patch, _switch.device_kernels("forced"):
+        patch.setattr(_kernel_memory, "launch", ft.partial(_launched, texts))
+        jax.jit(function).lower(*args)
+    return texts
+
+
+def _launched(texts, text, name, args, outs, *_):
+    texts.append(text)
+    return [jnp.zeros(x.shape, x.dtype) for x in outs]
+
+
+def steady(scan, tuning, x):
+    """Two controllers of the same gains: sums, products and a square root that never change."""
+    low, high = tuning[:1], tuning[1:]
+
+    def step(x, now):
+        push = [jnp.clip(jnp.sqrt(low * high) * x + now * (high - low), 0.1, 0.3) for _ in "ab"]
+        return x + 0.1 * (push[0] + push[1]), None
+
+    return jnp.sum(scan(step, x, jnp.linspace(0.0, 1.0, SAMPLES))[0] ** 2)
+
+
+def test_what_is_the_same_in_every_sample_is_computed_before_the_loop():
+    args = spread(2, MEMBERS), spread(1, MEMBERS, seed=1)
+    forward, reverse = written(jax.grad(ft.partial(steady, kernel)), *args)
+    for text in forward, reverse:
+        assert "sqrt(" not in text.split("kernel(")[1]
+    found, expected = (compiled(jax.grad(ft.partial(steady, s)), *args) for s in (kernel, plain))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def limited(scan, low, high, x):
+    """By either way to write it, at and beyond the limits and between them."""
+
+    def step(x, now):
+        held = jax.lax.clamp(low, x + now, high) + jnp.clip(x - now, low, high)
+        return 0.5 * jnp.maximum(held, x), None
+
+    return jnp.sum(scan(step, x, jnp.array([0.0, 0.2, 0.0]))[0] ** 2)
+
+
+def test_slopes_of_limits_are_one_choice_and_no_quotient():
+    x = jnp.array([[0.1, 0.3, 0.2, 0.4, 0.05] * (MEMBERS // 5)])
+    args = jnp.full((1, MEMBERS), 0.1), jnp.full((1, MEMBERS), 0.3), x
+    slope = jax.grad(ft.partial(limited, kernel), range(3))
+    reverse = written(slope, *args)[1].split("kernel(")[1]
+    assert "within(" in reverse
+    assert not [line for line in reverse.splitlines() if "/ v" in line]
+    found, expected = (compiled(jax.grad(ft.partial(limited, s), range(3)), *args)
+                       for s in (kernel, plain))  # fmt: skip
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind, far", [(np.float32, 1e6), (np.float64, 1e9)])
+def test_sines_and_cosines_of_a_kernel_are_right_to_the_last_bit(kind, far):
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(-4, 4, 3000), rng.uniform(-far, far, 3000), [2 * far, np.nan]])
+    x = x.astype(kind)
+    step = lambda c, now: (jnp.stack(sincos(c[0] + 0 * now)), None)
+    run = lambda x: scan_on_device(step, jnp.stack([x, x]), jnp.ones(1, kind), x.size, plain)
+    found = np.asarray(compiled(run, jnp.asarray(x))[0])
+    with np.errstate(invalid="ignore"):
+        expected = np.stack([np.sin(x.astype(np.longdouble)), np.cos(x.astype(np.longdouble))])
+    error = np.abs(found - expected)[:, :-2] / np.finfo(kind).eps
+    assert error.max() < 0.7
+    assert np.isnan(found[:, -2:]).all()
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
