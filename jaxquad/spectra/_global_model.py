@@ -2,7 +2,7 @@
 
 import functools as ft
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,15 +11,14 @@ from jaxtyping import Complex, Float, Int
 from jaxquad._core import beside
 
 from ._local_fit import Bins
+from ._model_order import next_order, refine_orders, search_orders
 from ._rational_fit import (
     columns_of,
     descend,
     Equations,
-    EXACT,
     make_basis,
     parts_of,
     powers_of,
-    relax,
     slopes_of,
     solve_linear,
     Solved,
@@ -29,11 +28,9 @@ from ._rational_fit import (
 _BEYOND = 5.0  # ratio of the highest bin that is modelled to the highest frequency asked for
 _MOST_BINS = 20000  # that a model is fitted to
 _TRIAL_BINS = 4000  # with which its order is chosen
-_SETTLED, _TRIAL = 1e-6, 1e-3  # relative gain of a step at which the descent, or a trial, ends
-_PER_PARAMETER = 6  # real equations
+_SETTLED = 1e-6  # relative gain of a step at which the descent ends
+_LEAST = 1e-12  # noise, to the mean power of the output
 _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
-_THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
-_PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
 _BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of the residual's power: in ln(omega), and bins a side at least
 
 
@@ -163,8 +160,11 @@ def _identify_weighted(
     most: int,
 ) -> "Identified | None":
     every = _thin(len(omega), _TRIAL_BINS)
-    chosen = _choose(equations.weighted(weight).pick(every), most)
-    return None if chosen is None else _settle(equations, omega, weight, chosen)
+    white = equations.weighted(weight).pick(every)
+    found = search_orders(white, most)
+    if found.best == 0:
+        return None
+    return _settle(equations, omega, weight, next_order(white, found, most))
 
 
 def _equations(
@@ -229,28 +229,37 @@ def _identify(
 ) -> Identified | None:
     """A model whose bins count by what a first one leaves."""
     every = _thin(len(omega), _TRIAL_BINS)
-    first = _choose(equations.pick(every), most)
-    if first is None:
+    few = equations.pick(every)
+    rough = 1 / np.sqrt(rough_noise(few, omega[every]))
+    first = search_orders(few.weighted(rough), most)
+    if first.best == 0:
         return None
-    noise = running_power(omega, _residual(equations, first), np.ones_like(omega))
+    noise = _noise_after(equations, omega, first)
     weight = 1 / np.sqrt(noise)
     if np.max(noise) < _EVEN * np.min(noise):
         weight = np.full_like(noise, np.mean(weight))
-    white = equations.weighted(weight)
-    chosen = _choose(white.pick(every), most) if np.ptp(weight) > 0 else first
-    return None if chosen is None else _settle(equations, omega, weight, chosen)
+    found = refine_orders(few.weighted(weight[every]), first, most)
+    if found.best == 0:
+        return None
+    return _settle(equations, omega, weight, next_order(few, found, most))
+
+
+def _noise_after(equations, omega, orders):
+    above = orders.solved.get(orders.best + 1, orders.solved[orders.best])
+    solved = solve_linear(equations, make_basis(equations, len(above.denominator)), above.denominator)
+    return noise_left(omega, solved.left, solved.below, np.ones_like(omega))
 
 
 def _settle(
     equations: Equations,
     omega: Float[np.ndarray, " bins"],
     weight: Float[np.ndarray, " bins"],
-    chosen: Solved,
+    start: Float[np.ndarray, " powers"],
 ) -> Identified:
     """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
     white = equations.weighted(weight)
-    basis = make_basis(white, len(chosen.denominator))
-    solved = descend(white, basis, chosen.denominator, _SETTLED)
+    basis = make_basis(white, start.size)
+    solved = descend(white, basis, start, _SETTLED)
     fixed = basis.largest(solved.denominator)
     slopes = parts_of(slopes_of(white, basis, solved, fixed))
     length = np.linalg.norm(slopes, axis=1, keepdims=True)
@@ -259,66 +268,45 @@ def _settle(
     follow = right.view(complex)
     drive = (left * inverse / length) @ np.conj(follow)
     taken = np.sum(np.abs(follow) ** 2, axis=0) / 2
-    noise = running_power(omega, solved.left / weight, 1 - taken)
+    noise = noise_left(omega, solved.left / weight, solved.below, 1 - taken)
     return solved, fixed, drive * weight, follow.T, noise
 
 
-def _residual(equations: Equations, solved: Solved) -> Complex[np.ndarray, " bins"]:
-    basis = make_basis(equations, len(solved.denominator))
-    return equations.y - solved.linear @ basis.columns / (solved.denominator @ basis.powers)
-
-
-def _choose(equations: Equations, most: int) -> Solved | None:
-    """The solution of the order above the best one, where it was tried and leaves less.
-
-    Descents begin at a linear estimate, and at the solution of the order below, so that no order
-    leaves more than a lower one. The noise draws the poles of linear estimates to the stability
-    limit or beyond it, from where few descents find back: those models can lack a lag of the plant,
-    for hundreds of the criterion.
-    """
-    count, below = 2 * len(equations.y), np.ones(1)
-    best, above, least, worse = None, None, _information(_proportional(equations), 1, count), 0
-    lowest, floor = least, EXACT * float(np.sum(np.abs(equations.y) ** 2))
-    for order in _orders(most):
-        parameters = equations.parameters(order)
-        if parameters * _PER_PARAMETER > count:
-            break
-        basis = make_basis(equations, order + 1)
-        solved = descend(equations, basis, relax(equations, basis), _TRIAL)
-        value = _information(solved.cost + 0.01 * floor, parameters, count)
-        # What the order below leads to must not end the search: higher orders may find more.
-        worse, lowest = (0, value) if value < lowest else (worse + 1, lowest)
-        again = descend(equations, basis, np.pad(below, (0, order + 1 - below.size)), _TRIAL)
-        if again.cost < solved.cost:
-            solved, value = again, _information(again.cost + 0.01 * floor, parameters, count)
-        below = solved.denominator
-        if value < least:
-            best, above, least = solved, None, value
-        elif above is None:
-            above = solved
-        if (worse >= _PATIENCE and order >= _THOROUGH) or solved.cost <= floor:
-            break
-    if best is None or above is None or above.cost >= best.cost:
-        return best
-    return above
-
-
-def _orders(most: int) -> Iterator[int]:
-    """All up to 6, then every second."""
-    yield from (order for order in range(1, most + 1) if order <= 6 or (most - order) % 2 == 0)
-
-
-def _information(cost: float, parameters: int, count: int) -> float:
-    return count * np.log(max(cost, 1e-300) / count) + _PRICE * parameters
-
-
-def _proportional(equations: Equations) -> float:
-    """Squared residuals of gains that do not depend on frequency."""
-    return solve_linear(equations, make_basis(equations, 1), np.ones(1)).cost
+def rough_noise(
+    equations: Equations, omega: Float[np.ndarray, " bins"]
+) -> Float[np.ndarray, " bins"]:
+    """Power of what gains, and transients, that are linear over a few bins leave of them."""
+    factors = np.concatenate([equations.u, equations.own])
+    count, columns = omega.size, 2 * len(factors)
+    length = min(2 * columns, count)
+    each = np.arange(-(-count // length) * length).reshape(-1, length)
+    inside = np.minimum(each, count - 1)
+    place = np.linspace(-1.0, 1.0, length)
+    rows = np.moveaxis(factors[:, inside], 0, 2)
+    basis = np.linalg.qr(np.concatenate([rows, rows * place[:, None]], axis=2))[0]
+    y = equations.y[inside][:, :, None]
+    left = (y - basis @ (np.conj(np.swapaxes(basis, 1, 2)) @ y)).ravel()[:count]
+    power = running_power(omega, left, np.full(count, 1 - columns / length))
+    return power + _LEAST * np.mean(np.abs(equations.y) ** 2)
 
 
 def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "records bins"]:
     return (record == np.arange(records)[:, None]).astype(float)
+
+
+_LIKELIER = 10.0
+
+
+def noise_left(omega, left, below, freedom):
+    """Running power of what is left, or that before the poles, where that is clearly likelier."""
+    after = running_power(omega, left, freedom)
+    before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
+    likelier = 2 * (_log_likelihood(left, before) - _log_likelihood(left, after))
+    return before if likelier > _LIKELIER else after
+
+
+def _log_likelihood(left, power) -> float:
+    return -float(np.sum(np.log(power) + np.abs(left) ** 2 / power))
 
 
 def running_power(

@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float, Int
 
 
 _RELAXATIONS, _STEPS = 12, 20  # of Sanathanan and Koerner, of Gauss and Newton
-_NEAREST = 1e-9  # size of the denominator, to its largest, so that no pole falls onto a bin
+_NEAREST = 1e-9  # size of the denominator, to its terms', so that no pole falls onto a bin
 EXACT = 1e-20  # share of the output's power that is rounding
 _LEAST_CONDITION = 1e-10  # reciprocal, of normal equations that leave digits enough
 _DEPENDENT = 1e-13  # singular value, to the largest, of a direction that is left alone
@@ -57,17 +57,17 @@ class Basis(NamedTuple):
 
     powers: Complex[np.ndarray, "powers bins"]
     columns: Complex[np.ndarray, "parameters bins"]  # of the numerators and transients
-    size: Float[np.ndarray, " powers"]  # mean over the bins
+    magnitude: Float[np.ndarray, "powers bins"]  # of the powers
 
     def largest(self, denominator: Float[np.ndarray, " powers"]) -> int:
         """The power whose term is largest over the bins."""
-        return int(np.argmax(np.abs(denominator) * self.size))
+        return int(np.argmax(np.abs(denominator) * np.mean(self.magnitude, axis=1)))
 
 
 def make_basis(equations: Equations, size: int) -> Basis:
     powers = powers_of(equations.x, size)
     columns = columns_of(powers, equations.u, equations.own)
-    return Basis(powers, columns, np.mean(np.abs(powers), axis=1))
+    return Basis(powers, columns, np.abs(powers))
 
 
 def powers_of(x: Complex[np.ndarray, " bins"], size: int) -> Complex[np.ndarray, "powers bins"]:
@@ -214,12 +214,29 @@ def _project(
 ) -> tuple[Solved, _Span]:
     """The best linear coefficients under a denominator, and what their columns span."""
     below = denominator @ basis.powers
-    size = np.abs(below)
-    below = np.where(size < _NEAREST * np.max(size), _NEAREST * np.max(size), below)
+    least = _NEAREST * (np.abs(denominator) @ basis.magnitude)
+    below = np.where(np.abs(below) < least, least, below)
     span, y = _span_of(parts_of(basis.columns * (1 / below))), parts_of(equations.y)
     linear, left = span.nearest(y)
     solved = Solved(denominator, linear, below, left.view(complex), float(left @ left))
     return solved, span
+
+
+def cost_with_pole(
+    equations: Equations, basis: Basis, solved: Solved, places: Float[np.ndarray, " places"]
+) -> Float[np.ndarray, " places"]:
+    """What is left with one more pole, at each of some places on the real axis of x.
+
+    Polynomials over A (1 - x/p) are those of one degree less over A, and a constant over the same.
+    """
+    _, span = _project(equations, basis, solved.denominator)
+    driven, left = np.concatenate([equations.u, equations.own]) / solved.below, parts_of(solved.left)
+    costs = np.empty(len(places))
+    for k, place in enumerate(places):
+        _, rows = span.nearest(parts_of(driven / (1 - equations.x / place)))
+        rest = left - _least_squares(rows, left) @ rows
+        costs[k] = rest @ rest
+    return costs
 
 
 def parts_of(rows: Complex[np.ndarray, "*rows bins"]) -> Float[np.ndarray, "*rows parts"]:
