@@ -29,7 +29,7 @@ _BEYOND = 5.0  # ratio of the highest bin that is modelled to the highest freque
 _MOST_BINS = 20000  # that a model is fitted to
 _TRIAL_BINS = 4000  # with which its order is chosen
 _SETTLED = 1e-6  # relative gain of a step at which the descent ends
-_LEAST = 1e-12  # noise, to the mean power of the output
+_LEAST = 1e-6  # input, or noise, to its root mean square over the bins
 _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
 _BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of the residual's power: in ln(omega), and bins a side at least
 
@@ -279,15 +279,19 @@ def rough_noise(
     factors = np.concatenate([equations.u, equations.own])
     count, columns = omega.size, 2 * len(factors)
     length = min(2 * columns, count)
-    each = np.arange(-(-count // length) * length).reshape(-1, length)
-    inside = np.minimum(each, count - 1)
-    place = np.linspace(-1.0, 1.0, length)
+    blocks = np.arange(-(-count // length) * length).reshape(-1, length)
+    inside, place = np.minimum(blocks, count - 1), np.linspace(-1.0, 1.0, length)
     rows = np.moveaxis(factors[:, inside], 0, 2)
-    basis = np.linalg.qr(np.concatenate([rows, rows * place[:, None]], axis=2))[0]
+    rows = np.concatenate([rows, rows * place[:, None]], axis=2)
+    # Of bins that no input moves, the fit must not take what rounding leaves there.
+    least = _LEAST * np.sqrt(np.mean(np.abs(rows) ** 2, axis=(0, 1)))
+    least = np.broadcast_to(np.diag(least), (len(blocks), columns, columns))
+    basis = np.linalg.qr(np.concatenate([rows, least], axis=1))[0][:, :length]
     y = equations.y[inside][:, :, None]
     left = (y - basis @ (np.conj(np.swapaxes(basis, 1, 2)) @ y)).ravel()[:count]
-    power = running_power(omega, left, np.full(count, 1 - columns / length))
-    return power + _LEAST * np.mean(np.abs(equations.y) ** 2)
+    freedom = 1 - np.sum(np.abs(basis) ** 2, axis=2).ravel()[:count]
+    power = running_power(omega, left, freedom)
+    return power + _LEAST**2 * np.mean(np.abs(equations.y) ** 2)
 
 
 def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "records bins"]:
