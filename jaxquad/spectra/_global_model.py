@@ -20,7 +20,6 @@ from ._rational_fit import (
     parts_of,
     powers_of,
     slopes_of,
-    solve_linear,
     Solved,
 )
 
@@ -246,8 +245,10 @@ def _identify(
 
 def _noise_after(equations, omega, orders):
     above = orders.solved.get(orders.best + 1, orders.solved[orders.best])
-    solved = solve_linear(equations, make_basis(equations, len(above.denominator)), above.denominator)
-    return noise_left(omega, solved.left, solved.below, np.ones_like(omega))
+    basis = make_basis(equations, len(above.denominator))
+    below = above.denominator @ basis.powers
+    left = equations.y - above.linear @ basis.columns / below
+    return noise_left(omega, left, below, np.ones_like(omega))
 
 
 def _settle(
