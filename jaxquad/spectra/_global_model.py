@@ -11,7 +11,8 @@ from jaxtyping import Complex, Float, Int
 from jaxquad._core import beside
 
 from ._local_fit import Bins
-from ._model_order import next_order, refine_orders, search_orders
+from ._model_noise import noise_left, rough_noise
+from ._model_order import next_order, Orders, refine_orders, search_orders
 from ._rational_fit import (
     columns_of,
     descend,
@@ -28,9 +29,7 @@ _BEYOND = 5.0  # ratio of the highest bin that is modelled to the highest freque
 _MOST_BINS = 20000  # that a model is fitted to
 _TRIAL_BINS = 4000  # with which its order is chosen
 _SETTLED = 1e-6  # relative gain of a step at which the descent ends
-_LEAST = 1e-6  # input, or noise, to its root mean square over the bins
 _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
-_BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of the residual's power: in ln(omega), and bins a side at least
 
 
 class GlobalModel(NamedTuple):
@@ -158,12 +157,11 @@ def _identify_weighted(
     weight: Float[np.ndarray, " bins"],
     most: int,
 ) -> "Identified | None":
-    every = _thin(len(omega), _TRIAL_BINS)
-    white = equations.weighted(weight).pick(every)
-    found = search_orders(white, most)
-    if found.best == 0:
+    white = equations.weighted(weight).pick(_thin(len(omega), _TRIAL_BINS))
+    orders = search_orders(white, most)
+    if orders.best == 0:
         return None
-    return _settle(equations, omega, weight, next_order(white, found, most))
+    return _settle(equations, omega, weight, next_order(white, orders, most))
 
 
 def _equations(
@@ -229,25 +227,29 @@ def _identify(
     """A model whose bins count by what a first one leaves."""
     every = _thin(len(omega), _TRIAL_BINS)
     few = equations.pick(every)
-    rough = 1 / np.sqrt(rough_noise(few, omega[every]))
-    first = search_orders(few.weighted(rough), most)
+    # Unweighted, it would fit the loud bins alone.
+    first = search_orders(few.weighted(1 / np.sqrt(rough_noise(few, omega[every]))), most)
     if first.best == 0:
         return None
     noise = _noise_after(equations, omega, first)
     weight = 1 / np.sqrt(noise)
     if np.max(noise) < _EVEN * np.min(noise):
         weight = np.full_like(noise, np.mean(weight))
-    found = refine_orders(few.weighted(weight[every]), first, most)
-    if found.best == 0:
+    white = few.weighted(weight[every])
+    orders = refine_orders(white, first, most)
+    if orders.best == 0:
         return None
-    return _settle(equations, omega, weight, next_order(few, found, most))
+    return _settle(equations, omega, weight, next_order(white, orders, most))
 
 
-def _noise_after(equations, omega, orders):
-    above = orders.solved.get(orders.best + 1, orders.solved[orders.best])
-    basis = make_basis(equations, len(above.denominator))
-    below = above.denominator @ basis.powers
-    left = equations.y - above.linear @ basis.columns / below
+def _noise_after(
+    equations: Equations, omega: Float[np.ndarray, " bins"], orders: Orders
+) -> Float[np.ndarray, " bins"]:
+    """The noise, from what the order above the best one leaves of all bins."""
+    solved = orders.solved.get(orders.best + 1, orders.solved[orders.best])
+    basis = make_basis(equations, len(solved.denominator))
+    below = solved.denominator @ basis.powers
+    left = equations.y - solved.linear @ basis.columns / below
     return noise_left(omega, left, below, np.ones_like(omega))
 
 
@@ -257,7 +259,7 @@ def _settle(
     weight: Float[np.ndarray, " bins"],
     start: Float[np.ndarray, " powers"],
 ) -> Identified:
-    """The solution, the fixed power, the drive of the errors, what follows noise, and its power."""
+    """A descent from `start`: solution, fixed power, drive of errors, what follows noise, its power."""
     white = equations.weighted(weight)
     basis = make_basis(white, start.size)
     solved = descend(white, basis, start, _SETTLED)
@@ -273,59 +275,5 @@ def _settle(
     return solved, fixed, drive * weight, follow.T, noise
 
 
-def rough_noise(
-    equations: Equations, omega: Float[np.ndarray, " bins"]
-) -> Float[np.ndarray, " bins"]:
-    """Power of what gains, and transients, that are linear over a few bins leave of them."""
-    factors = np.concatenate([equations.u, equations.own])
-    count, columns = omega.size, 2 * len(factors)
-    length = min(2 * columns, count)
-    blocks = np.arange(-(-count // length) * length).reshape(-1, length)
-    inside, place = np.minimum(blocks, count - 1), np.linspace(-1.0, 1.0, length)
-    rows = np.moveaxis(factors[:, inside], 0, 2)
-    rows = np.concatenate([rows, rows * place[:, None]], axis=2)
-    # Of bins that no input moves, the fit must not take what rounding leaves there.
-    least = _LEAST * np.sqrt(np.mean(np.abs(rows) ** 2, axis=(0, 1)))
-    least = np.broadcast_to(np.diag(least), (len(blocks), columns, columns))
-    basis = np.linalg.qr(np.concatenate([rows, least], axis=1))[0][:, :length]
-    y = equations.y[inside][:, :, None]
-    left = (y - basis @ (np.conj(np.swapaxes(basis, 1, 2)) @ y)).ravel()[:count]
-    freedom = 1 - np.sum(np.abs(basis) ** 2, axis=2).ravel()[:count]
-    power = running_power(omega, left, freedom)
-    return power + _LEAST**2 * np.mean(np.abs(equations.y) ** 2)
-
-
 def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "records bins"]:
     return (record == np.arange(records)[:, None]).astype(float)
-
-
-_LIKELIER = 10.0
-
-
-def noise_left(omega, left, below, freedom):
-    """Running power of what is left, or that before the poles, where that is clearly likelier."""
-    after = running_power(omega, left, freedom)
-    before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
-    likelier = 2 * (_log_likelihood(left, before) - _log_likelihood(left, after))
-    return before if likelier > _LIKELIER else after
-
-
-def _log_likelihood(left, power) -> float:
-    return -float(np.sum(np.log(power) + np.abs(left) ** 2 / power))
-
-
-def running_power(
-    omega: Float[np.ndarray, " bins"],
-    values: Complex[np.ndarray, " bins"],
-    freedom: Float[np.ndarray, " bins"],
-) -> Float[np.ndarray, " bins"]:
-    """Sum of |values|^2 over that of `freedom`, within a fifth of a neper of each bin."""
-    each = np.arange(omega.size)
-    first = np.searchsorted(omega, omega * np.exp(-_BANDWIDTH))
-    last = np.searchsorted(omega, omega * np.exp(_BANDWIDTH), "right")
-    first = np.maximum(np.minimum(first, each - _NEIGHBOURS), 0)
-    last = np.minimum(np.maximum(last, each + _NEIGHBOURS + 1), omega.size)
-    power, count = (
-        np.concatenate([[0.0], np.cumsum(part)]) for part in (np.abs(values) ** 2, freedom)
-    )
-    return (power[last] - power[first]) / np.maximum(count[last] - count[first], 1.0)

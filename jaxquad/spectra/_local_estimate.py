@@ -97,7 +97,7 @@ def estimate_local_polynomial(
         _divided(setup, narrow, moved),
         _remark_on_lost(omega[~np.all(known, axis=(1, 2)) & ~doubts.lost], setup, options.width)
         + _remark_on_resolution(omega[doubts.unresolved & coherent])
-        + _remark_on_unmoved(doubts.unmoved)
+        + _remark_on_unmoved(doubts.unmoved, known)
         + _remark_on_ringing(omega[ringing]),
     )
 
@@ -239,9 +239,12 @@ def _remark_on_lost(omega: Grid, setup: Setup, given: float | None) -> tuple[Rem
     return (Remark(remark, omega),)
 
 
-def _remark_on_unmoved(unmoved: Bool[np.ndarray, " frequencies"]) -> tuple[Remark, ...]:
+def _remark_on_unmoved(
+    unmoved: Bool[np.ndarray, " frequencies"],
+    known: Bool[np.ndarray, "frequencies outputs inputs"],
+) -> tuple[Remark, ...]:
     """Where no frequency is left, the reader needs to know why."""
-    if not np.all(unmoved):
+    if np.any(known) or not np.any(unmoved):
         return ()
     text = (
         "no response at any frequency: the references move the inputs too little to divide by "

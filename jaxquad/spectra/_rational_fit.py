@@ -230,13 +230,14 @@ def cost_with_pole(
     Polynomials over A (1 - x/p) are those of one degree less over A, and a constant over the same.
     """
     _, span = _project(equations, basis, solved.denominator)
-    driven, left = np.concatenate([equations.u, equations.own]) / solved.below, parts_of(solved.left)
-    costs = np.empty(len(places))
-    for k, place in enumerate(places):
-        _, rows = span.nearest(parts_of(driven / (1 - equations.x / place)))
-        rest = left - _least_squares(rows, left) @ rows
-        costs[k] = rest @ rest
-    return costs
+    driven = np.concatenate([equations.u, equations.own]) / solved.below
+    driven = driven / (1 - equations.x / places[:, None])[:, None]
+    _, rows = span.nearest(parts_of(driven.reshape(-1, len(equations.x))))
+    rows /= _lengths(rows)[:, None]
+    rows = rows.reshape(len(places), -1, rows.shape[1])
+    along = rows @ parts_of(solved.left)
+    products = rows @ np.swapaxes(rows, 1, 2) + _LEAST_CONDITION * np.eye(rows.shape[1])
+    return solved.cost - np.vecdot(along, np.linalg.solve(products, along[:, :, None])[:, :, 0])
 
 
 def parts_of(rows: Complex[np.ndarray, "*rows bins"]) -> Float[np.ndarray, "*rows parts"]:
