@@ -259,7 +259,7 @@ def _settle(
     weight: Float[np.ndarray, " bins"],
     start: Float[np.ndarray, " powers"],
 ) -> Identified:
-    """A descent from `start`: solution, fixed power, drive of errors, what follows noise, its power."""
+    """A descent from `start`, the fixed power, drive of errors, what follows noise, its power."""
     white = equations.weighted(weight)
     basis = make_basis(white, start.size)
     solved = descend(white, basis, start, _SETTLED)

@@ -1,4 +1,4 @@
-"""Ratios of polynomials fitted to bins by least squares: linear estimates, and descents.
+"""Ratios of polynomials fitted to bins by least squares: their linear parts, and descents.
 
 A row of complex values at the bins counts as that of their real and imaginary parts, of twice the
 length: coefficients are real, and so are the products of rows.
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 
-_RELAXATIONS, _STEPS = 12, 20  # of Sanathanan and Koerner, of Gauss and Newton
+_STEPS = 20  # of Gauss and Newton
 _NEAREST = 1e-9  # size of the denominator, to its terms', so that no pole falls onto a bin
 EXACT = 1e-20  # share of the output's power that is rounding
 _LEAST_CONDITION = 1e-10  # reciprocal, of normal equations that leave digits enough
@@ -92,27 +92,6 @@ def columns_of(
     for (factor, values), start, end in zip(pairs, ends[:-1], ends[1:], strict=True):
         np.multiply(factor, values, out=columns[start:end])
     return columns
-
-
-def relax(equations: Equations, basis: Basis) -> Float[np.ndarray, " powers"]:
-    """The denominator by repeated linear least squares, each weighted by the one before."""
-    moved, best = basis.powers * equations.y, None
-    solved, span = _project(equations, basis, np.eye(len(moved))[0])
-    for _ in range(_RELAXATIONS):
-        denominator = _null_vector(span, parts_of(moved / solved.below))
-        solved, span = _project(equations, basis, denominator)
-        if best is not None and solved.cost > 0.999 * best.cost:
-            break
-        best = solved if best is None or solved.cost < best.cost else best
-    assert best is not None
-    return best.denominator
-
-
-def _null_vector(span: "_Span", rows: Rows) -> Vector:
-    """Coefficients of the rows, each of unit length, whose sum lies nearest to what is spanned."""
-    length = _lengths(rows)
-    corner = _triangle(span.nearest(rows / length[:, None])[1])
-    return np.linalg.svd(corner)[2][-1] / length
 
 
 def descend(
