@@ -64,7 +64,7 @@ def test_a_line_is_not_told_from_a_mode_that_rings_and_both_are_named():
     """A plant without any mode, and a tone in its output."""
     y = np.asarray(signal.lfilter([0.05], [1, -0.95], U))
     noise = 0.02 * np.random.default_rng(0).standard_normal(y.size)
-    tone = np.sin(7 * DT * np.arange(U.size) + 1)
+    tone = np.sin(5 * DT * np.arange(U.size) + 1)
     record = Record(DT * np.arange(U.size), U, y + np.std(y) * (noise + tone))
     found = frequency_response(record, OMEGA, estimator=LocalPolynomial(global_order=1))
     ringing = [remark for remark in found.remarks if "a mode that rings" in remark]
