@@ -14,14 +14,17 @@ Bins = Float[np.ndarray, " bins"]
 
 
 def rough_noise(equations: Equations, omega: Bins) -> Bins:
-    """Power of what gains and transients that are linear over a few bins leave of the output."""
+    """Power of what local rational functions, of one pole in a few bins, leave of the output.
+
+    Without a pole a light mode would leave much, and its bins would hardly count.
+    """
     factors = np.concatenate([equations.u, equations.own])
-    count, columns = omega.size, 2 * len(factors)
+    count, columns = omega.size, 2 * len(factors) + 1
     length = min(2 * columns, count)
     blocks = np.arange(-(-count // length) * length).reshape(-1, length)
     inside = np.minimum(blocks, count - 1)
-    basis = _directions(np.moveaxis(factors[:, inside], 0, 2))
     y = equations.y[inside][:, :, None]
+    basis = _directions(np.moveaxis(factors[:, inside], 0, 2), y)
     left = y - basis @ (np.conj(np.swapaxes(basis, 1, 2)) @ y)
     freedom = 1 - np.sum(np.abs(basis) ** 2, axis=2)
     power = running_power(omega, left.ravel()[:count], freedom.ravel()[:count])
@@ -29,11 +32,11 @@ def rough_noise(equations: Equations, omega: Bins) -> Bins:
 
 
 def _directions(
-    factors: Complex[np.ndarray, "blocks bins factors"],
+    factors: Complex[np.ndarray, "blocks bins factors"], y: Complex[np.ndarray, "blocks bins 1"]
 ) -> Complex[np.ndarray, "blocks bins columns"]:
-    """What the factors, and they times the bin's place, span in each block."""
-    place = np.linspace(-1.0, 1.0, factors.shape[1])
-    rows = np.concatenate([factors, factors * place[:, None]], axis=2)
+    """What the factors, and all times the bin's place, span in each block."""
+    place = np.linspace(-1.0, 1.0, factors.shape[1])[:, None]
+    rows = np.concatenate([factors, factors * place, y * place], axis=2)
     # Where no input moves the bins, their rounding must not count as one.
     least = np.diag(_LEAST * np.sqrt(np.mean(np.abs(rows) ** 2, axis=(0, 1))))
     ridge = np.broadcast_to(least, (len(rows), *least.shape))
