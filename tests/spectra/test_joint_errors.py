@@ -96,23 +96,30 @@ def test_95_per_cent_intervals_of_the_response_hold_the_plant(name):
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.1
 
 
-def test_the_last_digit_of_a_short_record_does_not_choose_its_models():
-    """8 s of which other minima, as near, are up to a hundred errors away."""
-    time, loop = np.arange(0.0, 8.0, DT), CASES["mode in a gust"][0]
-    reference = np.sin(time + 0.9 * time**2) * np.minimum(1.0, (8.0 - time) / 2)
-    rng = np.random.default_rng(0)
-    gust, noise = coloured(rng, (time.size, 1), 1.0, 0.05), 0.01 * rng.standard_normal((400, 1))
-    flown = loop.record(reference[:, None], gust, noise)
-    digit = np.finfo(float).eps * rng.integers(-1, 2, flown.outputs.shape)
-    moved = dataclasses.replace(flown, outputs=flown.outputs * (1 + digit))
+def cut_off(seed):
+    """8 s of rest and of the beginning of a sweep, of a mode in a gust, and rounded otherwise."""
+    loop, clock = CASES["mode in a gust"][0], np.clip(DT * np.arange(400) - 3.0, 0.0, None)
+    growth = np.log(15.0) / 7.0
+    edge = np.minimum(np.minimum(clock, 7.0 - clock) / 2, 1.0)
+    wave = (0.5 - 0.5 * np.cos(np.pi * edge)) * np.sin(np.expm1(growth * clock) / growth)
+    rng = np.random.default_rng(seed)
+    gust = coloured(rng, (400, 1), 1.0, 0.05)
+    flown = loop.record(wave[:, None], gust, 0.01 * rng.standard_normal((400, 1)))
+    digits = 1 + 1e-14 * rng.uniform(-1, 1, flown.outputs.shape)
+    return flown, dataclasses.replace(flown, outputs=flown.outputs * digits)
+
+
+def test_the_last_digits_of_a_short_record_do_not_choose_its_models():
+    """Other minima, which leave hardly more, are up to twenty errors away."""
+    omega = np.geomspace(1.5, 14.0, 40)
     one, other = (
-        jq.frequency_response(each, OMEGA[12:], estimator=jq.spectra.JointInputOutput())
-        for each in (flown, moved)
+        jq.frequency_response(each, omega, estimator=jq.spectra.JointInputOutput())
+        for each in cut_off(0)
     )
     known = np.isfinite(one.response)
     assert np.count_nonzero(known) > 10
     apart = np.abs(one.response / other.response - 1)[known] / one.random_error[known]
-    assert np.max(apart) < 1e-6
+    assert np.max(apart) < 1e-3
 
 
 def test_the_share_of_the_denominator_falls_as_the_loop_opens():
