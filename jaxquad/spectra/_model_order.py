@@ -1,5 +1,6 @@
 """Search for the order of a rational model: poles are added one by one."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -38,35 +39,44 @@ def search_orders(equations: Equations, most: int) -> Orders:
     the stability limit, or beyond it, and the last digit of a record chooses among them.
     """
     found = {0: solve_linear(equations, make_basis(equations, 1), np.ones(1))}
-    least, worse = _information(equations, found[0]), 0
-    for order in range(1, _most(equations, most) + 1):
-        found[order] = _descend(equations, _with_pole(equations, found[order - 1]))
-        value = _information(equations, found[order])
-        worse, least = (0, value) if value < least else (worse + 1, least)
-        if (worse >= _PATIENCE and order >= _THOROUGH) or _is_exact(equations, found[order]):
-            break
+    _climb(equations, found, most, {}, _THOROUGH, _PATIENCE)
     return _judge(equations, found)
 
 
 def refine_orders(equations: Equations, before: Orders, most: int) -> Orders:
     """Of the same equations in other weights: orders around the best one `before`."""
-    first = before.best
-    found = {first: _descend(equations, before.solved[first].denominator)}
-    least, worse, order = _information(equations, found[first]), 0, first
-    while worse < _DOUBTED and order < _most(equations, most):
-        if _is_exact(equations, found[order]):
+    first, known = before.best, before.solved
+    found = {first: _descend(equations, known[first].denominator)}
+    _climb(equations, found, most, known, first, _DOUBTED)
+    for order in range(first - 1, 0, -1):
+        found[order] = _descend(equations, known[order].denominator)
+        if _judge(equations, found).best != order:
+            break
+    return _judge(equations, found)
+
+
+def _climb(
+    equations: Equations,
+    found: dict[int, Solved],
+    most: int,
+    known: Mapping[int, Solved],
+    thorough: int,
+    patience: int,
+) -> None:
+    """Add orders to those `found` until too many in a row have no better criterion.
+
+    `known` solutions, of other weights, are places to begin, too.
+    """
+    order, worse = max(found), 0
+    least = _information(equations, found[order])
+    while order < _most(equations, most) and not _is_exact(equations, found[order]):
+        if worse >= patience and order >= thorough:
             break
         order += 1
-        found[order] = _descend(equations, _start(equations, before, found, order))
+        start = _start(equations, found[order - 1], known.get(order))
+        found[order] = _descend(equations, start)
         value = _information(equations, found[order])
         worse, least = (0, value) if value < least else (worse + 1, least)
-    for order in range(first - 1, 0, -1):
-        found[order] = _descend(equations, before.solved[order].denominator)
-        value = _information(equations, found[order])
-        if value > least:
-            break
-        least = value
-    return _judge(equations, found)
 
 
 def next_order(equations: Equations, orders: Orders, most: int) -> Float[np.ndarray, " powers"]:
@@ -82,14 +92,15 @@ def next_order(equations: Equations, orders: Orders, most: int) -> Float[np.ndar
 
 
 def _start(
-    equations: Equations, before: Orders, found: dict[int, Solved], order: int
+    equations: Equations, below: Solved, known: Solved | None
 ) -> Float[np.ndarray, " powers"]:
-    """The solution `before`, or that of the order below with a pole more, which leaves less."""
-    grown = _with_pole(equations, found[order - 1])
-    if order not in before.solved:
+    """The solution of the order below with a pole more, or the `known` one where it leaves less."""
+    grown = _with_pole(equations, below)
+    if known is None:
         return grown
-    basis, known = make_basis(equations, order + 1), before.solved[order].denominator
-    return min((known, grown), key=lambda start: solve_linear(equations, basis, start).cost)
+    basis = make_basis(equations, grown.size)
+    starts = known.denominator, grown
+    return min(starts, key=lambda start: solve_linear(equations, basis, start).cost)
 
 
 def _with_pole(equations: Equations, solved: Solved) -> Float[np.ndarray, " powers"]:

@@ -1,5 +1,7 @@
 """The search for the order of a global model, and the noise by which its bins count."""
 
+import functools as ft
+
 import numpy as np
 
 from jaxquad.spectra._model_noise import noise_left, rough_noise, running_power
@@ -31,7 +33,7 @@ def white(count, seed=0):
     return (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / np.sqrt(2)
 
 
-def measured(noise=0.01, u=None):
+def measured(noise: float | np.ndarray = 0.01, u=None):
     """Two light modes driven by an input like noise."""
     u = white(OMEGA.size, 1) if u is None else u
     y = sum(gain * u / below(OMEGA, *mode) for *mode, gain in MODES)
@@ -48,7 +50,7 @@ def test_no_order_leaves_more_than_the_one_below_it():
 def test_poles_that_are_added_one_by_one_find_light_modes():
     orders = search_orders(measured(), MOST)
     assert orders.best == 4
-    expected = np.convolve(*(denominator_of(*mode) for *mode, _ in MODES))
+    expected = ft.reduce(np.convolve, (denominator_of(w, zeta) for w, zeta, _ in MODES))
     found = orders.solved[4].denominator
     np.testing.assert_allclose(found / found[0], expected, rtol=0.02)
 
