@@ -11,8 +11,8 @@ from jaxtyping import Complex, Float, Int
 from jaxquad._core import beside
 
 from ._local_fit import Bins
-from ._model_noise import noise_left, rough_noise
-from ._model_order import next_order, Orders, refine_orders, search_orders
+from ._model_noise import log_likelihood, noise_left, rough_noise
+from ._model_order import next_order, Orders, PRICE, refine_orders, search_orders
 from ._rational_fit import (
     columns_of,
     descend,
@@ -228,10 +228,12 @@ def _identify(
     every = _thin(len(omega), _TRIAL_BINS)
     few = equations.pick(every)
     # Unweighted, it would fit the loud bins alone.
-    first = search_orders(few.weighted(1 / np.sqrt(rough_noise(few, omega[every]))), most)
-    if first.best == 0:
+    rough = rough_noise(few, omega[every])
+    found = search_orders(few.weighted(1 / np.sqrt(rough)), most)
+    if found.best == 0:
         return None
-    noise = _noise_after(equations, omega, first)
+    first = found._replace(best=_likeliest(few, omega[every], rough, found))
+    noise = _noise_after(equations, omega, first.solved[first.best])
     weight = 1 / np.sqrt(noise)
     if np.max(noise) < _EVEN * np.min(noise):
         weight = np.full_like(noise, np.mean(weight))
@@ -242,11 +244,30 @@ def _identify(
     return _settle(equations, omega, weight, next_order(white, orders, most))
 
 
+def _likeliest(
+    equations: Equations,
+    omega: Float[np.ndarray, " bins"],
+    rough: Float[np.ndarray, " bins"],
+    orders: Orders,
+) -> int:
+    """The order whose model and smoothed noise are likeliest together, at the same price.
+
+    In weights without the peak that gusts make through a light mode, further poles describe it.
+    """
+
+    def value(order: int) -> float:
+        solved, even = orders.solved[order], np.ones_like(omega)
+        left = solved.left * np.sqrt(rough)
+        noise = noise_left(omega, left, solved.below, even)
+        return PRICE * equations.parameters(order) - 2 * log_likelihood(left, noise)
+
+    return min((order for order in orders.solved if order > 0), key=value)
+
+
 def _noise_after(
-    equations: Equations, omega: Float[np.ndarray, " bins"], orders: Orders
+    equations: Equations, omega: Float[np.ndarray, " bins"], solved: Solved
 ) -> Float[np.ndarray, " bins"]:
-    """The noise, from what the order above the best one leaves of all bins."""
-    solved = orders.solved.get(orders.best + 1, orders.solved[orders.best])
+    """The noise, from what a solution leaves of all bins."""
     basis = make_basis(equations, len(solved.denominator))
     below = solved.denominator @ basis.powers
     left = equations.y - solved.linear @ basis.columns / below

@@ -1,7 +1,7 @@
 """The noise by which a rational model's bins count: before there is a model, and after."""
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ._rational_fit import Equations
 
@@ -56,23 +56,29 @@ def noise_left(
     """
     after = running_power(omega, left, freedom)
     before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
-    gain = _log_likelihood(left, before) - _log_likelihood(left, after)
+    gain = log_likelihood(left, before) - log_likelihood(left, after)
     return before if 2 * gain > _LIKELIER else after
 
 
-def _log_likelihood(left: Complex[np.ndarray, " bins"], power: Bins) -> float:
+def log_likelihood(left: Complex[np.ndarray, " bins"], power: Bins) -> float:
+    """Of circular normal noise of this power, but for a constant."""
     power = np.maximum(power, np.finfo(float).tiny)
     return -float(np.sum(np.log(power) + np.abs(left) ** 2 / power))
 
 
 def running_power(omega: Bins, values: Complex[np.ndarray, " bins"], freedom: Bins) -> Bins:
     """Sum of |values|^2 over that of `freedom`, within a fifth of a neper of each bin."""
-    each = np.arange(omega.size)
-    first = np.searchsorted(omega, omega * np.exp(-_BANDWIDTH))
-    last = np.searchsorted(omega, omega * np.exp(_BANDWIDTH), "right")
-    first = np.maximum(np.minimum(first, each - _NEIGHBOURS), 0)
-    last = np.minimum(np.maximum(last, each + _NEIGHBOURS + 1), omega.size)
+    first, last = _around(omega)
     power, count = (
         np.concatenate([[0.0], np.cumsum(part)]) for part in (np.abs(values) ** 2, freedom)
     )
     return (power[last] - power[first]) / np.maximum(count[last] - count[first], 1.0)
+
+
+def _around(omega: Bins) -> tuple[Int[np.ndarray, " bins"], Int[np.ndarray, " bins"]]:
+    """First and last bin, exclusive, of the neighbourhood of each."""
+    each = np.arange(omega.size)
+    first = np.searchsorted(omega, omega * np.exp(-_BANDWIDTH))
+    last = np.searchsorted(omega, omega * np.exp(_BANDWIDTH), "right")
+    first = np.maximum(np.minimum(first, each - _NEIGHBOURS), 0)
+    return first, np.minimum(np.maximum(last, each + _NEIGHBOURS + 1), omega.size)

@@ -21,7 +21,7 @@ _TRIAL = 1e-3  # relative gain of a step at which a descent ends
 _PER_PARAMETER = 6  # real equations
 _THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
 _DOUBTED = 2  # orders in a row no better that end the search around an order
-_PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
+PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
 _PLACES = 5  # at which one more pole is tried
 
 
@@ -132,7 +132,7 @@ def _information(equations: Equations, solved: Solved) -> float:
     count, order = 2 * len(equations.y), len(solved.denominator) - 1
     parameters = equations.parameters(order) if order else 1
     cost = max(solved.cost + 0.01 * _floor(equations), 1e-300)
-    return count * np.log(cost / count) + _PRICE * parameters
+    return count * np.log(cost / count) + PRICE * parameters
 
 
 def _is_exact(equations: Equations, solved: Solved) -> bool:
