@@ -14,7 +14,7 @@ import jax
 
 
 _LEAST = 2  # samples: a carry is then written in less time than a sample takes
-_SHARE = 0.25  # of the device's free memory, for what is kept
+_SHARE = 0.15  # of the device's free memory, for what is kept: a program may have some loops
 BLOCKS = 2  # that a processor runs at once, by their registers
 _OWN = 1024  # bytes of a block that are the driver's
 # Bytes of shared memory of a processor, by compute capability; 64 KB are everywhere.

@@ -104,14 +104,14 @@ def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-13)
 
 
-def test_carries_are_kept_as_often_as_a_quarter_of_the_memory_allows(monkeypatch):
+def test_carries_are_kept_as_often_as_a_part_of_the_memory_allows(monkeypatch):
     count, carry, members, block = 5000, 140, 100_000, 128
     assert segments_of(count, carry, members, block) == Segments(count, 71, False)  # no GPU
     for room, expected in (
         (400e9, Segments(count, 2, True)),
-        (100e9, Segments(count, 3, True)),
-        (50e9, Segments(count, 6, True)),
-        (40e9, Segments(count, 71, False)),  # 7 carries of a block take more than 113 kB
+        (160e9, Segments(count, 3, True)),
+        (80e9, Segments(count, 6, True)),
+        (70e9, Segments(count, 71, False)),  # 7 carries of a block take more than 113 kB
     ):
         monkeypatch.setattr(_segments, "_memory", lambda room=room: (int(room), 228 * 1024))
         assert segments_of(count, carry, members, block) == expected

@@ -134,7 +134,7 @@ H200, JAX 0.11: the loop of the AVX-512 lines above, 5000 samples, gradients for
 
 | loops | numbers | loop-steps/s | of the gradient |
 |---|---|---|---|
-| 100,000 | float32 | 4.18e10 | 1.05e10 |
+| 100,000 | float32 | 4.18e10 | 1.03e10 |
 | 1,000,000 | float32 | 4.38e10 | 8.67e9 |
 | 100,000 | float64 | 1.44e10 | 1.67e9 |
 """
