@@ -14,7 +14,7 @@ from ._lane_arithmetic import EXPRESSIONS
 from ._lanes import CALLS, NUMBERS, numbers
 
 
-_MORE = 16  # numbers of a member that the loop may hold for it, beside those it held before
+_MORE = 16  # numbers of a member, and arrays, that the loop may take for it beside those before
 
 
 def without_invariants(
@@ -27,7 +27,8 @@ def without_invariants(
     each = _used(parts.each, parts.outs)
     read = dict.fromkeys(v for v in (*_read(each), *parts.outs) if isinstance(v, Var))
     needed = [v for v in read if v in parts.once or v in own]
-    if _size(needed, members) > _size(own, members) + _MORE:
+    grown = max(_size(needed, members) - _size(own, members), len(needed) - len(own))
+    if grown > _MORE:
         return step, list(consts)
     first = body.replace(invars=own, outvars=needed, eqns=_used(parts.steady, needed))
     within = body.replace(invars=[*needed, *rest], outvars=parts.outs, eqns=each)

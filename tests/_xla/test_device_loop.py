@@ -154,6 +154,21 @@ def test_what_is_the_same_in_every_sample_is_computed_before_the_loop():
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+def test_what_would_take_many_arrays_before_the_loop_stays_in_it():
+    """The differences of a map's values, as many as they are."""
+    knots, x = spread(40, MEMBERS), spread(1, MEMBERS, seed=1)
+
+    def cost(scan, knots, x):
+        slopes = lambda: (knots[k + 1 : k + 2] - knots[k : k + 1] for k in range(39))
+        step = lambda x, now: (x + now * sum(jnp.sin(slope * x) for slope in slopes()), None)
+        return jnp.sum(scan(step, x, jnp.linspace(0.0, 0.1, SAMPLES))[0])
+
+    [text] = written(ft.partial(cost, kernel), knots, x)
+    assert "fixed0" in text and "fixed1" not in text
+    found, expected = (compiled(jax.grad(ft.partial(cost, s)), knots, x) for s in (kernel, plain))
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
 def limited(scan, low, high, x):
     """By either way to write it, at and beyond the limits and between them."""
 
