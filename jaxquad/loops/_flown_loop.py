@@ -60,6 +60,7 @@ class FlownLoop(eqx.Module):
     used: Bool[np.ndarray, " frequencies"]
     scale: float
     scale_error: float  # standard error
+    plant_misfit: float = 1.0  # of the plant's fit, relative to its errors
 
     @property
     def misfit(self) -> float:
@@ -102,6 +103,13 @@ class FlownLoop(eqx.Module):
         )
         if self.kind == "flown":
             return f"the loop of these gains is the one that flew: {numbers}"
+        if self.plant_misfit > MISFIT:
+            return (
+                f"the loop of these gains is {numbers}, but the plant's own fit misses by "
+                f"{self.plant_misfit:.2g} times its errors, so this does not say that other gains "
+                "flew; fly a chirp of the rate set-point, or strong and quick stick on this axis, "
+                "for 20 s or more"
+            )
         worst = int(np.argmax(np.where(self.used, np.abs(self._off), 0.0)))
         return (
             f"the loop of these gains is not the one that flew: {numbers}, most at "
@@ -117,6 +125,7 @@ class FlownLoop(eqx.Module):
             "verdict": self.verdict,
             "misfit": self.misfit,
             "misfit_over_errors": self.ratio,
+            "plant_misfit_over_errors": self.plant_misfit,
             "gain_scale": self.scale,
             "gain_scale_standard_error": self.scale_error,
             "omega": self.omega,
@@ -196,7 +205,8 @@ def reproduce_flight(
     errors = _only(np.asarray(response.random_error)), np.sqrt(np.maximum(spread, 0.0) / 2)
     measured = _only(np.asarray(response.response))
     scale, doubt = _scale(measured / predicted - 1, by_gain, errors, inside)
-    return FlownLoop(omega, measured, errors[0], predicted, errors[1], inside, 1 + scale, doubt)
+    compared = omega, measured, errors[0], predicted, errors[1], inside
+    return FlownLoop(*compared, 1 + scale, doubt, float(np.sqrt(fit.chi_squared)))
 
 
 def _only(pairs: np.ndarray) -> np.ndarray:

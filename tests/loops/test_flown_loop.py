@@ -76,6 +76,14 @@ def test_other_gains_are_refused_with_the_factor_between_them(closed, fit, facto
     assert found.scale == pytest.approx(1 / factor, rel=0.1)  # of first order in the factor
 
 
+def test_a_plant_that_is_not_explained_does_not_say_that_other_gains_flew(closed, fit):
+    law = dataclasses.replace(LAW, p=1.25 * P, i=1.25 * I, d=1.25 * D)
+    doubtful = dataclasses.replace(fit, chi_squared=4.8)
+    found = jq.loops.reproduce_flight(doubtful, law, closed, unit="deg/s")
+    assert found.kind == "not flown" and "misses by 2.2 times its errors" in found.verdict
+    assert "fly a chirp" in found.verdict and "is not the one" not in found.verdict
+
+
 def test_another_filter_of_the_derivative_is_refused(closed, fit):
     law = dataclasses.replace(LAW, dterm=(PT1(CUTOFF / 3),))
     assert jq.loops.reproduce_flight(fit, law, closed, unit="deg/s").kind == "not flown"
