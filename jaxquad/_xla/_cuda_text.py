@@ -1,14 +1,16 @@
 """Statements of CUDA C for a jaxpr of scalars."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
-from ._cuda_shortcuts import shortened, Source
 from ._cuda_sincos import SINCOS
 from ._lane_arithmetic import EXPRESSIONS, TYPES
+
+
+Source = Mapping[Var, JaxprEqn]  # of what it is the result
 
 
 # Of the operations that CUDA C has no sign and no function for.
@@ -105,7 +107,7 @@ class _Writer:
         return self.lines, [_name(v, names) for v in body.outvars]
 
     def _statement(self, equation: JaxprEqn, names: dict[Var, str], source: Source) -> None:
-        name, given = shortened(equation, source)
+        name, given = _shortened(equation, source)
         [out] = equation.outvars
         kind = type_of(out.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
         text = EXPRESSIONS[name](kind, equation.params, *(_name(v, names) for v in given))
@@ -123,7 +125,7 @@ def _in_order(results: Sequence[Any], source: Source) -> list[JaxprEqn]:
     for v in results:
         open_ = [source[v]] if isinstance(v, Var) and v in source else []
         while open_:
-            given = shortened(open_[-1], source)[1]
+            given = _shortened(open_[-1], source)[1]
             needs = [source[x] for x in given if isinstance(x, Var) and x in source]
             missing = [x for x in needs if id(x) not in found]
             if missing:
@@ -132,6 +134,50 @@ def _in_order(results: Sequence[Any], source: Source) -> list[JaxprEqn]:
                 equation = open_.pop()
                 found[id(equation)] = equation
     return list(found.values())
+
+
+def _shortened(equation: JaxprEqn, source: Source) -> tuple[str, list]:
+    """The name in `EXPRESSIONS` of what an operation is, and what that is given.
+
+    Small groups, as derivatives make them, are one expression.
+    """
+    name = equation.primitive.name
+    rule = _RULES.get(name)
+    found = None if rule is None else rule(equation.invars, source)
+    return (name, equation.invars) if found is None else found
+
+
+def _slope_of_clamp(given: list, source: Source) -> tuple[str, list] | None:
+    """`then` where low < x < high, else 0."""
+    which, zero, *then = given
+    one, other = _given_to("and", which, source) or (None, None)
+    above, below = _given_to("gt", one, source), _given_to("lt", other, source)
+    if not (_is_zero(zero) and above and below and above[0] is below[0] and len(then) == 1):
+        return None
+    given = [above[1], above[0], below[1], *then]
+    return ("within", given) if len({v.aval.dtype for v in given}) == 1 else None
+
+
+def _slope_of_extreme(given: list, source: Source) -> tuple[str, list] | None:
+    """1, 1/2 where both are as large, or 0: JAX writes it as a quotient of two choices."""
+    choices = [_given_to("select_n", v, source) for v in given]
+    numbers = [v for choice in choices for v in choice[1:]]
+    if len(numbers) != 4 or not all(isinstance(v, Literal) for v in numbers):
+        return None
+    return "quotient_of_choices", [v for choice in choices for v in choice]
+
+
+_RULES = {"select_n": _slope_of_clamp, "div": _slope_of_extreme}
+
+
+def _is_zero(v: Any) -> bool:
+    return isinstance(v, Literal) and not isinstance(v.val, bool) and bool(v.val == 0)
+
+
+def _given_to(name: str, v: Any, source: Source) -> list:
+    """The arguments of the operation of that name that `v` is the result of; none of another."""
+    equation = source.get(v) if isinstance(v, Var) else None
+    return equation.invars if equation is not None and equation.primitive.name == name else []
 
 
 def _name(v: Any, names: dict[Var, str]) -> str:

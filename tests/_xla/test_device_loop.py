@@ -236,6 +236,10 @@ def test_other_derivatives_run_as_plain_scans(mode):
     np.testing.assert_allclose(found, expected, rtol=1e-11)
 
 
+def between(k):
+    return (k > 3) & (k < 6)
+
+
 OPERATIONS = {
     name: getattr(jnp, name)
     for name in """
@@ -264,6 +268,8 @@ OPERATIONS = {
     "constants": lambda x: x + jnp.sqrt(jnp.full_like(x, 2.0)) ** 3,
     "not finite": lambda x: jnp.where(x > 0.6, jnp.inf, jnp.where(x > 0.4, -jnp.inf, jnp.nan)),
     "error function": jax.scipy.special.erf,
+    "counted": lambda x: jnp.where((x > 0.3) & (x < 0.6), jnp.int32(3), 0),
+    "chosen by a number": lambda x: jnp.where(between(jnp.floor(9 * x).astype(int)), x, 0.0),
     "switch": lambda x: jax.lax.switch(2, [jnp.sin, jnp.cos, jnp.tan], x),
 }  # fmt: skip
 ROWS = np.array([[1.0, 2.0], [0.0, 3.0]])
