@@ -198,7 +198,7 @@ def information_root(blocks: list[Block]) -> Float[np.ndarray, "rows all"]:
 
 def cramer_rao(bread: Matrix) -> Float[np.ndarray, " parameters"]:
     """CIFER's Cramer-Rao bound 2 sqrt((H^-1)_ii) with H = d2J/dz2 = 2 J'J."""
-    return 2 * np.sqrt(np.diagonal(scaled_inverse(2 * bread)))
+    return np.sqrt(2 * np.diagonal(scaled_inverse(bread)))
 
 
 def insensitivity(bread: Matrix) -> Float[np.ndarray, " parameters"]:

@@ -292,7 +292,7 @@ def _with_floor(points: Points, floor: float) -> Points:
 
 def _are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
     pairs = zip(old, new, strict=True)
-    return all(np.allclose(one, other, rtol=share) for one, other in pairs)
+    return all(np.all(np.abs(one - other) <= share * np.abs(other)) for one, other in pairs)
 
 
 def _weighted(

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Complex, Int
 
 Effect = Complex[np.ndarray, "frequencies inputs width"]
 _TOGETHER = 32  # frequencies that are multiplied at once
+_NARROW = 4  # atoms of an effect, up to which places are fewer steps than frequencies
 
 
 class Reach(NamedTuple):
@@ -82,10 +83,28 @@ def add_effects(
 ) -> None:
     """Add effects times `values`, over frequencies and inputs, to the atoms from `low` on."""
     high = low + len(into)
-    for f in np.flatnonzero((reach.first < high) & (reach.last > low)):
+    near = np.flatnonzero((reach.first < high) & (reach.last > low))
+    if effect.shape[2] <= _NARROW and np.all(np.diff(reach.first[near]) > 0):
+        _add_by_place(into, low, effect[near], Reach(*(x[near] for x in reach)), values[near])
+        return
+    for f in near:
         begin, end = max(reach.first[f], low), min(reach.last[f], high)
         mine = effect[f, :, begin - reach.first[f] : end - reach.first[f]]
         into[begin - low : end - low] += mine.T @ values[f]
+
+
+def _add_by_place(
+    into: Complex[np.ndarray, "atoms columns"],
+    low: int,
+    effect: Effect,
+    reach: Reach,
+    values: Complex[np.ndarray, "frequencies inputs columns"],
+) -> None:
+    """The same of frequencies whose first atoms rise: so no two have the same atom at a place."""
+    for place in range(effect.shape[2]):
+        atoms = reach.first + place
+        here = (atoms >= low) & (atoms < low + len(into)) & (atoms < reach.last)
+        into[atoms[here] - low] += np.einsum("fi,fip->fp", effect[here, :, place], values[here])
 
 
 def times_drive(

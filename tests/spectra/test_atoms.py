@@ -7,6 +7,7 @@ import pytest
 
 import jaxquad as jq
 from jaxquad.spectra import ErrorCovariance
+from jaxquad.spectra._atoms import add_effects, reach_of
 
 
 FREQUENCIES, OUTPUTS, INPUTS, PARAMETERS = 70, 2, 3, 4
@@ -118,3 +119,20 @@ def test_independent_errors_take_room_for_themselves_only():
     np.testing.assert_allclose(errors.variance(), 0.25)
     np.testing.assert_allclose(errors.between((0, 1), (0, 1)), 0.25 * np.eye(FREQUENCIES))
     np.testing.assert_allclose(errors.between((0, 1), (0, 2)), 0.0)
+
+
+@pytest.mark.parametrize("width", (1, 4, 5))
+@pytest.mark.parametrize("step", (1, -1), ids=("rising", "falling"))
+def test_narrow_effects_are_those_of_all_atoms(width, step):
+    rng = np.random.default_rng(width)
+    first = np.cumsum(rng.integers(1, 4, FREQUENCIES))[::step]
+    effect, values = draw(rng, FREQUENCIES, INPUTS, width), draw(rng, FREQUENCIES, INPUTS, 2)
+    effect[3, :, -1] = 0.0  # a shorter one
+    count, half = int(np.max(first)) + width, 61
+    found = np.zeros((count, 2), complex)
+    for low, high in ((0, half), (half, count)):
+        add_effects(found[low:high], low, effect, reach_of(effect, first), values)
+    expected = np.zeros_like(found)
+    for begin, each, value in zip(first, effect, values, strict=True):
+        expected[begin : begin + width] += each.T @ value
+    np.testing.assert_allclose(found, expected, atol=1e-12)
