@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, IO, NamedTuple, ParamSpec, TypeVar
 
+from ._garbage import collect_seldom
 from ._stages import STAGES
 from ._threads import available_cores
 
@@ -158,6 +159,7 @@ class _Second:
     def __init__(self):
         self._waiting: deque[Later] = deque()
         self._held: deque[Later] = deque()  # until the caller waits
+        self._released: deque[Later] = deque()  # held before: behind all that waits
         self._idle = False  # then the first that waits is the process's
         self._changed = threading.Condition()
         self._process = subprocess.Popen(
@@ -183,18 +185,18 @@ class _Second:
     def claim(self, wanted: Later) -> Later | None:
         """What the caller computes while it waits: the result itself, or the last that waits."""
         with self._changed:
-            self._waiting.extend(self._held)
+            self._released.extend(self._held)
             self._held.clear()
             self._changed.notify_all()
             self._changed.wait_for(lambda: wanted.answer or self._mine(wanted))
             if wanted.answer:
                 return None
             mine = self._mine(wanted)[-1]
-            self._waiting.remove(mine)
+            (self._waiting if mine in self._waiting else self._released).remove(mine)
             return mine
 
     def _mine(self, wanted: Later) -> list[Later]:
-        free = list(self._waiting)[self._idle :]
+        free = [*self._waiting, *self._released][self._idle :]
         return [wanted] if wanted in free else [each for each in free if each.shared]
 
     def end(self) -> None:
@@ -225,9 +227,9 @@ class _Second:
     def _next(self) -> Later | None:
         with self._changed:
             self._idle = True
-            self._changed.wait_for(lambda: self._waiting or self._ended)
+            self._changed.wait_for(lambda: self._waiting or self._released or self._ended)
             self._idle = False
-            return None if self._ended else self._waiting.popleft()
+            return None if self._ended else (self._waiting or self._released).popleft()
 
 
 _wanted = False
@@ -256,6 +258,7 @@ def _answer_there(call: Call) -> Answer:
 
 def serve() -> None:
     """Answer the calls on stdin, until it ends: what is printed must not come among the answers."""
+    collect_seldom()
     calls, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     with contextlib.suppress(EOFError, BrokenPipeError):

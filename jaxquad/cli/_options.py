@@ -217,7 +217,7 @@ _LARGEST = 32 << 20  # bytes of logs, which are in the memory of both processes
 def open_beside(
     logs: Sequence[Path], opening: Callable[..., "OpenedLogs"], *args: Any, **named: Any
 ) -> "Later[OpenedLogs]":
-    """Have a second process open `logs` while this one imports JAX; it helps from there on."""
+    """Have a second process open `logs` while this one imports; it helps from there on."""
     sizes = [path.stat().st_size if path.is_file() else math.inf for path in logs]
     if sum(sizes) <= _LARGEST:
         start_second_process()
@@ -225,12 +225,17 @@ def open_beside(
     start_computing()
     if has_second_process():
         announce(f"reading {' and '.join(path.name for path in logs)}")
+        _import_estimates()  # which takes as long
     return opened
 
 
 def _prepare() -> None:
     """What a second process will need first: JAX and estimates."""
     start_computing()
+    _import_estimates()
+
+
+def _import_estimates() -> None:
     import scipy.linalg.lapack
     import scipy.special
 

@@ -1,3 +1,4 @@
+import functools as ft
 from collections.abc import Sequence
 from typing import Literal
 
@@ -66,20 +67,6 @@ def _result(
     spread = np.sqrt(found.errors.variance() / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(np.isfinite(response), spread / np.abs(response), np.inf)
-    names = records[0].output_names, records[0].input_names
-    measured = omega, response, error, coherence, direct
-
-    def remarks() -> tuple[Remark, ...]:
-        noted = remarks_on_feedback(records, method, *measured, names, found.errors)
-        if isinstance(found, LocalEstimate):  # periods show their own distortion
-            noted += remarks_on_linearity(records, omega, response, coherence, method)
-            seconds = sum(record.duration for record in records)
-            known = np.isfinite(response)
-            sharp = known & (error <= _SHARP) & (coherence >= _COHERENT)
-            used = np.any(sharp if sharp.any() else known, axis=(1, 2))
-            noted += _remarks_on_length(seconds, np.asarray(omega), used)
-        return noted + found.remarks
-
     # Not jnp.asarray: it compiles a program for each new shape.
     put = jax.device_put
     return FrequencyResponse(
@@ -93,7 +80,7 @@ def _result(
         method=method,
         input_names=records[0].input_names,
         output_names=records[0].output_names,
-        remarks=Remarks(remarks),
+        remarks=Remarks(ft.partial(_find_remarks, records, omega, found, error, method)),
         integrators=integrators,
         log_noise_covariance=found.log_noise_covariance,
         divided=found.divided if isinstance(found, LocalEstimate) else None,
@@ -104,6 +91,27 @@ def _result(
         input_units=records[0].input_units,
         output_units=records[0].output_units,
     )
+
+
+def _find_remarks(
+    records: Sequence[Record],
+    omega: Grid,
+    found: LocalEstimate | PeriodicEstimate,
+    error: Float[np.ndarray, "frequencies outputs inputs"],
+    method: Method,
+) -> tuple[Remark, ...]:
+    response, coherence, direct = found.response, found.coherence, found.direct_coherence
+    names = records[0].output_names, records[0].input_names
+    measured = omega, response, error, coherence, direct
+    noted = remarks_on_feedback(records, method, *measured, names, found.errors)
+    if isinstance(found, LocalEstimate):  # periods show their own distortion
+        noted += remarks_on_linearity(records, omega, response, coherence, method)
+        seconds = sum(record.duration for record in records)
+        known = np.isfinite(response)
+        sharp = known & (error <= _SHARP) & (coherence >= _COHERENT)
+        used = np.any(sharp if sharp.any() else known, axis=(1, 2))
+        noted += _remarks_on_length(seconds, np.asarray(omega), used)
+    return noted + found.remarks
 
 
 _SHARP, _COHERENT = 0.3, 0.6  # random error and coherence of frequencies that fits rest on

@@ -33,6 +33,7 @@ from jaxquad.identify import (
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.records import Record
 from jaxquad.spectra import (
+    begin_remarks,
     Composite,
     Estimator,
     frequency_response,
@@ -83,12 +84,18 @@ def fit_best(
     delay = _delay_of(fit_response(unasked, settings), records)
     frfs = _responses(records, methods, settings, filters, delay)
     announce(f"fit to the {best} response")
-    found = fit_response(frfs[0].get(), settings)
+    found = _fit_first(frfs, settings)
     other = _delay_of(found, records)
     if other and abs(other - delay) > _NEAR * dt:
         frfs = _responses(records, methods, settings, filters, other)
-        found = fit_response(frfs[0].get(), settings)
+        found = _fit_first(frfs, settings)
     return Estimated(frfs[0].get(), found, dict(zip(methods[1:], frfs[1:], strict=True)))
+
+
+def _fit_first(frfs: Sequence[Later[FrequencyResponse]], settings: IdentifySettings) -> Fit:
+    frf = frfs[0].get()
+    begin_remarks(frf.remarks)
+    return fit_response(frf, settings)
 
 
 def _responses(

@@ -17,6 +17,8 @@ from jaxquad._core import (
     prepare_second_process,
     start_second_process,
 )
+from jaxquad.spectra import begin_remarks
+from jaxquad.spectra._remarks import Remarks
 
 
 @pytest.fixture
@@ -97,6 +99,27 @@ def test_of_what_is_wanted_last_the_last_call_is_taken_first_and_preparations_ar
     while prepared.answer is None:
         time.sleep(0.01)
     assert later.answer and earlier.answer and not second._held
+
+
+def test_what_is_begun_comes_before_what_was_held(second):
+    begun(time.sleep, 0.2)
+    held, other = behind(time.sleep, 0.3), beside(os.getpid)
+    assert other.get() == os.getpid()  # from here on the held one may be taken
+    soon = begun(os.getpid)
+    while soon.answer is None:
+        time.sleep(0.01)
+    assert held.answer is None and soon.get() != os.getpid()
+
+
+def test_remarks_are_found_there_while_nobody_looks(second):
+    remarks = Remarks(tuple)
+    remarks.begin()
+    later: Later = vars(remarks)["_find"].__self__
+    while later.answer is None:
+        time.sleep(0.01)
+    assert remarks == ()
+    begin_remarks(remarks)  # which are found
+    begin_remarks(())
 
 
 def test_what_is_wanted_last_and_nobody_has_begun_is_computed_by_who_wants_it(second):

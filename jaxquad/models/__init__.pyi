@@ -1,0 +1,47 @@
+from ._allocation import Allocation as Allocation
+from ._attitude import Attitude as Attitude
+from ._connect import realise as realise, series as series, state_space as state_space
+from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
+from ._entry_slopes import Entry as Entry, factor_slopes as factor_slopes
+from ._exponential import matrix_exponential as matrix_exponential
+from ._from_control import from_control as from_control
+from ._modes import Mode as Mode, modes as modes
+from ._multirotor import (
+    CRAZYFLIE as CRAZYFLIE,
+    crazyflie as crazyflie,
+    MotorLag as MotorLag,
+    Multirotor as Multirotor,
+    MultirotorState as MultirotorState,
+    QUANSER_HOVER as QUANSER_HOVER,
+    quanser_hover as quanser_hover,
+)
+from ._protocols import (
+    evaluate_response as evaluate_response,
+    Model as Model,
+    with_arrays as with_arrays,
+)
+from ._response import Split as Split
+from ._rotation import (
+    euler_acceleration as euler_acceleration,
+    euler_from_quaternion as euler_from_quaternion,
+    euler_rates as euler_rates,
+    euler_rates_matrix as euler_rates_matrix,
+    quaternion_derivative as quaternion_derivative,
+    quaternion_from_euler as quaternion_from_euler,
+    rotation_matrix as rotation_matrix,
+)
+from ._simulate_linear import (
+    free_responses as free_responses,
+    sample_rational as sample_rational,
+    SampledRational as SampledRational,
+    simulate_linear as simulate_linear,
+    split_delay as split_delay,
+)
+from ._state_space import explicit as explicit, matrices_of as matrices_of, StateSpace as StateSpace
+from ._transfer_function import (
+    AttitudeAxis as AttitudeAxis,
+    imaginary as imaginary,
+    LaggedIntegrator as LaggedIntegrator,
+    TransferFunction as TransferFunction,
+)
+from ._units import parameter_units as parameter_units

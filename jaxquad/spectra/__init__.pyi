@@ -1,0 +1,27 @@
+from ._broken_loop import (
+    BrokenLoop as BrokenLoop,
+    Entry as Entry,
+    estimate_broken_loop as estimate_broken_loop,
+)
+from ._closed_loop import (
+    deembed as deembed,
+    feedback_bias as feedback_bias,
+    FeedbackBias as FeedbackBias,
+)
+from ._density import spectral_density as spectral_density, SpectralDensity as SpectralDensity
+from ._error_covariance import (
+    ErrorCovariance as ErrorCovariance,
+    independent_errors as independent_errors,
+)
+from ._estimate import Estimator as Estimator, frequency_response as frequency_response
+from ._estimators import (
+    Composite as Composite,
+    JointInputOutput as JointInputOutput,
+    LocalPolynomial as LocalPolynomial,
+    Periodic as Periodic,
+    Welch as Welch,
+)
+from ._frequency_response import Distortion as Distortion, FrequencyResponse as FrequencyResponse
+from ._lines import find_line as find_line, SpectralLine as SpectralLine
+from ._remarks import begin_remarks as begin_remarks, Remark as Remark
+from ._step_response import estimate_step as estimate_step, StepResponse as StepResponse
