@@ -30,6 +30,23 @@ def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -
     return [function(x) if y is None else y[0] for x, y in zip(items, found, strict=True)]
 
 
+def begin_in_thread(function: Callable[[], Found]) -> Callable[[], Found]:
+    """Begin it in a thread of its own; what is returned waits for its result.
+
+    Where JAX is set differently for the caller's thread alone, that computes it, and waits for
+    nothing.
+    """
+    pool, settings = ThreadPoolExecutor(1), thread_settings()
+    begun = pool.submit(lambda: (function(),) if thread_settings() == settings else None)
+    pool.shutdown(wait=False)
+
+    def wait() -> Found:
+        found = begun.result()
+        return function() if found is None else found[0]
+
+    return wait
+
+
 def available_cores() -> int:
     """That this process may use."""
     try:

@@ -18,7 +18,11 @@ _NEAR, _FLAT = 0.02, 1e-3  # nepers to a bound, and the slope per neper that pus
 
 def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
     """Why the controller at `z` cannot be built or must not be flown; empty if it can."""
-    controller = build_design(coordinates, as_array(z))
+    return refusal_of(build_design(coordinates, as_array(z)))
+
+
+def refusal_of(controller: PyTree) -> str:
+    """As `find_refusal`, of a controller that was not checked when it was made."""
     for part in _iter_modules(controller):
         try:
             _check_again(part)
