@@ -40,17 +40,11 @@ def start_costs(
 ) -> Callable[[], CostResult]:
     """Begin an `evaluate_cost`; what is returned waits for it, in arrays of NumPy."""
     parts = _take_apart(z, on, coordinates, problem, subproblem)
-    added = None
-    if parts.analysed is not None:
-        given = parts.analysed
-        added = begin_in_thread(lambda: jax.block_until_ready(evaluate_limits(*given)))
-    running = evaluate_cost(*parts.flown)
-
-    def wait() -> CostResult:
-        found = _on_host(running)
-        return found if added is None else _joined(found, _on_host(added()), parts.places)
-
-    return wait
+    given, running = parts.analysed, evaluate_cost(*parts.flown)
+    if given is None:
+        return lambda: _on_host(running)
+    added = begin_in_thread(lambda: _on_host(evaluate_limits(*given)))
+    return lambda: _joined(_on_host(running), added(), parts.places)
 
 
 def trace_costs(*given: Any) -> None:
