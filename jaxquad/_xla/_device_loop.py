@@ -33,7 +33,7 @@ from ._loop_kernels import (
 )
 from ._nvrtc import CannotCompile
 from ._reverse_kernel import holds_cotangents, run_reverse
-from ._segments import segments_of
+from ._segments import held_bytes, segments_of
 from ._switch import note, warn_once
 
 
@@ -44,8 +44,11 @@ def scan_in_kernel(
     jaxpr, consts, result = _trace(step, carry, signals)
     jaxpr, consts = without_invariants(jaxpr, consts, members)
     first, now = jax.tree.leaves(carry), jax.tree.leaves(signals)
-    carried = sum(numbers(x.shape, members) * memory_type(x.dtype).itemsize for x in first)
-    segments = segments_of(len(now[0]) if now else 0, carried, members, BLOCK)
+    carried, doubles = _bytes_of(first, members)
+    fixed, fixed_doubles = _bytes_of(consts, members)
+    # The carry and its cotangents, what is fixed and the cotangents of that.
+    held = held_bytes(2 * carried + 2 * fixed, doubles + 2 * fixed_doubles, BLOCK)
+    segments = segments_of(len(now[0]) if now else 0, carried, members, BLOCK, held)
     loop = Loop(jaxpr, len(consts), len(first), members, segments)
     reason = _why_not(loop)
     if reason is not None:
@@ -53,6 +56,12 @@ def scan_in_kernel(
         return None
     found = _loop.bind(*consts, *first, *now, loop=loop, scan=scan, keep=False)
     return jax.tree.unflatten(result, found)
+
+
+def _bytes_of(arrays: Sequence[Array], members: int) -> tuple[int, int]:
+    """Of a member's numbers, and of those with eight bytes."""
+    sizes = [(numbers(x.shape, members), memory_type(x.dtype).itemsize) for x in arrays]
+    return sum(n * size for n, size in sizes), sum(n * size for n, size in sizes if size == 8)
 
 
 def _trace(step: Step, carry: PyTree, signals: PyTree) -> tuple[ClosedJaxpr, list[Array], PyTree]:

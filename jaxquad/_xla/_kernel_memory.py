@@ -146,9 +146,38 @@ def tiles_of(loop: Loop, prefix: str, times: int, *, shared: bool = False) -> li
     return sorted(made, key=lambda tile: -memory_type(tile.kind).itemsize)
 
 
-def declared(tiles: Sequence[Tile]) -> Lines:
-    """Where tiles that are shared lie, the largest numbers first, so that all are aligned."""
-    lines, first = ["extern __shared__ long long shelf[];"], 0
+class Held:
+    """Numbers in double precision that a thread holds in its block's memory, if it is to do so.
+
+    They are read and written there each time (`volatile`).
+    """
+
+    def __init__(self, is_used: bool):
+        self.is_used, self._count = is_used, 0
+
+    @property
+    def size(self) -> int:
+        """Bytes of a block."""
+        return self._count * BLOCK * 8
+
+    def variables(
+        self, loop: Loop, prefix: str, avals: Sequence[Shaped], values: Sequence[str]
+    ) -> tuple[Lines, Lines]:
+        """As the function of this name, of which these numbers are not."""
+        lines, names = variables(loop, prefix, avals, values)
+        kinds = [x.dtype for x in avals for _ in range(size(loop, x))]
+        for k in [k for k, kind in enumerate(kinds) if self.is_used and kind == np.float64]:
+            names[k] = f"held[{self._count * BLOCK}]"
+            lines[k] = f"{names[k]} = {values[k]};"
+            self._count += 1
+        return lines, names
+
+
+def declared(held: Held, tiles: Sequence[Tile]) -> Lines:
+    """Where what a block shares lies, the largest numbers first, so that all are aligned."""
+    lines, first = ["extern __shared__ long long shelf[];"], held.size
+    if held.size:
+        lines.append("volatile double *const held = (double *)shelf + threadIdx.x;")
     for tile in tiles:
         kind = type_of(memory_type(tile.kind))
         lines.append(f"{kind} *const {tile.name} = ({kind} *)((char *)shelf + {first});")
@@ -198,8 +227,8 @@ def variables(
 
 def assigned(names: Sequence[str], values: Sequence[str]) -> Lines:
     """Of variables whose new values may be each other's old ones."""
-    held = [f"const auto next_{x} = {y};" for x, y in zip(names, values, strict=True)]
-    return [*held, *(f"{x} = next_{x};" for x in names)]
+    first = [f"const auto next{k} = {y};" for k, y in enumerate(values)]
+    return [*first, *(f"{x} = next{k};" for k, x in enumerate(names))]
 
 
 def nested(head: str, lines: Iterable[str]) -> Lines:

@@ -12,6 +12,7 @@ from ._kernel_memory import (
     assigned,
     declared,
     fetch_before,
+    Held,
     Lines,
     load_all,
     load_tiles,
@@ -89,8 +90,10 @@ class _Reverse:
         given = [*self.fixed, *self.now, *self.kept, *self.felt, *self.left]
         made = [*self.to_fixed, *self.to_carry, *self.to_now, *(() if self.shelf else self.again)]
         pairs = (given, self._packed(args)), (made, self._outs())
-        own = sum(tile.size for tile in self.shelf)
-        found = run(self.loop, self.lines(), *pairs, shared=own)
+        held = Held(bool(self.loop.segments.held))
+        lines = self.lines(held)
+        own = held.size + sum(tile.size for tile in self.shelf)
+        found = run(self.loop, lines, *pairs, shared=own)
         consts, carry, signals, _ = split(
             found, len(self.wanted_consts), len(self.moving), len(self.wanted_signals)
         )
@@ -134,13 +137,14 @@ class _Reverse:
             outs.append(jax.ShapeDtypeStruct((loop.count, size(loop, x), last), x.dtype))
         return outs if self.shelf else outs + [x.out(loop) for x in self.again]
 
-    def lines(self) -> Lines:
+    def lines(self, held: Held) -> Lines:
         loop = self.loop
         loads, fixed = load_all(self.fixed)
+        fixed_begin, fixed = held.variables(loop, "still", self.consts, fixed)
         felt, last = load_all(self.felt)
-        begins, moved = variables(loop, "moved", self.moving, last)
+        begins, moved = held.variables(loop, "moved", self.moving, last)
         zeros = ["0"] * sum(size(loop, x) for x in self.wanted_consts)
-        sums_begin, sums = variables(loop, "sum", self.wanted_consts, zeros)
+        sums_begin, sums = held.variables(loop, "sum", self.wanted_consts, zeros)
         kept, first = load_tiles(self.kept, "segment")
         kept += nested("if (segment > 0)", fetch_before(self.kept)) if self.shelf else []
         state_begins, state = variables(loop, "state", self.carry, first)
@@ -152,8 +156,9 @@ class _Reverse:
         ]  # fmt: skip
         head = f"for (int segment = {loop.segments.number - 1}; segment >= 0; --segment)"
         ends = [*store_all(self.to_carry, moved), *store_all(self.to_fixed, sums)]
-        shelf = declared(self.shelf) if self.shelf else []
-        return [*shelf, *loads, *felt, *begins, *sums_begin, *nested(head, segment), *ends]
+        shelf = declared(held, self.shelf) if held.size or self.shelf else []
+        begins = [*loads, *fixed_begin, *felt, *begins, *sums_begin]
+        return [*shelf, *begins, *nested(head, segment), *ends]
 
     def _once_more(self, fixed: Lines, state: Lines) -> Lines:
         """A sample of the forward pass, whose carry is written to memory."""

@@ -21,7 +21,7 @@ from jaxquad._xla import (
     sincos,
 )
 from jaxquad._xla._nvrtc import CannotCompile
-from jaxquad._xla._segments import Segments, segments_of
+from jaxquad._xla._segments import held_bytes, Segments, segments_of
 
 
 MEMBERS, SAMPLES = 150, 7  # a block and a part of one; segments of 3, 3 and 1
@@ -91,11 +91,18 @@ def have_memory(monkeypatch):
     monkeypatch.setattr(_segments, "_memory", lambda: (10**9, 228 * 1024))
 
 
-@pytest.mark.parametrize("memory", ["little", "much"])
+@pytest.mark.parametrize("memory", ["little", "much", "much, few registers", "few registers"])
 def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
     """With respect to what members share and what they do not, at the start and in every sample."""
-    if memory == "much":
+    if "much" in memory:
         have_memory(monkeypatch)
+    if memory == "few registers":
+        monkeypatch.setattr(_segments, "_memory", lambda: (1, 228 * 1024))
+    if "registers" in memory:
+        monkeypatch.setattr(_segments, "_HELD", 0)
+        reverse = written(jax.grad(lambda *args: total(kernel, *args)[0], range(5)), *given())[1]
+        assert all(f"held[{k * _kernel_memory.BLOCK}]" in reverse for k in range(20))
+        assert ("again_float64 = " in reverse) == ("much" in memory)
     both = [jax.value_and_grad(ft.partial(total, scan), argnums=range(5), has_aux=True)
             for scan in (kernel, plain)]  # fmt: skip
     found, expected = (jax.tree.leaves(compiled(f, *given())) for f in both)
@@ -118,6 +125,16 @@ def test_carries_are_kept_as_often_as_a_part_of_the_memory_allows(monkeypatch):
     monkeypatch.setattr(_segments, "_memory", lambda: (10**12, 64 * 1024))
     assert not segments_of(count, carry, members, block).are_shared  # not even two of them fit
     assert segments_of(count, 40, members, block) == Segments(count, 2, True)
+
+
+def test_what_registers_have_no_room_for_is_held_in_shared_memory(monkeypatch):
+    assert held_bytes(944, 664, 128) == 0  # no GPU
+    monkeypatch.setattr(_segments, "_memory", lambda: (10**12, 228 * 1024))
+    assert held_bytes(944, 664, 128) == 664 and held_bytes(472, 0, 128) == 0
+    assert held_bytes(680, 500, 128) == 0 and held_bytes(684, 500, 128) == 500
+    assert held_bytes(4000, 2000, 128) == 0  # more than a block has
+    assert segments_of(5000, 40, 1000, 128, 664) == Segments(5000, 2, True, 664)
+    assert segments_of(5000, 280, 1000, 128, 664) == Segments(5000, 71, False, 664)
 
 
 def written(function, *args):
