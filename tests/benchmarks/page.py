@@ -136,9 +136,9 @@ memory for every fifth sample's numbers, from which the reverse pass goes on.
 
 | loops | numbers | loop-steps/s | of the gradient | by batches of 100,000 |
 |---|---|---|---|---|
-| 100,000 | float32 | 4.26e10 | 1.03e10 | |
-| 1,000,000 | float32 | 4.37e10 | 8.76e9 | 1.04e10 |
-| 100,000 | float64 | 1.43e10 | 1.67e9 | |
+| 100,000 | float32 | 4.14e10 | 1.03e10 | |
+| 1,000,000 | float32 | 4.37e10 | 8.67e9 | 1.04e10 |
+| 100,000 | float64 | 1.44e10 | 2.00e9 | |
 """
 _OF_PYTEST = re.compile(r"benchmark: |Outliers: |OPS: ")  # lines that a plugin prints
 
