@@ -1,3 +1,4 @@
+import functools as ft
 from collections.abc import Callable
 
 import jax
@@ -44,9 +45,31 @@ def matrix_exponential(
     def nest(power: Array, k: Array) -> tuple[Array, None]:
         return unit + dot(small, power) / k, None
 
-    def square(power: Array, k: Array) -> tuple[Array, None]:
-        return jnp.where(k < halvings, dot(power, power), power), None
-
     terms = jnp.arange(_TERMS, 0, -1, dtype=matrix.dtype)
     series = jax.lax.scan(nest, unit, terms)[0]
-    return jax.lax.scan(square, series, jnp.arange(_SQUARINGS, dtype=matrix.dtype))[0]
+    return _squared(series, halvings, dot)
+
+
+@ft.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _squared(
+    power: Float[Array, "n n"], times: Float[Array, ""], dot: Callable[[Array, Array], Array]
+) -> Float[Array, "n n"]:
+    """`power` squared so many times: of most matrices hardly one, of an ensemble's as the most."""
+    more = lambda state: state[1] < times
+    square = lambda state: (dot(state[0], state[0]), state[1] + 1)
+    return jax.lax.while_loop(more, square, (power, jnp.zeros_like(times)))[0]
+
+
+@_squared.defjvp
+def _squared_jvp(
+    dot: Callable[[Array, Array], Array], primals: tuple[Array, Array], tangents: tuple[Array, ...]
+) -> tuple[Array, Array]:
+    # A loop whose length is not known has no derivative in reverse.
+    power, times = primals
+
+    def square(power: Array, k: Array) -> tuple[Array, None]:
+        return jnp.where(k < times, dot(power, power), power), None
+
+    steps = jnp.arange(_SQUARINGS, dtype=power.dtype)
+    run = lambda power: jax.lax.scan(square, power, steps)[0]
+    return jax.jvp(run, (power,), (tangents[0],))
