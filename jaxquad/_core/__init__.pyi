@@ -76,7 +76,6 @@ from ._pytree_node import pytree_node as pytree_node
 from ._stages import announce as announce, STAGES as STAGES
 from ._threads import (
     available_cores as available_cores,
-    begin_in_thread as begin_in_thread,
     map_in_threads as map_in_threads,
     thread_settings as thread_settings,
 )

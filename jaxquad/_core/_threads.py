@@ -1,13 +1,10 @@
 """Threads beside that of a caller, which compute only what they would compute in its place."""
 
-import functools as ft
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-
-_THREADS = 8  # that are begun at once, at most; more wait for one of these
 
 Given = TypeVar("Given")
 Found = TypeVar("Found")
@@ -31,29 +28,6 @@ def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -
     with ThreadPoolExecutor(max(available_cores(), 2)) as pool:
         found = list(pool.map(run, remember()))
     return [function(x) if y is None else y[0] for x, y in zip(items, found, strict=True)]
-
-
-def begin_in_thread(function: Callable[[], Found]) -> Callable[[], Found]:
-    """Begin it in a thread of its own; what is returned waits for its result.
-
-    Where JAX is set differently for the caller's thread alone, that computes it, and waits for
-    nothing.
-    """
-    settings = thread_settings()
-    run = lambda: (function(),) if thread_settings() == settings else None
-    begun = _pool(os.getpid()).submit(run)
-
-    def wait() -> Found:
-        found = begun.result()
-        return function() if found is None else found[0]
-
-    return wait
-
-
-@ft.cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Of threads that stay: to start one takes as long as a short program."""
-    return ThreadPoolExecutor(_THREADS)
 
 
 def available_cores() -> int:

@@ -1,13 +1,14 @@
 """What stands beside a design in its certificate; a tune evaluates it while it descends."""
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from jaxquad._core import begin_in_thread
+from jaxquad._core import thread_settings
 from jaxquad._xla import asked_devices, may_be_several
 from jaxquad.control import Reference
 from jaxquad.ensembles import Ensemble, Members
@@ -80,9 +81,19 @@ def begin_evaluating(
     """
     if may_be_several(asked_devices(devices)):
         return evaluate
+    pool, settings = ThreadPoolExecutor(1), thread_settings()
 
-    def run() -> Beside:
+    def run() -> Beside | None:
+        if thread_settings() != settings:
+            return None
         before()
         return evaluate()
 
-    return begin_in_thread(run)
+    begun: Future[Beside | None] = pool.submit(run)
+    pool.shutdown(wait=False)
+
+    def wait() -> Beside:
+        found = begun.result()
+        return evaluate() if found is None else found
+
+    return wait

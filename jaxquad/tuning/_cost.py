@@ -18,7 +18,7 @@ from jaxquad.control import ObserverController
 
 from ._objective import Limit, Objective, soft, Worst
 from ._parameters import Coordinates
-from ._problem import LinearLoops, Problem
+from ._problem import Problem
 from ._quantities import QUANTITIES, split_quantities
 
 
@@ -82,32 +82,23 @@ def evaluate_cost(
 
     A problem by itself is evaluated in any case.
     """
-    return _of_each(_evaluate_one, z, on, (coordinates, problem), subproblem)
-
-
-def _of_each(
-    evaluate: Callable[..., Tree],
-    z: Float[Array, "problems n"],
-    on: Bool[Array, " problems"],
-    common: tuple[PyTree, ...],
-    subproblem: Subproblem,
-) -> Tree:
-    """`evaluate(z, *common, subproblem)` of each problem, on a leading axis."""
     arrays, rest = eqx.partition(subproblem, eqx.is_array)
     if len(z) == 1:
         alone = eqx.combine(jax.tree.map(lambda x: x[0], arrays), rest)
-        return jax.tree.map(lambda x: x[None], evaluate(z[0], *common, alone))
-    shared, fixed = eqx.partition(common, eqx.is_array)
+        found = _evaluate_one(z[0], coordinates, problem, alone)
+        return jax.tree.map(lambda x: x[None], found)
+    common, fixed = eqx.partition((coordinates, problem), eqx.is_array)
 
     @jax.jit  # traced once, for its shapes and for its use
-    def run(z: Array, mine: PyTree, shared: PyTree) -> Tree:
-        return evaluate(z, *eqx.combine(shared, fixed), eqx.combine(mine, rest))
+    def run(z: Array, mine: PyTree, common: PyTree) -> CostResult:
+        of, members = eqx.combine(common, fixed)
+        return _evaluate_one(z, of, members, eqx.combine(mine, rest))
 
-    def one(given: tuple[Array, Array, PyTree]) -> Tree:
+    def one(given: tuple[Array, Array, PyTree]) -> CostResult:
         z, on, mine = given
-        shapes = jax.eval_shape(run, z, mine, shared)
+        shapes = jax.eval_shape(run, z, mine, common)
         skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return jax.lax.cond(on, run, skip, z, mine, shared)
+        return jax.lax.cond(on, run, skip, z, mine, common)
 
     # One after the other: the members of each fill the machine, and none waits for another's phase.
     return jax.lax.map(one, (z, on, arrays))
@@ -154,56 +145,12 @@ def _limited(
     controller: PyTree, problem: Problem, limits: Sequence[Limit], seen: dict[str, Array]
 ) -> tuple[Array, ...]:
     """The quantity of each limit: of the linear loop, which is cheap, on many more members."""
-    found = dict(seen)
-    if problem.limited is not None:
-        found |= _on_more(controller, problem.limited, limits)
-    return tuple(found[limit.quantity][: count_members(problem, limit)] for limit in limits)
-
-
-def _on_more(
-    controller: PyTree, loops: LinearLoops, limits: Sequence[Limit]
-) -> dict[str, Float[Array, " members"]]:
-    """The quantities of limits on linear loops, of each member's worst axis."""
     names = {limit.quantity for limit in limits if QUANTITIES[limit.quantity].linear}
-    found = loops.numbers(controller, names, SMOOTHING) if names else {}
-    return {name: QUANTITIES[name].combine_axes(found[name], worst=True) for name in names}
-
-
-class LimitResult(NamedTuple):
-    """What limits on the linear loops of many members add to a `CostResult`."""
-
-    value: Float[Array, " problems"]
-    gradient: Float[Array, "problems n"]
-    limited: tuple[Float[Array, "problems members"], ...]
-    beyond: tuple[Float[Array, "problems members"], ...]
-
-
-@ft.partial(Jit, options=brief_options)
-def evaluate_limits(
-    z: Float[Array, "problems n"],
-    on: Bool[Array, " problems"],
-    coordinates: Coordinates,
-    loops: LinearLoops,
-    subproblem: Subproblem,
-) -> LimitResult:
-    """The part of `evaluate_cost` that is of limits on `loops` alone, and of no flight."""
-    return _of_each(_limits_of_one, z, on, (coordinates, loops), subproblem)
-
-
-def _limits_of_one(
-    z: Float[Array, " n"], coordinates: Coordinates, loops: LinearLoops, subproblem: Subproblem
-) -> LimitResult:
-    limits = subproblem.limits
-
-    def total(z: Float[Array, " n"]) -> tuple[Array, PyTree]:
-        found = _on_more(coordinates.controller_at(z), loops, limits)
-        limited = tuple(found[limit.quantity] for limit in limits)
-        beyond = tuple(limit.beyond(x) for limit, x in zip(limits, limited, strict=True))
-        added = _lagrangian(beyond, subproblem.multipliers)
-        return jnp.where(subproblem.fly, added, 0.0), (limited, beyond)
-
-    (value, others), gradient = jax.value_and_grad(total, has_aux=True)(z)
-    return LimitResult(value, gradient, *others)
+    found = dict(seen)
+    if problem.limited is not None and names:
+        wide = problem.limited.numbers(controller, names, SMOOTHING)
+        found |= {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
+    return tuple(found[limit.quantity][: count_members(problem, limit)] for limit in limits)
 
 
 def count_members(problem: Problem, limit: Limit) -> int:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
@@ -13,13 +14,13 @@ from jaxquad.ensembles import Members
 
 from ._cost import (
     CostResult,
+    evaluate_cost,
     Evaluation,
     Multipliers,
     Progress,
     Subproblem,
     take_problem,
 )
-from ._evaluate import start_costs, trace_costs
 from ._gauss_newton import GaussNewton, minimise_squares
 from ._lbfgs import Descent, Evaluate, LBFGS, minimise, Pairs
 from ._multipliers import initial_multipliers, MET, Rounds, update_multipliers
@@ -201,15 +202,15 @@ class _Runner(eqx.Module):
     memory: _Memory
 
     def trace(self, z: np.ndarray) -> None:
-        """Trace and lower the programs of all evaluations, which the first one compiles."""
+        """Trace and lower the program of all evaluations, which the first one compiles."""
         multipliers = initial_multipliers(self.problem, self.limits, len(z))
-        trace_costs(*self._given(z, np.ones(len(z), bool), False, multipliers))
+        evaluate_cost.begin(*self._given(z, np.ones(len(z), bool), False, multipliers))
 
     def evaluate(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
     ) -> CostResult:
         """One evaluation of the problems that are on."""
-        return start_costs(*self._given(z, on, fly, multipliers))()
+        return _on_host(evaluate_cost(*self._given(z, on, fly, multipliers)))
 
     def _given(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
@@ -224,12 +225,12 @@ class _Runner(eqx.Module):
         """What a descent calls: infinite where a step must not go."""
 
         def evaluate(z: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            # Before the costs: JAX runs one program after the other.
+            # Before the costs, and looked at while they run: JAX runs one program after the other.
             designs = [self._design(x) for x, go in zip(z, on, strict=True) if go]
-            running = start_costs(*self._given(z, on, fly, multipliers))
+            running = evaluate_cost(*self._given(z, on, fly, multipliers))
             refused = np.zeros(len(z), bool)
             refused[np.flatnonzero(on)] = [bool(self.refusal(design)) for design in designs]
-            result = running()
+            result = _on_host(running)
             if fly:  # limits must not buy themselves members that are unstable
                 lost = np.max(result.numbers["abscissa"], axis=1) >= 0
                 result = result._replace(value=np.where(lost, np.inf, result.value))
@@ -330,6 +331,11 @@ class _Runner(eqx.Module):
             beyond = np.stack([np.max(x, axis=1) for x in result.beyond], axis=1)
             descent = descent._replace(z=z, gradient=np.asarray(result.gradient))
         return _Optimised(descent, multipliers, result, beyond, counts)
+
+
+def _on_host(result: CostResult) -> CostResult:
+    """Wait for it, in NumPy's arrays, which compile nothing for what follows."""
+    return jax.tree.map(np.asarray, result)
 
 
 class _Optimised(NamedTuple):

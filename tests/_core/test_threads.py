@@ -1,17 +1,12 @@
-"""An estimate gives NumPy's small matrices one thread, and puts back what was there.
-
-What is begun in a thread is what its caller would compute.
-"""
+"""An estimate gives NumPy's small matrices one thread, and puts back what was there."""
 
 import subprocess
 import sys
-import threading
 
-import jax
 import pytest
 import threadpoolctl
 
-from jaxquad._core import begin_in_thread, map_in_threads, one_blas_thread
+from jaxquad._core import map_in_threads, one_blas_thread
 
 
 def threads():
@@ -58,15 +53,3 @@ def test_a_library_that_an_estimate_loads_only_then_has_one_thread_too():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert set(done.stdout.split()) <= {"1"}
-
-
-def test_what_is_begun_in_a_thread_runs_beside_and_raises_where_it_is_waited_for():
-    elsewhere, wrong = begin_in_thread(threading.get_ident), begin_in_thread(lambda: [][0])
-    assert elsewhere() != threading.get_ident()
-    with pytest.raises(IndexError):
-        wrong()
-
-
-def test_what_a_thread_would_compute_with_other_numbers_its_caller_computes():
-    with jax.default_matmul_precision("highest"):
-        assert begin_in_thread(threading.get_ident)() == threading.get_ident()
