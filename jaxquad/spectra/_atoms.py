@@ -83,28 +83,16 @@ def add_effects(
 ) -> None:
     """Add effects times `values`, over frequencies and inputs, to the atoms from `low` on."""
     high = low + len(into)
-    near = np.flatnonzero((reach.first < high) & (reach.last > low))
-    if effect.shape[2] <= _NARROW and np.all(np.diff(reach.first[near]) > 0):
-        _add_by_place(into, low, effect[near], Reach(*(x[near] for x in reach)), values[near])
+    if effect.shape[2] <= _NARROW and np.all(np.diff(reach.first) > 0):
+        for place in range(effect.shape[2]):  # at which no two frequencies have the same atom
+            atoms = reach.first + place
+            here = (atoms >= low) & (atoms < high) & (atoms < reach.last)
+            into[atoms[here] - low] += np.einsum("fi,fip->fp", effect[here, :, place], values[here])
         return
-    for f in near:
+    for f in np.flatnonzero((reach.first < high) & (reach.last > low)):
         begin, end = max(reach.first[f], low), min(reach.last[f], high)
         mine = effect[f, :, begin - reach.first[f] : end - reach.first[f]]
         into[begin - low : end - low] += mine.T @ values[f]
-
-
-def _add_by_place(
-    into: Complex[np.ndarray, "atoms columns"],
-    low: int,
-    effect: Effect,
-    reach: Reach,
-    values: Complex[np.ndarray, "frequencies inputs columns"],
-) -> None:
-    """The same of frequencies whose first atoms rise: so no two have the same atom at a place."""
-    for place in range(effect.shape[2]):
-        atoms = reach.first + place
-        here = (atoms >= low) & (atoms < low + len(into)) & (atoms < reach.last)
-        into[atoms[here] - low] += np.einsum("fi,fip->fp", effect[here, :, place], values[here])
 
 
 def times_drive(

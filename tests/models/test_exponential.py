@@ -8,7 +8,7 @@ import scipy.linalg
 from jaxquad.models import matrix_exponential
 
 
-SIZES = np.array([0.0, 1e-3, 0.7, 3.0, 40.0])  # of which each takes another number of squarings
+SIZES = np.array([0.0, 0.5, 2.0, 8.0, 40.0])  # no squarings, none, and more and more
 GIVEN = np.random.default_rng(0).standard_normal((5, 4, 4)) - 2 * np.eye(4)
 GIVEN = SIZES[:, None, None] * GIVEN / np.linalg.norm(GIVEN, axis=(1, 2), keepdims=True)
 TOWARDS = np.random.default_rng(1).standard_normal((5, 4, 4))
