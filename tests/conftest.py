@@ -20,6 +20,7 @@ import jax
 import jaxtyping
 import psutil
 import pytest
+import type_checks
 
 
 jax.config.update("jax_enable_x64", True)
@@ -65,6 +66,10 @@ def compiled_quickly():
         jax.config.update(QUICKLY, True)
         yield
         jax.config.update(QUICKLY, False)
+
+
+def pytest_runtest_setup():
+    type_checks.begin_test()
 
 
 def pytest_collection_finish():

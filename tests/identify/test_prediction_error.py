@@ -1,5 +1,7 @@
 """Refinement under noise models: prediction errors."""
 
+import functools as ft
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,8 +20,12 @@ TRUTH = jq.TransferFunction([8.0], [1.0, 3.0, 20.0], 0.03)
 FREE = ("numerator[0]", "denominator[1]", "denominator[2]", "delay")
 VALUES = np.array([8.0, 3.0, 20.0, 0.03])
 U = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], SAMPLES // 25), 25)
-CLEAN = np.asarray(jq.models.simulate_linear(TRUTH, U - U[0], DT))
 POLES, ZEROS = [1, -1.6, 0.68], [1, 0.5]
+
+
+@ft.cache
+def clean():
+    return np.asarray(jq.models.simulate_linear(TRUTH, U - U[0], DT))
 
 
 def noise(seed, numerator, denominator, samples=SAMPLES):
@@ -28,7 +34,7 @@ def noise(seed, numerator, denominator, samples=SAMPLES):
 
 
 def record(seed, pole=0.9):
-    return jq.Record(TIME, U, CLEAN + 0.02 * noise(seed, [1.0], [1, -pole]), hold=DT)
+    return jq.Record(TIME, U, clean() + 0.02 * noise(seed, [1.0], [1, -pole]), hold=DT)
 
 
 def test_the_whitener_of_a_problem_gives_the_shocks():
@@ -81,7 +87,7 @@ def test_a_coloured_residual_is_whitened_and_the_estimate_is_that_of_the_known_n
     assert not any("coloured" in remark for remark in fit.remarks)
     # Generalised least squares with the true covariance; slopes by central differences.
     inverse = np.linalg.inv(cholesky(toeplitz(pole ** np.arange(SAMPLES)), lower=True))
-    y = flight.outputs[:, 0] - CLEAN
+    y = flight.outputs[:, 0] - clean()
     slopes = []
     for k, value in enumerate(VALUES):
         ends = [VALUES.copy(), VALUES.copy()]

@@ -96,21 +96,24 @@ def test_a_hover_beyond_the_top_speed_is_refused():
 
 
 CORNER, DT = 4.0, 0.01
-GUSTS = np.asarray(
-    gauss_markov(jax.random.key(0), (400, 2000), deviation=0.3, corner=CORNER, dt=DT)
-)
+
+
+@pytest.fixture(scope="module")
+def gusts():
+    key = jax.random.key(0)
+    return np.asarray(gauss_markov(key, (400, 2000), deviation=0.3, corner=CORNER, dt=DT))
 
 
 @pytest.mark.parametrize("sample", [0, 1, 399])
-def test_gusts_have_their_deviation_from_the_first_sample_on(sample):
+def test_gusts_have_their_deviation_from_the_first_sample_on(sample, gusts):
     # 2000 members leave 1.6 % of doubt.
-    assert np.std(GUSTS[sample]) == pytest.approx(0.3, rel=0.06)
+    assert np.std(gusts[sample]) == pytest.approx(0.3, rel=0.06)
 
 
 @pytest.mark.parametrize("start", [0, 200])
 @pytest.mark.parametrize("lag", [1, 10, 50])
-def test_the_correlation_of_gusts_decays_at_their_corner(start, lag):
-    found = np.corrcoef(GUSTS[start], GUSTS[start + lag])[0, 1]
+def test_the_correlation_of_gusts_decays_at_their_corner(start, lag, gusts):
+    found = np.corrcoef(gusts[start], gusts[start + lag])[0, 1]
     expected = np.exp(-CORNER * DT * lag)
     assert found == pytest.approx(expected, abs=4 * (1 - expected**2) / np.sqrt(2000))
 

@@ -67,37 +67,39 @@ def plain_covariance(errors: ErrorCovariance) -> np.ndarray:
     return rows @ rows.conj().T
 
 
-PLAIN = plain_covariance(WHOLE).reshape(*SHAPE, *SHAPE)
+@pytest.fixture(scope="module")
+def plain():
+    return plain_covariance(WHOLE).reshape(*SHAPE, *SHAPE)
 
 
 @pytest.mark.parametrize("errors", (ERRORS, WHOLE), ids=("reach", "whole"))
-def test_all_forms_of_the_covariance_are_the_plain_one(errors):
+def test_all_forms_of_the_covariance_are_the_plain_one(errors, plain):
     for first, second in (((0, 0), (0, 0)), ((1, 2), (1, 2)), ((0, 1), (1, 2))):
-        expected = PLAIN[:, first[0], first[1], :, second[0], second[1]]
+        expected = plain[:, first[0], first[1], :, second[0], second[1]]
         found = errors.between(first, second)
         np.testing.assert_allclose(found, expected, atol=1e-12 * np.max(np.abs(expected)))
     each = np.arange(FREQUENCIES)
-    at_each = PLAIN[each, :, :, each].reshape(FREQUENCIES, OUTPUTS * INPUTS, -1)
+    at_each = plain[each, :, :, each].reshape(FREQUENCIES, OUTPUTS * INPUTS, -1)
     np.testing.assert_allclose(errors.at_each_frequency(), at_each, atol=1e-9)
     np.testing.assert_allclose(
         errors.variance().reshape(FREQUENCIES, -1), np.real(np.diagonal(at_each, axis1=1, axis2=2))
     )
 
 
-def test_projections_and_pairs_do_not_depend_on_the_form():
+def test_projections_and_pairs_do_not_depend_on_the_form(plain):
     columns = draw(np.random.default_rng(1), *SHAPE, 5)
     expected = WHOLE.project(columns)
     np.testing.assert_allclose(ERRORS.project(columns), expected, rtol=1e-10)
     one = ERRORS.pair(1, 2).scaled(np.full(FREQUENCIES, 2.0 + 0j))
-    np.testing.assert_allclose(one.between((0, 0), (0, 0)), 4 * PLAIN[:, 1, 2, :, 1, 2], rtol=1e-9)
+    np.testing.assert_allclose(one.between((0, 0), (0, 0)), 4 * plain[:, 1, 2, :, 1, 2], rtol=1e-9)
 
 
-def test_the_projection_is_the_variance_of_a_weighted_sum():
+def test_the_projection_is_the_variance_of_a_weighted_sum(plain):
     """The two columns are the real and the imaginary part of one sum."""
     columns = np.zeros((*SHAPE, 2), complex)
     columns[3, 1, 0], columns[69, 0, 2] = (1.0, 1j), (2.0, 2j)
     weights = columns[..., 0].reshape(-1)
-    expected = weights.conj() @ PLAIN.reshape(weights.size, -1) @ weights
+    expected = weights.conj() @ plain.reshape(weights.size, -1) @ weights
     assert np.trace(ERRORS.project(columns)) == pytest.approx(float(np.real(expected)), rel=1e-9)
 
 
