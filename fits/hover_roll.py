@@ -201,4 +201,6 @@ if __name__ == "__main__":
     jq.enable_compile_cache()
     gc.set_threshold(500_000, 10, 10)  # a tenth of the time would go to what lives on anyway
     atexit.register(gc.freeze)  # at the end, too
-    main(**vars(options()))
+    given = vars(options())
+    with jq.second_process():
+        main(**given)

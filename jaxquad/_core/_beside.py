@@ -137,8 +137,11 @@ def prepare_second_process(prepare: Callable[[], None], *, last: bool = False) -
 
 @contextlib.contextmanager
 def allowed_second_process() -> Iterator[None]:
-    """Allow a second process within, which ends with it."""
+    """Allow a second process within, which ends with it; with the outer one, within another."""
     global _wanted
+    if _wanted:
+        yield
+        return
     _wanted = os.environ.get(_VARIABLE) != "off"
     try:
         yield

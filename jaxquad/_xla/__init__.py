@@ -6,6 +6,7 @@ from ._accelerator import (
 )
 from ._compile_cache import (
     enable_compile_cache as enable_compile_cache,
+    own_folder as own_folder,
     share_programs as share_programs,
 )
 from ._devices import (

@@ -25,6 +25,8 @@ from jaxquad.workflows import (
     free_folder,
     GROUPS,
     IdentifySettings,
+    import_estimates,
+    import_figures,
     TuneSettings,
 )
 
@@ -202,7 +204,7 @@ def start_computing() -> None:
     What a command can say without JAX it says before. A second process does the same.
     """
     prepare_second_process(_prepare)
-    prepare_second_process(_prepare_figures, last=True)
+    prepare_second_process(import_figures, last=True)
     collect_seldom()
     from jaxquad._core import enable_x64
     from jaxquad._xla import enable_compile_cache
@@ -225,29 +227,14 @@ def open_beside(
     start_computing()
     if has_second_process():
         announce(f"reading {' and '.join(path.name for path in logs)}")
-        _import_estimates()  # which takes as long
+        import_estimates()  # which takes as long
     return opened
 
 
 def _prepare() -> None:
     """What a second process will need first: JAX and estimates."""
     start_computing()
-    _import_estimates()
-
-
-def _import_estimates() -> None:
-    import scipy.linalg.lapack
-    import scipy.special
-
-    from jaxquad.workflows import identify
-
-    del identify, scipy
-
-
-def _prepare_figures() -> None:
-    from jaxquad.report import write_report  # with matplotlib
-
-    del write_report
+    import_estimates()
 
 
 @contextlib.contextmanager

@@ -36,6 +36,11 @@ from ._result_file import (
     StoredResult as StoredResult,
     StoredTuning as StoredTuning,
 )
+from ._second_process import (
+    import_estimates as import_estimates,
+    import_figures as import_figures,
+    second_process as second_process,
+)
 from ._settings import (
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,
