@@ -8,8 +8,8 @@ from beartype import beartype, BeartypeConf, BeartypeStrategy
 
 
 CALLS = 10  # of each function that are checked in a test
-_ALL_ITEMS = BeartypeConf(strategy=BeartypeStrategy.On)
 _tests = 0  # that have begun in this process
+_of_all_items = beartype(conf=BeartypeConf(strategy=BeartypeStrategy.On))
 
 
 def begin_test():
@@ -28,7 +28,7 @@ def checked(function):
             test, calls = _tests, 0
         if calls < CALLS:
             calls += 1
-            check = check or beartype(function, conf=_ALL_ITEMS)
+            check = check or _of_all_items(function)
             check(*args, **kwargs)
 
     return check_first

@@ -21,7 +21,8 @@ def allowed(monkeypatch):
 
 def settings():
     """Of the process that calls it."""
-    return os.getpid(), jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir
+    values = jax.config.values
+    return os.getpid(), values["jax_enable_x64"], values["jax_compilation_cache_dir"]
 
 
 def there(function):
