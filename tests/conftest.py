@@ -27,7 +27,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-MEMORY = 3 * 2**30  # bytes
+MEMORY = max(3 * 2**30, psutil.virtual_memory().total // 5)  # bytes of one worker
 ROOT = Path(__file__).parent.parent
 QUICKLY = "jax_disable_most_optimizations"
 FLAGS = "--xla_backend_optimization_level=0"
