@@ -1,34 +1,53 @@
-"""Types of arguments and results, checked on the first calls of each function in each test.
+"""Types of arguments and results, checked again and again only where they differ.
 
 A search calls the same small functions some 10,000 times. To check all of these calls takes longer
-than they do, and finds nothing that the first ones do not show.
+than they do. So calls whose arrays have the same shapes and types are checked a few times in each
+test; what is new is always checked.
 """
 
+from collections import Counter
+
+import jax
+import numpy as np
 from beartype import beartype, BeartypeConf, BeartypeStrategy
 
 
-CALLS = 10  # of each function that are checked in a test
+CALLS = 10  # of a function with arguments of the same kinds that are checked in a test
+_ARRAYS = (np.ndarray, np.generic, jax.Array)
+_LONG = 16  # items of a list, beyond which its length stands for it
 _tests = 0  # that have begun in this process
 _of_all_items = beartype(conf=BeartypeConf(strategy=BeartypeStrategy.On))
 
 
 def begin_test():
-    """Let all functions be checked again."""
+    """Let all calls be checked again."""
     global _tests
     _tests += 1
 
 
 def checked(function):
     """`function` for its checks only, as jaxtyping calls it: made when it is called first."""
-    check, test, calls = None, 0, 0
+    check, test, calls = None, 0, Counter()
 
     def check_first(*args, **kwargs):
-        nonlocal check, test, calls
+        nonlocal check, test
         if test != _tests:
-            test, calls = _tests, 0
-        if calls < CALLS:
-            calls += 1
+            test = _tests
+            calls.clear()
+        kinds = (*map(_kind, args), *kwargs, *map(_kind, kwargs.values()))
+        if calls[kinds] < CALLS:
+            calls[kinds] += 1
             check = check or _of_all_items(function)
             check(*args, **kwargs)
 
     return check_first
+
+
+def _kind(value):
+    """What a check of `value` depends on."""
+    kind = type(value)
+    if isinstance(value, _ARRAYS):
+        return kind, value.shape, value.dtype
+    if kind in (tuple, list):
+        return kind, len(value), *map(_kind, value[:_LONG])
+    return (kind, value) if kind is str else kind
