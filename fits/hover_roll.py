@@ -81,7 +81,7 @@ def identify_both(
         (frf, loaded),
         free=("J_x", "K_t", "lag"),
         cost=COSTS["maximum likelihood"],
-        conditions=(None, lambda axis: axis.with_added_inertia(ADDED)),
+        conditions=(None, jq.identify.Changed("J_x", plus=ADDED)),
     )
 
 

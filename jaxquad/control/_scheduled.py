@@ -1,6 +1,7 @@
 """Controllers whose gains follow from an inertia that they are given."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable, Collection
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import as_float, ensemble_shape, multiply_gains, require_positive, signal_shape
+from jaxquad._xla import hasty_options, Jit
 
 from ._ladrc import LADRC
 from ._pid import PID
@@ -135,7 +137,7 @@ def gain_at(map: InertiaToGain, inertia: Float[ArrayLike, "..."]) -> Array:
     return as_float(_evaluate_map(map, wide, shape))
 
 
-@eqx.filter_jit  # as one program: a tune evaluates it for each ensemble that it draws
+@ft.partial(Jit, options=hasty_options)  # a tune evaluates it for each ensemble that it draws
 def _evaluate_map(
     map: InertiaToGain, inertia: Float[Array, "..."], shape: tuple[int, ...]
 ) -> Array:

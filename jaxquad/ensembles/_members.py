@@ -1,5 +1,6 @@
 """The members of an ensemble, and what of a plant varies between them."""
 
+import functools as ft
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key, PyTree
 
 from jaxquad._core import as_float, is_concrete, mark_members, per_member
+from jaxquad._xla import brief_options, Jit
 from jaxquad.control import schedule_for_flight
 from jaxquad.loops import Drive, Loop, Sensor
 from jaxquad.models import Allocation, Attitude, DecoupledAxes, MotorLag, Multirotor
@@ -260,7 +262,7 @@ def _require_indices(indices: ArrayLike | Sequence[int], size: int) -> Array:
     return places
 
 
-@eqx.filter_jit  # as one program: eager, it would be a dozen for each shape
+@ft.partial(Jit, options=brief_options)  # eager, it would be a dozen programs for each shape
 def _add_drawn(
     scenario: Scenario,
     keys: Key[Array, " members"],

@@ -1,4 +1,5 @@
 from ._compare import compare as compare, Comparison as Comparison
+from ._condition import Changed as Changed
 from ._cost import (
     coherence_weight as coherence_weight,
     CoherenceWeighted as CoherenceWeighted,

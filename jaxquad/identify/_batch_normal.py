@@ -21,11 +21,12 @@ from jaxquad._xla import (
 )
 from jaxquad.models import evaluate_response, StateSpace
 
+from ._condition import unchanged
 from ._held import held
 from ._mixing import Mixing
 from ._normal import problem_normal
 from ._parameters import Numbers, Parameters, Place
-from ._problem import Problem, unchanged
+from ._problem import Problem
 
 
 class Member(NamedTuple):

@@ -1,13 +1,14 @@
 """Curves of a fitted model, over frequency and over time, with the band that its doubt leaves."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float, Inexact, PyTree
 
+from jaxquad._xla import hasty_options, Jit
 from jaxquad.models import evaluate_response, simulate_linear, StateSpace, TransferFunction
 
 from ._accuracy import Matrix
@@ -80,7 +81,7 @@ def _step_of(plant: StateSpace, k: int, samples: int, dt: float) -> np.ndarray:
     return np.asarray(simulate_linear(plant, u, dt))
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=hasty_options)
 def _response(model: PyTree, omega: Float[Array | np.ndarray, " frequencies"]) -> Array:
     return evaluate_response(model, jnp.asarray(omega))
 

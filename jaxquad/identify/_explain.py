@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
+from ._condition import Condition
 from ._cost import MaximumLikelihood
 from ._half_bands import model_to_start_from, require_origin
 from ._origin import free_again, Options, Origin
 from ._parameters import Positive, Real, Tie
-from ._problem import Condition, Prior
+from ._problem import Prior
 
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt

@@ -12,6 +12,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._assess import assess, Counted, discrepancy_at, records_at
 from ._bounds import settle_at_bounds, solve_within_bounds
+from ._condition import Condition
 from ._cost import (
     Band,
     Cost,
@@ -33,7 +34,7 @@ from ._mixing import Mixing, mixings_of
 from ._model_checks import require_model, require_model_response
 from ._origin import Options, Origin
 from ._parameters import Free, Parameters, select_parameters, Tie
-from ._problem import Condition, make_problem, Prior, Problem, require_priors
+from ._problem import make_problem, Prior, Problem, require_priors
 from ._result import Fit
 from ._solve import Solution
 from ._starts import Minimum, solve_from_many, spread_starts
@@ -95,8 +96,8 @@ def fit(
     - `tied`: parameters that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
     - `cost`: `jq.identify.MaximumLikelihood()`, or `jq.identify.CoherenceWeighted()`: Eq. (14),
         the paper's and CIFER's.
-    - `conditions`: how the model differs in each response, for instance
-        `(None, lambda m: m.with_added_inertia(0.03))`.
+    - `conditions`: how the model differs in each response: `None` where it does not, a
+        `jq.identify.Changed`, or a function from the model to the one that this record saw.
     - `priors`: known values with their standard errors, `jq.identify.Prior`.
     - `band`: (low, high) in rad/s. A mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs
         of output and input a band of their own, or leaves them out with `None`.

@@ -1,6 +1,5 @@
 """The gain over the throttle: levels of throttle in records, one lag and delay, a gain for each."""
 
-import functools as ft
 import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import as_float
+from jaxquad._core import as_float, pytree_node
 from jaxquad.models import LaggedIntegrator
 from jaxquad.records import Channel, Record, RecordWarning, resample, select
 from jaxquad.spectra import (
@@ -24,7 +23,6 @@ from ._cost import usable
 from ._curve_parameters import relative_slope
 from ._fit import fit, guess_lagged_integrator
 from ._known_filters import KnownFilter, without_filters
-from ._problem import Condition
 from ._result import Fit
 from ._thrust_curve import GainOverThrottle, ThrottleLevels
 
@@ -48,10 +46,14 @@ class ThrottledIntegrator(eqx.Module):
         return LaggedIntegrator(self.gain[level], self.lag, self.delay)
 
 
-@ft.cache
-def _at_level(level: int) -> Condition:
-    """The same function for the same level, so that fits share their programs."""
-    return lambda model: model.at(level)
+@pytree_node
+class _AtLevel:
+    """The condition of a record that was flown at one throttle level."""
+
+    level: int = eqx.field(static=True)
+
+    def __call__(self, model: ThrottledIntegrator) -> LaggedIntegrator:
+        return model.at(self.level)
 
 
 class _Signals(NamedTuple):
@@ -394,5 +396,5 @@ def _fitted(responses: Sequence[FrequencyResponse]) -> Fit:
     start = ThrottledIntegrator(
         np.array([float(each.gain) for each in guesses]), middle("lag"), middle("delay")
     )
-    conditions = [_at_level(k) for k in range(len(responses))]
+    conditions = [_AtLevel(k) for k in range(len(responses))]
     return fit(start, list(responses), conditions=conditions)

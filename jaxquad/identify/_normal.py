@@ -10,8 +10,9 @@ from jaxquad._core import Normal, normal_equations
 from jaxquad._xla import arctan2, no_fuse
 from jaxquad.models import Entry, factor_slopes, matrices_of, Split, StateSpace
 
+from ._condition import unchanged
 from ._mixing import mix_parts
-from ._problem import prior_misfits, Problem, residuals, unchanged
+from ._problem import prior_misfits, Problem, residuals
 
 
 def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:

@@ -10,9 +10,10 @@ from jaxtyping import PyTree
 from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
 
+from ._condition import Condition
 from ._cost import Band, Cost, Points
 from ._parameters import Free, Parameters, Positive, Real, Tie
-from ._problem import Condition, Prior
+from ._problem import Prior
 
 
 class Options(NamedTuple):

@@ -13,12 +13,10 @@ from jaxquad._xla import no_fuse
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
+from ._condition import Condition, require_conditions
 from ._held import Aliases, evaluate_sampled, hold_of, plan_aliases
 from ._mixing import mix_parts, Mixing, unmixed
 from ._parameters import find_place, Numbers, Parameters
-
-
-Condition = Callable[[PyTree], PyTree]
 
 
 class Prior(eqx.Module):
@@ -71,7 +69,7 @@ class Problem:
 
     model: PyTree
     parameters: Parameters
-    conditions: tuple[Condition, ...] = eqx.field(static=True)
+    conditions: tuple[Condition, ...]
     quantities: tuple[Condition, ...] = eqx.field(static=True)  # that a prior speaks of
     omega: tuple[Float[Numbers, " frequencies"], ...]
     measured: tuple[Complex[Numbers, "frequencies outputs inputs"], ...]
@@ -151,17 +149,11 @@ def make_problem(
 
     **Raises:**
 
-    - `ValueError`: another number of conditions than of responses.
+    - `ValueError`: another number of conditions than of responses, or what is no condition.
     """
-    conditions = [None] * len(frfs) if conditions is None else list(conditions)
-    if len(conditions) != len(frfs):
-        raise ValueError(
-            f"{len(conditions)} conditions for {len(frfs)} responses: give one for each, None "
-            "where the model holds as it is"
-        )
+    taken = require_conditions(model, conditions, len(frfs))
     numbers = [[prior.value, prior.standard_error] for prior in priors]
     shapes = [(*frf.response.shape, 2) for frf in frfs]
-    taken = [condition or unchanged for condition in conditions]
     return Problem(
         model=model,
         parameters=parameters,
@@ -216,11 +208,6 @@ def _silent_pairs(
 
 
 _evaluate = eqx.filter_jit(evaluate_response)
-
-
-def unchanged(model: PyTree) -> PyTree:
-    """The condition of a record that was taken on the model as it is."""
-    return model
 
 
 def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, "..."]]:

@@ -1,5 +1,6 @@
 """Linear models over a record: what the inputs force, and what start and trim add to it."""
 
+import functools as ft
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import Jit
+from jaxquad._xla import brief_options, Jit
 from jaxquad.models import (
     explicit,
     free_responses,
@@ -285,7 +286,7 @@ def free_response(
     return jnp.concatenate([shifts, dot(bias, motions.slow), dot(start, motions.fast)], axis=2)
 
 
-@Jit
+@ft.partial(Jit, options=brief_options)
 def forced_and_free(
     plant: TransferFunction | StateSpace,
     motions: Motions,

@@ -212,7 +212,8 @@ def remedies_for(lost: tuple[str, ...]) -> tuple[str, ...]:
     return (
         f"fix {names} at a measured value (leave it out of free=)",
         "give a known value: priors=[jq.identify.Prior(name or function, value, standard error)]",
-        f"fit a second record under a known change of {names} (conditions=)",
+        f"fit a second record under a known change of {names}: "
+        "conditions=(None, jq.identify.Changed(name, change))",
     )
 
 

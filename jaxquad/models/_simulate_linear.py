@@ -1,13 +1,14 @@
 """Exact simulation of a linear model with delayed inputs and outputs."""
 
+import functools as ft
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxquad._core import require_all_positive
+from jaxquad._xla import brief_options, Jit
 
 from ._connect import realise
 from ._exponential import dot, matrix_exponential, small_dot
@@ -294,7 +295,7 @@ def _segments(u: Float[Array, "samples inputs"], hold: str) -> Float[Array, "inp
     return jnp.stack([u.T, change.T], axis=2)
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=brief_options)
 def _simulate(
     plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: Number
 ) -> Float[Array, "samples outputs"]:
@@ -338,7 +339,7 @@ def _direct_outputs(
     return jnp.einsum("oi,oik->ko", D, by_both, precision="highest")
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=brief_options)
 def _free_outputs(
     plant: _Plant, samples: int, dt: Number
 ) -> tuple[Float[Array, "samples outputs states"], Float[Array, "samples outputs states"]]:

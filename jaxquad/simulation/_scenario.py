@@ -1,3 +1,4 @@
+import functools as ft
 import math
 from collections.abc import Mapping, Sequence
 
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, PyTree
 
 from jaxquad._core import as_float, ensemble_shape, per_member, require_all_positive, whole_samples
+from jaxquad._xla import brief_options, Jit
 from jaxquad.excitation import Excitation
 from jaxquad.records import AXES
 
@@ -277,7 +279,7 @@ def _check_excitation(
             raise ValueError(f"{name} is {value}: it is {bound} and finite")
 
 
-@eqx.filter_jit
+@ft.partial(Jit, options=brief_options)
 def _excited(signal, key, levels, dt, axis) -> Scenario:
     torque_key, sensor_key = jax.random.split(key)
     torque = gauss_markov(torque_key, signal.shape, deviation=levels[0], corner=levels[1], dt=dt)

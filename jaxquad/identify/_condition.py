@@ -1,0 +1,85 @@
+"""How a model differs in one of several records."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import ArrayLike, Float, PyTree
+
+from jaxquad._core import pytree_node, require_finite, require_positive
+
+from ._parameters import find_place, with_values
+
+
+Condition = Callable[[PyTree], PyTree]
+
+
+def unchanged(model: PyTree) -> PyTree:
+    """The condition of a record that was taken on the model as it is."""
+    return model
+
+
+@pytree_node
+class Changed:
+    """A known change of one parameter, in one of the records of a fit.
+
+    A weight on the arms, another propeller: it tells parameters apart of which one record shows
+    the ratio alone. The parameter counts as `times * value + plus`.
+
+    **Arguments:**
+
+    - `parameter`: its name, as in `free=`.
+    - `plus`: what is added, in the parameter's unit.
+    - `times`: a factor, above 0.
+
+    A function of the model does the same. This one pickles, and fits with it keep their compiled
+    program for the next process.
+
+    !!! example
+
+        ```python
+        loaded = jq.identify.Changed("J_x", plus=0.0276)
+        fit = jq.fit(model, (frf, frf_loaded), conditions=(None, loaded))
+        ```
+    """
+
+    parameter: str = eqx.field(static=True)
+    plus: Float[ArrayLike, ""] = 0.0
+    times: Float[ArrayLike, ""] = 1.0
+
+    def __post_init__(self):
+        require_finite("plus", self.plus)
+        require_positive("times", self.times)
+        if float(self.plus) == 0.0 and float(self.times) == 1.0:
+            raise ValueError(f"{self.parameter} is not changed: give plus= or times=")
+        for name in ("plus", "times"):  # arrays: other numbers run the same program
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+
+    def __call__(self, model: PyTree) -> PyTree:
+        """The model with the change."""
+        place = find_place(model, self.parameter, "for a condition")
+        arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+        value = self.times * arrays[place.leaf].reshape(-1)[place.index] + self.plus
+        return with_values(model, (place,), value[None])
+
+
+def require_conditions(
+    model: PyTree, conditions: Sequence[Condition | None] | None, count: int
+) -> list[Condition]:
+    """One for each of `count` responses; ValueError for another number, or for no condition."""
+    given = [None] * count if conditions is None else list(conditions)
+    if len(given) != count:
+        raise ValueError(
+            f"{len(given)} conditions for {count} responses: give one for each, None where the "
+            "model holds as it is"
+        )
+    for each in given:
+        if isinstance(each, Changed):
+            find_place(model, each.parameter, "for a condition")
+        elif each is not None and not callable(each):
+            raise ValueError(
+                f"condition {each!r} is no change of the model: give None, "
+                "jq.identify.Changed(name, change), or a function from a model to a model"
+            )
+    return [each or unchanged for each in given]

@@ -1,0 +1,96 @@
+"""A known change of the model in one of several records."""
+
+import inspect
+import pickle
+
+import numpy as np
+import pytest
+from synthetic import response_of
+
+import jaxquad as jq
+from jaxquad._xla import _kept_programs
+from jaxquad.identify._condition import require_conditions
+
+
+RIG = jq.models.AttitudeAxis(L=0.197, K_t=0.1188, J_x=0.0552, lag=0.02)
+START = jq.models.AttitudeAxis(L=0.197, K_t=0.2, J_x=0.1, lag=0.03)
+FREE = ("J_x", "K_t", "lag")
+ADDED = 0.0276
+untyped_conditions = inspect.unwrap(
+    require_conditions
+)  # as without the test suite's check of types
+CHANGED = jq.identify.Changed("J_x", plus=ADDED)
+
+
+def loaded(rig):
+    return rig.with_added_inertia(ADDED)
+
+
+@pytest.fixture(scope="module")
+def frfs():
+    return response_of(RIG, seed=2), response_of(loaded(RIG), seed=3)
+
+
+def fit(frfs, condition):
+    return jq.fit(START, frfs, free=FREE, conditions=(None, condition))
+
+
+def test_a_changed_parameter_is_fitted_as_the_function_that_changes_it(frfs):
+    named, function = fit(frfs, CHANGED), fit(frfs, loaded)
+    assert named.identifiable
+    np.testing.assert_allclose(named.values, function.values, rtol=1e-9)
+    np.testing.assert_allclose(named.standard_errors, function.standard_errors, rtol=1e-6)
+    assert np.all(np.abs(named.values - [0.0552, 0.1188, 0.02]) < 3 * named.standard_errors)
+
+
+def test_it_adds_and_multiplies():
+    changed = jq.identify.Changed("K_t", plus=0.01, times=2.0)(RIG)
+    assert float(changed.K_t) == pytest.approx(2 * 0.1188 + 0.01)
+    assert float(changed.J_x) == 0.0552 and float(RIG.K_t) == 0.1188
+
+
+def test_its_numbers_are_no_part_of_a_program_which_is_kept(monkeypatch, tmp_path):
+    monkeypatch.setattr(_kept_programs, "_folder", lambda: tmp_path)
+    lowered, kept = [], _kept_programs._lowered
+    monkeypatch.setattr(
+        _kept_programs, "_lowered", lambda *given: lowered.append(given[1]) or kept(*given)
+    )
+    omega = np.geomspace(0.5, 20.0, 23)  # as no other test has them
+    few = response_of(RIG, seed=2, omega=omega), response_of(loaded(RIG), seed=3, omega=omega)
+    fit(few, CHANGED)
+    assert any("descend" in name for name in lowered)
+    lowered.clear()
+    other = fit(few, jq.identify.Changed("J_x", plus=0.03))
+    assert not lowered and other.identifiable
+
+
+def test_it_pickles():
+    again = pickle.loads(pickle.dumps(CHANGED))
+    assert float(again(RIG).J_x) == pytest.approx(0.0552 + ADDED)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "J_x is not changed: give plus= or times="),
+        ({"plus": np.nan}, "plus"),
+        ({"times": -1.0}, "times"),
+    ],
+    ids=["nothing", "not finite", "a turned sign"],
+)
+def test_what_is_no_change_is_refused(given, said):
+    with pytest.raises(ValueError, match=said):
+        jq.identify.Changed("J_x", **given)
+
+
+@pytest.mark.parametrize(
+    ("condition", "said"),
+    [
+        (jq.identify.Changed("Jx", plus=0.01), "no parameter 'Jx' for a condition; the model has"),
+        (0.0276, "condition 0.0276 is no change of the model: give None, jq.identify.Changed"),
+    ],
+    ids=["an unknown parameter", "a number"],
+)
+def test_what_is_no_condition_is_refused(condition, said):
+    with pytest.raises(ValueError, match=said):
+        untyped_conditions(START, (None, condition), 2)
