@@ -16,6 +16,7 @@ CALLS = 10  # of a function with arguments of the same kinds that are checked in
 _ARRAYS = (np.ndarray, np.generic, jax.Array)
 _LONG = 16  # items of a list, beyond which its length stands for it
 _tests = 0  # that have begun in this process
+_is_array: dict[type, bool] = {}
 _of_all_items = beartype(conf=BeartypeConf(strategy=BeartypeStrategy.On))
 
 
@@ -46,8 +47,11 @@ def checked(function):
 def _kind(value):
     """What a check of `value` depends on."""
     kind = type(value)
-    if isinstance(value, _ARRAYS):
+    is_array = _is_array.get(kind)
+    if is_array is None:  # to ask JAX takes longer than all else here
+        is_array = _is_array[kind] = isinstance(value, _ARRAYS)
+    if is_array:
         return kind, value.shape, value.dtype
-    if kind in (tuple, list):
+    if kind is tuple or kind is list:
         return kind, len(value), *map(_kind, value[:_LONG])
     return (kind, value) if kind is str else kind

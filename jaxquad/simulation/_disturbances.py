@@ -28,6 +28,17 @@ def gauss_markov(
     `deviation` is its standard deviation, `corner` its bandwidth in rad/s.
     """
     white = jax.random.normal(key, shape, dtype=float)
+    return gauss_markov_of(white, deviation=deviation, corner=corner, dt=dt)
+
+
+def gauss_markov_of(
+    white: Float[Array, "samples ..."],
+    *,
+    deviation: float | Float[Array, ""],
+    corner: float | Float[Array, ""],
+    dt: float,
+) -> Float[Array, "samples ..."]:
+    """`gauss_markov` that white noise of unit variance drives."""
     keep = jnp.exp(jnp.asarray(-corner * dt))
     drive = deviation * jnp.sqrt(1 - keep**2)
 

@@ -13,7 +13,7 @@ from jaxquad._xla import brief_options, Jit
 from jaxquad.excitation import Excitation
 from jaxquad.records import AXES
 
-from ._disturbances import gauss_markov
+from ._disturbances import gauss_markov_of
 from ._memory import require_memory
 from ._signal import as_signal, Clock, fit, Motion, Signal
 
@@ -281,9 +281,10 @@ def _check_excitation(
 
 @ft.partial(Jit, options=brief_options)
 def _excited(signal, key, levels, dt, axis) -> Scenario:
-    torque_key, sensor_key = jax.random.split(key)
-    torque = gauss_markov(torque_key, signal.shape, deviation=levels[0], corner=levels[1], dt=dt)
-    jitter = levels[2] * jax.random.normal(sensor_key, signal.shape, signal.dtype)
+    draw = lambda key: jax.random.normal(key, signal.shape, signal.dtype)
+    gusts, white = jax.vmap(draw)(jax.random.split(key))  # together: they are compiled once
+    torque = gauss_markov_of(gusts, deviation=levels[0], corner=levels[1], dt=dt)
+    jitter = levels[2] * white
     still = jnp.zeros((signal.shape[0], len(AXES), *signal.shape[1:]), signal.dtype)
     injection, disturbance, noise = (still.at[:, axis].set(x) for x in (signal, torque, jitter))
     return Scenario(still, injection, disturbance, noise, dt=dt)
