@@ -104,7 +104,10 @@ class Jit:
         return self if self._options is brief_options else Jit(self._function, brief_options)
 
     def __call__(self, *args: PyTree) -> PyTree:
-        leaves, structure = jax.tree.flatten(args)
+        return self.of_flat(args, *jax.tree.flatten(args))
+
+    def of_flat(self, args: tuple, leaves: list, structure: PyTree) -> PyTree:
+        """The same for arguments that the caller has taken apart."""
         if not _is_outermost(leaves):
             return self._plain(*args)
         run = lambda: self._run(args, leaves, structure)

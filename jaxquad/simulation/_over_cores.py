@@ -36,13 +36,15 @@ def over_cores(
     is worth it and nobody asked for devices; what a part shares with others comes from the first.
     `check` is given the shapes of the whole result before there is room for it.
     """
-    part, members = None, _members(run)
+    part, args = None, (*run, *further, devices)
+    leaves, structure = jax.tree.flatten(args)
+    members = _members(run, leaves)
     if members >= 2 * _FEWEST:
         part = _part(program, run, further, devices)
     if _SINGLE < (members if part is None else part.width) <= _SOME:
         program = program.brief
     if part is None:
-        return gathered(program(*run, *further, devices))
+        return gathered(program.of_flat(args, leaves, structure))
     joined = _Joined(part, check)
 
     def compute(first: int) -> None:
@@ -90,9 +92,9 @@ def _part(program: Jit, run: Run, further: tuple, devices: Devices | None) -> _P
     return _Part(members, width, own) if program.is_outermost(*run, *further) else None
 
 
-def _members(run: Run) -> int:
-    """On the last axis; 1 for a single loop, which shows sooner than an ensemble."""
-    few = max(map(_last_axis, jax.tree.leaves(run))) <= _SINGLE
+def _members(run: Run, leaves: list) -> int:
+    """On the last axis; 1 for a single loop, which its leaves show sooner than an ensemble."""
+    few = max(map(_last_axis, leaves)) <= _SINGLE
     return 1 if few else (1, *ensemble_shape(*run))[-1]
 
 

@@ -52,9 +52,10 @@ def _check_payload(plant: Plant, payload: Float[Array, "samples axes ..."]) -> N
 
 
 def _check_numbers(name: str, part: Float[Array, "samples axes ..."]) -> None:
-    finite = np.isfinite(np.asarray(part))
-    if finite.all():
+    known = np.asarray(part)
+    if np.isfinite(np.vdot(known, known)):  # half the time of a look at each number
         return
+    finite = np.isfinite(known)
     bad = np.flatnonzero(~finite.all(axis=tuple(range(1, part.ndim))))
     if bad.size:
         raise ValueError(
