@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, Float, PyTree
+from jaxtyping import Float, PyTree
 
 from jaxquad._core import pytree_node, require_finite, require_positive
 
-from ._parameters import find_place, with_values
+from ._parameters import find_place, Numbers, with_values
 
 
 Condition = Callable[[PyTree], PyTree]
@@ -33,6 +33,8 @@ class Changed:
     - `plus`: what is added, in the parameter's unit.
     - `times`: a factor, above 0.
 
+    **Raises:** ValueError for what is not one finite number each, and where both change nothing.
+
     A function of the model does the same. This one pickles, and fits with it keep their compiled
     program for the next process.
 
@@ -45,16 +47,19 @@ class Changed:
     """
 
     parameter: str = eqx.field(static=True)
-    plus: Float[ArrayLike, ""] = 0.0
-    times: Float[ArrayLike, ""] = 1.0
+    plus: float | Float[Numbers, ""] = 0.0
+    times: float | Float[Numbers, ""] = 1.0
 
     def __post_init__(self):
+        for name in ("plus", "times"):  # arrays: other numbers run the same program
+            number = np.asarray(getattr(self, name), dtype=float)
+            if number.ndim:
+                raise ValueError(f"{name} has the shape {number.shape}: give one number")
+            object.__setattr__(self, name, number)
         require_finite("plus", self.plus)
         require_positive("times", self.times)
-        if float(self.plus) == 0.0 and float(self.times) == 1.0:
+        if self.plus == 0.0 and self.times == 1.0:
             raise ValueError(f"{self.parameter} is not changed: give plus= or times=")
-        for name in ("plus", "times"):  # arrays: other numbers run the same program
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
 
     def __call__(self, model: PyTree) -> PyTree:
         """The model with the change."""
