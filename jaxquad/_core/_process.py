@@ -32,7 +32,7 @@ def require_x64(what: str) -> None:
         )
 
 
-def require_float64(what: str, array: Array) -> None:
+def require_float64(what: str, array: Array | np.ndarray) -> None:
     """Raise a `PrecisionError` if `array` was created in single precision."""
     require_x64(what)
     if array.dtype in (jnp.float32, jnp.complex64):

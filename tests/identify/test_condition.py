@@ -3,6 +3,7 @@
 import inspect
 import pickle
 
+import jax
 import numpy as np
 import pytest
 from synthetic import response_of
@@ -47,6 +48,11 @@ def test_it_adds_and_multiplies():
     changed = jq.identify.Changed("K_t", plus=0.01, times=2.0)(RIG)
     assert float(changed.K_t) == pytest.approx(2 * 0.1188 + 0.01)
     assert float(changed.J_x) == 0.0552 and float(RIG.K_t) == 0.1188
+
+
+def test_it_changes_models_of_numpys_arrays_too():
+    changed = CHANGED(jax.tree.map(np.asarray, RIG))
+    assert isinstance(changed.J_x, np.ndarray) and float(changed.J_x) == 0.0552 + ADDED
 
 
 def test_its_numbers_are_no_part_of_a_program_which_is_kept(monkeypatch, tmp_path):
