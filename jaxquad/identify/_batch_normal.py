@@ -21,7 +21,7 @@ from jaxquad._xla import (
 )
 from jaxquad.models import evaluate_response, StateSpace
 
-from ._condition import unchanged
+from ._condition import UNCHANGED
 from ._held import held
 from ._mixing import Mixing
 from ._normal import problem_normal
@@ -134,7 +134,7 @@ def _problem_of_one(batch: Batch, member: _Single) -> Problem:
     return Problem(
         model=batch.model,
         parameters=batch.parameters,
-        conditions=(unchanged,),
+        conditions=(UNCHANGED,),
         quantities=(),
         omega=(batch.omega,),
         measured=(jnp.moveaxis(jax.lax.complex(*member.measured), -1, 0),),

@@ -15,9 +15,26 @@ from ._parameters import find_place, Numbers, with_values
 Condition = Callable[[PyTree], PyTree]
 
 
-def unchanged(model: PyTree) -> PyTree:
-    """The condition of a record that was taken on the model as it is."""
+@pytree_node
+class _ByFunction:
+    """A condition that is a function, into which JAX cannot look."""
+
+    change: Condition = eqx.field(static=True)
+
+    def __call__(self, model: PyTree) -> PyTree:
+        return self.change(model)
+
+
+def _same(model: PyTree) -> PyTree:
     return model
+
+
+UNCHANGED = _ByFunction(_same)  # the condition of a record that was taken on the model as it is
+
+
+def is_unchanged(condition: Condition) -> bool:
+    """Whether it is `UNCHANGED`, or what JAX has made of it."""
+    return isinstance(condition, _ByFunction) and condition.change is _same
 
 
 @pytree_node
@@ -72,7 +89,10 @@ class Changed:
 def require_conditions(
     model: PyTree, conditions: Sequence[Condition | None] | None, count: int
 ) -> list[Condition]:
-    """One for each of `count` responses; ValueError for another number, or for no condition."""
+    """One for each of `count` responses, all of them pytrees.
+
+    ValueError for another number, and for what is no condition.
+    """
     given = [None] * count if conditions is None else list(conditions)
     if len(given) != count:
         raise ValueError(
@@ -87,4 +107,10 @@ def require_conditions(
                 f"condition {each!r} is no change of the model: give None, "
                 "jq.identify.Changed(name, change), or a function from a model to a model"
             )
-    return [each or unchanged for each in given]
+    return [_as_node(each) for each in given]
+
+
+def _as_node(condition: Condition | None) -> Condition:
+    if condition is None:
+        return UNCHANGED
+    return _ByFunction(condition) if jax.tree_util.all_leaves([condition]) else condition

@@ -10,7 +10,7 @@ from jaxquad._core import Normal, normal_equations
 from jaxquad._xla import arctan2, no_fuse
 from jaxquad.models import Entry, factor_slopes, matrices_of, Split, StateSpace
 
-from ._condition import unchanged
+from ._condition import is_unchanged
 from ._mixing import mix_parts
 from ._problem import prior_misfits, Problem, residuals
 
@@ -38,7 +38,7 @@ def is_plain(problem: Problem) -> bool:
     """Whether slopes are products of the resolvent's columns and rows."""
     plain = type(problem.model) is StateSpace and not problem.parameters.ties
     plain = plain and all(each is None for each in problem.aliases) and not any(problem.silent)
-    return plain and all(condition is unchanged for condition in problem.conditions)
+    return plain and all(map(is_unchanged, problem.conditions))
 
 
 def _record(z: Float[Array, " parameters"], problem: Problem, k: int) -> list[Normal]:

@@ -3,6 +3,7 @@
 import inspect
 import pickle
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -68,6 +69,13 @@ def test_its_numbers_are_no_part_of_a_program_which_is_kept(monkeypatch, tmp_pat
     lowered.clear()
     other = fit(few, jq.identify.Changed("J_x", plus=0.03))
     assert not lowered and other.identifiable
+
+
+@pytest.mark.parametrize("condition", [None, loaded, CHANGED], ids=["none", "function", "changed"])
+def test_jax_finds_arrays_alone_in_a_problem(frfs, condition):
+    parameters = jq.identify.select_parameters(START, FREE)
+    problem = jq.identify.make_problem(START, parameters, frfs, (None, condition))
+    assert all(map(eqx.is_array, jax.tree.leaves(problem)))
 
 
 def test_it_pickles():

@@ -10,7 +10,7 @@ from synthetic import response_of
 import jaxquad as jq
 from jaxquad._xla import arctan2, evaluate_once, in_real_parts, NotInRealPartsError
 from jaxquad.identify import select_parameters
-from jaxquad.identify._condition import unchanged
+from jaxquad.identify._condition import UNCHANGED
 from jaxquad.identify._fit_batch import solve_batch
 from jaxquad.identify._problem import Problem, residuals
 
@@ -45,7 +45,7 @@ def one_by_one(response, weights):
     problem = Problem(
         model=START,
         parameters=select_parameters(START, FREE),
-        conditions=(unchanged,),
+        conditions=(UNCHANGED,),
         quantities=(),
         omega=(OMEGA,),
         measured=(response,),
