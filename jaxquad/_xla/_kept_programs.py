@@ -214,9 +214,9 @@ def _kind(leaf: object) -> object:
 
 
 def _written(leaf: object) -> object:
-    """The same in what pickles, for a file's name."""
+    """The same in words, for a file's name."""
     if not eqx.is_array(leaf):
-        return leaf
+        return _kind(leaf)
     known = jax.typeof(leaf)
     return known.shape, str(known.dtype), known.weak_type
 

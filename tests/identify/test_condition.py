@@ -18,10 +18,9 @@ RIG = jq.models.AttitudeAxis(L=0.197, K_t=0.1188, J_x=0.0552, lag=0.02)
 START = jq.models.AttitudeAxis(L=0.197, K_t=0.2, J_x=0.1, lag=0.03)
 FREE = ("J_x", "K_t", "lag")
 ADDED = 0.0276
-untyped_conditions = inspect.unwrap(
-    require_conditions
-)  # as without the test suite's check of types
 CHANGED = jq.identify.Changed("J_x", plus=ADDED)
+# As without the test suite's check of types.
+untyped_conditions = inspect.unwrap(require_conditions)
 
 
 def loaded(rig):
