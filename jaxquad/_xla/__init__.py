@@ -27,7 +27,7 @@ from ._engine import (
     hasty_options as hasty_options,
     Jit as Jit,
 )
-from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse
+from ._fusion import evaluate_once as evaluate_once, FEW as FEW, no_fuse as no_fuse
 from ._kept_programs import KeptPrograms as KeptPrograms
 from ._kernel import (
     as_one_kernel as as_one_kernel,

@@ -5,7 +5,7 @@ computes them again.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,14 +36,16 @@ def _fuse_within(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
 
 _COSTLY = {"exp", "log", "sin", "cos", "tan", "div", "atan2", "sqrt", "rsqrt", "pow", "tanh"}
 _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
-_SMALL = 1024  # elements, below which a call costs more than recomputing
+_LARGE = 1024  # elements, from which on no call costs more than recomputing
+FEW = 32  # elements, from which on a call costs less than recomputing them five times
 
 
-def evaluate_once(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+def evaluate_once(function: Callable[..., PyTree], *, least: int = _LARGE) -> Callable[..., PyTree]:
     """The same function, in which expensive operations on large arrays are not recomputed.
 
     A response with its slopes by five parameters, for many members at many frequencies, takes less
-    than half the time with it.
+    than half the time with it. Arrays are large from `least` elements on. What is called by
+    `no_fuse` stays a call where its result is of 1024 elements or more.
 
     Complex quotients become products with one reciprocal, which loses them where a denominator's
     square overflows or underflows (1e-154 to 1e154): the result is then not finite. On other
@@ -56,14 +58,21 @@ def evaluate_once(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
         leaves, structure = jax.tree.flatten(args)
         flat = lambda *xs: function(*jax.tree.unflatten(structure, xs))
         closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        values = _evaluate(closed.jaxpr, closed.consts, leaves, {})
+        values = _evaluate(closed.jaxpr, closed.consts, leaves, _Known(least, {}))
         return jax.tree.unflatten(jax.tree.structure(shape), values)
 
     return run
 
 
+class _Known(NamedTuple):
+    """What has been computed, of arrays of so many elements at least."""
+
+    least: int
+    values: dict[tuple, tuple[Sequence[Value], list[Value]]]
+
+
 def _evaluate(
-    jaxpr: Jaxpr, consts: Sequence[Value], args: Sequence[Value], known: dict
+    jaxpr: Jaxpr, consts: Sequence[Value], args: Sequence[Value], known: _Known
 ) -> list[Value]:
     values = dict(zip(jaxpr.constvars, consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
@@ -74,24 +83,33 @@ def _evaluate(
     return [read(var) for var in jaxpr.outvars]
 
 
-def _apply(equation: JaxprEqn, args: list[Value], known: dict) -> list[Value]:
+def _apply(equation: JaxprEqn, args: list[Value], known: _Known) -> list[Value]:
     name, params = equation.primitive.name, equation.params
     if name in _INLINED:
         inner = params[_INLINED[name]]
+        if _stays_a_call(equation):
+            return _remembered(("call", id(inner)), args, known, lambda: _bind(equation, args))
         return _evaluate(inner.jaxpr, inner.consts, args, known)
     if equation.primitive.multiple_results:
         return _bind(equation, args)
     return _remembered((name, str(params)), args, known, lambda: [_single(equation, args, known)])
 
 
+def _stays_a_call(equation: JaxprEqn) -> bool:
+    """Whether `no_fuse` keeps apart what takes longer than a call."""
+    sizes = [var.aval.size for var in equation.outvars]  # pyright: ignore[reportAttributeAccessIssue]
+    apart = (equation.ctx.xla_metadata or {}).get("inlineable") == "false"
+    return apart and max(sizes) >= _LARGE
+
+
 def _remembered(
-    what: tuple, args: Sequence[Value], known: dict, compute: Callable[[], list[Value]]
+    what: tuple, args: Sequence[Value], known: _Known, compute: Callable[[], list[Value]]
 ) -> list[Value]:
     """The slopes by each parameter were traced apart: what they share has to be found again."""
     key = (*what, *(_identity(arg) for arg in args))
-    if key not in known:
-        known[key] = args, compute()  # holding the arguments keeps their ids their own
-    return known[key][1]
+    if key not in known.values:
+        known.values[key] = args, compute()  # holding the arguments keeps their ids their own
+    return known.values[key][1]
 
 
 def _identity(arg: Value) -> Value:
@@ -100,9 +118,9 @@ def _identity(arg: Value) -> Value:
     return (str(arg.dtype), repr(arg.item())) if is_number else id(arg)
 
 
-def _single(equation: JaxprEqn, args: list[Value], known: dict) -> Value:
+def _single(equation: JaxprEqn, args: list[Value], known: _Known) -> Value:
     name, params = equation.primitive.name, equation.params
-    if equation.outvars[0].aval.size < _SMALL:  # pyright: ignore[reportAttributeAccessIssue]
+    if equation.outvars[0].aval.size < known.least:  # pyright: ignore[reportAttributeAccessIssue]
         return _bind(equation, args)[0]
     if name == "div" and jnp.iscomplexobj(args[1]):
         return args[0] * _reciprocal_of(args[1], known)
@@ -116,11 +134,12 @@ def _single(equation: JaxprEqn, args: list[Value], known: dict) -> Value:
 def _bind(equation: JaxprEqn, args: Sequence[Value]) -> list[Value]:
     bound = equation.primitive.get_bind_params(equation.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before jax 0.10, both
-    found = equation.primitive.bind(*functions, *args, **params)
+    with equation.ctx.manager:  # without it `no_fuse` would be lost
+        found = equation.primitive.bind(*functions, *args, **params)
     return list(found) if equation.primitive.multiple_results else [found]
 
 
-def _reciprocal_of(value: Any, known: dict) -> Value:
+def _reciprocal_of(value: Any, known: _Known) -> Value:
     return _remembered(("reciprocal",), [value], known, lambda: [no_fuse(_reciprocal, value)])[0]
 
 

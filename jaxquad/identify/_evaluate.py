@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import hasty_options, KeptPrograms
+from jaxquad._xla import evaluate_once, FEW, hasty_options, KeptPrograms
 
 from ._mixing import mix_complex, Mixing
 from ._parameters import Numbers
@@ -147,10 +147,11 @@ def misfits_and_slopes(
 ) -> tuple[Float[Array, " residuals"], Float[Array, "all residuals"]]:
     """Those of an `Evaluation`, in JAX."""
 
-    def along(change):
+    def along(z, change):
         return jax.jvp(lambda z: misfits(z, problem), (z,), (change,))
 
-    return jax.vmap(along, out_axes=(None, 0))(jnp.eye(z.size, dtype=z.dtype))
+    everywhere = jax.vmap(along, in_axes=(None, 0), out_axes=(None, 0))
+    return evaluate_once(everywhere, least=FEW)(z, jnp.eye(z.size, dtype=z.dtype))
 
 
 _OF_FEW = KeptPrograms(misfits_and_slopes, hasty_options)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from jaxquad._core import Normal, normal_equations
-from jaxquad._xla import arctan2, no_fuse
+from jaxquad._xla import arctan2, evaluate_once, FEW, no_fuse
 from jaxquad.models import Entry, factor_slopes, matrices_of, Split, StateSpace
 
 from ._condition import is_unchanged
@@ -27,7 +27,8 @@ def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:
     - `problem`: of `jq.identify.make_problem`.
     """
     if not is_plain(problem):
-        return normal_equations(residuals, z, problem)
+        once = evaluate_once(lambda z: normal_equations(residuals, z, problem), least=FEW)
+        return once(z)
     parts = [part for k in range(len(problem.omega)) for part in _record(z, problem, k)]
     if problem.quantities:
         parts.append(normal_equations(prior_misfits, z, problem))

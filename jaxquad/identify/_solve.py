@@ -201,8 +201,8 @@ def _solve_at_once(
     """All of a solution by one program: to run one more takes as long as what it computes."""
     frame, arrays = take_apart(problem)
     stop, leaves, *rest = _whole_program(frame, max_steps)([z0, *arrays])
+    model = take_apart(problem.model)[0].filled(leaves)  # while the program runs
     message, steps = _message_and_steps(stop)
-    model = take_apart(problem.model)[0].filled(leaves)
     z, values, slopes, *found, aside = map(np.asarray, (stop.z, *rest))
     derivatives = _sensitivity(problem, Evaluation(*found))
     solution = Solution(z, model, values, slopes, message, not message, steps, derivatives)
