@@ -82,7 +82,14 @@ PAIRS = (
         "test_composite_speed.py",
         "test_jaxquad",
         "test_zoom_fft",
-        "scipy ZoomFFT",
+        "scipy ZoomFFT, no errors",
+    ),
+    Pair(
+        "the same",
+        "test_composite_speed.py",
+        "test_jaxquad",
+        "test_zoom_fft_with_errors",
+        "scipy ZoomFFT, with errors behind leakage",
     ),
     Pair("one loop of 10 s at 2 ms", "test_loop_speed.py", "test_ours_as_c", "test_c", "C"),
     Pair(
