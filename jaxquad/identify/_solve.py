@@ -91,8 +91,8 @@ def solve(
 
 def _message_and_steps(stop: Stop) -> tuple[str, int]:
     """Why the solver stopped before a minimum, if it did, and after how many steps."""
-    steps = int(stop.steps)
-    return "" if stop.converged else f"{_reason(stop.reason)} (after {steps} steps)", steps
+    converged, steps = bool(np.asarray(stop.converged)), int(np.asarray(stop.steps))
+    return "" if converged else f"{_reason(stop.reason)} (after {steps} steps)", steps
 
 
 def _with_one_weight(problem: Problem) -> Problem:
