@@ -45,6 +45,7 @@ def _run(options: argparse.Namespace) -> int:
 
     settings = settings_of(options, TuneSettings)
     stored = load_result(options.result)
+    stored.require_radians()  # before anything is imported that takes long
     opening = open_beside(stored.logs, open_again, stored, log=options.log)
     from jaxquad.workflows import identify_fit, tune
 

@@ -83,6 +83,13 @@ class StoredResult(NamedTuple):
         """The response that was fitted; its errors count as independent between frequencies."""
         return _response(_part(self.content, "response"))
 
+    def require_radians(self) -> None:
+        """As the function of this name, for the output as it was stored."""
+        response = _part(self.content, "response")
+        names, units = response.get("outputs"), response.get("output_units")
+        if isinstance(names, list) and isinstance(units, list):  # not in an earlier version's
+            require_radians(*map(str, (names[0], units[0])))
+
     @property
     def tuned(self) -> "StoredTuning | None":
         """What `jaxquad tune` has stored for this result, in its folder or in `tuned/` there."""
@@ -158,6 +165,23 @@ class StoredTuning(NamedTuple):
         lines = [f"{words[each['holds']]} {each['name']}: {each['text']}" for each in verdicts]
         gains = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
         return "\n".join([*lines, f"tuned: {gains}"])
+
+
+def require_radians(name: str, unit: str) -> None:
+    """Raise ValueError for an output that gains for an angle are not for, before a fit is made."""
+    if unit not in ("rad", "rad/s"):
+        raise ValueError(
+            f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
+            f"identify with the output in rad/s or rad {_in_radians(name, unit)}"
+        )
+
+
+def _in_radians(name: str, unit: str) -> str:
+    """The options that convert degrees, or that say what an unknown unit is."""
+    if unit in ("deg", "deg/s"):
+        radians = unit.replace("deg", "rad")
+        return f"(--output angle=0.017453293*{name} --unit angle={radians})"
+    return f"(--unit {name}=rad/s)"
 
 
 def _controller(content: Mapping[str, Any]) -> "ScheduledLADRC":

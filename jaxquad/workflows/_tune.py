@@ -15,7 +15,6 @@ from jaxquad.export import write_c_header
 from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
-from jaxquad.records import Record
 from jaxquad.report import provenance, write_json
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, simulate, Simulation, Step
 from jaxquad.tuning import (
@@ -33,7 +32,7 @@ from jaxquad.tuning import (
 
 from ._identify import Identification, identify_fit
 from ._log import open_again
-from ._result_file import StoredResult
+from ._result_file import load_result, require_radians, StoredResult
 from ._tune_settings import TuneSettings
 
 
@@ -163,31 +162,15 @@ def tune(
     """
     found = result
     if not isinstance(found, Identification):
-        found = identify_fit(open_again(found, log=log))
+        stored = found if isinstance(found, StoredResult) else load_result(found)
+        stored.require_radians()
+        found = identify_fit(open_again(stored, log=log))
     if not found.fit.verdict.fitted:
         raise UndeterminedError(found.fit.verdict.summary)
     record = found.records[0]
-    _check_unit(record)
+    require_radians(record.output_names[0], record.output_units[0])
     dt = record.dt if settings.dt is None else settings.dt
     return _tuned(found, dt, settings, progress)
-
-
-def _check_unit(record: Record) -> None:
-    [unit] = record.output_units
-    if unit not in ("rad", "rad/s"):
-        name = record.output_names[0]
-        raise ValueError(
-            f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
-            f"identify with the output in rad/s or rad {_in_radians(unit, name)}"
-        )
-
-
-def _in_radians(unit: str, name: str) -> str:
-    """The options that convert degrees, or that say what an unknown unit is."""
-    if unit in ("deg", "deg/s"):
-        radians = unit.replace("deg", "rad")
-        return f"(--output angle=0.017453293*{name} --unit angle={radians})"
-    return f"(--unit {name}=rad/s)"
 
 
 def _tuned(

@@ -28,6 +28,7 @@ LIGHT = {
     "identify log.csv --input u --output y --band 3 1": 2,
     "identify log.csv --input u --output y --verify missing.csv": 2,
     "tune missing --inertia 1 --limit 1": 2,
+    "tune in_degrees --inertia 1 --limit 1": 2,
     "autopilot missing": 2,
     "report missing": 2,
     "verify missing log.csv": 2,
@@ -40,9 +41,20 @@ LIGHT = {
 }
 
 
+IN_DEGREES = {
+    "settings": {"input": "u", "output": "q"},
+    "provenance": {"files": []},
+    "record": {"file": "log.csv"},
+    "band_rad_per_s": [1.0, 10.0],
+    "response": {"outputs": ["q"], "output_units": ["deg/s"]},
+}
+
+
 def test_help_lists_designs_and_wrong_options_do_not_import_jax(tmp_path):
     rows = "".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(50))
     (tmp_path / "log.csv").write_text(f"time,u,y\n{rows}")
+    (tmp_path / "in_degrees").mkdir()
+    (tmp_path / "in_degrees" / "result.json").write_text(json.dumps(IN_DEGREES))
     asked = json.dumps([line.split() for line in LIGHT])
     answer = subprocess.run(
         [sys.executable, "-c", PROGRAM, asked], cwd=tmp_path, capture_output=True, check=True
