@@ -64,6 +64,11 @@ class Later(Generic[Found]):
         later.answer = Answer(found)
         return later
 
+    def check(self) -> None:
+        """Raise what the call has raised, if that is known by now."""
+        if self.answer is not None and self.answer.error is not None:
+            self.get()
+
     def get(self) -> Found:
         """The result; until it is there, this process computes what nobody has begun."""
         while self.answer is None:

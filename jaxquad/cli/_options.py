@@ -225,6 +225,7 @@ def open_beside(
         start_second_process()
     opened = beside(opening, *args, **named)
     start_computing()
+    opened.check()  # a channel that the log does not have needs no estimates
     if has_second_process():
         announce(f"reading {' and '.join(path.name for path in logs)}")
         import_estimates()  # which takes as long

@@ -66,6 +66,17 @@ def test_errors_and_warnings_come_where_the_result_is_asked_for(second):
         warned.get()
 
 
+def test_an_error_can_be_asked_for_as_soon_as_it_is_known(second):
+    Later(_beside.Call(scale, ("a", 1.5), {}), None).check()  # nobody has begun with it
+    fine, wrong = beside(os.getpid), beside(scale, "a", 1.5)
+    with pytest.raises(TypeError):
+        while wrong.answer is None:
+            time.sleep(0.01)
+        wrong.check()
+    fine.check()
+    assert fine.get() != os.getpid()  # it was done before
+
+
 def test_who_waits_computes_what_nobody_has_begun(second):
     long, last = begun(time.sleep, 0.3), beside(os.getpid)
     long.get()
