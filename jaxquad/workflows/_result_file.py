@@ -84,11 +84,12 @@ class StoredResult(NamedTuple):
         return _response(_part(self.content, "response"))
 
     def require_radians(self) -> None:
-        """As the function of this name, for the output as it was stored."""
+        """As the function of this name, for the output by the stored settings and response."""
         response = _part(self.content, "response")
-        names, units = response.get("outputs"), response.get("output_units")
-        if isinstance(names, list) and isinstance(units, list):  # not in an earlier version's
-            require_radians(*map(str, (names[0], units[0])))
+        pairs = (response.get("outputs"), response.get("output_units"))
+        names, units = (each if isinstance(each, list) else [] for each in pairs)
+        for name, unit in zip(names, units, strict=False):  # an earlier version stored no units
+            require_radians(str(name), dict(self.settings.units).get(str(name), str(unit)))
 
     @property
     def tuned(self) -> "StoredTuning | None":
