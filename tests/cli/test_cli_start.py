@@ -4,6 +4,10 @@ import json
 import subprocess
 import sys
 
+import pytest
+
+from jaxquad.workflows import load_result
+
 
 PROGRAM = """
 import contextlib, io, json, sys
@@ -48,6 +52,15 @@ IN_DEGREES = {
     "band_rad_per_s": [1.0, 10.0],
     "response": {"outputs": ["q"], "output_units": ["deg/s"]},
 }
+
+
+def test_a_result_in_degrees_says_so_before_its_log_is_looked_for(tmp_path):
+    (tmp_path / "result.json").write_text(json.dumps(IN_DEGREES))
+    with pytest.raises(ValueError, match="unit of q is deg/s.*--output angle=0.017453293"):
+        load_result(tmp_path).require_radians()
+    known = IN_DEGREES | {"settings": IN_DEGREES["settings"] | {"units": {"q": "rad/s"}}}
+    (tmp_path / "result.json").write_text(json.dumps(known))
+    load_result(tmp_path).require_radians()
 
 
 def test_help_lists_designs_and_wrong_options_do_not_import_jax(tmp_path):
