@@ -30,6 +30,7 @@ from ._engine import (
 from ._fusion import evaluate_once as evaluate_once, FEW as FEW, no_fuse as no_fuse
 from ._kept_programs import KeptPrograms as KeptPrograms
 from ._kernel import (
+    apart_in_reverse as apart_in_reverse,
     as_one_kernel as as_one_kernel,
     most_numbers as most_numbers,
     why_no_kernels as why_no_kernels,

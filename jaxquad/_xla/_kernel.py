@@ -45,6 +45,18 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     return jax.tree.map(_marked(leave), jax.jit(jaxquad_kernel)(*entered))
 
 
+def apart_in_reverse(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """`function` of a kernel, which is kernels of its own where it is computed again and reversed.
+
+    Two cores compile these two at once, and the time of both grows faster than their operations.
+    """
+
+    def jaxquad_block(*args: PyTree) -> PyTree:
+        return function(*args)
+
+    return jax.jit(jaxquad_block)
+
+
 def why_no_kernels() -> str | None:
     """Why loops are compiled plain here; None if they become kernels."""
     if is_off():

@@ -163,6 +163,24 @@ def _count(name: str, functions: Mapping[str, Op], known: dict[str, _Counts]) ->
     return known[name]
 
 
+def calls_within(name: str, what: str, module: ir.Module) -> list[Op]:
+    """In a function and all it calls: the calls of functions whose name begins with `what`.
+
+    Without those that are given nothing, which are done before the program runs.
+    """
+    functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
+    found, open_ = [], [name]
+    for name in open_:
+        calls = [op for op in operations_in(functions[name]) if op.name == "func.call"]
+        for op in calls:
+            callee = text(op, "callee")
+            if callee.startswith(what) and len(op.operands):
+                found.append(op)
+            elif callee not in open_:
+                open_.append(callee)
+    return found
+
+
 def operations_in(parent: Op) -> Iterator[Op]:
     for region in parent.regions:
         for block in region:

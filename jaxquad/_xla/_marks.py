@@ -6,7 +6,15 @@ from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
-from ._kernel_limits import ATTRIBUTE, hold_in_kernel, Op, operations_in, text, why_not
+from ._kernel_limits import (
+    ATTRIBUTE,
+    calls_within,
+    hold_in_kernel,
+    Op,
+    operations_in,
+    text,
+    why_not,
+)
 from ._kernel_parts import in_parts
 from ._switch import note, warn_once
 
@@ -73,7 +81,11 @@ def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:
         return
     name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-    hold_in_kernel(call, whole.module, whole.symbol_table, _attributes(_TAGS))
+    blocks = calls_within(name, "jaxquad_block", whole.module)
+    if len(blocks) > 1:  # a reverse pass: a forward one has a single one
+        call.attributes[ATTRIBUTE] = _attributes(_SEEN)
+    for found in blocks if len(blocks) > 1 else [call]:
+        hold_in_kernel(found, whole.module, whole.symbol_table, _attributes(_TAGS))
 
 
 def _attributes(texts: dict[str, str]) -> ir.Attribute:

@@ -1,6 +1,5 @@
 """Long scans in blocks, large ensembles in chunks: what keeps gradients and caches small."""
 
-import functools as ft
 import math
 import sys
 from collections.abc import Callable
@@ -11,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
-from jaxquad._xla import as_one_kernel, most_numbers, scan_on_device, why_no_device_kernels
+from jaxquad._xla import (
+    apart_in_reverse,
+    as_one_kernel,
+    most_numbers,
+    scan_on_device,
+    why_no_device_kernels,
+)
 
 from ._delay import Queue
 from ._guard import KEPT
@@ -19,6 +24,7 @@ from ._guard import KEPT
 
 _POLICY = jax.checkpoint_policies.save_only_these_names(KEPT)
 _SHORT = 128  # samples that need no blocks
+SINGLE, _SOME = 8, 64  # members up to which a loop is compiled as a single one, and briefly
 Step = Callable[..., tuple[PyTree, PyTree]]
 
 
@@ -34,8 +40,9 @@ def scan_members(
 
     `members` are on the last axis of the carry; None for a single loop, or for more axes.
     """
+    few = members is not None and are_few(members)
     if members is None or why_no_device_kernels() is not None:
-        return scan_in_blocks(step, carry, xs, count, queue)
+        return scan_in_blocks(step, carry, xs, count, queue, few)
     plain = lambda step, carry, xs: scan_in_blocks(step, carry, xs, count)
     if queue is None:
         found = scan_on_device(step, carry, xs, members, plain)
@@ -43,7 +50,12 @@ def scan_members(
         begun = (_in_order(queue), carry)
         found = scan_on_device(_with_rows(step), begun, xs, members, plain)
         found = found and (found[0][1], found[1])
-    return scan_in_blocks(step, carry, xs, count, queue) if found is None else found
+    return scan_in_blocks(step, carry, xs, count, queue, few) if found is None else found
+
+
+def are_few(members: int) -> bool:
+    """Whether a loop of so many takes longer to compile than to run, and is no single loop."""
+    return SINGLE < members <= _SOME
 
 
 def _in_order(queue: Queue) -> tuple[Array, ...]:
@@ -63,12 +75,18 @@ def _with_rows(step: Step) -> Step:
 
 
 def scan_in_blocks(
-    step: Step, carry: PyTree, xs: PyTree, count: int, queue: Queue | None = None
+    step: Step,
+    carry: PyTree,
+    xs: PyTree,
+    count: int,
+    queue: Queue | None = None,
+    few: bool = False,
 ) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` whose reverse keeps the carry of blocks only, and of the one it is in.
 
     Twice the square root of `count` carries instead of all, for one forward pass more. With a
     `queue`, of which only blocks are kept, `step(carry, x, oldest)` returns (carry, (newest, y)).
+    The reverse of `few` members is kernels that two cores compile at once.
     """
     size = _block_size(count)
     length = -(-count // size) * size
@@ -79,9 +97,10 @@ def scan_in_blocks(
     if queue is not None:
         step, carry, xs = _with_queue(step), (queue, carry), (jnp.arange(length), xs)
 
-    @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
         return jax.lax.scan(step, carry, xs)
+
+    block = jax.checkpoint(apart_in_reverse(block) if few else block, prevent_cse=False)
 
     if length == size:
         carry, out = block(carry, xs)

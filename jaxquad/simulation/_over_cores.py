@@ -13,11 +13,11 @@ from jaxtyping import PyTree
 from jaxquad._core import available_cores, ensemble_shape, map_in_threads, mark_members
 from jaxquad._xla import Devices, gathered, Jit, may_be_several
 
+from ._blocks import are_few, SINGLE
 from ._over_devices import Run
 
 
 _VECTOR, _FEWEST, _USUAL = 16, 32, 128  # members that are computed at once, and of a part
-_SINGLE, _SOME = 8, 64  # members up to which a loop is compiled as a single one, and briefly
 _MOST_PARTS = 64  # beyond which parts grow: each costs a call
 _LEAST = 2**15  # samples times members that make a thread worth its while
 _ALIGNED = 64  # bytes, for an array that JAX takes over without a copy
@@ -41,7 +41,7 @@ def over_cores(
     members = _members(run, leaves)
     if members >= 2 * _FEWEST:
         part = _part(program, run, further, devices)
-    if _SINGLE < (members if part is None else part.width) <= _SOME:
+    if are_few(members if part is None else part.width):
         program = program.brief
     if part is None:
         return gathered(program.of_flat(args, leaves, structure))
@@ -94,7 +94,7 @@ def _part(program: Jit, run: Run, further: tuple, devices: Devices | None) -> _P
 
 def _members(run: Run, leaves: list) -> int:
     """On the last axis; 1 for a single loop, which its leaves show sooner than an ensemble."""
-    few = max(map(_last_axis, leaves)) <= _SINGLE
+    few = max(map(_last_axis, leaves)) <= SINGLE
     return 1 if few else (1, *ensemble_shape(*run))[-1]
 
 

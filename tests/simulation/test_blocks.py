@@ -82,11 +82,15 @@ def test_derivatives_through_chunks_blocks_and_kernels_are_those_of_the_plain_sc
         close(fast(*args), slow(*args), rtol=1e-9)
 
 
-def test_a_gradient_alone_has_both_passes_in_kernels():
-    """Nothing asks for the forward pass's own result there, which is where its mark is."""
-    last = lambda start, gains: jnp.sum(engine_run(start, gains, chunk=1000)[0])
+@pytest.mark.parametrize("chunk, kernels", [(1000, 2), (48, 3)])
+def test_a_gradient_alone_has_both_passes_in_kernels(chunk, kernels):
+    """Nothing asks for the forward pass's own result there, which is where its mark is.
+
+    Few members are computed again by one kernel and reversed by another, compiled side by side.
+    """
+    last = lambda start, gains: jnp.sum(engine_run(start, gains, chunk=chunk)[0])
     text = jax.jit(jax.grad(last)).lower(START, GAINS).as_text()
-    assert text.count(TAG) == 2
+    assert text.count(TAG) == kernels
 
 
 def test_a_kernel_computes_a_value_that_several_need_once():
