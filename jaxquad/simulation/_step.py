@@ -168,7 +168,7 @@ class LoopStep(eqx.Module):
         following = self._move(carry, memory, felt, happens, fine)
         if oldest is not None:
             following = following._replace(queue=Queue(None, inputs))
-        return following, SampleResult(
+        result = SampleResult(
             index=index,
             time=index.astype(angle.dtype) * self.dt,
             angle=angle,
@@ -182,6 +182,9 @@ class LoopStep(eqx.Module):
             signals={name: _wide_signal(x, angle) for name, x in signals.items()},
             running=fine,
         )
+        # Unchanged, but batched by `jax.vmap` where `fine` is, because the derivatives of `guarded`
+        # are: JAX does not widen the value where only the derivatives of a custom rule are wide.
+        return following, choose(fine, result, result, self.ensemble)
 
     def _answer(
         self,

@@ -176,6 +176,22 @@ def test_evaluate_runs_under_jit_and_vmap(paper):
     np.testing.assert_allclose(together, paper.itae[0], rtol=1e-12)
 
 
+def test_the_gradient_of_a_mean_over_vmap_is_that_of_central_differences():
+    """Here over inertias, by a bandwidth that they share."""
+    loads = {"reference": {0: Step(0.1)}, "disturbance": {0: Pulse(0.1, width=0.1, at=0.1)}}
+    happens = scenario(duration=0.2, axes=1, **loads)
+
+    def cost(wc, inertia):
+        loop = Loop(DecoupledAxes([GAIN], inertia[None]), LADRC(wc[None], [30.0], [0.85]))
+        found = evaluate(loop, happens)
+        return jnp.mean(found.itae) + jnp.mean(found.disturbance_rmse)
+
+    inertias, wc, h = INERTIA * jnp.asarray([0.7, 1.0, 1.5]), jnp.asarray(10.0), 1e-4
+    mean = jax.jit(lambda wc: jnp.mean(jax.vmap(cost, in_axes=(None, 0))(wc, inertias)))
+    numeric = (mean(wc + h) - mean(wc - h)) / (2 * h)
+    assert float(jax.grad(mean)(wc)) == pytest.approx(float(numeric), rel=1e-6)
+
+
 def test_float32_loops_are_judged_in_float32(paper):
     single = lambda tree: jax.tree.map(
         lambda x: x.astype(jnp.float32) if eqx.is_array(x) else x, tree
