@@ -94,9 +94,10 @@ def _attributes(texts: dict[str, str]) -> ir.Attribute:
 
 
 def _is_plain_call(op: Op | ir.Block) -> TypeGuard[ir.Operation]:
+    """Whether this is a call to make a kernel of; one that is given nothing is a constant."""
     if not isinstance(op, ir.Operation) or op.name != "func.call" or ATTRIBUTE in op.attributes:
         return False
-    return text(op, "callee").startswith("jaxquad_kernel")
+    return text(op, "callee").startswith("jaxquad_kernel") and len(op.operands) > 0
 
 
 def _is_for_one_cpu(whole: mlir.ModuleContext) -> bool:
