@@ -46,10 +46,15 @@ def are_sound(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, ""]:
 def choose(
     fresh: Bool[Array, "*ensemble"], new: PyTree, old: PyTree, ensemble: tuple[int, ...]
 ) -> PyTree:
-    """Per member the `new` numbers or the `old`; what all members share is always new."""
+    """Per member the `new` numbers or the `old`; what all members share is always new.
+
+    So is a single integer, such as a count of samples, in a single loop, too: what happens at some
+    samples only (`jax.lax.cond`) then stays so for all that are batched by `jax.vmap`.
+    """
 
     def leaf(new: Array, old: Array) -> Array:
-        if not _is_per_member(new, ensemble):
+        count = new.ndim == 0 and jnp.issubdtype(new.dtype, jnp.integer)
+        if count or not _is_per_member(new, ensemble):
             return new
         return jnp.where(fresh.reshape((1,) * (new.ndim - fresh.ndim) + ensemble), new, old)
 
