@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad.control import LADRC, PD
+from jaxquad.control import AdaptiveLADRC, certainty_equivalence, LADRC, LockInInertia, PD
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
 from jaxquad.simulation import (
@@ -190,6 +190,21 @@ def test_the_gradient_of_a_mean_over_vmap_is_that_of_central_differences():
     mean = jax.jit(lambda wc: jnp.mean(jax.vmap(cost, in_axes=(None, 0))(wc, inertias)))
     numeric = (mean(wc + h) - mean(wc - h)) / (2 * h)
     assert float(jax.grad(mean)(wc)) == pytest.approx(float(numeric), rel=1e-6)
+
+
+def test_what_happens_at_some_samples_only_stays_so_under_vmap():
+    """Such as the lock-in's solution at the end of a window, which has a gradient, too."""
+    happens = scenario(duration=0.1, axes=1, reference={0: Step(0.1)})
+    map_ = certainty_equivalence(GAIN, INERTIA, span=(0.5, 3.0), knots=3)
+
+    def cost(wc, inertia):
+        law = LADRC(wc[None], [30.0], [0.85])
+        law = AdaptiveLADRC(law, LockInInertia([GAIN], [INERTIA]), map_)
+        return jnp.mean(evaluate(Loop(DecoupledAxes([GAIN], inertia[None]), law), happens).itae)
+
+    inertias = INERTIA * jnp.asarray([0.7, 1.5])
+    mean = lambda wc: jnp.mean(jax.vmap(cost, in_axes=(None, 0))(wc, inertias))
+    assert "cond[" in str(jax.make_jaxpr(jax.grad(mean))(jnp.asarray(10.0)))
 
 
 def test_float32_loops_are_judged_in_float32(paper):
