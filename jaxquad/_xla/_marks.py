@@ -81,11 +81,13 @@ def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:
         return
     name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-    blocks = calls_within(name, "jaxquad_block", whole.module)
-    if len(blocks) > 1:  # a reverse pass: a forward one has a single one
+    parts = calls_within(name, "jaxquad_block", whole.module)
+    if len(parts) > 1:  # a block computed again, and reversed
         call.attributes[ATTRIBUTE] = _attributes(_SEEN)
-    for found in blocks if len(blocks) > 1 else [call]:
-        hold_in_kernel(found, whole.module, whole.symbol_table, _attributes(_TAGS))
+    else:
+        parts = [call]
+    for part in parts:
+        hold_in_kernel(part, whole.module, whole.symbol_table, _attributes(_TAGS))
 
 
 def _attributes(texts: dict[str, str]) -> ir.Attribute:

@@ -193,7 +193,7 @@ def run_program(name, first, last):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 304, 309])  # 64, 130 and 64 members, in chunks of up to 128
+@pytest.mark.parametrize("seed", [1, 2, 304, 309])
 def test_random_loops_are_the_same_as_kernels_and_no_process_ends(seed):
     run_program("random_loops.py", seed, seed + 1)
 

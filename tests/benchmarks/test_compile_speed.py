@@ -5,8 +5,9 @@
 Ten seconds at 2 ms of a three-axis rig under three LADRC, and of three axes under an adaptive LADRC
 with least squares; one loop and 48 inertias. Nothing is read from a cache. "brief" options are
 those of `jq.tune`, "light" ones those of docs/how_to.md for a `jax.jit` of your own. What was
-traced once is not traced again. Then `jq.evaluate` by itself, which chooses its options, beside the
-same under XLA's own in the same run: seconds by the clock.
+traced once is not traced again. Then, in seconds by the clock, an ensemble beside `jax.vmap` of
+single loops, and `jq.evaluate` by itself, which chooses its options, beside the same under XLA's
+own in the same run.
 """
 
 import time
@@ -74,6 +75,27 @@ def test_a_gradient(make, members):
                 end="",
             )
             assert np.isfinite(jax.tree.leaves(run())[0])
+
+
+def test_an_ensemble_beside_vmap_of_single_loops():
+    inertia, scales = jnp.asarray([J0, J0, 2 * J0]), jnp.asarray(np.geomspace(0.7, 1.5, 48))
+    cost = lambda gains, inertia: jnp.mean(evaluate(rig(gains, inertia), HAPPENS).itae)
+    together = lambda gains: cost(gains, jnp.outer(inertia, scales))
+    mapped = lambda gains: jnp.mean(jax.vmap(lambda scale: cost(gains, inertia * scale))(scales))
+    found = []
+    for name, function in (("an ensemble", together), ("vmap", mapped)):
+        lowered = jax.jit(jax.value_and_grad(function), compiler_options=LIGHT).lower(GAINS)
+        began = time.perf_counter()
+        compiled = lowered.compile()
+        took = time.perf_counter() - began
+        run = lambda c=compiled: jax.block_until_ready(c(GAINS))
+        least = 1e3 * min(timed(run) for _ in range(5))
+        print(
+            f"\n48 rigs, gradient, {name}: compiled in {took:.1f} s, runs in {least:.0f} ms", end=""
+        )
+        found.append(run())
+    for one, other in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8)
 
 
 @pytest.mark.parametrize("members", [1, 16, 32, 48, 64, 100])
