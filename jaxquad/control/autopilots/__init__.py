@@ -66,7 +66,12 @@ from ._harmonic_notch import (
     ardupilot_harmonic_notch as ardupilot_harmonic_notch,
     HarmonicNotch as HarmonicNotch,
 )
-from ._law import AngleLoop as AngleLoop, FirmwareLoop as FirmwareLoop, LoopState as LoopState
+from ._law import (
+    AngleLoop as AngleLoop,
+    FirmwareLoop as FirmwareLoop,
+    LoopState as LoopState,
+    pick_axis as pick_axis,
+)
 from ._parameters import (
     check_ranges as check_ranges,
     find_parameter as find_parameter,
@@ -79,7 +84,11 @@ from ._parameters import (
     with_parameters as with_parameters,
 )
 from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
-from ._replay import replay_terms as replay_terms
+from ._replay import (
+    fly_again as fly_again,
+    HeldPlant as HeldPlant,
+    replay_terms as replay_terms,
+)
 from ._reproduce import (
     hold_response as hold_response,
     predict_loop as predict_loop,

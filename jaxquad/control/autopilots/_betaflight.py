@@ -27,6 +27,7 @@ from ._law import (
 )
 
 
+_BOOSTED = 50.0  # deg/s of set-point, up to which anti-gravity's boost of P is whole
 P_SCALE, I_SCALE, D_SCALE, F_SCALE = 0.032029, 0.244381, 0.000529, 0.013754e-2  # per unit of CLI
 
 
@@ -113,10 +114,10 @@ class BetaflightPID(FirmwareLoop):
         Sum = Kp e + I - Kd d/dt (filtered gyro) + Kf d/dt (set-point),    e = set-point - gyro
 
     in deg/s with Kp = 0.032029 p, Ki = 0.244381 i, Kd = 0.000529 d, Kf = 0.013754 f / 100. The
-    integral is used at once (backward Euler). The sum is what a log's `axisSum` holds. Not
-    modelled: anti-gravity, absolute control and the fading of the integral at the mixer's limits,
-    all of which are inactive at steady throttle, and the smoothing of the sticks, which is before
-    the set-point. Source: docs/autopilots.md.
+    integral is used at once (backward Euler). The sum is what a log's `axisSum` holds. Anti-gravity
+    and the fading of the integral at the mixer's limits are numbers of the moment, which a replay
+    gives (`FlownBetaflight.at`). Not modelled: absolute control, and the smoothing of the sticks,
+    which is before the set-point. Source: docs/autopilots.md.
 
     !!! example
 
@@ -134,6 +135,9 @@ class BetaflightPID(FirmwareLoop):
     - `relax`: an `ItermRelax`; `d_max`: a `DMax`; None is off.
     - `tpa`: factor of the D term by the throttle, see `tpa_factor`; `tpa_p`: of the P term.
     - `f_share`: factor of F; 0 for centred sticks where feedforward_transition is above 0.
+    - `accelerator`: what anti-gravity adds to Ki; `p_boost`: to P, as a share of it; both are 0 at
+        steady throttle.
+    - `integral_share`: of what the integral grows by; below 1 near the mixer's limits until 4.5.
     - `limit`: pidsum_limit; `integral_limit`: of the I term.
     - `dt`: of the PID loop in s.
 
@@ -157,6 +161,9 @@ class BetaflightPID(FirmwareLoop):
     tpa: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
     tpa_p: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
     f_share: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
+    accelerator: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    p_boost: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    integral_share: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
     limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=500.0)
     integral_limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=400.0)
     dt: float = eqx.field(static=True, default=1 / 4000)  # s
@@ -207,12 +214,14 @@ class BetaflightPID(FirmwareLoop):
         share = low_pass_share(self.p_lowpass_hz, self.dt, y)
         next["p"] = memory["p"] + share * (pulled - memory["p"])
         relaxed, error = self._relaxed(memory, DEGREES * r, y)
-        grown = I_SCALE * at(self.i) * at(self.integral_factor) * self.dt * error
+        ki = I_SCALE * at(self.i) * at(self.integral_factor) + at(self.accelerator)
+        grown = ki * self.dt * at(self.integral_share) * error
         next["integral"] = bounded(memory["integral"] + grown, self.integral_limit)
+        boost = 1 + at(self.p_boost) / jnp.maximum(jnp.abs(DEGREES * r) / _BOOSTED, 1.0)
         delta = (memory["d"] - next["d"]) / self.dt
         raised, factor = self._raised(memory, delta, DEGREES * speed)
         terms = {
-            "P": next["p"], "I": next["integral"],
+            "P": next["p"] * boost, "I": next["integral"],
             "D": D_SCALE * at(self.d) * at(self.tpa) * factor * delta,
             "F": F_SCALE * at(self.f) * at(self.f_share) * DEGREES * speed,
         }  # fmt: skip

@@ -64,12 +64,16 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         low-pass of gyro and D; None where it is static.
     - `tpa`: tpa_rate in percent and the breakpoint's throttle.
     - `tpa_on_p`: whether TPA acts on P too.
+    - `anti_gravity`: gain, cutoff in Hz and gain of P, see `surge`; None is off.
+    - `windup`: of the mixer's range, above which the integral grows less; 1 is off.
     """
 
     gyro_dynamic: tuple[float, float, float] | None = eqx.field(static=True, default=None)
     dterm_dynamic: tuple[float, float, float] | None = eqx.field(static=True, default=None)
     tpa: tuple[float, float] = eqx.field(static=True, default=(0.0, 0.35))
     tpa_on_p: bool = eqx.field(static=True, default=False)
+    anti_gravity: tuple[float, float, float] | None = eqx.field(static=True, default=None)
+    windup: float = eqx.field(static=True, default=1.0)
 
     def parameters(self) -> dict[str, float]:
         """The values that flew, by the names of `PARAMETERS`, with the dynamic cutoffs."""
@@ -79,13 +83,51 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
                 found[f"{name}_lpf1_dyn_min_hz"], found[f"{name}_lpf1_dyn_max_hz"] = range[:2]
         return found
 
-    def at(self, throttle: Float[ArrayLike, "..."]) -> BetaflightPID:
-        """The law at a throttle of 0 to 1: its dynamic cutoffs and TPA."""
+    def at(
+        self,
+        throttle: Float[ArrayLike, "..."],
+        *,
+        surge: Float[ArrayLike, "..."] = 0.0,
+        integral_share: Float[ArrayLike, "..."] = 1.0,
+    ) -> BetaflightPID:
+        """The law at a throttle of 0 to 1: its dynamic cutoffs and TPA, and anti-gravity's part."""
         law, factor = self.law, tpa_factor(throttle, *self.tpa)
         filters = _retuned(law.filters, self.gyro_dynamic, throttle)
         dterm = _retuned(law.dterm, self.dterm_dynamic, throttle)
         on_p = factor if self.tpa_on_p else jnp.ones_like(factor)
-        return dataclasses.replace(law, filters=filters, dterm=dterm, tpa=factor, tpa_p=on_p)
+        held = jnp.where(jnp.asarray(law.integral_factor) == 1, 1.0, 0.0)  # not of yaw
+        boost = 0.0 if self.anti_gravity is None else _SURGED_P * self.anti_gravity[2] / 100
+        return dataclasses.replace(
+            law, filters=filters, dterm=dterm, tpa=factor, tpa_p=on_p,
+            accelerator=_SURGED_I * surge * held, p_boost=boost * surge * held,
+            integral_share=integral_share,
+        )  # fmt: skip
+
+    def surge(self, throttle: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+        """Anti-gravity's measure of a moving throttle times its gain, at the loop's samples."""
+        from scipy.signal import lfilter
+
+        if self.anti_gravity is None:
+            return np.zeros_like(throttle)
+        gain, cutoff, _ = self.anti_gravity
+        change = np.diff(throttle, prepend=throttle[:1])
+        moved = np.abs(change) / self.law.dt * (1 - throttle) ** 2
+        moved = np.where(change > 0, 0.5 * (1 - throttle), 1.0) * moved
+        for section in PT2(cutoff).sections(1 / self.law.dt):
+            pole = [1.0, float(np.asarray(section.a1))]
+            moved = lfilter([float(np.asarray(section.b0))], pole, moved)
+        return gain * moved
+
+    def integral_share(
+        self, mixer_range: Float[np.ndarray, " samples"]
+    ) -> Float[np.ndarray, " samples"]:
+        """Of what the integral grows by, while the motors use this share of the mixer's range."""
+        if self.windup >= 1:
+            return np.ones_like(mixer_range)
+        return np.clip((1 - mixer_range) / (1 - self.windup), 0.0, 1.0)
+
+
+_SURGED_I, _SURGED_P = 0.34, 0.0034  # what anti-gravity's measure adds to Ki, and to P per percent
 
 
 def _retuned(
@@ -140,13 +182,14 @@ def betaflight_loop(
         p_lowpass_hz=[0.0, 0.0, read.number("yaw_lowpass_hz", default=0.0)],
         f_share=1.0 if read.number("feedforward_transition", default=0.0) == 0 else 0.0,
         relax=read.relax(), d_max=read.d_max(base, ceiling), limit=limits,
-        integral_limit=0.8 * limits if read.version >= (2025,) else 400.0, dt=dt,
+        integral_limit=read.windup(80.0) * limits if read.version >= (2025,) else 400.0, dt=dt,
     )  # fmt: skip
     start = read.number("tpa_breakpoint", default=1350.0)
     flown = FlownBetaflight(
         law, read.unmodelled(), gyro_dynamic, dterm_dynamic,
         (read.number("tpa_rate", default=0.0), (start - 1000) / 1000),
-        read.number("tpa_mode", default=1.0) == 0,
+        read.number("tpa_mode", default=1.0) == 0, read.anti_gravity(),
+        1.0 if read.version >= (2025,) else read.windup(85.0),
     )  # fmt: skip
     return dataclasses.replace(flown, law=flown.at(throttle))
 
@@ -270,7 +313,21 @@ class _Header:
         if self.version < (4, 3):
             early = (Butterworth(80.0),), (PT1(10.0),)
             return DMax(ceiling, 5e-5 * gain / 10, 5e-5 * gain * advance / 1000, *early)
-        return DMax(ceiling, 8e-5 * gain / 35, 8e-5 * advance / 35)
+        by_gain = 1.0 if self.version >= (2025,) else gain / 100
+        return DMax(ceiling, 8e-5 * gain / 35, 8e-5 * advance * by_gain / 35)
+
+    def windup(self, default: float) -> float:
+        """Of 1; 0 in the header is off."""
+        return (self.number("iterm_windup", default=default) or 100.0) / 100
+
+    def anti_gravity(self) -> tuple[float, float, float] | None:
+        """Gain, cutoff and gain of P; versions before 4.4 have another law."""
+        on = int(self.number("features", default=float(1 << 28))) & 1 << 28
+        gain = self.number("anti_gravity_gain", default=0.0)
+        if self.version < (4, 4) or not on or gain == 0:
+            return None
+        cutoff = self.number("anti_gravity_cutoff_hz", default=5.0)
+        return gain, cutoff, self.number("anti_gravity_p_gain", default=100.0)
 
     def relax(self) -> ItermRelax | None:
         mode = int(self.number("iterm_relax", default=0.0))
@@ -282,7 +339,9 @@ class _Header:
         return ItermRelax(cutoff, 40.0, share, kind, mode in (3, 4))
 
     def unmodelled(self) -> tuple[str, ...]:
-        found = ["anti-gravity: the integral grows faster while the throttle moves"]
+        found = []
+        if self.version < (4, 4):
+            found.append("anti-gravity: the integral grows faster while the throttle moves")
         harmonics = self.number("rpm_filter_harmonics", "gyro_rpm_notch_harmonics", default=0.0)
         if harmonics > 0:
             found.append(f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors")
@@ -304,6 +363,8 @@ _UNUSUAL = {
     "use_integrated_yaw": "the yaw command is integrated",
     "dterm_rpm_notch_harmonics": "RPM notches on the D term",
     "acc_limit": "the set-point's acceleration is limited",
+    "tpa_curve_type": "TPA is hyperbolic; the law has the straight one",
+    "iterm_rotation": "the integrals turn with the vehicle",
 }
 
 

@@ -109,11 +109,6 @@ def _chirped(log: Log, run: _Run, alike: list[_Run], remarks: list[str]) -> Setu
     axis = _axis(run)
     letter = _LETTERS[axis]
     command = {f"RATE.{letter}Out": 1.0}
-    if run.place in _MIXER:
-        command["SIDD.Targ"] = 1.0
-        remarks.append(
-            "the chirp is added after the controller, so the command is the sum of the two"
-        )
     if run.place <= 3:
         remarks.append("the chirp passes the input shaping, which is nonlinear for large steps")
     rate = f"RATE.{letter}"
@@ -125,7 +120,8 @@ def _chirped(log: Log, run: _Run, alike: list[_Run], remarks: list[str]) -> Setu
             f"the log has no RATE messages during the chirp at t = {run.start:.6g} s."
         )
     what = f"SystemID chirp into {_PLACES[run.place]} (SID_AXIS {run.place})"
-    setup = Setup(axis, command, rate, "SIDD.Targ", remarks=tuple(remarks))
+    place = "mixer" if run.place in _MIXER else "rate" if run.place > 6 else "angle"
+    setup = Setup(axis, command, rate, "SIDD.Targ", remarks=tuple(remarks), injected_at=place)
     return with_injections(setup, found, what)
 
 

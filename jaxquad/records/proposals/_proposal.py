@@ -1,6 +1,6 @@
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,7 @@ class Setup(NamedTuple):
     segments: tuple[tuple[float, float], ...] = ()  # s
     hold: float | None = None  # s; of the command, where the log says it
     throttle: Mix = {}  # the collective, 0 to 1 but for PX4's sign; empty if it is not logged
+    injected_at: Literal["", "rate", "mixer", "angle"] = ""
 
 
 class Proposal(NamedTuple):

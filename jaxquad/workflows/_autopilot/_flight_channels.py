@@ -5,6 +5,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -39,9 +40,16 @@ class FlightChannels:
     - `rates`: behind the gyro's filters, of roll, pitch and yaw, in rad/s, on `dt`.
     - `unfiltered`: before them, on `unfiltered_dt`.
     - `setpoint`: of the axis in rad/s, on `dt`.
-    - `terms`: "P", "I", "D" and "F" of the axis, in the firmware's units.
-    - `motors`: a column each; `motor_ends`: lowest and highest command.
-    - `throttle`: 0 to 1.
+    - `axis`: 0 for roll; `start`: the time of the first sample in s.
+    - `terms`: "P", "I", "D" and "F" of the axis, in the firmware's units, on `dt`; `output`: what
+        the law gave, with an injection into the mixer; `injected`: that alone.
+    - `reference`: what no feedback computes, where the log has it beside the set-point.
+    - `motors`: a column each, on `dt`; `motor_ends`: lowest and highest command.
+    - `throttle`: 0 to 1, on `dt`; `stick`: likewise what the filters and TPA follow, where that is
+        another one.
+    - `late`: s after its stamp at which the set-point acts.
+    - `resolution`: steps in which set-point and rates are logged, in rad/s, and the terms; 0 where
+        they are not rounded.
     - `names`: of the gyro's channels, filtered and unfiltered.
     - `tracked_hz`: medians of what ArduPilot's harmonic notches follow, by INS_HNTCH_MODE: the
         speeds of the motors (3) and of RPM sensors (2, 5).
@@ -50,13 +58,21 @@ class FlightChannels:
     rates: tuple[Samples, ...]
     dt: float
     setpoint: Samples
+    axis: int = 0
+    start: float = 0.0
     unfiltered: tuple[Samples, ...] = ()
     unfiltered_dt: float = 0.0
     averaged: bool = False  # whether the unfiltered rate is the mean over its sample
     terms: Mapping[str, Samples] = dataclasses.field(default_factory=dict)
+    output: Samples | None = None
+    injected: Samples | None = None
+    reference: Samples | None = None
     motors: Float[np.ndarray, "samples motors"] | None = None
     motor_ends: tuple[float, float] = (0.0, 1.0)
     throttle: Samples | None = None
+    stick: Samples | None = None
+    late: float = 0.0
+    resolution: tuple[float, float] = (0.0, 0.0)
     names: tuple[str, str] = ("", "")
     tracked_hz: Mapping[int, tuple[float, ...]] = dataclasses.field(default_factory=dict)
 
@@ -66,6 +82,38 @@ class FlightChannels:
         if self.throttle is None:
             return None
         return float(np.clip(np.median(self.throttle), 0.01, 1.0))
+
+    @property
+    def count(self) -> int:
+        """Of samples on `dt`."""
+        return len(self.setpoint)
+
+    @property
+    def followed(self) -> Samples:
+        """The throttle that filters and TPA follow at each sample; `HOVER` where none is logged."""
+        if self.stick is not None:
+            return self.stick
+        return np.full(self.count, HOVER) if self.throttle is None else self.throttle
+
+    @property
+    def limited(self) -> Samples:
+        """At each sample, 1 where a motor is at an end of its range, else 0."""
+        if self.motors is None:
+            return np.zeros(self.count)
+        low, high = self.motor_ends
+        near = _AT_END * (high - low)
+        return np.any((self.motors <= low + near) | (self.motors >= high - near), axis=1) * 1.0
+
+    @property
+    def mixer_range(self) -> Samples | None:
+        """Highest less lowest motor, over what a motor can be."""
+        if self.motors is None:
+            return None
+        low, high = self.motor_ends
+        return (self.motors.max(axis=1) - self.motors.min(axis=1)) / (high - low)
+
+
+_AT_END = 0.002  # of a motor's range
 
 
 def read_channels_if_any(
@@ -85,31 +133,40 @@ def read_channels(
     firmware, prefix = _firmware(proposal), proposal.setup.rate.rpartition("gyroADC")[0]
     axis = AXES.index(proposal.setup.axis)
     names = _NAMES[firmware](prefix, axis)
-    throttle = proposal.setup.throttle
+    throttle, injected = proposal.setup.throttle, _injected(proposal)
     wanted = [*names.filtered, *names.unfiltered, *names.terms, *names.motors, names.setpoint]
+    external = proposal.setup.reference
+    wanted += [*names.output, *names.stick, *injected, external]
     found = _read(path, [*wanted, *throttle], _span(settings))
     rates, rate = found.get(names.filtered[axis]), names.filtered[axis]
     if rates is None or names.setpoint not in found:
         raise RecordError(f"{path} holds no {rate} or no {names.setpoint} of the analysed part")
     on_its_clock = lambda name: np.interp(rates.time, found[name].time, _values(found[name], name))
+    at_rate = lambda name: np.interp(rates.time, found[name].time, found[name].channel(name))
+    sum_at = lambda mix: _mixed(mix, found, at_rate)
     raw = found.get(names.unfiltered[axis])
     motors = [name for name in names.motors if name in found]
     return FlightChannels(
         rates=tuple(on_its_clock(name) for name in names.filtered if name in found),
         dt=rates.dt,
         setpoint=on_its_clock(names.setpoint),
+        axis=axis, start=float(rates.time[0]),
         unfiltered=() if raw is None else tuple(
             _values(raw, name) for name in names.unfiltered if name in raw.names
         ),
         unfiltered_dt=0.0 if raw is None else raw.dt,
         averaged=firmware == "px4",
         terms={
-            key: found[name].channel(name)
+            key: at_rate(name)
             for key, name in zip(_TERMS, names.terms, strict=False) if name in found
         },
-        motors=np.stack([found[x].channel(x) for x in motors], axis=1) if motors else None,
+        output=sum_at(names.output), injected=sum_at(injected),
+        reference=None if injected or external == names.setpoint or external not in found
+        else at_rate(external),
+        motors=np.stack([at_rate(x) for x in motors], axis=1) if motors else None,
         motor_ends=_motor_ends(firmware, values),
-        throttle=_mixed(found, throttle),
+        throttle=sum_at(throttle), stick=_stick(sum_at(names.stick), firmware, values),
+        late=_late(firmware, values), resolution=_resolution(firmware, values),
         names=(rate, "" if raw is None else names.unfiltered[axis]),
         tracked_hz=_tracked(path, _span(settings)) if firmware == "ardupilot" else {},
     )  # fmt: skip
@@ -147,6 +204,8 @@ class _Names(NamedTuple):
     setpoint: str
     terms: Sequence[str]
     motors: Sequence[str]
+    output: Mapping[str, float]
+    stick: Mapping[str, float] = MappingProxyType({})
 
 
 def _betaflight_names(prefix: str, axis: int) -> _Names:
@@ -156,6 +215,8 @@ def _betaflight_names(prefix: str, axis: int) -> _Names:
         f"{prefix}setpoint[{axis}]",
         [f"{prefix}axis{x}[{axis}]" for x in _TERMS],
         [f"{prefix}motor[{k}]" for k in range(8)],
+        {f"{prefix}axisSum[{axis}]": 1.0},
+        {f"{prefix}rcCommand[3]": 1.0},
     )
 
 
@@ -166,6 +227,7 @@ def _px4_names(prefix: str, axis: int) -> _Names:
         f"vehicle_rates_setpoint.{AXES[axis]}",
         [],
         [f"actuator_motors.control[{k}]" for k in range(4)],
+        {f"vehicle_torque_setpoint.xyz[{axis}]": 1.0},
     )
 
 
@@ -176,6 +238,7 @@ def _ardupilot_names(prefix: str, axis: int) -> _Names:
         f"RATE.{'RPY'[axis]}Des",
         [f"PID{'RPY'[axis]}.{x}" for x in ("P", "I", "D", "FF")],
         [f"RCOU.C{k}" for k in range(1, 5)],
+        {f"RATE.{'RPY'[axis]}Out": 1.0},
     )
 
 
@@ -237,10 +300,35 @@ def _motor_ends(firmware: Firmware, values: Mapping[str, str]) -> tuple[float, f
     return share(number("MOT_SPIN_MIN", 0.15)), share(number("MOT_SPIN_MAX", 0.95))
 
 
-def _mixed(found: Mapping[str, Record], mix: Mapping[str, float]) -> Samples | None:
+def _mixed(
+    mix: Mapping[str, float], found: Mapping[str, Record], at: Callable[[str], Samples]
+) -> Samples | None:
     if not mix or any(name not in found for name in mix):
         return None
-    total = np.zeros(())
-    for name, weight in mix.items():
-        total = total + weight * found[name].channel(name)
-    return total
+    return np.sum([weight * at(name) for name, weight in mix.items()], axis=0)
+
+
+def _injected(proposal: Proposal) -> Mapping[str, float]:
+    """What was added to the command behind the law."""
+    return {"SIDD.Targ": 1.0} if proposal.setup.injected_at == "mixer" else {}
+
+
+def _stick(
+    command: Samples | None, firmware: Firmware, values: Mapping[str, str]
+) -> Samples | None:
+    """Betaflight's throttle before its boost, 0 to 1; a limit of the throttle is another one."""
+    if command is None or firmware != "betaflight" or float(values.get("throttle_limit_type", 0)):
+        return None
+    return np.clip((command - 1000) / 1000, 0.0, 1.0)
+
+
+def _late(firmware: Firmware, values: Mapping[str, str]) -> float:
+    """ArduPilot's modes run behind the rate loop and before the logging: docs/autopilots.md."""
+    return 1 / float(values.get("SCHED_LOOP_RATE", 400)) if firmware == "ardupilot" else 0.0
+
+
+def _resolution(firmware: Firmware, values: Mapping[str, str]) -> tuple[float, float]:
+    if firmware != "betaflight":
+        return 0.0, 0.0
+    finer = float(values.get("blackbox_high_resolution", 0)) > 0
+    return np.radians(0.1 if finer else 1.0), 1.0

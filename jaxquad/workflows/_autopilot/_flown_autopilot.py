@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import Number
-from jaxquad.control.autopilots import change_filters, Firmware, flown_loop
+from jaxquad.control.autopilots import change_filters, Firmware, flown_loop, FlownLoop
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
 from .._tune_settings import AutopilotSettings
@@ -19,13 +19,14 @@ from ._rate_gains import gains_of, parameters_of, RateLaw
 class FlownAutopilot:
     """The rate loop of a log: firmware, version, law and what of it is not modelled.
 
-    `values` are the log's own parameters, `throttle` is where Betaflight's dynamic filters and TPA
+    `loop` is the law with what moves in flight, `law` that at one throttle. `values` are the log's own parameters, `throttle` is where Betaflight's dynamic filters and TPA
     and ArduPilot's notches are taken, and `tracked_hz` what other notches of the latter followed.
     """
 
     firmware: Firmware
     version: tuple[int, ...]
     axis: int
+    loop: FlownLoop
     law: RateLaw
     parameters: Mapping[str, float]
     unmodelled: tuple[str, ...]
@@ -79,6 +80,6 @@ def read_flown(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
     return FlownAutopilot(
-        firmware, tuple(given.version), axis, loop.law, loop.parameters(), loop.unmodelled,
+        firmware, tuple(given.version), axis, loop, loop.law, loop.parameters(), loop.unmodelled,
         given.values, throttle, tracked_hz,
     )  # fmt: skip

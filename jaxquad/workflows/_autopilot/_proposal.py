@@ -16,7 +16,6 @@ from jaxquad.export import (
     propose_changes,
     write_parameter_files,
 )
-from jaxquad.loops import FlownLoop as Reproduction
 from jaxquad.records import AXES
 from jaxquad.report import provenance, write_json, write_pilot_page
 
@@ -25,6 +24,7 @@ from .._tune_settings import AutopilotSettings
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import GyroNoise
+from ._loop_check import LoopCheck
 from ._over_throttle import ThrottleVerdict
 from ._pilot_page import pilot_page
 from ._plants import PlantSource
@@ -63,7 +63,7 @@ class AutopilotProposal:
     settings: AutopilotSettings
     identification: Identification
     flown: FlownAutopilot
-    reproduction: Reproduction | None
+    reproduction: LoopCheck | None
     stages: tuple[Stage, ...] = ()
     new: Mapping[str, float] = dataclasses.field(default_factory=dict)
     filters: FilterVerdict | None = None
@@ -121,7 +121,7 @@ class AutopilotProposal:
             "filters": None if self.filters is None else self.filters.content(),
             "noise": None if self.noise is None else self.noise.content(),
             "throttle": None if self.throttle is None else self.throttle.content(),
-            "reproduction": None if self.reproduction is None else self.reproduction.to_dict(),
+            "reproduction": None if self.reproduction is None else self.reproduction.content(),
             "plant": self._plant,
             "settings": self.settings.content(),
             "identified_with": self.identification.settings.content(),

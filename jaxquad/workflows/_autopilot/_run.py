@@ -1,41 +1,26 @@
 """From the log of an autopilot to parameters for it: read, identify, reproduce, tune."""
 
 import dataclasses
-import functools as ft
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
+from jaxquad._core import announce
+from jaxquad.records import Proposal
 
-from jaxquad._core import announce, behind
-from jaxquad.control.autopilots import without_gyro_filters
-from jaxquad.identify import usable
-from jaxquad.loops import FlownLoop as Reproduction, reproduce_flight
-from jaxquad.records import AXES, Proposal
-from jaxquad.spectra import (
-    frequency_response,
-    FrequencyResponse,
-    JointInputOutput,
-    LocalPolynomial,
-)
-
-from .._fits import grid_of
-from .._identify import Identification, identify_plant
+from .._identify import identify_plant
 from .._kinds import SettingsError
-from .._log import propose_settings, read_records
+from .._log import propose_settings
 from .._settings import IdentifySettings
 from .._tune_settings import AutopilotSettings
 from ._adrc_flight import flew_adrc, tune_adrc
 from ._adrc_result import ADRCAutopilot
 from ._flight_channels import FlightChannels, read_channels_if_any
 from ._flown_autopilot import FlownAutopilot, read_flown, settings_of
+from ._law_check import check_law
+from ._loop_check import check_loop
 from ._over_throttle import study_throttle
 from ._proposal import AutopilotProposal
 from ._rate_design import design_gains
-from ._rate_gains import gyro_chains, law_responses
-
-
-_INJECTED = "SIDD.Targ"  # ArduPilot's chirp
+from ._rate_gains import gyro_chains
 
 
 def autopilot(
@@ -82,14 +67,16 @@ def autopilot(
         return tune_adrc(path, asked, proposal, settings)
     announce("gains and filters that flew")
     flown, flight = _read_flight(path, asked, proposal, settings)
-    compared = behind(_flown_responses, path, asked, flown)
     found = identify_plant(path, asked, proposal, gyro_chains(flown.law))
     known = (settings, found, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
     if not found.fit.identifiable:
         return unsure(f"this log cannot tell: {found.fit.verdict.summary}; {_FLY}", None)
+    if flight is None:
+        return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")
-    again = _reproduce(found, flown, compared.get())
+    law = check_law(flown.loop, flown.axis, flight)
+    again = check_loop(found, flown, flight, law)
     if again.kind != "flown":
         why = again.verdict
         return unsure(why if again.kind == "unknown" else f"this log cannot tell: {why}", again)
@@ -101,6 +88,10 @@ def autopilot(
     )  # fmt: skip
 
 
+_NO_SETPOINT = (
+    "this log cannot tell: it holds no set-point of the rate beside the gyro, so nothing says "
+    "whether these gains flew: log both"
+)
 _FLY = "fly a chirp of the rate set-point, or strong and quick stick on this axis, for 20 s or more"
 
 
@@ -125,88 +116,3 @@ def _read_flight(
         settings = dataclasses.replace(settings, throttle=flight.middle)
     tracked = {} if flight is None else flight.tracked_hz
     return read_flown(path, proposal, settings, tracked), flight
-
-
-def _flown_responses(
-    path: Path, settings: IdentifySettings, flown: FlownAutopilot
-) -> tuple[FrequencyResponse, ...]:
-    """What the loop is compared with: from the set-point to the rate.
-
-    Where ArduPilot's chirp enters at the mixer, from the chirp to output, rate and set-point.
-    """
-    of = ft.partial(_response_of, path, settings)
-    if _is_injected(settings):
-        letter = AXES[flown.axis][0].upper()
-        names = (f"RATE.{letter}Out", f"RATE.{letter}", f"RATE.{letter}Des")
-        return tuple(of(input=_INJECTED, output=name, reference=None) for name in names)
-    setpoint = _setpoint_of(settings.output or "", flown)
-    try:
-        reference = None if settings.reference == setpoint else settings.reference
-        return (of(input=setpoint, reference=reference),)
-    except ValueError:  # the stick is the set-point in another unit: that one is external
-        return (of(input=setpoint, reference=None),)
-
-
-def _is_injected(settings: IdentifySettings) -> bool:
-    return _INJECTED in (settings.input or "")
-
-
-def _response_of(
-    path: Path, settings: IdentifySettings, **changed: str | None
-) -> FrequencyResponse:
-    """The response between other channels of the log, joint where there is a reference."""
-    settings = dataclasses.replace(settings, **changed)
-    estimator = JointInputOutput() if settings.reference else LocalPolynomial()
-    records = list(read_records(path, settings))
-    return frequency_response(records, grid_of(settings), estimator=estimator)
-
-
-def _reproduce(
-    found: Identification, flown: FlownAutopilot, responses: Sequence[FrequencyResponse]
-) -> Reproduction:
-    """The flown loop compared with the log."""
-    if _is_injected(found.settings):
-        return _reproduce_law(found, flown, *responses)
-    [response], [unit] = responses, found.records[0].output_units
-    return reproduce_flight(
-        found.fit, flown.law, response, unit="deg/s" if unit == "deg/s" else "rad/s",
-        filters=gyro_chains(flown.law), axis=flown.axis,
-    )  # fmt: skip
-
-
-def _reproduce_law(
-    found: Identification,
-    flown: FlownAutopilot,
-    output: FrequencyResponse,
-    rate: FrequencyResponse,
-    setpoint: FrequencyResponse,
-) -> Reproduction:
-    """The law's output, of set-point and rate, from a chirp at the mixer.
-
-    The noise of the rate is in the output, too, so that the error of the latter counts alone.
-    """
-    [unit] = found.records[0].output_units
-    omega, only = np.asarray(output.omega), lambda x: np.asarray(x)[:, 0, 0]
-    ahead, back = law_responses(without_gyro_filters(flown.law), flown.axis, omega)
-    factor = np.pi / 180 if unit == "deg/s" else 1.0
-    predicted = factor * (ahead * only(setpoint.response) + back * only(rate.response))
-    measured, error = only(output.response), only(output.random_error)
-    used = only(usable(output, None, 0.6))
-    weight, off = 1 / error[used] ** 2, (measured / predicted - 1)[used]
-    total = max(float(np.sum(weight)), 1e-12)
-    scale = float(np.sum(weight * off.real)) / total
-    left = float(np.sum(weight * np.abs(off - scale) ** 2)) / max(2 * off.size, 1)
-    doubt = float(np.sqrt(max(left, 1.0) / total))
-    return Reproduction(
-        omega, measured, error, predicted, np.zeros_like(error), used, 1 + scale, doubt
-    )
-
-
-def _setpoint_of(rate: str, flown: FlownAutopilot) -> str:
-    """The channel of the rate's set-point."""
-    name = AXES[flown.axis]
-    if flown.firmware == "px4":
-        return f"vehicle_rates_setpoint.{name}"
-    if flown.firmware == "ardupilot":
-        return f"RATE.{name[0].upper()}Des"
-    return rate.replace("gyroADC", "setpoint")
