@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from .._protocols import Setpoint
 from ._betaflight import F_SCALE
-from ._filters import FilterChain
 from ._flown import FlownBetaflight, FlownLoop
 from ._law import DEGREES
 from ._reproduce import without_gyro_filters

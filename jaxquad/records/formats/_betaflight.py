@@ -17,6 +17,7 @@ from .._errors import ReadError
 from .._log import Log, Table
 from ._betaflight_frames import ADJUSTMENT, Frames, Payload, payload
 from ._betaflight_header import Frame, Header, headers, MARKER, scaled, with_axis_sums
+from ._betaflight_mixer import with_mixed_axes
 from ._betaflight_predict import add_constants, believed, constants, elapsed, predicted, segments
 
 
@@ -142,7 +143,8 @@ def _seconds(counter: np.ndarray) -> np.ndarray:
 
 def _main_table(main: Frames, time: np.ndarray, header: Header) -> Table:
     fields = table(main.coded, header.frames["I"], time, header)
-    return dataclasses.replace(fields, columns=with_axis_sums(fields.columns))
+    columns = with_mixed_axes(with_axis_sums(fields.columns), header.settings, time)
+    return dataclasses.replace(fields, columns=columns)
 
 
 def _remarks(held: Payload, rows: np.ndarray) -> list[str]:
@@ -214,7 +216,9 @@ def load_table(path: Path) -> Log:
     columns = {header.names[wanted[k]]: values[:, k] for k in numeric}
     units = {name: unit for name, unit in zip(header.names, header.units, strict=True) if unit}
     counter, _ = unwrap(values[:, clock])
-    table = Table(with_axis_sums(columns), counter / _PER_SECOND[unit], units)
+    time = counter / _PER_SECOND[unit]
+    columns = with_mixed_axes(with_axis_sums(columns), header.settings, time)
+    table = Table(columns, time, units)
     return Log({"": table}, tuple(remarks), "betaflight", header.settings)
 
 

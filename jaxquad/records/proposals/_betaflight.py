@@ -75,7 +75,7 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
     best = max(sweeps, key=lambda each: each.stop - each.start, default=None)
     axis = axis or (most_active_axis(signals, rates) if best is None else AXES[best.axis])
     i = AXES.index(axis)
-    command = first_logged(signals, [f"{prefix}axisSum[{i}]"])
+    command = first_logged(signals, [f"{prefix}axisMixed[{i}]", f"{prefix}axisSum[{i}]"])
     if not command or not rates[axis]:
         raise RecordError(f"the log has no PID terms or no gyro for {axis}.")
     remarks = [f"{rates[axis]} is measured after the gyro filters, so the model includes their lag"]

@@ -43,6 +43,7 @@ class Setup(NamedTuple):
     hold: float | None = None  # s; of the command, where the log says it
     throttle: Mix = {}  # the collective, 0 to 1 but for PX4's sign; empty if it is not logged
     injected_at: Literal["", "rate", "mixer", "angle"] = ""
+    levelled: bool = False  # whether an angle loop of Betaflight is known to have been closed
 
 
 class Proposal(NamedTuple):
@@ -252,7 +253,7 @@ def _in_words(changes: Sequence[SettingChange]) -> str:
 _THROTTLES: Mapping[str, tuple[tuple[str, float], ...]] = {  # channel, its factor to 0 .. 1
     "ardupilot": (("RATE.AOut", 1.0), ("CTUN.ThO", 1.0)),
     "px4": (("vehicle_thrust_setpoint.xyz[2]", -1.0), ("actuator_controls_0.control[3]", 1.0)),
-    "betaflight": (("setpoint[3]", 1e-3),),
+    "betaflight": (("collective", 1.0), ("setpoint[3]", 1e-3)),
     "crazyflie": (("controller.cmd_thrust", 1 / 65535), ("stabilizer.thrust", 1 / 65535)),
 }
 

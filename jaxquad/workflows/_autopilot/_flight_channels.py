@@ -79,9 +79,9 @@ class FlightChannels:
     @property
     def middle(self) -> float | None:
         """The median throttle, at which filters that follow it are taken."""
-        if self.throttle is None:
+        if self.throttle is None and self.stick is None:
             return None
-        return float(np.clip(np.median(self.throttle), 0.01, 1.0))
+        return float(np.clip(np.median(self.followed), 0.01, 1.0))
 
     @property
     def count(self) -> int:

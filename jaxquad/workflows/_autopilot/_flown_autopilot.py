@@ -11,6 +11,7 @@ from jaxquad.control.autopilots import change_filters, Firmware, flown_loop, Flo
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
 from .._tune_settings import AutopilotSettings
+from ._angle_loop import angle_loop_of, AngleLoop
 from ._flight_channels import HOVER
 from ._rate_gains import gains_of, parameters_of, RateLaw
 
@@ -19,8 +20,10 @@ from ._rate_gains import gains_of, parameters_of, RateLaw
 class FlownAutopilot:
     """The rate loop of a log: firmware, version, law and what of it is not modelled.
 
-    `loop` is the law with what moves in flight, `law` that at one throttle. `values` are the log's own parameters, `throttle` is where Betaflight's dynamic filters and TPA
-    and ArduPilot's notches are taken, and `tracked_hz` what other notches of the latter followed.
+    `loop` is the law with what moves in flight, `law` that at one throttle. `values` are the log's
+    own parameters, `throttle` is where Betaflight's dynamic filters and TPA and ArduPilot's notches
+    are taken, and `tracked_hz` what other notches of the latter followed. `angle` is the angle loop
+    around the rate loop, None where the firmware has none.
     """
 
     firmware: Firmware
@@ -33,6 +36,7 @@ class FlownAutopilot:
     values: Mapping[str, str] = dataclasses.field(default_factory=dict)
     throttle: float = 0.3
     tracked_hz: Mapping[int, Sequence[float]] = dataclasses.field(default_factory=dict)
+    angle: AngleLoop | None = None
 
     def with_filters(self, parameters: Mapping[str, Number]) -> RateLaw:
         """The law as it is read from a log with these cutoffs and notches."""
@@ -82,4 +86,7 @@ def read_flown(
     return FlownAutopilot(
         firmware, tuple(given.version), axis, loop, loop.law, loop.parameters(), loop.unmodelled,
         given.values, throttle, tracked_hz,
+        angle_loop_of(
+            firmware, given.values, axis, loop.law.interval(), levelled=setup.levelled
+        ),
     )  # fmt: skip

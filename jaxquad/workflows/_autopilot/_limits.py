@@ -63,3 +63,36 @@ def beyond_limits(
         ),
     ]
     return [words for is_beyond, words in found if is_beyond]
+
+
+@runtime_checkable
+class CertifiedAngle(Protocol):
+    """What an angle loop gives on fresh plants, as `OuterStage` says it."""
+
+    @property
+    def parameter(self) -> str: ...
+    @property
+    def value(self) -> float: ...
+    @property
+    def stable(self) -> float: ...
+    @property
+    def peak(self) -> float: ...
+    @property
+    def resonance(self) -> float: ...
+
+
+def beyond_angle(angle: CertifiedAngle, limits: Limits) -> list[str]:
+    """In words, which limits an angle loop does not keep."""
+    around = f"of the angle loop ({angle.parameter} {angle.value:.3g})"
+    found = [
+        (angle.stable < 1, f"only {100 * angle.stable:.1f} % {around} are stable"),
+        (
+            angle.peak > limits.sensitivity,
+            f"the worst Ms {around} is {angle.peak:.2f}, above {limits.sensitivity:g}",
+        ),
+        (
+            angle.resonance > limits.resonance,
+            f"the worst peak {around} is {angle.resonance:.2f}, above {limits.resonance:g}",
+        ),
+    ]
+    return [words for is_beyond, words in found if is_beyond]

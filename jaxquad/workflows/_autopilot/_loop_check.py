@@ -111,8 +111,8 @@ class LoopCheck:
         at = f"most at {self.omega[worst] / (2 * np.pi):.1f} Hz"
         if self.limited > _SATURATED:
             cause = (
-                f"motors were at their limits in {100 * self.limited:.1f} % of the flight: fly with "
-                "less amplitude"
+                f"motors were at their limits in {100 * self.limited:.1f} % of the flight: fly "
+                "with less amplitude"
             )
         else:
             cause = (
@@ -169,12 +169,12 @@ def check_loop(
     both = np.asarray(response.response)[:, :, 0]
     passed = filter_response(gyro_chains(flown.law), omega)
     used = np.asarray(usable(response, None, _COHERENT))[:, 0, 0]
-    part = _liveliest(drive, flight.dt)
+    part, time = _liveliest(drive, flight.dt), flight.start + flight.dt * np.arange(len(drive))
     chain = _filtered(again, found, flown, flight.dt)
     return LoopCheck(
         law, omega, both[:, 0], np.asarray(response.random_error)[:, 0, 0], both[:, 1] * passed,
         used & np.isfinite(both).all(axis=1), float(np.mean(flight.limited)),
-        float(np.sqrt(found.fit.chi_squared)), flight.start + flight.dt * np.arange(len(drive))[part],
+        float(np.sqrt(found.fit.chi_squared)), time[part],
         flight.setpoint[part], flight.rates[flown.axis][part], chain[part],
     )  # fmt: skip
 
@@ -217,9 +217,7 @@ def _liveliest(drive: Samples, dt: float) -> slice:
     return slice(start, start + size)
 
 
-def _filtered(
-    again: Samples, found: Identification, flown: FlownAutopilot, dt: float
-) -> Samples:
+def _filtered(again: Samples, found: Identification, flown: FlownAutopilot, dt: float) -> Samples:
     """Through the gyro's filters, as the log has it."""
     omega = 2 * np.pi * np.fft.rfftfreq(2 * len(again), dt)
     limited = np.minimum(omega, 0.499 * 2 * np.pi / flown.law.dt)

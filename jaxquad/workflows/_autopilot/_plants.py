@@ -8,11 +8,14 @@ from jaxtyping import Float
 
 from jaxquad.identify import draw_models, Fit, GainOverThrottle
 
+from ._angle_loop import AngleLoop
 from ._rate_gains import (
     ceiling_of,
     cells_of,
+    forward_path,
     gyro_chain_response,
     hold_plants,
+    is_relaxed,
     law_paths,
     RateLaw,
     RateLoops,
@@ -42,11 +45,17 @@ class PlantSource:
     over: GainOverThrottle | None = None
     span: tuple[float, float] = (0.0, 1.0)
 
+    @property
+    def damping(self) -> float:
+        """Of the rate in 1/s, as the fit has it."""
+        return float(np.asarray(vars(self.fit.model).get("damping", 0.0)))
+
     def loops(
         self, law: RateLaw, axis: int, count: int, seed: int, *,
         omega: Frequencies | None = None, throttle: float | None = None,
+        angle: AngleLoop | None = None,
     ) -> RateLoops:  # fmt: skip
-        """The loops of a law with so many plants.
+        """The loops of a law with so many plants, and an angle loop around them.
 
         All are at one `throttle`, or each is at its own, evenly over the span.
 
@@ -56,7 +65,7 @@ class PlantSource:
             omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
         back, ahead = law_paths(law, axis, omega)
         passed = gyro_chain_response(law, omega)
-        gain, lag, delay = self._drawn(count, seed, throttle)
+        gain, lag, delay, damping = self._drawn(count, seed, throttle)
         if np.any(gain <= 0):
             raise ValueError(
                 f"the gain from the command to the rate is not above 0 in {int(np.sum(gain <= 0))} "
@@ -64,23 +73,30 @@ class PlantSource:
                 "excitation"
             )
         per_radian = np.pi / 180 if self.unit == "deg/s" else 1.0
-        plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt)
+        plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt, damping)
         white = cells_of(omega) * np.abs(passed) ** 2
-        return RateLoops(omega, back, ahead, plants * passed, white, passed, ceiling_of(law, axis))
+        return RateLoops(
+            omega, back, ahead, plants * passed, white, passed, ceiling_of(law, axis),
+            is_relaxed(law, axis), forward_path(law, axis, omega),
+            None if angle is None else angle.path(omega),
+        )  # fmt: skip
 
-    def _drawn(self, count: int, seed: int, throttle: float | None) -> tuple[Drawn, Drawn, Drawn]:
-        """Gain, lag and delay."""
+    def _drawn(
+        self, count: int, seed: int, throttle: float | None
+    ) -> tuple[Drawn, Drawn, Drawn, Drawn]:
+        """Gain, lag, delay and damping."""
         if self.over is None:
             names = len(self.fit.names)
             scores = np.zeros((names, -(-count // _AT_ONCE) * _AT_ONCE))
             scores[:, :count] = np.random.default_rng(seed).standard_normal((names, count))
             models = draw_models(self.fit, jnp.asarray(scores))
             wide = lambda x: np.broadcast_to(np.asarray(x, float), scores[0].shape)[:count, None]
-            return wide(models.gain), wide(models.lag), wide(models.delay)
+            return wide(models.gain), wide(models.lag), wide(models.delay), wide(models.damping)
         if throttle is None:
             drawn = self.over.draw(np.linspace(*self.span, count), count, seed=seed)
             gain = np.diagonal(drawn.gain)
         else:
             drawn = self.over.draw(np.array([throttle]), count, seed=seed)
             gain = drawn.gain[0]
-        return gain[:, None], drawn.lag[:, None], drawn.delay[:, None]
+        lag, delay = drawn.lag[:, None], drawn.delay[:, None]
+        return gain[:, None], lag, delay, np.full_like(lag, self.damping)

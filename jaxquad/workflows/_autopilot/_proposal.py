@@ -29,7 +29,7 @@ from ._over_throttle import ThrottleVerdict
 from ._pilot_page import pilot_page
 from ._plants import PlantSource
 from ._rate_design import FilterVerdict, Kind
-from ._rate_gains import Stage
+from ._stages import Stage
 
 
 _THIRD, _ALL = 1 / 3, 1.0
@@ -82,7 +82,10 @@ class AutopilotProposal:
     @property
     def old(self) -> dict[str, float]:
         """What flew, of the gains and of filters that change."""
-        return self.flown.old | ({} if self.filters is None else dict(self.filters.flown))
+        angle = self.flown.angle
+        around = {} if angle is None or angle.name not in self.new else {angle.name: angle.value}
+        filters = {} if self.filters is None else dict(self.filters.flown)
+        return self.flown.old | filters | around
 
     @property
     def changes(self) -> tuple[ParameterChange, ...]:
@@ -97,12 +100,16 @@ class AutopilotProposal:
             return {}
         before, *_, after = self.stages
         why = (
-            f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of what "
-            f"flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
+            f"effect of a step of torque {after.rejection:.2f}, command noise {after.noise:.2f} of "
+            f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
         )
         reasons = dict.fromkeys(self.new, why)
         if self.filters is not None:
             reasons |= dict.fromkeys(self.filters.flown, self.filters.reason)
+        if before.angle is not None and after.angle is not None:
+            reasons[after.angle.parameter] = (
+                f"Ms of the angle loop {before.angle.peak:.2f} -> {after.angle.peak:.2f}"
+            )
         return {name: reason for name, reason in reasons.items() if name in self.new}
 
     def content(self) -> dict[str, object]:
@@ -117,7 +124,7 @@ class AutopilotProposal:
             "unmodelled": self.flown.unmodelled,
             "old": self.old,
             "new": dict(self.new),
-            "stages": [stage._asdict() for stage in self.stages],
+            "stages": [stage.content() for stage in self.stages],
             "filters": None if self.filters is None else self.filters.content(),
             "noise": None if self.noise is None else self.noise.content(),
             "throttle": None if self.throttle is None else self.throttle.content(),
@@ -133,9 +140,15 @@ class AutopilotProposal:
         fit = self.identification.fit
         if not fit.verdict.fitted:
             return {"verdict": fit.verdict.summary}
+        errors = zip(fit.names, map(float, fit.standard_errors), strict=True)
         return {
             "verdict": fit.verdict.summary,
             **dict(zip(fit.names, map(float, fit.values), strict=True)),
+            "standard_errors": dict(errors),
+            "intervals_95": {name: list(map(float, fit.interval(name))) for name in fit.names},
+            "units": dict(zip(fit.names, fit.parameter_units, strict=True)),
+            "band_rad_s": list(self.identification.band),
+            "misfit_over_errors": float(np.sqrt(fit.chi_squared)),
         }
 
     def write(self, folder: str | Path) -> list[Path]:

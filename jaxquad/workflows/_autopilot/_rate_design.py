@@ -8,27 +8,27 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxquad._core import announce
-from jaxquad.control.autopilots import filter_choices
+from jaxquad.control.autopilots import filter_choices, find_parameter
 from jaxquad.export import propose_changes
 
 from .._identify import Identification
 from .._tune_settings import AutopilotSettings
+from ._angle_loop import AngleLoop
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
-from ._limits import beyond_limits
+from ._limits import beyond_angle, beyond_limits
 from ._over_throttle import ThrottleVerdict
 from ._rate_gains import (
     ceiling_in,
-    certify_gains,
     gains_in,
     gains_of,
     grouped,
     parameters_of,
     RateLoops,
-    Stage,
 )
 from ._rate_search import filter_values, FilterBank, Search, shared_change, SharedChange, Targets
+from ._stages import certify_angle, certify_gains, Stage
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
@@ -39,6 +39,7 @@ _ALLOWED = 1.03  # of a limit that the search kept on the ratio of filters, for 
 _CERTIFICATES = 3  # at most: the worst plants of one that fails are tuned on, too
 _WORST = 16
 _HARD = 14  # plants of a search with filters
+_ANGLES, _RESERVE = 25, 0.98  # gains of the angle loop that are tried; of its limits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +172,7 @@ class _Work:
         source, seed = self.throttle.plants(self.found), self.settings.seed + seed
         places = self.throttle.certified or (None,)
         groups = [
-            source.loops(each.law, each.axis, count, seed, throttle=throttle)
+            source.loops(each.law, each.axis, count, seed, throttle=throttle, angle=each.angle)
             for each, throttle in zip(self._flown_there, places, strict=True)
         ]
         return self._heard(groups)
@@ -218,8 +219,33 @@ class _Work:
             parts = {name: way[name] for name in filters}
             loops.append(self._filtered(loops[0], parts) if filters else loops[0])
         designs = [self.before, *(gains_in(law, axis, way) for way in ways)]
-        stages = tuple(certify_gains(loops, designs))
-        return _Certified(stages, whole, dict(filters), designs, loops)
+        stages = certify_gains(loops, designs)
+        angle = self.flown.angle
+        if angle is not None:
+            last = self._angle_value(loops[-1].worst(designs[-1][None], _WORST), designs[-1], angle)
+            if last != angle.value:
+                whole[angle.name] = last
+            values = angle.value, self._third(whole, filters).get(angle.name, angle.value), last
+            stages = [
+                stage._replace(angle=certify_angle(one, gains, angle, value))
+                for stage, one, gains, value in zip(stages, loops, designs, values, strict=True)
+            ]
+        return _Certified(tuple(stages), whole, dict(filters), designs, loops)
+
+    def _angle_value(self, loops: RateLoops, gains: np.ndarray, angle: AngleLoop) -> float:
+        """The greatest stored gain, up to what flew, with which the angle loop keeps the limits."""
+        kept = self.settings
+        row = find_parameter(self.flown.firmware, angle.name)
+        values = angle.value * np.geomspace(1.0, 1 / kept.change, _ANGLES)
+        values[1:] = [np.rint(x) if row.whole else float(f"{x:.2g}") for x in values[1:]]
+        if not angle.closed:
+            return angle.value
+        for value in values:
+            around = loops.outer_qualities(gains, angle.gain(value))
+            most = np.max(around.peak) / kept.sensitivity, np.max(around.resonance) / kept.resonance
+            if np.all(around.stable) and max(most) <= (1.0 if value == angle.value else _RESERVE):
+                return float(value)
+        return float(values[-1])
 
     def _filtered(self, flown: RateLoops, filters: Mapping[str, float]) -> RateLoops:
         """The loops with other filters, at each throttle."""
@@ -234,6 +260,8 @@ class _Work:
         flown = self.flown
         bank = {} if not filters else self.flown_filters(filters)
         old = flown.old | bank
+        if flown.angle is not None and flown.angle.name in new:
+            old[flown.angle.name] = flown.angle.value
         changes = propose_changes(
             flown.firmware, old, new, share=_THIRD, beyond=list(new), at_once=switched(bank)
         )
@@ -326,6 +354,8 @@ def _judge(
             f"the command's noise on another axis is {shared.noise:.2f} of what flew, above "
             f"{settings.noise:g}"
         )
+    if whole.angle is not None and whole.angle.closed:
+        beyond += beyond_angle(whole.angle, settings)
     if beyond and flown.stable < _BELIEVED:
         return "cannot tell", (
             "this log cannot tell: the loop flew, but with the gains that flew it is stable on "
@@ -342,8 +372,10 @@ def _judge(
     if throttle.logged:
         at = ", ".join(f"{each:.2f}" for each in throttle.logged)
         plants += f" at each of the throttles {at}"
-    better = f"{whole.rejection:.2f} of the flown effect of torque"
+    better = f"{whole.rejection:.2f} of the flown effect of a step of torque"
     within = flown.peak <= limit and flown.resonance <= settings.resonance
+    if flown.angle is not None and flown.angle.closed:
+        within = within and not beyond_angle(flown.angle, settings)
     if flown.stable == 1 and within and whole.rejection > _WORTH:
         return "kept", (
             f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
@@ -351,5 +383,26 @@ def _judge(
         )
     return "proposed", (
         f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most "
-        f"{limit:g}, {better}. Load the file for a third of the way first"
+        f"{limit:g}, {better}{_around(flown, whole)}. {_first(flown, third, settings)}"
+    )
+
+
+def _around(flown: Stage, whole: Stage) -> str:
+    """What the proposal does to the angle loop."""
+    before, after = flown.angle, whole.angle
+    if before is None or after is None or not after.closed:
+        return ""
+    moved = f"{after.parameter} {before.value:.3g}"
+    moved += f" -> {after.value:.3g}" if after.value != before.value else " as it flew"
+    return f"; with the angle loop around it ({moved}) worst Ms {after.peak:.2f}"
+
+
+def _first(flown: Stage, third: Stage, settings: AutopilotSettings) -> str:
+    """How to go on; a third of the way from a bad loop may be beyond the limits, too."""
+    if third.peak <= settings.sensitivity and third.resonance <= settings.resonance:
+        return "Load the file for a third of the way first"
+    return (
+        f"The file for a third of the way is beyond the limits (worst Ms {third.peak:.2f}, peak "
+        f"from set-point to rate {third.resonance:.2f}), but better than what flew "
+        f"({flown.peak:.2f}, {flown.resonance:.2f}): hover with it alone, then load all of it"
     )

@@ -31,6 +31,8 @@ from jaxquad.control.autopilots import (
 from jaxquad.identify import filter_response
 from jaxquad.records import AXES
 
+from ._angle_loop import OuterQualities
+
 
 RateLaw = BetaflightPID | PX4Rate | ArduPilotRate
 Gains = Float[np.ndarray, "designs gains"]
@@ -78,6 +80,10 @@ class RateLoops:
     - `noise`: power of the logged rate's noise around each frequency, behind the flown filters.
     - `passed`: response of the gyro's filters that flew.
     - `ceiling`: by which factor D can rise in flight (D_MAX); 1 where it cannot.
+    - `relaxed`: whether the integral can be held in flight, as Betaflight's iterm_relax does.
+    - `forward`: response of the law's feed-forward, from the set-point to the command.
+    - `angle`: of the angle loop around this one, from rate to minus the set-point, per 1/s of its
+        gain; None where there is none.
     - `beside`: loops at other throttles, under the law there; their plants count, too.
     """
 
@@ -88,6 +94,9 @@ class RateLoops:
     noise: Float[np.ndarray, " frequencies"]
     passed: Complex[np.ndarray, " frequencies"]
     ceiling: float = 1.0
+    relaxed: bool = False
+    forward: Complex[np.ndarray, " frequencies"] | None = None
+    angle: Complex[np.ndarray, " frequencies"] | None = None
     beside: tuple["RateLoops", ...] = ()
 
     @property
@@ -102,7 +111,9 @@ class RateLoops:
         """
         back, ahead = law_paths(law, axis, self.omega)
         changed = gyro_chain_response(law, self.omega) / self.passed
-        return dataclasses.replace(self, feedback=back * changed, ahead=ahead)
+        return dataclasses.replace(
+            self, feedback=back * changed, ahead=ahead, forward=forward_path(law, axis, self.omega),
+        )  # fmt: skip
 
     def worst(self, gains: Gains, count: int) -> "RateLoops":
         """With those plants alone that have the greatest peaks under these gains."""
@@ -137,19 +148,58 @@ class RateLoops:
         """
         found = [self._own_qualities(gains, filters)]
         found += [each.qualities(gains, filters) for each in self.beside]
-        return found[0] if len(found) == 1 else _together(found)
+        return found[0] if len(found) == 1 else together(found)
 
     def _own_qualities(self, gains: Gains, filters: Filters | None) -> LoopQualities:
         base = self._qualities(*self.paths(gains, filters))
         if self.ceiling == 1:
             return base
-        raised = self._qualities(*self.paths(gains * np.array([[1, 1, self.ceiling]]), filters))
-        return base._replace(
-            stable=base.stable & raised.stable,
-            peak=np.maximum(base.peak, raised.peak),
-            resonance=np.maximum(base.resonance, raised.resonance),
-            crossover=np.maximum(base.crossover, raised.crossover),
-        )
+        return _worst_of(base, self._moved(gains, filters, (1.0, 1.0, self.ceiling)))
+
+    def relaxed_qualities(self, gains: Gains) -> LoopQualities:
+        """With the integral held where it can be held in flight, D as set and at its ceiling."""
+        parts = []
+        for each in self.groups:
+            if not each.relaxed:
+                parts.append(each._own_qualities(gains, None))
+                continue
+            base = each._moved(gains, None, (1.0, 0.0, 1.0))
+            raised = each._moved(gains, None, (1.0, 0.0, each.ceiling))
+            parts.append(_worst_of(base, raised))
+        return together(parts)
+
+    def _moved(
+        self, gains: Gains, filters: Filters | None, factors: tuple[float, ...]
+    ) -> LoopQualities:
+        return self._qualities(*self.paths(gains * np.array([factors]), filters))
+
+    def open_loops(
+        self, gains: Float[np.ndarray, " gains"]
+    ) -> Complex[np.ndarray, "plants frequencies"]:
+        """Of the rate, of all groups."""
+        return np.concatenate([gains @ each.feedback * each.plants for each in self.groups])
+
+    def outer_loops(
+        self, gains: Float[np.ndarray, " gains"], angle_gain: float
+    ) -> Complex[np.ndarray, "plants frequencies"]:
+        """Of the angle with a gain in 1/s, of all groups; the true rate is before the filters."""
+        loops = []
+        for each in self.groups:
+            assert each.angle is not None
+            ahead = gains @ each.ahead + (0 if each.forward is None else each.forward)
+            rate = ahead * each.plants / each.passed / (1 + gains @ each.feedback * each.plants)
+            loops.append(angle_gain * each.angle * rate)
+        return np.concatenate(loops)
+
+    def outer_qualities(
+        self, gains: Float[np.ndarray, " gains"], angle_gain: float
+    ) -> OuterQualities:
+        """What an angle loop with a gain in 1/s gives around the rate loop."""
+        loops = self.outer_loops(gains, angle_gain)
+        distance = 1 + loops
+        stable = _is_stable(distance.real[None], distance.imag[None])[0]
+        peaks = 1 / np.abs(distance).min(axis=1), np.abs(loops / distance).max(axis=1)
+        return OuterQualities(stable, *peaks)
 
     def paths(self, gains: Gains, filters: Filters | None = None) -> tuple[Paths, Paths]:
         """The law from the logged rate to minus the command, and from the set-point to it."""
@@ -196,13 +246,23 @@ def _one_plus(
     return real, imaginary
 
 
+def _worst_of(one: LoopQualities, other: LoopQualities) -> LoopQualities:
+    """Of each plant; effects of torque and of noise are those of the first."""
+    return one._replace(
+        stable=one.stable & other.stable,
+        peak=np.maximum(one.peak, other.peak),
+        resonance=np.maximum(one.resonance, other.resonance),
+        crossover=np.maximum(one.crossover, other.crossover),
+    )
+
+
 def grouped(groups: Iterable[RateLoops]) -> RateLoops:
     """The loops of several throttles as one."""
     first, *others = groups
     return dataclasses.replace(first, beside=tuple(others))
 
 
-def _together(parts: Sequence[LoopQualities]) -> LoopQualities:
+def together(parts: Sequence[LoopQualities]) -> LoopQualities:
     """Of the plants of all parts."""
     return LoopQualities(*(np.concatenate(each, axis=1) for each in zip(*parts, strict=True)))
 
@@ -260,12 +320,29 @@ def gyro_chain_response(
     return filter_response(gyro_chains(law), omega)
 
 
+def forward_path(
+    law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, " frequencies"] | None:
+    """Of the law's feed-forward, from the set-point to the command; of Betaflight's sticks none."""
+    names = _ahead_of(law)
+    if isinstance(law, BetaflightPID) or not any(np.any(vars(law)[name]) for name in names):
+        return None
+    without = eqx.tree_at(
+        lambda each: [vars(each)[name] for name in FIELDS],
+        without_gyro_filters(law), [jnp.zeros_like(law.p)] * len(FIELDS),
+    )  # fmt: skip
+    return law_responses(without, axis, omega)[0]
+
+
+def _ahead_of(law: RateLaw) -> tuple[str, ...]:
+    if isinstance(law, ArduPilotRate):
+        return "ff", "d_ff"
+    return ("f",) if isinstance(law, BetaflightPID) else ("ff",)
+
+
 def _alone(law: RateLaw, name: str) -> RateLaw:
     """The law with a gain of 1, none of the other two and no feed-forward."""
-    if isinstance(law, ArduPilotRate):
-        ahead = ("ff", "d_ff")
-    else:
-        ahead = ("f",) if isinstance(law, BetaflightPID) else ("ff",)
+    ahead = _ahead_of(law)
     of = lambda law: [vars(law)[each] for each in (*FIELDS, *ahead)]
     gains = [jnp.full_like(law.p, float(each == name)) for each in (*FIELDS, *ahead)]
     return eqx.tree_at(of, law, gains)  # what `replace` would check anew is known to be right
@@ -290,15 +367,28 @@ def hold_plants(
     delay: Float[np.ndarray, "plants 1"],
     omega: Float[np.ndarray, " frequencies"],
     dt: float,
+    damping: Float[np.ndarray, "plants 1"] | None = None,
 ) -> Complex[np.ndarray, "plants frequencies"]:
-    """K e^(-delay s) / (s (lag s + 1)) behind a hold, exactly: its modified z-transform."""
+    """K e^(-delay s) / ((s + damping) (lag s + 1)) behind a hold: its modified z-transform."""
     lag, delay = np.maximum(lag, 1e-6), np.maximum(delay, 0.0)
+    damping = np.maximum(np.zeros_like(lag) if damping is None else damping, 1e-6)
     whole = np.floor(delay / dt)
     ahead = dt * (whole + 1) - delay  # from the command's arrival to the next sample
     q = np.exp(-1j * omega * dt)[None]
-    steps = dt * q / (1 - q) ** 2 + (ahead - lag) / (1 - q)
-    steps = steps + lag * np.exp(-ahead / lag) / (1 - np.exp(-dt / lag) * q)
+    # The step's response is 1/damping and two exponentials, at the poles of rate and actuator.
+    apart = 1 - damping * lag
+    apart = np.where(np.abs(apart) < 1e-6, 1e-6, apart)
+    rate = np.exp(-damping * ahead) / (1 - np.exp(-damping * dt) * q)
+    actuator = np.exp(-ahead / lag) / (1 - np.exp(-dt / lag) * q)
+    steps = (1 / (1 - q) - (rate - damping * lag * actuator) / apart) / damping
     return gain * (1 - q) * q ** (whole + 1) * steps
+
+
+def is_relaxed(law: RateLaw, axis: int) -> bool:
+    """Whether the integral can be held while the set-point moves (iterm_relax)."""
+    if not isinstance(law, BetaflightPID) or law.relax is None:
+        return False
+    return float(np.broadcast_to(law.relax.share, (3,))[axis]) > 0
 
 
 def ceiling_of(law: RateLaw, axis: int) -> float:
@@ -349,51 +439,3 @@ def gains_in(
     for k, name in enumerate(FIELDS):
         gains[k] = parameters.get(gain_row(firmware, axis, name).name, gains[k])
     return gains
-
-
-class Stage(NamedTuple):
-    """What gains give on fresh plants.
-
-    **Attributes:**
-
-    - `gains`: P, I and D.
-    - `stable`: share of the plants; `peak`, `resonance`: the greatest of them.
-    - `crossover`: their median in rad/s.
-    - `rejection`, `noise`: relative to what flew.
-    - `peaks`: the greatest Ms at each throttle.
-    """
-
-    gains: tuple[float, ...]
-    stable: float
-    peak: float
-    resonance: float
-    crossover: float
-    rejection: float
-    noise: float
-    peaks: tuple[float, ...] = ()
-
-
-def certify_gains(
-    loops: Sequence[RateLoops], designs: Sequence[Float[np.ndarray, " gains"]]
-) -> list[Stage]:
-    """What each of the designs gives under its own law, the first of which is what flew."""
-    parts = [
-        [group.qualities(gains[None]) for group in one.groups]
-        for one, gains in zip(loops, designs, strict=True)
-    ]
-    found = [_together(each) for each in parts]
-    rms = lambda x: float(np.sqrt(np.mean(x**2)))
-    first = found[0]
-    return [
-        Stage(
-            tuple(map(float, gains)),
-            float(np.mean(each.stable)),
-            float(np.max(each.peak)),
-            float(np.max(each.resonance)),
-            float(np.median(each.crossover)),
-            rms(each.rejection) / rms(first.rejection),
-            rms(each.noise) / rms(first.noise),
-            tuple(float(np.max(group.peak)) for group in groups),
-        )
-        for each, groups, gains in zip(found, parts, designs, strict=True)
-    ]
