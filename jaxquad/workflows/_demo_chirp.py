@@ -115,8 +115,8 @@ def _fly(random: np.random.Generator) -> tuple[dict[str, np.ndarray], np.ndarray
         **_motors(boosted, (p + i + d) / 1000),
     }  # fmt: skip
     unsigned = np.array([name in _UNSIGNED for name in values])
-    whole = np.rint(np.stack(list(values.values()))).astype(np.int64)
-    folded = np.where(unsigned[:, None], whole, (whole << 1) ^ (whole >> 63))
+    rounded = np.rint(np.stack(list(values.values()))).astype(np.int64)
+    folded = np.where(unsigned[:, None], rounded, (rounded << 1) ^ (rounded >> 63))
     return dict(zip(values, folded, strict=True)), on
 
 
@@ -225,11 +225,11 @@ def _fly_axis(
         d = -kd * change
         rows.append((p, integral, d, gyro, raw))
         waiting.append(min(max(p + integral + d, -limit), limit))
-        held = waiting.pop(0)
+        applied = waiting.pop(0)
         for half in (0, 1):  # the lag's exact mean over a step, in which its input is constant
             if flying:
-                rate += step * (gain * (held + (motor - held) * lagged) + gust)
-            motor = held + (motor - held) * stay
+                rate += step * (gain * (applied + (motor - applied) * lagged) + gust)
+            motor = applied + (motor - applied) * stay
             if half == 0:
                 fast += second * (rate + last - fast)
                 gyro += share * (fast - gyro)
