@@ -44,9 +44,10 @@ def ardupilot(request, data):
     tables = load_log(path).tables
     axis = "R" if "roll" in request.param else "P"
     rate, terms = (tables[name].columns for name in ("RATE", f"PID{axis}"))
-    times, chirp = [tables[name].time for name in ("RATE", "SIDD")], np.zeros_like(rate["R"])
+    time, chirped = (np.asarray(tables[name].time) for name in ("RATE", "SIDD"))
+    chirp = np.zeros_like(rate["R"])
     if "mixer" in request.param:  # SIDD begins with the mode
-        chirp[np.searchsorted(*map(np.asarray, times))] = tables["SIDD"].columns["Targ"]
+        chirp[np.searchsorted(time, chirped)] = tables["SIDD"].columns["Targ"]
     return axis, rate, terms, chirp
 
 
