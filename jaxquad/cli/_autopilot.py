@@ -1,4 +1,6 @@
 import argparse
+from collections.abc import Callable
+from pathlib import Path
 
 from jaxquad._core import prepare_second_process, start_second_process
 from jaxquad.records import require_file
@@ -41,18 +43,34 @@ def _add(declared: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     settings = settings_of(options, AutopilotSettings)
     require_file(options.file)
+    folder = options.out or default_folder(options.file) / "autopilot"
+    return run_autopilot(options, lambda: options.file, settings, folder)
+
+
+def run_autopilot(
+    options: argparse.Namespace,
+    log: Callable[[], Path],
+    settings: AutopilotSettings,
+    wanted: Path,
+    note: str = "",
+) -> int:
+    """Tune the gains of the loop that flew the log, print and write what comes out.
+
+    `log` makes the file while a second process starts; `{page}` in `note` is the page's path.
+    """
     start_second_process()
     start_computing()
     prepare_second_process(_prepare)
     from jaxquad.workflows import autopilot
 
-    found = autopilot(options.file, settings)
+    file = log()
+    found = autopilot(file, settings)
     with stdout_for_json(options):
         print(in_options(str(found)))
-        wanted = options.out or default_folder(options.file) / "autopilot"
         same = {"settings": settings.content()}
-        folder = folder_to_write(options, wanted, "autopilot.json", same, [options.file])
-        print(f"\n{folder}: {', '.join(path.name for path in found.write(folder))}")
+        folder = folder_to_write(options, wanted, "autopilot.json", same, [file])
+        names = ", ".join(path.name for path in found.write(folder))
+        print(f"\n{folder}: {names}{note.format(page=folder / 'autopilot.html')}")
     if options.json:
         print_json(found.content())
     return _EXIT.get(found.kind, 0)

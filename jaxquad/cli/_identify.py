@@ -1,4 +1,4 @@
-"""Commands around one log: channels, identify, report, verify and demo."""
+"""Commands around one log: channels, identify, report and verify."""
 
 import argparse
 import math
@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxquad._core import start_second_process
 from jaxquad.records import parse_mix, require_file
 from jaxquad.workflows import (
     default_folder,
@@ -93,7 +92,7 @@ NOT_IDENTIFIABLE = 3
 _CODES = "exit codes: 0 done, 2 unusable input, 3 the record does not determine the parameters\n"
 
 
-def _finish(
+def finish_identification(
     options: argparse.Namespace, found: "Identification", folder: Path, note: str = ""
 ) -> int:
     """Print an identification, write its folder, and tell whether it is identifiable."""
@@ -141,7 +140,7 @@ def _identify(options: argparse.Namespace) -> int:
         with stdout_for_json(options):
             print(f"{opened.proposal}\n", flush=True)
     folder = options.out or default_folder(options.file[0])
-    return _finish(options, identify_opened(opened), folder)
+    return finish_identification(options, identify_opened(opened), folder)
 
 
 def _require_used_units(typed: Sequence[str], settings: IdentifySettings) -> None:
@@ -209,7 +208,7 @@ def _report(options: argparse.Namespace) -> int:
     from jaxquad.workflows import identify_opened
 
     found = identify_opened(opening.get())
-    return _finish(options, found, options.out or stored.folder)
+    return finish_identification(options, found, options.out or stored.folder)
 
 
 REPORT = Command(
@@ -295,69 +294,4 @@ parameters of the model, or the result holds none
 """,
     _add_verify,
     _verify,
-)
-
-
-_NEXT = """
-
-The log is simulated: one axis under rate feedback, in gusts, excited by a sweep of its command.
-True values: gain {gain:g}, lag {lag:g} s, delay {delay:g} s, so lag + delay = {sum:.4g} s.
-Look at {{report}}
-Then identify your own log:
-  jaxquad channels YOUR.LOG
-  jaxquad identify YOUR.LOG"""
-
-
-def _add_demo(declared: argparse.ArgumentParser) -> None:
-    text = "identify a measured flight instead: a quadrotor on a pitch test stand (JAXQUAD_DATA)"
-    declared.add_argument("--flight", action="store_true", help=text)
-    output = add_output(declared)
-    add_out(output, "results/demo")
-    add_force(output)
-    add_json(output, "result.json")
-    add_quiet(output)
-
-
-def _demo(options: argparse.Namespace) -> int:
-    if options.flight:
-        return _demo_flight(options)
-    start_second_process()
-    start_computing()
-    from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
-
-    folder = options.out or Path("results/demo")
-    log = write_demo_log(folder / "demo.csv")
-    note = _NEXT.format(**DEMO_TRUTH, sum=DEMO_TRUTH["lag"] + DEMO_TRUTH["delay"])
-    return _finish(options, identify(log, DEMO), folder, note)
-
-
-_NEXT_FLIGHT = """
-
-The flight is measured: an ANT-X quadrotor on a pitch test stand in closed loop, with a binary
-sequence on the set-point x0 of its position.
-Look at {report}"""
-
-
-def _demo_flight(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import find_demo_flight
-
-    log, settings = find_demo_flight()  # before JAX: it may have nothing to compute
-    opening = open_beside([log], open_logs, log, settings)
-    from jaxquad.workflows import identify_opened
-
-    folder = options.out or Path("results/demo_flight")
-    return _finish(options, identify_opened(opening.get()), folder, _NEXT_FLIGHT)
-
-
-DEMO = Command(
-    "demo",
-    "write a simulated log whose true model is known, and identify it",
-    """example:
-  jaxquad demo
-  jaxquad demo --flight
-
-exit codes: 0 done, 2 the folder cannot be written, or the flight is not found
-""",
-    _add_demo,
-    _demo,
 )

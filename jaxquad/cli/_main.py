@@ -15,8 +15,9 @@ from jaxquad.workflows import in_options
 
 from ._autopilot import AUTOPILOT
 from ._batch import BATCH
+from ._demo import DEMO
 from ._design import DESIGN
-from ._identify import CHANNELS, DEMO, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
+from ._identify import CHANNELS, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
 from ._options import check_out
 from ._progress import shown_stages
 from ._tune import TUNE

@@ -15,6 +15,10 @@ from ._demo import (
     find_demo_flight as find_demo_flight,
     write_demo_log as write_demo_log,
 )
+from ._demo_chirp import (
+    CHIRP_TRUTH as CHIRP_TRUTH,
+    write_chirp_log as write_chirp_log,
+)
 from ._identify import (
     Identification as Identification,
     identify as identify,

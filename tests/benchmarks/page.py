@@ -48,19 +48,11 @@ PAIRS = (
         "test_scipy_least_squares",
         "scipy",
     ),
-    Pair("1000 such fits", "test_batch_speed.py", "test_ours", "test_scipy", "scipy"),
     Pair(
         "state-space fit, 20 parameters",
         "test_state_space_speed.py",
         "test_solve",
         "test_scipy_least_squares",
-        "scipy",
-    ),
-    Pair(
-        "200 such fits",
-        "test_state_space_speed.py",
-        "test_batch_of_200",
-        "test_200_by_scipy",
         "scipy",
     ),
     Pair(
