@@ -159,9 +159,10 @@ class _AtSolution(NamedTuple):
 def _see(problem: Problem, counted: Counted, solution: Solution) -> _AtSolution:
     start = units = units_of(solution)
     seen = tangent = see(counted.records, counted.found, solution, units)
-    step = newton_step(seen.bread, seen.gradient, solution.at_zero)
-    decrement = 0.5 * float(seen.gradient @ step)
     near = near_zeros(problem, solution, seen, units)
+    still = [each.k for each in near if each.changes is not None and each.bound.value]
+    step = newton_step(seen.bread, seen.gradient, solution.at_zero, still)
+    decrement = 0.5 * float(seen.gradient @ step)
     bounds, frfs = (), [each.frf for each in counted.points]
 
     def see_again() -> Seen:
@@ -329,9 +330,13 @@ def newton_step(
     bread: Float[np.ndarray, "parameters parameters"],
     gradient: Float[np.ndarray, " parameters"],
     at_zero: Sequence[int],
+    still: Sequence[int] = (),
 ) -> Float[np.ndarray, " parameters"]:
-    """The next Gauss-Newton step, downhill; parameters at zero do not become negative."""
-    held = [k for k in at_zero if gradient[k] > 0]
+    """The next Gauss-Newton step, downhill; parameters at zero do not become negative.
+
+    Others stand `still`: those so near zero that slopes there say nothing about a step.
+    """
+    held = [*(k for k in at_zero if gradient[k] > 0), *still]
     if not held:
         return scaled_inverse(bread) @ gradient
     free, step = np.setdiff1d(np.arange(gradient.size), held), np.zeros(gradient.size)

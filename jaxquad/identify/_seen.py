@@ -84,7 +84,7 @@ class NearZero(NamedTuple):
 # A tenth of the magnitude and 6 deg of phase are less than a design's margins leave open, so what a
 # parameter does to the loop is known well enough, whatever its share of it.
 _SLIGHT = 0.1
-_FEW = 1 / 3  # of the limit: below it the slopes at a value say little about the way to the limit
+_FEW = 0.1  # of the limit: below it the slopes at a value say little about the way to the limit
 
 
 def near_zeros(
