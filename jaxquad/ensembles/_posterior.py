@@ -130,7 +130,13 @@ def _of_integrator(model: LaggedIntegrator, believed: Number) -> Build:
             "or 2 to angle; for another one give plant="
         )
     lagging = not is_zero(model.lag)
-    return lambda m: (_axis(m.gain, m.lag if lagging else None, believed), m.delay)
+
+    def build(m: LaggedIntegrator) -> tuple[DecoupledAxes, Number]:
+        lag = m.lag if lagging else None
+        plant = DecoupledAxes(m.gain * believed, believed, lag=lag, damping=m.damping * believed)
+        return plant, m.delay
+
+    return build
 
 
 def _of_transfer_function(model: TransferFunction, believed: Number) -> Build:

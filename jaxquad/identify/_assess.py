@@ -56,14 +56,16 @@ from ._parameters import Place
 from ._problem import on_device, Problem
 from ._result import Fit
 from ._seen import (
-    bounds_of,
+    bounds_among,
     halved,
+    near_zeros,
     prior_rows,
     pulled_beyond,
     records_of,
     see,
     Seen,
     units_of,
+    with_changes,
     with_tangled,
 )
 from ._simulated import HasStateSpace, HasTransferFunction, linear_model
@@ -100,17 +102,15 @@ def assess(
     The fit gets the `further` remarks and its `origin`.
     """
     frfs, count = [each.frf for each in counted.points], problem.parameters.count
-    seen, units, bounds = _see(problem, counted, solution)
+    seen, units, bounds, bread, newton = _see(problem, counted, solution)
     here = _cost(seen.blocks, seen.prior)
-    falls_aside = look_aside(problem, solution.z, here, seen.bread, solution.aside)
+    falls_aside = look_aside(problem, solution.z, here, bread, solution.aside)
     costs = _costs_by_noise(problem, counted, solution, seen, units)
-    step = newton_step(seen.bread, seen.gradient, solution.at_zero)
     cut = ft.partial(halved, seen=seen, names=problem.parameters.names, bounds=bounds)
     by_noise, covariance = cut(seen.by_noise), cut(seen.covariance)
     facts = _information(problem, solution, seen.blocks, (covariance, by_noise), units)
-    verdict, by_data = _judge(problem, solution, seen, facts, bounds, step, costs.cost)
-    decrement = 0.5 * float(seen.gradient @ step)
-    estimate = Estimate(seen.bread, covariance, by_noise, units[:count], verdict, decrement)
+    verdict, by_data = _judge(problem, solution, seen, facts, bounds, newton, costs.cost)
+    estimate = Estimate(seen.bread, covariance, by_noise, units[:count], verdict, newton.decrement)
     remarks = [
         *_remarks_on_used(problem, frfs),
         *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
@@ -118,7 +118,7 @@ def assess(
     if not is_fed_back(verdict):
         doubted = _doubted(seen, costs)
         remarks += [
-            *remarks_on_fit(problem, solution, costs.cost, decrement, doubted, verdict),
+            *remarks_on_fit(problem, solution, costs.cost, newton.decrement, doubted, verdict),
             *remarks_on_bounds(pulled_beyond(seen, problem.parameters.names, bounds), verdict),
             *_remarks_on_growth(problem, solution, frfs),
             *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
@@ -139,17 +139,44 @@ def assess(
     )
 
 
-def _see(
-    problem: Problem, counted: Counted, solution: Solution
-) -> tuple[Seen, Float[np.ndarray, " all"], tuple[Bound, ...]]:
+class _Newton(NamedTuple):
+    """The next step of Gauss and Newton, and half of what it takes off the cost."""
+
+    step: Float[np.ndarray, " parameters"]
+    decrement: float
+
+
+class _AtSolution(NamedTuple):
     """What the records say, by changes relative to units, and parameters that may be zero."""
-    units = units_of(solution)
-    seen = see(counted.records, counted.found, solution, units)
-    bounds, tangled = bounds_of(problem, solution, seen, units)
-    if tangled:
-        frfs, units = [each.frf for each in counted.points], with_tangled(units, seen, tangled)
-        seen = see(records_of(problem, frfs, solution, units), counted.found, solution, units)
-    return seen, units, bounds
+
+    seen: Seen
+    units: Float[np.ndarray, " all"]
+    bounds: tuple[Bound, ...]
+    bread: Matrix  # by the slopes at the solution itself
+    newton: _Newton
+
+
+def _see(problem: Problem, counted: Counted, solution: Solution) -> _AtSolution:
+    start = units = units_of(solution)
+    seen = tangent = see(counted.records, counted.found, solution, units)
+    near = near_zeros(problem, solution, seen, units)
+    still = [each.k for each in near if each.changes is not None and each.bound.value]
+    step = newton_step(seen.bread, seen.gradient, solution.at_zero, still)
+    decrement = 0.5 * float(seen.gradient @ step)
+    bounds, frfs = (), [each.frf for each in counted.points]
+
+    def see_again() -> Seen:
+        records = with_changes(records_of(problem, frfs, solution, units), near, units)
+        return see(records, counted.found, solution, units)
+
+    if near:
+        seen = see_again()
+        bounds, tangled = bounds_among(near, seen, solution, units)
+        if tangled:
+            units = with_tangled(units, near, tangled)
+            seen = see_again()
+    newton = _Newton(step * (start / units)[: step.size], decrement)
+    return _AtSolution(seen, units, bounds, tangent.bread, newton)
 
 
 def _costs_by_noise(
@@ -183,12 +210,12 @@ def _judge(
     seen: Seen,
     facts: Information,
     bounds: tuple[Bound, ...],
-    step: Float[np.ndarray, " parameters"],
+    newton: _Newton,
     cost: float,
 ) -> tuple[Verdict, Verdict]:
     """What data and priors determine together, and what the data determine alone."""
     names, frfs = problem.parameters.names, [each.frf for each in seen.records]
-    decrement = 0.5 * float(seen.gradient @ step)
+    step, decrement = newton
     dominated, used = _count_dominated(problem, frfs)
     if 2 * dominated > used:
         verdict = fed_back(names, dominated, used)
@@ -303,9 +330,13 @@ def newton_step(
     bread: Float[np.ndarray, "parameters parameters"],
     gradient: Float[np.ndarray, " parameters"],
     at_zero: Sequence[int],
+    still: Sequence[int] = (),
 ) -> Float[np.ndarray, " parameters"]:
-    """The next Gauss-Newton step, downhill; parameters at zero do not become negative."""
-    held = [k for k in at_zero if gradient[k] > 0]
+    """The next Gauss-Newton step, downhill; parameters at zero do not become negative.
+
+    Others stand `still`: those so near zero that slopes there say nothing about a step.
+    """
+    held = [*(k for k in at_zero if gradient[k] > 0), *still]
     if not held:
         return scaled_inverse(bread) @ gradient
     free, step = np.setdiff1d(np.arange(gradient.size), held), np.zeros(gradient.size)

@@ -185,6 +185,17 @@ def one_sided_limits(
     return limits, abs(unit) * slope / curvature
 
 
+def changes_up_to(
+    problem: Problem, solution: Solution, k: int, limit: float
+) -> list[Float[np.ndarray, "frequencies outputs inputs 2"]]:
+    """Changes of the misfits from here to a limit of parameter `k`, over that of its value."""
+    z, value = np.array(solution.z), float(np.asarray(solution.values)[k])
+    z[k] = np.log(abs(limit / float(np.asarray(problem.parameters.scale)[k])))
+    there = solution_at(problem, z).sensitivity.misfits
+    pairs = zip(there, solution.sensitivity.misfits, strict=True)
+    return [(np.asarray(new) - np.asarray(old)) / (limit - value) for new, old in pairs]
+
+
 def _limit(problem: Problem, solution: Solution, local: _Local, k: int, wanted: float) -> float:
     """By which factor parameter `k` grows until the cost has risen by what is wanted."""
     if not wanted > 0:  # of a variance that rounding left negative

@@ -49,7 +49,7 @@ class _Spread(NamedTuple):
     """How the free parameters of a fit are drawn."""
 
     root: Matrix  # of the covariance of relative changes
-    at_zero: tuple[int, ...]  # parameters at their bound
+    at_zero: tuple[int, ...]  # parameters at or near their bound
     along: Float[np.ndarray, "bounds parameters"]  # what changes with each of these
     here: Float[np.ndarray, " parameters"]
     units: Float[np.ndarray, " parameters"]
@@ -59,11 +59,17 @@ class _Spread(NamedTuple):
 def _spread_of(fit: "Fit", hold_undetermined: bool) -> _Spread:
     check_drawable(fit, hold_undetermined)
     covariance = known_covariance(fit)
+    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])
+    here, units = np.asarray(fit.values), np.asarray(fit.units)
     at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
     along = covariance[at_zero] / np.diagonal(covariance)[at_zero, None]
-    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])
+    # In other units than its own value a parameter is mixed up with others near zero.
+    scaled = logarithmic & (here != 0) & ~np.isclose(units, here, rtol=1e-9, atol=0.0)
+    mixed_up = np.setdiff1d(np.flatnonzero(scaled), at_zero)
+    whole = np.asarray(fit.relative_covariance)[mixed_up]
+    along = np.concatenate([along, whole / whole[np.arange(len(whole)), mixed_up, None]])
+    at_zero += mixed_up.tolist()
     logarithmic[at_zero] = False
-    here, units = np.asarray(fit.values), np.asarray(fit.units)
     return _Spread(_root(covariance), tuple(at_zero), along, here, units, logarithmic)
 
 
@@ -90,8 +96,10 @@ def _drawn_values(
         drawn = spread.here[k] / spread.units[k] + changes[k]
         folded = jnp.abs(drawn) - drawn
         changes += along[:, None] * folded[None]
-    logarithmic = spread.logarithmic[:, None]
-    return jnp.where(logarithmic, here * jnp.exp(changes), here + units * changes)
+    linear = here + units * changes
+    for k in spread.at_zero:  # several that go along with each other may have pushed one back
+        linear = linear.at[k].set(jnp.copysign(linear[k], spread.units[k]))
+    return jnp.where(spread.logarithmic[:, None], here * jnp.exp(changes), linear)
 
 
 def check_drawable(fit: "Fit", hold_undetermined: bool) -> None:

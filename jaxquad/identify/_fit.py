@@ -91,8 +91,8 @@ def fit(
     - `model`: any `eqx.Module` with `frequency_response(omega)`; its values are the start.
     - `frf`: a `jq.spectra.FrequencyResponse`, or a list of them that share the parameters.
     - `free`: the parameters to fit, by name (`"J_x"`, `"numerator[0]"`,
-        `jq.identify.Real("zero")`) or selected (`lambda m: (m.gain, m.delay)`); `None` for all.
-        A bare name keeps the sign of its start.
+        `jq.identify.Real("zero")`) or selected (`lambda m: (m.gain, m.delay)`); `None` for all
+        but a damping of 0. A bare name keeps the sign of its start.
     - `tied`: parameters that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
     - `cost`: `jq.identify.MaximumLikelihood()`, or `jq.identify.CoherenceWeighted()`: Eq. (14),
         the paper's and CIFER's.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import is_concrete, pytree_node, require_float64
-from jaxquad.models import StateSpace
+from jaxquad.models import is_optional, StateSpace
 
 
 class Positive(NamedTuple):
@@ -272,7 +272,9 @@ def _tied(places: list[Place], tied: Mapping[str, Tie]) -> tuple[tuple[Place, Ti
 
 def _expand(model: PyTree, places: list[Place], free: Free) -> list[str | Positive | Real]:
     if free is None:
-        return [place.name for place in places]
+        values = _numbers(model, places)
+        absent = lambda p: values[p.name] == 0 and is_optional(model, p.path)
+        return [place.name for place in places if not absent(place)]
     if callable(free):
         return _marked(model, places, free)
     items = []

@@ -1,6 +1,7 @@
 """What the derivatives at a solution say: errors of the parameters, and limits of those at zero."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,13 @@ from ._accuracy import (
     ResponseTerm,
     scaled_inverse,
 )
-from ._bounds import apart_at_zero, inflation_at_zero, one_sided, one_sided_limits
+from ._bounds import (
+    apart_at_zero,
+    changes_up_to,
+    inflation_at_zero,
+    one_sided,
+    one_sided_limits,
+)
 from ._discrepancy import describe_discrepancy, Discrepancy, discrepancy_effect, Mixture
 from ._identifiability import LIMIT
 from ._problem import Problem
@@ -60,14 +67,31 @@ def see(
     return Seen(records, blocks, prior, bread, gradient, noise, by_noise, covariance, discrepancy)
 
 
-def bounds_of(
-    problem: Problem, solution: Solution, seen: Seen, units: Float[np.ndarray, " all"]
-) -> tuple[tuple[Bound, ...], list[int]]:
-    """The limits of parameters that may be zero, and those at zero that are mixed up with others.
+class NearZero(NamedTuple):
+    """A parameter that may be zero, how far from it the data allow, and what it does up to there.
 
-    That is where another one would change by too much if this one had a value up to its limit.
+    `changes` are those of the misfits by its value, as the way to the limit has them on average,
+    where the slopes at the value itself say little about the rest of the way; else None. `slight`
+    is whether all of that way moves the responses by little.
     """
-    bounds, tangled = [], []
+
+    k: int
+    bound: Bound
+    changes: list[Float[np.ndarray, "frequencies outputs inputs 2"]] | None
+    slight: bool
+
+
+# A tenth of the magnitude and 6 deg of phase are less than a design's margins leave open, so what a
+# parameter does to the loop is known well enough, whatever its share of it.
+_SLIGHT = 0.1
+_FEW = 0.1  # of the limit: below it the slopes at a value say little about the way to the limit
+
+
+def near_zeros(
+    problem: Problem, solution: Solution, seen: Seen, units: Float[np.ndarray, " all"]
+) -> list[NearZero]:
+    """Parameters that may be zero, with the limits of their one-sided 95 % intervals."""
+    near = []
     curvature, names = scaled_inverse(seen.bread), problem.parameters.names
     for k in _possible_zeros(problem, solution, seen):
         others = [j for j in solution.at_zero if j != k]
@@ -77,14 +101,56 @@ def bounds_of(
         else:
             inflation = [float(each[k, k] / curvature[k, k]) for each in parts]
         (limit, by_noise), beyond = one_sided_limits(problem, solution, k, inflation)
-        moved = _along(seen, k) * abs(limit / units[k])
-        moved[[k, *(solution.at_zero if k in solution.at_zero else ())]] = 0.0
+        value = float(np.asarray(solution.values)[k])
+        bound = Bound(names[k], value, limit, by_noise, beyond)
+        if not np.isfinite(limit):
+            near.append(NearZero(k, bound, None, slight=False))
+            continue
+        changes = changes_up_to(problem, solution, k, limit)
+        used = (each.weights > 0 for each in seen.records)
+        pairs = zip(changes, used, strict=True)
+        largest = max(float(np.max(np.abs(each[mine]), initial=0.0)) for each, mine in pairs)
+        few = abs(value) < _FEW * abs(limit)
+        slight = largest * abs(limit) < _SLIGHT
+        near.append(NearZero(k, bound, changes if few else None, slight))
+    return near
+
+
+def with_changes(
+    records: Sequence[ResponseTerm], near: Sequence[NearZero], units: Float[np.ndarray, " all"]
+) -> list[ResponseTerm]:
+    """The records with slopes that hold up to the limits of parameters near zero."""
+    changed = []
+    for number, record in enumerate(records):
+        slopes = record.slopes.copy()
+        for each in near:
+            if each.changes is not None:
+                slopes[..., each.k] = units[each.k] * each.changes[number]
+        changed.append(dataclasses.replace(record, slopes=slopes))
+    return changed
+
+
+def bounds_among(
+    near: Sequence[NearZero], seen: Seen, solution: Solution, units: Float[np.ndarray, " all"]
+) -> tuple[tuple[Bound, ...], dict[int, float]]:
+    """Those that a limit determines, and those at zero that are mixed up with others.
+
+    That is where another one would change by too much if this one had a value up to its limit; by
+    how much, as a share of that other one.
+    """
+    bounds, tangled = [], {}
+    slight = [each.k for each in near if each.slight]
+    for each in near:
+        moved = _along(seen, each.k) * abs(each.bound.limit / units[each.k])
+        moved[[each.k, *(solution.at_zero if each.k in solution.at_zero else ())]] = 0.0
+        moved[slight if each.slight else []] = 0.0
         if np.all(moved <= LIMIT):
-            value = float(np.asarray(solution.values)[k])
-            bounds.append(Bound(names[k], value, limit, by_noise, beyond))
-        elif k in solution.at_zero:
-            tangled.append(k)
-    return tuple(bounds), tangled
+            bounds.append(each.bound)
+        elif each.k in solution.at_zero or each.changes is not None:
+            tangled[each.k] = moved
+    others = [j for j in range(len(seen.bread)) if j not in tangled]
+    shares = {k: float(np.max(moved[others], initial=0.0)) for k, moved in tangled.items()}
+    return tuple(bounds), shares
 
 
 _ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
@@ -94,6 +160,7 @@ def _possible_zeros(problem: Problem, solution: Solution, seen: Seen) -> list[in
     """Parameters that keep their sign, at zero or so near it that the data allow it."""
     count = problem.parameters.count
     near = np.sqrt(np.diagonal(seen.covariance)) * _ONE_SIDED > 1
+    near |= np.sqrt(np.diagonal(seen.by_noise)) > LIMIT
     near &= np.array(problem.parameters.logarithmic[:count])
     near[list(solution.at_zero)] = True
     return np.flatnonzero(near & (np.diagonal(seen.bread) > 0)).tolist()
@@ -105,12 +172,14 @@ def _along(seen: Seen, k: int) -> Float[np.ndarray, " parameters"]:
 
 
 def with_tangled(
-    units: Float[np.ndarray, " all"], seen: Seen, tangled: Sequence[int]
+    units: Float[np.ndarray, " all"], near: Sequence[NearZero], tangled: Mapping[int, float]
 ) -> Float[np.ndarray, " all"]:
     """Units of parameters at zero that count as much as the parameter they are mixed up with."""
     units = units.copy()
-    for k in tangled:
-        units[k] /= np.max(np.delete(_along(seen, k), tangled), initial=1e-300)
+    for each in near:
+        if each.k in tangled and np.isfinite(each.bound.limit):
+            share = tangled[each.k]
+            units[each.k] = each.bound.limit / (share if share > LIMIT else 1.0)
     return units
 
 

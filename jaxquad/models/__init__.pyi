@@ -44,4 +44,4 @@ from ._transfer_function import (
     LaggedIntegrator as LaggedIntegrator,
     TransferFunction as TransferFunction,
 )
-from ._units import parameter_units as parameter_units
+from ._units import is_optional as is_optional, parameter_units as parameter_units

@@ -22,7 +22,7 @@ from jaxquad._core import (
 
 from ._pade import check_order, pade_coefficients, require_package
 from ._protocols import as_floats, as_frequencies, Frequencies
-from ._units import Scale, unit
+from ._units import OPTIONAL, Scale, unit
 
 
 if TYPE_CHECKING:
@@ -240,7 +240,8 @@ def _rational(model: TransferFunction, pade: int | None) -> tuple[np.ndarray, np
 class LaggedIntegrator(eqx.Module):
     """The simplest model of an axis: K e^(-delay s) / (s^integrators (lag s + 1)).
 
-    From a moment command to a rate with one integration, to an angle with two. Over a narrow band a
+    From a moment command to a rate with one integration, to an angle with two. With `damping` one
+    of the integrators is s + damping instead of s, as air slows a rotation. Over a narrow band a
     record determines only the sum of lag and delay.
 
     **Arguments:**
@@ -248,10 +249,12 @@ class LaggedIntegrator(eqx.Module):
     - `gain`: K, in units of the output per unit of input and s^integrators.
     - `lag`, `delay`: in s.
     - `integrators`: 0 to 3.
+    - `damping`: in 1/s, of the rate; it takes at least one integrator. A fit leaves one of 0 as it
+        is, unless `free` names it, which takes a start above 0.
 
     **Raises:**
 
-    - `ValueError`: lag or delay is negative.
+    - `ValueError`: lag, delay or damping is negative, or there is damping without an integrator.
     """
 
     gain: Float[Array, ""] = eqx.field(
@@ -260,19 +263,32 @@ class LaggedIntegrator(eqx.Module):
     lag: Float[Array, ""] = eqx.field(converter=as_float, default=0.0, metadata=unit("s"))
     delay: Float[Array, ""] = eqx.field(converter=as_float, default=0.0, metadata=unit("s"))
     integrators: int = eqx.field(static=True, default=1)
+    damping: Float[Array, ""] = eqx.field(
+        converter=as_float, default=0.0, metadata=unit("1/s") | OPTIONAL
+    )
 
     def __check_init__(self):
         require_finite("gain", self.gain)
         for name, value in {"lag": self.lag, "delay": self.delay}.items():
             require_nonnegative(name, value, "give seconds, and 0 for none")
+        require_nonnegative("damping", self.damping, "give 1/s, and 0 for none")
         if self.integrators not in (0, 1, 2, 3):
             raise ValueError(f"integrators is {self.integrators}: give 0 to 3.")
+        if not self.integrators and is_concrete(self.damping) and np.any(self.damping):
+            raise ValueError(
+                f"damping is {np.asarray(self.damping)} 1/s, but integrators is 0: damping stands "
+                "in the place of one of 1 to 3 integrators."
+            )
 
     def frequency_response(self, omega: Frequencies) -> Complex[Array, "frequencies 1 1"]:
         """Response at `omega` in rad/s."""
         s = imaginary(as_frequencies(omega))
-        gain, lag, delay = (x.astype(s.dtype) for x in (self.gain, self.lag, self.delay))
-        return (gain * jnp.exp(-delay * s) / ((lag * s + 1) * s**self.integrators))[:, None, None]
+        gain, lag, delay, damping = (
+            x.astype(s.dtype) for x in (self.gain, self.lag, self.delay, self.damping)
+        )
+        n = self.integrators
+        rigid = s ** (n - 1) * (s + damping) if n else 1.0
+        return (gain * jnp.exp(-delay * s) / ((lag * s + 1) * rigid))[:, None, None]
 
     def to_control(self, *, pade: int | None = None) -> "control.TransferFunction":
         """`transfer_function().to_control(pade=)`: the same model for python-control."""
@@ -284,10 +300,13 @@ class LaggedIntegrator(eqx.Module):
 
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials; a known lag of 0 is left out."""
-        gain, lag, xp = *on_host((self.gain, self.lag)), _namespace(self.gain, self.lag)
-        one, zero = xp.ones_like(lag), xp.zeros_like(lag)
-        first = [one] if is_zero(self.lag) else [lag, one]
-        denominator = xp.stack([*first, *[zero] * self.integrators])
+        numbers = self.gain, self.lag, self.damping
+        (gain, lag, damping), xp = on_host(numbers), _namespace(*numbers)
+        one, zero, n = xp.ones_like(lag), xp.zeros_like(lag), self.integrators
+        slow = [one, damping] if n else [one]
+        if not is_zero(self.lag):
+            slow = [lag, one + lag * damping, damping] if n else [lag, one]
+        denominator = xp.stack([*slow, *[zero] * (n - 1)])
         return TransferFunction(gain[None], denominator, self.delay)
 
 

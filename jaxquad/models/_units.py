@@ -1,6 +1,6 @@
 import dataclasses
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from jaxtyping import PyTree
@@ -19,6 +19,9 @@ Unit = str | Callable[[PyTree, int], Scale]  # by the model, and by the index wi
 def unit(declared: Unit) -> dict[str, Unit]:
     """The metadata of a field whose numbers have this unit."""
     return {"unit": declared}
+
+
+OPTIONAL = {"optional": True}  # metadata of a field that is no term of the model while it is 0
 
 
 _NAME = re.compile(r"([A-Za-z_][\w.]*)(?:\[(\d+)\])?.*")
@@ -42,18 +45,28 @@ def parameter_units(
     return tuple(_unit_of(model, name, output, input) for name in names)
 
 
-def _unit_of(model: PyTree, name: str, output: str, input: str) -> str:
+def is_optional(model: PyTree, name: str) -> bool:
+    """Whether a number of a model is no term of it while it is 0, as its field declares."""
+    return bool(_declared(model, name)[1].get("optional"))
+
+
+def _declared(model: PyTree, name: str) -> tuple[PyTree, Mapping]:
+    """The part of a model that has a number, and the metadata of its field there."""
     found = _NAME.fullmatch(name)
     *owners, leaf = found[1].split(".") if found else ("",)
     for owner in owners:
         model = vars(model).get(owner) if dataclasses.is_dataclass(model) else None
-    if not dataclasses.is_dataclass(model):
-        return ""
-    declared = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(model)}
-    kind = declared.get(leaf, "")
+    fields = dataclasses.fields(model) if dataclasses.is_dataclass(model) else ()
+    return model, {field.name: field.metadata for field in fields}.get(leaf, {})
+
+
+def _unit_of(model: PyTree, name: str, output: str, input: str) -> str:
+    owner, declared = _declared(model, name)
+    kind = declared.get("unit", "")
     if isinstance(kind, str):
         return kind
-    scale = kind(model, int(found[2] or 0) if found else 0)
+    found = _NAME.fullmatch(name)
+    scale = kind(owner, int(found[2] or 0) if found else 0)
     if scale.of_ratio:
         return f"{_over_seconds(output, scale.power)} per {input}"
     return _over_seconds("1", scale.power) if scale.power else ""

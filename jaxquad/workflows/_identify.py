@@ -124,7 +124,7 @@ class Identification:
     @property
     def formula(self) -> str:
         """The structure of the model in words."""
-        return model_formula(self.settings)
+        return model_formula(self.settings, damped="damping" in self.fit.names)
 
     @ft.cached_property
     def combinations(self) -> tuple[Combination, ...]:
@@ -342,14 +342,16 @@ def _fitted_again(found: Identification) -> dict[str, Bands | Explanation | None
     return {"bands": fit.bands(), "explanation": fit.explain() if wanted else None}
 
 
-def model_formula(settings: IdentifySettings) -> str:
+def model_formula(settings: IdentifySettings, *, damped: bool = False) -> str:
     """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
     n = settings.integrators
     [output], [source] = mix_of(settings.output), mix_of(settings.input)
     if settings.poles is not None:
         kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
         return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
-    powers = [] if n == 0 else ["s"] if n == 1 else [f"s^{n}"]
+    pure = n - damped
+    powers = [] if pure == 0 else ["s"] if pure == 1 else [f"s^{pure}"]
+    powers += ["(s + damping)"] if damped else []
     below = powers + (["(lag s + 1)"] if settings.lag else [])
     above = "K e^(-delay s)" if settings.delay else "K"
     product = " ".join(below)
