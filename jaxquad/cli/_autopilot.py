@@ -34,7 +34,7 @@ def _add(declared: argparse.ArgumentParser) -> None:
     add_config(declared)
     add_settings(declared, AutopilotSettings)
     output = add_output(declared)
-    add_out(output, "autopilot/ in results/NAME of the file")
+    add_out(output, "autopilot/ in results/NAME of the file, autopilot_AXIS/ of one axis")
     add_force(output)
     add_json(output, "autopilot.json")
     add_quiet(output)
@@ -43,7 +43,8 @@ def _add(declared: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     settings = settings_of(options, AutopilotSettings)
     require_file(options.file)
-    folder = options.out or default_folder(options.file) / "autopilot"
+    name = "autopilot" if settings.axis == "all" else f"autopilot_{settings.axis}"
+    folder = options.out or default_folder(options.file) / name
     return run_autopilot(options, lambda: options.file, settings, folder)
 
 
@@ -88,7 +89,7 @@ AUTOPILOT = Command(
     "autopilot",
     "tune the gains of the autopilot that flew a log, and write its parameter file",
     """examples:
-  jaxquad autopilot flight.bbl --axis roll
+  jaxquad autopilot flight.bbl
   jaxquad autopilot flight.ulg --axis pitch --sensitivity 1.6 --noise 1
   jaxquad autopilot flight.bbl --axis roll --law adrc
 

@@ -4,6 +4,7 @@ from ._autopilot._adrc import (
 )
 from ._autopilot._adrc_result import ADRCAutopilot as ADRCAutopilot
 from ._autopilot._adrc_stages import ADRCStage as ADRCStage, ADRCTargets as ADRCTargets
+from ._autopilot._axes_proposal import AxesProposal as AxesProposal
 from ._autopilot._proposal import AutopilotProposal as AutopilotProposal
 from ._autopilot._run import autopilot as autopilot
 from ._batch._jobs import Job as Job

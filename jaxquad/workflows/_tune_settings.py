@@ -113,8 +113,11 @@ class AutopilotSettings(Settings):
     **Raises:** `SettingsError` (a ValueError) for values that cannot be.
     """
 
-    axis: str | None = option_field(
-        kinds.AXIS, None, "the axis to tune; by default the one that was excited", group=THE_RECORD
+    axis: str = option_field(
+        kinds.ONE_OR_ALL_AXES,
+        "all",
+        "the axis to tune; all by default, with one file of parameters",
+        group=THE_RECORD,
     )
     start: float | None = option_field(
         kinds.TIME, None, "first time to use, in the file's time", group=THE_RECORD

@@ -2,22 +2,15 @@
 
 import dataclasses
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, plain_content, write_file
-from jaxquad.control.autopilots import find_parameter
-from jaxquad.export import (
-    change_table,
-    parameter_file,
-    ParameterChange,
-    propose_changes,
-    write_parameter_files,
-)
+from jaxquad._core import announce, plain_content
+from jaxquad.export import change_table, ParameterChange
 from jaxquad.records import AXES
-from jaxquad.report import provenance, write_json, write_pilot_page
+from jaxquad.report import Provenance, provenance, write_json, write_pilot_page
 
 from .._identify import Identification
 from .._tune_settings import AutopilotSettings
@@ -28,12 +21,13 @@ from ._loop_check import LoopCheck
 from ._over_throttle import ThrottleVerdict
 from ._pilot_page import pilot_page
 from ._plants import PlantSource
+from ._proposed_parameters import ProposedParameters
 from ._rate_design import FilterVerdict, Kind
 from ._stages import Stage
 
 
-_THIRD, _ALL = 1 / 3, 1.0
-_STEM, _CURVE = "proposal", "thrust_curve"
+_CURVE = "thrust_curve"
+_SHORT = ("RLL", "PIT", "YAW")  # of ArduPilot's parameters of one axis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,11 +82,26 @@ class AutopilotProposal:
         return self.flown.old | filters | around
 
     @property
+    def parameters(self) -> ProposedParameters:
+        """Old and new values by the firmware's names."""
+        at_once = () if self.filters is None else self.filters.at_once
+        return ProposedParameters(
+            self.flown.firmware, self.flown.version, self.old, dict(self.new), self._reasons,
+            at_once,
+        )  # fmt: skip
+
+    @property
+    def shared_filters(self) -> dict[str, float]:
+        """New filters that the other axes have, too."""
+        if self.filters is None or not self.new:
+            return {}
+        own = f"_{_SHORT[self.flown.axis]}_"
+        return {name: self.new[name] for name in self.filters.flown if own not in name}
+
+    @property
     def changes(self) -> tuple[ParameterChange, ...]:
         """From what flew to the proposal."""
-        return propose_changes(
-            self.flown.firmware, self.old, self.new, reasons=self._reasons, beyond=list(self.new)
-        )
+        return self.parameters.changes
 
     @property
     def _reasons(self) -> dict[str, str]:
@@ -157,27 +166,22 @@ class AutopilotProposal:
         **Returns:** their paths.
         """
         announce("parameter files")
-        folder, flown = Path(folder), self.flown
-        known = {k: v for k, v in self.settings.content().items() if v is not None}
-        log = self.identification.path
-        words = ["jaxquad", "autopilot", str(log), *self.settings.words()]
-        origin = provenance(log, command=shlex.join(words), settings=known)
+        folder, origin = Path(folder), self.provenance(self.settings)
         stored = write_json(
             folder / "autopilot.json", self.content() | {"provenance": origin.content()}
         )
         announce("the page")
         page = write_pilot_page(folder / "autopilot.html", pilot_page(self, origin))
-        beside = [page, stored, *self._write_curve(folder)]
-        if self.kind != "proposed":
-            return [*beside, self._write_flown(folder)]
-        files = write_parameter_files(
-            folder, flown.firmware, self.old, self.new, stem=_STEM, shares=(_THIRD, _ALL),
-            reasons=self._reasons, beyond=list(self.new), version=flown.version or (2025, 12),
-            at_once=() if self.filters is None else self.filters.at_once, profile=None,
-        )  # fmt: skip
-        return [*beside, *files.stages, files.revert, files.table]
+        return [page, stored, *self.write_curve(folder), *self.parameters.write(folder)]
 
-    def _write_curve(self, folder: Path) -> list[Path]:
+    def provenance(self, settings: AutopilotSettings) -> Provenance:
+        """Of a result with these settings."""
+        known = {k: v for k, v in settings.content().items() if v is not None}
+        log = self.identification.path
+        words = ["jaxquad", "autopilot", str(log), *settings.words()]
+        return provenance(log, command=shlex.join(words), settings=known)
+
+    def write_curve(self, folder: Path) -> list[Path]:
         """The thrust curve's parameter and what flew of it, never in a file with gains."""
         curve = None if self.throttle is None else self.throttle.curve
         if curve is None or curve.change is None:
@@ -187,30 +191,11 @@ class AutopilotProposal:
             "_revert": f"the {curve.name} that flew",
         }
         return [
-            self._write_text(f"{_CURVE}{end}", [curve.change], title, folder, revert=bool(end))
+            self.parameters.write_one(
+                f"{_CURVE}{end}", [curve.change], title, folder, revert=bool(end)
+            )
             for end, title in titles.items()
         ]
-
-    def _write_flown(self, folder: Path) -> Path:
-        flown = self.flown
-        same = [
-            ParameterChange(find_parameter(flown.firmware, name), value, value)
-            for name, value in self.old.items()
-        ]
-        return self._write_text(f"{_STEM}_revert", same, "what flew", folder, revert=True)
-
-    def _write_text(
-        self, stem: str, changes: Sequence[ParameterChange], title: str, folder: Path, *,
-        revert: bool,
-    ) -> Path:  # fmt: skip
-        flown = self.flown
-        raised = [AXES[flown.axis]] if f"d_max_{AXES[flown.axis]}" in self.old else []
-        text = parameter_file(
-            flown.firmware, changes, revert=revert, version=flown.version or (2025, 12),
-            raised=raised, title=title, profile=None,
-        )  # fmt: skip
-        suffix = {"betaflight": "txt", "px4": "params", "ardupilot": "param"}[flown.firmware]
-        return write_file(folder / f"{stem}.{suffix}", text)
 
     def __str__(self) -> str:
         flown = self.flown

@@ -90,10 +90,16 @@ def design_gains(
     flown: FlownAutopilot,
     flight: FlightChannels | None,
     throttle: ThrottleVerdict,
+    filters: Mapping[str, float],
 ) -> Design:
-    """Search gains, and filters where the log shows the gyro's noise; certify the rounded ones."""
+    """Search gains, and filters where the log shows the gyro's noise; certify the rounded ones.
+
+    With `filters` that another axis has changed, these stay, and gains alone are searched.
+    """
     work = _Work(settings, found, flown, throttle)
     noise, why = _noise_of(settings, flown, flight, work)
+    if filters:
+        return _design_behind(dataclasses.replace(work, noise=noise), filters)
     work = dataclasses.replace(work, noise=noise)
     loops, targets = work.loops(settings.members, 0), work.targets
     bank = work.bank(loops)
@@ -121,6 +127,27 @@ def design_gains(
             break
         loops = loops.joined(design.loops[-1].worst(design.gains[-1][None], _WORST))
     return Design(kind, text, design.stages, design.new, verdict, noise)
+
+
+def _design_behind(work: "_Work", filters: Mapping[str, float]) -> Design:
+    """Gains alone, behind filters that another axis has changed."""
+    flown, settings = work.flown, work.settings
+    loops, gains = work.loops(settings.members, 0), None
+    for attempt in range(1, _CERTIFICATES + 1):
+        behind = work.filtered(loops, filters)
+        announce(f"searching gains on {len(loops.plants)} plants")
+        search = Search(behind, work.before, work.targets, flown.firmware, flown.axis, None, loops)
+        gains = search.gains(gains)
+        parameters = parameters_of(flown.law, flown.axis, gains)
+        design = work.certified(work.fresh(attempt), parameters, filters)
+        kind, text = _judge(design.stages, settings, work.found.band[1], None, work.throttle)
+        if kind != "not to be flown":
+            break
+        loops = loops.joined(work.fresh(attempt).worst(design.gains[-1][None], _WORST))
+    before = work.flown_filters(filters)
+    listed = ", ".join(filters)
+    verdict = FilterVerdict(f"{listed} as changed for another axis", before, "for another axis")
+    return Design(kind, text, design.stages, design.new, verdict, work.noise)
 
 
 class _Certified(NamedTuple):
@@ -217,7 +244,7 @@ class _Work:
         loops = [grouped(dataclasses.replace(each, ceiling=ceiling) for each in fresh.groups)]
         for way in ways:
             parts = {name: way[name] for name in filters}
-            loops.append(self._filtered(loops[0], parts) if filters else loops[0])
+            loops.append(self.filtered(loops[0], parts) if filters else loops[0])
         designs = [self.before, *(gains_in(law, axis, way) for way in ways)]
         stages = certify_gains(loops, designs)
         angle = self.flown.angle
@@ -247,7 +274,7 @@ class _Work:
                 return float(value)
         return float(values[-1])
 
-    def _filtered(self, flown: RateLoops, filters: Mapping[str, float]) -> RateLoops:
+    def filtered(self, flown: RateLoops, filters: Mapping[str, float]) -> RateLoops:
         """The loops with other filters, at each throttle."""
         laws = [each.with_filters(filters) for each in self._flown_there]
         return grouped(

@@ -170,9 +170,11 @@ class Search:
     def __init__(
         self, loops: RateLoops, flown: Float[np.ndarray, " gains"], targets: Targets,
         firmware: Firmware, axis: int, bank: FilterBank | None = None,
+        before: RateLoops | None = None,
     ):  # fmt: skip
+        """`before` are the loops of what flew, where `loops` are behind other filters."""
         self.loops, self.flown, self.targets, self.bank = loops, flown, targets, bank
-        self.noise = loops.qualities(flown[None]).noise
+        self.noise = (before or loops).qualities(flown[None]).noise
         self.through = loops.paths(flown[None])[0]
         self.free = np.flatnonzero(flown > 0)
         self.rows = [gain_row(firmware, axis, FIELDS[k]) for k in self.free]

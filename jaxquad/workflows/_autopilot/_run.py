@@ -1,10 +1,11 @@
 """From the log of an autopilot to parameters for it: read, identify, reproduce, tune."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 from jaxquad._core import announce
-from jaxquad.records import Proposal
+from jaxquad.records import AXES, Proposal
 
 from .._identify import identify_plant
 from .._kinds import SettingsError
@@ -13,6 +14,7 @@ from .._settings import IdentifySettings
 from .._tune_settings import AutopilotSettings
 from ._adrc_flight import flew_adrc, tune_adrc
 from ._adrc_result import ADRCAutopilot
+from ._axes_proposal import AxesProposal
 from ._flight_channels import FlightChannels, read_channels_if_any
 from ._flown_autopilot import FlownAutopilot, read_flown, settings_of
 from ._law_check import check_law
@@ -21,30 +23,33 @@ from ._over_throttle import study_throttle
 from ._proposal import AutopilotProposal
 from ._rate_design import design_gains
 from ._rate_gains import gyro_chains
+from ._recipe import what_to_fly
 
 
 def autopilot(
     path: str | Path, settings: AutopilotSettings | None = None
-) -> AutopilotProposal | ADRCAutopilot:
+) -> AutopilotProposal | AxesProposal | ADRCAutopilot:
     """Tune the gains of the autopilot that flew a log, as `jaxquad autopilot` does.
 
-    Gains and filters are read from the log, the plant is identified in the firmware's own units up
-    to what the gyro's filters are given, and the loop of both has to reproduce the flight. P, I and
-    D of the rate loop are searched over the plants that the fit leaves uncertain: least rate after
-    a step of torque, with limits on the peak of |S|, on the command's noise and on the crossover,
-    which stays in the identified band. Where the log shows the gyro's noise, cutoffs and notches
-    are searched with them. The rounded numbers are certified on fresh plants, as is a third of the
-    way. Where the log holds several levels of throttle, plants have the gain that it shows at each
-    of them. Feed-forward and the angle loop stay as they are. Loops are taken as linear: no limit
-    of the motors is simulated. Source: docs/autopilots.md.
+    Gains and filters are read from the log, and the law is replayed on its set-point and gyro to
+    tell whether they flew. The plant is identified in the firmware's own units up to what the
+    gyro's filters are given, and both are flown again in time. P, I and D of the rate loop are
+    searched over the plants that the fit leaves uncertain: least rate after a step of torque, with
+    limits on the peak of |S|, on the command's noise and on the crossover, which stays in the
+    identified band. Where the log shows the gyro's noise, cutoffs and notches are searched with
+    them. The rounded numbers are certified on fresh plants, as is a third of the way: with the
+    integral as set and held, and with the angle loop around the rate loop, whose gain is lowered
+    where it spoils that. Where the log holds several levels of throttle, plants have the gain that
+    it shows at each of them. Source: docs/autopilots.md.
 
     **Arguments:**
 
     - `path`: a log of Betaflight, PX4 or ArduPilot.
     - `settings`: the axis, and what is kept.
 
-    **Returns:** an `AutopilotProposal`, or an `ADRCAutopilot` where the ADRC flew or is asked for
-    by `law`; nothing is written before its `.write(folder)`.
+    **Returns:** an `AxesProposal` of all axes that the log holds, an `AutopilotProposal` where
+    `axis` names one, or an `ADRCAutopilot` where the ADRC flew or is asked for by `law`; nothing is
+    written before its `.write(folder)`.
 
     **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
     ValueError for one without the parameters of the loop.
@@ -65,23 +70,58 @@ def autopilot(
         raise SettingsError(f"`law` is pid, but the ADRC flew {path} (pid_type): leave it out")
     if adrc or settings.law == "adrc":
         return tune_adrc(path, asked, proposal, settings)
+    if settings.axis == "all":
+        return _tune_axes(path, settings)
+    return _tune_axis(path, settings, asked, proposal)
+
+
+def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
+    """One axis after the other; filters that they share are those of the first that changes them.
+
+    Raises the error of the first axis where none can be read.
+    """
+    axes: dict[str, AutopilotProposal] = {}
+    errors: dict[str, ValueError] = {}
+    filters: Mapping[str, float] = {}
+    for axis in AXES:
+        announce(f"{axis}:")
+        one = dataclasses.replace(settings, axis=axis)
+        try:
+            axes[axis] = _tune_axis(path, one, *_channels_of(path, one), filters)
+        except ValueError as error:  # the log lacks what this axis needs
+            errors[axis] = error
+            continue
+        filters = filters or axes[axis].shared_filters
+    if not axes:
+        raise next(iter(errors.values()))
+    return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
+
+
+def _tune_axis(
+    path: Path, settings: AutopilotSettings, asked: IdentifySettings, proposal: Proposal,
+    filters: Mapping[str, float] | None = None,
+) -> AutopilotProposal:  # fmt: skip
+    """The gains of one axis, with `filters` that are changed already."""
     announce("gains and filters that flew")
     flown, flight = _read_flight(path, asked, proposal, settings)
-    found = identify_plant(path, asked, proposal, gyro_chains(flown.law))
-    known = (settings, found, flown)
+    plant = identify_plant(path, asked, proposal, gyro_chains(flown.law))
+    known = (settings, plant, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
-    if not found.fit.identifiable:
-        return unsure(f"this log cannot tell: {found.fit.verdict.summary}; {_FLY}", None)
+    recipe = what_to_fly(flown.firmware, AXES[flown.axis])
+    if not plant.fit.identifiable:
+        summary = plant.fit.verdict.summary
+        return unsure(f"this log cannot tell: {summary}. {recipe}", None)
     if flight is None:
         return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")
     law = check_law(flown.loop, flown.axis, flight)
-    again = check_loop(found, flown, flight, law)
+    again = check_loop(plant, flown, flight, law)
+    if again.kind == "unknown":
+        return unsure(f"this log cannot tell: {again.verdict}. {recipe}", again)
     if again.kind != "flown":
-        why = again.verdict
-        return unsure(why if again.kind == "unknown" else f"this log cannot tell: {why}", again)
-    throttle = study_throttle(found, proposal, flown)
-    made = design_gains(settings, found, flown, flight, throttle)
+        return unsure(f"this log cannot tell: {again.verdict}", again)
+    throttle = study_throttle(plant, proposal, flown)
+    made = design_gains(settings, plant, flown, flight, throttle, filters or {})
     return AutopilotProposal(
         made.kind, made.verdict, *known, again, made.stages,
         made.new if made.kind == "proposed" else {}, made.filters, made.noise, flight, throttle,
@@ -92,14 +132,14 @@ _NO_SETPOINT = (
     "this log cannot tell: it holds no set-point of the rate beside the gyro, so nothing says "
     "whether these gains flew: log both"
 )
-_FLY = "fly a chirp of the rate set-point, or strong and quick stick on this axis, for 20 s or more"
 
 
 def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
     """What the log itself says is command, rate and reference."""
     asked = IdentifySettings(
-        axis=settings.axis, start=settings.start, stop=settings.stop, band=settings.band
-    )
+        axis=None if settings.axis == "all" else settings.axis,
+        start=settings.start, stop=settings.stop, band=settings.band,
+    )  # fmt: skip
     found, proposal = propose_settings(path, asked)
     if proposal is None:
         raise SettingsError(f"{path} proposes no channels: give the log of an autopilot")
