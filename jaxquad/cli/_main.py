@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from jaxquad._core import allowed_second_process
+from jaxquad._core import allowed_second_process, is_ours
 from jaxquad.records import RecordWarning
 from jaxquad.workflows import in_options
 
@@ -121,8 +121,10 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _print_warning(message: Warning | str, *_: object) -> None:
-    print("!", *in_options(str(message)).split(), file=sys.stderr)
+def _print_warning(message: Warning | str, kind: type[Warning], *_: object) -> None:
+    """One of the package; what NumPy or JAX warn of is no word to a user."""
+    if is_ours(kind):
+        print("!", *in_options(str(message)).split(), file=sys.stderr)
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -1,3 +1,4 @@
+from ._attempt import attempt as attempt, reason_of as reason_of
 from ._fit import compare_fits as compare_fits
 from ._page import (
     Cell as Cell,
