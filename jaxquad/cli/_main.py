@@ -11,6 +11,7 @@ from importlib.metadata import version
 
 from jaxquad._core import allowed_second_process, is_ours
 from jaxquad.records import RecordWarning
+from jaxquad.report import PageWarning
 from jaxquad.workflows import in_options
 
 from ._autopilot import AUTOPILOT
@@ -82,7 +83,8 @@ def _run(words: Sequence[str]) -> int:
     if unknown:
         return _fail(_describe_unknown(options, unknown), _UNUSABLE)
     with warnings.catch_warnings(), shown_stages(options), allowed_second_process():
-        warnings.simplefilter("always", RecordWarning)
+        for kind in (RecordWarning, PageWarning):
+            warnings.simplefilter("always", kind)
         warnings.showwarning = _print_warning
         check_out(options)
         return options.run(options)

@@ -11,6 +11,10 @@ Part = TypeVar("Part")
 FAILED = "failed"  # key of the reason, in what templates show instead of a section
 
 
+class PageWarning(UserWarning):
+    """A figure beside a page could not be drawn; the rest is written."""
+
+
 def reason_of(error: Exception) -> str:
     """Why something could not be computed: the text of our errors, with the kind of all others."""
     text = " ".join(str(error).split())

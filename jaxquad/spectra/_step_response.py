@@ -178,8 +178,8 @@ def estimate_step(
     bottom = np.maximum(power + noise, 1e-300)
     answers = [answer]
     if simulated is not None:
-        output = record.channel(names[1])
-        answers.append(_simulated_spectra(output, simulated, size, drift) * moves)
+        measured = record.channel(names[1])
+        answers.append(_simulated_spectra(measured, simulated, size, drift) * moves)
     transfers = [np.sum(np.conj(source) * each, axis=0) / bottom for each in answers]
     time, steps = _integrate(np.stack([power / bottom + 0j, *transfers]), size, dt, length)
     errors = [_errors(source, *each, bottom) for each in zip(answers, transfers, strict=True)]
