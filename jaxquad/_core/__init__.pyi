@@ -64,6 +64,7 @@ from ._members import (
     mark_members as mark_members,
     per_member as per_member,
 )
+from ._ours import is_ours as is_ours
 from ._process import (
     enable_x64 as enable_x64,
     keep_freed_memory as keep_freed_memory,

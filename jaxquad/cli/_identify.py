@@ -102,7 +102,8 @@ def finish_identification(
     with stdout_for_json(options):
         print(in_options(str(found)), flush=True)
         path = found.write(folder_to_write(options, folder, "result.json", same, sources))
-        names = ", ".join(["report.html", *found.figure_names])
+        drawn = [name for name in found.figure_names if path.with_name(name).exists()]
+        names = ", ".join(["report.html", *drawn])
         print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
     if options.json:
         print(path.read_text(), end="")

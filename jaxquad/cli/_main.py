@@ -9,8 +9,9 @@ import warnings
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from jaxquad._core import allowed_second_process
+from jaxquad._core import allowed_second_process, is_ours
 from jaxquad.records import RecordWarning
+from jaxquad.report import PageWarning
 from jaxquad.workflows import in_options
 
 from ._autopilot import AUTOPILOT
@@ -83,7 +84,8 @@ def _run(words: Sequence[str]) -> int:
     if unknown:
         return _fail(_describe_unknown(options, unknown), _UNUSABLE)
     with warnings.catch_warnings(), shown_stages(options), allowed_second_process():
-        warnings.simplefilter("always", RecordWarning)
+        for kind in (RecordWarning, PageWarning):
+            warnings.simplefilter("always", kind)
         warnings.showwarning = _print_warning
         check_out(options)
         return options.run(options)
@@ -122,8 +124,10 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _print_warning(message: Warning | str, *_: object) -> None:
-    print("!", *in_options(str(message)).split(), file=sys.stderr)
+def _print_warning(message: Warning | str, kind: type[Warning], *_: object) -> None:
+    """One of the package; what NumPy or JAX warn of is no word to a user."""
+    if is_ours(kind):
+        print("!", *in_options(str(message)).split(), file=sys.stderr)
 
 
 def make_parser() -> argparse.ArgumentParser:

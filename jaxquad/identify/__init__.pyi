@@ -51,6 +51,10 @@ from ._known_loop import (
     KnownController as KnownController,
     SampledFeedback as SampledFeedback,
 )
+from ._measured_chain import (
+    measured_chain as measured_chain,
+    MeasuredChain as MeasuredChain,
+)
 from ._noise_model import (
     ARMA as ARMA,
     AutoRegressive as AutoRegressive,

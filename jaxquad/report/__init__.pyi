@@ -1,3 +1,8 @@
+from ._attempt import (
+    attempt as attempt,
+    PageWarning as PageWarning,
+    reason_of as reason_of,
+)
 from ._fit import compare_fits as compare_fits
 from ._page import (
     Cell as Cell,

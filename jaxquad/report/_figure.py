@@ -18,6 +18,8 @@ from matplotlib.lines import Line2D
 
 from jaxquad.plot import headless, Panels, visible
 
+from ._attempt import reason_of
+
 
 Section = dict[str, Any]  # what a template of the page shows
 
@@ -40,6 +42,7 @@ class Image(NamedTuple):
     ratio: tuple[str, str] | None = None  # output and input, in front of the caption
     curves: str = "[]"  # JSON: what a pointer reads on each panel
     is_map: bool = False  # its colours are a scale, which a dark page must not invert
+    failure: str = ""  # why it could not be drawn
 
 
 def embed_figure(
@@ -50,7 +53,23 @@ def embed_figure(
     ratio: tuple[str, str] | None = None,
     is_map: bool = False,
 ) -> Image:
-    """What `draw()` returns as an image. Texts in it are drawn as they are, dollar signs too."""
+    """What `draw()` returns as an image. Texts in it are drawn as they are, dollar signs too.
+
+    Where that cannot be drawn, the page says why in its place.
+    """
+    try:
+        return _embedded(draw, alt, caption, ratio, is_map)
+    except Exception as error:
+        return Image(alt, "", "", "", failure=reason_of(error))
+
+
+def _embedded(
+    draw: Callable[[], Panels | Figure],
+    alt: str,
+    caption: str,
+    ratio: tuple[str, str] | None,
+    is_map: bool,
+) -> Image:
     settings = {"svg.hashsalt": "jaxquad", "svg.fonttype": "path", "text.parse_math": False}
     silent = warnings.catch_warnings()
     with headless(), silent, rc_context(settings):  # pyright: ignore[reportArgumentType]

@@ -9,6 +9,7 @@ from jaxquad.control.autopilots import FilterChain
 from jaxquad.identify import GainBand
 from jaxquad.plot import Spectrum, StepBand, ThrottleCurve
 
+from ._attempt import attempt, FAILED
 from ._page import Headline, render_page, Table
 from ._provenance import Provenance, provenance_section
 
@@ -50,6 +51,8 @@ class PilotPage:
     - `motors`: rows of name and shares of samples at the lowest and the highest command.
     - `stages`, `changes`: tables.
     - `unit`: of the command.
+    - `failures`: why a section could not be computed, by its name (a key of the page's sections:
+      "changes", "filters", "noise", "steps", "b0", "balance"); the reason stands in its place.
     """
 
     title: str
@@ -69,13 +72,14 @@ class PilotPage:
     text: str = ""
     unit: str = ""
     provenance: Provenance | None = None
+    failures: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
     """Write one self-contained HTML page on a proposal for an autopilot, whole or not at all.
 
     It is made as `jaxquad.report.write_report` makes its page: figures inside it, nothing fetched,
-    texts from a log escaped.
+    texts from a log escaped, and a section or a figure that cannot be computed says why.
 
     **Arguments:**
 
@@ -85,14 +89,17 @@ def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
     **Returns:** the path.
     """
     # The caller has compiled what filters are drawn from: it waits for them first.
-    begun = {name: beside(_draw, name, page) for name in ("noise", "steps", "b0", "balance")}
-    begun = {"filters": beside(_draw, "filters", page)} | begun
+    draw = lambda name: beside(attempt, _draw, name, page)
+    begun = {name: draw(name) for name in ("noise", "steps", "b0", "balance")}
+    begun = {"filters": draw("filters")} | begun
+    origin = page.provenance
     sections = {
         "changes": {"changes": page.changes, "stages": page.stages},
         **{name: section.get() for name, section in begun.items()},
         "text": {"text": page.text} if page.text else None,
-        "provenance": None if page.provenance is None else provenance_section(page.provenance),
+        "provenance": None if origin is None else attempt(provenance_section, origin),
     }
+    sections |= {name: {FAILED: reason} for name, reason in page.failures.items()}
     text = render_page(
         "pilot.html",
         title=f"{page.headlines[0].word}: {page.title}",

@@ -13,6 +13,7 @@ from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 from ._answers import answer_section
+from ._attempt import attempt
 from ._fit import identifiability_section, parameter_section
 from ._page import Headline, render_page
 from ._provenance import Provenance, provenance_section
@@ -56,7 +57,8 @@ def write_report(
     results, and records at the end. Figures are inside the page; under a pointer they show the
     numbers of their curves, and they can be enlarged. The script that does this is part of the
     page, and the page's policy lets no other run. Nothing is fetched from elsewhere, and every text
-    from a log is escaped.
+    from a log is escaped. A section or a figure that cannot be computed says why; the rest is
+    written.
 
     **Arguments:**
 
@@ -95,12 +97,14 @@ def write_report(
     names = (first.output_names[0], first.input_names[0])
     begun = {} if tuned is None else _begin_tuned(tuned, flights or {})
     begun |= shown.begin() if drawn is None else {}
-    begun |= {"verification": begin(check_section, found)} if found else {}
+    begun |= {"verification": begin(attempt, check_section, found)} if found else {}
+    record_asked = next(iter(shown.records.values()), None)
+    texts = attempt(parameter_section, fit, derived, beside or {}) if fit.verdict.fitted else None
     sections = {
-        "answers": answer_section(fit, first, next(iter(shown.records.values()), None), found),
-        "parameters": parameter_section(fit, derived, beside or {}) if fit.verdict.fitted else None,
-        "identifiability": identifiability_section(fit),
-        "provenance": provenance_section(provenance) if provenance is not None else None,
+        "answers": attempt(answer_section, fit, first, record_asked, found),
+        "parameters": texts,
+        "identifiability": attempt(identifiability_section, fit),
+        "provenance": attempt(provenance_section, provenance) if provenance is not None else None,
         **(drawn or {}),
     } | {name: section.get() for name, section in begun.items()}
     text = render_page(
@@ -121,7 +125,7 @@ def _begin_tuned(
 ) -> dict[str, Later]:
     from ._tuned import tuned_section
 
-    return {"tuned": begin(tuned_section, tuned, flights)}
+    return {"tuned": begin(attempt, tuned_section, tuned, flights)}
 
 
 def fit_headline(fit: Fit, remarks: int) -> Headline:

@@ -9,6 +9,7 @@ from jaxquad.models import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
+from ._attempt import attempt
 from ._loop import loop_section
 from ._record import record_section
 from ._response import response_section
@@ -41,15 +42,15 @@ class Shown(NamedTuple):
         """Each section, which a second process draws where a command has one."""
         first, flown = self.first, self.flown
         sections: dict[str, Later] = {
-            "response": begin(response_section, self.frfs, self.models, self.others)
+            "response": begin(attempt, response_section, self.frfs, self.models, self.others)
         }
         if flown is not None:
-            sections["step"] = begin(step_section, self.fit, first, flown)
-            sections["loop"] = begin(loop_section, first, flown)
+            sections["step"] = begin(attempt, step_section, self.fit, first, flown)
+            sections["loop"] = begin(attempt, loop_section, first, flown)
         if (record := flown if self.spectrum is None else self.spectrum) is not None:
-            sections["spectrum"] = begin(spectrum_section, first, record)
+            sections["spectrum"] = begin(attempt, spectrum_section, first, record)
         if self.records:
-            sections["record"] = begin(record_section, self.records)
+            sections["record"] = begin(attempt, record_section, self.records)
         return sections
 
 

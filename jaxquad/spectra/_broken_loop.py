@@ -115,12 +115,13 @@ def estimate_broken_loop(
     answer = output or record.output_names[0]
     answer = answer if entry == "set-point" else input or record.input_names[0]
     omega, closed, error, coherence = _closed(record, source, answer, band)
+    kept = (coherence >= _COHERENT) & (closed != 0) & (closed != 1)
+    omega, closed, error, coherence = (x[kept] for x in (omega, closed, error, coherence))
     if entry == "set-point":
         loop, size = closed / (1 - closed), error / np.abs(1 - closed)
     else:
         loop, size = 1 / closed - 1, error / np.abs(1 - closed)
-    kept = (coherence >= _COHERENT) & np.isfinite(size) & (loop != 0)
-    return BrokenLoop(omega[kept], loop[kept], size[kept], coherence[kept])
+    return BrokenLoop(omega, loop, size, coherence)
 
 
 def _closed(
@@ -142,8 +143,8 @@ def _closed(
     ]
     rows = [row for row in rows if row.size]
     found = [_average(one[:, row], other[:, row], fine[row]) for row in rows]
-    omega, closed, error, coherence = (np.array(each) for each in zip(*found, strict=True))
-    return omega, closed, error, coherence
+    table = np.array(found, complex).reshape(-1, 4).T
+    return table[0].real, table[1], table[2].real, table[3].real
 
 
 def _average(
@@ -151,9 +152,9 @@ def _average(
 ) -> tuple[float, complex, float, float]:
     """Over windows and neighbours, at the frequency where the reference has its power."""
     each = np.abs(one) ** 2
-    power = np.maximum(np.sum(each), 1e-300)
+    power = np.maximum(np.sum(each), 1e-150)
     cross = np.sum(np.conj(one) * other)
-    whole = np.maximum(np.sum(np.abs(other) ** 2), 1e-300)
+    whole = np.maximum(np.sum(np.abs(other) ** 2), 1e-150)
     # Windows that overlap, and neighbours of tapered spectra, are half as many as they seem.
     count = max(power**2 / np.maximum(np.sum(each**2), 1e-300) / 2, 1.0)
     raw = np.abs(cross) ** 2 / (power * whole)

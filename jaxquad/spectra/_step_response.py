@@ -13,9 +13,11 @@ _WINDOWS = 12  # that a record is cut into, at least, for the default length
 _LONGEST = 3.0  # s, of the default length
 _FEWEST = 5  # windows, with which coherence says something
 _NEAR = 3  # neighbours to either side over which coherence is averaged
+_WIDTH = 2 * _NEAR + 1
 _CHANCE = 1e-4  # that noise alone is called coherent at a frequency
 _LEAKED = 1e-6  # of the largest power: what leaks that far through the taper
 _ACTIVE = 0.2  # of the most active window's reference, by rms, from which a window counts
+_RESTS = 0.01  # of that, below which a reference rests, as on the ground: such a window is left out
 _END = 0.2  # of the length, over which the final value is taken
 _SETTLED = 0.05  # of the final value
 _DOUBT = 0.1  # of the final value, by which error, drift and blur may change it
@@ -78,6 +80,8 @@ class StepResponse(NamedTuple):
         """Why the log cannot tell the step response, or a part of it; none if it can."""
         doubts = []
         count, end = len(self.windows), self._end
+        if self.final == 0:
+            return (f"{self.names[0]} or {self.names[1]} rests: fly steps of it, or a sweep",)
         if count < _FEWEST:
             doubts.append(
                 f"the reference is active in {count} of {self.total} windows, and {_FEWEST} are "
@@ -167,19 +171,21 @@ def estimate_step(
     names = _names(record, reference, output)
     length, dt = default_length(record) if length is None else float(length), record.dt
     size = _window_size(record, length)
-    source, answer = (_spectra(record.channel(name), size) for name in names)
+    moves = _moves(record.channel(names[0]), size, _RESTS)[:, None]
+    source, answer = (_spectra(record.channel(name), size) * moves for name in names)
     noise = _noise_over_response(source, answer)
     power = np.sum(np.abs(source) ** 2, axis=0)
     bottom = np.maximum(power + noise, 1e-300)
     answers = [answer]
     if simulated is not None:
-        answers.append(_simulated_spectra(record.channel(names[1]), simulated, size, drift))
+        measured = record.channel(names[1])
+        answers.append(_simulated_spectra(measured, simulated, size, drift) * moves)
     transfers = [np.sum(np.conj(source) * each, axis=0) / bottom for each in answers]
     time, steps = _integrate(np.stack([power / bottom + 0j, *transfers]), size, dt, length)
     errors = [_errors(source, *each, bottom) for each in zip(answers, transfers, strict=True)]
     scatter = [_scatter(_integrate(each, size, dt, length)[1]) for each in errors]
     single = np.conj(source) * answer / np.maximum(np.abs(source) ** 2 + noise, 1e-300)
-    active = _active(record.channel(names[0]), size)
+    active = _moves(record.channel(names[0]), size, _ACTIVE)
     _, windows = _integrate(single[active], size, dt, length)
     found = StepResponse(time, steps[1], scatter[0], windows, steps[0], len(source), names)
     if simulated is None:
@@ -235,17 +241,17 @@ def _taper(size: int) -> Float[np.ndarray, " size"]:
     return np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
 
 
-def _active(values: Samples, size: int) -> Bool[np.ndarray, " windows"]:
+def _moves(values: Samples, size: int, share: float) -> Bool[np.ndarray, " windows"]:
+    """Whether each window moves by at least this share of the window that moves most."""
     swing = np.std(_windows(values, size), axis=1)
-    return swing >= _ACTIVE * np.max(swing)
+    return (swing > 0) & (swing >= share * np.max(swing))
 
 
 def _smooth(values: Float[np.ndarray, "*windows frequencies"]) -> Float[np.ndarray, "..."]:
     """Sums over neighbouring frequencies; at 0 the spectrum goes on as its mirror image."""
     padded = np.concatenate([values[..., _NEAR:0:-1], values, values[..., : -_NEAR - 1 : -1]], -1)
-    sums = np.cumsum(np.insert(padded, 0, 0.0, axis=-1), axis=-1)
-    width = 2 * _NEAR + 1
-    return sums[..., width:] - sums[..., :-width]
+    count = values.shape[-1]
+    return sum(padded[..., k : k + count] for k in range(1, _WIDTH)) + padded[..., :count]
 
 
 def _above_rounding(power: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " frequencies"]:
@@ -263,12 +269,13 @@ def _noise_over_response(source: _Spectra, answer: _Spectra) -> Float[np.ndarray
     coherence = np.abs(near_cross) ** 2 / (near_power * near_whole)
     # Windows and neighbours that count: one that holds all the power makes any pair coherent.
     # Neighbours of a tapered spectrum are half as many as they seem.
-    count = near_power**2 / np.maximum(_smooth(np.sum(each**2, axis=0)), 1e-300) / 2
-    count = np.maximum(count, 1.0)
+    most = _WIDTH * len(source)  # by Cauchy and Schwarz: rounding may make it more
+    fourth = np.maximum(_smooth(np.sum(each**2, axis=0)), near_power**2 / most)
+    count = np.maximum(near_power**2 / fourth / 2, 1.0)
     known = np.clip((count * coherence - 1) / np.maximum(count - 1, 1e-3), 1e-9, 1.0)
     known[coherence < 1 - _CHANCE ** (1 / np.maximum(count - 1, 1e-3))] = 1e-9
     noise = near_power * (1 - known) / (known * count) + _LEAKED * np.max(near_power)
-    return noise / (2 * _NEAR + 1)
+    return noise / _WIDTH
 
 
 def _errors(

@@ -25,6 +25,7 @@ from jaxquad.records import (
     Proposal,
     Record,
 )
+from jaxquad.report import reason_of
 from jaxquad.spectra import (
     FrequencyResponse,
 )
@@ -69,6 +70,7 @@ class Identification:
     - `check`: the second record simulated, where `settings.verify` names one.
     - `proposal`: where the log itself said what is input and output.
     - `more`: the logs that were taken together with the first.
+    - `failures`: by title, why something beside the fit could not be computed.
     """
 
     path: Path
@@ -82,6 +84,7 @@ class Identification:
     bands: Bands | None = None
     explanation: Explanation | None = None
     more: tuple[Path, ...] = ()
+    failures: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -141,10 +144,11 @@ class Identification:
     def beside(self) -> dict[str, str]:
         """What goes with the fit as text, by title: halves of the band, what explains a misfit."""
         found: dict[str, Bands | Explanation | None] = {
-            "Lower and upper half of the band": self.bands,
-            "What explains the misfit": self.explanation,
+            _HALVES: self.bands,
+            _EXPLAINED: self.explanation,
         }
-        return {title: str(each) for title, each in found.items() if each is not None}
+        texts = {title: str(each) for title, each in found.items() if each is not None}
+        return texts | {x: f"could not be computed: {why}" for x, why in self.failures.items()}
 
     @property
     def figure_names(self) -> tuple[str, ...]:
@@ -155,18 +159,23 @@ class Identification:
 
     def figures(self) -> "dict[str, Panels]":
         """The figures by file name: records, Bode diagram, and the check on a second record."""
+        return {name: draw() for name, draw in self.drawings().items()}
+
+    def drawings(self) -> "dict[str, Callable[[], Panels]]":
+        """What draws each of the `figures()`, by file name."""
         from jaxquad.plot import bode, compare, headless, record_figure  # here: matplotlib is slow
 
         stopped = self.fit.verdict.kind in ("no model", "no minimum")
         name = f"{self.fit.verdict.kind}: where the fit stopped" if stopped else "identified"
         models = {name: self.fit} if self.fit.verdict.fitted else {}
         others = {f"{name} estimate": self.responses[name] for name in list(self.responses)[1:]}
-        with headless():
-            figures = [record_figure(record) for record in self.records]
-            figures += [bode(self.frf, others, models, title=self.title)]
-            if self.check is not None:
-                figures += [compare(self.check, title=Path(self.settings.verify or "").name)]
-        return dict(zip(self.figure_names, figures, strict=True))
+        drawings = [ft.partial(record_figure, record) for record in self.records]
+        drawings += [ft.partial(bode, self.frf, others, models, title=self.title)]
+        if self.check is not None:
+            verified = Path(self.settings.verify or "").name
+            drawings += [ft.partial(compare, self.check, title=verified)]
+        silent = [headless()(draw) for draw in drawings]
+        return dict(zip(self.figure_names, silent, strict=True))
 
     def write(self, folder: str | Path | None = None) -> Path:
         """Write `result.json`, `report.html` and the figures, by default to results/NAME.
@@ -199,6 +208,9 @@ class Identification:
             parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, sums)}"]
         parts += [f"\n{title}:\n{text}" for title, text in self.beside.items()]
         return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
+
+
+_HALVES, _EXPLAINED = "Lower and upper half of the band", "What explains the misfit"
 
 
 def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:
@@ -268,7 +280,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
     found, others = _identify(opened, compare=True)
-    found = dataclasses.replace(found, check=_checked(found), **_fitted_again(found))
+    found = _with_fits_again(dataclasses.replace(found, check=_checked(found)))
     return _with_others(found, others)
 
 
@@ -324,22 +336,35 @@ def _with_others(
     found: Identification, others: Mapping[str, Later[FrequencyResponse]]
 ) -> Identification:
     """The estimates that are compared with the one to trust, and the fits to them."""
-    responses, fits = dict(found.responses), dict(found.fits)
+    responses, fits, failures = dict(found.responses), dict(found.fits), dict(found.failures)
     for method, later in others.items():
         announce(f"fit to the {method} response")
-        responses[method] = later.get()
-        fit = with_remedies(fit_response(responses[method], found.settings), found.settings)
+        try:
+            response = later.get()
+            fit = with_remedies(fit_response(response, found.settings), found.settings)
+        except Exception as error:
+            failures[f"The {method} estimate"] = reason_of(error)
+            continue
+        responses[method] = response
         fits[method] = in_option_words(with_units(fit, found.records[0]))
-    return dataclasses.replace(found, responses=responses, fits=fits)
+    return dataclasses.replace(found, responses=responses, fits=fits, failures=failures)
 
 
-def _fitted_again(found: Identification) -> dict[str, Bands | Explanation | None]:
-    """The halves of the band, and the explanation of a misfit that was asked for."""
-    fit = found.fit
+def _with_fits_again(found: Identification) -> Identification:
+    """With the halves of the band, and the explanation of a misfit that was asked for."""
+    fit, failures = found.fit, dict(found.failures)
     if not fit.verdict.fitted or fit.verdict.kind == "no minimum":
-        return {}
-    wanted = found.settings.explain and fit.chi_squared > MISFIT**2
-    return {"bands": fit.bands(), "explanation": fit.explain() if wanted else None}
+        return found
+    wanted: dict[str, tuple[str, Callable[[], object]]] = {"bands": (_HALVES, fit.bands)}
+    if found.settings.explain and fit.chi_squared > MISFIT**2:
+        wanted["explanation"] = (_EXPLAINED, fit.explain)
+    computed = {}
+    for field, (title, compute) in wanted.items():
+        try:
+            computed[field] = compute()
+        except Exception as error:
+            failures[title] = reason_of(error)
+    return dataclasses.replace(found, failures=failures, **computed)
 
 
 def model_formula(settings: IdentifySettings, *, damped: bool = False) -> str:

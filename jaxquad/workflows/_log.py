@@ -17,6 +17,7 @@ from jaxquad.records import (
     Record,
     RecordError,
     Segment,
+    select,
 )
 from jaxquad.report import sha256_of
 
@@ -99,7 +100,21 @@ def open_logs(
         given = settings or IdentifySettings()
         settings, proposal = propose_settings(paths[0], given, several=len(paths) > 1)
     settings = settings or IdentifySettings()
-    return OpenedLogs(paths, settings, proposal, read_logs(paths, settings))
+    records = read_logs(paths, settings)
+    if proposal is not None and settings.reference == proposal.options["references"]:
+        settings, records = _without_resting(settings, records)
+    return OpenedLogs(paths, settings, proposal, records)
+
+
+def _without_resting(
+    settings: IdentifySettings, records: tuple[Record, ...]
+) -> tuple[IdentifySettings, tuple[Record, ...]]:
+    """Without a proposed reference that rests in the analysed part: it excites nothing there."""
+    names = records[0].reference_names
+    if not names or any(np.ptp(record.channel(x)) > 0 for record in records for x in names):
+        return settings, records
+    bare = [select(x, inputs=x.input_names, outputs=x.output_names) for x in records]
+    return dataclasses.replace(settings, reference=None), tuple(bare)
 
 
 def open_again(result: str | Path | StoredResult, *, log: str | Path | None = None) -> OpenedLogs:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from jaxquad._core import announce, beside
 from jaxquad.identify import Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError
-from jaxquad.report import provenance, write_results
+from jaxquad.report import PageWarning, provenance, reason_of, write_results
 
 from ._identify import Identification, identify_opened
 from ._log import open_again, read_records
@@ -87,12 +88,18 @@ def _record_title(found: Identification, record: Record) -> str:
 
 
 def _write_figures(found: Identification, folder: Path) -> None:
-    figures = found.figures()
+    """Those that can be drawn; a `PageWarning` for each other one, of which no file is left."""
     for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
-        if earlier.name not in figures:
+        if earlier.name not in found.figure_names:
             earlier.unlink(missing_ok=True)
-    for name, panels in figures.items():
-        panels.figure.savefig(folder / name, dpi=130)
+    for name, draw in found.drawings().items():
+        try:
+            draw().figure.savefig(folder / name, dpi=130)
+        except OSError:
+            raise
+        except Exception as error:
+            (folder / name).unlink(missing_ok=True)
+            warnings.warn(f"{name} could not be drawn: {reason_of(error)}", PageWarning, 2)
 
 
 def _content_beside(found: Identification) -> dict[str, object]:

@@ -1,5 +1,6 @@
 """The page of a proposal for an autopilot: whole, harmless, and of the numbers it was given."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -8,7 +9,15 @@ from html_pages import HOSTILE, Page, UNSEEN
 
 from jaxquad.control.autopilots import FilterChain, PT1
 from jaxquad.plot import Spectrum, StepBand
-from jaxquad.report import Headline, PilotPage, Table, write_pilot_page
+from jaxquad.report import (
+    _pilot,
+    _pilot_sections,
+    Headline,
+    PilotPage,
+    provenance,
+    Table,
+    write_pilot_page,
+)
 
 
 FLOWN = {
@@ -64,3 +73,33 @@ def test_what_a_log_does_not_hold_has_no_section(tmp_path):
     text = write_pilot_page(tmp_path / "page.html", bare).read_text(encoding="utf-8")
     ids = [each["id"] for each in Page(text).of("section")]
     assert ids == ["changes", "filters"] and "holds what flew" in text
+
+
+@pytest.mark.parametrize("name", ["filters", "noise", "steps", "b0", "balance"])
+def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, monkeypatch, name):
+    stubs = dict.fromkeys(_pilot_sections.SECTIONS, lambda _: {"failed": "left out here"})
+    stubs[name] = lambda _: {}["rate"]
+    monkeypatch.setattr(_pilot_sections, "SECTIONS", stubs)
+    text = write_pilot_page(tmp_path / "page.html", page("roll")).read_text(encoding="utf-8")
+    shown = Page(text)
+    assert not shown.errors and "p_roll" in shown.text("section")
+    assert shown.text("section").count("Could not be computed: left out") == 4
+    assert shown.text("section").count("Could not be computed: KeyError: 'rate'") == 1
+
+
+def test_provenance_and_figures_may_fail_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(_pilot_sections, "steps_figure", lambda *_: 1 / 0)
+    monkeypatch.setattr(_pilot, "provenance_section", lambda _: 1 / 0)
+    whole = dataclasses.replace(page("roll"), provenance=provenance())
+    text = write_pilot_page(tmp_path / "page.html", whole).read_text(encoding="utf-8")
+    shown = Page(text)
+    assert not shown.errors and len(shown.of("img")) == 3
+    assert "figure could not be drawn: ZeroDivisionError" in shown.text("section")
+    assert "Could not be computed: ZeroDivisionError" in shown.text("section")
+    assert "Step responses" in shown.text("section")  # its table
+
+
+def test_what_the_caller_could_not_compute_is_said_where_it_would_stand(tmp_path):
+    lost = dataclasses.replace(page("roll"), steps={}, failures={"steps": "no plant is stable"})
+    text = write_pilot_page(tmp_path / "page.html", lost).read_text(encoding="utf-8")
+    assert "Could not be computed: no plant is stable" in Page(text).text("section")

@@ -25,7 +25,20 @@ from html_pages import (
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.report import _sections, draw_sections, provenance, write_report
+from jaxquad.identify import UndeterminedError
+from jaxquad.report import (
+    _record,
+    _report,
+    _sections,
+    _tuned,
+    draw_sections,
+    provenance,
+    reason_of,
+    write_report,
+)
+
+
+ORIGIN = provenance(command="jaxquad identify flight.csv")
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +94,49 @@ def test_the_page_is_well_formed_and_holds_every_section(whole):
     links = [attributes["href"] for attributes in page.of("a")]
     assert links == [f"#{name}" for name in names]
     assert len(page.of("h1")) == 1
+    assert "could not be" not in page.text().lower()
+
+
+SECTIONS = {
+    "answers": (_report, "answer_section"), "step": (_sections, "step_section"),
+    "loop": (_sections, "loop_section"), "tuned": (_tuned, "tuned_section"),
+    "response": (_sections, "response_section"), "parameters": (_report, "parameter_section"),
+    "identifiability": (_report, "identifiability_section"),
+    "verification": (_report, "check_section"), "spectrum": (_sections, "spectrum_section"),
+    "record": (_sections, "record_section"), "provenance": (_report, "provenance_section"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, frf, fit, monkeypatch, name):
+    record = record_of(("u0", "y0", "r"), ("V", "rad/s", "V"))
+    for room, function in SECTIONS.values():
+        if room is _sections:  # drawing takes long
+            monkeypatch.setattr(room, function, lambda *_: {"failed": "left out here"})
+    monkeypatch.setattr(*SECTIONS[name], lambda *_: 1 / 0)
+    path = write_report(
+        tmp_path / "report.html", fit=fit, frf=frf, record=record, tuned=tuned_by_hand(),
+        checks={"other.csv": jq.verify(TRUTH, record)}, provenance=ORIGIN,
+    )  # fmt: skip
+    page = read_page(path)
+    assert page.errors == []
+    assert [each["id"] for each in page.of("section")] == list(SECTIONS)
+    shown = page.text("section")
+    assert shown.count("Could not be computed: ZeroDivisionError: division by zero") == 1
+    assert shown.count("Could not be computed: left") == 5 - (SECTIONS[name][0] is _sections)
+
+
+def test_errors_of_the_package_speak_for_themselves():
+    assert reason_of(UndeterminedError("too few\npoints")) == "too few points"
+    assert reason_of(KeyError("rate")) == "KeyError: 'rate'"
+
+
+def test_a_figure_that_cannot_be_drawn_leaves_its_section(tmp_path, frf, fit, record, monkeypatch):
+    monkeypatch.setattr(_record, "record_figure", lambda *_: 1 / 0)
+    page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=frf, record=record))
+    assert page.errors == [] and len(page.of("img")) == 2  # of the response
+    assert "figure could not be drawn: ZeroDivisionError" in page.text("section")
+    assert "4000 samples" in page.text("section")
 
 
 def test_the_verdict_is_the_first_that_is_read(whole, fit):

@@ -1,5 +1,7 @@
 """The broken loop of a flight, beside that of the loop that was simulated."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
@@ -51,3 +53,20 @@ def test_what_the_reference_does_not_move_is_left_out():
     bare = jq.Record(DT * np.arange(100), np.sin(np.arange(100.0)), np.cos(np.arange(100.0)))
     with pytest.raises(ValueError, match="no reference"):
         estimate_broken_loop(bare, entry="set-point")
+
+
+@pytest.mark.parametrize("entry", ["set-point", "plant input"])
+def test_a_reference_that_rests_divides_nothing_by_nothing(entry):
+    """A warning of NumPy is an error here."""
+    record = flown()
+    still = np.where(np.arange(SAMPLES) < SAMPLES // 2, 0.0, np.sin(0.04 * np.arange(SAMPLES)))
+    for r in (still, 0 * still):
+        y = lfilter(ABOVE, BELOW, r)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", jq.records.RecordWarning)  # of what is constant
+            quiet = jq.Record(record.time, r - y, y, r)
+        found = estimate_broken_loop(quiet, entry=entry)
+        assert np.all(np.isfinite(found.response)) and np.all(np.isfinite(found.error))
+    assert found.omega.size == 0
+    short = jq.Record(DT * np.arange(60), *np.random.default_rng(0).standard_normal((3, 60)))
+    assert estimate_broken_loop(short, entry=entry).omega.size == 0

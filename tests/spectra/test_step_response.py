@@ -87,7 +87,7 @@ def test_a_log_that_cannot_tell_the_step_says_so(reference, noise, why):
 def test_no_reference_and_no_room_are_refused():
     record = flown(seconds=2.0)
     with pytest.raises(ValueError, match="choose another length"):
-        estimate_step(record, length=1.0)
+        estimate_step(record, length=2.0)
     bare = jq.Record(record.time, record.inputs, record.outputs)
     with pytest.raises(ValueError, match="no reference"):
         estimate_step(bare)
@@ -101,3 +101,45 @@ def test_a_log_that_was_resampled_far_above_its_own_rate_has_the_same_step():
     found = estimate_step(jq.Record(time, r, y, r, input_names="u", output_names="y"))
     assert found.is_told
     assert np.max(np.abs(found.mean - exact_at(found))) < 0.02
+
+
+def rests(seconds, reference=stick):
+    """Nothing is asked for before and behind the flight, as of a vehicle on the ground."""
+
+    def values(random, samples):
+        count = int(seconds / DT)
+        return np.pad(reference(random, samples - 2 * count), count)
+
+    return values
+
+
+def test_a_rest_on_the_ground_before_and_behind_the_flight_changes_nothing():
+    flight = estimate_step(flown(noise=0.002, seconds=60.0), length=2.0)
+    longer = estimate_step(flown(noise=0.002, seconds=100.0, reference=rests(20.0)), length=2.0)
+    assert longer.is_told and len(longer.windows) < longer.total
+    assert np.max(np.abs(longer.mean - exact_at(longer))) < 0.02
+    assert np.max(longer.standard_error) < 2 * np.max(flight.standard_error)
+
+
+def test_a_reference_without_power_at_most_frequencies_divides_nothing_by_nothing():
+    """A warning of NumPy is an error here; between its tones rounding alone is left."""
+
+    def tones(_, samples):
+        t = DT * np.arange(samples)
+        return np.sin(2 * np.pi * t) + np.sin(2 * np.pi * 0.25 * t)
+
+    for reference in (tones, rests(25.0, tones), rests(20.0, sweep)):
+        found = estimate_step(flown(noise=0.0, reference=reference))
+        assert all(np.all(np.isfinite(part)) for part in (found.mean, found.standard_error))
+        assert found.doubts
+
+
+@pytest.mark.parametrize("resting", ["r", "y"])
+def test_where_nothing_moves_there_is_no_step(resting):
+    record = flown()
+    part = {name: 0 * record.channel(name) for name in resting}
+    r, y = (part.get(name, record.channel(name)) for name in ("r", "y"))
+    with pytest.warns(jq.records.RecordWarning, match="constant"):
+        still = jq.Record(record.time, record.channel("u"), y, r, output_names="y")
+    found = estimate_step(still)
+    assert found.doubts and "rests" in found.doubts[0] and "cannot tell" in str(found)

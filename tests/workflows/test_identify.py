@@ -181,6 +181,21 @@ def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
         verify_result(stored, noise)
 
 
+def test_what_stands_beside_the_fit_may_fail(log, tmp_path, monkeypatch, capsys):
+    """Halves of the band and a figure: the code stays 0, page and text say what is missing."""
+    monkeypatch.setattr(jq.identify.Fit, "bands", lambda _: 1 / 0)
+    monkeypatch.setattr(jq.plot, "record_figure", lambda _: 1 / 0)
+    (tmp_path / "record.png").write_text("of an earlier run")
+    words = ["identify", str(log), "--input", "M=right-left", "--output", "q", "--band", "0.5", "6"]
+    assert main([*words, "--quiet", "--force", "--out", str(tmp_path)]) == 0
+    printed, warned = capsys.readouterr()
+    assert "half of the band:\ncould not be computed: ZeroDivisionError" in printed
+    assert "could not be computed: ZeroDivisionError" in (tmp_path / "report.html").read_text()
+    assert warned.startswith("! record.png could not be drawn: ZeroDivisionError")
+    assert not (tmp_path / "record.png").exists() and "record.png" not in printed
+    assert (tmp_path / "bode.png").exists() and "bode.png" in printed
+
+
 def write_hover(path):
     """Gusts on q' = 20 u behind a lag of 30 ms, and u = -0.25 q - 0.5 integral of q."""
     rng, q, slow, turned, gust, rows = np.random.default_rng(0), 0.0, 0.0, 0.0, 0.0, []

@@ -93,6 +93,9 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
         )
         return with_injections(setup, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
+    if setpoint and not np.ptp(values_of(signals, setpoint)):
+        remarks.append(f"{setpoint} rests, so there is no external reference")
+        return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
     if setpoint and not _levelled(log, prefix):
         remarks.append("flown in acro, where the set-point comes from the pilot only")
         return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=tuple(remarks))

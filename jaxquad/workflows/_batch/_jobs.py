@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, IO, NamedTuple
 
-from jaxquad._core import write_file
+from jaxquad._core import is_ours, write_file
 
 from .._settings import IdentifySettings
 
@@ -90,7 +90,8 @@ def identify_log(job: Job) -> Content:
     share_programs()  # Not only at the end: workers are killed.
     texts = [str(found)] if found.proposal is None else [str(found.proposal), str(found)]
     write_file(folder / "printed.txt", "\n\n".join(texts))
-    warned = list(dict.fromkeys(" ".join(str(each.message).split()) for each in caught))
+    ours = [each.message for each in caught if is_ours(each.category)]
+    warned = list(dict.fromkeys(" ".join(str(each).split()) for each in ours))
     if warned:
         write_file(folder / "warnings.txt", "\n".join(warned))
     fit = found.fit
