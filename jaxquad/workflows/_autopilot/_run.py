@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxquad._core import announce, behind
 from jaxquad.control.autopilots import without_gyro_filters
@@ -33,9 +34,6 @@ from ._over_throttle import study_throttle
 from ._proposal import AutopilotProposal
 from ._rate_design import design_gains
 from ._rate_gains import gyro_chains, law_responses
-
-
-_INJECTED = "SIDD.Targ"  # ArduPilot's chirp
 
 
 def autopilot(
@@ -82,14 +80,14 @@ def autopilot(
         return tune_adrc(path, asked, proposal, settings)
     announce("gains and filters that flew")
     flown, flight = _read_flight(path, asked, proposal, settings)
-    compared = behind(_flown_responses, path, asked, flown)
+    compared = behind(_flown_responses, path, asked, proposal, flown)
     found = identify_plant(path, asked, proposal, gyro_chains(flown.law))
     known = (settings, found, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
     if not found.fit.identifiable:
         return unsure(f"this log cannot tell: {found.fit.verdict.summary}; {_FLY}", None)
     announce("the flown loop again")
-    again = _reproduce(found, flown, compared.get())
+    again = _reproduce(found, proposal, flown, compared.get())
     if again.kind != "flown":
         why = again.verdict
         return unsure(why if again.kind == "unknown" else f"this log cannot tell: {why}", again)
@@ -107,8 +105,9 @@ _FLY = "fly a chirp of the rate set-point, or strong and quick stick on this axi
 def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
     """What the log itself says is command, rate and reference."""
     asked = IdentifySettings(
-        axis=settings.axis, start=settings.start, stop=settings.stop, band=settings.band
-    )
+        axis=settings.axis, chirp=settings.chirp, start=settings.start, stop=settings.stop,
+        band=settings.band,
+    )  # fmt: skip
     found, proposal = propose_settings(path, asked)
     if proposal is None:
         raise SettingsError(f"{path} proposes no channels: give the log of an autopilot")
@@ -128,27 +127,29 @@ def _read_flight(
 
 
 def _flown_responses(
-    path: Path, settings: IdentifySettings, flown: FlownAutopilot
+    path: Path, settings: IdentifySettings, proposal: Proposal, flown: FlownAutopilot
 ) -> tuple[FrequencyResponse, ...]:
     """What the loop is compared with: from the set-point to the rate.
 
-    Where ArduPilot's chirp enters at the mixer, from the chirp to output, rate and set-point.
+    Where the chirp enters at the mixer, from the chirp to output, rate and set-point.
     """
     of = ft.partial(_response_of, path, settings)
-    if _is_injected(settings):
-        letter = AXES[flown.axis][0].upper()
-        names = (f"RATE.{letter}Out", f"RATE.{letter}", f"RATE.{letter}Des")
-        return tuple(of(input=_INJECTED, output=name, reference=None) for name in names)
+    setup = proposal.setup
+    if setup.injected_at == "mixer":
+        names = (*setup.command, setup.rate, _setpoint_of(setup.rate, flown))
+        return tuple(of(input=setup.reference, output=name, reference=None) for name in names)
     setpoint = _setpoint_of(settings.output or "", flown)
     try:
         reference = None if settings.reference == setpoint else settings.reference
-        return (of(input=setpoint, reference=reference),)
+        found = of(input=setpoint, reference=reference)
     except ValueError:  # the stick is the set-point in another unit: that one is external
-        return (of(input=setpoint, reference=None),)
+        found = of(input=setpoint, reference=None)
+    later = 1 / _delay(np.asarray(found.omega), setup.late_s.get(setpoint, 0.0))
+    return (dataclasses.replace(found, response=found.response * later[:, None, None]),)
 
 
-def _is_injected(settings: IdentifySettings) -> bool:
-    return _INJECTED in (settings.input or "")
+def _delay(omega: Float[np.ndarray, " frequencies"], seconds: float) -> np.ndarray:
+    return np.exp(-1j * omega * seconds)
 
 
 def _response_of(
@@ -162,11 +163,15 @@ def _response_of(
 
 
 def _reproduce(
-    found: Identification, flown: FlownAutopilot, responses: Sequence[FrequencyResponse]
+    found: Identification,
+    proposal: Proposal,
+    flown: FlownAutopilot,
+    responses: Sequence[FrequencyResponse],
 ) -> Reproduction:
     """The flown loop compared with the log."""
-    if _is_injected(found.settings):
-        return _reproduce_law(found, flown, *responses)
+    if proposal.setup.injected_at == "mixer":
+        late = proposal.setup.late_s.get(proposal.setup.reference, 0.0)
+        return _reproduce_law(found, flown, late, *responses)
     [response], [unit] = responses, found.records[0].output_units
     return reproduce_flight(
         found.fit, flown.law, response, unit="deg/s" if unit == "deg/s" else "rad/s",
@@ -177,21 +182,25 @@ def _reproduce(
 def _reproduce_law(
     found: Identification,
     flown: FlownAutopilot,
+    late: float,
     output: FrequencyResponse,
     rate: FrequencyResponse,
     setpoint: FrequencyResponse,
 ) -> Reproduction:
     """The law's output, of set-point and rate, from a chirp at the mixer.
 
+    The logged output contains the chirp, which as the set-point is `late` seconds behind its stamp.
     The noise of the rate is in the output, too, so that the error of the latter counts alone.
     """
     [unit] = found.records[0].output_units
     omega, only = np.asarray(output.omega), lambda x: np.asarray(x)[:, 0, 0]
     ahead, back = law_responses(without_gyro_filters(flown.law), flown.axis, omega)
-    factor = np.pi / 180 if unit == "deg/s" else 1.0
-    predicted = factor * (ahead * only(setpoint.response) + back * only(rate.response))
-    measured, error = only(output.response), only(output.random_error)
+    factor, later = np.pi / 180 if unit == "deg/s" else 1.0, _delay(omega, late)
+    predicted = factor * (later * ahead * only(setpoint.response) + back * only(rate.response))
+    measured, error = only(output.response) - later, only(output.random_error)
     used = only(usable(output, None, 0.6))
+    # The error of the output is relative to its own size.
+    error = error * np.abs(only(output.response) / measured)
     weight, off = 1 / error[used] ** 2, (measured / predicted - 1)[used]
     total = max(float(np.sum(weight)), 1e-12)
     scale = float(np.sum(weight * off.real)) / total
