@@ -18,7 +18,7 @@ COLLECTIVE = 0.4 + 0.2 * np.sin(0.5 * TIME)  # throttle, 0 to 1
 
 def ardupilot(
     folder, place, *, sidd=True, gain="0", runs=((22, 30, 8.0),), changes=(), collective="",
-    changed="ATC_RAT_RLL_P",
+    changed="ATC_RAT_RLL_P", gyros=(), core=None, settings=(),
 ):  # fmt: skip
     """A log with chirps of 0.5 Hz up to so many, from and to so many seconds.
 
@@ -26,7 +26,8 @@ def ardupilot(
     zeros, and the output contains what is added at the mixer. `runs` are start, stop and highest
     frequency, and the SID_AXIS if it is not `place`. `changes` are pairs of a time in s and a value
     of the parameter `changed`, which begins at 0.135.
-    `collective` is "RATE.AOut", at 400 Hz, "CTUN.ThO", at 10 Hz, or none.
+    `gyros` are the instances of GYR, whose rate about x is that number and a wave, and `core` is
+    XKF4.PI. `collective` is "RATE.AOut", at 400 Hz, "CTUN.ThO", at 10 Hz, or none.
     """
     log = DataFlash()
     log.define("SIDS", "QBfff", "TimeUS,Ax,Mag,FSt,FSp", units="s----", mults="F----")
@@ -41,6 +42,10 @@ def ardupilot(
     log.write("PARM", 0, b"ATC_RAT_PIT_I", float(gain))
     log.write("PARM", 0, changed.encode(), 0.135)
     log.write("PARM", 0, b"SCHED_LOOP_RATE", float(RATE_HZ))
+    for name, value in settings:
+        log.write("PARM", 0, name.encode(), value)
+    log.define("GYR", "QBfff", "TimeUS,I,GyrX,GyrY,GyrZ", units="s#EEE", mults="F----")
+    log.define("XKF4", "QBB", "TimeUS,C,PI", units="s#-", mults="F--")
     before, outputs = 0.0, dict.fromkeys((10, 11, 12), 0.0)
     for k, t in enumerate(np.round(TIME * 1e6).astype(int).tolist()):
         run = next((run for run in runs if run[0] <= TIME[k] < run[1] + AFTER), None)
@@ -57,6 +62,10 @@ def ardupilot(
                 log.write("PARM", t, changed.encode(), value)
                 log.write("PARM", t, b"LOG_BITMASK", 1e3 * value)
         w = float(WAVE[k])
+        for number in gyros:
+            log.write("GYR", t + number, number, number + w, w, w)
+        if core is not None and k % 40 == 0:
+            log.write("XKF4", t + 5, 0, core)
         last = beside * (float(COLLECTIVE[k]),)
         roll, pitch, yaw = (outputs[axis] for axis in (10, 11, 12))
         log.write(

@@ -379,7 +379,7 @@ _DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)} 
 
 def find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
     """Give RATE its unit in logs before FMTU, by the size of IMU's gyro; returns the remark."""
-    rate, imu = tables.get("RATE"), tables.get("IMU", tables.get("IMU[0]"))
+    rate, imu = tables.get("RATE"), tables.get(_first_instance(tables, "IMU"))
     if rate is None or scaled.letters.get("RATE"):
         return []
     ratio = _rate_over_gyro(rate, imu)
@@ -397,6 +397,11 @@ def find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
         why = f"because its rates are {ratio:.3g} times those of IMU's gyro in rad/s"
     hundredths = " (logged in hundredths)" if scale != 1.0 else ""
     return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
+
+
+def _first_instance(tables: Mapping[str, Table], kind: str) -> str:
+    """Messages of a kind without instances, or of the first one: `IMU`, `IMU[0]`, ..."""
+    return min((name for name in tables if name.partition("[")[0] == kind), default="")
 
 
 def _rate_over_gyro(rate: Table, imu: Table | None) -> float | None:
