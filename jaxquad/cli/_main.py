@@ -6,7 +6,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
 from jaxquad._core import allowed_second_process, is_ours
@@ -86,7 +86,7 @@ def _run(words: Sequence[str]) -> int:
     with warnings.catch_warnings(), shown_stages(options), allowed_second_process():
         for kind in (RecordWarning, PageWarning):
             warnings.simplefilter("always", kind)
-        warnings.showwarning = _print_warning
+        warnings.showwarning = _printer_of_warnings()
         check_out(options)
         return options.run(options)
 
@@ -124,10 +124,19 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _print_warning(message: Warning | str, kind: type[Warning], *_: object) -> None:
-    """One of the package; what NumPy or JAX warn of is no word to a user."""
-    if is_ours(kind):
-        print("!", *in_options(str(message)).split(), file=sys.stderr)
+def _printer_of_warnings() -> Callable[..., None]:
+    """Prints each warning of the package once: several steps of a command read the same log.
+
+    What NumPy or JAX warn of is no word to a user.
+    """
+    printed = set()
+
+    def print_warning(message: Warning | str, kind: type[Warning], *_: object) -> None:
+        if is_ours(kind) and str(message) not in printed:
+            printed.add(str(message))
+            print("!", *in_options(str(message)).split(), file=sys.stderr)
+
+    return print_warning
 
 
 def make_parser() -> argparse.ArgumentParser:

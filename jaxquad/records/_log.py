@@ -54,6 +54,7 @@ class Log:
     vehicle: str = ""  # ardupilot, px4, betaflight, crazyflie, or unknown
     settings: Mapping[str, str] = dataclasses.field(default_factory=dict)  # header, parameters
     changes: tuple[SettingChange, ...] = ()  # of settings in flight, in the order of time
+    firmware: str = ""  # as the log names it with its version: "ArduCopter V4.5.7 (2a3dc4b7)"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ._errors import ReadError
+from ._log import Log
 from .formats import load_log
 
 
@@ -58,12 +59,12 @@ def read_settings(path: str | Path, *, log: str = "", at: float | int | None = N
             + (f" under {log!r}" if log else "")
             + ": give the log that the autopilot wrote, with its parameters logged."
         )
-    return Settings(found.vehicle, _version(found.vehicle, values), values)
+    return Settings(found.vehicle, _version(found, values), values)
 
 
-def _version(vehicle: str, values: Mapping[str, str]) -> tuple[int, ...]:
-    text = values.get("ver_sw_release", values.get("Firmware revision", ""))
-    if vehicle == "px4" and text.isdecimal():  # one byte each
+def _version(log: Log, values: Mapping[str, str]) -> tuple[int, ...]:
+    text = values.get("ver_sw_release", values.get("Firmware revision", log.firmware))
+    if log.vehicle == "px4" and text.isdecimal():  # one byte each
         return tuple(int(text) >> shift & 0xFF for shift in (24, 16, 8))
     match = _REVISION.search(text)
     return tuple(int(part or 0) for part in match.groups()) if match else ()

@@ -41,9 +41,11 @@ def propose_settings(
             f"several logs need `input` and `output`: run jaxquad identify {path} alone, and give "
             "what it proposes"
         )
-    proposal = propose(path, axis=settings.axis)
+    start, stop = _hull(settings)
+    proposal = propose(path, axis=settings.axis, chirp=settings.chirp, start=start, stop=stop)
     offered = proposal.options
-    found = {"input": mix_text(offered["inputs"]), "output": offered["outputs"], "axis": None}
+    found = {"input": mix_text(offered["inputs"]), "output": offered["outputs"]}
+    found |= {"axis": None, "chirp": None}
     if settings.reference is None:
         found["reference"] = offered["references"]
     if settings.rate is None:
@@ -53,6 +55,14 @@ def propose_settings(
     if proposal.setup.band and settings.band is settings.band_rad is None:
         found["band"] = proposal.setup.band
     return dataclasses.replace(settings, **found | _proposed_span(settings, proposal)), proposal
+
+
+def _hull(settings: IdentifySettings) -> tuple[float | None, float | None]:
+    """From the first to the last time that the settings name."""
+    if not settings.segments:
+        return settings.start, settings.stop
+    starts, stops = zip(*settings.segments, strict=True)
+    return min(starts), max(stops)
 
 
 def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, object]:

@@ -203,6 +203,13 @@ class IdentifySettings(Settings):
     axis: str | None = option_field(
         kinds.AXIS, None, "the axis to propose input and output for", group=THE_RECORD
     )
+    chirp: int | None = option_field(
+        kinds.SIZE,
+        None,
+        "the number of the one to use of the chirps that a log's proposal lists; by default the "
+        "longest, with all others on its axis at its place",
+        group=THE_RECORD,
+    )
     units: Mapping[str, str] = option_field(
         kinds.UNITS,
         {},
@@ -343,6 +350,10 @@ class IdentifySettings(Settings):
         if self.input is not None and self.axis is not None:
             raise SettingsError(
                 "`axis` is for a proposal: leave it out, or leave `input` and `output` out"
+            )
+        if self.input is not None and self.chirp is not None:
+            raise SettingsError(
+                "`chirp` is for a proposal: leave it out, or leave `input` and `output` out"
             )
         if self.segments and (self.start is not None or self.stop is not None):
             raise SettingsError(

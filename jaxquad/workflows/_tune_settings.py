@@ -119,6 +119,13 @@ class AutopilotSettings(Settings):
         "the axis to tune; all by default, with one file of parameters",
         group=THE_RECORD,
     )
+    chirp: int | None = option_field(
+        kinds.SIZE,
+        None,
+        "the number of the one to use of the chirps that a log's proposal lists; by default the "
+        "longest, with all others on its axis at its place",
+        group=THE_RECORD,
+    )
     start: float | None = option_field(
         kinds.TIME, None, "first time to use, in the file's time", group=THE_RECORD
     )

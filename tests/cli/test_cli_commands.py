@@ -196,8 +196,8 @@ def chirped(folder, starts=(22,)):
     output, moved = np.zeros(time.size), 0.0
     for k in range(time.size):
         rate[k] += moved
-        output[k] = -0.02 * rate[k]
-        moved += chirp[k] + output[k] + idle[k] * np.sin(9 * time[k])  # 100 / s for 10 ms
+        output[k] = -0.02 * rate[k] + (chirp[k - 1] if k else 0.0)  # acts one loop later
+        moved += output[k] + idle[k] * np.sin(9 * time[k])  # 100 / s for 10 ms
     for k, t in enumerate(np.round(time * 1e6).astype(int).tolist()):
         if run[k]:
             if not run[k - 1]:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from log_writers import DataFlash
 
-from jaxquad.records import channels, read, ReadError, RecordWarning
+from jaxquad.records import channels, read, read_settings, ReadError, RecordWarning
 from jaxquad.records.formats import load_log
 
 
@@ -103,14 +103,76 @@ def test_damaged_blocks_are_skipped_and_told_with_their_bytes(tmp_path):
     np.testing.assert_array_equal(record.inputs[:, 0], GYRO[:, 0])
 
 
-def test_a_log_cut_off_in_flight_is_read_up_to_there(tmp_path):
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("filling", [b"", bytes(500), b"\xff" * 500])
+def test_a_log_that_ends_within_a_message_or_before_its_space_is_whole(tmp_path, filling):
+    """The writer's buffer ends where it does, and a file may be prepared longer than it gets."""
     content = bytes(written().content)
     path = tmp_path / "log.bin"
-    path.write_bytes(content[:-5])
-    with pytest.warns(
-        RecordWarning, match=f"cut off: the last 16 bytes, from byte {len(content) - 21}"
-    ):
-        assert {each.samples for each in channels(path)} == {200, 199}
+    path.write_bytes(content + filling if filling else content[:-5])
+    last = 200 if filling else 199
+    assert {each.samples for each in channels(path)} == {200, last}
+
+
+@pytest.mark.filterwarnings("ignore:.*holds 2 logs")
+@pytest.mark.parametrize("cut", [0, 5, 16])
+def test_a_file_of_two_boots_is_read_as_the_longest_with_a_chirp(tmp_path, cut):
+    """The first log may end within a message, and the second one may define others."""
+    first = written()
+    second = DataFlash()
+    second.define("SIDD", "Qf", "TimeUS,Targ")
+    second.define("IMU", "QBfff", "TimeUS,I,GyrX,GyrY,GyrZ", units="s#EEE", mults="F-000")
+    for k in range(100):
+        second.write("SIDD", 1_000_000 + 25_000 * k, 1.0)
+        second.write("IMU", 1_000_000 + 25_000 * k, 0, float(k), 0.0, 0.0)
+    parts = [bytes(first.content)[: len(first.content) - cut], bytes(second.content)]
+    path = tmp_path / "log.bin"
+    path.write_bytes(parts[0] + parts[1])
+    with pytest.warns(RecordWarning, match="holds 2 logs.*: number 2 is read .t = 1") as caught:
+        log = load_log(path)
+    assert len(caught) == 1
+    assert f"bytes 0 .. {len(parts[0]) - 1}" in str(caught[0].message)
+    np.testing.assert_array_equal(log.tables["IMU[0]"].columns["GyrX"], np.arange(100.0))
+    assert "ATT" not in log.tables and log.settings == {}
+    path.write_bytes(parts[1] + parts[1] if cut else parts[1] + parts[0])
+    with pytest.warns(RecordWarning, match="number 1 is read"):
+        assert load_log(path).tables["IMU[0]"].columns["GyrX"].size == 100
+    # Where the clock goes on, it is one log.
+    short, later = (bytes(written(first=a, rows=b).content) for a, b in ((0, 100), (100, 100)))
+    path.write_bytes(short + later)
+    log = load_log(path)
+    np.testing.assert_array_equal(log.tables["IMU[0]"].columns["GyrX"], GYRO[:, 0])
+
+
+@pytest.mark.filterwarnings("ignore:.*the unit of RATE")
+def test_a_text_file_of_two_boots_is_read_as_the_longest(tmp_path):
+    head = "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n"
+    head += "FMT, 146, 21, RATE, Qf, TimeUS,R\n"
+    logs = [
+        head + "".join(f"RATE, {10_000 * k + 5_000_000}, {k}\n" for k in range(count))
+        for count in (150, 300)
+    ]
+    path = tmp_path / "log.log"
+    path.write_text("".join(logs))
+    with pytest.warns(RecordWarning, match="number 2 is read .*, the longest one. Left out: numb"):
+        log = load_log(path)
+    np.testing.assert_array_equal(log.tables["RATE"].columns["R"], np.arange(300.0))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_log_names_its_firmware(tmp_path, text):
+    path = tmp_path / ("log.log" if text else "log.bin")
+    if text:
+        path.write_text(
+            "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n"
+            "FMT, 147, 75, MSG, QZ, TimeUS,Message\nPARM, 1, SID_AXIS, 10\n"
+            "MSG, 1, Barometer calibrated\nMSG, 2, ArduPlane V4.5.7 (2a3dc4b7)\n"
+        )
+    else:
+        path.write_bytes(written().content)
+    found = read_settings(path)
+    assert found.version == ((4, 5, 7) if text else (4, 5, 0))
+    assert load_log(path).firmware == ("ArduPlane V4.5.7 (2a3dc4b7)" if text else "ArduCopter V4.5")
 
 
 def test_other_definitions_further_on_are_refused_with_their_place(tmp_path):
@@ -165,4 +227,13 @@ def test_a_log_without_messages_is_refused(tmp_path, kept):
     path = tmp_path / "log.bin"
     path.write_bytes(bytes(written().content)[:kept])
     with pytest.raises(ReadError):
+        channels(path)
+
+
+def test_a_file_with_too_many_definitions_is_refused(tmp_path):
+    log = DataFlash()
+    log.define("IMU", "Qf", "TimeUS,GyrX")
+    path = tmp_path / "log.bin"
+    path.write_bytes(bytes(log.content) * 101)
+    with pytest.raises(ReadError, match="defines its messages more than 100 times"):
         channels(path)

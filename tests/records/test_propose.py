@@ -7,7 +7,7 @@ from log_writers import DataFlash
 
 from jaxquad.cli import make_parser
 from jaxquad.records import parse_mix, propose, read, read_settings, ReadError, RecordError
-from jaxquad.workflows import IdentifySettings
+from jaxquad.workflows import IdentifySettings, open_logs, SettingsError
 
 
 @pytest.mark.parametrize("place", range(1, 13))
@@ -17,17 +17,19 @@ def test_ardupilot_chirps_are_found_with_axis_time_band_and_summing_point(tmp_pa
     letter = axis[0].upper()
     setup = proposal.setup
     assert (setup.axis, setup.rate, setup.reference) == (axis, f"RATE.{letter}", "SIDD.Targ")
-    # Only what is added behind the controller is missing from its logged output.
-    added = {"SIDD.Targ": 1.0} if place >= 10 else {}
-    assert setup.command == {f"RATE.{letter}Out": 1.0} | added
+    assert setup.command == {f"RATE.{letter}Out": 1.0}
+    assert setup.injected_at == ("angle", "angle", "rate", "mixer")[(place - 1) // 3]
+    assert setup.late_s == {f"RATE.{letter}Des": 0.0025, "SIDD.Targ": 0.0025}
     assert setup.band == (0.5, 8.0)
     assert (setup.start, setup.stop) == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
     record = read(proposal.path, **proposal.options)
     if place >= 10:
         w = WAVE[IN_RUN] * {"roll": 0.1, "pitch": 0.2, "yaw": 1.0}[axis]
         middle = slice(100, -100)
-        given = np.interp(record.time, TIME[IN_RUN], w + CHIRP[IN_RUN])
-        np.testing.assert_allclose(record.inputs[middle, 0], given[middle], atol=2e-2)
+        late = setup.late_s["SIDD.Targ"]
+        given = np.interp(record.time, TIME[IN_RUN], w)
+        given += np.interp(record.time, TIME[IN_RUN] + late, CHIRP[IN_RUN])
+        np.testing.assert_allclose(record.inputs[middle, 0], given[middle], atol=1e-2)
 
 
 def test_the_printed_line_is_what_the_command_line_takes(tmp_path):
@@ -36,7 +38,7 @@ def test_the_printed_line_is_what_the_command_line_takes(tmp_path):
     words = shlex.split(line)
     assert words[:2] == ["jaxquad", "identify"]
     typed = settings_typed(words)
-    assert parse_mix(typed.input or "") == {"roll": {"RATE.ROut": 1.0, "SIDD.Targ": 1.0}}
+    assert parse_mix(typed.input or "") == {"RATE.ROut": {"RATE.ROut": 1.0}}
     assert typed.reference == "SIDD.Targ"
     assert (typed.rate, typed.band) == (400.0, (0.5, 8.0))
 
@@ -56,6 +58,105 @@ def test_all_chirps_into_one_place_are_segments_of_the_printed_line(tmp_path):
     typed = settings_typed(shlex.split(line))
     np.testing.assert_allclose(typed.segments, proposal.segments)
     assert typed.start is None and typed.stop is None
+
+
+THREE = ((21, 24, 6.0), (25, 27.5, 8.0, 8), (28, 31.5, 8.0, 10))  # roll, pitch, roll again
+
+
+def test_several_chirps_are_listed_with_number_axis_place_time_and_band(tmp_path):
+    proposal = propose(ardupilot(tmp_path, 10, runs=THREE))
+    lines = [line.strip() for line in str(proposal).splitlines()]
+    assert lines[2] == "chirps of this log (* used; --chirp N chooses one):"
+    assert lines[3:6] == [
+        "* 1: roll, the mixer (SID_AXIS 10), t = 21 .. 23.9975 s, 0.5 .. 6 Hz",
+        "2: pitch, the rate set-point (SID_AXIS 8), t = 25 .. 27.4975 s, 0.5 .. 8 Hz",
+        "* 3: roll, the mixer (SID_AXIS 10), t = 28 .. 31.4975 s, 0.5 .. 8 Hz",
+    ]
+    assert np.allclose(proposal.segments, [(21, 24), (28, 31.5)], atol=0.01)
+    assert "chirps of this log" not in str(propose(ardupilot(tmp_path, 10)))
+
+
+@pytest.mark.parametrize(
+    ("options", "axis", "spans"),
+    [
+        ({"chirp": 2}, "pitch", [(25, 27.5)]),
+        ({"chirp": 3}, "roll", [(28, 31.5)]),
+        ({"chirp": 3, "stop": 30.5}, "roll", [(28, 30.5)]),
+        ({"axis": "pitch"}, "pitch", [(25, 27.5)]),
+        ({"start": 24.5, "stop": 28.5}, "pitch", [(25, 27.5)]),
+        ({"start": 25.5, "axis": "roll"}, "roll", [(28, 31.5)]),
+        ({"start": 22}, "roll", [(22, 24), (28, 31.5)]),
+    ],
+)
+def test_chirps_are_chosen_by_number_axis_or_time(tmp_path, options, axis, spans):
+    proposal = propose(ardupilot(tmp_path, 10, runs=THREE), **options)
+    assert proposal.setup.axis == axis
+    assert list(proposal.setup.command) == [f"RATE.{axis[0].upper()}Out"]
+    assert proposal.setup.injected_at == ("rate" if axis == "pitch" else "mixer")
+    assert np.allclose(proposal.segments, spans, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"chirp": 4}, r"there is no chirp 4. Chirps of this log: 1: roll, .*; 3: roll, the mixer"),
+        ({"chirp": 2, "axis": "yaw"}, "chirp 2 is not on the axis yaw"),
+        ({"chirp": 2, "start": 28}, "chirp 2 lies outside the span of start and stop"),
+    ],
+)
+def test_a_chirp_that_the_log_does_not_hold_is_refused_with_a_list(tmp_path, options, complaint):
+    with pytest.raises(RecordError, match=complaint):
+        propose(ardupilot(tmp_path, 10, runs=THREE), **options)
+    with pytest.raises(RecordError, match="the chirps of px4 have no numbers"):
+        propose(px4(tmp_path, state=2), chirp=1)
+
+
+def test_the_setting_chirp_decides_what_is_read(tmp_path):
+    path = ardupilot(tmp_path, 10, runs=THREE)
+    typed = settings_typed(["jaxquad", "identify", str(path), "--chirp", "2"])
+    opened = open_logs(path, typed)
+    assert opened.settings.output == "RATE.P" and opened.settings.chirp is None
+    assert opened.records[0].time[[0, -1]] == pytest.approx([25, 27.5], abs=0.01)
+    opened = open_logs(path, IdentifySettings(start=24.5, stop=30))
+    assert opened.settings.output == "RATE.P"
+    with pytest.raises(SettingsError, match="`chirp` is for a proposal"):
+        IdentifySettings(chirp=2, input="a", output="b")
+
+
+def test_a_span_without_a_chirp_is_identified_without_a_reference(tmp_path):
+    proposal = propose(ardupilot(tmp_path, 10), axis="roll", stop=21.5)
+    assert not proposal.setup.reference and not proposal.setup.injected_at
+    assert "1: roll, the mixer (SID_AXIS 10), t = 22" in str(proposal)
+
+
+@pytest.mark.parametrize(("place", "words"), [(13, "the thrust"), (19, "the velocity set-point")])
+def test_a_chirp_that_turns_no_axis_is_refused_with_what_to_fly(tmp_path, place, words):
+    path = ardupilot(tmp_path, place)
+    with pytest.raises(RecordError, match=rf"{words} .SID_AXIS {place}., which turns no .* 10 \("):
+        propose(path)
+    runs = ((21, 26, 6.0), (27, 30, 8.0, 11))
+    proposal = propose(ardupilot(tmp_path, place, runs=runs))
+    assert proposal.setup.axis == "pitch" and f"1: no axis, {words}" in str(proposal)
+
+
+def test_the_hovers_throttle_that_the_firmware_learns_is_no_change_of_the_loop(tmp_path):
+    changes = ((25.0, 0.2), (27.0, 0.25))
+    proposal = propose(ardupilot(tmp_path, 10, changes=changes, changed="MOT_THST_HOVER"))
+    assert not proposal.changes and proposal.setup.stop == pytest.approx(30, abs=0.01)
+
+
+@pytest.mark.parametrize("terms", [False, True])
+def test_a_log_of_a_plane_is_refused_by_its_name(tmp_path, terms):
+    log = DataFlash()
+    log.define("MSG", "QZ", "TimeUS,Message")
+    log.write("MSG", 1, b"ArduPlane V4.5.7 (2a3dc4b7)")
+    for name in ("ATT", *(("PIDR", "PIDP") if terms else ())):
+        log.define(name, "Qff", "TimeUS,Tar,Act")
+        log.write_rows(name, np.arange(50) * 10_000, np.arange(50.0), np.arange(50.0))
+    (tmp_path / "log.bin").write_bytes(log.content)
+    with pytest.raises(RecordError, match="log is of ArduPlane V4.5.7 .2a3dc4b7.") as refused:
+        propose(tmp_path / "log.bin")
+    assert ("--output PIDR.Act" in str(refused.value)) == terms
 
 
 def test_a_change_of_the_loops_parameters_splits_the_log_there(tmp_path):

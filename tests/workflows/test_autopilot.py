@@ -358,6 +358,8 @@ def fly_ardupilot(gains, seconds=30.0, noise=0.01, plant=80.0, notches=None):
     """Chirp, set-point, rate in rad/s and output at 400 Hz: a loop that holds the level.
 
     The gyro is filtered at 2 kHz, by `NOTCHES` too; the chirp of 0.5 to 30 Hz enters at the mixer.
+    As in the firmware, set-point and chirp act one loop after they are logged, and the output
+    contains the chirp.
     """
     rng, parts, dt = np.random.default_rng(7), 5, 1 / 400
     count = int(seconds / dt)
@@ -371,18 +373,18 @@ def fly_ardupilot(gains, seconds=30.0, noise=0.01, plant=80.0, notches=None):
     share, fine, late = 1 - 1 / (1 + 2 * np.pi * 20.0 * dt), dt / parts, 10
     decay = float(np.exp(-fine / 0.03))
     s1 = s2 = y = push = rate = angle = target = error = slope = integral = 0.0
-    sent, rows = [0.0] * late, []
+    sent, rows, wanted = [0.0] * late, [], 0.0
     banks = [[notch_of(*x), 0.0, 0.0] for x in (NOTCHES if notches is None else notches)]
     for n in range(count):
-        wanted = -4.5 * angle
         target += share * (wanted - target)
         before, error = error, target - y
         slope += share * ((error - before) / dt - slope)
         integral += i * error * dt
-        u = p * error + integral + d * slope
+        u = p * error + integral + d * slope + (chirp[n - 1] if n else 0.0)
+        wanted = -4.5 * angle
         rows.append((chirp[n], wanted, y, u))
         for m in range(parts):
-            sent.append(u + chirp[n])
+            sent.append(u)
             moved = plant * sent[parts * n + m]
             step = moved * fine + (push - moved) * 0.03 * (1 - decay)
             push, rate, angle = moved + (push - moved) * decay, rate + step, angle + rate * fine

@@ -1,18 +1,21 @@
-"""ArduPilot DataFlash logs, binary (.bin) and text (.log), which describe their own messages.
+"""ArduPilot DataFlash logs, binary (.bin), which describe their own messages.
 
 Format: ardupilot.org/dev, "Adding a new log message", and the FMT, FMTU, UNIT and MULT messages
 that every log begins with.
 """
 
+import collections
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import UInt8
 
 from .._errors import ReadError
 from .._log import changes_of, describe_skips, Log, Table
+from ._dataflash_boots import choose_log, CUT_IT, firmware_of, MOST_PARTS, Part, span_of
 
 
 FORMAT_TYPE = 128
@@ -23,7 +26,10 @@ _CODES = {
     "e": "<i4", "E": "<u4", "L": "<i4", "M": "u1", "q": "<i8", "Q": "<u8",
 }  # fmt: skip
 _BUILT_IN = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
-_CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}  # s
+CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}  # s
+
+
+Offsets = dict[int, list[int]]  # of the messages of each type, in bytes
 
 
 class Format(NamedTuple):
@@ -66,7 +72,7 @@ class Scaling(NamedTuple):
 
 HEAD = b"\xa3\x95"
 _FMT_LENGTH = 89
-_ABOUT = ("FMT", "FMTU", "UNIT", "MULT", "PARM")  # tables about the log, not of signals
+ABOUT = ("FMT", "FMTU", "UNIT", "MULT", "PARM")  # tables about the log, not of signals
 
 
 def sniff(head: bytes, path: Path) -> bool:
@@ -76,84 +82,186 @@ def sniff(head: bytes, path: Path) -> bool:
 def load(path: Path) -> Log:
     """The message types of a DataFlash log as tables, those with instances as `IMU[0]`, ..."""
     data = path.read_bytes()
-    formats, offsets, remarks = _scan(data)
-    if not formats:
+    parts, remarks = _scan(data)
+    if not parts[0].formats:
         raise ReadError(
             "there is no FMT message: the file is not a DataFlash log, or its beginning is missing",
             offset=0,
         )
-    rows, odd = _all_rows(np.frombuffer(data, np.uint8), formats, offsets)
+    buffer = np.frombuffer(data, np.uint8)
+    formats, offsets, left_out = _one_log(buffer, parts)
+    rows, odd = _all_rows(buffer, formats, offsets)
+    remarks += left_out
     if odd:
         remarks.append(f"messages with an inconsistent format were left out: {', '.join(odd)}")
     scaled = scaling(rows, {kind: each.name for kind, each in formats.items()})
     tables: dict[str, Table] = {}
     for each in formats.values():
-        if each.name in rows and each.name not in _ABOUT:
+        if each.name in rows and each.name not in ABOUT:
             columns = {name: rows[each.name][name] for name in each.columns}
             tables |= tables_of(each, columns, scaled)
-    remarks += _find_rate_unit(tables, scaled)
+    remarks += find_rate_unit(tables, scaled)
     stamped = _parameters(rows.get("PARM"))
     settings = {name: value for _, name, value in stamped}
-    return Log(
-        tables, tuple(remarks), "ardupilot", settings, changes_of(stamped, lambda time: time)
-    )
+    changes = changes_of(stamped, lambda time: time)
+    firmware = firmware_of(_texts(rows))
+    return Log(tables, tuple(remarks), "ardupilot", settings, changes, firmware)
+
+
+def _texts(rows: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """What the messages that name the firmware say."""
+    for name, column in (("VER", "FWS"), ("MSG", "Message")):
+        table = rows.get(name)
+        if table is not None and column in (table.dtype.names or ()):
+            if table.dtype[column].kind == "S":
+                yield from (text(each) for each in table[column].tolist())
 
 
 def _all_rows(
-    buffer: UInt8[np.ndarray, " bytes"], formats: Mapping[int, Format], offsets: list[list[int]]
+    buffer: UInt8[np.ndarray, " bytes"], formats: Mapping[int, Format], offsets: Offsets
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """The messages by name as structured arrays, and the names of what cannot be laid out."""
     rows, odd = {}, []
     for kind, each in formats.items():
         dtype = each.dtype()
         if dtype is None or each.name in rows:
-            odd += [each.name] if offsets[kind] else []
-        elif offsets[kind]:
+            odd += [each.name] if offsets.get(kind) else []
+        elif offsets.get(kind):
             windows = np.lib.stride_tricks.sliding_window_view(buffer, each.length)
             rows[each.name] = windows[np.array(offsets[kind])].view(dtype)[:, 0]
     return rows, odd
 
 
-def _scan(data: bytes) -> tuple[dict[int, Format], list[list[int]], list[str]]:
-    """The formats by message type, the offsets of each type's messages, what was skipped."""
-    formats: dict[int, Format] = {}
-    offsets: list[list[int]] = [[] for _ in range(256)]
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    """From definitions of messages to the next ones: formats by message type, offsets of each.
+
+    `defined` are the types that it defines itself, and `redefined` place, old and new format of
+    those that the part before defined otherwise.
+    """
+
+    begin: int
+    formats: dict[int, Format]
+    offsets: dict[int, list[int]] = dataclasses.field(
+        default_factory=lambda: collections.defaultdict(list)
+    )
+    defined: set[int] = dataclasses.field(default_factory=set)
+    redefined: list[tuple[int, Format, Format]] = dataclasses.field(default_factory=list)
+
+
+_FIRST = HEAD + bytes([FORMAT_TYPE, FORMAT_TYPE, _FMT_LENGTH])  # of a log: the FMT of FMT
+
+
+def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
+    """The parts of a file, and what was skipped.
+
+    A log ends within a message, wherever the writer's buffer did, which is no damage.
+    """
+    parts = [part := _Part(0, {})]
     lengths = [0] * 256
     lengths[FORMAT_TYPE] = _FMT_LENGTH
     skipped: list[tuple[int, int]] = []
-    place, end = 0, len(data)
+    place, last, end = 0, -1, len(data)
     while place + 3 <= end:
         kind = data[place + 2]
         length = lengths[kind]
         if not length or data[place] != 0xA3 or data[place + 1] != 0x95:
+            begin = data.find(_FIRST, last + 3, place) if last >= 0 else -1
+            if begin >= 0:  # the log before ended within its last message
+                part.offsets[data[last + 2]].pop()
+                place = last = begin
+                continue
             after = _next_message(data, place + 1, lengths)
             skipped.append((place, after))
-            place = after
+            place, last = after, -1
         elif place + length > end:
             break
         else:
             if kind == FORMAT_TYPE:
-                _define(data, place, formats, lengths)
-            offsets[kind].append(place)
+                part = _part_at(place, data[place + 3], parts)
+                _define(data, place, part, lengths)
+            part.offsets[kind].append(place)
+            last = place
             place += length
-    return formats, offsets, describe_skips(skipped, place, end)
+    if skipped and skipped[-1][1] == end and not data[skipped[-1][0] :].strip(b"\0\xff"):
+        skipped.pop()  # what a file was prepared with, and not written
+    return parts, describe_skips(skipped, end, end)
 
 
-def _define(data: bytes, place: int, formats: dict[int, Format], lengths: list[int]) -> None:
+def _part_at(place: int, kind: int, parts: list[_Part]) -> _Part:
+    """The part that a definition belongs to: a new one where its type is defined once more."""
+    part = parts[-1]
+    if kind in part.defined and part.offsets.keys() != {FORMAT_TYPE}:
+        if len(parts) == MOST_PARTS:
+            raise ReadError(
+                f"the file defines its messages more than {MOST_PARTS} times: {CUT_IT}",
+                offset=place,
+            )
+        parts.append(part := _Part(place, dict(part.formats)))
+    part.defined.add(kind)
+    return part
+
+
+def _define(data: bytes, place: int, part: _Part, lengths: list[int]) -> None:
     new = parse_format(data[place + 3 : place + _FMT_LENGTH])
-    old = formats.get(new.kind)
+    old = part.formats.get(new.kind)
     if old is not None and old != new:
-        raise ReadError(
-            f"message type {new.kind} ({old.name}) is defined a second time, differently "
-            f"({new.name}): if the file holds two logs, cut it there",
-            offset=place,
-        )
+        part.redefined.append((place, old, new))
     if new.kind == FORMAT_TYPE and new.length != _FMT_LENGTH:
         raise ReadError(
             f"the FMT message declares a length of {new.length} bytes; it has 89", offset=place
         )
-    formats[new.kind] = new
+    part.formats[new.kind] = new
     lengths[new.kind] = new.length if new.length > 3 else 0
+
+
+def _one_log(
+    buffer: UInt8[np.ndarray, " bytes"], parts: Sequence[_Part]
+) -> tuple[Mapping[int, Format], Offsets, list[str]]:
+    """Formats and offsets of one of the logs that a file holds, and a remark on the others."""
+    ends = [*(part.begin for part in parts[1:]), buffer.size]
+    described = [
+        Part(
+            part.begin,
+            end,
+            _span(buffer, part),
+            _holds(part, "SIDD"),
+            bool(part.redefined) and FORMAT_TYPE in part.defined,
+        )
+        for part, end in zip(parts, ends, strict=True)
+    ]
+    numbers, remarks = choose_log(described)
+    offsets: Offsets = collections.defaultdict(list)
+    for i in numbers:
+        if parts[i].redefined and (i == 0 or i - 1 in numbers):
+            _refuse_other_definition(*parts[i].redefined[0])
+        for kind, places in parts[i].offsets.items():
+            offsets[kind] += places
+    return parts[numbers[-1]].formats, offsets, remarks
+
+
+def _refuse_other_definition(place: int, old: Format, new: Format) -> NoReturn:
+    raise ReadError(
+        f"message type {new.kind} ({old.name}) is defined a second time, differently "
+        f"({new.name}): if the file holds two logs, cut it there",
+        offset=place,
+    )
+
+
+def _span(buffer: UInt8[np.ndarray, " bytes"], part: _Part) -> tuple[float, float] | None:
+    """First and last time of a part in s, by its most frequent messages with a time."""
+    timed = [each for each in part.formats.values() if each.columns[0] in CLOCKS]
+    timed = [each for each in timed if part.offsets.get(each.kind) and each.name not in ABOUT]
+    timed = [each for each in timed if each.dtype() is not None]
+    if not timed:
+        return None
+    most = max(timed, key=lambda each: len(part.offsets[each.kind]))
+    rows, _ = _all_rows(buffer, {most.kind: most}, part.offsets)
+    return span_of(CLOCKS[most.columns[0]] * rows[most.name][most.columns[0]].astype(np.float64))
+
+
+def _holds(part: _Part, name: str) -> bool:
+    return any(each.name == name and part.offsets.get(k) for k, each in part.formats.items())
 
 
 def _next_message(data: bytes, place: int, lengths: list[int]) -> int:
@@ -229,12 +337,12 @@ def tables_of(
     `rows` are columns by name, with their own scale `applied` or not. Messages without a time
     stamp (formats, parameters) make no table.
     """
-    clock = next((name for name in layout.columns if name in _CLOCKS), None)
+    clock = next((name for name in layout.columns if name in CLOCKS), None)
     if clock is None or clock not in rows:
         return {}
     if rows[clock].ndim != 1 or rows[clock].dtype.kind not in "iuf":
         return {}
-    time = rows[clock] * _CLOCKS[clock]
+    time = rows[clock] * CLOCKS[clock]
     units, scales, instance = _labels(layout, scaled, applied)
     columns = {name: rows[name] for name in layout.columns if name in rows and name != clock}
     numbers = np.unique(columns[instance]) if instance in columns else np.empty(0)
@@ -269,9 +377,9 @@ _GYROS = {"R": "GyrX", "P": "GyrY", "Y": "GyrZ"}  # of IMU, in rad/s
 _DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)}  # rate over gyro
 
 
-def _find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
+def find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
     """Give RATE its unit in logs before FMTU, by the size of IMU's gyro; returns the remark."""
-    rate, imu = tables.get("RATE"), tables.get("IMU", tables.get("IMU[0]"))
+    rate, imu = tables.get("RATE"), tables.get(_first_instance(tables, "IMU"))
     if rate is None or scaled.letters.get("RATE"):
         return []
     ratio = _rate_over_gyro(rate, imu)
@@ -291,6 +399,11 @@ def _find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
     return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
 
 
+def _first_instance(tables: Mapping[str, Table], kind: str) -> str:
+    """Messages of a kind without instances, or of the first one: `IMU`, `IMU[0]`, ..."""
+    return min((name for name in tables if name.partition("[")[0] == kind), default="")
+
+
 def _rate_over_gyro(rate: Table, imu: Table | None) -> float | None:
     """Of the deviations over all axes; None where there is no gyro, or nothing turned."""
     pairs = [] if imu is None else [(rate.columns.get(r), imu.columns.get(g)) for r, g in
@@ -299,131 +412,3 @@ def _rate_over_gyro(rate: Table, imu: Table | None) -> float | None:
     turned, measured = (np.sqrt(sum(float(np.var(c)) for c in each)) for each in
                         (zip(*known, strict=True) if known else ((), ())))  # fmt: skip
     return float(turned / measured) if measured > 1e-3 and turned > 0 else None
-
-
-_MOST_TYPES = 1000
-_MOST_COLUMNS = 64
-
-
-def sniff_text(head: bytes, path: Path) -> bool:
-    return head.lstrip().startswith(b"FMT,")
-
-
-def load_text(path: Path) -> Log:
-    """The same of a text log, as ground stations write them from the binary ones.
-
-    Numbers stand in the units of their format letters; those of FMTU remain to be multiplied.
-    """
-    lines, skipped = _by_name(path.read_bytes())
-    formats = _text_formats(lines.get("FMT", []))
-    if not formats:
-        raise ReadError(
-            "there is no valid FMT line: the file is not a DataFlash log, or its beginning is "
-            "missing",
-            offset=0,
-        )
-    scaled = _text_scaling(lines, {each.kind: each.name for each in formats})
-    tables: dict[str, Table] = {}
-    for each in formats:
-        if each.name in lines and each.name not in _ABOUT:
-            columns, odd = _text_columns(lines[each.name], each)
-            skipped += odd
-            tables |= tables_of(each, columns, scaled, applied=True)
-    remarks = [f"{skipped} lines that match no format were left out"] if skipped else []
-    remarks += _find_rate_unit(tables, scaled)
-    stamped = _text_parameters(lines, formats)
-    settings = {name: value for _, name, value in stamped}
-    return Log(
-        tables, tuple(remarks), "ardupilot", settings, changes_of(stamped, lambda time: time)
-    )
-
-
-def _text_parameters(
-    lines: Mapping[str, list[bytes]], formats: Sequence[Format]
-) -> list[tuple[float | None, str, str]]:
-    """As `_parameters`. Later versions log a parameter's default behind its value."""
-    columns = next((each.columns for each in formats if each.name == "PARM"), ())
-    at = columns.index("Name") if {"Name", "Value"} <= set(columns) else -2
-    beside = columns.index("Value") if at >= 0 else -1
-    timed = columns[:1] == ("TimeUS",)
-    least = max(2, at + 1, beside + 1)
-    return [
-        (1e-6 * _number(cells[0]) if timed else None, cells[at], cells[beside])
-        for cells in _split(lines.get("PARM", []))
-        if len(cells) >= least
-    ]
-
-
-def _by_name(content: bytes) -> tuple[dict[str, list[bytes]], int]:
-    """What follows the name on each line, by name; and how many lines have none."""
-    lines: dict[bytes, list[bytes]] = {}
-    skipped = 0
-    for line in content.split(b"\n"):
-        name, comma, rest = line.partition(b",")
-        if comma and (name in lines or len(lines) < _MOST_TYPES):
-            lines.setdefault(name, []).append(rest)
-        else:
-            skipped += bool(line.strip())
-    return {name.decode("latin-1").strip(): rests for name, rests in lines.items()}, skipped
-
-
-def _split(lines: Sequence[bytes]) -> list[list[str]]:
-    return [[cell.strip() for cell in line.decode("latin-1").split(",")] for line in lines]
-
-
-def _text_formats(lines: Sequence[bytes]) -> list[Format]:
-    """From `140, 27, RATE, Qfff, TimeUS,RDes,R,ROut`; the first of a name counts."""
-    formats: dict[str, Format] = {}
-    for kind, length, name, codes, *columns in (c for c in _split(lines) if len(c) >= 5):
-        plausible = kind.isdecimal() and length.isdecimal() and name
-        if plausible and len(codes) == len(columns) == len(set(columns)) <= _MOST_COLUMNS:
-            each = Format(int(kind[:9]), int(length[:9]), name, codes, tuple(columns))
-            formats.setdefault(name, each)
-    return list(formats.values())
-
-
-def _text_scaling(lines: dict[str, list[bytes]], names: dict[int, str]) -> Scaling:
-    units = {chr(int(c[-2])): c[-1] for c in _split(lines.get("UNIT", [])) if _is_pair(c)}
-    mults = {chr(int(c[-2])): _number(c[-1]) for c in _split(lines.get("MULT", [])) if _is_pair(c)}
-    letters = {
-        names[int(kind)]: (unit_ids, mult_ids)
-        for kind, unit_ids, mult_ids in (c[-3:] for c in _split(lines.get("FMTU", [])) if c[2:])
-        if kind.isdecimal() and len(kind) < 9 and int(kind) in names
-    }
-    return Scaling(units, {k: mult for k, mult in mults.items() if 0 < mult < np.inf}, letters)
-
-
-def _is_pair(cells: list[str]) -> bool:
-    return len(cells) >= 2 and cells[-2].isdecimal() and len(cells[-2]) <= 3
-
-
-def _text_columns(lines: list[bytes], layout: Format) -> tuple[dict[str, np.ndarray], int]:
-    """The columns that hold numbers throughout, and how many lines had too many or few cells."""
-    width = len(layout.columns)
-    fitting = [line for line in lines if line.count(b",") == width - 1]
-    odd = len(lines) - len(fitting)
-    table = _plain(fitting, width)
-    if table is not None:
-        return dict(zip(layout.columns, table.T, strict=True)), odd
-    columns = {}
-    for name, cells in zip(layout.columns, zip(*_split(fitting), strict=True), strict=True):
-        values = np.array([_number(cell) for cell in cells])
-        if np.isfinite(values).any():
-            columns[name] = values
-    return columns, odd
-
-
-def _plain(lines: Sequence[bytes], width: int) -> np.ndarray | None:
-    """All numbers at once, where there is nothing else."""
-    try:
-        numbers = np.fromstring(b",".join(lines).decode("latin-1"), sep=",")
-    except ValueError:
-        return None
-    return numbers.reshape(-1, width) if numbers.size == width * len(lines) else None
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return float("nan")

@@ -28,6 +28,7 @@ from . import (
     _crazyflie,
     _csv,
     _dataflash,
+    _dataflash_text,
     _mat,
     _npz,
     _ulog,
@@ -134,7 +135,7 @@ READERS: Mapping[str, Reader] = {
         "an ArduPilot DataFlash log", _dataflash.sniff, _dataflash.load, (".bin",)
     ),
     "dataflash_text": Reader(
-        "an ArduPilot text log", _dataflash.sniff_text, _dataflash.load_text, (".log",)
+        "an ArduPilot text log", _dataflash_text.sniff_text, _dataflash_text.load_text, (".log",)
     ),
     "ulog": Reader("a PX4 ULog", _ulog.sniff, _ulog.load, (".ulg", ".ulog")),
     "betaflight": Reader(

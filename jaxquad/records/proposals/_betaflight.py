@@ -89,8 +89,9 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
         ]
         alike = [Injection(*each[1:]) for each in sweeps if each.axis == best.axis]
         setup = Setup(
-            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", remarks=tuple(remarks)
-        )
+            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", remarks=tuple(remarks),
+            injected_at="rate",
+        )  # fmt: skip
         return with_injections(setup, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
     if setpoint and not np.ptp(values_of(signals, setpoint)):

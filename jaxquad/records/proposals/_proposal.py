@@ -1,12 +1,13 @@
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._clock import FEWEST, native_rate
 from .._errors import RecordError
 from .._log import flattened, Log, SettingChange, Signals
+from ._chirps import Chirp, Point
 
 
 AXES: tuple[str, ...] = ("roll", "pitch", "yaw")
@@ -27,7 +28,10 @@ class Setup(NamedTuple):
     """The channels and excitation of one axis in a vehicle's log.
 
     `start` and `stop` are those of the longest injection, `segments` those of all injections of the
-    same kind, in the order of time.
+    same kind, in the order of time. `injected_at` says where the reference enters the loop: at the
+    set-point of the rate or of the angle, or at the mixer, behind the controller, whose logged
+    output, the `command`, contains it all the same. `late_s` are channels whose value acts that
+    long after its stamp, and is computed from measurements of that stamp.
     """
 
     axis: str
@@ -42,7 +46,9 @@ class Setup(NamedTuple):
     segments: tuple[tuple[float, float], ...] = ()  # s
     hold: float | None = None  # s; of the command, where the log says it
     throttle: Mix = {}  # the collective, 0 to 1 but for PX4's sign; empty if it is not logged
-    injected_at: Literal["", "rate", "mixer", "angle"] = ""
+    injected_at: Point = ""  # empty: nothing was injected, or it is not known
+    late_s: Mapping[str, float] = {}
+    chirps: tuple[Chirp, ...] = ()  # all of the log, of any axis
     levelled: bool = False  # whether an angle loop of Betaflight is known to have been closed
 
 
@@ -129,12 +135,25 @@ class Proposal(NamedTuple):
         )
         return f"{self.setup.axis}={''.join(terms).removeprefix('+')}"
 
+    @property
+    def _listed_chirps(self) -> list[str]:
+        """All chirps of the log, where there is a choice; those that are used have a star."""
+        used = lambda chirp: any(
+            start < chirp.stop and chirp.start < stop for start, stop in self.segments
+        )
+        chirps = self.setup.chirps
+        if len(chirps) < 2 and all(map(used, chirps)):
+            return []
+        lines = [f"    {'*' if used(chirp) else ' '} {chirp}" for chirp in chirps]
+        return ["  chirps of this log (* used; --chirp N chooses one):", *lines]
+
     def __str__(self) -> str:
         setup = self.setup
         none = "none (feedback biases the direct estimate; the joint one needs a reference)"
         lines = [
             f"Proposal for the {setup.axis} axis of {self.path} ({self.vehicle})",
             f"  excitation: {setup.excitation}",
+            *self._listed_chirps,
             f"  command: {self._mix}",
             f"  rate: {setup.rate} [{self.units.get(setup.rate) or 'unit unknown'}]",
             f"  external reference: {setup.reference or none}",
@@ -186,7 +205,11 @@ def complete(path: str, log: Log, setup: Setup) -> Proposal:
     setup = setup._replace(
         remarks=remarks, hold=_loop_period(log), throttle=_throttle(log, signals)
     )
-    changes = tuple(change for change in log.changes if change.name.startswith(_OF_LOOP))
+    changes = tuple(
+        change
+        for change in log.changes
+        if change.name.startswith(_OF_LOOP) and change.name not in _LEARNED
+    )
     return Proposal(path, log.vehicle, _split(setup, changes, signals), rate, units, changes)
 
 
@@ -194,6 +217,7 @@ _OF_LOOP = (
     "ATC_", "INS_GYRO_", "INS_HNTC", "MOT_", "SCHED_LOOP_RATE", "PSC_", "FSTRATE_",
     "MC_", "IMU_GYRO_", "IMU_DGYRO_", "THR_MDL_FAC", "CA_", "PWM_", "DSHOT_",
 )  # fmt: skip
+_LEARNED = ("MOT_THST_HOVER",)  # in flight, and stored at the end of it: the hover's throttle
 _SHOWN = 4  # changes in a remark
 _SHORTEST = 2.0  # s of a part worth a record
 

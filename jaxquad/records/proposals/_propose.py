@@ -6,6 +6,7 @@ from .._log import flattened, Log, Signals
 from ..formats import load_log
 from ._ardupilot import ardupilot_setup
 from ._betaflight import betaflight_setup
+from ._chirps import Selection
 from ._proposal import (
     AXES,
     complete,
@@ -76,35 +77,44 @@ def _command(signals: Signals, prefix: str, axis: str) -> dict[str, float] | Non
     return dict(zip(motors, map(float, _MOTORS[axis]), strict=True))
 
 
-_SETUPS: Mapping[str, Callable[[Log, str | None], Setup]] = {
+_SETUPS: Mapping[str, Callable[[Log, Selection], Setup]] = {
     "ardupilot": ardupilot_setup,
-    "px4": px4_setup,
-    "betaflight": betaflight_setup,
-    "crazyflie": crazyflie_setup,
+    "px4": lambda log, wanted: px4_setup(log, wanted.axis),
+    "betaflight": lambda log, wanted: betaflight_setup(log, wanted.axis),
+    "crazyflie": lambda log, wanted: crazyflie_setup(log, wanted.axis),
 }
+_NUMBERED = ("ardupilot",)  # whose chirps are listed with numbers
 
 
-def propose(path: str | Path, *, axis: str | None = None) -> Proposal:
+def propose(
+    path: str | Path,
+    *,
+    axis: str | None = None,
+    chirp: int | None = None,
+    start: float | int | None = None,
+    stop: float | int | None = None,
+) -> Proposal:
     """Propose which channels of an autopilot's log are command, rate and external reference.
 
     Injected excitation is found, with its time and band: ArduPilot's SystemID mode, PX4's
     autotune, Betaflight's chirp mode. A set-point that an outer loop computes contains feedback,
-    and is never proposed as the external reference. For ArduPilot's chirps into the mixer (SID_AXIS
-    10 to 12) the command is the sum of controller output and chirp; for others the output already
-    contains it.
+    and is never proposed as the external reference.
 
     **Arguments:**
 
     - `path`: a log of ArduPilot, PX4, Betaflight or Crazyflie.
     - `axis`: `"roll"`, `"pitch"` or `"yaw"`; by default that of the longest injected excitation,
         else the one that moves most.
+    - `chirp`: the number, from 1, of one of the chirps that the proposal of an ArduPilot log lists;
+        by default the longest one, with all others on its axis at its place.
+    - `start`, `stop`: in s of the log's time; only ArduPilot's chirps between them are taken.
 
     **Returns:** a `Proposal`, which prints its reasons and the command line.
 
     **Raises:**
 
     - `ReadError`: where the file is missing, damaged or of an unknown format.
-    - `RecordError`: where the log lacks the channels of the axis.
+    - `RecordError`: where the log lacks the channels of the axis, or the chirp.
     """
     if axis is not None and axis not in AXES:
         raise RecordError(f"axis is {axis!r}: use one of {', '.join(AXES)}.")
@@ -115,8 +125,15 @@ def propose(path: str | Path, *, axis: str | None = None) -> Proposal:
             f"channels is unknown. jaxquad identify takes it all the same: list them (jaxquad "
             f"channels, jq.records.channels) and name inputs, outputs and references yourself."
         )
+    if chirp is not None and log.vehicle not in _NUMBERED:
+        raise RecordError(
+            f"{path}: the chirps of {log.vehicle} have no numbers: leave `chirp` out, and give the "
+            "time (`start`, `stop`) of the one to use."
+        )
     try:
-        return complete(str(path), log, _SETUPS[log.vehicle](log, axis))
+        low, high = (None if end is None else float(end) for end in (start, stop))
+        wanted = Selection(axis, chirp, low, high)
+        return complete(str(path), log, _SETUPS[log.vehicle](log, wanted))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
     # A log may call anything by the names that its vehicle uses.

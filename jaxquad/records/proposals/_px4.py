@@ -48,7 +48,8 @@ def px4_setup(log: Log, axis: str | None) -> Setup:
             f"the log has no torque set-point (vehicle_torque_setpoint) or no rate for {axis}."
         )
     if axis in tuned:
-        setup = Setup(axis, {command: 1.0}, rates[axis], f"{_AUTOTUNE}.rate_sp[{i}]")
+        reference = f"{_AUTOTUNE}.rate_sp[{i}]"
+        setup = Setup(axis, {command: 1.0}, rates[axis], reference, injected_at="rate")
         return with_injections(setup, tuned[axis], "autotune's steps on the rate set-point")
     return _untuned(log, signals, axis, command, rates[axis])
 

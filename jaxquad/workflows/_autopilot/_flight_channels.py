@@ -1,6 +1,7 @@
 """What a proposal reads of a flight beside the record: gyros, set-point, terms, motors."""
 
 import dataclasses
+import functools as ft
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -27,6 +28,7 @@ from .._settings import IdentifySettings
 
 
 Samples = Float[np.ndarray, " samples"]
+Span = tuple[float | None, float | None]  # s; None: from the beginning, to the end
 _TERMS = ("P", "I", "D", "F")
 HOVER = 0.3  # of the throttle, where a log does not hold it
 
@@ -60,7 +62,7 @@ class FlightChannels:
     setpoint: Samples
     axis: int = 0
     start: float = 0.0
-    unfiltered: tuple[Samples, ...] = ()
+    unfiltered: tuple[Float[np.ndarray, " raw_samples"], ...] = ()
     unfiltered_dt: float = 0.0
     averaged: bool = False  # whether the unfiltered rate is the mean over its sample
     terms: Mapping[str, Samples] = dataclasses.field(default_factory=dict)
@@ -133,18 +135,21 @@ def read_channels(
     firmware, prefix = _firmware(proposal), proposal.setup.rate.rpartition("gyroADC")[0]
     axis = AXES.index(proposal.setup.axis)
     names = _NAMES[firmware](prefix, axis)
+    log = _HeldChannels(path, frozenset(each.name for each in channels(path)))
+    if firmware == "ardupilot":
+        names = names._replace(unfiltered=_ardupilot_gyro(log, values, _span(settings)))
     throttle, injected = proposal.setup.throttle, _injected(proposal)
     wanted = [*names.filtered, *names.unfiltered, *names.terms, *names.motors, names.setpoint]
     external = proposal.setup.reference
     wanted += [*names.output, *names.stick, *injected, external]
-    found = _read(path, [*wanted, *throttle], _span(settings))
+    found = _read(log, [*wanted, *throttle], _span(settings))
     rates, rate = found.get(names.filtered[axis]), names.filtered[axis]
     if rates is None or names.setpoint not in found:
         raise RecordError(f"{path} holds no {rate} or no {names.setpoint} of the analysed part")
     on_its_clock = lambda name: np.interp(rates.time, found[name].time, _values(found[name], name))
     at_rate = lambda name: np.interp(rates.time, found[name].time, found[name].channel(name))
     sum_at = lambda mix: _mixed(mix, found, at_rate)
-    raw = found.get(names.unfiltered[axis])
+    raw = found.get(names.unfiltered[axis]) if names.unfiltered else None
     motors = [name for name in names.motors if name in found]
     return FlightChannels(
         rates=tuple(on_its_clock(name) for name in names.filtered if name in found),
@@ -166,9 +171,10 @@ def read_channels(
         motors=np.stack([at_rate(x) for x in motors], axis=1) if motors else None,
         motor_ends=_motor_ends(firmware, values),
         throttle=sum_at(throttle), stick=_stick(sum_at(names.stick), firmware, values),
-        late=_late(firmware, values), resolution=_resolution(firmware, values),
+        late=proposal.setup.late_s.get(names.setpoint, 0.0),
+        resolution=_resolution(firmware, values),
         names=(rate, "" if raw is None else names.unfiltered[axis]),
-        tracked_hz=_tracked(path, _span(settings)) if firmware == "ardupilot" else {},
+        tracked_hz=_tracked(log, _span(settings)) if firmware == "ardupilot" else {},
     )  # fmt: skip
 
 
@@ -178,20 +184,26 @@ _SPEEDS = {
 }  # fmt: skip
 
 
-def _tracked(path: Path, span: tuple[float | None, float | None]) -> dict[int, tuple[float, ...]]:
+class _HeldChannels(NamedTuple):
+    """A log and the names of all its channels."""
+
+    path: Path
+    names: frozenset[str]
+
+
+def _tracked(log: _HeldChannels, span: Span) -> dict[int, tuple[float, ...]]:
     """The median speeds in Hz that the log holds, of those that turn."""
-    held = [each.name for each in channels(path)]
     found: dict[int, tuple[float, ...]] = {}
     for mode, pattern in _SPEEDS.items():
-        names = [name for name in held if pattern.fullmatch(name)]
-        records = _read(path, names, (None, None)) if names else {}
+        names = sorted(name for name in log.names if pattern.fullmatch(name))
+        records = _read(log, names, (None, None)) if names else {}
         medians = [_median(record, name, span) / 60 for name, record in records.items()]
         if turning := tuple(each for each in medians if each > 0):
             found[mode] = turning
     return found
 
 
-def _median(record: Record, name: str, span: tuple[float | None, float | None]) -> float:
+def _median(record: Record, name: str, span: Span) -> float:
     """Within a span; 0 without samples there."""
     low, high = (end if x is None else x for x, end in zip(span, (-np.inf, np.inf), strict=True))
     inside = record.channel(name)[(record.time >= low) & (record.time <= high)]
@@ -234,12 +246,41 @@ def _px4_names(prefix: str, axis: int) -> _Names:
 def _ardupilot_names(prefix: str, axis: int) -> _Names:
     return _Names(
         [f"RATE.{letter}" for letter in "RPY"],
-        [f"GYR.Gyr{letter}" for letter in "XYZ"],
+        [],
         f"RATE.{'RPY'[axis]}Des",
         [f"PID{'RPY'[axis]}.{x}" for x in ("P", "I", "D", "FF")],
         [f"RCOU.C{k}" for k in range(1, 5)],
         {f"RATE.{'RPY'[axis]}Out": 1.0},
     )
+
+
+_POST, _BOTH = 4, 8  # of INS_RAW_LOG_OPT: behind the filters, or before and behind them
+_GYROS = re.compile(r"(GYR(\d|\[\d\])?)\.GyrX")
+
+
+def _ardupilot_gyro(log: _HeldChannels, values: Mapping[str, str], span: Span) -> list[str]:
+    """The gyro before its filters that flew, else the first; none where it is logged behind them.
+
+    Its messages are GYR[0], in older logs GYR1 or GYR. Where both kinds are logged, those behind
+    the filters have the higher numbers.
+    """
+    options = int(_number(values, "INS_RAW_LOG_OPT", 0.0))
+    tables = [hit[1] for name in log.names if (hit := _GYROS.fullmatch(name))]
+    if not tables or (options & _POST and not options & _BOTH):
+        return []
+    used = f"GYR[{_gyro_in_use(log, values, span)}]"
+    table = used if used in tables else min(tables)
+    return [f"{table}.Gyr{letter}" for letter in "XYZ"]
+
+
+def _gyro_in_use(log: _HeldChannels, values: Mapping[str, str], span: Span) -> int:
+    """The IMU of the filter that flew (XKF4.PI): each of them has one of EK3_IMU_MASK."""
+    name = "XKF4[0].PI"
+    found = _read(log, [name], span)
+    mask = int(_number(values, "EK3_IMU_MASK", 3.0))
+    imus = [i for i in range(8) if mask >> i & 1]
+    core = int(np.median(found[name].channel(name))) if name in found else 0
+    return imus[core] if core < len(imus) else 0
 
 
 _NAMES: Mapping[Firmware, Callable[[str, int], _Names]] = {
@@ -252,7 +293,7 @@ def _firmware(proposal: Proposal) -> Firmware:
     return known.get(proposal.vehicle, "ardupilot")
 
 
-def _span(settings: IdentifySettings) -> tuple[float | None, float | None]:
+def _span(settings: IdentifySettings) -> Span:
     if not settings.segments:
         return settings.start, settings.stop
     ends = [(-np.inf if a is None else a, np.inf if b is None else b) for a, b in settings.segments]
@@ -260,22 +301,20 @@ def _span(settings: IdentifySettings) -> tuple[float | None, float | None]:
     return (low if np.isfinite(low) else None), (high if np.isfinite(high) else None)
 
 
-def _read(
-    path: Path, names: Sequence[str], span: tuple[float | None, float | None]
-) -> dict[str, Record]:
+def _read(log: _HeldChannels, names: Sequence[str], span: Span) -> dict[str, Record]:
     """For each channel that the log has the record of its table, on that table's clock."""
-    held = {each.name for each in channels(path)}
     tables: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
-        if name in held:
-            tables.setdefault(name.partition("[")[0].rpartition(".")[0], []).append(name)
+        if name in log.names:
+            kind = name.rpartition(".")[0].partition("[")[0]  # instances have clocks alike
+            tables.setdefault(kind, []).append(name)
     found: dict[str, Record] = {}
     for group in tables.values():
         first = {"the first one": {group[0]: 1.0}}  # a record has an input
         try:
             with warnings.catch_warnings():  # of axes that rest
                 warnings.simplefilter("ignore", RecordWarning)
-                record = read(path, inputs=first, outputs=group, start=span[0], stop=span[1])
+                record = read(log.path, inputs=first, outputs=group, start=span[0], stop=span[1])
         except RecordError:  # too few samples in this span, or missing ones
             continue
         found |= dict.fromkeys(group, record)
@@ -289,15 +328,19 @@ def _values(record: Record, name: str) -> Samples:
 
 
 def _motor_ends(firmware: Firmware, values: Mapping[str, str]) -> tuple[float, float]:
-    number = lambda name, default: float(values.get(name, default))
     if firmware == "betaflight":
         low, high = (float(x) for x in values.get("motorOutput", "48,2047").split(",")[:2])
         return low, high
     if firmware == "px4":
         return 0.0, 1.0
+    number = ft.partial(_number, values)
     low, high = number("MOT_PWM_MIN", 1000.0), number("MOT_PWM_MAX", 2000.0)
     share = lambda part: low + part * (high - low)
     return share(number("MOT_SPIN_MIN", 0.15)), share(number("MOT_SPIN_MAX", 0.95))
+
+
+def _number(values: Mapping[str, str], name: str, default: float) -> float:
+    return float(values.get(name, default))
 
 
 def _mixed(
@@ -320,11 +363,6 @@ def _stick(
     if command is None or firmware != "betaflight" or float(values.get("throttle_limit_type", 0)):
         return None
     return np.clip((command - 1000) / 1000, 0.0, 1.0)
-
-
-def _late(firmware: Firmware, values: Mapping[str, str]) -> float:
-    """ArduPilot's modes run behind the rate loop and before the logging: docs/autopilots.md."""
-    return 1 / float(values.get("SCHED_LOOP_RATE", 400)) if firmware == "ardupilot" else 0.0
 
 
 def _resolution(firmware: Firmware, values: Mapping[str, str]) -> tuple[float, float]:

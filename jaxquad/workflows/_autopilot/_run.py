@@ -137,7 +137,7 @@ _NO_SETPOINT = (
 def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
     """What the log itself says is command, rate and reference."""
     asked = IdentifySettings(
-        axis=None if settings.axis == "all" else settings.axis,
+        axis=None if settings.axis == "all" else settings.axis, chirp=settings.chirp,
         start=settings.start, stop=settings.stop, band=settings.band,
     )  # fmt: skip
     found, proposal = propose_settings(path, asked)
