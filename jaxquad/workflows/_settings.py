@@ -203,6 +203,13 @@ class IdentifySettings(Settings):
     axis: str | None = option_field(
         kinds.AXIS, None, "the axis to propose input and output for", group=THE_RECORD
     )
+    flight: int | None = option_field(
+        kinds.SIZE,
+        None,
+        "the number of the flight in a file with several; by default the longest with a chirp, "
+        "else the longest with sticks that move",
+        group=THE_RECORD,
+    )
     units: Mapping[str, str] = option_field(
         kinds.UNITS,
         {},
@@ -343,6 +350,11 @@ class IdentifySettings(Settings):
         if self.input is not None and self.axis is not None:
             raise SettingsError(
                 "`axis` is for a proposal: leave it out, or leave `input` and `output` out"
+            )
+        if self.input is not None and self.flight is not None:
+            raise SettingsError(
+                "`flight` is for a proposal: name the channels of that flight (log2.axisSum[0]), "
+                "or leave `input` and `output` out"
             )
         if self.segments and (self.start is not None or self.stop is not None):
             raise SettingsError(

@@ -1,11 +1,15 @@
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from .._errors import printable, RecordError
 from .._log import flattened, Log, Signals
 from ..formats import load_log
 from ._ardupilot import ardupilot_setup
-from ._betaflight import betaflight_setup
+from ._betaflight import betaflight_setup, saturation
+from ._flights import choose_flight
+from ._flown_span import in_flight
 from ._proposal import (
     AXES,
     complete,
@@ -84,20 +88,37 @@ _SETUPS: Mapping[str, Callable[[Log, str | None], Setup]] = {
 }
 
 
-def propose(path: str | Path, *, axis: str | None = None) -> Proposal:
+_USED_PART: Mapping[str, Callable[[Log, Setup, Sequence[tuple[float, float]]], tuple[str, ...]]] = {
+    "betaflight": saturation
+}  # remarks that depend on the part that is used
+
+
+def propose(
+    path: str | Path,
+    *,
+    axis: str | None = None,
+    flight: int | None = None,
+    start: float | int | None = None,
+    stop: float | int | None = None,
+) -> Proposal:
     """Propose which channels of an autopilot's log are command, rate and external reference.
 
     Injected excitation is found, with its time and band: ArduPilot's SystemID mode, PX4's
     autotune, Betaflight's chirp mode. A set-point that an outer loop computes contains feedback,
     and is never proposed as the external reference. For ArduPilot's chirps into the mixer (SID_AXIS
     10 to 12) the command is the sum of controller output and chirp; for others the output already
-    contains it.
+    contains it. Without injected excitation the proposal is of the time in flight: what comes
+    before take-off and after landing or a crash is left out.
 
     **Arguments:**
 
     - `path`: a log of ArduPilot, PX4, Betaflight or Crazyflie.
     - `axis`: `"roll"`, `"pitch"` or `"yaw"`; by default that of the longest injected excitation,
         else the one that moves most.
+    - `flight`: the number of the flight in a file with several, as `flights` lists them; by default
+        the longest with a chirp, else the longest with sticks that move, else the longest.
+    - `start`, `stop`: in s, instead of what the log says: the ends of the injected excitation, or
+        take-off and landing.
 
     **Returns:** a `Proposal`, which prints its reasons and the command line.
 
@@ -116,7 +137,7 @@ def propose(path: str | Path, *, axis: str | None = None) -> Proposal:
             f"channels, jq.records.channels) and name inputs, outputs and references yourself."
         )
     try:
-        return complete(str(path), log, _SETUPS[log.vehicle](log, axis))
+        return _proposed(str(path), log, axis, flight, (start, stop))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
     # A log may call anything by the names that its vehicle uses.
@@ -126,3 +147,20 @@ def propose(path: str | Path, *, axis: str | None = None) -> Proposal:
             f"({type(error).__name__}: {printable(str(error))}). Name inputs, outputs and "
             f"references yourself."
         ) from error
+
+
+def _proposed(
+    path: str, log: Log, axis: str | None, flight: int | None,
+    span: tuple[float | int | None, float | int | None],
+) -> Proposal:  # fmt: skip
+    log, choice = choose_flight(log, axis, flight)
+    ends = (None if end is None else float(end) for end in span)
+    setup = in_flight(log, _SETUPS[log.vehicle](log, axis), *ends)
+    proposal = complete(path, log, setup._replace(remarks=(*choice, *setup.remarks)))
+    setup = proposal.setup
+    used = [
+        (-np.inf if start is None else start, np.inf if stop is None else stop)
+        for start, stop in setup.segments or ((setup.start, setup.stop),)
+    ]
+    further = _USED_PART.get(log.vehicle, lambda *_: ())(log, setup, used)
+    return proposal._replace(setup=setup._replace(remarks=(*setup.remarks, *further)))

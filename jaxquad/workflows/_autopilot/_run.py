@@ -107,8 +107,9 @@ _FLY = "fly a chirp of the rate set-point, or strong and quick stick on this axi
 def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
     """What the log itself says is command, rate and reference."""
     asked = IdentifySettings(
-        axis=settings.axis, start=settings.start, stop=settings.stop, band=settings.band
-    )
+        axis=settings.axis, flight=settings.flight, start=settings.start, stop=settings.stop,
+        band=settings.band,
+    )  # fmt: skip
     found, proposal = propose_settings(path, asked)
     if proposal is None:
         raise SettingsError(f"{path} proposes no channels: give the log of an autopilot")
