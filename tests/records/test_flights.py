@@ -212,3 +212,9 @@ def test_what_was_injected_outside_of_start_and_stop_is_not_used(data):
     for start, stop in ((10.0, 12.0), (29.5, 30.5)):
         used = in_flight(log, setup, start, stop)
         assert (used.start, used.stop, used.segments) == (start, stop, ())
+
+
+def test_a_set_point_that_rests_is_no_reference(data):
+    setup = propose(data / FIRMWARE / "A_hover.BFL", axis="roll").setup
+    assert setup.reference == ""
+    assert any("setpoint[0] never moves" in each for each in setup.remarks)

@@ -12,6 +12,7 @@ from ._proposal import (
     first_logged,
     Injection,
     most_active_axis,
+    moves,
     Setup,
     values_of,
     with_injections,
@@ -51,6 +52,12 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
         setup = Setup(axis, {command: 1.0}, rates[axis], reference, remarks=tuple(remarks))
         return with_injections(setup, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
+    if setpoint and not moves(signals, setpoint):
+        remarks.append(
+            f"{setpoint} never moves, so nothing from outside excites {axis}: fly the chirp mode "
+            f"(debug_mode = CHIRP), or stick pulses of different widths"
+        )
+        return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
     if setpoint and not _levelled(log, prefix):
         remarks.append("flown in acro, where the set-point comes from the pilot only")
         return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=tuple(remarks))

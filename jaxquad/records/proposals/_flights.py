@@ -163,7 +163,7 @@ def choose_flight(log: Log, axis: str | None, number: int | None) -> tuple[Log, 
         return log, ()
     others = "; ".join(str(each) for each in every if each is not chosen)
     reason = "" if number is not None else f", {_reason(chosen, axis)}"
-    remark = f"{chosen} is used{reason}; others of this file (flight=): {others or 'none'}"
+    remark = f"{chosen} is used{reason}; others of this file (--flight N): {others or 'none'}"
     return _log_of(log, chosen.log), (remark,)
 
 

@@ -29,7 +29,7 @@ def command_hold(log: Log) -> tuple[float | None, tuple[str, ...]]:
     remark = (
         f"the header says a loop of {1e6 * stated:.6g} us (looptime, pid_process_denom), but the "
         f"time stamps say {1e6 * stamped:.6g} us for each loopIteration: the stamps are taken for "
-        f"how long the command is held (hold=)"
+        f"how long the command is held (--hold takes another)"
     )
     return float(f"{stamped:.6g}"), (remark,)
 
