@@ -5,10 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxquad.records import flights, propose, read, read_settings, RecordError
+from jaxquad.records import flights, propose, read, read_settings, Record, RecordError
 from jaxquad.records.formats import load_log
+from jaxquad.records.formats._betaflight_header import with_derived
+from jaxquad.records.proposals._betaflight import betaflight_setup
+from jaxquad.records.proposals._chirps import chirps
 from jaxquad.records.proposals._flown_span import flown_span, in_flight
 from jaxquad.records.proposals._hold import command_hold
+from jaxquad.spectra import frequency_response, JointInputOutput
 from jaxquad.workflows import autopilot, AutopilotSettings, IdentifySettings, SettingsError
 from jaxquad.workflows._log import open_logs
 
@@ -218,3 +222,50 @@ def test_a_set_point_that_rests_is_no_reference(data):
     setup = propose(data / FIRMWARE / "A_hover.BFL", axis="roll").setup
     assert setup.reference == ""
     assert any("setpoint[0] never moves" in each for each in setup.remarks)
+
+
+def of_phase_alone(log):
+    """The log as firmware writes it that fills nothing but the phase of its chirp."""
+    table = log.tables[""]
+    columns = {k: v for k, v in table.columns.items() if k != "chirp"}
+    columns |= {f"debug[{k}]": np.zeros(table.time.size, np.int32) for k in range(1, 8)}
+    again = dataclasses.replace(table, columns=with_derived(columns))
+    return dataclasses.replace(log, tables={**log.tables, "": again})
+
+
+@pytest.mark.parametrize("name", ["A_chirp_roll", "B_chirp_three_axes"])
+def test_a_chirp_whose_phase_alone_is_logged_is_the_same_chirp(data, name):
+    log = load_log(data / FIRMWARE / f"{name}.BFL")
+    table = of_phase_alone(log).tables[""]
+    sine, axis, tenths, excitation = (
+        table.columns["chirp"], *(log.tables[""].columns[f"debug[{k}]"] for k in (1, 2, 3))
+    )  # fmt: skip
+    above = tenths > 11  # 0.1 Hz; this firmware injects the cosine
+    np.testing.assert_allclose(sine[above] ** 2 + (excitation[above] / 1e3) ** 2, 1, atol=3e-3)
+    assert not sine[axis == -1].any()
+    assert "chirp" not in log.tables[""].columns
+    ours, theirs = chirps(table), chirps(log.tables[""])
+    assert [x.axis for x in ours] == [x.axis for x in theirs] == list(range(len(theirs)))
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose([a.start, a.stop], [b.start, b.stop], atol=0.05)
+        np.testing.assert_allclose([a.low, a.high], [b.low, b.high], rtol=0.2)
+    setup = betaflight_setup(of_phase_alone(log), None)
+    assert setup.reference == "chirp" and len(setup.remarks) == len(theirs)
+
+
+def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data):
+    """To three standard errors, at all frequencies that both see."""
+    log = load_log(data / FIRMWARE / "A_chirp_roll.BFL")
+    table, wanted = of_phase_alone(log).tables[""], log.tables[""]
+    used = (wanted.time > 9) & (wanted.time < 29)
+    u, y = (np.asarray(wanted.columns[x], float) for x in ("axisSum[0]", "gyroADC[0]"))
+    omega = 2 * np.pi * np.geomspace(1.5, 25, 20)
+    both = [
+        frequency_response(
+            Record(1e-3 * np.arange(used.sum()), u[used], y[used], np.asarray(r, float)[used]),
+            omega, estimator=JointInputOutput(),
+        )
+        for r in (table.columns["chirp"], wanted.columns["debug[3]"])
+    ]  # fmt: skip
+    (a, b), error = (np.asarray(x.response).ravel() for x in both), both[1].random_error
+    np.testing.assert_array_less(np.abs(a / b - 1), 3 * np.asarray(error).ravel())

@@ -65,7 +65,9 @@ def in_flight(
         return setup._replace(start=start, stop=stop)
     cut = (flown.before if start is None else "", flown.after if stop is None else "")
     left_out = " and ".join(filter(None, cut))
-    said = (f"left out, as no flight: {left_out}; --start and --stop take others",) if left_out else ()
+    said = (
+        (f"left out, as no flight: {left_out}; --start and --stop take others",) if left_out else ()
+    )
     return setup._replace(
         start=flown.start if start is None else start,
         stop=flown.stop if stop is None else stop,
