@@ -1,5 +1,7 @@
 """Flight modes as blackbox_decode writes them: names in the cells of its table."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -52,7 +54,7 @@ def _is_old(text: str) -> bool:
     return any(name.endswith("_MODE") for name in text.split("|"))
 
 
-def _mask(text: str, names: list[str]) -> int | None:
+def _mask(text: str, names: Sequence[str]) -> int | None:
     """The bits of a cell; None for what is not understood."""
     if text in _NONE:
         return 0

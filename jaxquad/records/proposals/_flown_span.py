@@ -65,13 +65,11 @@ def in_flight(
         return setup._replace(start=start, stop=stop)
     cut = (flown.before if start is None else "", flown.after if stop is None else "")
     left_out = " and ".join(filter(None, cut))
-    said = (
-        (f"left out, as no flight: {left_out}; --start and --stop take others",) if left_out else ()
-    )
+    said = f"left out, as no flight: {left_out}; --start and --stop take others"
     return setup._replace(
         start=flown.start if start is None else start,
         stop=flown.stop if stop is None else stop,
-        remarks=(*setup.remarks, *flown.remarks, *said),
+        remarks=(*setup.remarks, *flown.remarks, *((said,) if left_out else ())),
     )
 
 
