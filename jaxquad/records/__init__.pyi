@@ -15,4 +15,10 @@ from ._segments import (
 )
 from ._settings import read_settings as read_settings, Settings as Settings
 from .formats import require_file as require_file
-from .proposals import AXES as AXES, Proposal as Proposal, propose as propose
+from .proposals import (
+    AXES as AXES,
+    Flight as Flight,
+    flights as flights,
+    Proposal as Proposal,
+    propose as propose,
+)

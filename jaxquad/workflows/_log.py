@@ -41,11 +41,14 @@ def propose_settings(
             f"several logs need `input` and `output`: run jaxquad identify {path} alone, and give "
             "what it proposes"
         )
-    start, stop = _hull(settings)
-    proposal = propose(path, axis=settings.axis, chirp=settings.chirp, start=start, stop=stop)
+    start, stop = _given_span(settings)
+    proposal = propose(
+        path, axis=settings.axis, chirp=settings.chirp, flight=settings.flight, start=start,
+        stop=stop,
+    )  # fmt: skip
     offered = proposal.options
     found = {"input": mix_text(offered["inputs"]), "output": offered["outputs"]}
-    found |= {"axis": None, "chirp": None}
+    found |= {"axis": None, "chirp": None, "flight": None}  # the names of the channels say them
     if settings.reference is None:
         found["reference"] = offered["references"]
     if settings.rate is None:
@@ -57,25 +60,20 @@ def propose_settings(
     return dataclasses.replace(settings, **found | _proposed_span(settings, proposal)), proposal
 
 
-def _hull(settings: IdentifySettings) -> tuple[float | None, float | None]:
-    """From the first to the last time that the settings name."""
-    if not settings.segments:
-        return settings.start, settings.stop
-    starts, stops = zip(*settings.segments, strict=True)
-    return min(starts), max(stops)
-
-
 def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, object]:
-    """All injections that were found, or those within `start` and `stop`."""
+    """All injections that were found, or the time in flight, within `start` and `stop`."""
     if settings.segments:
         return {}
-    low = -np.inf if settings.start is None else settings.start
-    high = np.inf if settings.stop is None else settings.stop
-    inside = [(max(start, low), min(stop, high)) for start, stop in proposal.segments]
-    spans = [(start, stop) for start, stop in inside if start < stop]
-    if len(spans) > 1:
-        return {"segments": spans, "start": None, "stop": None}
-    return dict(zip(("start", "stop"), spans[0], strict=True)) if spans else {}
+    if len(proposal.segments) > 1:
+        return {"segments": proposal.segments, "start": None, "stop": None}
+    return {"start": proposal.setup.start, "stop": proposal.setup.stop}
+
+
+def _given_span(settings: IdentifySettings) -> tuple[float | None, float | None]:
+    """What the settings say of the part to use: the ends of all segments."""
+    if settings.segments:
+        return min(a for a, _ in settings.segments), max(b for _, b in settings.segments)
+    return settings.start, settings.stop
 
 
 class OpenedLogs(NamedTuple):

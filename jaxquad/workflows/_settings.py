@@ -210,6 +210,13 @@ class IdentifySettings(Settings):
         "longest, with all others on its axis at its place",
         group=THE_RECORD,
     )
+    flight: int | None = option_field(
+        kinds.SIZE,
+        None,
+        "the number of the flight in a file with several; by default the longest with a chirp, "
+        "else the longest with sticks that move",
+        group=THE_RECORD,
+    )
     units: Mapping[str, str] = option_field(
         kinds.UNITS,
         {},
@@ -354,6 +361,11 @@ class IdentifySettings(Settings):
         if self.input is not None and self.chirp is not None:
             raise SettingsError(
                 "`chirp` is for a proposal: leave it out, or leave `input` and `output` out"
+            )
+        if self.input is not None and self.flight is not None:
+            raise SettingsError(
+                "`flight` is for a proposal: name the channels of that flight (log2.axisSum[0]), "
+                "or leave `input` and `output` out"
             )
         if self.segments and (self.start is not None or self.stop is not None):
             raise SettingsError(

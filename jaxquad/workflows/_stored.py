@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxquad._core import announce, beside
 from jaxquad.identify import Fit, Verification, verify
-from jaxquad.records import read, Record, RecordError
+from jaxquad.records import read, Record, RecordError, RecordWarning
 from jaxquad.report import PageWarning, provenance, reason_of, write_results
 
 from ._identify import Identification, identify_opened
@@ -74,9 +74,11 @@ def _with_throttle(found: Identification) -> Record | None:
         return None
     options = proposal.options_with_throttle
     options |= {"start": float(first.time[0]), "stop": float(first.time[-1])}
-    options["sample_rate"] = first.sample_rate
+    options |= {"sample_rate": first.sample_rate, "max_gap": found.settings.max_gap}
     try:
-        return read(found.path, **options)
+        with warnings.catch_warnings():  # the record has said what was repaired
+            warnings.simplefilter("ignore", RecordWarning)
+            return read(found.path, **options)
     except RecordError as error:
         announce(f"no spectrum over the throttle: {error}")
         return None

@@ -126,6 +126,13 @@ class AutopilotSettings(Settings):
         "longest, with all others on its axis at its place",
         group=THE_RECORD,
     )
+    flight: int | None = option_field(
+        kinds.SIZE,
+        None,
+        "the number of the flight in a file with several; by default the longest with a chirp, "
+        "else the longest with sticks that move",
+        group=THE_RECORD,
+    )
     start: float | None = option_field(
         kinds.TIME, None, "first time to use, in the file's time", group=THE_RECORD
     )

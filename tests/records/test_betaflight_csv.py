@@ -3,7 +3,7 @@ import pytest
 from blackbox_rows import clock
 from hypothesis import given, settings, strategies as st
 
-from jaxquad.records import channels, read, ReadError
+from jaxquad.records import channels, propose, read, ReadError
 from jaxquad.records.formats import READERS
 
 
@@ -98,3 +98,40 @@ def test_damage_raises_nothing_but_read_errors(folder, new, at, gone):
     except ReadError:
         return
     assert np.isfinite(clock(result.tables[""])).all()
+
+
+def flown(folder, mode):
+    """An acro or a levelled flight as blackbox_decode writes it, its modes as text."""
+    header = "loopIteration, time (us), axisP[0], setpoint[0], gyroADC[0] (deg/s), "
+    header += "flightModeFlags (flags), stateFlags (flags)"
+    lines = [
+        f"{8 * k}, {5_000_000 + 1000 * k}, {k % 7}, {k % 11}, {g}, {mode(k)}, 0"
+        for k, g in enumerate(GYRO)
+    ]
+    return written(folder, lines, header=header)
+
+
+@pytest.mark.parametrize(
+    ("mode", "reference"),
+    [
+        (lambda k: "ARM", "setpoint[0]"),
+        (lambda k: "ARM|AIRMODE", "setpoint[0]"),
+        (lambda k: "0" if k < 9 else "ARM", "setpoint[0]"),
+        (lambda k: "1", "setpoint[0]"),  # --raw
+        (lambda k: "ANGLE_MODE", "setpoint[0]"),  # an old blackbox_decode's name of ARM
+        (lambda k: "ANGLE_MODE|HORIZON_MODE" if k > 50 else "ANGLE_MODE", ""),  # of ANGLE
+        (lambda k: "ARM|ANGLE" if k > 50 else "ARM", ""),
+        (lambda k: "ARM|HORIZON", ""),
+        (lambda k: "3", ""),
+        (lambda k: "ARM|SOMETHING", ""),  # not understood, so that it may be anything
+        (lambda k: "", ""),
+    ],
+)
+def test_the_modes_of_a_table_say_whether_the_set_point_is_the_pilots(tmp_path, mode, reference):
+    assert propose(flown(tmp_path, mode), axis="roll").setup.reference == reference
+
+
+def test_the_modes_of_a_table_are_those_of_its_native_log(tmp_path):
+    modes = load(flown(tmp_path, lambda k: "ARM|ANGLE" if k >= 40 else "ARM")).tables["slow"]
+    assert modes.columns["flightModeFlags"].tolist() == [1, 3]
+    np.testing.assert_allclose(clock(modes), [5.0, 5.04])

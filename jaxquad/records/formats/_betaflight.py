@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import NamedTuple, TextIO
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._clock import unwrap
 from .._errors import ReadError
 from .._log import Log, Table
+from ._betaflight_flags import FlagTexts
 from ._betaflight_frames import ADJUSTMENT, Frames, Payload, payload
-from ._betaflight_header import Frame, Header, headers, MARKER, scaled, with_axis_sums
+from ._betaflight_header import Frame, Header, headers, MARKER, scaled, with_derived
 from ._betaflight_mixer import with_mixed_axes
 from ._betaflight_predict import add_constants, believed, constants, elapsed, predicted, segments
 
@@ -143,7 +144,7 @@ def _seconds(counter: np.ndarray) -> np.ndarray:
 
 def _main_table(main: Frames, time: np.ndarray, header: Header) -> Table:
     fields = table(main.coded, header.frames["I"], time, header)
-    columns = with_mixed_axes(with_axis_sums(fields.columns), header.settings, time)
+    columns = with_mixed_axes(with_derived(fields.columns), header.settings, time)
     return dataclasses.replace(fields, columns=columns)
 
 
@@ -183,6 +184,7 @@ _LONGEST_LINE = 1 << 16  # characters
 _HEADED = re.compile(r"([^()]*?)\s*\(([^()]*)\)")
 _PER_SECOND = {"": 1e6, "us": 1e6, "ms": 1e3, "s": 1.0}
 _CHUNK = 20_000  # lines
+_MODES = "flightModeFlags"
 _MOST_SETTINGS = 2000
 
 
@@ -202,13 +204,15 @@ def sniff_table(head: bytes, path: Path) -> bool:
 def load_table(path: Path) -> Log:
     """The columns with numbers under their names, the units taken off.
 
-    Cells that are missing or hold text are NaN; rows without a time are left out.
+    Cells that are missing or hold text are NaN; rows without a time are left out. Flight modes,
+    which are text, become the table `slow`, as a native log has it.
     """
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         header = _table_header(file)
         wanted = [i for i, unit in enumerate(header.units) if unit != "flags"]
         clock = wanted.index(header.names.index("time"))
-        values, remarks = _rows(file, wanted, clock, header.lines)
+        flags = header.names.index(_MODES) if _MODES in header.names else None
+        values, kept, modes, remarks = _rows(file, wanted, clock, header.lines, flags)
     unit = header.units[wanted[clock]]
     if unit not in _PER_SECOND:
         raise ReadError(f"the unit of time is {unit[:20]!r}: us, ms and s are known")
@@ -217,9 +221,11 @@ def load_table(path: Path) -> Log:
     units = {name: unit for name, unit in zip(header.names, header.units, strict=True) if unit}
     counter, _ = unwrap(values[:, clock])
     time = counter / _PER_SECOND[unit]
-    columns = with_mixed_axes(with_axis_sums(columns), header.settings, time)
-    table = Table(columns, time, units)
-    return Log({"": table}, tuple(remarks), "betaflight", header.settings)
+    columns = with_mixed_axes(with_derived(columns), header.settings, time)
+    tables = {"": Table(columns, time, units)}
+    slow = modes.table(kept, time) if flags is not None else None
+    tables |= {} if slow is None else {"slow": slow}
+    return Log(tables, tuple(remarks), "betaflight", header.settings)
 
 
 def _table_header(file: TextIO) -> _TableHeader:
@@ -245,12 +251,24 @@ def _cells(file: TextIO) -> list[str]:
     return [cell.strip().strip('"') for cell in line.rstrip("\r\n").split(",")] if line else []
 
 
-def _rows(file: TextIO, wanted: list[int], clock: int, above: int) -> tuple[Values, list[str]]:
-    """The wanted columns of the lines that have a time; `above` lines stand over them."""
-    parts = []
+class _Rows(NamedTuple):
+    values: Values
+    kept: Bool[np.ndarray, " lines"]  # the lines that have a time
+    modes: FlagTexts
+    remarks: list[str]
+
+
+def _rows(file: TextIO, wanted: list[int], clock: int, above: int, flags: int | None) -> _Rows:
+    """The wanted columns of the lines that have a time, and the texts of the column `flags`.
+
+    `above` lines stand over them.
+    """
+    parts, modes = [], FlagTexts()
     while chunk := list(islice(file, _CHUNK)):
         commas = np.array([line.count(",") for line in chunk])
         parts.append(np.full((len(chunk), len(wanted)), np.nan))
+        if flags is not None:
+            modes.add(chunk, flags)
         for count in np.unique(commas[commas > 0]):
             rows = np.flatnonzero(commas == count)
             parts[-1][rows] = _parse_equal([chunk[i] for i in rows], wanted, int(count) + 1)
@@ -263,7 +281,7 @@ def _rows(file: TextIO, wanted: list[int], clock: int, above: int) -> tuple[Valu
         values = values[timed]
     if not values.size:
         raise ReadError(f"no line after line {above} has an iteration and a time")
-    return values, remarks
+    return _Rows(values, timed, modes, remarks)
 
 
 def _parse_equal(lines: list[str], wanted: list[int], cells: int) -> Values:

@@ -205,10 +205,14 @@ def scaled(names: tuple[str, ...], settings: dict[str, str]) -> dict[str, tuple[
     return known
 
 
-def with_axis_sums(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns, and `axisSum[i]`: the output of the controller of axis i before its limit.
+def with_derived(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns, and what follows from them.
 
-    It is the sum of the P, I, D, feed-forward (F) and S terms that were logged.
+    `axisSum[i]` is the output of the controller of axis i before its limit, the sum of the P, I, D,
+    feed-forward (F) and S terms that were logged. `chirp` is the sine of the phase of a sweep,
+    5000 a radian in debug[0], where firmware before betaflight pull request 15113 logs nothing else
+    of it. Firmware that injects the cosine has the same sweep a quarter of a turn ahead: as the
+    external reference of a joint estimate it serves as well.
     """
     sums = {}
     for axis in range(3):
@@ -216,7 +220,26 @@ def with_axis_sums(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         logged = [columns[term] for term in terms if term in columns]
         if logged and f"axisSum[{axis}]" not in columns:
             sums[f"axisSum[{axis}]"] = sum(logged[1:], start=logged[0])
-    return {**columns, **sums}
+    return {**columns, **sums, **_chirp_of_phase(columns)}
+
+
+_TURN = 2 * np.pi * 5e3  # of debug[0] in debug mode CHIRP
+_FEWEST_TURNS = 3
+
+
+def _chirp_of_phase(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The sine of debug[0] where that is a phase: within a turn, from whose end it jumps back.
+
+    The other debug channels rest, which later firmware fills.
+    """
+    debug = [columns[name] for i in range(4) if (name := f"debug[{i}]") in columns]
+    if "chirp" in columns or not debug or any(x.ndim != 1 or x.any() for x in debug[1:]):
+        return {}
+    phase = np.nan_to_num(np.asarray(debug[0], np.float64))
+    if not phase.size or phase.min() < 0 or not 0.9 * _TURN < phase.max() <= _TURN + 1:
+        return {}
+    turns = (phase[:-1] > 0.9 * _TURN) & (phase[1:] < 0.1 * _TURN)
+    return {"chirp": np.sin(phase / 5e3)} if turns.sum() >= _FEWEST_TURNS else {}
 
 
 def _gyro_scale(settings: dict[str, str]) -> float:

@@ -1,72 +1,33 @@
 """Betaflight: PID sum, filtered gyro, set-point, and the chirp mode's debug channels."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
 from .._errors import RecordError
 from .._log import flattened, Log, Table
+from ._betaflight_chirps import chirps
 from ._proposal import (
     AXES,
     first_logged,
     Injection,
     most_active_axis,
+    moves,
     Setup,
     values_of,
     with_injections,
 )
 
 
-_AXES = (0, 1, 2)
-_SHORTEST = 1.0  # s
-_MOST_EDGES = 10_000
-
-
-class Chirp(NamedTuple):
-    """A sweep that Betaflight's chirp mode injected, on axis 0 (roll), 1 (pitch) or 2 (yaw)."""
-
-    axis: int
-    start: float  # s
-    stop: float
-    low: float  # Hz
-    high: float
-
-
-def chirps(table: Table) -> list[Chirp]:
-    """The sweeps in a log whose debug channels are those of debug mode CHIRP.
-
-    There, debug[1] is the axis (-1 when idle), debug[2] the frequency in 0.1 Hz and debug[3] the
-    excitation (betaflight pull request 15113). The number of that mode depends on the version, so
-    the data decide: a frequency that only rises while the axis stays the same.
-    """
-    debug = [table.columns.get(f"debug[{i}]") for i in range(4)]
-    if table.time is None or any(each is None for each in debug):
-        return []
-    _, axis, tenths, excitation = (np.asarray(each, np.float64) for each in debug)
-    active = np.where(tenths > 0, axis, -1)
-    edges = np.flatnonzero(np.diff(active)) + 1
-    if not np.isin(axis, (-1, *_AXES)).all() or edges.size > _MOST_EDGES:
-        return []
-    found = []
-    for first, end in zip([0, *edges], [*edges, axis.size], strict=True):
-        frequency, time = tenths[first:end] / 10, table.time[first:end]
-        sweeps = (np.diff(frequency) >= 0).all() and frequency[-1] > frequency[0]
-        moves = sweeps and np.ptp(excitation[first:end]) > 0
-        if active[first] in _AXES and moves and time[-1] - time[0] >= _SHORTEST:
-            ends = (float(time[0]), float(time[-1]), float(frequency[0]), float(frequency[-1]))
-            found.append(Chirp(int(active[first]), *ends))
-    return found
-
-
 _SELF_LEVELLING = 0b110  # ANGLE and HORIZON in the flight mode flags
 
 
 def betaflight_setup(log: Log, axis: str | None) -> Setup:
-    """The set-up for the longest chirp of the longest log.
+    """The set-up for the longest chirp of a log that holds one flight.
 
     Without a chirp the reference is the set-point if flown in acro, else the stick.
     """
-    prefix, table = _longest(log)
+    prefix, table = _main_table(log)
     signals = flattened(log)
     rates = {each: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, each in enumerate(AXES)}
     if not any(rates.values()):
@@ -79,7 +40,6 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
     if not command or not rates[axis]:
         raise RecordError(f"the log has no PID terms or no gyro for {axis}.")
     remarks = [f"{rates[axis]} is measured after the gyro filters, so the model includes their lag"]
-    remarks += _limited(log, prefix, axis, values_of(signals, command))
     if best is not None:
         others = [each for each in sweeps if each.axis != best.axis]
         remarks += [
@@ -87,15 +47,18 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
             f"t = {each.start:.6g} .. {each.stop:.6g} s"
             for each in others
         ]
-        alike = [Injection(*each[1:]) for each in sweeps if each.axis == best.axis]
+        alike = [Injection(*each[1:5]) for each in sweeps if each.axis == best.axis]
         setup = Setup(
-            axis, {command: 1.0}, rates[axis], f"{prefix}debug[3]", remarks=tuple(remarks),
+            axis, {command: 1.0}, rates[axis], f"{prefix}{best.channel}", remarks=tuple(remarks),
             injected_at="rate",
         )  # fmt: skip
         return with_injections(setup, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
-    if setpoint and not np.ptp(values_of(signals, setpoint)):
-        remarks.append(f"{setpoint} rests, so there is no external reference")
+    if setpoint and not moves(signals, setpoint):
+        remarks.append(
+            f"{setpoint} never moves, so nothing from outside excites {axis}: fly the chirp mode "
+            f"(debug_mode = CHIRP), or stick pulses of different widths"
+        )
         return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
     if setpoint and not _levelled(log, prefix):
         remarks.append("flown in acro, where the set-point comes from the pilot only")
@@ -110,8 +73,8 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
     return Setup(axis, {command: 1.0}, rates[axis], reference, remarks=tuple(remarks))
 
 
-def _longest(log: Log) -> tuple[str, Table]:
-    """The main table of the longest log in the file, and what precedes its channels."""
+def _main_table(log: Log) -> tuple[str, Table]:
+    """The main table of a log, and what precedes its channels."""
     main = {
         name: table
         for name, table in log.tables.items()
@@ -119,8 +82,8 @@ def _longest(log: Log) -> tuple[str, Table]:
     }
     if not main:
         raise RecordError("the log has no main frames.")
-    name = max(main, key=lambda each: np.ptp(np.asarray(main[each].time)))
-    return f"{name}." if name else "", main[name]
+    name, table = next(iter(main.items()))
+    return f"{name}." if name else "", table
 
 
 def _levelled(log: Log, prefix: str) -> bool:
@@ -132,10 +95,17 @@ def _levelled(log: Log, prefix: str) -> bool:
     return bool((modes.astype(np.int64) & _SELF_LEVELLING).any())
 
 
-def _limited(log: Log, prefix: str, axis: str, command: np.ndarray) -> list[str]:
-    """A remark on samples where the firmware limits the PID sum."""
-    name = "pidsum_limit_yaw" if axis == "yaw" else "pidsum_limit"
-    text = log.settings.get(f"{prefix.rstrip('.')} {name}".lstrip(), "")
-    beyond = int((np.abs(command) > int(text)).sum()) if text.isdecimal() and len(text) < 9 else 0
-    share = f"{beyond} of {command.size} samples of the command"
-    return [f"{share} exceed {name} = {text}, where it saturates"] if beyond else []
+def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> tuple[str, ...]:
+    """A remark on samples within the `spans` (s) where the firmware limits the PID sum."""
+    name = "pidsum_limit_yaw" if setup.axis == "yaw" else "pidsum_limit"
+    text = log.settings.get(name, "")
+    _, table = _main_table(log)
+    if not (text.isdecimal() and len(text) < 9) or table.time is None:
+        return ()
+    command = values_of(flattened(log), next(iter(setup.command)))
+    used = np.zeros(command.size, bool)
+    for start, stop in spans:
+        used |= (table.time >= start) & (table.time <= stop)
+    beyond = int((np.abs(command[used]) > int(text)).sum())
+    share = f"{beyond} of {used.sum()} samples of the command"
+    return (f"{share} exceed {name} = {text}, where it saturates",) if beyond else ()

@@ -8,6 +8,7 @@ from .._clock import FEWEST, native_rate
 from .._errors import RecordError
 from .._log import flattened, Log, SettingChange, Signals
 from ._chirps import Chirp, Point
+from ._hold import command_hold
 
 
 AXES: tuple[str, ...] = ("roll", "pitch", "yaw")
@@ -28,10 +29,11 @@ class Setup(NamedTuple):
     """The channels and excitation of one axis in a vehicle's log.
 
     `start` and `stop` are those of the longest injection, `segments` those of all injections of the
-    same kind, in the order of time. `injected_at` says where the reference enters the loop: at the
-    set-point of the rate or of the angle, or at the mixer, behind the controller, whose logged
-    output, the `command`, contains it all the same. `late_s` are channels whose value acts that
-    long after its stamp, and is computed from measurements of that stamp.
+    same kind, in the order of time. Without an injection `start` and `stop` are take-off and
+    landing, None where the log begins or ends in flight. `injected_at` says where the reference
+    enters the loop: at the set-point of the rate or of the angle, or at the mixer, behind the
+    controller, whose logged output, the `command`, contains it all the same. `late_s` are channels
+    whose value acts that long after its stamp, and is computed from measurements of that stamp.
     """
 
     axis: str
@@ -97,7 +99,10 @@ class Proposal(NamedTuple):
 
     @property
     def segments(self) -> tuple[tuple[float, float], ...]:
-        """Start and stop of all injections of the same kind, in s; empty where none was found."""
+        """Start and stop of all injections of the same kind, else of the flight, in s.
+
+        Empty where neither was found.
+        """
         setup = self.setup
         if setup.segments or setup.start is None or setup.stop is None:
             return setup.segments
@@ -202,8 +207,9 @@ def complete(path: str, log: Log, setup: Setup) -> Proposal:
         )
     units = {name: array_of(signals, name)[1] for name in names}
     rate = float(f"{min(rates.values()):.3g}")
+    hold, doubts = command_hold(log)
     setup = setup._replace(
-        remarks=remarks, hold=_loop_period(log), throttle=_throttle(log, signals)
+        remarks=(*remarks, *doubts), hold=hold, throttle=throttle_of(log, signals)
     )
     changes = tuple(
         change
@@ -282,36 +288,14 @@ _THROTTLES: Mapping[str, tuple[tuple[str, float], ...]] = {  # channel, its fact
 }
 
 
-def _throttle(log: Log, signals: Signals) -> Mix:
-    """The collective of the vehicle, where the log has it."""
+def throttle_of(log: Log, signals: Signals) -> Mix:
+    """The collective of the vehicle, where the log of one flight has it."""
     for name, factor in _THROTTLES.get(log.vehicle, ()):
-        found = next((each for each in signals.arrays if each.endswith(name)), "") or name
-        if first_logged(signals, [found]):
-            return {found: factor}
+        logged = (each for each in signals.arrays if each == name or each.endswith(f".{name}"))
+        full = next(logged, name)
+        if first_logged(signals, [full]):
+            return {full: factor}
     return {}
-
-
-_RATES = ("SCHED_LOOP_RATE", "IMU_GYRO_RATEMAX")  # Hz, of ArduPilot's and of PX4's rate loop
-_LONGEST = 0.1  # s
-
-
-def _loop_period(log: Log) -> float | None:
-    """For how long the rate loop holds its command, in s, where the log has the loop's settings."""
-    given = {name: float(text) for name, text in log.settings.items() if _is_number(text)}
-    rates = [given[name] for name in _RATES if given.get(name, 0.0) > 0]
-    period = 1 / rates[0] if rates else 0.0
-    if (
-        not rates and "looptime" in given
-    ):  # Betaflight: us, and loops of the gyro for one of the PID
-        period = 1e-6 * given["looptime"] * given.get("pid_process_denom", 1.0)
-    return period if 0 < period < _LONGEST else None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return bool(np.isfinite(float(text)))
-    except ValueError:
-        return False
 
 
 def channel_rate(signals: Signals, name: str) -> float:

@@ -1,12 +1,16 @@
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from .._errors import printable, RecordError
 from .._log import flattened, Log, Signals
 from ..formats import load_log
 from ._ardupilot import ardupilot_setup
-from ._betaflight import betaflight_setup
+from ._betaflight import betaflight_setup, saturation
 from ._chirps import Selection
+from ._flights import choose_flight
+from ._flown_span import in_flight
 from ._proposal import (
     AXES,
     complete,
@@ -86,11 +90,17 @@ _SETUPS: Mapping[str, Callable[[Log, Selection], Setup]] = {
 _NUMBERED = ("ardupilot",)  # whose chirps are listed with numbers
 
 
+_USED_PART: Mapping[str, Callable[[Log, Setup, Sequence[tuple[float, float]]], tuple[str, ...]]] = {
+    "betaflight": saturation
+}  # remarks that depend on the part that is used
+
+
 def propose(
     path: str | Path,
     *,
     axis: str | None = None,
     chirp: int | None = None,
+    flight: int | None = None,
     start: float | int | None = None,
     stop: float | int | None = None,
 ) -> Proposal:
@@ -98,7 +108,8 @@ def propose(
 
     Injected excitation is found, with its time and band: ArduPilot's SystemID mode, PX4's
     autotune, Betaflight's chirp mode. A set-point that an outer loop computes contains feedback,
-    and is never proposed as the external reference.
+    and is never proposed as the external reference. Without injected excitation the proposal is of
+    the time in flight: what comes before take-off and after landing or a crash is left out.
 
     **Arguments:**
 
@@ -107,7 +118,10 @@ def propose(
         else the one that moves most.
     - `chirp`: the number, from 1, of one of the chirps that the proposal of an ArduPilot log lists;
         by default the longest one, with all others on its axis at its place.
-    - `start`, `stop`: in s of the log's time; only ArduPilot's chirps between them are taken.
+    - `flight`: the number of the flight in a file with several, as `flights` lists them; by default
+        the longest with a chirp, else the longest with sticks that move, else the longest.
+    - `start`, `stop`: in s, instead of what the log says: the ends of the injected excitation, or
+        take-off and landing; only ArduPilot's chirps between them are taken.
 
     **Returns:** a `Proposal`, which prints its reasons and the command line.
 
@@ -132,8 +146,7 @@ def propose(
         )
     try:
         low, high = (None if end is None else float(end) for end in (start, stop))
-        wanted = Selection(axis, chirp, low, high)
-        return complete(str(path), log, _SETUPS[log.vehicle](log, wanted))
+        return _proposed(str(path), log, Selection(axis, chirp, low, high), flight)
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
     # A log may call anything by the names that its vehicle uses.
@@ -143,3 +156,16 @@ def propose(
             f"({type(error).__name__}: {printable(str(error))}). Name inputs, outputs and "
             f"references yourself."
         ) from error
+
+
+def _proposed(path: str, log: Log, wanted: Selection, flight: int | None) -> Proposal:
+    log, choice = choose_flight(log, wanted.axis, flight)
+    setup = in_flight(log, _SETUPS[log.vehicle](log, wanted), wanted.start, wanted.stop)
+    proposal = complete(path, log, setup._replace(remarks=(*choice, *setup.remarks)))
+    setup = proposal.setup
+    used = [
+        (-np.inf if start is None else start, np.inf if stop is None else stop)
+        for start, stop in setup.segments or ((setup.start, setup.stop),)
+    ]
+    further = _USED_PART.get(log.vehicle, lambda *_: ())(log, setup, used)
+    return proposal._replace(setup=setup._replace(remarks=(*setup.remarks, *further)))

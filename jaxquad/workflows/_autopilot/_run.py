@@ -138,7 +138,7 @@ def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySetti
     """What the log itself says is command, rate and reference."""
     asked = IdentifySettings(
         axis=None if settings.axis == "all" else settings.axis, chirp=settings.chirp,
-        start=settings.start, stop=settings.stop, band=settings.band,
+        flight=settings.flight, start=settings.start, stop=settings.stop, band=settings.band,
     )  # fmt: skip
     found, proposal = propose_settings(path, asked)
     if proposal is None:

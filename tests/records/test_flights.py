@@ -1,0 +1,273 @@
+"""Several flights in one file, and the part of a log in which the vehicle flies."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from blackbox_rows import clock
+
+from jaxquad.records import flights, propose, read, read_settings, Record, RecordError
+from jaxquad.records.formats import load_log
+from jaxquad.records.formats._betaflight_header import with_derived
+from jaxquad.records.proposals._betaflight import betaflight_setup
+from jaxquad.records.proposals._betaflight_chirps import chirps
+from jaxquad.records.proposals._flown_span import flown_span, in_flight
+from jaxquad.records.proposals._hold import command_hold
+from jaxquad.spectra import frequency_response, JointInputOutput
+from jaxquad.workflows import autopilot, AutopilotSettings, IdentifySettings, SettingsError
+from jaxquad.workflows._log import open_logs
+
+
+FIRMWARE = "betaflight_firmware"
+
+
+@pytest.fixture
+def joined(data, tmp_path):
+    """Flights in one file, as a flash chip holds them."""
+
+    def join(*names, change=lambda name, content: content):
+        parts = [(data / FIRMWARE / f"{name}.BFL").read_bytes() for name in names]
+        path = tmp_path / "flash.BFL"
+        path.write_bytes(b"".join(map(change, names, parts)))
+        return path
+
+    return join
+
+
+def test_the_flights_of_a_file_are_listed_with_throttle_and_excitation(joined):
+    hover, chirp, levels = flights(joined("A_hover", "A_chirp_roll", "A_throttle"))
+    assert [each.number for each in (hover, chirp, levels)] == [1, 2, 3]
+    assert chirp.duration == pytest.approx(24.34, abs=0.01) and chirp.log == "log2"
+    assert chirp.chirps == {"roll": pytest.approx(20, abs=0.01)} and not levels.chirps
+    assert levels.throttle == (0.0, pytest.approx(0.64, abs=0.01))
+    assert levels.sticks["roll"] > 0.2 and levels.sticks["pitch"] < 0.01
+    assert [each.is_excited("roll") for each in (hover, chirp, levels)] == [False, True, True]
+    assert str(chirp) == "flight 2: 24.3 s, throttle 0.00 .. 0.41, chirp on roll 20 s"
+
+
+@pytest.mark.parametrize(
+    ("names", "axis", "number"),
+    [
+        (("A_throttle", "A_chirp_roll"), None, 2),  # a chirp before longer sticks
+        (("A_chirp_roll", "B_chirp_three_axes"), "roll", 2),
+        (("A_chirp_roll", "A_sticks", "A_hover"), "pitch", 2),  # the chirp is on roll
+        (("B_chirp_three_axes", "A_hover"), "yaw", 1),
+    ],
+)
+def test_the_longest_flight_with_excitation_is_proposed_and_the_others_are_told(
+    joined, names, axis, number
+):
+    proposal = propose(joined(*names), axis=axis)
+    assert proposal.setup.rate.startswith(f"log{number}.")
+    said = proposal.setup.remarks[0]
+    assert said.startswith(f"flight {number}: ") and ", the longest with" in said
+    assert all(f"flight {k}: " in said for k in range(1, len(names) + 1))
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_everything_of_a_proposal_is_of_the_flight_that_is_chosen(joined, data, number):
+    """Rates, throttle, hold and parameters are as those of the file with this flight alone."""
+    names = ("A_sticks", "B_chirp_three_axes")
+    slower = lambda name, content: content.replace(
+        b"H looptime:125\n", b"H looptime:125\n" if name == "A_sticks" else b"H looptime:126\n"
+    )
+    path = joined(*names, change=slower)
+    proposal = propose(path, axis="pitch", flight=number)
+    alone = propose(data / FIRMWARE / f"{names[number - 1]}.BFL", axis="pitch")
+    ours, theirs = proposal.setup, alone.setup
+    label = f"log{number}."
+    assert ours.rate == label + theirs.rate and ours.reference == label + theirs.reference
+    assert ours.throttle == {label + name: x for name, x in theirs.throttle.items()}
+    assert ours.hold == pytest.approx({1: 250e-6, 2: 252e-6}[number], rel=1e-9)
+    assert (ours.start, ours.stop, ours.band) == (theirs.start, theirs.stop, theirs.band)
+    assert ours.remarks[1:] == tuple(
+        x.replace("gyroADC", f"{label}gyroADC") for x in theirs.remarks
+    )
+    assert proposal.sample_rate == alone.sample_rate
+    both = [read(x.path, **x.options_with_throttle) for x in (proposal, alone)]
+    np.testing.assert_array_equal(both[0].inputs, both[1].inputs)
+    np.testing.assert_array_equal(both[0].outputs, both[1].outputs)
+    values = read_settings(path, log=f"log{number}").values
+    assert values["looptime"] == {1: "125", 2: "126"}[number]
+
+
+def test_the_workflows_take_the_number_of_a_flight(joined):
+    path = joined("A_chirp_roll", "A_sticks")
+    opened = open_logs(path, IdentifySettings(flight=2, axis="roll"))
+    assert opened.settings.output == "log2.gyroADC[0]" and opened.settings.flight is None
+    assert opened.settings.hold == 250e-6
+    assert opened.records[0].time[-1] == pytest.approx(33.999, abs=1e-3)
+    with pytest.raises(ValueError, match=r"flight is 3, but the file holds: flight 1: 24.3 s"):
+        autopilot(path, AutopilotSettings(flight=3))
+    with pytest.raises(SettingsError, match="`flight` is for a proposal"):
+        IdentifySettings(input="log1.axisSum[0]", output="log1.gyroADC[0]", flight=1)
+
+
+def test_a_file_of_one_flight_has_number_1_alone(data):
+    path = data / FIRMWARE / "A_chirp_roll.BFL"
+    assert propose(path, flight=1) == propose(path)
+    with pytest.raises(RecordError, match="flight is 2, but the file holds: flight 1: 24.3 s"):
+        propose(path, flight=2)
+
+
+@pytest.mark.parametrize("name", ["A_sticks", "A_throttle", "A_doublets", "A_hover"])
+def test_the_ground_before_take_off_is_left_out_and_flight_is_kept(data, name):
+    """The motors arm at 6.5 s, throttle comes at 7.6 s, and flight begins at 8 s."""
+    setup = propose(data / FIRMWARE / f"{name}.BFL", axis="roll").setup
+    assert setup.start is not None and 7.3 < setup.start <= 8 and setup.stop is None
+    assert any("left out, as no flight: t = 6.65516 .. 7" in each for each in setup.remarks)
+
+
+def test_a_chirp_keeps_its_own_window(data):
+    setup = propose(data / FIRMWARE / "A_chirp_roll.BFL").setup
+    assert (setup.start, setup.stop) == (pytest.approx(9.0, abs=2e-3), pytest.approx(29, abs=2e-3))
+    assert not any("left out" in each for each in setup.remarks)
+
+
+def changed(log, rows, **columns):
+    """The log of one flight with other values in some rows of its main table."""
+    table = log.tables[""]
+    values = {name: np.array(table.columns[name], np.float64) for name in columns}
+    for name, x in columns.items():
+        values[name][rows] = x / table.scales.get(name, 1.0)
+    table = dataclasses.replace(table, columns={**table.columns, **values})
+    return dataclasses.replace(log, tables={**log.tables, "": table})
+
+
+@pytest.fixture
+def sticks(data):
+    return load_log(data / FIRMWARE / "A_sticks.BFL")
+
+
+def landed(log, after):
+    """On the ground from `after` (s) on, as it was before take-off."""
+    table = log.tables[""]
+    rows = table.time > after
+    still = {f"gyroADC[{k}]": 0.1 * np.sin(50 * table.time[rows]) for k in range(3)}
+    return changed(log, rows, **still, **{"setpoint[3]": 0.0 * table.time[rows]})
+
+
+def test_a_landing_is_left_out(sticks):
+    span = flown_span(landed(sticks, 30.0))
+    assert span.stop is not None and 30 - 0.25 <= span.stop < 30.5
+    assert "(landed)" in span.after
+
+
+def test_a_crash_is_left_out_although_the_motors_still_run(sticks):
+    table = sticks.tables[""]
+    rows = table.time > 32
+    span = flown_span(changed(sticks, rows, **{"gyroADC[0]": 1500 * np.ones(rows.sum())}))
+    assert span.stop == pytest.approx(32, abs=0.26) and "(a crash)" in span.after
+
+
+def test_a_dive_without_throttle_is_flight(sticks):
+    table = sticks.tables[""]
+    rows = (table.time > 15) & (table.time < 20)
+    dived = changed(sticks, rows, **{"setpoint[3]": np.zeros(rows.sum())})
+    assert flown_span(dived)[:2] == flown_span(sticks)[:2]
+
+
+def test_a_log_that_never_leaves_the_ground_says_so(sticks):
+    still = changed(sticks, slice(None), **{"setpoint[3]": np.zeros(sticks.tables[""].time.size)})
+    span = flown_span(still)
+    assert (span.start, span.stop) == (None, None) and "no flight" in span.remarks[0]
+
+
+def test_start_and_stop_of_the_user_win(data):
+    path = data / FIRMWARE / "A_sticks.BFL"
+    setup = propose(path, start=6.7, stop=20).setup
+    assert (setup.start, setup.stop) == (6.7, 20)
+    assert not any("left out" in each for each in setup.remarks)
+    opened = open_logs(path, IdentifySettings(stop=20.0))
+    assert 7.3 < (opened.settings.start or 0) < 8 and opened.settings.stop == 20
+    chirp = open_logs(data / FIRMWARE / "A_chirp_roll.BFL", IdentifySettings(start=12.0))
+    assert chirp.settings.start == 12 and chirp.settings.stop == pytest.approx(29, abs=2e-3)
+
+
+def test_samples_beyond_the_limit_count_within_the_part_that_is_used(data):
+    """The firmware saturates in a doublet, from time to time; never between two of them."""
+    path = data / FIRMWARE / "A_doublets.BFL"
+    beyond = lambda **span: [x for x in propose(path, **span).setup.remarks if "pidsum_limit" in x]
+    [whole] = beyond(axis="roll")
+    assert whole.startswith("140 of 22595 samples")
+    assert beyond(axis="roll", start=11.0, stop=14.0) == []
+    part, samples = beyond(axis="roll", stop=11.0)[0].split(" samples")[0].split(" of ")
+    assert 0 < int(part) < 140 and int(samples) < 4000
+
+
+@pytest.mark.parametrize(("stated", "held"), [("125", 250e-6), ("127", 254e-6), ("16", 250e-6)])
+def test_the_hold_is_that_of_the_stamps_where_the_header_contradicts_them(sticks, stated, held):
+    period, remarks = command_hold(
+        dataclasses.replace(sticks, settings={**sticks.settings, "looptime": stated})
+    )
+    assert period == pytest.approx(held, rel=1e-4)
+    assert bool(remarks) == (stated == "16")
+    assert all("32 us" in each and "250 us" in each for each in remarks)
+
+
+def test_stamps_that_are_as_the_header_says_leave_the_hold_as_it_is(data):
+    """LOG00037 lost frames, which its counters of loops and of time both show."""
+    log = load_log(data / "betaflight_ar8/LOG00037.BFL")
+    assert command_hold(log) == (125e-6, ())
+
+
+def test_what_was_injected_outside_of_start_and_stop_is_not_used(data):
+    log = load_log(data / FIRMWARE / "A_chirp_roll.BFL")
+    setup = propose(data / FIRMWARE / "A_chirp_roll.BFL").setup
+    for start, stop in ((10.0, 12.0), (29.5, 30.5)):
+        used = in_flight(log, setup, start, stop)
+        assert (used.start, used.stop, used.segments) == (start, stop, ())
+
+
+def test_a_set_point_that_rests_is_no_reference(data):
+    setup = propose(data / FIRMWARE / "A_hover.BFL", axis="roll").setup
+    assert setup.reference == ""
+    assert any("setpoint[0] never moves" in each for each in setup.remarks)
+
+
+def of_phase_alone(log):
+    """The log as firmware writes it that fills nothing but the phase of its chirp."""
+    table = log.tables[""]
+    columns = {k: v for k, v in table.columns.items() if k != "chirp"}
+    columns |= {f"debug[{k}]": np.zeros(table.time.size, np.int32) for k in range(1, 8)}
+    again = dataclasses.replace(table, columns=with_derived(columns))
+    return dataclasses.replace(log, tables={**log.tables, "": again})
+
+
+@pytest.mark.parametrize("name", ["A_chirp_roll", "B_chirp_three_axes"])
+def test_a_chirp_whose_phase_alone_is_logged_is_the_same_chirp(data, name):
+    log = load_log(data / FIRMWARE / f"{name}.BFL")
+    table = of_phase_alone(log).tables[""]
+    sine, axis, tenths, excitation = (
+        table.columns["chirp"], *(log.tables[""].columns[f"debug[{k}]"] for k in (1, 2, 3))
+    )  # fmt: skip
+    above = tenths > 11  # 0.1 Hz; this firmware injects the cosine
+    np.testing.assert_allclose(sine[above] ** 2 + (excitation[above] / 1e3) ** 2, 1, atol=3e-3)
+    assert not sine[axis == -1].any()
+    assert "chirp" not in log.tables[""].columns
+    ours, theirs = chirps(table), chirps(log.tables[""])
+    assert [x.axis for x in ours] == [x.axis for x in theirs] == list(range(len(theirs)))
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose([a.start, a.stop], [b.start, b.stop], atol=0.05)
+        np.testing.assert_allclose([a.low, a.high], [b.low, b.high], rtol=0.2)
+    setup = betaflight_setup(of_phase_alone(log), None)
+    assert setup.reference == "chirp" and len(setup.remarks) == len(theirs)
+
+
+def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data):
+    """To three standard errors, at all frequencies that both see."""
+    log = load_log(data / FIRMWARE / "A_chirp_roll.BFL")
+    table, wanted = of_phase_alone(log).tables[""], log.tables[""]
+    time = clock(wanted)
+    used = (time > 9) & (time < 29)
+    u, y = (np.asarray(wanted.columns[x], float) for x in ("axisSum[0]", "gyroADC[0]"))
+    omega = 2 * np.pi * np.geomspace(1.5, 25, 20)
+    both = [
+        frequency_response(
+            Record(1e-3 * np.arange(used.sum()), u[used], y[used], np.asarray(r, float)[used]),
+            omega, estimator=JointInputOutput(),
+        )
+        for r in (table.columns["chirp"], wanted.columns["debug[3]"])
+    ]  # fmt: skip
+    (a, b), error = (np.asarray(x.response).ravel() for x in both), both[1].random_error
+    np.testing.assert_array_less(np.abs(a / b - 1), 3 * np.asarray(error).ravel())
