@@ -203,7 +203,7 @@ def throttle_levels(
 def _extent(levels: Sequence[_Level]) -> ThrottleLevels:
     throttle = [np.concatenate([piece.throttle for piece in level]) for level in levels]
     return ThrottleLevels(
-        np.array([_mean(level) for level in levels]),
+        np.array([each.mean() for each in throttle]),
         np.array([each.min() for each in throttle]),
         np.array([each.max() for each in throttle]),
         np.array([sum(piece.seconds for piece in level) for level in levels]),
@@ -348,14 +348,7 @@ def _inaudible(levels: Sequence[_Level]) -> str:
 
 
 def _mean(level: _Level) -> float:
-    """The throttle at which the command acts: its mean, weighted by the command's power."""
-    throttle, weights = (np.concatenate(x) for x in zip(*map(_weighted, level), strict=True))
-    return float(np.average(throttle, weights=weights))
-
-
-def _weighted(piece: _Piece) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-    command = piece.signals.record.inputs[piece.first : piece.end, 0]
-    return piece.throttle, (command - command.mean()) ** 2 + 1e-12 * (1 + np.max(command**2))
+    return float(np.concatenate([piece.throttle for piece in level]).mean())
 
 
 def _respond(

@@ -1,4 +1,8 @@
-"""What the mixer of a Betaflight quadrotor carried out of each axis' command."""
+"""What the motors of a Betaflight quadrotor made of each axis' command.
+
+Thrust grows faster than a motor's command, and behind the motor's lag. A motor at an end of its
+range, or two axes at once, therefore make another torque than the sum of the PID terms says.
+"""
 
 from collections.abc import Mapping
 
@@ -11,70 +15,122 @@ _QUAD_X = {  # by motor: rear right, front right, rear left, front left
     1: (1.0, -1.0, 1.0, -1.0),
     2: (1.0, -1.0, -1.0, 1.0),  # or the other way, with reversed motors
 }
+_CURVE = 0.5  # of thrust = (1 - curve) t + curve t^2, as propellers have it (0.4 to 0.6)
+_LAGS = np.geomspace(0.008, 0.12, 24)  # s, of motors
+_USUAL_LAG = 0.03  # s
+_BAND = (1.0, 25.0)  # Hz, where the lag is looked for
+_SHOWN = 0.5  # of the rate's acceleration that the command explains, for a lag to be seen
+_LEVEL = 0.04  # of the throttle, over which the motors' mean is taken
+_ARMED = 0.02  # of the motors' range, from which the propellers carry
 _ALIKE = 0.02  # of the slope from the command to what the motors show
 _SCATTER = 2.0  # units of pidsum, rms, which rounding and a moving throttle make
 _UNLIMITED = 300.0  # units of pidsum, below each limit of the sum
 _FEWEST = 200  # samples with all motors between their limits
-_MEAN = 0.5  # s
 _AT_END = 0.002  # of a motor's range
+
+Samples = Float[np.ndarray, " samples"]
+Motors = Float[np.ndarray, "samples motors"]
 
 
 def with_mixed_axes(
-    columns: Mapping[str, np.ndarray],
-    settings: Mapping[str, str],
-    time: Float[np.ndarray, " samples"],
+    columns: Mapping[str, np.ndarray], settings: Mapping[str, str], time: Samples
 ) -> dict[str, np.ndarray]:
-    """The columns, `axisMixed[i]`: how much of `axisSum[i]` the motors had, and `collective`.
+    """The columns, `axisMixed[i]`: the torque that the motors made of `axisSum[i]`, in its unit.
 
-    The latter is the mean of the motors over their range, 0 to 1, as a running mean over 0.5 s:
-    where the mixer makes room for the axes it is not the throttle that was asked for.
-
-    It is less where the sum is limited, and where the motors are at an end of their range. It is
-    given where the motors show that they are mixed as those of a quadrotor X without a thrust
-    curve: where none is at an end they must follow `axisSum`.
+    It is the sum where all motors run alike and within their range, and else what a thrust curve of
+    0.5 makes of them behind their lag: less where the sum or a motor is limited. It comes with
+    `collective`, the motors' mean over their range, 0 to 1, at the throttle of the moment: where
+    the mixer makes room for the axes it is above the throttle that was asked for. Both are
+    given where the motors are seen to be mixed as those of a quadrotor X without a thrust curve of
+    the firmware's: where none is at an end they must follow `axisSum`.
     """
     ends = _ends(settings)
     names = [f"motor[{k}]" for k in range(4)]
     if ends is None or any(name not in columns for name in names) or "motor[4]" in columns:
         return dict(columns)
     low, high = ends
-    motors = np.stack([np.asarray(columns[name], float) for name in names], axis=1)
-    near = _AT_END * (high - low)
-    free = np.all((motors > low + near) & (motors < high - near), axis=1)
-    mixed: dict[str, np.ndarray] = {}
-    for axis, signs in _QUAD_X.items():
-        command = columns.get(f"axisSum[{axis}]")
-        if command is None:
-            continue
-        shown = 1000 * (motors @ np.array(signs)) / (4 * (high - low))
-        side = _side(shown[free], np.asarray(command, float)[free])
-        if side:
-            mixed[f"axisMixed[{axis}]"] = side * shown
-    if mixed:
-        mixed["collective"] = _running_mean((motors.mean(axis=1) - low) / (high - low), time)
-    return {**columns, **mixed}
+    motors = (np.stack([np.asarray(columns[x], float) for x in names], axis=1) - low) / (high - low)
+    sides = {axis: _side(axis, motors, columns) for axis in _QUAD_X}
+    seen = {axis: side for axis, side in sides.items() if side}
+    if not seen:
+        return dict(columns)
+    dt = float(np.median(np.diff(time)))
+    collective = _mean_at_throttle(motors.mean(axis=1), columns)
+    thrust = _linear_thrust(motors, _lag_of(columns, motors, seen, dt), dt)
+    slope = 1 - _CURVE + 2 * _CURVE * collective
+    mixed = {
+        f"axisMixed[{axis}]": side * 250 * (thrust @ np.array(_QUAD_X[axis])) / slope
+        for axis, side in seen.items()
+    }
+    return {**columns, **mixed, "collective": collective}
 
 
-def _running_mean(
-    values: Float[np.ndarray, " samples"], time: Float[np.ndarray, " samples"]
-) -> Float[np.ndarray, " samples"]:
-    """Over half a second around each sample."""
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    first = np.searchsorted(time, time - _MEAN / 2)
-    last = np.searchsorted(time, time + _MEAN / 2, side="right")
-    return (total[last] - total[first]) / (last - first)
+def _linear_thrust(motors: Motors, lag: float, dt: float) -> Motors:
+    """The command whose lag has the thrust that the motors have, by a curve behind their lag.
+
+    With v the lagged command and T its thrust, it is T(v) + lag dT/dt = T'(v) t + T(v) - T'(v) v.
+    """
+    lagged = _lagged(motors, lag, dt)
+    slope = 1 - _CURVE + 2 * _CURVE * lagged
+    return slope * motors - _CURVE * lagged**2
 
 
-def _side(shown: Float[np.ndarray, " samples"], command: Float[np.ndarray, " samples"]) -> float:
-    """1 or -1 where the motors show the command, or its negative; 0 where they do not."""
-    within = np.abs(command) < _UNLIMITED
-    shown, command = shown[within], command[within]
+def _lagged(motors: np.ndarray, lag: float, dt: float) -> np.ndarray:
+    from scipy.signal import lfilter
+
+    k = 1 - np.exp(-dt / lag)
+    return lfilter([k], [1, k - 1], motors, axis=0, zi=(1 - k) * motors[:1])[0]
+
+
+def _lag_of(
+    columns: Mapping[str, np.ndarray], motors: Motors, sides: Mapping[int, float], dt: float
+) -> float:
+    """The motors' lag that explains most of an axis' acceleration, of the axis that moved most."""
+    from scipy.signal import butter, sosfiltfilt
+
+    rates = {axis: columns.get(f"gyroADC[{axis}]") for axis in sides if axis < 2}
+    moved = {axis: np.asarray(rate, float) for axis, rate in rates.items() if rate is not None}
+    if not moved or 1 / dt < 4 * _BAND[1]:
+        return _USUAL_LAG
+    axis = max(moved, key=lambda each: float(np.std(moved[each])))
+    sections = butter(2, _BAND, "bandpass", fs=1 / dt, output="sos")
+    turned = sosfiltfilt(sections, np.gradient(moved[axis], dt))
+    command = sosfiltfilt(sections, sides[axis] * motors @ np.array(_QUAD_X[axis]))
+    shares = []
+    for lag in _LAGS:
+        made = _lagged(command, float(lag), dt)
+        power = float(made @ made) * float(turned @ turned)
+        shares.append(float(made @ turned) ** 2 / power if power > 0 else 0.0)
+    best = int(np.argmax(shares))
+    return float(_LAGS[best]) if shares[best] > _SHOWN else _USUAL_LAG
+
+
+def _side(axis: int, motors: Motors, columns: Mapping[str, np.ndarray]) -> float:
+    """1 or -1 where the motors show the axis' command, or its negative; 0 where they do not."""
+    command = columns.get(f"axisSum[{axis}]")
+    if command is None:
+        return 0.0
+    command = np.asarray(command, float)
+    free = np.all((motors > _AT_END) & (motors < 1 - _AT_END), axis=1)
+    within = free & (np.abs(command) < _UNLIMITED)
+    shown, command = 250 * (motors @ np.array(_QUAD_X[axis]))[within], command[within]
     if shown.size < _FEWEST or not np.any(command):
         return 0.0
     slope = float(shown @ command) / float(command @ command)
     side = float(np.sign(slope))
     follows = abs(abs(slope) - 1) < _ALIKE
     return side if follows and np.std(side * shown - command) < _SCATTER else 0.0
+
+
+def _mean_at_throttle(mean: Samples, columns: Mapping[str, np.ndarray]) -> Samples:
+    """Of the motors, over all samples in flight with about the throttle of each sample."""
+    throttle = columns.get("rcCommand[3]", columns.get("setpoint[3]"))
+    asked = np.zeros(mean.size) if throttle is None else np.asarray(throttle, float) / 1000
+    level = np.rint((asked - np.median(asked)) / _LEVEL).astype(int)
+    level -= level.min()
+    weight = np.where(mean > _ARMED, 1.0, 1e-9)
+    total, count = np.bincount(level, weight * mean), np.bincount(level, weight)
+    return (total / np.where(count > 0, count, 1.0))[level]
 
 
 def _ends(settings: Mapping[str, str]) -> tuple[float, float] | None:
