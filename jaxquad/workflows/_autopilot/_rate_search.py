@@ -238,7 +238,8 @@ class Search:
         """Of free gains, and picked filters."""
         gains = np.tile(self.flown, (len(points), 1))
         gains[:, self.free] = points
-        count = max(1, _TOGETHER // len(self.loops.plants))
+        plants = sum(len(each.plants) for each in self.loops.groups)
+        count = max(1, _TOGETHER // max(plants, 1))
         parts = np.array_split(np.arange(len(gains)), -(-len(gains) // count))
         return np.concatenate(
             [self._of(gains[part], None if picks is None else picks[part]) for part in parts]
