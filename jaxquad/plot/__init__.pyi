@@ -18,6 +18,7 @@ from ._names import (
 )
 from ._panels import headless as headless, Panels as Panels
 from ._pilot import (
+    again_figure as again_figure,
     b0_figure as b0_figure,
     balance_figure as balance_figure,
     filters_figure as filters_figure,

@@ -117,6 +117,39 @@ def steps_figure(
     return _finished(panels, (2.8,), title)
 
 
+class FlownAgain(NamedTuple):
+    """A part of a flight as it was logged, and as law and plant fly it again: s and rad/s."""
+
+    time: Float[np.ndarray, " samples"]
+    setpoint: Float[np.ndarray, " samples"]
+    rate: Float[np.ndarray, " samples"]
+    again: Float[np.ndarray, " samples"]
+
+
+def again_figure(flight: FlownAgain, *, ax: Given = None, title: str = "") -> Panels:
+    """Draw a part of a flight, logged and simulated, and what is between them.
+
+    **Arguments:**
+
+    - `flight`: in rad/s, drawn in deg/s.
+    - `ax`: two axes to draw into.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`.
+    """
+    panels = stacked(2, ax)
+    setpoint, rate, again = (np.degrees(x) for x in flight[1:])
+    panels[0].plot(flight.time, setpoint, color="0.6", lw=1.0, label="set-point")
+    panels[0].plot(flight.time, rate, color="black", lw=1.2, label="rate, logged")
+    panels[0].plot(flight.time, again, color="C0", lw=1.2, ls="--", label="rate, law and plant")
+    panels[0].set_ylabel("deg/s")
+    panels[1].plot(flight.time, rate - again, color="black", lw=0.8)
+    panels[1].set(xlabel="time, s", ylabel="logged less\nsimulated, deg/s")
+    for panel in panels:
+        panel.margins(x=0)
+    return _finished(panels, (2.4, 1.0), title)
+
+
 def b0_figure(
     levels: GainBand, taken: Mapping[str, ThrottleCurve], *, curve: GainBand | None = None,
     ax: Given = None, title: str = "",

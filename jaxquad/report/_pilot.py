@@ -4,10 +4,10 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaxquad._core import beside, write_file
+from jaxquad._core import beside, Later, write_file
 from jaxquad.control.autopilots import FilterChain
 from jaxquad.identify import GainBand
-from jaxquad.plot import Spectrum, StepBand, ThrottleCurve
+from jaxquad.plot import FlownAgain, Spectrum, StepBand, ThrottleCurve
 
 from ._attempt import attempt, FAILED
 from ._page import Headline, render_page, Table
@@ -71,12 +71,15 @@ class PilotPage:
     changes: Table | None = None
     text: str = ""
     unit: str = ""
+    again: FlownAgain | None = None
+    again_text: str = ""
+    overview: str = ""
     provenance: Provenance | None = None
     failures: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
-def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
-    """Write one self-contained HTML page on a proposal for an autopilot, whole or not at all.
+def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
+    """Write one self-contained HTML page on proposals for an autopilot, whole or not at all.
 
     It is made as `jaxquad.report.write_report` makes its page: figures inside it, nothing fetched,
     texts from a log escaped, and a section or a figure that cannot be computed says why.
@@ -84,31 +87,40 @@ def write_pilot_page(path: str | Path, page: PilotPage) -> Path:
     **Arguments:**
 
     - `path`: of the page.
-    - `page`: what it shows.
+    - `pages`: what it shows, one for each axis; the provenance is that of the first.
 
     **Returns:** the path.
     """
     # The caller has compiled what filters are drawn from: it waits for them first.
-    draw = lambda name: beside(attempt, _draw, name, page)
-    begun = {name: draw(name) for name in ("noise", "steps", "b0", "balance")}
-    begun = {"filters": draw("filters")} | begun
-    origin = page.provenance
-    sections = {
-        "changes": {"changes": page.changes, "stages": page.stages},
-        **{name: section.get() for name, section in begun.items()},
-        "text": {"text": page.text} if page.text else None,
-        "provenance": None if origin is None else attempt(provenance_section, origin),
-    }
-    sections |= {name: {FAILED: reason} for name, reason in page.failures.items()}
+    begun = [{name: beside(attempt, _draw, name, page) for name in _DRAWN} for page in pages]
+    first, origin = pages[0], pages[0].provenance
+    axes = [
+        {
+            "title": page.title, "headlines": list(page.headlines), "remarks": list(page.remarks),
+            "sections": _sections(page, drawn),
+        }
+        for page, drawn in zip(pages, begun, strict=True)
+    ]  # fmt: skip
     text = render_page(
         "pilot.html",
-        title=f"{page.headlines[0].word}: {page.title}",
-        title_text=page.title,
-        headlines=list(page.headlines),
-        remarks=list(page.remarks),
-        sections={name: section for name, section in sections.items() if section is not None},
+        title=f"{first.headlines[0].word}: {first.title}" if len(pages) == 1 else first.overview,
+        axes=axes,
+        origin=None if origin is None else attempt(provenance_section, origin),
     )
     return write_file(path, text)
+
+
+_DRAWN = ("filters", "again", "noise", "steps", "b0", "balance")
+
+
+def _sections(page: PilotPage, drawn: Mapping[str, Later[object]]) -> dict[str, object]:
+    sections = {
+        "changes": {"changes": page.changes, "stages": page.stages},
+        **{name: section.get() for name, section in drawn.items()},
+        "text": {"text": page.text} if page.text else None,
+    }
+    sections |= {name: {FAILED: reason} for name, reason in page.failures.items()}
+    return {name: section for name, section in sections.items() if section is not None}
 
 
 def _draw(name: str, page: PilotPage) -> object:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 from jaxquad.control.autopilots import FilterChain
 from jaxquad.plot import (
+    again_figure,
     b0_figure,
     balance_figure,
     filters_figure,
@@ -92,6 +93,19 @@ def _step_numbers(band: StepBand) -> list[str]:
     return [f"{over[0]:.0f}", f"{over[1]:.0f}", f"{1e3 * half:.0f}"]
 
 
+def _again(page: PilotPage) -> Section | None:
+    flight = page.again
+    if flight is None:
+        return None
+    image = embed_figure(
+        lambda: again_figure(flight),
+        alt="Set-point, logged rate, and the rate that law and plant make of the set-point.",
+        caption="The liveliest part of the flight: the rate as logged, and as the law that flew and "
+        "the identified plant make it of the logged set-point alone, without gusts.",
+    )
+    return {"image": image, "text": page.again_text}
+
+
 def _b0(page: PilotPage) -> Section | None:
     section = page.b0
     if section is None:
@@ -132,6 +146,7 @@ def _balance(page: PilotPage) -> Section | None:
 
 SECTIONS: Mapping[str, Callable[[PilotPage], Section | None]] = {
     "filters": _filters,
+    "again": _again,
     "noise": _noise,
     "steps": _steps,
     "b0": _b0,

@@ -85,7 +85,9 @@ class AxesProposal:
         curve = next((paths for paths in curves if paths), [])
         files = self._parameters.write(folder)
         announce("the page")
-        pages = [pilot_page(one, origin) for one in self.axes.values()]
+        flown = first.flown
+        overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
+        pages = [pilot_page(one, origin, overview) for one in self.axes.values()]
         page = write_pilot_page(folder / "autopilot.html", *pages)
         return [page, stored, *curve, *files]
 

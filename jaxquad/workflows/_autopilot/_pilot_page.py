@@ -1,7 +1,7 @@
 """The page of a proposal for an autopilot, from what `autopilot` found."""
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TYPE_CHECKING, TypeVar
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -9,13 +9,14 @@ from jaxtyping import Complex, Float
 from jaxquad._core import Number
 from jaxquad.control.autopilots import ArduPilotRate, BetaflightPID, FilterChain, PT1
 from jaxquad.export import ParameterChange, WordChange
-from jaxquad.plot import Spectrum, StepBand
+from jaxquad.plot import FlownAgain, Spectrum, StepBand
 from jaxquad.records import AXES
-from jaxquad.report import Cell, Headline, PilotPage, Provenance, Table
+from jaxquad.report import Cell, Headline, PilotPage, Provenance, reason_of, Table
 
 from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
 from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, RateLaw
+from ._stages import Stage
 
 
 if TYPE_CHECKING:
@@ -30,20 +31,21 @@ _SLOWEST = 20.0  # Hz, below which motion is taken for noise
 _UNITS = {"betaflight": "pidsum", "px4": "torque set-point", "ardupilot": "ROut"}
 
 
-def pilot_page(found: "AutopilotProposal", origin: Provenance) -> PilotPage:
-    """All that the page shows."""
+def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "") -> PilotPage:
+    """All that the page shows; what cannot be computed says why. `overview` is of all axes."""
     flown, axis = found.flown, found.flown.axis
-    after = _proposed_law(found)
-    noise = found.noise
-    if noise is None and found.flight is not None:
-        told = gyro_noise(found.flight, flown.law, axis, _SLOWEST)
-        noise = told if isinstance(told, GyroNoise) else None
+    after, failures = _proposed_law(found), dict[str, str]()
+    noise = _tried(failures, "noise", lambda: _noise_shown(found), None)
     designs = {"flown": (flown.law, gains_of(flown.law, axis))}
     if after is not None:
         designs["proposed"] = (after, gains_in(flown.law, axis, found.new))
-    gyro, derivative = ({}, {}) if noise is None else _spectra(noise, axis, designs)
-    version = ".".join(map(str, flown.version))
-    terms, terms_are = _terms(found.flight, flown.law, axis)
+    spectra = lambda: ({}, {}) if noise is None else _spectra(noise, axis, designs)
+    gyro, derivative = _tried(failures, "noise", spectra, ({}, {}))
+    steps = lambda: _steps(found, designs) if found.identification.fit.identifiable else {}
+    terms, terms_are = _tried(
+        failures, "balance", lambda: _terms(found.flight, flown.law, axis), ({}, "")
+    )
+    version, check = ".".join(map(str, flown.version)), found.reproduction
     return PilotPage(
         title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
         headlines=_headlines(found),
@@ -55,7 +57,7 @@ def pilot_page(found: "AutopilotProposal", origin: Provenance) -> PilotPage:
             f"Noise of {noise.source}, less what the set-point explains. Below "
             f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
         ),
-        steps=_steps(found, designs) if found.identification.fit.identifiable else {},
+        steps=_tried(failures, "steps", steps, {}),
         terms=terms,
         terms_are=terms_are,
         motors=[] if found.flight is None else motor_rows(found.flight),
@@ -63,8 +65,35 @@ def pilot_page(found: "AutopilotProposal", origin: Provenance) -> PilotPage:
         changes=change_rows(found.changes) if found.new else None,
         text=str(found),
         unit=_UNITS[flown.firmware],
+        again=None if check is None else FlownAgain(
+            check.time, check.setpoint, check.rate, check.again
+        ),
+        again_text="" if check is None else f"{check.verdict}.",
+        overview=overview,
         provenance=origin,
+        failures=failures,
     )  # fmt: skip
+
+
+Part = TypeVar("Part")
+
+
+def _tried(
+    failures: dict[str, str], section: str, compute: Callable[[], Part], missing: Part
+) -> Part:
+    """A section's content; why it could not be computed goes to `failures`."""
+    try:
+        return compute()
+    except Exception as error:  # the page holds the rest
+        failures[section] = reason_of(error)
+        return missing
+
+
+def _noise_shown(found: "AutopilotProposal") -> GyroNoise | None:
+    if found.noise is not None or found.flight is None:
+        return found.noise
+    told = gyro_noise(found.flight, found.flown.law, found.flown.axis, _SLOWEST)
+    return told if isinstance(told, GyroNoise) else None
 
 
 VERDICTS = {
@@ -265,30 +294,40 @@ def _stage_rows(found: "AutopilotProposal") -> Table:
     rows: list[list[str | Cell]] = [
         [
             name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
-            f"{x.crossover / (2 * np.pi):.1f}", f"{x.rejection:.2f}", f"{x.noise:.2f}",
+            f"{x.crossover / (2 * np.pi):.1f}", f"{1e3 * x.delay_margin:.1f}",
+            f"{x.rejection:.2f}", f"{x.noise:.2f}", *_further(x),
             *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
         ]
         for name, x in zip(names, stages, strict=True)
     ]  # fmt: skip
+    first = stages[0]
     heads = (
-        "gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "torque", "noise",
+        "gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "delay margin, ms",
+        "torque", "noise", *(("Ms, integral held",) if first.relaxed is not None else ()),
+        *(("Ms, angle loop", "peak, angle loop") if first.angle is not None else ()),
         *(f"Ms at throttle {each:.2f}" for each in levels),
     )  # fmt: skip
     return Table(f"On {found.settings.fresh} fresh plants", heads, rows)
+
+
+def _further(stage: Stage) -> list[str]:
+    """With the integral held, and of the angle loop, where there are such."""
+    held = [] if stage.relaxed is None else [f"{stage.relaxed:.2f}"]
+    angle = stage.angle
+    return held if angle is None else [*held, f"{angle.peak:.2f}", f"{angle.resonance:.2f}"]
 
 
 def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
     """Old, new, unit, range and reason, for the page."""
     rows: list[list[str | Cell]] = [
         [
-            Cell(row.name), row.unit, _range(row.low, row.high), reason,
-            f"{old:.5g}", f"{new:.5g}",
+            Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, _range(row.low, row.high), reason,
         ]
         for row, old, new, reason in changes
     ]  # fmt: skip
-    rows += [[Cell(each.name), "", "", each.reason, each.old, each.new] for each in words]
-    heads = ("parameter", "unit", "range", "reason", "old", "new")
-    return Table("From what flew to the proposal", heads, rows, texts=4)
+    rows += [[Cell(each.name), each.old, each.new, "", "", each.reason] for each in words]
+    heads = ("parameter", "old", "new", "unit", "range", "reason")
+    return Table("From what flew to the proposal", heads, rows)
 
 
 def _range(low: Number, high: Number) -> str:

@@ -23,7 +23,7 @@ from ._pilot_page import pilot_page
 from ._plants import PlantSource
 from ._proposed_parameters import ProposedParameters
 from ._rate_design import FilterVerdict, Kind
-from ._stages import Stage
+from ._stages import OuterStage, Stage
 
 
 _CURVE = "thrust_curve"
@@ -234,8 +234,9 @@ _WAYS = ("what flew", "a third of the way", "all of it")
 
 
 _OF_STAGES = """(fresh plants: drawn from what the log leaves possible, not tuned on; Ms and
-resonance: peaks of |S| and of the response to the set-point; torque: how far a torque moves the
-rate, noise: that of the command, both over those of what flew)"""
+resonance: peaks of |S| and of the response to the set-point; torque: the rate after a step of
+torque, noise: that of the command, both over those of what flew; Ms held: without the integral,
+which iterm_relax holds while the set-point moves)"""
 
 
 def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> list[str]:
@@ -252,10 +253,25 @@ def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> lis
 
 
 def _stage_table(stages: tuple[Stage, ...]) -> str:
-    rows = [f"{'on fresh plants':<20} stable   worst Ms   resonance   crossover   torque   noise"]
+    first = stages[0]
+    held = "   Ms held" if first.relaxed is not None else ""
+    angle = "   Ms angle" if first.angle is not None else ""
+    heads = "stable   worst Ms   resonance   crossover   delay margin   torque   noise"
+    rows = [f"{'on fresh plants':<20} {heads}{held}{angle}"]
     for name, stage in zip(_WAYS, stages, strict=False):
-        rows.append(
+        row = (
             f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
-            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {stage.rejection:8.2f} {stage.noise:7.2f}"
+            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {1e3 * stage.delay_margin:9.1f} ms "
+            f"{stage.rejection:8.2f} {stage.noise:7.2f}"
         )
-    return "\n".join([*rows, _OF_STAGES])
+        row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"
+        rows.append(row + ("" if stage.angle is None else f" {stage.angle.peak:10.2f}"))
+    return "\n".join([*rows, _OF_STAGES, *_of_angle(first.angle)])
+
+
+def _of_angle(angle: OuterStage | None) -> list[str]:
+    """Which angle loop is meant, and whether it flew."""
+    if angle is None:
+        return []
+    flew = "as it flew" if angle.closed else "which was open in this flight"
+    return [f"(Ms angle: of the angle loop around it, {angle.parameter} {angle.value:.3g}, {flew})"]
