@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxquad._core import beside as begin, Later, write_file
-from jaxquad.identify import Combination, Fit, MISFIT, Verification
+from jaxquad.identify import Combination, Fit, KnownFilter, MISFIT, Verification
 from jaxquad.models import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
@@ -41,6 +41,7 @@ def write_report(
     others: Mapping[str, FrequencyResponse] | None = None,
     record: Record | Mapping[str, Record] | None = None,
     spectrum: Record | None = None,
+    filters: Sequence[KnownFilter] = (),
     checks: Verification | Mapping[str, Verification] | None = None,
     derived: Sequence[Combination] = (),
     beside: Mapping[str, str] | None = None,
@@ -71,6 +72,7 @@ def write_report(
     - `record`, `checks`: the records, and the model simulated on records; one, or several by name.
     - `spectrum`: the record whose spectrum is shown, such as one with the throttle beside its
         channels; by default the first record.
+    - `filters`: of the outputs, up to whose inputs response and model are.
     - `derived`: rows below the parameters, see `Fit.derived`.
     - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
@@ -84,7 +86,7 @@ def write_report(
 
     **Raises:** ValueError for no response, and for `models` whose names no response has.
     """
-    shown = shown_of(fit, frf, models, others, record, spectrum)
+    shown = shown_of(fit, frf, models, others, record, spectrum, filters)
     found = {"verification": checks} if isinstance(checks, Verification) else dict(checks or {})
     remarks = remarks_of(fit, found)
     headlines = [fit_headline(fit, len(remarks))]

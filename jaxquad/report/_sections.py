@@ -1,10 +1,10 @@
 """The sections of a page that show a response and its record in figures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from jaxquad._core import beside as begin, Later
-from jaxquad.identify import Fit
+from jaxquad.identify import Fit, KnownFilter
 from jaxquad.models import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
@@ -18,7 +18,10 @@ from ._step import step_section
 
 
 class Shown(NamedTuple):
-    """What is drawn of a fit, by name; `spectrum` is the record whose spectrum is."""
+    """What is drawn of a fit, by name; `spectrum` is the record whose spectrum is.
+
+    `filters` are those of the outputs that are divided out of responses and models.
+    """
 
     fit: Fit
     frfs: Mapping[str, FrequencyResponse]
@@ -26,6 +29,7 @@ class Shown(NamedTuple):
     others: Mapping[str, FrequencyResponse]
     records: Mapping[str, Record]
     spectrum: Record | None
+    filters: Sequence[KnownFilter] = ()
 
     @property
     def first(self) -> FrequencyResponse:
@@ -45,7 +49,7 @@ class Shown(NamedTuple):
             "response": begin(attempt, response_section, self.frfs, self.models, self.others)
         }
         if flown is not None:
-            sections["step"] = begin(attempt, step_section, self.fit, first, flown)
+            sections["step"] = begin(attempt, step_section, self.fit, first, flown, self.filters)
             sections["loop"] = begin(attempt, loop_section, first, flown)
         if (record := flown if self.spectrum is None else self.spectrum) is not None:
             sections["spectrum"] = begin(attempt, spectrum_section, first, record)
@@ -61,13 +65,15 @@ def shown_of(
     others: Mapping[str, FrequencyResponse] | None = None,
     record: Record | Mapping[str, Record] | None = None,
     spectrum: Record | None = None,
+    filters: Sequence[KnownFilter] = (),
 ) -> Shown:
     """What `write_report` was given, by name. Raises ValueError as that does."""
     frfs = {"response": frf} if isinstance(frf, FrequencyResponse) else dict(frf)
     if not frfs:
         raise ValueError("frf is empty: give the response that was fitted, or several by name")
     records = {"record": record} if isinstance(record, Record) else dict(record or {})
-    return Shown(fit, frfs, _models(fit, frfs, models or {}), others or {}, records, spectrum)
+    drawn = _models(fit, frfs, models or {})
+    return Shown(fit, frfs, drawn, others or {}, records, spectrum, tuple(filters))
 
 
 def _models(

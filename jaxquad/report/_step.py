@@ -7,7 +7,14 @@ import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.figure import Figure
 
-from jaxquad.identify import as_sampled, Fit, model_response, with_values
+from jaxquad.identify import (
+    as_sampled,
+    behind_filters,
+    Fit,
+    KnownFilter,
+    model_response,
+    with_values,
+)
 from jaxquad.models import Model
 from jaxquad.plot import short_names, unit_label
 from jaxquad.records import Record
@@ -34,8 +41,13 @@ class Prediction(NamedTuple):
     error: Samples | None
 
 
-def step_section(fit: Fit, frf: FrequencyResponse, record: Record) -> Section | None:
-    """Measured and predicted step response; None without a reference or room for one."""
+def step_section(
+    fit: Fit, frf: FrequencyResponse, record: Record, filters: Sequence[KnownFilter] = ()
+) -> Section | None:
+    """Measured and predicted step response; None without a reference or room for one.
+
+    The model is up to the input of the `filters`.
+    """
     if not record.reference_names:
         return None
     try:
@@ -45,7 +57,9 @@ def step_section(fit: Fit, frf: FrequencyResponse, record: Record) -> Section | 
     head: Section = {"names": found.names, "doubts": found.doubts}
     if not found.is_told:
         return head | {"image": None, "table": None, "notes": []}
-    predicted = predict_step(fit, frf, record) if fit.verdict.fitted else None
+    predicted = (
+        predict_step(fit, frf, behind_filters(record, filters)) if fit.verdict.fitted else None
+    )
     return head | {
         "image": _image(record, found, predicted),
         "table": _table(found, predicted),

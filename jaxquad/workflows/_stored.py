@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import announce, beside
-from jaxquad.identify import Fit, Verification, verify
+from jaxquad.identify import behind_filters, Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError
 from jaxquad.report import PageWarning, provenance, reason_of, write_results
 
@@ -42,6 +42,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         "used_band_rad_per_s": found.fit.used_band,
         "derived": [each._asdict() for each in found.combinations],
         "provenance": origin.content(),
+        **({"gyro_filters": found.flown.content()} if found.flown and found.filters else {}),
         **_content_beside(found),
         **_model_content(found),
     }
@@ -60,7 +61,8 @@ def write_identification(found: Identification, folder: Path) -> Path:
         checks={} if found.check is None else {Path(sources[-1]).name: found.check},
         derived=found.combinations,
         provenance=origin,
-        formula=found.formula,
+        filters=found.filters,
+        formula="; ".join(filter(None, (found.formula, found.filters_text))),
         beside=found.beside,
     )
     drawn.get()
@@ -190,4 +192,4 @@ def verify_result(
     if changed.band is not None:
         band = 2 * np.pi * changed.band[0], 2 * np.pi * changed.band[1]
     [record] = read_records(Path(path), changed)
-    return verify(model, record, band=band)
+    return verify(model, behind_filters(record, stored.filters), band=band)

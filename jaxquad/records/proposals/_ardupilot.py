@@ -117,7 +117,10 @@ def _chirped(log: Log, run: _Run, alike: list[_Run], remarks: list[str]) -> Setu
     if run.place <= 3:
         remarks.append("the chirp passes the input shaping, which is nonlinear for large steps")
     rate = f"RATE.{letter}"
-    remarks.append(f"{rate} is measured after the gyro filter, so the model includes its lag")
+    remarks.append(
+        f"{rate} is measured after the gyro filter, which identify divides out where the log has "
+        "its parameters"
+    )
     remarks += _gains(log, axis)
     found = [each for each in map(ft.partial(_common, log), alike) if each]
     if not found:
