@@ -18,7 +18,7 @@ Frequencies = Float[np.ndarray, " frequencies"]
 class KnownFilter(Protocol):
     """A filter of the log's output, as `jq.control.autopilots.FilterChain` is one."""
 
-    def response(self, frequency_hz: Frequencies) -> Complex[Array, " frequencies"]:
+    def response(self, frequency_hz: Frequencies) -> Complex[Array | np.ndarray, " frequencies"]:
         """At frequencies in Hz."""
         ...
 

@@ -48,9 +48,11 @@ class FlownLaw:
     **Attributes:**
 
     - `filters`: of the gyro, in front of the logged rate; none where all are off or unknown.
+    - `chains`: those that the parameters describe.
     - `text`: what is divided out, or why nothing is.
-    - `law`: the rate loop; None where it is not known.
-    - `axis`: 0, 1 or 2; `setpoint`: the channel of its set-point.
+    - `law`: the rate loop from the identified output to the identified input; None where the log
+      does not tell it.
+    - `axis`: 0, 1 or 2.
     - `unmodelled`: what of the firmware the law leaves out.
     """
 
@@ -58,25 +60,18 @@ class FlownLaw:
     text: str
     law: "RateLaw | None" = None
     axis: int = 0
-    setpoint: str = ""
     unmodelled: tuple[str, ...] = ()
+    chains: "tuple[FilterChain, ...]" = ()
 
     def content(self) -> dict[str, object]:
         """For `result.json`; `StoredFilters.of` reads the filters."""
-        chains, correction = self.filters, {}
-        if len(chains) == 1 and isinstance(chains[0], MeasuredChain):
-            [measured] = chains
-            chains = measured.known
-            correction = {"delay_s": measured.delay, "lag_s": measured.lag}
-        return {
-            "text": self.text,
-            "correction": correction,
-            "chains": [
-                {"rate_hz": x.rate_hz, "sections": [_numbers(each) for each in x.sections()]}
-                for x in chains
-                if hasattr(x, "sections")
-            ],
-        }
+        measured = [each for each in self.filters if isinstance(each, MeasuredChain)]
+        chains = [
+            {"rate_hz": x.rate_hz, "sections": [_numbers(each) for each in x.sections()]}
+            for x in self.chains
+        ]
+        correction = [{"delay_s": each.delay, "lag_s": each.lag} for each in measured]
+        return {"text": self.text, "chains": chains, "correction": (*correction, {})[0]}
 
 
 def _numbers(section: Sequence[object]) -> list[float]:
@@ -162,7 +157,7 @@ def _law_of(path: Path, rate: str, axis: int, opened: OpenedLogs) -> FlownLaw | 
 
 
 def _read_law(path: Path, axis: int, proposal: Proposal, settings: IdentifySettings) -> FlownLaw:
-    from jaxquad.control.autopilots import firmware_of, flies_adrc, flown_loop
+    from jaxquad.control.autopilots import flies_adrc, flown_loop
 
     from ._autopilot._flight_channels import HOVER, read_channels_if_any
     from ._autopilot._flown_autopilot import settings_of
@@ -181,18 +176,10 @@ def _read_law(path: Path, axis: int, proposal: Proposal, settings: IdentifySetti
     )  # fmt: skip
     chains = tuple(each for each in gyro_chains(loop.law) if each.filters)
     filters, text = _best_filters(chains, loop.unmodelled, flight, axis)
-    other = firmware_of(loop.law) == "betaflight" and flies_adrc(logged.values)
-    setpoint = _setpoint(proposal, axis)
-    law = None if other else loop.law
-    return FlownLaw(filters, text, law, axis, setpoint, tuple(loop.unmodelled))
-
-
-def _setpoint(proposal: Proposal, axis: int) -> str:
-    if proposal.vehicle == "px4":
-        return f"vehicle_rates_setpoint.{AXES[axis]}"
-    if proposal.vehicle == "ardupilot":
-        return f"RATE.{'RPY'[axis]}Des"
-    return proposal.setup.rate.replace("gyroADC", "setpoint")
+    adrc = proposal.vehicle == "betaflight" and flies_adrc(logged.values)
+    [command] = mix_of(settings.input).values()
+    law = loop.law if not adrc and command == dict(proposal.setup.command) else None
+    return FlownLaw(filters, text, law, axis, tuple(loop.unmodelled), chains)
 
 
 def _best_filters(
@@ -227,7 +214,7 @@ def _measured(
     moves = np.ptp(flight.setpoint) > 0
     try:
         return measured_chain(
-            unfiltered, filtered, flight.dt, known=chains, names=flight.names[::-1],
+            unfiltered, filtered, flight.dt, known=chains, names=(flight.names[1], flight.names[0]),
             reference=flight.setpoint if moves else None,
         )  # fmt: skip
     except ValueError as error:

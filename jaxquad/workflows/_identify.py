@@ -302,8 +302,8 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
     flown = flown_law(opened)
-    kept = flown is None or opened.settings.keep_gyro_filters
-    found, others = _identify(opened, compare=True, filters=() if kept else flown.filters)
+    filters = () if flown is None or opened.settings.keep_gyro_filters else flown.filters
+    found, others = _identify(opened, compare=True, filters=filters)
     found = dataclasses.replace(found, flown=flown)
     found = _with_fits_again(dataclasses.replace(found, check=_checked(found)))
     return _with_others(found, others)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxquad._core import announce, beside
 from jaxquad.identify import behind_filters, Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError
-from jaxquad.report import PageWarning, provenance, reason_of, write_results
+from jaxquad.report import LawLoop, PageWarning, provenance, reason_of, write_results
 
 from ._identify import Identification, identify_opened
 from ._log import open_again, read_records
@@ -62,11 +62,22 @@ def write_identification(found: Identification, folder: Path) -> Path:
         derived=found.combinations,
         provenance=origin,
         filters=found.filters,
+        law=_law_if_any(found),
         formula="; ".join(filter(None, (found.formula, found.filters_text))),
         beside=found.beside,
     )
     drawn.get()
     return path
+
+
+def _law_if_any(found: Identification) -> LawLoop | None:
+    from ._loop_of_law import loop_of_law
+
+    try:
+        return loop_of_law(found)
+    except Exception as error:  # the record shows its loop without the law, too
+        warnings.warn(f"the loop by its law is missing: {reason_of(error)}", PageWarning, 2)
+        return None
 
 
 def _with_throttle(found: Identification) -> Record | None:

@@ -50,13 +50,13 @@ class FlightChannels:
     rates: tuple[Samples, ...]
     dt: float
     setpoint: Samples
-    unfiltered: tuple[Samples, ...] = ()
+    unfiltered: tuple[Float[np.ndarray, " raw"], ...] = ()
     unfiltered_dt: float = 0.0
     averaged: bool = False  # whether the unfiltered rate is the mean over its sample
     terms: Mapping[str, Samples] = dataclasses.field(default_factory=dict)
-    motors: Float[np.ndarray, "samples motors"] | None = None
+    motors: Float[np.ndarray, "instants motors"] | None = None
     motor_ends: tuple[float, float] = (0.0, 1.0)
-    throttle: Samples | None = None
+    throttle: Float[np.ndarray, " positions"] | None = None
     names: tuple[str, str] = ("", "")
     tracked_hz: Mapping[int, tuple[float, ...]] = dataclasses.field(default_factory=dict)
 
