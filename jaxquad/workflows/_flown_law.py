@@ -175,14 +175,14 @@ def _read_law(path: Path, axis: int, proposal: Proposal, settings: IdentifySetti
         throttle=HOVER if middle is None else middle, tracked_hz=tracked,
     )  # fmt: skip
     chains = tuple(each for each in gyro_chains(loop.law) if each.filters)
-    filters, text = _best_filters(chains, loop.unmodelled, flight, axis)
+    filters, text = best_filters(chains, loop.unmodelled, flight, axis)
     adrc = proposal.vehicle == "betaflight" and flies_adrc(logged.values)
     [command] = mix_of(settings.input).values()
     law = loop.law if not adrc and command == dict(proposal.setup.command) else None
     return FlownLaw(filters, text, law, axis, tuple(loop.unmodelled), chains)
 
 
-def _best_filters(
+def best_filters(
     chains: "tuple[FilterChain, ...]",
     unmodelled: Sequence[str],
     flight: "FlightChannels | None",

@@ -1,15 +1,29 @@
 """The gyro's filters are divided out of an autopilot's model, and its loop is that of its law."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from html_pages import read_page
+from scipy.signal import lfilter
+from sweep_logs import write_sweep
 
 from jaxquad.cli import main
-from jaxquad.control.autopilots import Butterworth, FilterChain, PT1
-from jaxquad.workflows import identify, identify_again, IdentifySettings, load_result, verify_result
-from jaxquad.workflows._flown_law import FlownLaw, StoredFilters
+from jaxquad.control.autopilots import Butterworth, FilterChain, Notch, PT1
+from jaxquad.workflows import (
+    identify,
+    identify_again,
+    identify_fit,
+    IdentifySettings,
+    load_result,
+    open_logs,
+    tune,
+    TuneSettings,
+    verify_result,
+)
+from jaxquad.workflows._autopilot._flight_channels import FlightChannels
+from jaxquad.workflows._flown_law import best_filters, FlownLaw, StoredFilters
 from jaxquad.workflows._loop_of_law import loop_of_law
 
 
@@ -97,3 +111,38 @@ def test_betaflights_page_has_a_step_and_the_margins_of_its_law(log, tmp_path, n
     assert any("after a step of 1" in each for each in alts)
     assert "6.3" in page.text("dd") and "The law of the log's parameters" in page.text("section")
     assert "anti-gravity" in page.text("section")
+
+
+def test_a_loop_of_ones_own_is_tuned_behind_the_filters(tmp_path):
+    path = write_sweep(tmp_path / "sweep.csv")
+    asked = IdentifySettings(input="M=right-left", output="q", units={"q": "rad/s"}, band=(0.5, 6))
+    opened = open_logs(path, asked)
+    assert identify_fit(opened).settings.keep_gyro_filters
+    found = dataclasses.replace(identify_fit(opened), settings=opened.settings)
+    ahead = dataclasses.replace(found, flown=FlownLaw((CHAIN,), "as the parameters say"))
+    assert ahead.filters and not found.filters
+    with pytest.raises(ValueError, match="keep_gyro_filters=True"):
+        tune(ahead, TuneSettings(inertia=0.01, limit=1.0))
+
+
+def test_notches_that_follow_the_motors_are_divided_out_as_measured():
+    """30 s at 1 kHz: random motion, through a low-pass that is known and a notch that is not."""
+    known = FilterChain((PT1(250.0),), 1000.0)
+    whole = FilterChain((PT1(250.0), Notch(120.0, 2.0)), 1000.0)
+    raw = np.cumsum(np.random.default_rng(0).standard_normal(30000))
+    raw = np.asarray(lfilter([0.01], [1.0, -0.99], raw)) - raw.mean()
+    rate = raw
+    for section in whole.sections():
+        b0, b1, a1, b2, a2 = (0.0 if x is None else float(x) for x in section)
+        rate = np.asarray(lfilter([b0, b1, b2], [1.0, a1, a2], rate))
+    names, hidden = ("gyroADC[0]", "gyroUnfilt[0]"), ("3 RPM notches per motor on the gyro: x",)
+    flight = FlightChannels((rate,), 1e-3, 0 * rate, (raw,), 1e-3, names=names)
+    [measured], text = best_filters((known,), hidden, flight, 0)
+    assert text.startswith("the gyro's filters are divided out, measured: gyroADC[0] over gyroUnf")
+    truth, at = np.asarray(whole.response(np.array([5.0, 10.0, 20.0]))), np.array([5.0, 10.0, 20.0])
+    assert np.max(np.abs(np.asarray(measured.response(at)) / truth - 1)) < 0.01
+    same = best_filters((known,), (), flight, 0)
+    assert same[0] == (known,) and "pt1 250 Hz, are divided out" in same[1]
+    still = dataclasses.replace(flight, unfiltered=(0 * raw,))
+    chains, text = best_filters((known,), hidden, still, 0)
+    assert chains == (known,) and "3 RPM notches per motor on the gyro, which could not be" in text
