@@ -43,6 +43,7 @@ from ._gain_over_throttle import (
 from ._half_bands import Bands as Bands
 from ._held import as_sampled as as_sampled
 from ._known_filters import (
+    behind_filters as behind_filters,
     filter_response as filter_response,
     KnownFilter as KnownFilter,
     without_filters as without_filters,

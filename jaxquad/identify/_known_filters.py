@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 
@@ -17,7 +18,7 @@ Frequencies = Float[np.ndarray, " frequencies"]
 class KnownFilter(Protocol):
     """A filter of the log's output, as `jq.control.autopilots.FilterChain` is one."""
 
-    def response(self, frequency_hz: Frequencies) -> Complex[Array, " frequencies"]:
+    def response(self, frequency_hz: Frequencies) -> Complex[Array | np.ndarray, " frequencies"]:
         """At frequencies in Hz."""
         ...
 
@@ -30,6 +31,21 @@ def filter_response(
     for each in filters:
         passed = passed * np.asarray(each.response(omega / (2 * np.pi)))
     return passed
+
+
+def behind_filters(record: Record, filters: Sequence[KnownFilter]) -> Record:
+    """The record with inputs that have passed the filters, which the outputs have.
+
+    A model up to what the filters were given makes of these inputs what left the filters. Before
+    the record the inputs are taken as constant.
+    """
+    if not filters:
+        return record
+    inputs, size = np.asarray(record.inputs), 2 * record.samples
+    passed = filter_response(filters, 2 * np.pi * np.fft.rfftfreq(size, record.dt))
+    spectra = np.fft.rfft(inputs - inputs[0], size, axis=0) * passed[:, None]
+    late = inputs[0] + np.fft.irfft(spectra, size, axis=0)[: record.samples]
+    return dataclasses.replace(record, inputs=late)
 
 
 def without_filters(frf: FrequencyResponse, filters: Sequence[KnownFilter]) -> FrequencyResponse:

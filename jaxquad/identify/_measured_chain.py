@@ -72,11 +72,11 @@ class MeasuredChain:
     def error(self, frequency_hz: Frequencies) -> Frequencies:
         """The standard error of the response at frequencies in Hz, relative and in rad."""
         omega = 2 * np.pi * np.asarray(frequency_hz, float)
-        slopes = _slopes(omega, self.lag)
-        parts = [
-            np.einsum("fp,pq,fq->f", x, self.covariance, x) for x in (slopes.real, slopes.imag)
-        ]
-        return np.sqrt(np.maximum(*parts))
+        slopes, covariance = _slopes(omega, self.lag), self.covariance
+        size, turn = (
+            np.einsum("fp,pq,fq->f", x, covariance, x) for x in (np.real(slopes), np.imag(slopes))
+        )
+        return np.sqrt(np.maximum(size, turn))
 
     def delay_ms(self, frequency_hz: Frequencies) -> Frequencies:
         """The phase delay in ms at frequencies in Hz, which are above 0."""

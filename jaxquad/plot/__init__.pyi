@@ -1,6 +1,11 @@
 from ._bode import bode as bode, coherence as coherence
 from ._certificate import certificate_figure as certificate_figure
-from ._curves import Spectrum as Spectrum, StepBand as StepBand, ThrottleCurve as ThrottleCurve
+from ._curves import (
+    FlownAgain as FlownAgain,
+    Spectrum as Spectrum,
+    StepBand as StepBand,
+    ThrottleCurve as ThrottleCurve,
+)
 from ._flight import flight as flight
 from ._histories import (
     channels_of as channels_of,

@@ -30,3 +30,12 @@ class ThrottleCurve(NamedTuple):
 
     throttle: Float[np.ndarray, " points"]
     value: Float[np.ndarray, " points"]
+
+
+class FlownAgain(NamedTuple):
+    """A part of a flight as it was logged, and as law and plant fly it again: s and rad/s."""
+
+    time: Float[np.ndarray, " samples"]
+    setpoint: Float[np.ndarray, " samples"]
+    rate: Float[np.ndarray, " samples"]
+    again: Float[np.ndarray, " samples"]

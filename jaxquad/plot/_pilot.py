@@ -7,7 +7,7 @@ import numpy as np
 from jaxquad.control.autopilots import FilterChain
 from jaxquad.identify import GainBand
 
-from ._curves import Spectrum, StepBand, ThrottleCurve
+from ._curves import FlownAgain, Spectrum, StepBand, ThrottleCurve
 from ._labels import few_ticks, look_of, plain_ticks
 from ._panels import arrange, Given, legend_of, Panels, stacked
 
@@ -115,15 +115,6 @@ def steps_figure(
     panel.set(xlabel="time, s", ylabel=label)
     panel.margins(x=0)
     return _finished(panels, (2.8,), title)
-
-
-class FlownAgain(NamedTuple):
-    """A part of a flight as it was logged, and as law and plant fly it again: s and rad/s."""
-
-    time: Float[np.ndarray, " samples"]
-    setpoint: Float[np.ndarray, " samples"]
-    rate: Float[np.ndarray, " samples"]
-    again: Float[np.ndarray, " samples"]
 
 
 def again_figure(flight: FlownAgain, *, ax: Given = None, title: str = "") -> Panels:

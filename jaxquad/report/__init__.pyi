@@ -4,6 +4,7 @@ from ._attempt import (
     reason_of as reason_of,
 )
 from ._fit import compare_fits as compare_fits
+from ._loop import LawLoop as LawLoop
 from ._page import (
     Cell as Cell,
     Headline as Headline,

@@ -12,7 +12,7 @@ FAILED = "failed"  # key of the reason, in what templates show instead of a sect
 
 
 class PageWarning(UserWarning):
-    """A figure beside a page could not be drawn; the rest is written."""
+    """A part of a result could not be computed; the rest is written."""
 
 
 def reason_of(error: Exception) -> str:

@@ -100,8 +100,8 @@ def _again(page: PilotPage) -> Section | None:
     image = embed_figure(
         lambda: again_figure(flight),
         alt="Set-point, logged rate, and the rate that law and plant make of the set-point.",
-        caption="The liveliest part of the flight: the rate as logged, and as the law that flew and "
-        "the identified plant make it of the logged set-point alone, without gusts.",
+        caption="The liveliest part of the flight: the rate as logged, and as the law that flew "
+        "and the identified plant make it of the logged set-point alone, without gusts.",
     )
     return {"image": image, "text": page.again_text}
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxquad._core import beside as begin, Later, write_file
-from jaxquad.identify import Combination, Fit, MISFIT, Verification
+from jaxquad.identify import Combination, Fit, KnownFilter, MISFIT, Verification
 from jaxquad.models import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
@@ -15,6 +15,7 @@ from jaxquad.spectra import FrequencyResponse
 from ._answers import answer_section
 from ._attempt import attempt
 from ._fit import identifiability_section, parameter_section
+from ._loop import LawLoop
 from ._page import Headline, render_page
 from ._provenance import Provenance, provenance_section
 from ._record import check_section, GOOD_TIC
@@ -41,6 +42,8 @@ def write_report(
     others: Mapping[str, FrequencyResponse] | None = None,
     record: Record | Mapping[str, Record] | None = None,
     spectrum: Record | None = None,
+    filters: Sequence[KnownFilter] = (),
+    law: LawLoop | None = None,
     checks: Verification | Mapping[str, Verification] | None = None,
     derived: Sequence[Combination] = (),
     beside: Mapping[str, str] | None = None,
@@ -71,6 +74,8 @@ def write_report(
     - `record`, `checks`: the records, and the model simulated on records; one, or several by name.
     - `spectrum`: the record whose spectrum is shown, such as one with the throttle beside its
         channels; by default the first record.
+    - `filters`: of the outputs, up to whose inputs response and model are.
+    - `law`: the flown loop where its law is known, which is shown instead of an estimate.
     - `derived`: rows below the parameters, see `Fit.derived`.
     - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
@@ -84,7 +89,7 @@ def write_report(
 
     **Raises:** ValueError for no response, and for `models` whose names no response has.
     """
-    shown = shown_of(fit, frf, models, others, record, spectrum)
+    shown = shown_of(fit, frf, models, others, record, spectrum, filters, law)
     found = {"verification": checks} if isinstance(checks, Verification) else dict(checks or {})
     remarks = remarks_of(fit, found)
     headlines = [fit_headline(fit, len(remarks))]

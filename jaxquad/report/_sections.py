@@ -1,16 +1,16 @@
 """The sections of a page that show a response and its record in figures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from jaxquad._core import beside as begin, Later
-from jaxquad.identify import Fit
+from jaxquad.identify import Fit, KnownFilter
 from jaxquad.models import Model
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 from ._attempt import attempt
-from ._loop import loop_section
+from ._loop import LawLoop, loop_section
 from ._record import record_section
 from ._response import response_section
 from ._spectrum import spectrum_section
@@ -18,7 +18,11 @@ from ._step import step_section
 
 
 class Shown(NamedTuple):
-    """What is drawn of a fit, by name; `spectrum` is the record whose spectrum is."""
+    """What is drawn of a fit, by name; `spectrum` is the record whose spectrum is.
+
+    `filters` are those of the outputs that are divided out of responses and models; `law` is the
+    loop where the log tells the controller.
+    """
 
     fit: Fit
     frfs: Mapping[str, FrequencyResponse]
@@ -26,6 +30,8 @@ class Shown(NamedTuple):
     others: Mapping[str, FrequencyResponse]
     records: Mapping[str, Record]
     spectrum: Record | None
+    filters: Sequence[KnownFilter] = ()
+    law: LawLoop | None = None
 
     @property
     def first(self) -> FrequencyResponse:
@@ -44,9 +50,12 @@ class Shown(NamedTuple):
         sections: dict[str, Later] = {
             "response": begin(attempt, response_section, self.frfs, self.models, self.others)
         }
+        step = None if self.law is None else self.law.step
         if flown is not None:
-            sections["step"] = begin(attempt, step_section, self.fit, first, flown)
-            sections["loop"] = begin(attempt, loop_section, first, flown)
+            sections["step"] = begin(
+                attempt, step_section, self.fit, first, flown, self.filters, step
+            )
+            sections["loop"] = begin(attempt, loop_section, first, flown, self.law)
         if (record := flown if self.spectrum is None else self.spectrum) is not None:
             sections["spectrum"] = begin(attempt, spectrum_section, first, record)
         if self.records:
@@ -61,13 +70,16 @@ def shown_of(
     others: Mapping[str, FrequencyResponse] | None = None,
     record: Record | Mapping[str, Record] | None = None,
     spectrum: Record | None = None,
+    filters: Sequence[KnownFilter] = (),
+    law: LawLoop | None = None,
 ) -> Shown:
     """What `write_report` was given, by name. Raises ValueError as that does."""
     frfs = {"response": frf} if isinstance(frf, FrequencyResponse) else dict(frf)
     if not frfs:
         raise ValueError("frf is empty: give the response that was fitted, or several by name")
     records = {"record": record} if isinstance(record, Record) else dict(record or {})
-    return Shown(fit, frfs, _models(fit, frfs, models or {}), others or {}, records, spectrum)
+    drawn = _models(fit, frfs, models or {})
+    return Shown(fit, frfs, drawn, others or {}, records, spectrum, tuple(filters), law)
 
 
 def _models(

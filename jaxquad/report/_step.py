@@ -7,9 +7,16 @@ import numpy as np
 from jaxtyping import Complex, Float
 from matplotlib.figure import Figure
 
-from jaxquad.identify import as_sampled, Fit, model_response, with_values
+from jaxquad.identify import (
+    as_sampled,
+    behind_filters,
+    Fit,
+    KnownFilter,
+    model_response,
+    with_values,
+)
 from jaxquad.models import Model
-from jaxquad.plot import short_names, unit_label
+from jaxquad.plot import short_names, StepBand, steps_figure, unit_label
 from jaxquad.records import Record
 from jaxquad.spectra import estimate_step, FrequencyResponse, StepResponse
 
@@ -34,8 +41,18 @@ class Prediction(NamedTuple):
     error: Samples | None
 
 
-def step_section(fit: Fit, frf: FrequencyResponse, record: Record) -> Section | None:
-    """Measured and predicted step response; None without a reference or room for one."""
+def step_section(
+    fit: Fit,
+    frf: FrequencyResponse,
+    record: Record,
+    filters: Sequence[KnownFilter] = (),
+    computed: StepBand | None = None,
+) -> Section | None:
+    """Measured and predicted step response; None without a reference or room for one.
+
+    The model is up to the input of the `filters`. What is `computed` from law and model is shown
+    where the log does not show a step.
+    """
     if not record.reference_names:
         return None
     try:
@@ -44,8 +61,11 @@ def step_section(fit: Fit, frf: FrequencyResponse, record: Record) -> Section | 
         return None
     head: Section = {"names": found.names, "doubts": found.doubts}
     if not found.is_told:
-        return head | {"image": None, "table": None, "notes": []}
-    predicted = predict_step(fit, frf, record) if fit.verdict.fitted else None
+        image = None if computed is None else _computed(computed)
+        return head | {"image": None, "table": None, "notes": [], "computed": image}
+    predicted = (
+        predict_step(fit, frf, behind_filters(record, filters)) if fit.verdict.fitted else None
+    )
     return head | {
         "image": _image(record, found, predicted),
         "table": _table(found, predicted),
@@ -122,6 +142,17 @@ def _interpolated(
         size = np.interp(omega, grid, np.log(np.maximum(np.abs(each), 1e-300)))
         columns.append(np.exp(size + 1j * np.interp(omega, grid, np.unwrap(np.angle(each)))))
     return np.stack(columns, axis=1)
+
+
+def _computed(band: StepBand) -> Image:
+    over = 100 * max(float(np.max(band.middle)) - 1, 0.0)
+    return embed_figure(
+        lambda: steps_figure({"law and model": band}),
+        alt=f"Rate after a step of 1 of the set-point by law and model: overshoot {over:.0f} %.",
+        caption="The logged rate after a step of 1 of the set-point, computed from the law of the "
+        "log's parameters, with the integral as set, and the identified model: overshoot "
+        f"{over:.0f} %; median and 95 % of the plants that the log leaves possible.",
+    )
 
 
 def _image(record: Record, found: StepResponse, predicted: Prediction | None) -> Image:

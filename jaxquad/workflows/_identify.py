@@ -11,6 +11,7 @@ import numpy as np
 from jaxquad._core import announce, end_second_process, Later
 from jaxquad.identify import (
     Bands,
+    behind_filters,
     Combination,
     Explanation,
     factors,
@@ -41,6 +42,7 @@ from ._fits import (
     with_remedies,
     with_units,
 )
+from ._flown_law import flown_law, FlownLaw
 from ._log import mix_of, open_logs, OpenedLogs, read_records
 from ._result_file import default_folder
 from ._settings import IdentifySettings
@@ -71,6 +73,8 @@ class Identification:
     - `proposal`: where the log itself said what is input and output.
     - `more`: the logs that were taken together with the first.
     - `failures`: by title, why something beside the fit could not be computed.
+    - `flown`: the gyro's filters and the law of an autopilot's log, up to whose filters the model
+      is, unless `settings.keep_gyro_filters`.
     """
 
     path: Path
@@ -85,6 +89,23 @@ class Identification:
     explanation: Explanation | None = None
     more: tuple[Path, ...] = ()
     failures: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    flown: FlownLaw | None = None
+
+    @property
+    def filters(self) -> tuple[KnownFilter, ...]:
+        """Those of the gyro that are divided out of the responses."""
+        if self.flown is None or self.settings.keep_gyro_filters:
+            return ()
+        return self.flown.filters
+
+    @property
+    def filters_text(self) -> str:
+        """What is divided out, or why nothing is; empty where the log is no autopilot's."""
+        if self.flown is None:
+            return ""
+        if self.flown.filters and not self.filters:
+            return "the gyro's filters are in the model, as `keep_gyro_filters` asks"
+        return self.flown.text
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -193,6 +214,7 @@ class Identification:
         record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
         frf = dataclasses.replace(self.frf, remarks=())  # the fit repeats what concerns it
         parts = [f"{record}\n\n{frf}"]
+        parts += [f"\n{self.filters_text}"] if self.filters_text else []
         parts += [f"\n{self.formula}, {self.method} estimate:\n{self.fit}"]
         sums, known = sums_of(self.settings), [each.name for each in self.fit.combinations]
         if self.settings.poles is not None and self.fit.verdict.fitted:
@@ -279,7 +301,10 @@ def identify_opened(opened: OpenedLogs) -> Identification:
 
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
-    found, others = _identify(opened, compare=True)
+    flown = flown_law(opened)
+    filters = () if flown is None or opened.settings.keep_gyro_filters else flown.filters
+    found, others = _identify(opened, compare=True, filters=filters)
+    found = dataclasses.replace(found, flown=flown)
     found = _with_fits_again(dataclasses.replace(found, check=_checked(found)))
     return _with_others(found, others)
 
@@ -287,11 +312,14 @@ def identify_opened(opened: OpenedLogs) -> Identification:
 def identify_fit(opened: OpenedLogs) -> Identification:
     """The estimate to trust and its fit alone, which are what a design needs.
 
+    The gyro's filters are kept in the model: a loop is closed on the rate behind them.
+
     **Arguments:**
 
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
-    return _identify(opened)[0]
+    settings = dataclasses.replace(opened.settings, keep_gyro_filters=True)
+    return _identify(opened._replace(settings=settings))[0]
 
 
 def identify_plant(
@@ -397,4 +425,4 @@ def _checked(found: Identification) -> Verification | None:
         reference=None,
     )
     [record] = read_records(Path(settings.verify), other)
-    return verify(found.fit, record)
+    return verify(found.fit, behind_filters(record, found.filters))

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from jaxquad.models import LaggedIntegrator, TransferFunction
     from jaxquad.spectra import FrequencyResponse
 
+    from ._flown_law import StoredFilters
+
 
 class StoredResult(NamedTuple):
     """What `jaxquad identify` has stored, as `jq.load_result` reads it.
@@ -105,6 +107,14 @@ class StoredResult(NamedTuple):
             for name, value in self.values.items()
         ]
         return "\n".join([*lines, "  (+- one standard error)"] if lines[1:] else lines)
+
+    @property
+    def filters(self) -> "tuple[StoredFilters, ...]":
+        """Those of the gyro up to whose input the model is, see `jq.identify.behind_filters`."""
+        from ._flown_law import StoredFilters
+
+        stored = self.content.get("gyro_filters")
+        return () if stored is None else (StoredFilters.of(_part(self.content, "gyro_filters")),)
 
     @property
     def doubts(self) -> tuple[str, ...]:

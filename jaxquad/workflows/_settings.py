@@ -299,6 +299,13 @@ class IdentifySettings(Settings):
     zeros: int = option_field(
         kinds.COUNT, 0, "number of zeros, with --poles; 0 by default", group=_MODEL
     )
+    keep_gyro_filters: bool = option_field(
+        kinds.SWITCH,
+        False,
+        "leave the gyro's filters in the model; by default those in front of an autopilot's logged "
+        "rate are divided out, where the log has their parameters",
+        group=_MODEL,
+    )
     band: Pair | None = option_field(
         kinds.BAND,
         None,

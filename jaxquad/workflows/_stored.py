@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import announce, beside
-from jaxquad.identify import Fit, Verification, verify
+from jaxquad.identify import behind_filters, Fit, Verification, verify
 from jaxquad.records import read, Record, RecordError, RecordWarning
-from jaxquad.report import PageWarning, provenance, reason_of, write_results
+from jaxquad.report import LawLoop, PageWarning, provenance, reason_of, write_results
 
 from ._identify import Identification, identify_opened
 from ._log import open_again, read_records
@@ -42,6 +42,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         "used_band_rad_per_s": found.fit.used_band,
         "derived": [each._asdict() for each in found.combinations],
         "provenance": origin.content(),
+        **({"gyro_filters": found.flown.content()} if found.flown and found.filters else {}),
         **_content_beside(found),
         **_model_content(found),
     }
@@ -60,11 +61,23 @@ def write_identification(found: Identification, folder: Path) -> Path:
         checks={} if found.check is None else {Path(sources[-1]).name: found.check},
         derived=found.combinations,
         provenance=origin,
-        formula=found.formula,
+        filters=found.filters,
+        law=_law_if_any(found),
+        formula="; ".join(filter(None, (found.formula, found.filters_text))),
         beside=found.beside,
     )
     drawn.get()
     return path
+
+
+def _law_if_any(found: Identification) -> LawLoop | None:
+    from ._loop_of_law import loop_of_law
+
+    try:
+        return loop_of_law(found)
+    except Exception as error:  # the record shows its loop without the law, too
+        warnings.warn(f"the loop by its law is missing: {reason_of(error)}", PageWarning, 2)
+        return None
 
 
 def _with_throttle(found: Identification) -> Record | None:
@@ -192,4 +205,4 @@ def verify_result(
     if changed.band is not None:
         band = 2 * np.pi * changed.band[0], 2 * np.pi * changed.band[1]
     [record] = read_records(Path(path), changed)
-    return verify(model, record, band=band)
+    return verify(model, behind_filters(record, stored.filters), band=band)

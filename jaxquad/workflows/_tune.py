@@ -165,6 +165,11 @@ def tune(
         stored = found if isinstance(found, StoredResult) else load_result(found)
         stored.require_radians()
         found = identify_fit(open_again(stored, log=log))
+    if found.filters:
+        raise ValueError(
+            "the model is up to what the gyro's filters were given, and a loop is closed behind "
+            "them: identify with keep_gyro_filters=True"
+        )
     if not found.fit.verdict.fitted:
         raise UndeterminedError(found.fit.verdict.summary)
     record = found.records[0]

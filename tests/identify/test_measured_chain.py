@@ -19,7 +19,7 @@ AT = np.array([2.0, 5.0, 10.0, 20.0, 40.0])
 def passed(chain, values):
     for section in chain.sections():
         b0, b1, a1, b2, a2 = (0.0 if x is None else float(x) for x in section)
-        values = lfilter([b0, b1, b2], [1.0, a1, a2], values)
+        values = np.asarray(lfilter([b0, b1, b2], [1.0, a1, a2], values))
     return values
 
 

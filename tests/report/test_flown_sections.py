@@ -6,8 +6,12 @@ from scipy.signal import lfilter
 from synthetic import response_of
 
 import jaxquad as jq
+from jaxquad.plot import StepBand
+from jaxquad.report import LawLoop
 from jaxquad.report._loop import entry_of, loop_section
 from jaxquad.report._spectrum import spectrum_section, throttle_of
+from jaxquad.report._step import step_section
+from jaxquad.spectra import BrokenLoop
 
 
 DT, SAMPLES = 0.004, 15000
@@ -47,6 +51,53 @@ def test_the_loop_has_the_crossover_of_the_one_that_was_simulated(frf):
     assert crossover == pytest.approx(10.4, rel=0.05)
     assert section["facts"]["phase margin"].startswith(("8", "9"))
     assert loop_section(frf, flown(("", "", ""))) is None
+
+
+def law_loop(top, *, model=True, crossover=10.0):
+    """A loop crossover / s with a delay, up to so many rad/s."""
+    ends = np.geomspace(1.0, top, 40), np.geomspace(1.0, 400.0, 300)
+    of = lambda w: crossover / (1j * w) * np.exp(-0.01j * w)
+    loops = [BrokenLoop(w, of(w), np.full(w.size, 0.01), np.ones(w.size)) for w in ends]
+    time = np.linspace(0.0, 1.0, 50)
+    step = StepBand(time, 1 - np.exp(-10 * time), 0 * time, 1 + 0 * time)
+    return LawLoop(loops[0], loops[1] if model else None, step, ("anti-gravity",))
+
+
+def test_a_known_law_gives_the_margins_whatever_the_reference_is(frf):
+    record = flown(("", "", ""))
+    section = loop_section(frf, record, law_loop(400.0))
+    assert section is not None and not section["image"].failure
+    facts = section["facts"]
+    assert facts["crossover"].startswith("1.59 Hz (10 rad/s)")
+    assert facts["phase margin"].startswith("84.3")  # 90 deg - 10 rad/s 0.01 s
+    assert facts["gain margin"].startswith("23.9 dB at 25 Hz") and "model" not in str(facts)
+    assert "law of the log's parameters" in section["note"] and "anti-gravity" in section["note"]
+
+
+def test_what_the_measured_response_does_not_reach_is_said_by_the_model(frf):
+    section = loop_section(frf, flown(("", "", "")), law_loop(60.0))
+    assert section is not None
+    assert "23.9 dB at 25 Hz (157 rad/s) by the identified model" in section["facts"]["gain margin"]
+    assert "model" not in section["facts"]["crossover"]
+    low = loop_section(frf, flown(("", "", "")), law_loop(6.0))
+    assert low is not None and "by the identified model" in low["facts"]["crossover"]
+    alone = loop_section(frf, flown(("", "", "")), law_loop(60.0, model=False))
+    assert alone is not None and alone["facts"]["gain margin"].startswith("not seen")
+
+
+def test_a_step_that_the_log_does_not_show_is_computed_by_the_law(frf):
+    """One step in a minute is too few."""
+    quiet = flown(("V", "rad/s", "rad/s"))
+    r = np.where(np.arange(SAMPLES) > SAMPLES // 2, 1.0, 0.0)
+    record = jq.Record(
+        quiet.time, quiet.inputs[:, 0], quiet.outputs, r, input_names="u0", output_names="y0"
+    )
+    fit = jq.fit(jq.LaggedIntegrator(10.0, 0.01, 0.0), frf, free=("gain", "lag"))
+    section = step_section(fit, frf, record, (), law_loop(60.0).step)
+    assert section is not None and section["doubts"]
+    assert "computed from the law" in section["computed"].caption
+    bare = step_section(fit, frf, record)
+    assert bare is not None and bare["computed"] is None
 
 
 def test_a_motor_is_called_one_where_it_follows_the_throttle(frf):

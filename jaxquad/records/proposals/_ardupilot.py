@@ -142,7 +142,10 @@ def _chirped(log: Log, chirps: list[Chirp]) -> Setup:
     rate, remarks = f"RATE.{_LETTERS[axis]}", []
     if place.startswith(_ANGLE.words):
         remarks.append("the chirp passes the input shaping, which is nonlinear for large steps")
-    remarks.append(f"{rate} is measured after the gyro filter, so the model includes its lag")
+    remarks.append(
+        f"{rate} is measured after the gyro filter, which identify divides out where the log has "
+        "its parameters"
+    )
     remarks += _gains(log, axis)
     logged = [each for chirp in chirps if (each := _common(log, chirp))]
     if not logged:

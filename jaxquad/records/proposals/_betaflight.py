@@ -39,7 +39,10 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
     command = first_logged(signals, [f"{prefix}axisMixed[{i}]", f"{prefix}axisSum[{i}]"])
     if not command or not rates[axis]:
         raise RecordError(f"the log has no PID terms or no gyro for {axis}.")
-    remarks = [f"{rates[axis]} is measured after the gyro filters, so the model includes their lag"]
+    remarks = [
+        f"{rates[axis]} is measured after the gyro filters, which identify divides out where the "
+        "log has their parameters"
+    ]
     if best is not None:
         others = [each for each in sweeps if each.axis != best.axis]
         remarks += [
