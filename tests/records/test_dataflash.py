@@ -237,3 +237,17 @@ def test_a_file_with_too_many_definitions_is_refused(tmp_path):
     path.write_bytes(bytes(log.content) * 101)
     with pytest.raises(ReadError, match="defines its messages more than 100 times"):
         channels(path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_short_numbers_are_scaled_without_an_overflow(tmp_path):
+    log = DataFlash()
+    log.write("MULT", 0, ord("/"), 3600.0)
+    log.define("BAT", "Qfg", "TimeUS,Tot,Half", units="s--", mults="F//")
+    for k in range(20):
+        log.write("BAT", 10_000 * k, 3e38, 100.0 + k)
+    path = tmp_path / "log.bin"
+    path.write_bytes(log.content)
+    found = {each.name: each for each in channels(path)}
+    assert found["BAT.Tot"].maximum == pytest.approx(3e38 * 3600)
+    assert found["BAT.Half"].maximum == pytest.approx(119 * 3600)

@@ -6,7 +6,6 @@ from .._log import flattened, Log, Signals
 from ..formats import load_log
 from ._ardupilot import ardupilot_setup
 from ._betaflight import betaflight_setup
-from ._chirps import Selection
 from ._proposal import (
     AXES,
     complete,
@@ -17,6 +16,7 @@ from ._proposal import (
     Setup,
 )
 from ._px4 import px4_setup
+from ._selection import Selection
 
 
 _MOTORS = {"roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}

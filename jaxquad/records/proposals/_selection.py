@@ -9,7 +9,7 @@ from .._errors import RecordError
 Point = Literal["", "rate", "mixer", "angle"]
 
 
-class Chirp(NamedTuple):
+class NumberedChirp(NamedTuple):
     """One of the chirps that a log holds.
 
     `number` counts them in the order of time, from 1; `axis` is empty where it turns none; `place`
@@ -39,14 +39,14 @@ class Selection(NamedTuple):
     start: float | None = None  # s
     stop: float | None = None
 
-    def part_of(self, chirp: Chirp) -> Chirp | None:
+    def part_of(self, chirp: NumberedChirp) -> NumberedChirp | None:
         """What the span leaves of a chirp."""
         start = chirp.start if self.start is None else max(chirp.start, self.start)
         stop = chirp.stop if self.stop is None else min(chirp.stop, self.stop)
         return chirp._replace(start=start, stop=stop) if start < stop else None
 
 
-def choose_chirps(chirps: Sequence[Chirp], wanted: Selection) -> list[Chirp]:
+def choose_chirps(chirps: Sequence[NumberedChirp], wanted: Selection) -> list[NumberedChirp]:
     """The chirp of that number; else the longest within the span and on the axis that are wanted.
 
     With it come all others on its axis at its place. One that turns no axis is taken where there is
@@ -64,7 +64,7 @@ def choose_chirps(chirps: Sequence[Chirp], wanted: Selection) -> list[Chirp]:
     return [each for each in candidates if (each.axis, each.place) == (best.axis, best.place)]
 
 
-def _numbered(chirps: Sequence[Chirp], wanted: Selection) -> Chirp:
+def _numbered(chirps: Sequence[NumberedChirp], wanted: Selection) -> NumberedChirp:
     listed = "; ".join(map(str, chirps)) or "none"
     chirp = next((each for each in chirps if each.number == wanted.chirp), None)
     if chirp is None:
