@@ -170,8 +170,8 @@ def test_a_log_names_its_firmware(tmp_path, text):
         )
     else:
         path.write_bytes(written().content)
-    found = read_settings(path)
-    assert found.version == ((4, 5, 7) if text else (4, 5, 0))
+    settings = read_settings(path)
+    assert settings.version == ((4, 5, 7) if text else (4, 5, 0))
     assert load_log(path).firmware == ("ArduPlane V4.5.7 (2a3dc4b7)" if text else "ArduCopter V4.5")
 
 
@@ -248,6 +248,6 @@ def test_short_numbers_are_scaled_without_an_overflow(tmp_path):
         log.write("BAT", 10_000 * k, 3e38, 100.0 + k)
     path = tmp_path / "log.bin"
     path.write_bytes(log.content)
-    found = {each.name: each for each in channels(path)}
-    assert found["BAT.Tot"].maximum == pytest.approx(3e38 * 3600)
-    assert found["BAT.Half"].maximum == pytest.approx(119 * 3600)
+    listed = {channel.name: channel for channel in channels(path)}
+    assert listed["BAT.Tot"].maximum == pytest.approx(3e38 * 3600)
+    assert listed["BAT.Half"].maximum == pytest.approx(119 * 3600)

@@ -115,7 +115,7 @@ def _announced(table: Table | None, log: Log, begin: float) -> tuple[int, float,
         before = np.flatnonzero(table.time <= begin + _BREAK)
         if before.size:
             row = (table.columns[name][before[-1]] for name in ("Ax", "FSt", "FSp"))
-            number, low, high = (_number(each) for each in row)
+            number, low, high = map(_number, row)
             return int(number), low, high
     names = ("SID_AXIS", "SID_F_START_HZ", "SID_F_STOP_HZ")
     number, low, high = (_number(log.settings.get(name)) for name in names)
@@ -144,7 +144,7 @@ def _chirped(log: Log, chirps: list[NumberedChirp]) -> Setup:
         remarks.append("the chirp passes the input shaping, which is nonlinear for large steps")
     remarks.append(f"{rate} is measured after the gyro filter, so the model includes its lag")
     remarks += _gains(log, axis)
-    logged = [each for chirp in chirps if (each := _common(log, chirp))]
+    logged = [part for chirp in chirps if (part := _common(log, chirp))]
     if not logged:
         raise RecordError(
             f"the log has no RATE messages during the chirp at t = {first.start:.6g} s."

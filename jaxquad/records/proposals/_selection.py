@@ -61,12 +61,12 @@ def choose_chirps(chirps: Sequence[NumberedChirp], wanted: Selection) -> list[Nu
     if not candidates:
         return []
     best = max(candidates, key=lambda chirp: chirp.stop - chirp.start)
-    return [each for each in candidates if (each.axis, each.place) == (best.axis, best.place)]
+    return [x for x in candidates if (x.axis, x.place) == (best.axis, best.place)]
 
 
 def _numbered(chirps: Sequence[NumberedChirp], wanted: Selection) -> NumberedChirp:
     listed = "; ".join(map(str, chirps)) or "none"
-    chirp = next((each for each in chirps if each.number == wanted.chirp), None)
+    chirp = next((x for x in chirps if x.number == wanted.chirp), None)
     if chirp is None:
         raise RecordError(f"there is no chirp {wanted.chirp}. Chirps of this log: {listed}.")
     if wanted.axis not in (None, chirp.axis):

@@ -141,11 +141,11 @@ def _flown_responses(
     setpoint = _setpoint_of(settings.output or "", flown)
     try:
         reference = None if settings.reference == setpoint else settings.reference
-        found = of(input=setpoint, reference=reference)
+        response = of(input=setpoint, reference=reference)
     except ValueError:  # the stick is the set-point in another unit: that one is external
-        found = of(input=setpoint, reference=None)
-    later = 1 / _delay(np.asarray(found.omega), setup.late_s.get(setpoint, 0.0))
-    return (dataclasses.replace(found, response=found.response * later[:, None, None]),)
+        response = of(input=setpoint, reference=None)
+    later = 1 / _delay(np.asarray(response.omega), setup.late_s.get(setpoint, 0.0))
+    return (dataclasses.replace(response, response=response.response * later[:, None, None]),)
 
 
 def _delay(omega: Float[np.ndarray, " frequencies"], seconds: float) -> np.ndarray:
