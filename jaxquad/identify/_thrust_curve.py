@@ -282,7 +282,7 @@ class GainOverThrottle(eqx.Module):
         wanted = (last - first) * reach / _SHARP
         if wanted <= 0.6:
             lower, upper = _around((first + last) / 2, wanted)
-            advice = f"fly from {lower:.2f} to {upper:.2f}, {fly} level"
+            advice = f"fly from {lower:.2f} to {upper:.2f}, {fly}"
         else:
             advice = (
                 f"fly from 0.20 to 0.80, with {wanted / 0.6:.1f} times the amplitude or "
@@ -444,12 +444,13 @@ def _around(middle: float, span: float) -> tuple[float, float]:
 
 def _beside_one(throttle: float, seconds: float) -> str:
     """What to fly beside one level."""
-    lower, upper = _around(throttle, 0.3)
+    lower, upper = _around(throttle, 0.2)
     return f"fly {lower:.2f} and {upper:.2f} as well, {_with_the_same(seconds)}"
 
 
 def _with_the_same(seconds: float) -> str:
-    return f"with the same excitation for {seconds:.0f} s at each"
+    turns = ", in turns of about 8 s, as the vehicle sinks or climbs" if seconds > 10 else ""
+    return f"with the same excitation for {seconds:.0f} s at each{turns}"
 
 
 def _half(low: float, high: float) -> float:

@@ -286,7 +286,9 @@ def _held(
 def column_values(signal: Signal, column: int | None, *, raw: bool = False) -> np.ndarray:
     """One column in its unit; `raw` as in the file."""
     values = signal.values if column is None else signal.values[:, column]
-    return values if raw or signal.scale == 1.0 else values * signal.scale
+    if raw or signal.scale == 1.0:
+        return values
+    return values.astype(np.float64) * signal.scale  # where short ones would overflow
 
 
 class _Clocks(NamedTuple):

@@ -177,6 +177,15 @@ def test_all_chirps_of_a_log_are_used_together(tmp_path, capsys):
     assert np.allclose(result(out)["record"]["segments_s"], [(45, 65)], atol=0.02)
 
 
+def test_what_several_steps_read_of_one_log_is_said_once(tmp_path, capsys):
+    path = chirped(tmp_path)
+    content = path.read_bytes()
+    path.write_bytes(content[:-3000] + b"noise" + content[-3000:])
+    assert main(["identify", str(path), "--band", "200", "300"]) == 2
+    printed = capsys.readouterr().err
+    assert printed.count("damaged block") == 1 and "Nyquist" in printed
+
+
 def chirped(folder, starts=(22,)):
     """ArduPilot's chirps of 20 s into the mixer of a roll axis 100 / s under feedback of the rate.
 

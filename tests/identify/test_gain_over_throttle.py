@@ -132,7 +132,9 @@ def test_levels_of_throttle_are_those_of_the_gains_and_one_alone_says_what_to_fl
     assert np.all((levels.low < levels.throttle) & (levels.throttle < levels.high))
     assert levels.what_to_fly() == ""
     single = throttle_levels(flight((0.4,)), throttle_range=(0.0, 1000.0))
-    assert single.what_to_fly().startswith("fly 0.25 and 0.55 as well, with the same excitation")
+    advice = single.what_to_fly()
+    assert advice.startswith("fly 0.30 and 0.50 as well, with the same excitation")
+    assert ("turns of about 8 s" in advice) == (single.seconds[0] > 10)
 
 
 def test_the_table_and_the_mapping_hold_the_levels_and_the_parameters(found):
@@ -154,7 +156,7 @@ def test_a_throttle_that_never_rests_says_what_to_fly():
 def test_levels_that_are_close_or_single_hold_too_little_and_say_so():
     single = identify(flight((0.4,)))
     assert single.curve is None and single.b0(0).value > 0
-    with pytest.raises(jq.identify.UndeterminedError, match="fly 0.25 and 0.55 as well"):
+    with pytest.raises(jq.identify.UndeterminedError, match="fly 0.30 and 0.50 as well"):
         single.firmware_value("px4")
     close = identify(flight((0.38, 0.46), noise=20.0))
     assert "too little of the thrust curve" in str(close)

@@ -170,8 +170,8 @@ def test_a_log_names_its_firmware(tmp_path, text):
         )
     else:
         path.write_bytes(written().content)
-    found = read_settings(path)
-    assert found.version == ((4, 5, 7) if text else (4, 5, 0))
+    settings = read_settings(path)
+    assert settings.version == ((4, 5, 7) if text else (4, 5, 0))
     assert load_log(path).firmware == ("ArduPlane V4.5.7 (2a3dc4b7)" if text else "ArduCopter V4.5")
 
 
@@ -237,3 +237,17 @@ def test_a_file_with_too_many_definitions_is_refused(tmp_path):
     path.write_bytes(bytes(log.content) * 101)
     with pytest.raises(ReadError, match="defines its messages more than 100 times"):
         channels(path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_short_numbers_are_scaled_without_an_overflow(tmp_path):
+    log = DataFlash()
+    log.write("MULT", 0, ord("/"), 3600.0)
+    log.define("BAT", "Qfg", "TimeUS,Tot,Half", units="s--", mults="F//")
+    for k in range(20):
+        log.write("BAT", 10_000 * k, 3e38, 100.0 + k)
+    path = tmp_path / "log.bin"
+    path.write_bytes(log.content)
+    listed = {channel.name: channel for channel in channels(path)}
+    assert listed["BAT.Tot"].maximum == pytest.approx(3e38 * 3600)
+    assert listed["BAT.Half"].maximum == pytest.approx(119 * 3600)

@@ -10,7 +10,7 @@ from jaxquad.records import flights, propose, read, read_settings, Record, Recor
 from jaxquad.records.formats import load_log
 from jaxquad.records.formats._betaflight_header import with_derived
 from jaxquad.records.proposals._betaflight import betaflight_setup
-from jaxquad.records.proposals._betaflight_chirps import chirps
+from jaxquad.records.proposals._chirps import chirps
 from jaxquad.records.proposals._flown_span import flown_span, in_flight
 from jaxquad.records.proposals._hold import command_hold
 from jaxquad.spectra import frequency_response, JointInputOutput

@@ -27,9 +27,9 @@ def test_ardupilot_chirps_are_found_with_axis_time_band_and_summing_point(tmp_pa
         w = WAVE[IN_RUN] * {"roll": 0.1, "pitch": 0.2, "yaw": 1.0}[axis]
         middle = slice(100, -100)
         late = setup.late_s["SIDD.Targ"]
-        given = np.interp(record.time, TIME[IN_RUN], w)
-        given += np.interp(record.time, TIME[IN_RUN] + late, CHIRP[IN_RUN])
-        np.testing.assert_allclose(record.inputs[middle, 0], given[middle], atol=1e-2)
+        flown = np.interp(record.time, TIME[IN_RUN], w)
+        flown += np.interp(record.time, TIME[IN_RUN] + late, CHIRP[IN_RUN])
+        np.testing.assert_allclose(record.inputs[middle, 0], flown[middle], atol=1e-2)
 
 
 def test_the_printed_line_is_what_the_command_line_takes(tmp_path):

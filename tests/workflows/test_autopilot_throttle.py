@@ -68,7 +68,7 @@ def test_a_curve_that_flew_right_is_kept_and_the_gain_is_one(tmp_path):
 @pytest.mark.slow
 def test_one_level_of_throttle_is_said_with_what_to_fly(tmp_path, capsys):
     content = tuned(tmp_path, Vehicle(), (0.5, 0.5), 0.0)
-    said = "gains hold near throttle 0.50, the only level of the log: fly 0.35 and 0.65 as well"
+    said = "gains hold near throttle 0.50, the only level of the log: fly 0.40 and 0.60 as well"
     assert said in content["throttle"]["text"] and said in capsys.readouterr().out
     assert content["throttle"]["gain_over_throttle"] is None
     assert len(content["stages"][-1]["peaks"]) == 1 and not list(tmp_path.glob("thrust_curve*"))

@@ -10,7 +10,7 @@ from jaxquad.workflows._autopilot._flight_channels import read_channels
 
 
 @pytest.mark.parametrize(
-    ("gyros", "core", "settings", "used"),
+    ("gyros", "core", "parameters", "used"),
     [
         ((0, 1), None, (), 0),
         ((0, 1), 1, (), 1),
@@ -27,10 +27,10 @@ from jaxquad.workflows._autopilot._flight_channels import read_channels
         ((), None, (), None),
     ],
 )
-def test_ardupilots_unfiltered_gyro_is_that_which_flew(tmp_path, gyros, core, settings, used):
-    path = ardupilot(tmp_path, 10, gyros=gyros, core=core, settings=settings)
-    asked = IdentifySettings(start=22, stop=30)
-    flight = read_channels(path, propose(path), asked, read_settings(path).values)
+def test_ardupilots_unfiltered_gyro_is_that_which_flew(tmp_path, gyros, core, parameters, used):
+    path = ardupilot(tmp_path, 10, gyros=gyros, core=core, settings=parameters)
+    settings = IdentifySettings(start=22, stop=30)
+    flight = read_channels(path, propose(path), settings, read_settings(path).values)
     if used is None:
         assert flight.unfiltered == () and flight.names == ("RATE.R", "")
         return

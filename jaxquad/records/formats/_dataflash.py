@@ -114,7 +114,7 @@ def _texts(rows: Mapping[str, np.ndarray]) -> Iterator[str]:
         table = rows.get(name)
         if table is not None and column in (table.dtype.names or ()):
             if table.dtype[column].kind == "S":
-                yield from (text(each) for each in table[column].tolist())
+                yield from map(text, table[column].tolist())
 
 
 def _all_rows(
@@ -250,18 +250,18 @@ def _refuse_other_definition(place: int, old: Format, new: Format) -> NoReturn:
 
 def _span(buffer: UInt8[np.ndarray, " bytes"], part: _Part) -> tuple[float, float] | None:
     """First and last time of a part in s, by its most frequent messages with a time."""
-    timed = [each for each in part.formats.values() if each.columns[0] in CLOCKS]
-    timed = [each for each in timed if part.offsets.get(each.kind) and each.name not in ABOUT]
-    timed = [each for each in timed if each.dtype() is not None]
+    timed = [layout for layout in part.formats.values() if layout.columns[0] in CLOCKS]
+    timed = [x for x in timed if part.offsets.get(x.kind) and x.name not in ABOUT]
+    timed = [layout for layout in timed if layout.dtype() is not None]
     if not timed:
         return None
-    most = max(timed, key=lambda each: len(part.offsets[each.kind]))
+    most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
     rows, _ = _all_rows(buffer, {most.kind: most}, part.offsets)
     return span_of(CLOCKS[most.columns[0]] * rows[most.name][most.columns[0]].astype(np.float64))
 
 
 def _holds(part: _Part, name: str) -> bool:
-    return any(each.name == name and part.offsets.get(k) for k, each in part.formats.items())
+    return any(x.name == name and part.offsets.get(kind) for kind, x in part.formats.items())
 
 
 def _next_message(data: bytes, place: int, lengths: list[int]) -> int:

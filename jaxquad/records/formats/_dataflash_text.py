@@ -47,8 +47,8 @@ def load_text(path: Path) -> Log:
     stamped = _text_parameters(lines, formats)
     settings = {name: value for _, name, value in stamped}
     changes = changes_of(stamped, lambda time: time)
-    told = (line.decode("latin-1") for name in ("VER", "MSG") for line in lines.get(name, []))
-    return Log(tables, tuple(remarks), "ardupilot", settings, changes, firmware_of(told))
+    texts = (line.decode("latin-1") for name in ("VER", "MSG") for line in lines.get(name, []))
+    return Log(tables, tuple(remarks), "ardupilot", settings, changes, firmware_of(texts))
 
 
 _BEGIN = re.compile(rb"^[ \t]*FMT, *128,", re.MULTILINE)
@@ -72,11 +72,11 @@ def _one_log(content: bytes) -> tuple[bytes, list[str]]:
 def _span_and_chirp(content: bytes) -> tuple[tuple[float, float] | None, bool]:
     """First and last time in s, by the most frequent messages, and whether there is a chirp."""
     lines, _ = _by_name(content)
-    formats = [each for each in _text_formats(lines.get("FMT", [])) if each.name not in ABOUT]
-    timed = [each for each in formats if each.columns[0] in CLOCKS and each.name in lines]
+    formats = [x for x in _text_formats(lines.get("FMT", [])) if x.name not in ABOUT]
+    timed = [x for x in formats if x.columns[0] in CLOCKS and x.name in lines]
     if not timed:
         return None, False
-    most = max(timed, key=lambda each: len(lines[each.name]))
+    most = max(timed, key=lambda layout: len(lines[layout.name]))
     stamps = [_number(line.partition(b",")[0].decode("latin-1")) for line in lines[most.name]]
     return span_of(CLOCKS[most.columns[0]] * np.array(stamps)), "SIDD" in lines
 

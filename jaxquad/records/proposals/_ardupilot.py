@@ -13,7 +13,6 @@ import numpy as np
 
 from .._errors import RecordError
 from .._log import flattened, Log, Signals, Table
-from ._chirps import Chirp, choose_chirps, Point, Selection
 from ._proposal import (
     AXES,
     channel_rate,
@@ -24,6 +23,7 @@ from ._proposal import (
     values_of,
     with_injections,
 )
+from ._selection import choose_chirps, NumberedChirp, Point, Selection
 
 
 _LETTERS: dict[str, str] = dict(zip(AXES, "RPY", strict=True))
@@ -86,7 +86,7 @@ def _without_rates(log: Log) -> str:
     return "the log has no RATE messages. Set LOG_BITMASK to log fast attitude (ATTITUDE_FAST)."
 
 
-def _chirps(log: Log) -> list[Chirp]:
+def _chirps(log: Log) -> list[NumberedChirp]:
     """All chirps of a log: each to the last value that is not 0, for SIDD goes on after it."""
     table = log.tables.get("SIDD")
     if table is None or table.time is None or "Targ" not in table.columns or not table.time.size:
@@ -105,7 +105,7 @@ def _chirps(log: Log) -> list[Chirp]:
         if number in _PLACES and end - begin >= _SHORTEST:
             words, point = _PLACES[number]
             axis, place = AXES[(number - 1) % 3] if point else "", f"{words} (SID_AXIS {number})"
-            chirps.append(Chirp(len(chirps) + 1, axis, place, point, begin, end, low, high))
+            chirps.append(NumberedChirp(len(chirps) + 1, axis, place, point, begin, end, low, high))
     return chirps
 
 
@@ -115,7 +115,7 @@ def _announced(table: Table | None, log: Log, begin: float) -> tuple[int, float,
         before = np.flatnonzero(table.time <= begin + _BREAK)
         if before.size:
             row = (table.columns[name][before[-1]] for name in ("Ax", "FSt", "FSp"))
-            number, low, high = (_number(each) for each in row)
+            number, low, high = map(_number, row)
             return int(number), low, high
     names = ("SID_AXIS", "SID_F_START_HZ", "SID_F_STOP_HZ")
     number, low, high = (_number(log.settings.get(name)) for name in names)
@@ -131,7 +131,7 @@ def _number(value: object) -> float:
     return number if np.isfinite(number) else 0.0
 
 
-def _chirped(log: Log, chirps: list[Chirp]) -> Setup:
+def _chirped(log: Log, chirps: list[NumberedChirp]) -> Setup:
     """The set-up for chirps into one place, where they have RATE messages."""
     _, axis, place, point, *_ = first = chirps[0]
     if not axis:
@@ -147,7 +147,7 @@ def _chirped(log: Log, chirps: list[Chirp]) -> Setup:
         "its parameters"
     )
     remarks += _gains(log, axis)
-    logged = [each for chirp in chirps if (each := _common(log, chirp))]
+    logged = [part for chirp in chirps if (part := _common(log, chirp))]
     if not logged:
         raise RecordError(
             f"the log has no RATE messages during the chirp at t = {first.start:.6g} s."
@@ -157,7 +157,7 @@ def _chirped(log: Log, chirps: list[Chirp]) -> Setup:
     return with_injections(setup, logged, f"SystemID chirp into {place}")
 
 
-def _common(log: Log, chirp: Chirp) -> Injection | None:
+def _common(log: Log, chirp: NumberedChirp) -> Injection | None:
     """Where RATE and SIDD overlap within the chirp."""
     clocks = [log.tables[name].time for name in ("RATE", "SIDD")]
     first = max(float(clock[0]) for clock in clocks if clock is not None)

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._errors import RecordError
 from .._log import flattened, Log, Table
-from ._betaflight_chirps import chirps
+from ._chirps import chirps
 from ._proposal import (
     AXES,
     first_logged,

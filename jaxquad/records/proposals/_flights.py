@@ -11,7 +11,7 @@ from .._clock import FEWEST
 from .._errors import RecordError
 from .._log import Log, Table
 from ..formats import load_log
-from ._betaflight_chirps import Chirp, chirps
+from ._chirps import Chirp, chirps
 from ._proposal import AXES
 
 

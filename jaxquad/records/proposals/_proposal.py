@@ -7,8 +7,8 @@ import numpy as np
 from .._clock import FEWEST, native_rate
 from .._errors import RecordError
 from .._log import flattened, Log, SettingChange, Signals
-from ._chirps import Chirp, Point
 from ._hold import command_hold
+from ._selection import NumberedChirp, Point
 
 
 AXES: tuple[str, ...] = ("roll", "pitch", "yaw")
@@ -50,7 +50,7 @@ class Setup(NamedTuple):
     throttle: Mix = {}  # the collective, 0 to 1 but for PX4's sign; empty if it is not logged
     injected_at: Point = ""  # empty: nothing was injected, or it is not known
     late_s: Mapping[str, float] = {}
-    chirps: tuple[Chirp, ...] = ()  # all of the log, of any axis
+    chirps: tuple[NumberedChirp, ...] = ()  # all of the log, of any axis
     levelled: bool = False  # whether an angle loop of Betaflight is known to have been closed
 
 

@@ -8,7 +8,6 @@ from .._log import flattened, Log, Signals
 from ..formats import load_log
 from ._ardupilot import ardupilot_setup
 from ._betaflight import betaflight_setup, saturation
-from ._chirps import Selection
 from ._flights import choose_flight
 from ._flown_span import in_flight
 from ._proposal import (
@@ -21,6 +20,7 @@ from ._proposal import (
     Setup,
 )
 from ._px4 import px4_setup
+from ._selection import Selection
 
 
 _MOTORS = {"roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}

@@ -135,7 +135,7 @@ def read_channels(
     firmware, prefix = _firmware(proposal), proposal.setup.rate.rpartition("gyroADC")[0]
     axis = AXES.index(proposal.setup.axis)
     names = _NAMES[firmware](prefix, axis)
-    log = _HeldChannels(path, frozenset(each.name for each in channels(path)))
+    log = _LoggedChannels(path, frozenset(channel.name for channel in channels(path)))
     if firmware == "ardupilot":
         names = names._replace(unfiltered=_ardupilot_gyro(log, values, _span(settings)))
     throttle, injected = proposal.setup.throttle, _injected(proposal)
@@ -184,14 +184,14 @@ _SPEEDS = {
 }  # fmt: skip
 
 
-class _HeldChannels(NamedTuple):
+class _LoggedChannels(NamedTuple):
     """A log and the names of all its channels."""
 
     path: Path
     names: frozenset[str]
 
 
-def _tracked(log: _HeldChannels, span: Span) -> dict[int, tuple[float, ...]]:
+def _tracked(log: _LoggedChannels, span: Span) -> dict[int, tuple[float, ...]]:
     """The median speeds in Hz that the log holds, of those that turn."""
     found: dict[int, tuple[float, ...]] = {}
     for mode, pattern in _SPEEDS.items():
@@ -258,7 +258,7 @@ _POST, _BOTH = 4, 8  # of INS_RAW_LOG_OPT: behind the filters, or before and beh
 _GYROS = re.compile(r"(GYR(\d|\[\d\])?)\.GyrX")
 
 
-def _ardupilot_gyro(log: _HeldChannels, values: Mapping[str, str], span: Span) -> list[str]:
+def _ardupilot_gyro(log: _LoggedChannels, values: Mapping[str, str], span: Span) -> list[str]:
     """The gyro before its filters that flew, else the first; none where it is logged behind them.
 
     Its messages are GYR[0], in older logs GYR1 or GYR. Where both kinds are logged, those behind
@@ -273,13 +273,13 @@ def _ardupilot_gyro(log: _HeldChannels, values: Mapping[str, str], span: Span) -
     return [f"{table}.Gyr{letter}" for letter in "XYZ"]
 
 
-def _gyro_in_use(log: _HeldChannels, values: Mapping[str, str], span: Span) -> int:
+def _gyro_in_use(log: _LoggedChannels, values: Mapping[str, str], span: Span) -> int:
     """The IMU of the filter that flew (XKF4.PI): each of them has one of EK3_IMU_MASK."""
     name = "XKF4[0].PI"
-    found = _read(log, [name], span)
+    records = _read(log, [name], span)
     mask = int(_number(values, "EK3_IMU_MASK", 3.0))
     imus = [i for i in range(8) if mask >> i & 1]
-    core = int(np.median(found[name].channel(name))) if name in found else 0
+    core = int(np.median(records[name].channel(name))) if name in records else 0
     return imus[core] if core < len(imus) else 0
 
 
@@ -301,7 +301,7 @@ def _span(settings: IdentifySettings) -> Span:
     return (low if np.isfinite(low) else None), (high if np.isfinite(high) else None)
 
 
-def _read(log: _HeldChannels, names: Sequence[str], span: Span) -> dict[str, Record]:
+def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, Record]:
     """For each channel that the log has the record of its table, on that table's clock."""
     tables: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
