@@ -6,7 +6,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
 from jaxquad._core import allowed_second_process
@@ -83,7 +83,7 @@ def _run(words: Sequence[str]) -> int:
         return _fail(_describe_unknown(options, unknown), _UNUSABLE)
     with warnings.catch_warnings(), shown_stages(options), allowed_second_process():
         warnings.simplefilter("always", RecordWarning)
-        warnings.showwarning = _print_warning
+        warnings.showwarning = _printer_of_warnings()
         check_out(options)
         return options.run(options)
 
@@ -121,8 +121,17 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _print_warning(message: Warning | str, *_: object) -> None:
-    print("!", *in_options(str(message)).split(), file=sys.stderr)
+def _printer_of_warnings() -> Callable[..., None]:
+    """Prints each text once: a log is read several times, for the estimate and for the page."""
+    printed: set[str] = set()
+
+    def show(message: Warning | str, *_: object) -> None:
+        text = " ".join(in_options(str(message)).split())
+        if text not in printed:
+            printed.add(text)
+            print("!", text, file=sys.stderr)
+
+    return show
 
 
 def make_parser() -> argparse.ArgumentParser:

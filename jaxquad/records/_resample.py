@@ -15,7 +15,7 @@ from ._clock import (
     nonuniformity,
     scatters,
 )
-from ._errors import choose_range, mend_holes, RecordError, RecordWarning
+from ._errors import choose_range, GapError, mend_holes, RecordError, RecordWarning
 from ._repair import as_float64, longest_gap
 
 
@@ -79,14 +79,14 @@ def contiguous_part(
     """The samples from `begin` to `end` (s), and up to `margin` (s) beyond, without a break.
 
     A break is a gap longer than `max_gap` (s) or a value that is not finite. Outside of
-    `begin` .. `end` it ends the part; inside it raises RecordError.
+    `begin` .. `end` it ends the part; inside it raises RecordError, a GapError where all are gaps.
     """
     time = channel.time
     bad = ~np.isfinite(channel.values)
     broken = (np.diff(time) > longest_gap(channel.time, max_gap)) | bad[:-1] | bad[1:]
     inside = (time[1:] > begin) & (time[:-1] < end)
     if (broken & inside).any():
-        _raise_for_break(channel, int(np.flatnonzero(broken & inside)[0]), max_gap)
+        _raise_for_breaks(channel, np.flatnonzero(broken & inside), max_gap)
     before = np.flatnonzero(broken & (time[1:] <= begin))
     after = np.flatnonzero(broken & (time[:-1] >= end))
     reach = margin + longest_gap(channel.time, max_gap)
@@ -102,20 +102,25 @@ def gaps(channel: Channel, begin: float, end: float) -> np.ndarray:
     return np.flatnonzero((step > longest_step(channel.time)) & inside)
 
 
-def _raise_for_break(channel: Channel, index: int, max_gap: float | int | None) -> None:
+def _raise_for_breaks(
+    channel: Channel, breaks: np.ndarray, max_gap: float | int | None
+) -> None:  # fmt: skip
+    holes = ~np.isfinite(channel.values[breaks]) | ~np.isfinite(channel.values[breaks + 1])
+    index = int(breaks[holes.argmax() if holes.any() else 0])
     left, right = channel.time[index : index + 2]
-    pair = channel.values[index : index + 2]
-    if not np.isfinite(pair).all():
+    if holes.any():
+        pair = channel.values[index : index + 2]
         i = index + int(np.isfinite(pair[0]))
         raise RecordError(
             f"channel {channel.name!r} is {channel.values[i]} at sample {i}, "
             f"t = {channel.time[i]:.6g} s. {mend_holes('it')}"
         )
     longest = longest_gap(channel.time, max_gap)
-    raise RecordError(
+    raise GapError(
         f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
         f"t = {left:.6g} s to {right:.6g} s (limit {1e3 * longest:.4g} ms). "
-        f"{choose_range('it')}, or allow it, by its length in s (max_gap=)."
+        f"{choose_range('it')}, or allow it, by its length in s (max_gap=).",
+        [(float(channel.time[i]), float(channel.time[i + 1])) for i in breaks],
     )
 
 

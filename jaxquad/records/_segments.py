@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._clock import TimeUnit
-from ._errors import RecordError
+from ._errors import GapError, RecordError, RecordWarning
 from ._read import read
 from ._record import Hold, Record
 from ._repair import Valid
@@ -105,11 +105,14 @@ def read_segments(
     - `sample_rate`: in Hz; by default that of the slowest segment.
     - `time`, `time_unit`, `dt`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
 
-    **Returns:** a `Record` for each segment. Each warning about the file is given once.
+    **Returns:** a `Record` for each segment; several where samples are missing for longer than
+    `max_gap`, by default 10 samples or 0.05 s: a segment is cut there, and parts shorter than 1 s
+    are left out, with a `RecordWarning`. Each warning about the file is given once.
 
     **Raises:**
 
-    - `RecordError`: for segments that overlap, are empty or leave the file's time.
+    - `RecordError`: for segments that overlap, are empty or leave the file's time, and for more
+        than 30 gaps in one of them.
     - `ReadError`: as `read` raises it.
     """
     _check(segments)
@@ -117,14 +120,74 @@ def read_segments(
     options = _Options(time, time_unit, dt, units or {}, hold, max_gap, valid or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        records = [_mixed(path, roles, each, sample_rate, options) for each in segments]
+        every = [_without_gaps(path, roles, each, sample_rate, options) for each in segments]
+        parts, records = zip(*(each for found in every for each in found), strict=True)
         slowest = min(record.sample_rate for record in records)
         if max(record.sample_rate for record in records) > (1 + 1e-6) * slowest:
             rate = float(f"{slowest:.3g}")
-            records = [_mixed(path, roles, each, rate, options) for each in segments]
+            records = [_mixed(path, roles, each, rate, options) for each in parts]
     for each in {str(one.message): one for one in caught}.values():
         warnings.warn(str(each.message), each.category, stacklevel=2)
-    return records
+    return list(records)
+
+
+_MOST_GAPS = 30  # in a segment
+_SHORTEST = 1.0  # s, of a part between two gaps
+
+
+def _without_gaps(
+    path: Path,
+    roles: Sequence[Mix],
+    segment: Segment,
+    rate: Number | None,
+    options: _Options,
+) -> list[tuple[Segment, Record]]:
+    """The parts of a segment between gaps that are too long to be interpolated."""
+    try:
+        return [(segment, _mixed(path, roles, segment, rate, options))]
+    except GapError as error:
+        gaps = error.gaps
+        begins, ends = (segment[0], *(b for _, b in gaps)), (*(a for a, _ in gaps), segment[1])
+        lasts = [
+            (a, b)
+            for a, b in zip(begins, ends, strict=True)
+            if a is None or b is None or b - a >= _SHORTEST
+        ]
+        if len(gaps) > _MOST_GAPS or not lasts:
+            raise
+        parts = [part for each in lasts for part in _part_if_any(path, roles, each, rate, options)]
+        if not parts:
+            raise
+    (left, right) = max(gaps, key=lambda each: each[1] - each[0])
+    warnings.warn(
+        f"samples are missing in {'one place' if len(gaps) == 1 else f'{len(gaps)} places'}, for "
+        f"up to {1e3 * (right - left):.4g} ms at t = {left:.6g} s: the record is cut there into "
+        f"{len(parts)} segments, {_in_words([record for _, record in parts])}. A gap up to a "
+        f"length in s is bridged instead where that is allowed (max_gap=).",
+        RecordWarning,
+        stacklevel=4,
+    )
+    return parts
+
+
+def _part_if_any(
+    path: Path,
+    roles: Sequence[Mix],
+    segment: Segment,
+    rate: Number | None,
+    options: _Options,
+) -> list[tuple[Segment, Record]]:
+    """The record of a part, or of its parts; none where it is too short for one."""
+    try:
+        parts = _without_gaps(path, roles, segment, rate, options)
+    except RecordError:  # too few samples between two gaps
+        return []
+    return [part for part in parts if part[1].duration >= _SHORTEST]
+
+
+def _in_words(records: Sequence[Record]) -> str:
+    spans = [f"{record.time[0]:.6g} .. {record.time[-1]:.6g}" for record in records]
+    return f"t = {', '.join(spans)} s"
 
 
 def _check(segments: Sequence[Segment]) -> None:

@@ -358,7 +358,10 @@ def model_formula(settings: IdentifySettings) -> str:
 
 
 def _checked(found: Identification) -> Verification | None:
-    """The second record simulated, within the band of the points that the fit used."""
+    """The second record simulated, within the band of the points that the fit used.
+
+    Where gaps cut it into several, it is the longest of them.
+    """
     settings = found.settings
     if settings.verify is None or not found.fit.verdict.fitted:
         return None
@@ -369,5 +372,5 @@ def _checked(found: Identification) -> Verification | None:
         segments=(),
         reference=None,
     )
-    [record] = read_records(Path(settings.verify), other)
-    return verify(found.fit, record)
+    records = read_records(Path(settings.verify), other)
+    return verify(found.fit, max(records, key=lambda record: record.samples))

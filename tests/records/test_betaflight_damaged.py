@@ -128,9 +128,9 @@ def test_huge_declarations_are_refused_before_they_take_memory():
 
 
 def test_a_header_alone_and_frames_without_a_key_hold_nothing():
-    for payload in (b"", writer.END, b"".join(FRAMES[1:20]), bytes(5000), b"P" * 5000):
+    for body in (b"", writer.END, b"".join(FRAMES[1:20]), bytes(5000), b"P" * 5000):
         with pytest.raises(ReadError, match="no readable frame"):
-            decode("betaflight", HEADER + payload)
+            decode("betaflight", HEADER + body)
 
 
 @FUZZ
@@ -193,6 +193,7 @@ def test_a_stray_byte_in_a_real_log_costs_one_interval_at_most(data):
 def key_frame_end(content, number):
     """Behind which byte an I frame of a log ends, by its decoder."""
     [header] = headers(content)
+    assert not isinstance(header, ReadError)
     main = payload(content, header).main
     row = np.flatnonzero(main.key)[100 + number]
     return int(main.offsets[row + 1])
