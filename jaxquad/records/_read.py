@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._clock import JITTER, nonuniformity, TimeUnit, window
+from ._clock import clock_start, JITTER, nonuniformity, show_times, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, unknown_name
 from ._record import as_tuple, check_distinct, Hold, Record
@@ -41,7 +41,8 @@ class ChannelSummary(NamedTuple):
     unit: str
 
     def __str__(self) -> str:
-        clock = f"{self.rate:.5g} Hz, t = {self.start:.6g} .. {self.stop:.6g} s"
+        start = clock_start(np.array([self.start]))
+        clock = f"{self.rate:.5g} Hz, t = {show_times(self.start, self.stop, start=start)}"
         extent = f"{self.minimum:.4g} .. {self.maximum:.4g} {self.unit}".rstrip()
         return f"{self.name}: {self.samples} samples, {clock}, {extent}"
 
@@ -122,6 +123,7 @@ def read(
         are kept bit by bit; others are resampled (see `resample`) to the lowest of their own rates,
         rounded to three digits.
     - `start`, `stop`: first and last time in s of the file's own time, which the record keeps.
+        Where that is a date, they may count from the log's start, as messages do.
     - `time`: the array with the time stamps, where the format does not define them, or those with
         seconds and nanoseconds, as `"sec+nanosec"`. The time stamps of `x` are `t_x`, else those
         that `time` names, else t, time, time_s, timestamp or such a pair in the same struct, in

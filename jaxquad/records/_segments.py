@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._clock import TimeUnit
+from ._clock import clock_start, show_times, TimeUnit
 from ._errors import GapError, RecordError, RecordWarning
 from ._read import read
 from ._record import Hold, Record
@@ -158,12 +158,13 @@ def _without_gaps(
         parts = [part for each in lasts for part in _part_if_any(path, roles, each, rate, options)]
         if not parts:
             raise
+    origin = min(clock_start(record.time) for _, record in parts)
     (left, right) = max(gaps, key=lambda each: each[1] - each[0])
     warnings.warn(
         f"samples are missing in {'one place' if len(gaps) == 1 else f'{len(gaps)} places'}, for "
-        f"up to {1e3 * (right - left):.4g} ms at t = {left:.6g} s: the record is cut there into "
-        f"{len(parts)} segments, {_in_words([record for _, record in parts])}. A gap up to a "
-        f"length in s is bridged instead where that is allowed (max_gap=).",
+        f"up to {1e3 * (right - left):.4g} ms at t = {show_times(left, start=origin)}: the record "
+        f"is cut there into {len(parts)} segments, {_in_words([record for _, record in parts])}. "
+        f"A gap up to a length in s is bridged instead where that is allowed (max_gap=).",
         RecordWarning,
         stacklevel=4,
     )
@@ -186,8 +187,10 @@ def _part_if_any(
 
 
 def _in_words(records: Sequence[Record]) -> str:
-    spans = [f"{record.time[0]:.6g} .. {record.time[-1]:.6g}" for record in records]
-    return f"t = {', '.join(spans)} s"
+    start = min(clock_start(record.time) for record in records)
+    *others, last = [(float(record.time[0]), float(record.time[-1])) for record in records]
+    spans = [f"{a - start:.6g} .. {b - start:.6g}" for a, b in others]
+    return f"t = {', '.join([*spans, show_times(*last, start=start)])}"
 
 
 def _check(segments: Sequence[Segment]) -> None:

@@ -10,7 +10,14 @@ import numpy as np
 
 from jaxquad._core import announce, beside
 from jaxquad.identify import Fit, Verification, verify
-from jaxquad.records import read, Record, RecordError, RecordWarning
+from jaxquad.records import (
+    clock_start,
+    read,
+    Record,
+    RecordError,
+    RecordWarning,
+    show_times,
+)
 from jaxquad.report import provenance, write_results
 
 from ._identify import Identification, identify_opened
@@ -85,7 +92,8 @@ def _with_throttle(found: Identification) -> Record | None:
 
 
 def _record_title(found: Identification, record: Record) -> str:
-    span = f"t = {record.time[0]:.6g} .. {record.time[-1]:.6g} s"
+    start = clock_start(record.time)
+    span = f"t = {show_times(record.time[0], record.time[-1], start=start)}"
     return f"{Path(record.source).name}, {span}" if found.more else span
 
 
