@@ -1,3 +1,4 @@
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -7,11 +8,12 @@ from jaxtyping import Float
 
 from ._clock import clock_start, JITTER, nonuniformity, show_times, TimeUnit, window
 from ._edit import combine
-from ._errors import located, ReadError, RecordError, unknown_name
+from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
 from ._record import as_tuple, check_distinct, Hold, Record
 from ._repair import check_ranges, repair_values, Valid, within
 from ._resample import Channel, resample
 from ._timebase import signal_names, Timebases
+from ._turns import without_turns
 from ._units import known_unit
 from .formats import load_signals
 
@@ -143,8 +145,9 @@ def read(
     - `valid`: channel name of the file -> lowest and highest value that can be true. Others count
         as missing, and are interpolated up to `max_gap`, as in `Record`.
 
-    **Returns:** a `Record`. Overflows of the time counter are undone, and up to 1 % of time
-    stamps that repeat or go back are dropped with their rows, both with a `RecordWarning`.
+    **Returns:** a `Record`. Overflows of the time counter are undone, up to 1 % of time stamps that
+    repeat or go back are dropped with their rows, and angles that jump by a turn (360, 2 pi) go on
+    instead, each with a `RecordWarning`.
 
     **Raises:**
 
@@ -195,9 +198,25 @@ def _repaired(
     whole, times = [], {}
     for each in channels:
         found = repair_values(each.name, each.time, each.values, valid.get(each.name), max_gap)
-        whole.append(Channel(each.name, each.time, found.values, each.unit))
+        whole.append(_continuous(Channel(each.name, each.time, found.values, each.unit)))
         times[each.name] = found.times
     return whole, times
+
+
+def _continuous(channel: Channel) -> Channel:
+    """The channel, an angle without its jumps of a turn."""
+    values, jumps, period = without_turns(channel.values, known_unit(channel.unit) or channel.unit)
+    if not jumps:
+        return channel
+    turn = "360" if period == 360 else "2 pi"
+    times = "once" if jumps == 1 else f"{jumps} times"
+    warnings.warn(
+        f"channel {channel.name!r} jumps by {turn} {times}, as an angle does at the end of its "
+        f"range: it is taken as one that goes on.",
+        RecordWarning,
+        stacklevel=4,
+    )
+    return Channel(channel.name, channel.time, values, channel.unit)
 
 
 def _after_resampling(hold: Hold, stamps: Float[np.ndarray, " samples"]) -> Hold:

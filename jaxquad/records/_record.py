@@ -404,7 +404,7 @@ def _check_channels(record: Record) -> None:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
                 f"{np.isinf(values).sum()} inf, the first at t = "
-                f"{show_times(record.time[bad[0]], start=start)}"
+                f"{show_times(float(record.time[bad[0]]), start=start)}"
                 f"{_longest_hole(record.time, np.isfinite(values))}. {mend_holes('them')}"
             )
         largest = float(np.max(np.abs(values)))

@@ -300,7 +300,7 @@ def _warn_of_gaps(pieces: Sequence[Channel], begin: float, end: float) -> None:
         if holes.size:
             step = np.diff(piece.time)[holes]
             where = piece.time[holes[step.argmax()]]
-            place = show_times(where, start=clock_start(piece.time))
+            place = show_times(float(where), start=clock_start(piece.time))
             longest = f"longest {1e3 * step.max():.4g} ms at t = {place}"
             texts.append(f"{piece.name!r} {holes.size}, {longest}")
     if texts:

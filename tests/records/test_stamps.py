@@ -1,4 +1,5 @@
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,11 +91,12 @@ def test_dates_are_shown_from_the_start_of_the_log(dated):
         record = read(dated, inputs="u", outputs="y", max_gap=0.3)
     assert "(t = 0 .. 19.99 s after 1710771234.500 s)" in str(record)
     assert record.time[0] == EPOCH
-    for options, said in (
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({}, "from t = 8 s to 8.2 s after 1710771234.500 s"),
         ({"start": 30}, "start 30 s after 1710771234.500 s is not before stop 19.99 s"),
         ({"stop": 25}, "0 .. 25 s after 1710771234.500 s is out of range; the record covers 0"),
-    ):
+    )
+    for options, said in cases:
         with pytest.raises(RecordError, match=said):
             read(dated, inputs="u", outputs="y", **options)
 
