@@ -104,6 +104,7 @@ def read(
     time: str | None = None,
     time_unit: TimeUnit | None = None,
     dt: float | int | None = None,
+    time_factor: float | int | None = None,
     max_gap: float | int | None = None,
     units: Mapping[str, str] | None = None,
     hold: Hold = None,
@@ -135,6 +136,9 @@ def read(
         steps of 0.25 and more, which may be milliseconds.
     - `dt`: the sampling interval in s of a table without time stamps, whose rows are equally
         spaced. Its time begins at 0.
+    - `time_factor`: of the time stamps, where their clock is known to run slow or fast; `start`,
+        `stop` and the record are in the corrected time. 85/84 for logs of a Crazyflie's micro-SD
+        card whose firmware is older than August 2026.
     - `max_gap`: the longest gap that is interpolated, in s: of time stamps (see `resample`), and of
         values that are not finite, which by default are refused.
     - `units`: channel name of the record -> unit, for figures and tables; by default those of the
@@ -162,7 +166,7 @@ def read(
     """
     roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
-    channels = _channels(path, names, time, time_unit, dt)
+    channels = _channels(path, names, time, time_unit, dt, time_factor)
     check_ranges(valid or {}, names)
     channels, repaired = _repaired(channels, valid or {}, max_gap)
     span = _shared_grid(channels, start, stop) if sample_rate is None else None
@@ -274,12 +278,13 @@ def _channels(
     time: str | None,
     time_unit: TimeUnit | None,
     dt: float | int | None,
+    time_factor: float | int | None,
 ) -> list[Channel]:
     signals = load_signals(path)
     if not names:
         raise ReadError(f"{path}: no channels are named. Name them (inputs=, outputs=).")
     try:
-        timebases = Timebases(signals, time, time_unit, dt)
+        timebases = Timebases(signals, time, time_unit, dt, time_factor)
         return [timebases.channel(name) for name in names]
     except ReadError as error:
         raise located(error, path) from error

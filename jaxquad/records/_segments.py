@@ -72,6 +72,7 @@ class _Options(NamedTuple):
     time: str | None
     time_unit: TimeUnit | None
     dt: float | int | None
+    time_factor: float | int | None
     units: Mapping[str, str]
     hold: Hold
     max_gap: float | int | None
@@ -89,6 +90,7 @@ def read_segments(
     time: str | None = None,
     time_unit: TimeUnit | None = None,
     dt: Number | None = None,
+    time_factor: Number | None = None,
     units: Mapping[str, str] | None = None,
     hold: Hold = None,
     max_gap: Number | None = None,
@@ -103,7 +105,7 @@ def read_segments(
     - `inputs`, `outputs`, `references`: name -> channel or its power (`m1^2`) -> weight, as
         `parse_mix` returns it.
     - `sample_rate`: in Hz; by default that of the slowest segment.
-    - `time`, `time_unit`, `dt`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
+    - `time`, `time_unit`, `dt`, `time_factor`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
 
     **Returns:** a `Record` for each segment; several where samples are missing for longer than
     `max_gap`, by default 10 samples or 0.05 s: a segment is cut there, and parts shorter than 1 s
@@ -117,7 +119,7 @@ def read_segments(
     """
     _check(segments)
     roles = (inputs, outputs, references or {})
-    options = _Options(time, time_unit, dt, units or {}, hold, max_gap, valid or {})
+    options = _Options(time, time_unit, dt, time_factor, units or {}, hold, max_gap, valid or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         every = [_without_gaps(path, roles, each, sample_rate, options) for each in segments]
@@ -227,6 +229,7 @@ def _mixed(
         time=options.time,
         time_unit=options.time_unit,
         dt=options.dt,
+        time_factor=options.time_factor,
         hold=options.hold,
         max_gap=options.max_gap,
         valid=options.valid,
