@@ -125,18 +125,19 @@ def _fail(message: str, code: int) -> int:
 
 
 def _printer_of_warnings() -> Callable[..., None]:
-    """Prints each warning of the package once: several steps of a command read the same log.
+    """Prints each text of the package once: a log is read for the estimate and for the page.
 
     What NumPy or JAX warn of is no word to a user.
     """
-    printed = set()
+    printed: set[str] = set()
 
-    def print_warning(message: Warning | str, kind: type[Warning], *_: object) -> None:
-        if is_ours(kind) and str(message) not in printed:
-            printed.add(str(message))
-            print("!", *in_options(str(message)).split(), file=sys.stderr)
+    def show(message: Warning | str, kind: type[Warning], *_: object) -> None:
+        text = " ".join(in_options(str(message)).split())
+        if is_ours(kind) and text not in printed:
+            printed.add(text)
+            print("!", text, file=sys.stderr)
 
-    return print_warning
+    return show
 
 
 def make_parser() -> argparse.ArgumentParser:

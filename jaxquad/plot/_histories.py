@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from jaxquad.records import Record
+from jaxquad.records import clock_start, Record
 
 from ._labels import few_ticks, LINES, Style
 from ._names import short_names, unit_label, visible
@@ -80,7 +80,8 @@ def record_figure(
         scale, unit = unit_label(visible(record.unit(name))[:12])
         values = record.channel(name)
         kept = extremes(values)
-        panel.plot(record.time[kept], scale * values[kept], color=_COLOURS[role], lw=0.7)
+        time = record.time[kept] - clock_start(record.time)
+        panel.plot(time, scale * values[kept], color=_COLOURS[role], lw=0.7)
         panel.set_ylabel(unit.removeprefix(", "))
         panel.set_title(f"{role}: {label}", loc="left", fontsize=9, pad=3, y=1.0)
         few_ticks(panel.yaxis, 4)

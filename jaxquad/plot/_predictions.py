@@ -16,7 +16,7 @@ from jaxquad.identify import (
     Verification,
 )
 from jaxquad.models import Model
-from jaxquad.records import Record
+from jaxquad.records import clock_start, Record
 from jaxquad.spectra import estimate_step, StepResponse
 
 from ._histories import extremes
@@ -104,14 +104,14 @@ def _draw_output(top: Axes, bottom: Axes, checks: Mapping[str, Verification], k:
     scale, unit = unit_label(one.unit)
     measured = scale * first.measured.reshape(shape)[:, k]
     ink = {"color": "0.15", "lw": 1.0} if len(checks) == 1 else {"color": "0.7", "lw": 3.0}
-    _plot(top, first.time, measured, ink | {"label": "measured"})
+    _plot(top, _shown(first.time), measured, ink | {"label": "measured"})
     for m, (name, check) in enumerate(checks.items()):
         simulated = scale * check.simulated.reshape(shape)[:, k]
         text = name if len(checks) == 1 else f"{name}: {check.outputs[k].fit_percent:.1f} %"
         look = look_of(m, text) | ({"ls": "--"} if len(checks) == 1 else {})
         alone: Style = {"color": "tab:red", "ls": "-"} if len(checks) == 1 else {}
-        _plot(top, check.time, simulated, look)
-        _plot(bottom, check.time, measured - simulated, look | {"lw": 0.9} | alone)
+        _plot(top, _shown(check.time), simulated, look)
+        _plot(bottom, _shown(check.time), measured - simulated, look | {"lw": 0.9} | alone)
     top.legend(loc="upper right", fontsize=8 if len(checks) > 1 else 9, ncols=2)
     top.set_ylabel(f"{one.name}{unit}")
     bottom.set_ylabel(f"difference{unit}")
@@ -121,6 +121,11 @@ def _draw_output(top: Axes, bottom: Axes, checks: Mapping[str, Verification], k:
         axis.margins(x=0)
     low, high = top.get_ylim()
     top.set_ylim(low, high + (0.15 + 0.1 * (len(checks) > 1)) * (high - low))
+
+
+def _shown(time: np.ndarray) -> np.ndarray:
+    """Time stamps that are dates count from the first of them."""
+    return time - clock_start(time)
 
 
 def _plot(panel: Axes, time: Samples, values: Samples, style: Style) -> None:

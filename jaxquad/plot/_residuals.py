@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxquad.identify import as_sampled, Fit, model_response, Verification, verify
 from jaxquad.models import Model
-from jaxquad.records import Record
+from jaxquad.records import clock_start, Record
 from jaxquad.spectra import FrequencyResponse
 
 from ._labels import add_hertz, few_ticks, plain_ticks
@@ -164,7 +164,7 @@ def _over_time(check: Verification, ax: Given, title: str) -> Panels:
     for k, one in enumerate(check.outputs):
         scale, unit = unit_label(one.unit)
         top, bottom = panels[2 * k], panels[2 * k + 1]
-        top.plot(check.time, scale * left[:, k], color="tab:red", lw=0.8)
+        top.plot(check.time - clock_start(check.time), scale * left[:, k], color="tab:red", lw=0.8)
         top.set(ylabel=f"{one.name}, measured\nminus model{unit}", xlabel="time, s")
         _correlation(bottom, autocorrelation(left[:, k])[:_LAGS], dt, 1.96 / np.sqrt(samples))
         for panel in (top, bottom):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad.records import Record
+from jaxquad.records import clock_start, Record
 
 from ._labels import add_hertz, few_ticks
 from ._names import raise_powers, short_names, unit_label, visible
@@ -100,7 +100,8 @@ def _over_time(record: Record, values: np.ndarray, samples: int) -> _Spectrum:
     power = np.abs(np.fft.rfft(level * shape, axis=1)) ** 2
     power *= 2 * record.dt / np.sum(shape**2)
     omega = 2 * np.pi * np.fft.rfftfreq(samples, record.dt)
-    middle = record.time[: len(parts) * step : step] + 0.5 * samples * record.dt
+    begins = record.time[: len(parts) * step : step] - clock_start(record.time)
+    middle = begins + 0.5 * samples * record.dt
     edges = np.append(middle, middle[-1] + step * record.dt) - 0.5 * step * record.dt
     with np.errstate(divide="ignore"):
         return _Spectrum(edges, omega[1:], 10 * np.log10(power[:, 1:].T))

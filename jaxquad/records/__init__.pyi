@@ -1,3 +1,4 @@
+from ._clock import clock_start as clock_start, show_times as show_times
 from ._edit import detrend as detrend, mix as mix, select as select, trim as trim
 from ._errors import (
     ReadError as ReadError,

@@ -21,6 +21,25 @@ _DATE_UNITS = {
 }  # fmt: skip
 
 
+_DATES = 1e8  # s: stamps from here on are dates, in s since 1970
+
+
+def clock_start(time: Times) -> float:
+    """Where the time begins that is shown: 0, or for dates the first stamp (s)."""
+    return float(time[0]) if time.size and time[0] >= _DATES else 0.0
+
+
+def show_times(*times: float, start: float = 0.0) -> str:
+    """Times in s as text: `3.2 .. 30 s`, counted from a `start` that `clock_start` gives."""
+    text = " .. ".join(f"{time - start:.6g}" for time in times)
+    return f"{text} s after {start:.3f} s" if start else f"{text} s"
+
+
+def in_file_time(time: float | int | None, start: float) -> float | int | None:
+    """A time that was given, which may count from the `start` that is shown (s)."""
+    return start + time if time is not None and start and time < _DATES else time
+
+
 def check_unit(unit: TimeUnit | None) -> None:
     """Raise RecordError for another unit of time."""
     if unit is not None and unit not in PER_SECOND:
@@ -123,27 +142,34 @@ def check_uniform(time: Times) -> None:
         raise RecordError(
             f"time is not uniformly sampled: the time stamps lie up to {worst:.3g} samples off a "
             f"uniform grid (limit {JITTER}); the most unusual step is {step[i]:.6g} s at "
-            f"t = {time[i]:.6g} s, the median step {np.median(step):.6g} s. "
+            f"t = {show_times(time[i], start=clock_start(time))}, the median step "
+            f"{np.median(step):.6g} s. "
             "Resample it with jq.read(..., sample_rate=), jq.Record.from_dataframe(..., "
             f"sample_rate=) or jq.records.resample{gap if missing else ''}."
         )
 
 
 def window(time: Times, start: float | int | None, stop: float | int | None) -> slice:
-    """The samples from `start` to `stop` (s, both included; None is the end of the record)."""
+    """The samples from `start` to `stop` (s, both included; None is the end of the record).
+
+    Where the time stamps are dates, both may count from the first of them.
+    """
     slack = 1e-6 * (time[-1] - time[0]) / (time.size - 1)
+    origin = clock_start(time)
+    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
     begin = time[0] if start is None else start
     end = time[-1] if stop is None else stop
-    extent = f"the record covers {time[0]:.6g} .. {time[-1]:.6g} s"
+    shown = lambda *times: show_times(*times, start=origin)
+    extent = f"the record covers {shown(time[0], time[-1])}"
     if not begin < end:
-        raise RecordError(f"start {begin:.6g} s is not before stop {end:.6g} s; {extent}.")
+        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {extent}.")
     if begin < time[0] - slack or end > time[-1] + slack:
-        raise RecordError(f"{begin:.6g} .. {end:.6g} s is out of range; {extent}.")
+        raise RecordError(f"{shown(begin, end)} is out of range; {extent}.")
     first = int(np.searchsorted(time, begin - slack))
     last = int(np.searchsorted(time, end + slack, side="right"))
     if last - first < FEWEST:
         raise RecordError(
-            f"{begin:.6g} .. {end:.6g} s holds {last - first} samples: at least {FEWEST} are "
+            f"{shown(begin, end)} holds {last - first} samples: at least {FEWEST} are "
             f"needed; {extent}."
         )
     return slice(first, last)

@@ -1,5 +1,5 @@
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 
@@ -26,6 +26,20 @@ class ReadError(RecordError):
     def __str__(self) -> str:
         where = "" if self.offset is None else f" (at byte {self.offset})"
         return f"{str(self.args[0]).rstrip('.')}{where}."
+
+
+class GapError(RecordError):
+    """Samples are missing for too long.
+
+    **Arguments:**
+
+    - `reason`: what is wrong, and what to do.
+    - `gaps`: first and last time in s of each, in order.
+    """
+
+    def __init__(self, reason: str, gaps: Sequence[tuple[float, float]] = ()):
+        super().__init__(reason)
+        self.gaps = tuple(gaps)
 
 
 class RecordWarning(UserWarning):

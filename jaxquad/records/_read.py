@@ -1,3 +1,4 @@
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -5,13 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._clock import JITTER, nonuniformity, TimeUnit, window
+from ._clock import clock_start, JITTER, nonuniformity, show_times, TimeUnit, window
 from ._edit import combine
-from ._errors import located, ReadError, RecordError, unknown_name
+from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
 from ._record import as_tuple, check_distinct, Hold, Record
 from ._repair import check_ranges, repair_values, Valid, within
 from ._resample import Channel, resample
 from ._timebase import signal_names, Timebases
+from ._turns import without_turns
 from ._units import known_unit
 from .formats import load_signals
 
@@ -41,7 +43,8 @@ class ChannelSummary(NamedTuple):
     unit: str
 
     def __str__(self) -> str:
-        clock = f"{self.rate:.5g} Hz, t = {self.start:.6g} .. {self.stop:.6g} s"
+        start = clock_start(np.array([self.start]))
+        clock = f"{self.rate:.5g} Hz, t = {show_times(self.start, self.stop, start=start)}"
         extent = f"{self.minimum:.4g} .. {self.maximum:.4g} {self.unit}".rstrip()
         return f"{self.name}: {self.samples} samples, {clock}, {extent}"
 
@@ -101,6 +104,7 @@ def read(
     time: str | None = None,
     time_unit: TimeUnit | None = None,
     dt: float | int | None = None,
+    time_factor: float | int | None = None,
     max_gap: float | int | None = None,
     units: Mapping[str, str] | None = None,
     hold: Hold = None,
@@ -122,6 +126,7 @@ def read(
         are kept bit by bit; others are resampled (see `resample`) to the lowest of their own rates,
         rounded to three digits.
     - `start`, `stop`: first and last time in s of the file's own time, which the record keeps.
+        Where that is a date, they may count from the log's start, as messages do.
     - `time`: the array with the time stamps, where the format does not define them, or those with
         seconds and nanoseconds, as `"sec+nanosec"`. The time stamps of `x` are `t_x`, else those
         that `time` names, else t, time, time_s, timestamp or such a pair in the same struct, in
@@ -131,6 +136,9 @@ def read(
         steps of 0.25 and more, which may be milliseconds.
     - `dt`: the sampling interval in s of a table without time stamps, whose rows are equally
         spaced. Its time begins at 0.
+    - `time_factor`: of the time stamps, where their clock is known to run slow or fast; `start`,
+        `stop` and the record are in the corrected time. 85/84 for logs of a Crazyflie's micro-SD
+        card whose firmware is older than August 2026.
     - `max_gap`: the longest gap that is interpolated, in s: of time stamps (see `resample`), and of
         values that are not finite, which by default are refused.
     - `units`: channel name of the record -> unit, for figures and tables; by default those of the
@@ -141,8 +149,9 @@ def read(
     - `valid`: channel name of the file -> lowest and highest value that can be true. Others count
         as missing, and are interpolated up to `max_gap`, as in `Record`.
 
-    **Returns:** a `Record`. Overflows of the time counter are undone, and up to 1 % of time
-    stamps that repeat or go back are dropped with their rows, both with a `RecordWarning`.
+    **Returns:** a `Record`. Overflows of the time counter are undone, up to 1 % of time stamps that
+    repeat or go back are dropped with their rows, and angles that jump by a turn (360, 2 pi) go on
+    instead, each with a `RecordWarning`.
 
     **Raises:**
 
@@ -157,7 +166,7 @@ def read(
     """
     roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
-    channels = _channels(path, names, time, time_unit, dt)
+    channels = _channels(path, names, time, time_unit, dt, time_factor)
     check_ranges(valid or {}, names)
     channels, repaired = _repaired(channels, valid or {}, max_gap)
     span = _shared_grid(channels, start, stop) if sample_rate is None else None
@@ -193,9 +202,25 @@ def _repaired(
     whole, times = [], {}
     for each in channels:
         found = repair_values(each.name, each.time, each.values, valid.get(each.name), max_gap)
-        whole.append(Channel(each.name, each.time, found.values, each.unit))
+        whole.append(_continuous(Channel(each.name, each.time, found.values, each.unit)))
         times[each.name] = found.times
     return whole, times
+
+
+def _continuous(channel: Channel) -> Channel:
+    """The channel, an angle without its jumps of a turn."""
+    values, jumps, period = without_turns(channel.values, known_unit(channel.unit) or channel.unit)
+    if not jumps:
+        return channel
+    turn = "360" if period == 360 else "2 pi"
+    times = "once" if jumps == 1 else f"{jumps} times"
+    warnings.warn(
+        f"channel {channel.name!r} jumps by {turn} {times}, as an angle does at the end of its "
+        f"range: it is taken as one that goes on.",
+        RecordWarning,
+        stacklevel=4,
+    )
+    return Channel(channel.name, channel.time, values, channel.unit)
 
 
 def _after_resampling(hold: Hold, stamps: Float[np.ndarray, " samples"]) -> Hold:
@@ -253,12 +278,13 @@ def _channels(
     time: str | None,
     time_unit: TimeUnit | None,
     dt: float | int | None,
+    time_factor: float | int | None,
 ) -> list[Channel]:
     signals = load_signals(path)
     if not names:
         raise ReadError(f"{path}: no channels are named. Name them (inputs=, outputs=).")
     try:
-        timebases = Timebases(signals, time, time_unit, dt)
+        timebases = Timebases(signals, time, time_unit, dt, time_factor)
         return [timebases.channel(name) for name in names]
     except ReadError as error:
         raise located(error, path) from error

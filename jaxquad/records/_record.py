@@ -13,10 +13,12 @@ from ._clock import (
     check_increasing,
     check_uniform,
     check_unit,
+    clock_start,
     dates_in_seconds,
     doubt_of_seconds,
     FEWEST,
     PER_SECOND,
+    show_times,
     TimeUnit,
 )
 from ._errors import mend_holes, RecordError, RecordWarning, unknown_name
@@ -260,7 +262,7 @@ class Record:
         lines = [
             f"Record {self.source}".rstrip(),
             f"  {self.samples} samples, {self.duration:.6g} s at {self.sample_rate:.6g} Hz "
-            f"(t = {self.time[0]:.6g} .. {self.time[-1]:.6g} s)",
+            f"(t = {show_times(self.time[0], self.time[-1], start=clock_start(self.time))})",
         ]
         for role, members in zip(roles, names, strict=True):
             texts = [f"{name} [{self.unit(name)}]" if self.unit(name) else name for name in members]
@@ -380,11 +382,13 @@ _SMALLEST = 1e-20  # of a channel's size: high powers of it are still numbers
 
 
 def _check_channels(record: Record) -> None:
+    start = clock_start(record.time)
     for name, times in record.repaired.items():
         if times.size > _MOST_REPAIRED * record.samples:
             warnings.warn(
                 f"channel {name!r}: {times.size} of {record.samples} samples are interpolated, the "
-                f"first at t = {times.min():.6g} s. Check valid= and the sensor.",
+                f"first at t = {show_times(times.min(), start=start)}. Check valid= and the "
+                "sensor.",
                 RecordWarning,
                 stacklevel=4,
             )
@@ -399,7 +403,8 @@ def _check_channels(record: Record) -> None:
         if bad.size:
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
-                f"{np.isinf(values).sum()} inf, the first at t = {record.time[bad[0]]:.6g} s"
+                f"{np.isinf(values).sum()} inf, the first at t = "
+                f"{show_times(float(record.time[bad[0]]), start=start)}"
                 f"{_longest_hole(record.time, np.isfinite(values))}. {mend_holes('them')}"
             )
         largest = float(np.max(np.abs(values)))

@@ -8,14 +8,17 @@ from numpy.typing import ArrayLike
 
 from ._clock import (
     check_increasing,
+    clock_start,
     dates_in_seconds,
     FEWEST,
+    in_file_time,
     longest_step,
     native_rate,
     nonuniformity,
     scatters,
+    show_times,
 )
-from ._errors import choose_range, mend_holes, RecordError, RecordWarning
+from ._errors import choose_range, GapError, mend_holes, RecordError, RecordWarning
 from ._repair import as_float64, longest_gap
 
 
@@ -79,14 +82,14 @@ def contiguous_part(
     """The samples from `begin` to `end` (s), and up to `margin` (s) beyond, without a break.
 
     A break is a gap longer than `max_gap` (s) or a value that is not finite. Outside of
-    `begin` .. `end` it ends the part; inside it raises RecordError.
+    `begin` .. `end` it ends the part; inside it raises RecordError, a GapError where all are gaps.
     """
     time = channel.time
     bad = ~np.isfinite(channel.values)
     broken = (np.diff(time) > longest_gap(channel.time, max_gap)) | bad[:-1] | bad[1:]
     inside = (time[1:] > begin) & (time[:-1] < end)
     if (broken & inside).any():
-        _raise_for_break(channel, int(np.flatnonzero(broken & inside)[0]), max_gap)
+        _raise_for_breaks(channel, np.flatnonzero(broken & inside), max_gap)
     before = np.flatnonzero(broken & (time[1:] <= begin))
     after = np.flatnonzero(broken & (time[:-1] >= end))
     reach = margin + longest_gap(channel.time, max_gap)
@@ -102,20 +105,27 @@ def gaps(channel: Channel, begin: float, end: float) -> np.ndarray:
     return np.flatnonzero((step > longest_step(channel.time)) & inside)
 
 
-def _raise_for_break(channel: Channel, index: int, max_gap: float | int | None) -> None:
+def _raise_for_breaks(
+    channel: Channel, breaks: np.ndarray, max_gap: float | int | None
+) -> None:  # fmt: skip
+    holes = ~np.isfinite(channel.values[breaks]) | ~np.isfinite(channel.values[breaks + 1])
+    index = int(breaks[holes.argmax() if holes.any() else 0])
     left, right = channel.time[index : index + 2]
-    pair = channel.values[index : index + 2]
-    if not np.isfinite(pair).all():
+    origin = clock_start(channel.time)
+    if holes.any():
+        pair = channel.values[index : index + 2]
         i = index + int(np.isfinite(pair[0]))
         raise RecordError(
             f"channel {channel.name!r} is {channel.values[i]} at sample {i}, "
-            f"t = {channel.time[i]:.6g} s. {mend_holes('it')}"
+            f"t = {show_times(channel.time[i], start=origin)}. {mend_holes('it')}"
         )
     longest = longest_gap(channel.time, max_gap)
-    raise RecordError(
+    raise GapError(
         f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
-        f"t = {left:.6g} s to {right:.6g} s (limit {1e3 * longest:.4g} ms). "
-        f"{choose_range('it')}, or allow it, by its length in s (max_gap=)."
+        f"t = {left - origin:.6g} s to {show_times(right, start=origin)} (limit "
+        f"{1e3 * longest:.4g} ms). "
+        f"{choose_range('it')}, or allow it, by its length in s (max_gap=).",
+        [(float(channel.time[i]), float(channel.time[i + 1])) for i in breaks],
     )
 
 
@@ -229,19 +239,22 @@ def _extent(
     latest = max(channels, key=lambda channel: channel.time[0])
     earliest = min(channels, key=lambda channel: channel.time[-1])
     first, last = float(latest.time[0]), float(earliest.time[-1])
+    origin = min(clock_start(channel.time) for channel in channels)
+    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
     begin = first if start is None else float(start)
     end = last if stop is None else float(stop)
+    shown = lambda *times: show_times(*times, start=origin)
     overlap = (
-        f"the channels overlap from {first:.6g} s ({latest.name!r} begins) "
-        f"to {last:.6g} s ({earliest.name!r} ends)"
+        f"the channels overlap from {first - origin:.6g} s ({latest.name!r} begins) "
+        f"to {shown(last)} ({earliest.name!r} ends)"
     )
     if not first < last:
         raise RecordError(f"the channels have no common time: {overlap}.")
     if not begin < end:
-        raise RecordError(f"start {begin:.6g} s is not before stop {end:.6g} s; {overlap}.")
+        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {overlap}.")
     slack = 1e-9 * (1 + abs(last))
     if begin < first - slack or end > last + slack:
-        raise RecordError(f"{begin:.6g} .. {end:.6g} s is out of range; {overlap}.")
+        raise RecordError(f"{shown(begin, end)} is out of range; {overlap}.")
     return max(begin, first), min(end, last)
 
 
@@ -251,7 +264,7 @@ def _grid(begin: float, end: float, sample_rate: float | int) -> Samples:
     steps = (end - begin) * sample_rate
     if not FEWEST - 1 <= steps + 1e-6 < _MOST:
         raise RecordError(
-            f"a sample rate of {sample_rate:.6g} Hz over {begin:.6g} .. {end:.6g} s makes "
+            f"a sample rate of {sample_rate:.6g} Hz over {end - begin:.6g} s makes "
             f"{steps + 1:.6g} samples; {FEWEST} .. {_MOST} are allowed. Choose another rate or "
             f"range."
         )
@@ -287,7 +300,8 @@ def _warn_of_gaps(pieces: Sequence[Channel], begin: float, end: float) -> None:
         if holes.size:
             step = np.diff(piece.time)[holes]
             where = piece.time[holes[step.argmax()]]
-            longest = f"longest {1e3 * step.max():.4g} ms at t = {where:.6g} s"
+            place = show_times(float(where), start=clock_start(piece.time))
+            longest = f"longest {1e3 * step.max():.4g} ms at t = {place}"
             texts.append(f"{piece.name!r} {holes.size}, {longest}")
     if texts:
         warnings.warn(

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._clock import TimeUnit
-from ._errors import RecordError
+from ._clock import clock_start, show_times, TimeUnit
+from ._errors import GapError, RecordError, RecordWarning
 from ._read import read
 from ._record import Hold, Record
 from ._repair import Valid
@@ -72,6 +72,7 @@ class _Options(NamedTuple):
     time: str | None
     time_unit: TimeUnit | None
     dt: float | int | None
+    time_factor: float | int | None
     units: Mapping[str, str]
     hold: Hold
     max_gap: float | int | None
@@ -89,6 +90,7 @@ def read_segments(
     time: str | None = None,
     time_unit: TimeUnit | None = None,
     dt: Number | None = None,
+    time_factor: Number | None = None,
     units: Mapping[str, str] | None = None,
     hold: Hold = None,
     max_gap: Number | None = None,
@@ -103,28 +105,94 @@ def read_segments(
     - `inputs`, `outputs`, `references`: name -> channel or its power (`m1^2`) -> weight, as
         `parse_mix` returns it.
     - `sample_rate`: in Hz; by default that of the slowest segment.
-    - `time`, `time_unit`, `dt`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
+    - `time`, `time_unit`, `dt`, `time_factor`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
 
-    **Returns:** a `Record` for each segment. Each warning about the file is given once.
+    **Returns:** a `Record` for each segment; several where samples are missing for longer than
+    `max_gap`, by default 10 samples or 0.05 s: a segment is cut there, and parts shorter than 1 s
+    are left out, with a `RecordWarning`. Each warning about the file is given once.
 
     **Raises:**
 
-    - `RecordError`: for segments that overlap, are empty or leave the file's time.
+    - `RecordError`: for segments that overlap, are empty or leave the file's time, and for more
+        than 30 gaps in one of them.
     - `ReadError`: as `read` raises it.
     """
     _check(segments)
     roles = (inputs, outputs, references or {})
-    options = _Options(time, time_unit, dt, units or {}, hold, max_gap, valid or {})
+    options = _Options(time, time_unit, dt, time_factor, units or {}, hold, max_gap, valid or {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        records = [_mixed(path, roles, each, sample_rate, options) for each in segments]
+        every = [_without_gaps(path, roles, each, sample_rate, options) for each in segments]
+        parts, records = zip(*(each for found in every for each in found), strict=True)
         slowest = min(record.sample_rate for record in records)
         if max(record.sample_rate for record in records) > (1 + 1e-6) * slowest:
             rate = float(f"{slowest:.3g}")
-            records = [_mixed(path, roles, each, rate, options) for each in segments]
+            records = [_mixed(path, roles, each, rate, options) for each in parts]
     for each in {str(one.message): one for one in caught}.values():
         warnings.warn(str(each.message), each.category, stacklevel=2)
-    return records
+    return list(records)
+
+
+_MOST_GAPS = 30  # in a segment
+_SHORTEST = 1.0  # s, of a part between two gaps
+
+
+def _without_gaps(
+    path: Path,
+    roles: Sequence[Mix],
+    segment: Segment,
+    rate: Number | None,
+    options: _Options,
+) -> list[tuple[Segment, Record]]:
+    """The parts of a segment between gaps that are too long to be interpolated."""
+    try:
+        return [(segment, _mixed(path, roles, segment, rate, options))]
+    except GapError as error:
+        gaps = error.gaps
+        begins, ends = (segment[0], *(b for _, b in gaps)), (*(a for a, _ in gaps), segment[1])
+        lasts = [
+            (a, b)
+            for a, b in zip(begins, ends, strict=True)
+            if a is None or b is None or b - a >= _SHORTEST
+        ]
+        if len(gaps) > _MOST_GAPS or not lasts:
+            raise
+        parts = [part for each in lasts for part in _part_if_any(path, roles, each, rate, options)]
+        if not parts:
+            raise
+    origin = min(clock_start(record.time) for _, record in parts)
+    (left, right) = max(gaps, key=lambda each: each[1] - each[0])
+    warnings.warn(
+        f"samples are missing in {'one place' if len(gaps) == 1 else f'{len(gaps)} places'}, for "
+        f"up to {1e3 * (right - left):.4g} ms at t = {show_times(left, start=origin)}: the record "
+        f"is cut there into {len(parts)} segments, {_in_words([record for _, record in parts])}. "
+        f"A gap up to a length in s is bridged instead where that is allowed (max_gap=).",
+        RecordWarning,
+        stacklevel=4,
+    )
+    return parts
+
+
+def _part_if_any(
+    path: Path,
+    roles: Sequence[Mix],
+    segment: Segment,
+    rate: Number | None,
+    options: _Options,
+) -> list[tuple[Segment, Record]]:
+    """The record of a part, or of its parts; none where it is too short for one."""
+    try:
+        parts = _without_gaps(path, roles, segment, rate, options)
+    except RecordError:  # too few samples between two gaps
+        return []
+    return [part for part in parts if part[1].duration >= _SHORTEST]
+
+
+def _in_words(records: Sequence[Record]) -> str:
+    start = min(clock_start(record.time) for record in records)
+    *others, last = [(float(record.time[0]), float(record.time[-1])) for record in records]
+    spans = [f"{a - start:.6g} .. {b - start:.6g}" for a, b in others]
+    return f"t = {', '.join([*spans, show_times(*last, start=start)])}"
 
 
 def _check(segments: Sequence[Segment]) -> None:
@@ -161,6 +229,7 @@ def _mixed(
         time=options.time,
         time_unit=options.time_unit,
         dt=options.dt,
+        time_factor=options.time_factor,
         hold=options.hold,
         max_gap=options.max_gap,
         valid=options.valid,

@@ -75,11 +75,14 @@ class Timebases:
         time: str | None,
         time_unit: TimeUnit | None,
         dt: float | int | None = None,
+        time_factor: float | int | None = None,
     ):
         check_unit(time_unit)
+        _check_factor(time_factor)
         _check_dt(dt, time, time_unit)
         self._signals, self._time, self._dt = signals, _named(signals, time), dt
         self._unit: TimeUnit | None = time_unit
+        self._factor = 1.0 if time_factor is None else float(time_factor)
         self._names = signal_names(signals, time, dt)
         self._every = _all_names(signals)
         self._clocks = _clocks(signals.arrays)
@@ -208,7 +211,8 @@ class Timebases:
         """For each row of the table, NaN where the time base is blank."""
         if base not in self._read:
             clock = self._signals.clocks.get(base)
-            self._read[base] = (clock, 0) if clock is not None else self._counted(base)
+            stamps, wraps = (clock, 0) if clock is not None else self._counted(base)
+            self._read[base] = (stamps if self._factor == 1 else self._factor * stamps, wraps)
         return self._read[base]
 
     def _counted(self, base: str) -> _Stamps:
@@ -245,6 +249,14 @@ class Timebases:
 
 
 _COUNTED = "rows"  # the time base where dt says how far apart they are
+
+
+def _check_factor(factor: float | int | None) -> None:
+    if factor is not None and not 0.5 <= factor <= 2:
+        raise RecordError(
+            f"time_factor is {factor:g}: give a number near 1, from 0.5 to 2; units of time are "
+            f"for time_unit (time_unit=)."
+        )
 
 
 def _check_dt(dt: float | int | None, time: str | None, unit: TimeUnit | None) -> None:

@@ -12,7 +12,7 @@ from jaxquad.plot import (
     short_names,
     unit_label,
 )
-from jaxquad.records import Record
+from jaxquad.records import clock_start, Record, show_times
 
 from ._figure import embed_figure, Image
 from ._page import Cell, short_unit, Table
@@ -33,8 +33,8 @@ def _record(record: Record) -> dict[str, object]:
     drawn, rest = channels[:ROWS], channels[ROWS:]
     names = ", ".join(f"{role} {name}" for role, name in drawn)
     text = (
-        f"{record.samples} samples, {record.duration:.6g} s at {record.sample_rate:.6g} Hz, from "
-        f"t = {record.time[0]:.6g} s to {record.time[-1]:.6g} s."
+        f"{record.samples} samples, {record.duration:.6g} s at {record.sample_rate:.6g} Hz, "
+        f"t = {show_times(record.time[0], record.time[-1], start=clock_start(record.time))}."
     )
     outside = "" if record.reference_names else " There is no external reference."
     image = embed_figure(

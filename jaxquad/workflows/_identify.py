@@ -413,7 +413,10 @@ def model_formula(settings: IdentifySettings, *, damped: bool = False) -> str:
 
 
 def _checked(found: Identification) -> Verification | None:
-    """The second record simulated, within the band of the points that the fit used."""
+    """The second record simulated, within the band of the points that the fit used.
+
+    Where gaps cut it into several, it is the longest of them.
+    """
     settings = found.settings
     if settings.verify is None or not found.fit.verdict.fitted:
         return None
@@ -424,5 +427,6 @@ def _checked(found: Identification) -> Verification | None:
         segments=(),
         reference=None,
     )
-    [record] = read_records(Path(settings.verify), other)
-    return verify(found.fit, behind_filters(record, found.filters))
+    records = read_records(Path(settings.verify), other)
+    longest = max(records, key=lambda record: record.samples)
+    return verify(found.fit, behind_filters(longest, found.filters))

@@ -42,17 +42,19 @@ def propose_settings(
             "what it proposes"
         )
     start, stop = _given_span(settings)
+    if settings.time_factor:  # the log itself is in the time of its stamps
+        start, stop = (None if x is None else x / settings.time_factor for x in (start, stop))
     proposal = propose(
         path, axis=settings.axis, chirp=settings.chirp, flight=settings.flight, start=start,
         stop=stop,
     )  # fmt: skip
-    offered = proposal.options
+    offered, factor = proposal.options, settings.time_factor or 1.0
     found = {"input": mix_text(offered["inputs"]), "output": offered["outputs"]}
     found |= {"axis": None, "chirp": None, "flight": None}  # the names of the channels say them
     if settings.reference is None:
         found["reference"] = offered["references"]
     if settings.rate is None:
-        found["rate"] = offered["sample_rate"]
+        found["rate"] = float(f"{offered['sample_rate'] / factor:.3g}")
     if settings.hold is None:
         found["hold"] = offered["hold"]
     if proposal.setup.band and settings.band is settings.band_rad is None:
@@ -64,9 +66,11 @@ def _proposed_span(settings: IdentifySettings, proposal: Proposal) -> dict[str, 
     """All injections that were found, or the time in flight, within `start` and `stop`."""
     if settings.segments:
         return {}
+    scaled = lambda end: None if end is None else end * (settings.time_factor or 1.0)
     if len(proposal.segments) > 1:
-        return {"segments": proposal.segments, "start": None, "stop": None}
-    return {"start": proposal.setup.start, "stop": proposal.setup.stop}
+        segments = [(scaled(a), scaled(b)) for a, b in proposal.segments]
+        return {"segments": segments, "start": None, "stop": None}
+    return {"start": scaled(proposal.setup.start), "stop": scaled(proposal.setup.stop)}
 
 
 def _given_span(settings: IdentifySettings) -> tuple[float | None, float | None]:
@@ -194,6 +198,7 @@ def read_records(
         time=settings.time,
         time_unit=settings.time_unit,
         dt=settings.dt,
+        time_factor=settings.time_factor,
         units={name: unit for name, unit in settings.units.items() if name in asked},
         max_gap=settings.max_gap,
         valid=settings.valid,

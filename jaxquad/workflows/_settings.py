@@ -239,6 +239,13 @@ class IdentifySettings(Settings):
         "the sampling interval of a table without time, whose rows are equally spaced",
         group=THE_RECORD,
     )
+    time_factor: float | None = option_field(
+        kinds.POSITIVE,
+        None,
+        "of the time stamps, where their clock runs slow or fast: 1.0119 (85/84) for a Crazyflie's "
+        "micro-SD log with firmware before August 2026",
+        group=THE_RECORD,
+    )
     rate: float | None = option_field(
         kinds.HERTZ,
         None,

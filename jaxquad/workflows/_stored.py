@@ -10,7 +10,14 @@ import numpy as np
 
 from jaxquad._core import announce, beside
 from jaxquad.identify import behind_filters, Fit, Verification, verify
-from jaxquad.records import read, Record, RecordError, RecordWarning
+from jaxquad.records import (
+    clock_start,
+    read,
+    Record,
+    RecordError,
+    RecordWarning,
+    show_times,
+)
 from jaxquad.report import LawLoop, PageWarning, provenance, reason_of, write_results
 
 from ._identify import Identification, identify_opened
@@ -98,7 +105,8 @@ def _with_throttle(found: Identification) -> Record | None:
 
 
 def _record_title(found: Identification, record: Record) -> str:
-    span = f"t = {record.time[0]:.6g} .. {record.time[-1]:.6g} s"
+    start = clock_start(record.time)
+    span = f"t = {show_times(record.time[0], record.time[-1], start=start)}"
     return f"{Path(record.source).name}, {span}" if found.more else span
 
 
@@ -204,5 +212,5 @@ def verify_result(
         band = changed.band_rad
     if changed.band is not None:
         band = 2 * np.pi * changed.band[0], 2 * np.pi * changed.band[1]
-    [record] = read_records(Path(path), changed)
-    return verify(model, behind_filters(record, stored.filters), band=band)
+    longest = max(read_records(Path(path), changed), key=lambda record: record.samples)
+    return verify(model, behind_filters(longest, stored.filters), band=band)

@@ -6,6 +6,8 @@ from hypothesis import given, settings, strategies as st
 from log_writers import decode
 
 from jaxquad.records import ReadError
+from jaxquad.records.formats._betaflight_frames import payload
+from jaxquad.records.formats._betaflight_header import headers
 
 
 ROWS = rows(320)
@@ -126,9 +128,9 @@ def test_huge_declarations_are_refused_before_they_take_memory():
 
 
 def test_a_header_alone_and_frames_without_a_key_hold_nothing():
-    for payload in (b"", writer.END, b"".join(FRAMES[1:20]), bytes(5000), b"P" * 5000):
+    for body in (b"", writer.END, b"".join(FRAMES[1:20]), bytes(5000), b"P" * 5000):
         with pytest.raises(ReadError, match="no readable frame"):
-            decode("betaflight", HEADER + payload)
+            decode("betaflight", HEADER + body)
 
 
 @FUZZ
@@ -151,3 +153,47 @@ def test_bytes_put_in_the_place_of_others_raise_nothing_but_read_errors(new, at,
 @given(st.binary(max_size=2000))
 def test_any_payload_raises_nothing_but_read_errors(payload):
     only_read_errors(HEADER + payload)
+
+
+@pytest.mark.parametrize("size", [1, 2, 7])
+@pytest.mark.parametrize("after", [0, 32, 64, 96])
+def test_stray_bytes_behind_a_key_frame_lose_no_frame(size, after):
+    """Not even the key frame that they follow; which is the last one is never known."""
+    cut = sum(map(len, FRAMES[: after + 1]))
+    count, remarks = true_rows(HEADER + BODY[:cut] + b"\xff" * size + BODY[cut:] + writer.END)
+    assert count == len(ROWS) and f"({size} bytes)" in remarks[0]
+
+
+@pytest.mark.parametrize("after", [65, 70, 94, 95])
+def test_stray_bytes_behind_another_frame_lose_no_more_than_up_to_the_next_key_frame(after):
+    cut = sum(map(len, FRAMES[: after + 1]))
+    count, _ = true_rows(HEADER + BODY[:cut] + b"\xff" + BODY[cut:] + writer.END)
+    assert count >= len(ROWS) - (96 - after) - 4
+
+
+def test_a_stray_byte_in_a_real_log_costs_one_interval_at_most(data):
+    """At a hundred places, behind frames of both kinds."""
+    content = (data / "betaflight_firmware/A_hover.BFL").read_bytes()[:400_000]
+    whole = decode("betaflight", content).tables[""]
+    true = np.stack([np.asarray(x, np.int64) for x in whole.columns.values()], axis=1)
+    rows = dict(zip(true[:, 0].tolist(), true, strict=True))
+    lost = []
+    for cut in range(20_000, 390_000, 3_700):
+        found = decode("betaflight", content[:cut] + b"\xfe" + content[cut:]).tables[""]
+        lost.append(true.shape[0] - found.columns["axisP[0]"].size)
+    assert max(lost) <= 128 // 8 + 4 + 1
+    for key in range(3):
+        at = key_frame_end(content, key)
+        found = decode("betaflight", content[:at] + b"\xfe" + content[at:]).tables[""]
+        values = np.stack([np.asarray(x, np.int64) for x in found.columns.values()], axis=1)
+        np.testing.assert_array_equal(values, true)
+        assert all((rows[row[0]] == row).all() for row in values)
+
+
+def key_frame_end(content, number):
+    """Behind which byte an I frame of a log ends, by its decoder."""
+    [header] = headers(content)
+    assert not isinstance(header, ReadError)
+    main = payload(content, header).main
+    row = np.flatnonzero(main.key)[100 + number]
+    return int(main.offsets[row + 1])

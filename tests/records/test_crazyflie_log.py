@@ -4,8 +4,10 @@ from blackbox_rows import clock
 from hypothesis import given, settings, strategies as st
 from log_writers import crazyflie_log as log, decode
 
-from jaxquad.records import channels, read, ReadError
+from jaxquad.records import channels, propose, read, ReadError, RecordError
 from jaxquad.records.formats import load_log
+from jaxquad.workflows import IdentifySettings
+from jaxquad.workflows._log import open_logs
 
 
 FIXED = (0xFFFF, "fixedFrequency", [("gyro.x", "f"), ("motor.m1", "H"), ("pm.state", "b")])
@@ -121,3 +123,39 @@ def test_the_real_log_is_listed_and_read_although_its_name_has_no_ending(data):
     rates = {each.name: each.rate for each in channels(path)}
     record = read(path, inputs="motor.m1", outputs="gyro.x", start=60, stop=60.5)
     assert rates["gyro.x"] == pytest.approx(1009.8, abs=0.5) and record.unit("gyro.x") == "deg/s"
+
+
+def slow_log(path, rate, slow):
+    """A rate and a command of 10 s, whose stamps run slow by a factor."""
+    kind = (0xFFFF, "fixedFrequency", [("controller.cmd_roll", "f"), ("gyro.x", "f")])
+    time = np.arange(round(10 * rate)) / rate
+    stamps = np.round(1e6 * time * slow).astype(int).tolist()
+    values = zip(np.cos(7 * time), np.sin(7 * time), strict=True)
+    path.write_bytes(log([kind], [(0, s, v) for s, v in zip(stamps, values, strict=True)]))
+    return path
+
+
+@pytest.mark.parametrize(("rate", "said"), [(500, "505.9"), (1000, "101"), (100, "101")])
+def test_stamps_that_run_slow_are_recognised_by_the_rate_of_the_log(tmp_path, rate, said):
+    remarks = propose(slow_log(tmp_path / "log00", rate, 84 / 85), axis="roll").setup.remarks
+    assert any(each.startswith(f"the time stamps say {said}") for each in remarks)
+    remarks = propose(slow_log(tmp_path / "log01", rate, 1.0), axis="roll").setup.remarks
+    assert not any("time stamps say" in each for each in remarks)
+
+
+def test_the_factor_that_is_offered_brings_back_the_true_time(tmp_path):
+    path, names = slow_log(tmp_path / "log00", 500, 84 / 85), ("controller.cmd_roll", "gyro.x")
+    record = read(path, inputs=names[0], outputs=names[1], time_factor=85 / 84, start=1, stop=8)
+    assert record.sample_rate == pytest.approx(500, rel=1e-5)
+    np.testing.assert_allclose(record.outputs[:, 0], np.sin(7 * record.time), atol=2e-5)
+    given = IdentifySettings(axis="roll", time_factor=85 / 84, start=1.0)
+    opened = open_logs(path, given)
+    assert opened.settings.rate == 500 and opened.settings.start == pytest.approx(1.0)
+    assert opened.records[0].sample_rate == pytest.approx(500, rel=1e-5)
+    with pytest.raises(RecordError, match="time_factor is 1000: give a number near 1"):
+        read(path, inputs=names[0], outputs=names[1], time_factor=1000)
+
+
+def test_the_measured_log_has_such_stamps(data):
+    remarks = propose(data / "crazyflie_rollpitch/log15", axis="roll").setup.remarks
+    assert any("85/84 of 1000 Hz" in each for each in remarks)

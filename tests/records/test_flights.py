@@ -1,12 +1,22 @@
 """Several flights in one file, and the part of a log in which the vehicle flies."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from blackbox_rows import clock
 
-from jaxquad.records import flights, propose, read, read_settings, Record, RecordError
+from jaxquad.records import (
+    flights,
+    propose,
+    read,
+    read_settings,
+    Record,
+    RecordError,
+    RecordWarning,
+)
 from jaxquad.records.formats import load_log
 from jaxquad.records.formats._betaflight_header import with_derived
 from jaxquad.records.proposals._betaflight import betaflight_setup
@@ -15,7 +25,8 @@ from jaxquad.records.proposals._flown_span import flown_span, in_flight
 from jaxquad.records.proposals._hold import command_hold
 from jaxquad.spectra import frequency_response, JointInputOutput
 from jaxquad.workflows import autopilot, AutopilotSettings, IdentifySettings, SettingsError
-from jaxquad.workflows._log import open_logs
+from jaxquad.workflows._log import open_logs, propose_settings, read_logs
+from jaxquad.workflows._stored import _with_throttle
 
 
 FIRMWARE = "betaflight_firmware"
@@ -271,3 +282,24 @@ def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data)
     ]  # fmt: skip
     (a, b), error = (np.asarray(x.response).ravel() for x in both), both[1].random_error
     np.testing.assert_array_less(np.abs(a / b - 1), 3 * np.asarray(error).ravel())
+
+
+def test_a_gap_that_is_allowed_is_allowed_for_the_spectrum_over_the_throttle(
+    tmp_path, without_type_checks
+):
+    time = np.arange(20_000) / 1000
+    wave = 50 * np.sin(20 * time)
+    columns = {
+        "loopIteration": np.arange(20_000), "time (us)": np.round(1e6 * time), "axisP[0]": wave,
+        "gyroADC[0] (deg/s)": wave, "setpoint[0]": wave, "setpoint[3]": 300 + 100 * np.sin(time),
+    }  # fmt: skip
+    kept = (time < 9) | (time > 9.08)
+    path, table = tmp_path / "log.csv", np.column_stack(list(columns.values()))[kept]
+    np.savetxt(path, table, fmt="%.9g", delimiter=", ", header=", ".join(columns), comments="")
+    settings, proposal = propose_settings(path, IdentifySettings(axis="roll", max_gap=0.1))
+    with pytest.warns(RecordWarning, match="gaps filled"):
+        records = read_logs([path], settings)
+    opened: Any = SimpleNamespace(path=path, settings=settings, proposal=proposal, records=records)
+    both = _with_throttle(opened)
+    assert both is not None and both.samples == records[0].samples
+    assert both.input_names[1] == "throttle"

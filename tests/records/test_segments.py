@@ -1,9 +1,11 @@
 """Weighted sums and powers of channels, and several segments of a file at once."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from jaxquad.records import parse_mix, read_segments, RecordError
+from jaxquad.records import parse_mix, read_segments, RecordError, RecordWarning
 
 
 MIX = {"M": {"w": 0.5, "w^2": 2.0}}
@@ -85,3 +87,55 @@ def test_segments_of_different_jitter_come_to_one_rate(tmp_path):
         tmp_path / "drift.npz", [(0, 0.98), (10, 10.98)], inputs=one("u"), outputs=one("y")
     )
     assert first.dt == pytest.approx(second.dt, rel=1e-12) == pytest.approx(0.01)
+
+
+def with_dropouts(path, *gaps, rate=500.0, **changed):
+    """20 s of a sine and its integral, with rows missing between times in s."""
+    time = np.arange(int(20 * rate)) / rate
+    lost = np.any([(time > a) & (time < b) for a, b in gaps], axis=0)
+    columns = {"u": np.cos(3 * time), "y": np.sin(3 * time) / 3} | changed
+    np.savez(path, t=time[~lost], **{k: v[~lost] for k, v in columns.items()})
+    return path
+
+
+CHANNELS: dict[str, Any] = {"inputs": {"u": {"u": 1.0}}, "outputs": {"y": {"y": 1.0}}}
+
+
+def test_a_record_is_cut_at_a_dropout_and_all_of_it_is_used(tmp_path):
+    path = with_dropouts(tmp_path / "log.npz", (8.0, 8.066))
+    said = r"one place, for up to 66 ms at t = 8 s: the record is cut there into 2 segments"
+    with pytest.warns(RecordWarning, match=said):
+        records = read_segments(path, [(None, None)], **CHANNELS)
+    assert [x.time[0] for x in records] == pytest.approx([0.0, 8.066])
+    assert [x.time[-1] for x in records] == pytest.approx([8.0, 19.998])
+    for record in records:
+        truth = np.sin(3 * record.time) / 3
+        np.testing.assert_allclose(record.outputs[:, 0], truth, atol=1e-9)
+
+
+def test_a_dropout_that_is_allowed_is_bridged(tmp_path):
+    path = with_dropouts(tmp_path / "log.npz", (8.0, 8.066))
+    with pytest.warns(RecordWarning, match="gaps filled by interpolation"):
+        [record] = read_segments(path, [(None, None)], max_gap=0.07, **CHANNELS)
+    assert record.duration == pytest.approx(19.998)
+
+
+def test_parts_too_short_for_a_record_are_left_out_and_segments_are_cut_too(tmp_path):
+    path = with_dropouts(tmp_path / "log.npz", (5.0, 5.1), (5.6, 5.7), (12.0, 12.2))
+    with pytest.warns(RecordWarning, match="in 2 places|in one place, for up to 200 ms"):
+        records = read_segments(path, [(1, 10), (11, 19)], **CHANNELS)
+    spans = [(x.time[0], x.time[-1]) for x in records]
+    np.testing.assert_allclose(spans, [(1, 5), (5.7, 10), (11, 12), (12.2, 19)], atol=2e-3)
+
+
+def test_a_log_full_of_gaps_is_refused_with_its_first_one(tmp_path):
+    gaps = [(a, a + 0.1) for a in np.arange(0.5, 19, 0.5)]
+    with pytest.raises(RecordError, match="has a gap of 100 ms from t = 0.5 s"):
+        read_segments(with_dropouts(tmp_path / "log.npz", *gaps), [(None, None)], **CHANNELS)
+
+
+def test_a_missing_value_is_no_gap_in_time(tmp_path):
+    holed = np.where(np.arange(10_000) == 40, np.nan, 1.0)
+    path = with_dropouts(tmp_path / "log.npz", (8.0, 8.1), u=holed)
+    with pytest.raises(RecordError, match="channel 'u' is nan at sample 40"):
+        read_segments(path, [(None, None)], **CHANNELS)

@@ -166,6 +166,7 @@ _CODED_TOGETHER = {6: _flagged, 7: _three, 8: _four_nibbles, 10: _three_variable
 
 
 BLOCK = 1 << 20  # bytes decoded at a time
+STRAY = 8  # bytes between two frames behind which both may be intact
 _NUMBERS = 1 << 22  # decoded at a time, wherever a frame may begin
 
 
@@ -199,6 +200,7 @@ class _Piece(NamedTuple):
     stop: int
     places: Int[np.ndarray, " places"]
     ends: Int[np.ndarray, " places"]  # -1 where no letter of a frame follows
+    reach: Int[np.ndarray, " places"]  # the same whatever follows; -1 for a number too long
     coded: dict[str, Frames]  # by letter, I and P together under M
 
 
@@ -253,9 +255,10 @@ def _piece(data: bytes, header: Header, at: int) -> _Piece:
     follows[header.stop - at :] = False
     if header.stop - at < raw.size:
         follows[header.stop - at] = True
+    reach = np.where(ends >= 0, ends + at, -1)
     ends = np.where((ends >= 0) & follows[np.maximum(ends, 0)], ends + at, -1)
     moved = {letter: f._replace(offsets=f.offsets + at) for letter, f in coded.items()}
-    return _Piece(stop, places + at, ends, moved)
+    return _Piece(stop, places + at, ends, reach, moved)
 
 
 def _decoded(
@@ -285,7 +288,7 @@ def _walk(
     letters = {ord(letter) for letter in (*header.frames, "E")}
     path, rank = [], bisect_left(places, at)
     while rank < len(places):
-        if places[rank] > at:
+        if skipped := places[rank] > at:
             _damaged(result.damage, at, places[rank])
         begin = rank
         while (after := following[rank]) >= 0:
@@ -298,6 +301,11 @@ def _walk(
         if noted and noted.name == LOG_END:
             result.events.append(noted)
             return header.stop, _mask(path, len(places))
+        resumed = None if skipped and rank == begin else _behind_key(data, piece, following, rank)
+        if resumed is not None:
+            path.append(rank)
+            at, rank = int(piece.reach[rank]), resumed
+            continue
         rank += 1
         if noted and (noted.end == header.stop or data[noted.end] in letters):
             result.events.append(noted)
@@ -307,6 +315,18 @@ def _walk(
         _damaged(result.damage, at, piece.stop)
         at = piece.stop
     return at, _mask(path, len(places))
+
+
+def _behind_key(data: bytes, piece: _Piece, following: list[int], rank: int) -> int | None:
+    """Where frames go on behind an I frame that a few stray bytes follow; None where they do not.
+
+    The I frame begins where the frame before it ends.
+    """
+    end = int(piece.reach[rank])
+    if data[int(piece.places[rank])] != ord("I") or end < 0:
+        return None
+    first, last = np.searchsorted(piece.places, [end, end + STRAY + 1])
+    return next((k for k in range(first, last) if following[k] >= 0), None)
 
 
 def _mask(path: list[int], places: int) -> Bool[np.ndarray, " places"]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int, Integer
 
 from .._errors import ReadError
-from ._betaflight_frames import Damage, Event, Frames, RESUME
+from ._betaflight_frames import Damage, Event, Frames, RESUME, STRAY
 from ._betaflight_header import Frame, Header
 
 
@@ -25,7 +25,7 @@ class Segments(NamedTuple):
     begin: Int[np.ndarray, " segments"]  # row of the key frame
     size: Int[np.ndarray, " segments"]  # rows up to the next one
     usable: Int[np.ndarray, " segments"]  # rows before the first that damage makes unreadable
-    whole: Bool[np.ndarray, " segments"]  # no damage before the next one
+    whole: Bool[np.ndarray, " segments"]  # no frame was damaged before the next one
 
 
 def segments(main: Frames, header: Header, damage: list[Damage]) -> Segments:
@@ -35,8 +35,26 @@ def segments(main: Frames, header: Header, damage: list[Damage]) -> Segments:
     hit = hits[np.searchsorted(hits, main.offsets[begin])]
     intact = np.searchsorted(main.offsets, hit) - begin
     whole = intact >= size
+    whole[:-1] &= hit[:-1] >= main.offsets[begin[1:]]  # none between the last frame and the next
+    whole |= _complete(main, header, damage, begin, size)
     usable = np.where(whole, size, np.maximum(intact - _DOUBTFUL, 0))
     return Segments(begin, size, np.minimum(usable, scheduled(header).size), whole)
+
+
+def _complete(
+    main: Frames, header: Header, damage: list[Damage],
+    begin: Int[np.ndarray, " segments"], size: Int[np.ndarray, " segments"],
+) -> Bool[np.ndarray, " segments"]:  # fmt: skip
+    """Whether a segment has all its frames although a few stray bytes stand between them."""
+    complete = np.zeros(begin.size, bool)
+    if not damage or not begin.size:
+        return complete
+    segment = np.searchsorted(main.offsets[begin], [d.offset for d in damage], "right") - 1
+    lost = np.zeros(begin.size, np.int64)
+    np.add.at(lost, segment[segment >= 0], np.array([d.size for d in damage])[segment >= 0])
+    iteration = np.ascontiguousarray(main.coded[begin, 0])
+    complete[:-1] = elapsed(iteration) == header.interval
+    return complete & (size == scheduled(header).size) & (lost <= STRAY)
 
 
 def scheduled(header: Header) -> Int[np.ndarray, " logged"]:

@@ -12,6 +12,7 @@ from ._flights import choose_flight
 from ._flown_span import in_flight
 from ._proposal import (
     AXES,
+    channel_rate,
     complete,
     first_logged,
     most_active_axis,
@@ -50,6 +51,7 @@ def crazyflie_setup(log: Log, axis: str | None) -> Setup:
         "for an external reference, log a signal that your own code injects, and name it with "
         "--reference",
     ]
+    remarks += _slow_stamps(signals, found[axis])
     target = next(
         (f"{p}ctrltarget.{axis}" for p in prefixes if moves(signals, f"{p}ctrltarget.{axis}")), ""
     )
@@ -64,6 +66,24 @@ def crazyflie_setup(log: Log, axis: str | None) -> Setup:
             "powers (--input 'NAME=0.1*a^2')"
         )
     return Setup(axis, command, found[axis], remarks=tuple(remarks))
+
+
+_SLOW_STAMPS = 85 / 84  # by which rates of the micro-SD deck's stamps are too high
+_NOMINAL = (50, 100, 125, 200, 250, 333.333, 400, 500, 800, 1000)  # Hz
+_NEAR = 0.004  # events come late or are lost
+
+
+def _slow_stamps(signals: Signals, rate: str) -> list[str]:
+    """A remark where the rate of the log is that of stamps which run 84/85 slow."""
+    hertz = channel_rate(signals, rate)
+    nominal = next((x for x in _NOMINAL if abs(hertz / x / _SLOW_STAMPS - 1) < _NEAR), None)
+    if nominal is None:
+        return []
+    return [
+        f"the time stamps say {hertz:.5g} Hz, 85/84 of {nominal:.6g} Hz: firmware before August "
+        f"2026 wrote them that much slow, so that the gain to a rate is 1.2 % too high, lag and "
+        f"delay 1.2 % too short. Where the log is of such firmware, --time-factor 1.0119 corrects it"
+    ]
 
 
 def _rate(signals: Signals, prefix: str, axis: str) -> str:

@@ -17,7 +17,7 @@ from jaxquad.records import (
     AXES,
     channels,
     Proposal,
-    read,
+    read_segments,
     ReadError,
     Record,
     RecordError,
@@ -302,7 +302,10 @@ def _span(settings: IdentifySettings) -> Span:
 
 
 def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, Record]:
-    """For each channel that the log has the record of its table, on that table's clock."""
+    """For each channel that the log has the record of its table, on that table's clock.
+
+    Where samples are missing it is the longest part without a gap.
+    """
     tables: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
         if name in log.names:
@@ -311,13 +314,14 @@ def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, R
     found: dict[str, Record] = {}
     for group in tables.values():
         first = {"the first one": {group[0]: 1.0}}  # a record has an input
+        outputs = {name: {name: 1.0} for name in group}
         try:
             with warnings.catch_warnings():  # of axes that rest
                 warnings.simplefilter("ignore", RecordWarning)
-                record = read(log.path, inputs=first, outputs=group, start=span[0], stop=span[1])
+                parts = read_segments(log.path, [span], inputs=first, outputs=outputs)
         except RecordError:  # too few samples in this span, or missing ones
             continue
-        found |= dict.fromkeys(group, record)
+        found |= dict.fromkeys(group, max(parts, key=lambda part: part.samples))
     return found
 
 
