@@ -45,6 +45,8 @@ class FlightChannels:
     - `axis`: 0 for roll; `start`: the time of the first sample in s.
     - `terms`: "P", "I", "D" and "F" of the axis, in the firmware's units, on `dt`; `output`: what
         the law gave, with an injection into the mixer; `injected`: that alone.
+    - `not_carried`: what the motors made of the law's output, less that output within its limit;
+        None where the log does not show it.
     - `reference`: what no feedback computes, where the log has it beside the set-point.
     - `motors`: a column each, on `dt`; `motor_ends`: lowest and highest command.
     - `throttle`: 0 to 1, on `dt`; `stick`: likewise what the filters and TPA follow, where that is
@@ -68,6 +70,7 @@ class FlightChannels:
     terms: Mapping[str, Samples] = dataclasses.field(default_factory=dict)
     output: Samples | None = None
     injected: Samples | None = None
+    not_carried: Samples | None = None
     reference: Samples | None = None
     motors: Float[np.ndarray, "samples motors"] | None = None
     motor_ends: tuple[float, float] = (0.0, 1.0)
@@ -141,7 +144,7 @@ def read_channels(
     throttle, injected = proposal.setup.throttle, _injected(proposal)
     wanted = [*names.filtered, *names.unfiltered, *names.terms, *names.motors, names.setpoint]
     external = proposal.setup.reference
-    wanted += [*names.output, *names.stick, *injected, external]
+    wanted += [*names.output, *names.stick, *names.mixed, *injected, external]
     found = _read(log, [*wanted, *throttle], _span(settings))
     rates, rate = found.get(names.filtered[axis]), names.filtered[axis]
     if rates is None or names.setpoint not in found:
@@ -166,6 +169,7 @@ def read_channels(
             for key, name in zip(_TERMS, names.terms, strict=False) if name in found
         },
         output=sum_at(names.output), injected=sum_at(injected),
+        not_carried=_not_carried(sum_at(names.output), sum_at(names.mixed), axis, values),
         reference=None if injected or external == names.setpoint or external not in found
         else at_rate(external),
         motors=np.stack([at_rate(x) for x in motors], axis=1) if motors else None,
@@ -218,6 +222,7 @@ class _Names(NamedTuple):
     motors: Sequence[str]
     output: Mapping[str, float]
     stick: Mapping[str, float] = MappingProxyType({})
+    mixed: Mapping[str, float] = MappingProxyType({})
 
 
 def _betaflight_names(prefix: str, axis: int) -> _Names:
@@ -229,6 +234,7 @@ def _betaflight_names(prefix: str, axis: int) -> _Names:
         [f"{prefix}motor[{k}]" for k in range(8)],
         {f"{prefix}axisSum[{axis}]": 1.0},
         {f"{prefix}rcCommand[3]": 1.0},
+        {f"{prefix}axisMixed[{axis}]": 1.0},
     )
 
 
@@ -367,6 +373,16 @@ def _stick(
     if command is None or firmware != "betaflight" or float(values.get("throttle_limit_type", 0)):
         return None
     return np.clip((command - 1000) / 1000, 0.0, 1.0)
+
+
+def _not_carried(
+    output: Samples | None, mixed: Samples | None, axis: int, values: Mapping[str, str]
+) -> Samples | None:
+    if output is None or mixed is None:
+        return None
+    name, usual = ("pidsum_limit_yaw", 400.0) if axis == 2 else ("pidsum_limit", 500.0)
+    limit = _number(values, name, usual)
+    return mixed - np.clip(output, -limit, limit)
 
 
 def _resolution(firmware: Firmware, values: Mapping[str, str]) -> tuple[float, float]:

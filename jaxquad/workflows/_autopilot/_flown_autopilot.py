@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxquad._core import Number
 from jaxquad.control.autopilots import change_filters, Firmware, flown_loop, FlownLoop
+from jaxquad.identify import KnownFilter, MeasuredChain
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
 from .._tune_settings import AutopilotSettings
@@ -23,7 +24,8 @@ class FlownAutopilot:
     `loop` is the law with what moves in flight, `law` that at one throttle. `values` are the log's
     own parameters, `throttle` is where Betaflight's dynamic filters and TPA and ArduPilot's notches
     are taken, and `tracked_hz` what other notches of the latter followed. `angle` is the angle loop
-    around the rate loop, None where the firmware has none.
+    around the rate loop, None where the firmware has none. `filters` are those of the gyro, by the
+    parameters, or as measured where the law lacks some of them; `filters_text` says which.
     """
 
     firmware: Firmware
@@ -37,6 +39,13 @@ class FlownAutopilot:
     throttle: float = 0.3
     tracked_hz: Mapping[int, Sequence[float]] = dataclasses.field(default_factory=dict)
     angle: AngleLoop | None = None
+    filters: tuple[KnownFilter, ...] = ()
+    filters_text: str = ""
+
+    @property
+    def measured(self) -> tuple[KnownFilter, ...] | None:
+        """The gyro's filters as measured; None where they are those of the law."""
+        return self.filters if any(isinstance(x, MeasuredChain) for x in self.filters) else None
 
     def with_filters(self, parameters: Mapping[str, Number]) -> RateLaw:
         """The law as it is read from a log with these cutoffs and notches."""

@@ -25,7 +25,6 @@ from .._identify import Identification
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._law_check import LawCheck
-from ._rate_gains import gyro_chains
 
 
 _CLOSE = 0.1  # relative misfit of the closed loop up to which plants are believed
@@ -159,18 +158,19 @@ def check_loop(
 ) -> LoopCheck:
     """Fly the loop again on the excitation that the log holds."""
     forward, injected = flight.terms.get("F"), flight.injected
+    added = flight.not_carried if injected is None else injected
     again, _ = fly_again(
         pick_axis(flown.loop, flown.axis), plant_of(found.fit, _unit(found)), flight.setpoint,
-        flight.followed, dt=flight.dt, late=law.late, feed_forward=forward, injected=injected,
+        flight.followed, dt=flight.dt, late=law.late, feed_forward=forward, injected=added,
     )  # fmt: skip
     drive = flight.setpoint if injected is None else injected
     response = _responses(found, flight, drive, again)
     omega = np.asarray(response.omega)
     both = np.asarray(response.response)[:, :, 0]
-    passed = filter_response(gyro_chains(flown.law), omega)
+    passed = filter_response(flown.filters, omega)
     used = np.asarray(usable(response, None, _COHERENT))[:, 0, 0]
     part, time = _liveliest(drive, flight.dt), flight.start + flight.dt * np.arange(len(drive))
-    chain = _filtered(again, found, flown, flight.dt)
+    chain = _filtered(again, flown, flight.dt)
     return LoopCheck(
         law, omega, both[:, 0], np.asarray(response.random_error)[:, 0, 0], both[:, 1] * passed,
         used & np.isfinite(both).all(axis=1), float(np.mean(flight.limited)),
@@ -217,9 +217,9 @@ def _liveliest(drive: Samples, dt: float) -> slice:
     return slice(start, start + size)
 
 
-def _filtered(again: Samples, found: Identification, flown: FlownAutopilot, dt: float) -> Samples:
+def _filtered(again: Samples, flown: FlownAutopilot, dt: float) -> Samples:
     """Through the gyro's filters, as the log has it."""
     omega = 2 * np.pi * np.fft.rfftfreq(2 * len(again), dt)
     limited = np.minimum(omega, 0.499 * 2 * np.pi / flown.law.dt)
-    passed = filter_response(gyro_chains(flown.law), limited)
+    passed = filter_response(flown.filters, limited)
     return np.fft.irfft(np.fft.rfft(again, 2 * len(again)) * passed, 2 * len(again))[: len(again)]

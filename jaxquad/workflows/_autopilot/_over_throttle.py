@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from jaxquad.identify import (
     FirmwareValue,
     gain_over_throttle,
     GainOverThrottle,
+    KnownFilter,
     throttle_levels,
     ThrottleLevels,
     UndeterminedError,
@@ -26,7 +27,6 @@ from .._identify import Identification
 from .._log import read_records
 from ._flown_autopilot import FlownAutopilot
 from ._plants import PlantSource
-from ._rate_gains import gyro_chains
 
 
 _PARAMETERS: Mapping[Firmware, str] = {
@@ -101,9 +101,12 @@ class ThrottleVerdict:
         low, high = self.span
         return () if self.gains is None else (low, (low + high) / 2, high)
 
-    def plants(self, found: Identification) -> PlantSource:
-        """What plants are drawn from."""
-        return PlantSource(found.fit, found.records[0].output_units[0], self.gains, self.span)
+    def plants(
+        self, found: Identification, measured: Sequence[KnownFilter] | None = None
+    ) -> PlantSource:
+        """What plants are drawn from, behind the gyro's filters as `measured`."""
+        unit = found.records[0].output_units[0]
+        return PlantSource(found.fit, unit, self.gains, self.span, measured)
 
     @property
     def table(self) -> str:
@@ -146,7 +149,7 @@ def study_throttle(
     announce("the gain over the throttle")
     try:
         gains = gain_over_throttle(
-            records, filters=gyro_chains(flown.law), flown_curve=parameter.curve,
+            records, filters=flown.filters, flown_curve=parameter.curve,
             band=_band(found, levels),
         )  # fmt: skip
         span = float(gains.low.min()), float(gains.high.max())

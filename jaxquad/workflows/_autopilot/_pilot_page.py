@@ -16,7 +16,7 @@ from jaxquad.report import Cell, Headline, PilotPage, Provenance, reason_of, Tab
 from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
 from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, RateLaw
-from ._stages import Stage
+from ._stages import margin_text, Stage
 
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ def _stage_rows(found: "AutopilotProposal") -> Table:
     rows: list[list[str | Cell]] = [
         [
             name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
-            f"{x.crossover / (2 * np.pi):.1f}", f"{1e3 * x.delay_margin:.1f}",
+            f"{x.crossover / (2 * np.pi):.1f}", margin_text(x),
             f"{x.rejection:.2f}", f"{x.noise:.2f}", *_further(x),
             *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
         ]

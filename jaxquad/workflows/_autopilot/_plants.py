@@ -1,12 +1,13 @@
 """The plants that a log leaves possible: drawn from one fit, or from the gain over the throttle."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad.identify import draw_models, Fit, GainOverThrottle
+from jaxquad.identify import draw_models, filter_response, Fit, GainOverThrottle, KnownFilter
 
 from ._angle_loop import AngleLoop
 from ._rate_gains import (
@@ -38,12 +39,14 @@ class PlantSource:
     - `fit`: up to what the gyro's filters are given, in `unit`.
     - `over`: the gain over the throttle, whose plants take the place of those of `fit`.
     - `span`: the lowest and the highest throttle of these.
+    - `filters`: of the gyro, as measured; None takes those of the law.
     """
 
     fit: Fit
     unit: str
     over: GainOverThrottle | None = None
     span: tuple[float, float] = (0.0, 1.0)
+    filters: Sequence[KnownFilter] | None = None
 
     @property
     def damping(self) -> float:
@@ -64,7 +67,8 @@ class PlantSource:
         if omega is None:
             omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
         back, ahead = law_paths(law, axis, omega)
-        passed = gyro_chain_response(law, omega)
+        chain = gyro_chain_response(law, omega)
+        passed = chain if self.filters is None else filter_response(self.filters, omega)
         gain, lag, delay, damping = self._drawn(count, seed, throttle)
         if np.any(gain <= 0):
             raise ValueError(
@@ -76,7 +80,7 @@ class PlantSource:
         plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt, damping)
         white = cells_of(omega) * np.abs(passed) ** 2
         return RateLoops(
-            omega, back, ahead, plants * passed, white, passed, ceiling_of(law, axis),
+            omega, back, ahead, plants * passed, white, passed, ceiling_of(law, axis), chain,
             is_relaxed(law, axis), forward_path(law, axis, omega),
             None if angle is None else angle.path(omega),
         )  # fmt: skip

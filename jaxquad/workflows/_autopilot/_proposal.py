@@ -23,7 +23,7 @@ from ._pilot_page import pilot_page
 from ._plants import PlantSource
 from ._proposed_parameters import ProposedParameters
 from ._rate_design import FilterVerdict, Kind
-from ._stages import OuterStage, Stage
+from ._stages import margin_text, OuterStage, Stage
 
 
 _CURVE = "thrust_curve"
@@ -70,8 +70,9 @@ class AutopilotProposal:
         """What the log leaves possible."""
         found = self.identification
         if self.throttle is not None:
-            return self.throttle.plants(found)
-        return PlantSource(found.fit, found.records[0].output_units[0])
+            return self.throttle.plants(found, self.flown.measured)
+        unit = found.records[0].output_units[0]
+        return PlantSource(found.fit, unit, filters=self.flown.measured)
 
     @property
     def old(self) -> dict[str, float]:
@@ -85,6 +86,8 @@ class AutopilotProposal:
     def parameters(self) -> ProposedParameters:
         """Old and new values by the firmware's names."""
         at_once = () if self.filters is None else self.filters.at_once
+        if self.stages and self.stages[1].stable < 1:
+            at_once = tuple(self.new)
         return ProposedParameters(
             self.flown.firmware, self.flown.version, self.old, dict(self.new), self._reasons,
             at_once,
@@ -131,6 +134,7 @@ class AutopilotProposal:
             "axis": AXES[self.flown.axis],
             "flown": dict(self.flown.parameters),
             "unmodelled": self.flown.unmodelled,
+            "gyro_filters": self.flown.filters_text,
             "old": self.old,
             "new": dict(self.new),
             "stages": [stage.content() for stage in self.stages],
@@ -203,6 +207,7 @@ class AutopilotProposal:
         lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
         lines += [f"  not modelled: {each}" for each in flown.unmodelled]
+        lines += [f"  {flown.filters_text}"] if flown.filters_text else []
         plant = "plant up to the gyro's filters, in the firmware's units"
         lines += ["", f"{plant}:\n{self.identification.fit}"]
         again = self.reproduction
@@ -261,7 +266,7 @@ def _stage_table(stages: tuple[Stage, ...]) -> str:
     for name, stage in zip(_WAYS, stages, strict=False):
         row = (
             f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
-            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {1e3 * stage.delay_margin:9.1f} ms "
+            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {margin_text(stage):>9} ms "
             f"{stage.rejection:8.2f} {stage.noise:7.2f}"
         )
         row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"

@@ -39,6 +39,7 @@ _ALLOWED = 1.03  # of a limit that the search kept on the ratio of filters, for 
 _CERTIFICATES = 3  # at most: the worst plants of one that fails are tuned on, too
 _WORST = 16
 _HARD = 14  # plants of a search with filters
+_NEARLY = 1.05  # of the limit of the resonance, which a third of the way may reach without a word
 _ANGLES, _RESERVE = 25, 0.98  # gains of the angle loop that are tried; of its limits
 
 
@@ -96,12 +97,14 @@ def design_gains(
 
     With `filters` that another axis has changed, these stay, and gains alone are searched.
     """
-    work = _Work(settings, found, flown, throttle)
+    swings = 0.0 if flight is None else float(np.mean(flight.limited))
+    work = _Work(settings, found, flown, throttle, swings=swings)
     noise, why = _noise_of(settings, flown, flight, work)
     if filters:
-        return _design_behind(dataclasses.replace(work, noise=noise), filters)
+        return _design_behind(dataclasses.replace(work, noise=noise), filters, swings)
     work = dataclasses.replace(work, noise=noise)
-    loops, targets = work.loops(settings.members, 0), work.targets
+    loops = work.loops(settings.members, 0)
+    targets = work.targets(loops)
     bank = work.bank(loops)
     if noise is not None and bank is None:
         why = "the firmware's filters are off, so there is none to change"
@@ -122,25 +125,30 @@ def design_gains(
             if filters:
                 design = work.certified(fresh, parameters_of(flown.law, flown.axis, both), filters)
             design, verdict = _compared(work, plain, design, bank, noise)
-        kind, text = _judge(design.stages, settings, found.band[1], verdict.shared, throttle)
+        kind, text = _judge(
+            design.stages, settings, found.band[1], verdict.shared, throttle, swings
+        )
         if kind != "not to be flown":
             break
         loops = loops.joined(design.loops[-1].worst(design.gains[-1][None], _WORST))
     return Design(kind, text, design.stages, design.new, verdict, noise)
 
 
-def _design_behind(work: "_Work", filters: Mapping[str, float]) -> Design:
+def _design_behind(work: "_Work", filters: Mapping[str, float], swings: float) -> Design:
     """Gains alone, behind filters that another axis has changed."""
     flown, settings = work.flown, work.settings
     loops, gains = work.loops(settings.members, 0), None
     for attempt in range(1, _CERTIFICATES + 1):
         behind = work.filtered(loops, filters)
         announce(f"searching gains on {len(loops.plants)} plants")
-        search = Search(behind, work.before, work.targets, flown.firmware, flown.axis, None, loops)
+        search = Search(
+            behind, work.before, work.targets(loops), flown.firmware, flown.axis, None, loops
+        )
         gains = search.gains(gains)
         parameters = parameters_of(flown.law, flown.axis, gains)
         design = work.certified(work.fresh(attempt), parameters, filters)
-        kind, text = _judge(design.stages, settings, work.found.band[1], None, work.throttle)
+        edge = work.found.band[1]
+        kind, text = _judge(design.stages, settings, edge, None, work.throttle, swings)
         if kind != "not to be flown":
             break
         loops = loops.joined(work.fresh(attempt).worst(design.gains[-1][None], _WORST))
@@ -165,17 +173,20 @@ class _Work:
     flown: FlownAutopilot
     throttle: ThrottleVerdict
     noise: GyroNoise | None = None
+    swings: float = 0.0
 
     @property
     def before(self) -> np.ndarray:
         """The gains that flew."""
         return gains_of(self.flown.law, self.flown.axis)
 
-    @property
-    def targets(self) -> Targets:
+    def targets(self, loops: RateLoops) -> Targets:
+        """What is kept; gains that made a loop swing may be left further than others."""
         kept = self.settings
+        stable = float(np.mean(loops.qualities(self.before[None]).stable))
+        far = 2 if stable < _BELIEVED and self.swings > _SWINGING else 1
         return Targets(
-            kept.sensitivity, kept.resonance, kept.noise, kept.change, self.found.band[1]
+            kept.sensitivity, kept.resonance, kept.noise, kept.change**far, self.found.band[1]
         )
 
     def loops(self, count: int, seed: int) -> RateLoops:
@@ -196,7 +207,10 @@ class _Work:
         return grouped(self._groups(self.settings.fresh, attempt))
 
     def _groups(self, count: int, seed: int) -> list[RateLoops]:
-        source, seed = self.throttle.plants(self.found), self.settings.seed + seed
+        source, seed = (
+            self.throttle.plants(self.found, self.flown.measured),
+            self.settings.seed + seed,
+        )
         places = self.throttle.certified or (None,)
         groups = [
             source.loops(each.law, each.axis, count, seed, throttle=throttle, angle=each.angle)
@@ -364,6 +378,7 @@ def _compared(
     return both, FilterVerdict(text, flown, reason, switched(flown), alone, shared)
 
 
+_SWINGING = 0.1  # of a flight with a motor at its limit, from which the motors bound a swing
 _BELIEVED = 0.5  # share of plants on which the loop that flew has to be stable
 
 
@@ -373,8 +388,12 @@ def _judge(
     edge: float,
     shared: SharedChange | None,
     throttle: ThrottleVerdict,
+    swings: float = 0.0,
 ) -> tuple[Kind, str]:
+    """The verdict; `swings` is the share of the flight with a motor at its limit."""
     flown, third, whole = stages
+    bounded = flown.stable < _BELIEVED and swings > _SWINGING  # by the motors alone
+    third = whole if bounded else third
     beyond = beyond_limits(flown, third, whole, settings, edge, loud=_ALLOWED)
     if shared is not None and shared.noise > _ALLOWED * settings.noise:
         beyond.append(
@@ -383,7 +402,7 @@ def _judge(
         )
     if whole.angle is not None and whole.angle.closed:
         beyond += beyond_angle(whole.angle, settings)
-    if beyond and flown.stable < _BELIEVED:
+    if beyond and flown.stable < _BELIEVED and not bounded:
         return "cannot tell", (
             "this log cannot tell: the loop flew, but with the gains that flew it is stable on "
             f"{100 * flown.stable:.1f} % only of the plants within the error bars, so most of "
@@ -408,6 +427,13 @@ def _judge(
             f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
             f"{plants} is {flown.peak:.2f}"
         )
+    if bounded:
+        return "proposed", (
+            f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most {limit:g}"
+            f"{_around(flown, whole)}. What flew is stable on {100 * flown.stable:.0f} % of them: "
+            f"it swung between the motors' limits ({100 * swings:.0f} % of the flight). A third of "
+            "the way would swing, too, so both files hold all of it: hover low with it first"
+        )
     return "proposed", (
         f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most "
         f"{limit:g}, {better}{_around(flown, whole)}. {_first(flown, third, settings)}"
@@ -426,7 +452,8 @@ def _around(flown: Stage, whole: Stage) -> str:
 
 def _first(flown: Stage, third: Stage, settings: AutopilotSettings) -> str:
     """How to go on; a third of the way from a bad loop may be beyond the limits, too."""
-    if third.peak <= settings.sensitivity and third.resonance <= settings.resonance:
+    near = third.resonance <= _NEARLY * settings.resonance
+    if third.peak <= settings.sensitivity and near:
         return "Load the file for a third of the way first"
     return (
         f"The file for a third of the way is beyond the limits (worst Ms {third.peak:.2f}, peak "

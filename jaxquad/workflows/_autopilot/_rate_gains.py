@@ -78,7 +78,8 @@ class RateLoops:
     - `ahead`: likewise from the set-point to the command.
     - `plants`: from the command to the logged rate in rad/s, the hold included.
     - `noise`: power of the logged rate's noise around each frequency, behind the flown filters.
-    - `passed`: response of the gyro's filters that flew.
+    - `passed`: response of the gyro's filters that flew, as measured where the log shows more than
+        the law has; `chain`: as the law has them.
     - `ceiling`: by which factor D can rise in flight (D_MAX); 1 where it cannot.
     - `relaxed`: whether the integral can be held in flight, as Betaflight's iterm_relax does.
     - `forward`: response of the law's feed-forward, from the set-point to the command.
@@ -94,6 +95,7 @@ class RateLoops:
     noise: Float[np.ndarray, " frequencies"]
     passed: Complex[np.ndarray, " frequencies"]
     ceiling: float = 1.0
+    chain: Complex[np.ndarray, " frequencies"] | None = None
     relaxed: bool = False
     forward: Complex[np.ndarray, " frequencies"] | None = None
     angle: Complex[np.ndarray, " frequencies"] | None = None
@@ -110,7 +112,8 @@ class RateLoops:
         Without those beside.
         """
         back, ahead = law_paths(law, axis, self.omega)
-        changed = gyro_chain_response(law, self.omega) / self.passed
+        before = self.passed if self.chain is None else self.chain
+        changed = gyro_chain_response(law, self.omega) / before
         return dataclasses.replace(
             self, feedback=back * changed, ahead=ahead, forward=forward_path(law, axis, self.omega),
         )  # fmt: skip

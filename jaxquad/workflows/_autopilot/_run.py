@@ -7,6 +7,7 @@ from pathlib import Path
 from jaxquad._core import announce
 from jaxquad.records import AXES, Proposal
 
+from .._flown_law import best_filters
 from .._identify import identify_plant
 from .._kinds import SettingsError
 from .._log import propose_settings
@@ -104,7 +105,7 @@ def _tune_axis(
     """The gains of one axis, with `filters` that are changed already."""
     announce("gains and filters that flew")
     flown, flight = _read_flight(path, asked, proposal, settings)
-    plant = identify_plant(path, asked, proposal, gyro_chains(flown.law))
+    plant = identify_plant(path, asked, proposal, flown.filters)
     known = (settings, plant, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
     recipe = what_to_fly(flown.firmware, AXES[flown.axis])
@@ -155,4 +156,7 @@ def _read_flight(
     if settings.throttle is None and flight is not None:
         settings = dataclasses.replace(settings, throttle=flight.middle)
     tracked = {} if flight is None else flight.tracked_hz
-    return read_flown(path, proposal, settings, tracked), flight
+    flown = read_flown(path, proposal, settings, tracked)
+    chains = tuple(each for each in gyro_chains(flown.law) if each.filters)
+    filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
+    return dataclasses.replace(flown, filters=filters, filters_text=text), flight

@@ -109,3 +109,8 @@ def certify_gains(
             found, parts, designs, held, margins, strict=True
         )
     ]
+
+
+def margin_text(stage: Stage) -> str:
+    """The least delay margin in ms; none of a loop that is not stable."""
+    return f"{1e3 * stage.delay_margin:.1f}" if stage.stable == 1 else "none"
