@@ -64,13 +64,13 @@ def _channels(options: argparse.Namespace) -> int:
         numbers = (f"{c.rate:.5g}", f"{c.start:.6g}", f"{c.stop:.6g}", f"{c.minimum:.4g}")
         rows.append((c.name, f"{c.samples}", *numbers, f"{c.maximum:.4g}", c.unit))
     print_table(rows)
-    if any(c.name.startswith("log1.") for c in found):
-        print("", *flights(options.file), "--flight N chooses one of them", sep="\n")
     if any(math.isnan(c.rate) for c in found):
         print(
             "\nnan: no time of that length is known, or its unit is not, or it goes back. Name "
             "it (--time), its unit (--time-unit), or give --dt."
         )
+    if any(c.name.startswith("log1.") for c in found):
+        print("", *flights(options.file), "--flight N chooses one of them", sep="\n")
     return 0
 
 

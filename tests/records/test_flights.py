@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from blackbox_rows import clock
 
+from jaxquad.cli import main
 from jaxquad.records import (
     flights,
     propose,
