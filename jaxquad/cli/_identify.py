@@ -50,7 +50,7 @@ def _add_channels(declared: argparse.ArgumentParser) -> None:
 
 
 def _channels(options: argparse.Namespace) -> int:
-    from jaxquad.records import channels
+    from jaxquad.records import channels, flights
 
     given = vars(options)
     time, unit, dt = given.get("time"), given.get("time_unit"), given.get("dt")
@@ -68,6 +68,8 @@ def _channels(options: argparse.Namespace) -> int:
             "\nnan: no time of that length is known, or its unit is not, or it goes back. Name "
             "it (--time), its unit (--time-unit), or give --dt."
         )
+    if any(c.name.startswith("log1.") for c in found):
+        print("", *flights(options.file), "--flight N chooses one of them", sep="\n")
     return 0
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from blackbox_rows import clock
 
+from jaxquad.cli import main
 from jaxquad.records import (
     flights,
     propose,
@@ -303,3 +304,10 @@ def test_a_gap_that_is_allowed_is_allowed_for_the_spectrum_over_the_throttle(
     both = _with_throttle(opened)
     assert both is not None and both.samples == records[0].samples
     assert both.input_names[1] == "throttle"
+
+
+def test_the_list_of_channels_ends_with_the_flights_of_a_file(joined, capsys):
+    path = joined("A_hover", "A_sticks")
+    assert main(["channels", str(path)]) == 0
+    *_, first, second, advice = capsys.readouterr().out.splitlines()
+    assert [first, second] == [str(each) for each in flights(path)] and "--flight N" in advice

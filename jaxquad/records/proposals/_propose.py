@@ -81,9 +81,9 @@ def _slow_stamps(signals: Signals, rate: str) -> list[str]:
         return []
     return [
         f"the time stamps say {hertz:.5g} Hz, 85/84 of {nominal:.6g} Hz: firmware before August "
-        f"2026 wrote them that much slow, so that the gain to a rate is 1.2 % too high, lag "
-        f"and delay 1.2 % too short. Where the log is of such firmware, --time-factor 1.0119 "
-        "corrects it"
+        f"2026 wrote them that much slow, so that the gain to a rate is 1.2 % too high, lag and "
+        f"delay 1.2 % too short. Where the log is of such firmware, --time-factor 1.0119 corrects "
+        f"it"
     ]
 
 
