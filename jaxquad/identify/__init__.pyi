@@ -23,6 +23,7 @@ from ._curves import (
     step_response as step_response,
     StepBand as StepBand,
 )
+from ._damped import fit_damped as fit_damped
 from ._derived import Tied as Tied
 from ._discrepancy import Discrepancy as Discrepancy
 from ._draw_models import (

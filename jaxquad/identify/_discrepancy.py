@@ -33,7 +33,7 @@ _NONE = 0.85  # the prior's mass at a discrepancy of zero
 _AMPLITUDES = 16
 _RANK = 16  # of a kernel over a band of two decades: 1 to 6 % of its variance is left, the fastest
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
-_FOLLOWS = 1.25  # factor by which such a width grows
+FOLLOWS = 1.25  # factor by which such a width grows
 
 
 Widths = Float[np.ndarray, " parameters"]
@@ -244,8 +244,8 @@ def describe_discrepancy(
     by_noise, with_one, with_other = (
         np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in (noise, noise + one, noise + other)
     )
-    widths = np.where(with_other > _FOLLOWS * with_one, "prior", "data")
-    widths = np.where(with_one < _FOLLOWS * by_noise, "noise", widths)
+    widths = np.where(with_other > FOLLOWS * with_one, "prior", "data")
+    widths = np.where(with_one < FOLLOWS * by_noise, "noise", widths)
     mixture = found[0]
     weight = mixture.powers / max(float(np.sum(mixture.powers)), 1e-300)
     length = float(np.exp(weight @ np.log(LENGTHS)))
