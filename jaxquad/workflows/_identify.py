@@ -16,12 +16,14 @@ from jaxquad.identify import (
     Explanation,
     factors,
     Fit,
+    fit_damped,
     KnownFilter,
     MISFIT,
     UndeterminedError,
     Verification,
     verify,
 )
+from jaxquad.models import LaggedIntegrator
 from jaxquad.records import (
     Proposal,
     Record,
@@ -350,7 +352,10 @@ def _identify(
     best, *others = ("joint", "direct") if settings.reference else ("direct",)
     methods = (best, *(others if compare else ()))
     estimated = fit_best(records, methods, settings, filters)
-    fit = with_units(with_remedies(estimated.fit, settings), records[0])
+    fit = estimated.fit
+    if proposal is not None and isinstance(fit.model, LaggedIntegrator) and settings.integrators:
+        fit = fit_damped(fit)  # a vehicle's rate, which air may damp
+    fit = with_units(with_remedies(fit, settings), records[0])
     announce("fits to parts of the band")
     fit, parts = fit_parts(fit, estimated.frf, settings)
     responses, fits = {best: estimated.frf}, {best: in_option_words(fit)}
