@@ -99,11 +99,11 @@ def test_other_gains_than_those_of_the_log_are_noticed(tmp_path, capsys):
     written = sorted(each.name for each in (tmp_path / "out").iterdir())
     assert written == ["autopilot.html", "autopilot.json", "proposal_revert.params"]
     text = capsys.readouterr().out
-    assert "this log cannot tell" in text and text.count("not the one that flew") == 1
+    assert "this log cannot tell" in text and text.count("not the gains that flew") == 1
 
 
 POOR = "not identifiable from this record: coherence reaches 0.6 at 0 of 100 frequencies"
-AGAIN = "the loop of these gains is not the one that flew: 31 % off"
+AGAIN = "these are not the gains that flew: P in the log is 1.31 times what they make"
 
 
 class PoorFit(SimpleNamespace):
@@ -113,10 +113,11 @@ class PoorFit(SimpleNamespace):
         return f"NOT {POOR}"
 
 
-@pytest.mark.parametrize("verdict", [f"this log cannot tell: {POOR}; fly a chirp", AGAIN])
+@pytest.mark.parametrize("verdict", [f"this log cannot tell: {POOR}. Fly a chirp", AGAIN])
 def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict):
     """Of stand-ins: such fits and loops were printed of a measured flight, each sentence twice."""
     flown = SimpleNamespace(version=(4, 2), axis=0, firmware="betaflight", unmodelled=(), old={})
+    vars(flown).update(filters_text="", angle=None)
     found = object.__new__(AutopilotProposal)
     vars(found).update(
         kind="cannot tell", verdict=verdict, flown=flown, stages=(), throttle=None, filters=None,
@@ -434,10 +435,12 @@ def write_dataflash(path, flights, gains, throttles=(AVERAGE,), changed=None):
 def test_ardupilots_chirp_at_the_mixer_shows_its_law(tmp_path, capsys):
     gains = (0.135, 0.135, 0.0036)
     path = write_dataflash(tmp_path / "flight.bin", [fly_ardupilot(gains)], gains)
-    assert main(["autopilot", str(path), "--out", str(tmp_path)]) == 0, capsys.readouterr()
+    options = ["--axis", "roll", "--out"]
+    assert main(["autopilot", str(path), *options, str(tmp_path)]) == 0, capsys.readouterr()
     content = json.loads((tmp_path / "autopilot.json").read_text())
     assert content["axis"] == "roll" and content["reproduction"]["misfit"] < 0.05
-    assert content["reproduction"]["gain_scale"] == pytest.approx(1, abs=0.05)
+    output = content["reproduction"]["law"]["terms"]["output"]
+    assert output["size"] == pytest.approx(1, abs=0.01) and output["share"] < 0.01
     assert (tmp_path / "proposal_100.param").read_text().count("ATC_RAT_RLL_") >= 4
     # The gyro's notches are part of the loop, and stay; beyond them the log shows the noise.
     assert content["unmodelled"] == [] and not any("HNTC" in name for name in content["new"])
@@ -446,8 +449,8 @@ def test_ardupilots_chirp_at_the_mixer_shows_its_law(tmp_path, capsys):
     assert content["noise"]["known_hz"] > 120
     # The log of other gains.
     path = write_dataflash(tmp_path / "other.bin", [fly_ardupilot((0.2, 0.2, 0.0036))], gains)
-    assert main(["autopilot", str(path), "--out", str(tmp_path / "other")]) == 3
-    assert "not the one that flew" in capsys.readouterr().out
+    assert main(["autopilot", str(path), *options, str(tmp_path / "other")]) == 3
+    assert "not the gains that flew" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -461,7 +464,8 @@ def test_ardupilots_runs_at_three_throttles_show_what_its_curve_leaves(tmp_path,
     flights = [fly_ardupilot(gains, seconds=15.0, plant=80.0 * each, notches=()) for each in slope]
     settings = {"MOT_THST_EXPO": flown, "INS_HNTCH_ENABLE": 0.0, "INS_HNTC2_ENABLE": 0.0}
     path = write_dataflash(tmp_path / "flight.bin", flights, gains, throttles.tolist(), settings)
-    assert main(["autopilot", str(path), "--out", str(tmp_path)]) == 0, capsys.readouterr()
+    options = ["--axis", "roll", "--out", str(tmp_path)]
+    assert main(["autopilot", str(path), *options]) == 0, capsys.readouterr()
     throttle = json.loads((tmp_path / "autopilot.json").read_text())["throttle"]
     low, high = throttle["ratio_of_gains"][1:]
     assert low < slope[2] / slope[0] < high < 0.8

@@ -150,6 +150,7 @@ def check_law(flown: FlownLoop, axis: int, flight: FlightChannels) -> LawCheck:
 
 def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
     logged = {name: x for name, x in flight.terms.items() if name != "F" and np.any(x)}
+    logged = logged if {"P", "I"} <= set(logged) else {}  # else the output alone
     forward, output = flight.terms.get("F"), flight.output
     setpoint, rate = flight.setpoint, flight.rates[flight.axis]
     roundings = np.random.default_rng(0)
