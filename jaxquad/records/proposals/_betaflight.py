@@ -39,6 +39,7 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
     command = first_logged(signals, [f"{prefix}axisMixed[{i}]", f"{prefix}axisSum[{i}]"])
     if not command or not rates[axis]:
         raise RecordError(f"the log has no PID terms or no gyro for {axis}.")
+    levelled = _levelled(log, prefix)
     remarks = [
         f"{rates[axis]} is measured after the gyro filters, which identify divides out where the "
         "log has their parameters"
@@ -53,7 +54,7 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
         alike = [Injection(*each[1:5]) for each in sweeps if each.axis == best.axis]
         setup = Setup(
             axis, {command: 1.0}, rates[axis], f"{prefix}{best.channel}", remarks=tuple(remarks),
-            injected_at="rate",
+            injected_at="rate", levelled=bool(levelled),
         )  # fmt: skip
         return with_injections(setup, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
@@ -63,7 +64,7 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
             f"(debug_mode = CHIRP), or stick pulses of different widths"
         )
         return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
-    if setpoint and not _levelled(log, prefix):
+    if setpoint and levelled is False:
         remarks.append("flown in acro, where the set-point comes from the pilot only")
         return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=tuple(remarks))
     if setpoint:
@@ -73,7 +74,10 @@ def betaflight_setup(log: Log, axis: str | None) -> Setup:
         )
     stick = first_logged(signals, [f"{prefix}rcCommand[{i}]"])
     reference = stick if stick and np.ptp(values_of(signals, stick)) else ""
-    return Setup(axis, {command: 1.0}, rates[axis], reference, remarks=tuple(remarks))
+    return Setup(
+        axis, {command: 1.0}, rates[axis], reference, remarks=tuple(remarks),
+        levelled=bool(levelled),
+    )  # fmt: skip
 
 
 def _main_table(log: Log) -> tuple[str, Table]:
@@ -89,12 +93,12 @@ def _main_table(log: Log) -> tuple[str, Table]:
     return f"{name}." if name else "", table
 
 
-def _levelled(log: Log, prefix: str) -> bool:
-    """Whether a self-levelling mode was on at any time; where that is unknown, it counts as on."""
+def _levelled(log: Log, prefix: str) -> bool | None:
+    """Whether a self-levelling mode was on at any time; None where that is unknown."""
     flags = log.tables.get(f"{prefix}slow")
     modes = None if flags is None else flags.columns.get("flightModeFlags")
     if modes is None or not modes.size or modes.dtype.kind not in "iuf":
-        return True
+        return None
     return bool((modes.astype(np.int64) & _SELF_LEVELLING).any())
 
 
@@ -102,13 +106,14 @@ def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> 
     """A remark on samples within the `spans` (s) where the firmware limits the PID sum."""
     name = "pidsum_limit_yaw" if setup.axis == "yaw" else "pidsum_limit"
     text = log.settings.get(name, "")
-    _, table = _main_table(log)
+    prefix, table = _main_table(log)
     if not (text.isdecimal() and len(text) < 9) or table.time is None:
         return ()
-    command = values_of(flattened(log), next(iter(setup.command)))
+    asked = f"{prefix}axisSum[{AXES.index(setup.axis)}]"
+    command = values_of(flattened(log), asked)
     used = np.zeros(command.size, bool)
     for start, stop in spans:
         used |= (table.time >= start) & (table.time <= stop)
     beyond = int((np.abs(command[used]) > int(text)).sum())
-    share = f"{beyond} of {used.sum()} samples of the command"
+    share = f"{beyond} of {used.sum()} samples of {asked}"
     return (f"{share} exceed {name} = {text}, where it saturates",) if beyond else ()

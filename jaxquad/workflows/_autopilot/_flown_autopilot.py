@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import Number
-from jaxquad.control.autopilots import change_filters, Firmware, flown_loop, FlownLoop
+from jaxquad.control.autopilots import (
+    BetaflightPID,
+    change_filters,
+    Firmware,
+    flown_loop,
+    FlownLoop,
+)
 from jaxquad.identify import KnownFilter, MeasuredChain
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
@@ -81,21 +87,43 @@ def read_flown(
 ) -> FlownAutopilot:  # fmt: skip
     """The loop that flew. Raises ValueError where the log does not hold its gains."""
     setup, given = proposal.setup, settings_of(path, proposal)
-    axis = AXES.index(setup.axis)
+    axis, values = AXES.index(setup.axis), _with_hold(given.values, setup.hold)
     known: dict[str, Firmware] = {"betaflight": "betaflight", "px4": "px4"}
     firmware = known.get(proposal.vehicle, "ardupilot")
     throttle = HOVER if settings.throttle is None else settings.throttle
-    loop = flown_loop(
-        firmware, given.values, given.version, throttle=throttle, tracked_hz=tracked_hz
-    )
+    loop = flown_loop(firmware, values, given.version, throttle=throttle, tracked_hz=tracked_hz)
+    loop = _in_angle_mode(loop) if setup.levelled else loop
     if not np.any(gains_of(loop.law, axis) > 0):
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
     return FlownAutopilot(
         firmware, tuple(given.version), axis, loop, loop.law, loop.parameters(), loop.unmodelled,
-        given.values, throttle, tracked_hz,
+        values, throttle, tracked_hz,
         angle_loop_of(
             firmware, given.values, axis, loop.law.interval(), levelled=setup.levelled
         ),
     )  # fmt: skip
+
+
+def _with_hold(values: Mapping[str, str], hold: float | None) -> Mapping[str, str]:
+    """Betaflight's parameters with the loop's interval that the log's stamps show, in s."""
+    if hold is None or "looptime" not in values:
+        return values
+    denominator = float(values.get("pid_process_denom", 1.0))
+    looptime = 1e6 * hold / denominator
+    if abs(looptime / float(values["looptime"]) - 1) < _SAME_LOOP:
+        return values
+    return {**values, "looptime": f"{looptime:.6g}"}
+
+
+_SAME_LOOP = 0.05  # of the interval in the header
+
+
+def _in_angle_mode(loop: FlownLoop) -> FlownLoop:
+    """Betaflight's integral is held from a fifth of the set-point's speed on there."""
+    relax = loop.law.relax if isinstance(loop.law, BetaflightPID) else None
+    if relax is None:
+        return loop
+    relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
+    return dataclasses.replace(loop, law=dataclasses.replace(loop.law, relax=relax))
