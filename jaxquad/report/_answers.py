@@ -372,7 +372,7 @@ def _sweep(needs: Sequence[_Need], frf: FrequencyResponse, record: Record | None
     low, high = min(low, measured[1] / 10), max(high, measured[0] * 10)  # at least a decade
     factor = max(each.factor for each in needs)
     louder = float(np.clip(factor, 1.0, _LOUDER))
-    longer = min((factor / louder) ** 2, _LONGER)
+    longer = min(factor / louder, _LONGER**0.5) ** 2
     now = 0.0 if record is None else record.duration
     seconds = max(now * longer, _CYCLES * 2 * np.pi / low, _SHORTEST)
     source, text = _amplitude(frf, record, louder)

@@ -117,10 +117,11 @@ class PoorFit(SimpleNamespace):
 def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict):
     """Of stand-ins: such fits and loops were printed of a measured flight, each sentence twice."""
     flown = SimpleNamespace(version=(4, 2), axis=0, firmware="betaflight", unmodelled=(), old={})
-    vars(flown).update(filters_text="", angle=None)
+    vars(flown).update(filters_text="", angle=None, measured=None)
     found = object.__new__(AutopilotProposal)
     vars(found).update(
         kind="cannot tell", verdict=verdict, flown=flown, stages=(), throttle=None, filters=None,
+        new={},
         identification=SimpleNamespace(fit=PoorFit()), reproduction=SimpleNamespace(verdict=AGAIN),
     )  # fmt: skip
     text = str(found)

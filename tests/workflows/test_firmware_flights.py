@@ -57,7 +57,7 @@ def test_the_law_replayed_leaves_nothing_of_the_logged_terms(data, folder, name,
     [({"relax": None}, "I"), ({"p": [50.0, 47.0, 45.0]}, "P"), ({"d": [34.0, 34.0, 0.0]}, "D")],
 )
 def test_another_law_is_named_by_its_term(data, changed, wrong):
-    check, _ = law_of(data / BETAFLIGHT / "A_sticks.BFL", "roll", **changed)
+    check, _ = law_of(data / BETAFLIGHT / "A_chirp_roll.BFL", "roll", **changed)
     assert not check.flew and check.wrong[0] == wrong
     assert check.text.startswith(f"these are not the gains that flew: {wrong} in the log")
 

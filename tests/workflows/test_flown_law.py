@@ -136,7 +136,9 @@ def test_notches_that_follow_the_motors_are_divided_out_as_measured():
         b0, b1, a1, b2, a2 = (0.0 if x is None else float(x) for x in section)
         rate = np.asarray(lfilter([b0, b1, b2], [1.0, a1, a2], rate))
     names, hidden = ("gyroADC[0]", "gyroUnfilt[0]"), ("3 RPM notches per motor on the gyro: x",)
-    flight = FlightChannels((rate,), 1e-3, 0 * rate, (raw,), 1e-3, names=names)
+    flight = FlightChannels(
+        (rate,), 1e-3, 0 * rate, unfiltered=(raw,), unfiltered_dt=1e-3, names=names
+    )
     [measured], text = best_filters((known,), hidden, flight, 0)
     assert text.startswith("the gyro's filters are divided out, measured: gyroADC[0] over gyroUnf")
     truth, at = np.asarray(whole.response(np.array([5.0, 10.0, 20.0]))), np.array([5.0, 10.0, 20.0])

@@ -5,7 +5,7 @@ import pytest
 from jaxquad.workflows import AutopilotSettings
 from jaxquad.workflows._autopilot._over_throttle import ThrottleVerdict
 from jaxquad.workflows._autopilot._rate_design import _judge
-from jaxquad.workflows._autopilot._rate_gains import Stage
+from jaxquad.workflows._autopilot._stages import Stage
 
 
 def stage(stable, peak=1.5, rejection=0.5):

@@ -276,7 +276,7 @@ def _flown_again(flown: FlownLoop, step: _Step, wait: int, rows: _Row):
         reference = Setpoint(row.setpoint, row.speed, zero)
         memory, command, terms = _law_at(flown, row).advance(memory, zero, reference, rate)
         queue = jnp.concatenate([(command + row.rate)[None], queue])  # the newest one first
-        moved = matrix @ state + now[:, None] * queue[-2] + before[:, None] * queue[-1]
+        moved = matrix @ state + jnp.outer(now, queue[-2]) + jnp.outer(before, queue[-1])
         return (memory, moved, queue[:-1]), (rate, terms)
 
     start = (flown.law.rest(zero), jnp.zeros((2, *zero.shape)), queue)

@@ -115,5 +115,5 @@ def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> 
     for start, stop in spans:
         used |= (table.time >= start) & (table.time <= stop)
     beyond = int((np.abs(command[used]) > int(text)).sum())
-    share = f"{beyond} of {used.sum()} samples of {asked}"
+    share = f"{beyond} of {used.sum()} samples of the command"
     return (f"{share} exceed {name} = {text}, where it saturates",) if beyond else ()

@@ -82,7 +82,7 @@ def flown_span(log: Log) -> FlownSpan:
     300 deg/s RMS off their set-points are a crash.
     """
     signals = flattened(log)
-    throttle = throttle_of(log, signals)
+    throttle = throttle_of(log, signals, asked=True)
     rates, setpoints = _CHANNELS.get(log.vehicle, ((), ()))
     names = [name for each in rates if (name := _logged(signals, each))]
     if not throttle or not names:

@@ -288,9 +288,13 @@ _THROTTLES: Mapping[str, tuple[tuple[str, float], ...]] = {  # channel, its fact
 }
 
 
-def throttle_of(log: Log, signals: Signals) -> Mix:
-    """The collective of the vehicle, where the log of one flight has it."""
-    for name, factor in _THROTTLES.get(log.vehicle, ()):
+def throttle_of(log: Log, signals: Signals, *, asked: bool = False) -> Mix:
+    """The collective of the vehicle, where the log of one flight has it.
+
+    It is what the motors had, where that is known; with `asked` what they were asked for.
+    """
+    names = _THROTTLES.get(log.vehicle, ())
+    for name, factor in reversed(names) if asked else names:
         logged = (each for each in signals.arrays if each == name or each.endswith(f".{name}"))
         full = next(logged, name)
         if first_logged(signals, [full]):

@@ -54,8 +54,9 @@ class TermReplay(NamedTuple):
     @property
     def off(self) -> bool:
         """Whether the term is not that of the gains, beyond its errors."""
-        doubt = max(_OFF, 3 * self.size_error + 3 * self.rounding / max(self.rms, 1e-300))
-        return abs(self.size - 1) > doubt or self.share > max(_LEFT, doubt)
+        blur = self.rounding / max(self.rms, 1e-300)
+        doubt = max(_OFF, 3 * self.size_error + 2 * blur**2)  # errors of both sides of a slope
+        return bool(abs(self.size - 1) > doubt or self.share > max(_LEFT, doubt))
 
 
 @dataclasses.dataclass(frozen=True)

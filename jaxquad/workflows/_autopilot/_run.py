@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from jaxquad._core import announce
 from jaxquad.records import AXES, Proposal
@@ -73,7 +74,7 @@ def autopilot(
         return tune_adrc(path, asked, proposal, settings)
     if settings.axis == "all":
         return _tune_axes(path, settings)
-    return _tune_axis(path, settings, asked, proposal)
+    return _tune_axis(_read_axis(path, settings), {})
 
 
 def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
@@ -81,30 +82,45 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
 
     Raises the error of the first axis where none can be read.
     """
-    axes: dict[str, AutopilotProposal] = {}
+    read: dict[str, _ReadAxis] = {}
     errors: dict[str, ValueError] = {}
-    filters: Mapping[str, float] = {}
     for axis in AXES:
-        announce(f"{axis}:")
-        one = dataclasses.replace(settings, axis=axis)
         try:
-            axes[axis] = _tune_axis(path, one, *_channels_of(path, one), filters)
+            read[axis] = _read_axis(path, dataclasses.replace(settings, axis=axis))
         except ValueError as error:  # the log lacks what this axis needs
             errors[axis] = error
-            continue
-        filters = filters or axes[axis].shared_filters
-    if not axes:
+    if not read:
         raise next(iter(errors.values()))
+    axes: dict[str, AutopilotProposal] = {}
+    filters: Mapping[str, float] = {}
+    for axis, each in read.items():
+        announce(f"{axis}:")
+        axes[axis] = _tune_axis(each, filters)
+        filters = filters or axes[axis].shared_filters
     return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
 
 
-def _tune_axis(
-    path: Path, settings: AutopilotSettings, asked: IdentifySettings, proposal: Proposal,
-    filters: Mapping[str, float] | None = None,
-) -> AutopilotProposal:  # fmt: skip
-    """The gains of one axis, with `filters` that are changed already."""
+class _ReadAxis(NamedTuple):
+    """What a log holds of one axis."""
+
+    path: Path
+    settings: AutopilotSettings
+    asked: IdentifySettings
+    proposal: Proposal
+    flown: FlownAutopilot
+    flight: FlightChannels | None
+
+
+def _read_axis(path: Path, settings: AutopilotSettings) -> _ReadAxis:
     announce("gains and filters that flew")
+    asked, proposal = _channels_of(path, settings)
     flown, flight = _read_flight(path, asked, proposal, settings)
+    return _ReadAxis(path, settings, asked, proposal, flown, flight)
+
+
+def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotProposal:
+    """The gains of one axis, with `filters` that are changed already."""
+    path, settings, asked, proposal, flown, flight = axis
     plant = identify_plant(path, asked, proposal, flown.filters)
     known = (settings, plant, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
@@ -122,7 +138,7 @@ def _tune_axis(
     if again.kind != "flown":
         return unsure(f"this log cannot tell: {again.verdict}", again)
     throttle = study_throttle(plant, proposal, flown)
-    made = design_gains(settings, plant, flown, flight, throttle, filters or {})
+    made = design_gains(settings, plant, flown, flight, throttle, filters)
     return AutopilotProposal(
         made.kind, made.verdict, *known, again, made.stages,
         made.new if made.kind == "proposed" else {}, made.filters, made.noise, flight, throttle,
