@@ -97,8 +97,9 @@ def _drawn_values(
         folded = jnp.abs(drawn) - drawn
         changes += along[:, None] * folded[None]
     linear = here + units * changes
-    for k in spread.at_zero:  # several that go along with each other may have pushed one back
-        linear = linear.at[k].set(jnp.copysign(linear[k], spread.units[k]))
+    # Several that go along with each other may have pushed one back.
+    near = np.isin(np.arange(len(linear)), spread.at_zero)[:, None]
+    linear = jnp.where(near, jnp.copysign(linear, units), linear)
     return jnp.where(spread.logarithmic[:, None], here * jnp.exp(changes), linear)
 
 

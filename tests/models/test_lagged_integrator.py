@@ -55,7 +55,7 @@ def test_a_fit_names_damping_and_leaves_one_of_zero_alone():
 
 
 def test_what_a_held_input_shows_of_it_is_the_exact_sampled_plant():
-    """Against its partial fractions, each held (Franklin et al., ch. 4); 16 aliases leave 4e-6 at 100 rad/s."""
+    """By its partial fractions, each held; 16 aliases leave 4e-6 at 100 rad/s."""
     dt = 0.01
     plant = jq.LaggedIntegrator(28.0, 0.03, damping=2.1)
     frf = response_of(plant, omega=np.geomspace(0.5, 100, 20))
