@@ -55,11 +55,11 @@ def read_table(
     if not averages > 0:
         raise ValueError(f"averages is {averages}: give how many windows were averaged, 1 or more")
     if coherence is not None:
-        known = _like("coherence", coherence, values)
-        if not np.all((known > 0) & (known <= 1)):
-            raise ValueError(f"the coherence runs from {known.min():.4g} to {known.max():.4g}: "
-                             "give numbers above 0, up to 1")  # fmt: skip
-        error = np.sqrt((1 - known) / (2 * averages * known))
+        coherent = _like("coherence", coherence, values)
+        if not np.all((coherent > 0) & (coherent <= 1)):
+            ends = f"{coherent.min():.4g} to {coherent.max():.4g}"
+            raise ValueError(f"the coherence runs from {ends}: give numbers above 0, up to 1")
+        error = np.sqrt((1 - coherent) / (2 * averages * coherent))
     else:
         assert random_error is not None
         error = _like("random_error", random_error, values)
@@ -67,8 +67,8 @@ def read_table(
             raise ValueError(
                 f"the random error is {error.min():.4g} at its least: give it above 0, 0.02 for 2 %"
             )
-        known = 1 / (1 + 2 * averages * error**2)
-    return Table(grid, values, known, np.maximum(error, _LEAST))
+        coherent = 1 / (1 + 2 * averages * error**2)
+    return Table(grid, values, coherent, np.maximum(error, _LEAST))
 
 
 def _require_table(
@@ -91,10 +91,10 @@ def _require_table(
 
 def _like(name: str, numbers: ArrayLike, values: np.ndarray) -> Pairs:
     """A number, one for each frequency, or one for each pair, as all of a response."""
-    given = np.asarray(numbers, float)
-    given = given[:, None, None] if given.ndim == 1 else given
+    array = np.asarray(numbers, float)
+    array = array[:, None, None] if array.ndim == 1 else array
     try:
-        return np.broadcast_to(given, values.shape).copy()
+        return np.broadcast_to(array, values.shape).copy()
     except ValueError:
         raise ValueError(
             f"{name} has the shape {np.shape(numbers)} and the response {values.shape}: give one "

@@ -92,11 +92,11 @@ def test_wrong_number_of_unstable_poles_is_noticed():
 def test_the_gain_margin_of_an_unstable_plant_is_at_frequency_0():
     """10 / (s - 1) with unit feedback is stable for a gain above 0.1."""
     plant = lambda k: jq.TransferFunction(jnp.array([k]), [1.0, -1.0])
-    found = margins(plant(10.0))
-    assert found.gain_reduction == pytest.approx(0.1, rel=1e-12)
-    assert found.reduction_crossover == 0 and np.isnan(found.gain_margin)
-    assert found.unstable_poles == 1 and found.unstable_roots == 0
-    assert "gain reduction         -20 dB at 0 rad/s" in str(found)
+    result = margins(plant(10.0))
+    assert result.gain_reduction == pytest.approx(0.1, rel=1e-12)
+    assert result.reduction_crossover == 0 and np.isnan(result.gain_margin)
+    assert result.unstable_poles == 1 and result.unstable_roots == 0
+    assert "gain reduction         -20 dB at 0 rad/s" in str(result)
     slope = jax.grad(lambda k: margins(plant(k)).gain_reduction)(10.0)
     assert slope == pytest.approx(-0.01, rel=1e-12)
 
