@@ -160,10 +160,10 @@ def _see(problem: Problem, counted: Counted, solution: Solution) -> _AtSolution:
     start = units = units_of(solution)
     seen = tangent = see(counted.records, counted.found, solution, units)
     near = near_zeros(problem, solution, seen, units)
-    still = [each.k for each in near if each.changes is not None and each.bound.value]
+    still = [one.k for one in near if one.changes is not None and one.bound.value]
     step = newton_step(seen.bread, seen.gradient, solution.at_zero, still)
     decrement = 0.5 * float(seen.gradient @ step)
-    bounds, frfs = (), [each.frf for each in counted.points]
+    bounds, frfs = (), [points.frf for points in counted.points]
 
     def see_again() -> Seen:
         records = with_changes(records_of(problem, frfs, solution, units), near, units)

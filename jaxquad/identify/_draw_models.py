@@ -66,8 +66,8 @@ def _spread_of(fit: "Fit", hold_undetermined: bool) -> _Spread:
     # In other units than its own value a parameter is mixed up with others near zero.
     scaled = logarithmic & (here != 0) & ~np.isclose(units, here, rtol=1e-9, atol=0.0)
     mixed_up = np.setdiff1d(np.flatnonzero(scaled), at_zero)
-    whole = np.asarray(fit.relative_covariance)[mixed_up]
-    along = np.concatenate([along, whole / whole[np.arange(len(whole)), mixed_up, None]])
+    relative = np.asarray(fit.relative_covariance)[mixed_up]
+    along = np.concatenate([along, relative / relative[np.arange(len(relative)), mixed_up, None]])
     at_zero += mixed_up.tolist()
     logarithmic[at_zero] = False
     return _Spread(_root(covariance), tuple(at_zero), along, here, units, logarithmic)
@@ -97,8 +97,9 @@ def _drawn_values(
         folded = jnp.abs(drawn) - drawn
         changes += along[:, None] * folded[None]
     linear = here + units * changes
-    for k in spread.at_zero:  # several that go along with each other may have pushed one back
-        linear = linear.at[k].set(jnp.copysign(linear[k], spread.units[k]))
+    # Several that go along with each other may have pushed one back.
+    near = np.isin(np.arange(len(linear)), spread.at_zero)[:, None]
+    linear = jnp.where(near, jnp.copysign(linear, units), linear)
     return jnp.where(spread.logarithmic[:, None], here * jnp.exp(changes), linear)
 
 

@@ -44,6 +44,7 @@ DOUBT = 0.05  # probability that the model is right, below which a misfit is rem
 NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
 _LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
 _POOR = 10.0  # ratio above which a local minimum is likely
+_EXACT = 1e-9  # cost of a response without noise: no step lowers what rounding has left
 _LOCAL = ", or this is a local minimum: try other starting values"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
 
@@ -58,8 +59,8 @@ def remarks_on_fit(
 ) -> list[str]:
     """Runaway parameters, missing convergence, misfit beyond the noise."""
     remarks = runaways(problem, solution, verdict)
-    no_minimum = decrement > 1e-3 * max(cost, 1e-9)
-    if not solution.converged and (no_minimum or not remarks):
+    no_minimum = decrement > 1e-3 * max(cost, _EXACT)
+    if not solution.converged and (no_minimum or not (remarks or cost < _EXACT)):
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
         more = "take more steps (max_steps=), or " if solution.message else ""

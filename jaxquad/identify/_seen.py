@@ -97,9 +97,9 @@ def near_zeros(
         others = [j for j in solution.at_zero if j != k]
         parts = seen.covariance, seen.by_noise
         if others:
-            inflation = [inflation_at_zero(each, seen.bread, k, others) for each in parts]
+            inflation = [inflation_at_zero(part, seen.bread, k, others) for part in parts]
         else:
-            inflation = [float(each[k, k] / curvature[k, k]) for each in parts]
+            inflation = [float(part[k, k] / curvature[k, k]) for part in parts]
         (limit, by_noise), beyond = one_sided_limits(problem, solution, k, inflation)
         value = float(np.asarray(solution.values)[k])
         bound = Bound(names[k], value, limit, by_noise, beyond)
@@ -107,9 +107,9 @@ def near_zeros(
             near.append(NearZero(k, bound, None, slight=False))
             continue
         changes = changes_up_to(problem, solution, k, limit)
-        used = (each.weights > 0 for each in seen.records)
+        used = (record.weights > 0 for record in seen.records)
         pairs = zip(changes, used, strict=True)
-        largest = max(float(np.max(np.abs(each[mine]), initial=0.0)) for each, mine in pairs)
+        largest = max(float(np.max(np.abs(change[mine]), initial=0.0)) for change, mine in pairs)
         few = abs(value) < _FEW * abs(limit)
         slight = largest * abs(limit) < _SLIGHT
         near.append(NearZero(k, bound, changes if few else None, slight))
@@ -123,9 +123,9 @@ def with_changes(
     changed = []
     for number, record in enumerate(records):
         slopes = record.slopes.copy()
-        for each in near:
-            if each.changes is not None:
-                slopes[..., each.k] = units[each.k] * each.changes[number]
+        for one in near:
+            if one.changes is not None:
+                slopes[..., one.k] = units[one.k] * one.changes[number]
         changed.append(dataclasses.replace(record, slopes=slopes))
     return changed
 
@@ -139,15 +139,15 @@ def bounds_among(
     how much, as a share of that other one.
     """
     bounds, tangled = [], {}
-    slight = [each.k for each in near if each.slight]
-    for each in near:
-        moved = _along(seen, each.k) * abs(each.bound.limit / units[each.k])
-        moved[[each.k, *(solution.at_zero if each.k in solution.at_zero else ())]] = 0.0
-        moved[slight if each.slight else []] = 0.0
+    slight = [one.k for one in near if one.slight]
+    for one in near:
+        moved = _along(seen, one.k) * abs(one.bound.limit / units[one.k])
+        moved[[one.k, *(solution.at_zero if one.k in solution.at_zero else ())]] = 0.0
+        moved[slight if one.slight else []] = 0.0
         if np.all(moved <= LIMIT):
-            bounds.append(each.bound)
-        elif each.k in solution.at_zero or each.changes is not None:
-            tangled[each.k] = moved
+            bounds.append(one.bound)
+        elif one.k in solution.at_zero or one.changes is not None:
+            tangled[one.k] = moved
     others = [j for j in range(len(seen.bread)) if j not in tangled]
     shares = {k: float(np.max(moved[others], initial=0.0)) for k, moved in tangled.items()}
     return tuple(bounds), shares
@@ -176,10 +176,10 @@ def with_tangled(
 ) -> Float[np.ndarray, " all"]:
     """Units of parameters at zero that count as much as the parameter they are mixed up with."""
     units = units.copy()
-    for each in near:
-        if each.k in tangled and np.isfinite(each.bound.limit):
-            share = tangled[each.k]
-            units[each.k] = each.bound.limit / (share if share > LIMIT else 1.0)
+    for one in near:
+        if one.k in tangled and np.isfinite(one.bound.limit):
+            share = tangled[one.k]
+            units[one.k] = one.bound.limit / (share if share > LIMIT else 1.0)
     return units
 
 

@@ -77,10 +77,10 @@ def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | St
         if len(above) == len(above[0]) == 1:
             return TransferFunction(above[0][0], below[0][0])
         return _pairs(above, below)
-    raise ValueError(
-        f"from_control cannot convert a {type(system).__name__}: give a TransferFunction or a "
-        "StateSpace of python-control or scipy.signal (control.ss, control.tf)."
-    )
+    remedy = "TransferFunction or a StateSpace of python-control or scipy.signal (control.tf)"
+    if hasattr(system, "frdata"):
+        remedy += "; data go to jq.spectra.FrequencyResponse.from_table(system, random_error=0.02)"
+    raise ValueError(f"from_control cannot convert a {type(system).__name__}: give a {remedy}.")
 
 
 def _pairs(

@@ -52,8 +52,8 @@ def is_optional(model: PyTree, name: str) -> bool:
 
 def _declared(model: PyTree, name: str) -> tuple[PyTree, Mapping]:
     """The part of a model that has a number, and the metadata of its field there."""
-    found = _NAME.fullmatch(name)
-    *owners, leaf = found[1].split(".") if found else ("",)
+    match = _NAME.fullmatch(name)
+    *owners, leaf = match[1].split(".") if match else ("",)
     for owner in owners:
         model = vars(model).get(owner) if dataclasses.is_dataclass(model) else None
     fields = dataclasses.fields(model) if dataclasses.is_dataclass(model) else ()
@@ -65,8 +65,8 @@ def _unit_of(model: PyTree, name: str, output: str, input: str) -> str:
     kind = declared.get("unit", "")
     if isinstance(kind, str):
         return kind
-    found = _NAME.fullmatch(name)
-    scale = kind(owner, int(found[2] or 0) if found else 0)
+    match = _NAME.fullmatch(name)
+    scale = kind(owner, int(match[2] or 0) if match else 0)
     if scale.of_ratio:
         return f"{_over_seconds(output, scale.power)} per {input}"
     return _over_seconds("1", scale.power) if scale.power else ""
@@ -74,7 +74,7 @@ def _unit_of(model: PyTree, name: str, output: str, input: str) -> str:
 
 def _over_seconds(unit: str, power: int) -> str:
     """`rad/s` over s is `rad/s^2`."""
-    found = _PER_SECOND.fullmatch(unit)
-    base, own = (found[1], int(found[2] or 1) if unit != found[1] else 0) if found else (unit, 0)
+    match = _PER_SECOND.fullmatch(unit)
+    base, own = (match[1], int(match[2] or 1) if unit != match[1] else 0) if match else (unit, 0)
     total = own + power
     return base if total == 0 else f"{base}/s" if total == 1 else f"{base}/s^{total}"

@@ -2,14 +2,16 @@ from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from jaxquad._core import pytree_node, require_float64
 
 from ._checks import in_hertz
-from ._error_covariance import ErrorCovariance
+from ._error_covariance import ErrorCovariance, independent_errors
 from ._remarks import points_dominated, Remark, remarks_on_used
+from ._table import HasFrequencyData, read_table
 
 
 class Distortion(eqx.Module):
@@ -99,6 +101,53 @@ class FrequencyResponse:
             return
         require_float64("the frequency response", self.response)
 
+    @classmethod
+    def from_table(
+        cls,
+        omega: Float[ArrayLike, " frequencies"] | HasFrequencyData,
+        response: Complex[ArrayLike, "frequencies ..."] | None = None,
+        *,
+        coherence: Float[ArrayLike, "..."] | None = None,
+        random_error: Float[ArrayLike, "..."] | None = None,
+        averages: float | int = 1,
+        input_names: Sequence[str] = (),
+        output_names: Sequence[str] = (),
+    ) -> "FrequencyResponse":
+        """A response that was measured elsewhere, as every fit and margin takes it.
+
+        **Arguments:**
+
+        - `omega`: in rad/s, rising; or a `FrequencyResponseData` of python-control alone.
+        - `response`: complex, one number for each frequency, or (frequencies, outputs, inputs).
+        - `coherence`: of each number (gamma squared). Then the relative random error is
+            sqrt((1 - coherence) / (2 averages coherence)).
+        - `random_error`: instead, relative and in rad, one standard error.
+        - `averages`: how many independent windows the coherence is from; 1 gives the largest error.
+        - `input_names`, `output_names`: by default `u0`, `y0`, and so on.
+
+        **Returns:** a `FrequencyResponse` whose errors at different frequencies are independent.
+
+        **Raises:** ValueError for shapes that differ, numbers that are not finite, frequencies that
+        do not rise from above 0, and for none or both of `coherence` and `random_error`.
+
+        Source: Bendat and Piersol, "Random Data", 4th ed., Table 9.6.
+        """
+        table = read_table(omega, response, coherence, random_error, averages)
+        variance = 2 * (table.random_error * np.abs(table.response)) ** 2
+        _, outputs, inputs = table.response.shape
+        return cls(
+            omega=jnp.asarray(table.omega),
+            response=jnp.asarray(table.response),
+            coherence=jnp.asarray(table.coherence),
+            random_error=jnp.asarray(table.random_error),
+            errors=independent_errors(table.omega, variance),
+            direct_coherence=jnp.asarray(table.coherence),
+            multiple_coherence=jnp.asarray(table.coherence.max(axis=2)),
+            method="direct",
+            input_names=_names("input_names", input_names, "u", inputs),
+            output_names=_names("output_names", output_names, "y", outputs),
+        )
+
     @property
     def magnitude_db(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """20 log10 of the magnitude."""
@@ -157,3 +206,10 @@ class FrequencyResponse:
         coherent = coherence >= 0.6
         shown = self.remarks_about(coherent) if np.any(coherent) else self.remarks
         return "\n".join(lines + [f"  ! {remark}" for remark in shown])
+
+
+def _names(kind: str, chosen: Sequence[str], letter: str, count: int) -> tuple[str, ...]:
+    names = tuple(chosen) or tuple(f"{letter}{k}" for k in range(count))
+    if len(names) != count:
+        raise ValueError(f"{kind} has {len(names)} names and the response {count} channels")
+    return names

@@ -78,8 +78,8 @@ def holds(fit, name, value):
 def test_the_intervals_hold_with_and_without_damping(damping):
     """95 % of 20, less two standard deviations."""
     plain = [jq.fit(START, flown(damping, seed)) for seed in range(20)]
-    fits = [fit_damped(each) for each in plain]
-    shown = [fit is not each for fit, each in zip(fits, plain, strict=True)]
+    fits = [fit_damped(one) for one in plain]
+    shown = [fit is not one for fit, one in zip(fits, plain, strict=True)]
     assert all(shown) if damping >= 0.5 else sum(shown) <= (14 if damping else 3)
     assert all(("damping" in fit.names) == mine for fit, mine in zip(fits, shown, strict=True))
     for name, value in {"gain": GAIN, "lag": LAG, "delay": DELAY}.items():

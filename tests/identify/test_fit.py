@@ -197,3 +197,15 @@ def test_a_local_minimum_is_called_one():
     """A delay that starts a whole turn away stays there."""
     fit = jq.fit(jq.LaggedIntegrator(1e4, 1.0, 1.0), response_of(TRUTH, seed=0))
     assert any("local minimum" in remark for remark in fit.remarks)
+
+
+def test_exact_data_end_a_fit_without_a_remark():
+    """Where rounding is all that is left, no step lowers the cost: that is the minimum."""
+    truth = jq.LaggedIntegrator(25000.0, 0.03, 0.001, damping=0.5)
+    for seed in range(4):
+        factors = np.exp(np.random.default_rng(seed).normal(0, 0.5, 4))
+        start = jq.LaggedIntegrator(
+            *(truth.gain * factors[0], 0.03 * factors[1], 0.001), damping=factors[3]
+        )
+        fit = jq.fit(start, response_of(truth, omega=np.geomspace(0.5, 200.0, 60)))
+        assert fit.cost < 1e-15 and fit.identifiable and not fit.remarks

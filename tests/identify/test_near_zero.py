@@ -54,9 +54,9 @@ def test_models_drawn_around_it_keep_its_sign_and_its_order():
 
 def test_a_firmware_s_chirp_with_a_delay_near_zero_is_identifiable(data):
     log = data / "betaflight_firmware" / "A_chirp_plain.BFL"
-    fit = jq.workflows.autopilot(
-        log, jq.workflows.AutopilotSettings(axis="roll")
-    ).identification.fit
+    proposal = jq.workflows.autopilot(log, jq.workflows.AutopilotSettings(axis="roll"))
+    assert isinstance(proposal, jq.workflows.AutopilotProposal)
+    fit = proposal.identification.fit
     assert fit.identifiable
     for name, value in {"gain": 36.95, "lag": 0.025, "delay": 125e-6}.items():
         low, high = fit.interval(name)
@@ -88,10 +88,10 @@ def test_a_lag_at_zero_is_in_the_interval_of_the_delay(weak):
     wrong = 0
     for fit in weak:
         lag, delay = fit.interval("lag"), fit.interval("delay")
-        held = lag[0] <= 0.03 <= lag[1] and delay[0] <= 0.01 <= delay[1]
+        inside = lag[0] <= 0.03 <= lag[1] and delay[0] <= 0.01 <= delay[1]
         marked = not fit.determined[1:].any()
         assert marked or fit.determined[1:].all()
-        wrong += not (held or marked)
+        wrong += not (inside or marked)
     assert wrong <= 2
 
 
@@ -99,9 +99,9 @@ def test_the_sum_of_a_lag_at_zero_and_the_delay_is_named_with_its_error(weak):
     """Its scatter is as large as it says, and it is within 3.3 standard errors of the truth."""
     assert sum(fit.values[1] < 1e-3 for fit in weak) > 8
     named = [fit.combinations for fit in weak if not fit.identifiable]
-    assert all(each and each[0].name == "lag + delay" for each in named)
+    assert all(one and one[0].name == "lag + delay" for one in named)
     sums = [fit.derived(lambda model: model.lag + model.delay) for fit in weak]
-    off = [(each.value - 0.04) / each.standard_error for each in sums]
+    off = [(one.value - 0.04) / one.standard_error for one in sums]
     assert np.max(np.abs(off)) < 3.3
     assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
 

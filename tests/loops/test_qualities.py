@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from ratios import delayed_integrator, Ratio, ratio
 
+import jaxquad as jq
 from jaxquad.loops import attitude_bandwidth, disturbance_rejection, margins, rms_response
 from jaxquad.loops.qualities._crossings import crossed, first
 
@@ -63,13 +64,10 @@ def test_margins_are_those_of_python_control(name):
     )
     # Its roots of a polynomial of twice the degree are good to about 1e-8.
     listed = [np.asarray(x)[np.isfinite(x)] for x in (found.phase_crossovers, found.crossovers)]
-    positive = w180 > 0
-    assert listed[0] == pytest.approx(np.sort(w180[positive]), rel=1e-7)
+    assert listed[0] == pytest.approx(np.sort(w180), rel=1e-7, abs=1e-9)
     assert listed[1] == pytest.approx(np.sort(crossovers), rel=1e-7)
-    order = np.argsort(w180[positive])
-    assert np.asarray(found.gain_margins)[: order.size] == pytest.approx(
-        gains[positive][order], rel=1e-6
-    )
+    order = np.argsort(w180)
+    assert np.asarray(found.gain_margins)[: order.size] == pytest.approx(gains[order], rel=1e-6)
     measured = np.degrees(np.asarray(found.phase_margins)[: crossovers.size])
     assert measured == pytest.approx(phases[np.argsort(crossovers)], abs=1e-5)
     peak = disturbance_rejection(ratio(b, a), unstable_poles=found.unstable_poles)
@@ -87,8 +85,30 @@ def test_unstable_roots_are_counted_by_nyquist(name):
 
 
 def test_wrong_number_of_unstable_poles_is_noticed():
-    found = margins(ratio(*LOOPS["unstable plant"]))
+    found = margins(ratio(*LOOPS["unstable plant"]), unstable_poles=0)
     assert "1 more unstable poles" in str(found)
+
+
+def test_the_gain_margin_of_an_unstable_plant_is_at_frequency_0():
+    """10 / (s - 1) with unit feedback is stable for a gain above 0.1."""
+    plant = lambda k: jq.TransferFunction(jnp.array([k]), [1.0, -1.0])
+    result = margins(plant(10.0))
+    assert result.gain_reduction == pytest.approx(0.1, rel=1e-12)
+    assert result.reduction_crossover == 0 and np.isnan(result.gain_margin)
+    assert result.unstable_poles == 1 and result.unstable_roots == 0
+    assert "gain reduction         -20 dB at 0 rad/s" in str(result)
+    slope = jax.grad(lambda k: margins(plant(k)).gain_reduction)(10.0)
+    assert slope == pytest.approx(-0.01, rel=1e-12)
+
+
+def test_a_model_knows_its_unstable_poles():
+    plant = jq.models.AttitudeAxis(0.2, 0.12, 0.05, lag=0.05, K_af=-0.01)
+    assert margins(plant).unstable_poles == 1
+    assert disturbance_rejection(plant).unstable_poles == 1
+    assert margins(plant.transfer_function(), unstable_poles=0).unstable_poles == 0
+    assert margins(jq.LaggedIntegrator(3.0, 0.1, integrators=2)).unstable_poles == 0
+    growing = jq.StateSpace([[2.0, 0.0], [0.0, -1.0]], [[1.0], [1.0]], [[1.0, 1.0]])
+    assert margins(growing).unstable_poles == 1
 
 
 def test_margins_of_a_delayed_integrator_are_the_closed_form():

@@ -20,8 +20,8 @@ def test_damping_stands_in_the_place_of_one_integrator(integrators, lag):
     model = jq.LaggedIntegrator(28.0, lag, 0.01, integrators, 2.1)
     s = 1j * np.asarray(OMEGA)
     wanted = 28 * np.exp(-0.01 * s) / (s ** (integrators - 1) * (s + 2.1) * (lag * s + 1))
-    for each in (model, model.transfer_function()):
-        np.testing.assert_allclose(evaluate_response(each, OMEGA)[:, 0, 0], wanted, rtol=1e-12)
+    for one in (model, model.transfer_function()):
+        np.testing.assert_allclose(evaluate_response(one, OMEGA)[:, 0, 0], wanted, rtol=1e-12)
 
 
 @pytest.mark.parametrize("integrators", [0, 1, 2, 3])
@@ -55,10 +55,7 @@ def test_a_fit_names_damping_and_leaves_one_of_zero_alone():
 
 
 def test_what_a_held_input_shows_of_it_is_the_exact_sampled_plant():
-    """Against its partial fractions, each held (Franklin et al., ch. 4).
-
-    16 aliases leave 4e-6 at 100 rad/s.
-    """
+    """By its partial fractions, one held; 16 aliases leave 4e-6 at 100 rad/s."""
     dt = 0.01
     plant = jq.LaggedIntegrator(28.0, 0.03, damping=2.1)
     frf = response_of(plant, omega=np.geomspace(0.5, 100, 20))

@@ -7,7 +7,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
 from jaxquad._core import is_concrete
-from jaxquad.models import imaginary, Model
+from jaxquad.models import (
+    AttitudeAxis,
+    imaginary,
+    LaggedIntegrator,
+    Model,
+    StateSpace,
+    TransferFunction,
+)
 from jaxquad.spectra import FrequencyResponse
 
 
@@ -111,6 +118,23 @@ def curve_of(
     pair = (_position("output", output, names[0]), _position("input", input, names[1]))
     model = _Opaque(response) if jax.tree.leaves(response) == [response] else response
     return Curve(model, grid, None, pair, integrations, 0)
+
+
+_GROWS = 1e-6  # of the fastest pole: what of a real part is above rounding
+
+
+def count_unstable_poles(response: Response, unstable_poles: int | None) -> int:
+    """As given; else those of a model that knows its poles, and 0 of others and of tracers."""
+    if unstable_poles is not None:
+        return unstable_poles
+    if isinstance(response, AttitudeAxis | LaggedIntegrator):
+        response = response.transfer_function()
+    if not isinstance(response, StateSpace | TransferFunction):
+        return 0
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves(response)):
+        return 0
+    poles = response.poles
+    return int(np.sum(np.real(poles) > _GROWS * np.max(np.abs(poles), initial=0.0)))
 
 
 def ambiguous(phase: Float[Array, " frequencies"]) -> Bool[Array, " intervals"]:

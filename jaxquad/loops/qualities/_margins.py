@@ -19,7 +19,7 @@ from ._basis import (
     with_coherence,
 )
 from ._crossings import crossed, crossings
-from ._curve import ambiguous, Curve, curve_of, Response
+from ._curve import ambiguous, count_unstable_poles, Curve, curve_of, Response
 
 
 _SLACK = 0.3  # of the slope at the lowest frequency, for a number of integrators
@@ -100,7 +100,7 @@ class Margins(eqx.Module):
     - `left_out`: crossings beyond 16 of a kind.
     - `standard_errors`: of a measured response, by the names above; else empty.
     - `basis`: what the numbers were found from.
-    - `unstable_poles`: of L, as they were given.
+    - `unstable_poles`: of L.
     """
 
     phase_margin: Float[Array, ""]
@@ -154,7 +154,7 @@ def margins(
     loop: Response,
     *,
     omega: Float[ArrayLike, " frequencies"] | None = None,
-    unstable_poles: int = 0,
+    unstable_poles: int | None = None,
     output: str | int | None = None,
     input: str | int | None = None,
 ) -> Margins:
@@ -163,7 +163,8 @@ def margins(
     Margins are distances to -1 in gain, phase and delay, whatever the branch of the phase, and mean
     what their names say where the closed loop is stable, which is counted by Nyquist's criterion. A
     missing crossing gives `nan`, not infinity: it may lie beyond the frequencies given. Two
-    crossings between the same neighbours of `omega` are not seen.
+    crossings between the same neighbours of `omega` are not seen. A model without integrators and
+    of negative static gain crosses -180 deg at frequency 0.
 
     **Arguments:**
 
@@ -172,7 +173,8 @@ def margins(
         `frequency_response(omega)`, whose numbers are exact and differentiable, also under jit.
     - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
         1000; of a measured response it picks some of its own frequencies.
-    - `unstable_poles`: how many the loop L has.
+    - `unstable_poles`: how many the loop L has. By default those of a model of s, as
+        `jq.TransferFunction` or `jq.StateSpace`, and none under jit and of other loops.
     - `output`, `input`: the channel, by name or number; None where there is one.
 
     **Returns:** `Margins`.
@@ -182,6 +184,7 @@ def margins(
     Source: Tischler & Remple, broken-loop responses; delay margin = phase margin / crossover.
     """
     curve = curve_of(loop, omega, output, input)
+    unstable_poles = count_unstable_poles(loop, unstable_poles)
     values, basis, errors = evaluate_curve(
         _numbers, curve, jnp.asarray(unstable_poles, curve.omega.dtype)
     )
@@ -235,6 +238,12 @@ def _gain_margins(curve: Curve, where: Array, rank: Array) -> Numbers:
     places = crossings(lambda w: jnp.angle(-curve(w)), curve.omega, where, rank=rank, limit=_LIMIT)
     stand_in = jnp.where(jnp.isfinite(places), places, curve.omega[0])
     margin = jnp.where(jnp.isfinite(places), 1 / jnp.abs(curve(stand_in)), jnp.nan)
+    listed = places.size
+    if curve.coherence is None:
+        place, static = _static_margin(curve)
+        places, margin = jnp.append(places, place), jnp.append(margin, static)
+        rising = jnp.argsort(jax.lax.stop_gradient(places))  # nan is last
+        places, margin = places[rising], margin[rising]
     up = jnp.argmin(jnp.where(margin >= 1, margin, jnp.inf))
     down = jnp.argmax(jnp.where(margin < 1, margin, 0.0))
     rises, falls = margin[up] >= 1, margin[down] < 1
@@ -243,9 +252,23 @@ def _gain_margins(curve: Curve, where: Array, rank: Array) -> Numbers:
         "phase_crossover": jnp.where(rises, places[up], jnp.nan),
         "gain_reduction": jnp.where(falls, margin[down], jnp.nan),
         "reduction_crossover": jnp.where(falls, places[down], jnp.nan),
-        "phase_crossovers": places,
-        "gain_margins": margin,
+        "phase_crossovers": places[:listed],
+        "gain_margins": margin[:listed],
     }
+
+
+_REAL = 1e-9  # imaginary over real part of a number that is real but for rounding
+
+
+def _static_margin(curve: Curve) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The crossing of -180 deg at frequency 0 of a model of negative static gain, nan without."""
+    zero = jnp.zeros(1, curve.omega.dtype)
+    gain = jax.lax.stop_gradient(curve(zero))[0]
+    crosses = jnp.isfinite(gain) & (jnp.real(gain) < 0)
+    crosses &= jnp.abs(jnp.imag(gain)) < _REAL * jnp.abs(jnp.real(gain))
+    stand_in = jnp.where(crosses, zero, curve.omega[:1])
+    margin = jnp.where(crosses, 1 / jnp.abs(curve(stand_in)[0]), jnp.nan)
+    return jnp.where(crosses, zero[0], jnp.nan), margin
 
 
 def _crosses_negative_axis(angle: Float[Array, " frequencies"]) -> Array:

@@ -18,7 +18,7 @@ from ._basis import (
     with_coherence,
 )
 from ._crossings import between, crossed, first
-from ._curve import Curve, curve_of, Response
+from ._curve import count_unstable_poles, Curve, curve_of, Response
 from ._margins import remarks_on_roots, unstable_roots
 
 
@@ -43,7 +43,7 @@ class Rejection(eqx.Module):
     - `unstable_roots`: of the closed loop, by Nyquist's count; nan if unknown.
     - `standard_errors`: of a measured response, by the names above; else empty.
     - `basis`: what the numbers were found from.
-    - `unstable_poles`: of L, as they were given.
+    - `unstable_poles`: of L.
     - `quantity`: what the response is of.
     """
 
@@ -90,7 +90,7 @@ def disturbance_rejection(
     *,
     quantity: str = "loop",
     omega: Float[ArrayLike, " frequencies"] | None = None,
-    unstable_poles: int = 0,
+    unstable_poles: int | None = None,
     output: str | int | None = None,
     input: str | int | None = None,
 ) -> Rejection:
@@ -108,7 +108,8 @@ def disturbance_rejection(
         S, from a disturbance at the output to the output.
     - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
         1000; of a measured response it picks some of its own frequencies.
-    - `unstable_poles`: how many the loop L has.
+    - `unstable_poles`: how many the loop L has. By default those of a model of s, as
+        `jq.TransferFunction` or `jq.StateSpace`, and none under jit and of other loops.
     - `output`, `input`: the channel, by name or number; None where there is one.
 
     **Returns:** a `Rejection`.
@@ -120,6 +121,9 @@ def disturbance_rejection(
     if quantity not in ("loop", "sensitivity"):
         raise ValueError(f'quantity is {quantity!r}: choose "loop" or "sensitivity"')
     curve = curve_of(response, omega, output, input)
+    if quantity == "loop":
+        unstable_poles = count_unstable_poles(response, unstable_poles)
+    unstable_poles = unstable_poles or 0
     poles = jnp.asarray(unstable_poles, curve.omega.dtype)
     values, basis, errors = evaluate_curve(_numbers, curve, quantity, poles)
     basis = with_coherence(basis, curve, {name: values[name] for name in _PLACES})
