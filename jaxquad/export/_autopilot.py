@@ -313,8 +313,9 @@ def write_parameter_files(
     stages, table, whole = [], [], ()
     for share in sorted(shares):
         whole = propose_changes(
-            firmware, old, new, share=share, reasons=reasons, beyond=beyond, at_once=at_once
-        )
+            firmware, old, new, share=share, beyond=beyond, at_once=at_once,
+            reasons=reasons if share >= 1 else {x: f"on the way to {new[x]:.5g}" for x in new},
+        )  # fmt: skip
         percent = round(100 * share)
         title = f"{percent} % of the way from what flew to the proposal"
         stages.append((folder / f"{stem}_{percent:03d}.{suffix}", text(whole, title)))

@@ -51,6 +51,7 @@ class FlightChannels:
     - `motors`: a column each, on `dt`; `motor_ends`: lowest and highest command.
     - `throttle`: 0 to 1, on `dt`; `stick`: likewise what the filters and TPA follow, where that is
         another one.
+    - `slewed`: by which P and D were lowered (ArduPilot's SMAX); None where the log does not say.
     - `late`: s after its stamp at which the set-point acts.
     - `resolution`: steps in which set-point and rates are logged, in rad/s, and the terms; 0 where
         they are not rounded.
@@ -76,6 +77,7 @@ class FlightChannels:
     motor_ends: tuple[float, float] = (0.0, 1.0)
     throttle: Samples | None = None
     stick: Samples | None = None
+    slewed: Samples | None = None
     late: float = 0.0
     resolution: tuple[float, float] = (0.0, 0.0)
     names: tuple[str, str] = ("", "")
@@ -144,7 +146,7 @@ def read_channels(
     throttle, injected = proposal.setup.throttle, _injected(proposal)
     wanted = [*names.filtered, *names.unfiltered, *names.terms, *names.motors, names.setpoint]
     external = proposal.setup.reference
-    wanted += [*names.output, *names.stick, *names.mixed, *injected, external]
+    wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected, external]
     found = _read(log, [*wanted, *throttle], _span(settings))
     rates, rate = found.get(names.filtered[axis]), names.filtered[axis]
     if rates is None or names.setpoint not in found:
@@ -175,7 +177,7 @@ def read_channels(
         motors=np.stack([at_rate(x) for x in motors], axis=1) if motors else None,
         motor_ends=_motor_ends(firmware, values),
         throttle=sum_at(throttle), stick=_stick(sum_at(names.stick), firmware, values),
-        late=proposal.setup.late_s.get(names.setpoint, 0.0),
+        slewed=sum_at(names.slewed), late=proposal.setup.late_s.get(names.setpoint, 0.0),
         resolution=_resolution(firmware, values),
         names=(rate, "" if raw is None else names.unfiltered[axis]),
         tracked_hz=_tracked(log, _span(settings)) if firmware == "ardupilot" else {},
@@ -223,6 +225,7 @@ class _Names(NamedTuple):
     output: Mapping[str, float]
     stick: Mapping[str, float] = MappingProxyType({})
     mixed: Mapping[str, float] = MappingProxyType({})
+    slewed: Mapping[str, float] = MappingProxyType({})
 
 
 def _betaflight_names(prefix: str, axis: int) -> _Names:
@@ -257,6 +260,7 @@ def _ardupilot_names(prefix: str, axis: int) -> _Names:
         [f"PID{'RPY'[axis]}.{x}" for x in ("P", "I", "D", "FF")],
         [f"RCOU.C{k}" for k in range(1, 5)],
         {f"RATE.{'RPY'[axis]}Out": 1.0},
+        slewed={f"PID{'RPY'[axis]}.Dmod": 1.0},
     )
 
 

@@ -69,12 +69,14 @@ class LawCheck:
     - `replayed`: the same as series, at the log's samples.
     - `late`: s after its stamp at which the set-point acted; `shifted`: whether that was found in
         this log, and not known of the firmware.
+    - `slewed`: by how much a slew limiter (SMAX) lowered P and D on the average, of 1.
     """
 
     terms: Mapping[str, TermReplay]
     replayed: Mapping[str, Samples]
     late: float = 0.0
     shifted: bool = False
+    slewed: float = 0.0
 
     @property
     def wrong(self) -> tuple[str, ...]:
@@ -124,6 +126,7 @@ class LawCheck:
             "text": self.text,
             "setpoint_late_s": self.late,
             "shift_found": self.shifted,
+            "lowered_by_slew_limit": self.slewed,
             "terms": {
                 name: plain_content(term._asdict() | {"share": term.share})
                 for name, term in self.terms.items()
@@ -166,13 +169,16 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
         integral=copies(flight.terms["I"], of_term) if "I" in flight.terms else None,
         mixer_range=flight.mixer_range, late=late, restart=_WINDOW,
     )  # fmt: skip
+    if flight.slewed is not None:
+        terms |= {name: terms[name] * flight.slewed[:, None] for name in "PD"}
     if forward is not None:
         terms["F"] = np.repeat(forward[:, None], many, axis=1)
     if output is not None:
         logged["output"] = output if flight.injected is None else output - _late_by(flight, late)
         terms["output"] = terms["P"] + terms["I"] + terms["D"] + terms["F"]
     compared = {name: _compared(x, terms[name], name, flight) for name, x in logged.items()}
-    return LawCheck(compared, {name: terms[name][:, 0] for name in compared}, late)
+    slewed = 0.0 if flight.slewed is None else float(1 - np.mean(flight.slewed))
+    return LawCheck(compared, {name: terms[name][:, 0] for name in compared}, late, slewed=slewed)
 
 
 def _late_by(flight: FlightChannels, late: float) -> Samples:

@@ -96,3 +96,22 @@ def beyond_angle(angle: CertifiedAngle, limits: Limits) -> list[str]:
         ),
     ]
     return [words for is_beyond, words in found if is_beyond]
+
+
+@runtime_checkable
+class GainLimits(Protocol):
+    """By which factors noise and gains may differ from what flew."""
+
+    @property
+    def noise(self) -> float: ...
+    @property
+    def change(self) -> float: ...
+
+
+def limits_text(limits: GainLimits) -> str:
+    """Of what the limits are relative to, and when to stop."""
+    return (
+        f"limits: noise {limits.noise:g} times and gains {limits.change:g} times those of this "
+        "flight at most. They compound from log to log: stop where a log keeps what flew, or the "
+        "motors get warm"
+    )

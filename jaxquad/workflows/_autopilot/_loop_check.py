@@ -33,6 +33,7 @@ _FEWEST = 6  # frequencies
 _COHERENT = 0.6
 _POINTS = 40
 _SATURATED = 0.02  # share of samples with a motor at its limit that is worth a word
+_SLEWED = 0.02  # by which a slew limiter lowered P and D, likewise
 _SHOWN = 4.0  # s of the flight on the page
 
 Samples = Float[np.ndarray, " samples"]
@@ -108,7 +109,12 @@ class LoopCheck:
             return f"{self.law.text}; {numbers}{self._limits}"
         worst = int(np.argmax(np.where(self.used, np.abs(self.predicted - self.measured), 0.0)))
         at = f"most at {self.omega[worst] / (2 * np.pi):.1f} Hz"
-        if self.limited > _SATURATED:
+        if self.law.slewed > _SLEWED:
+            cause = (
+                f"SMAX lowered P and D by {100 * self.law.slewed:.0f} % on the average, so these "
+                "gains did not fly: fly with less amplitude, or with SMAX 0"
+            )
+        elif self.limited > _SATURATED:
             cause = (
                 f"motors were at their limits in {100 * self.limited:.1f} % of the flight: fly "
                 "with less amplitude"

@@ -15,6 +15,7 @@ from jaxquad.report import Cell, Headline, PilotPage, Provenance, reason_of, Tab
 
 from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
+from ._limits import limits_text
 from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, RateLaw
 from ._stages import margin_text, Stage
 
@@ -49,7 +50,11 @@ def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "
     return PilotPage(
         title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
         headlines=_headlines(found),
-        remarks=[f"not modelled: {each}" for each in flown.unmodelled],
+        remarks=[
+            *(f"not modelled: {each}" for each in flown.unmodelled),
+            *([flown.filters_text] if flown.filters_text else []),
+            *([limits_text(found.settings)] if found.new else []),
+        ],
         filters=_filters(flown.law, after, axis),
         gyro=gyro,
         derivative=derivative,

@@ -17,6 +17,7 @@ from .._tune_settings import AutopilotSettings
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import GyroNoise
+from ._limits import limits_text
 from ._loop_check import LoopCheck
 from ._over_throttle import ThrottleVerdict
 from ._pilot_page import pilot_page
@@ -27,6 +28,7 @@ from ._stages import margin_text, OuterStage, Stage
 
 
 _CURVE = "thrust_curve"
+_FAR = 0.98  # of the factor by which a gain may change
 _SHORT = ("RLL", "PIT", "YAW")  # of ArduPilot's parameters of one axis
 
 
@@ -116,6 +118,8 @@ class AutopilotProposal:
             f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
         )
         reasons = dict.fromkeys(self.new, why)
+        for name in self._at_limit:
+            reasons[name] += f"; at the limit of a factor of {self.settings.change:g} (`change`)"
         if self.filters is not None:
             reasons |= dict.fromkeys(self.filters.flown, self.filters.reason)
         if before.angle is not None and after.angle is not None:
@@ -123,6 +127,13 @@ class AutopilotProposal:
                 f"Ms of the angle loop {before.angle.peak:.2f} -> {after.angle.peak:.2f}"
             )
         return {name: reason for name, reason in reasons.items() if name in self.new}
+
+    @property
+    def _at_limit(self) -> list[str]:
+        """Gains that are as far from what flew as `change` lets them be."""
+        flown, far = self.flown.old, _FAR * self.settings.change
+        away = {name: self.new[name] / old for name, old in flown.items() if name in self.new}
+        return [name for name, factor in away.items() if max(factor, 1 / factor) >= far]
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
@@ -220,7 +231,7 @@ class AutopilotProposal:
         if self.filters is not None:
             lines += ["", f"filters: {self.filters.text}"]
         if self.kind == "proposed":
-            lines += ["", change_table(self.changes).rstrip()]
+            lines += ["", change_table(self.changes).rstrip(), "", limits_text(self.settings)]
         curve = None if self.throttle is None else self.throttle.curve
         if curve is not None:
             lines += ["", f"thrust curve: {curve.text}"]
