@@ -31,6 +31,7 @@ def law_of(path, axis, **changed):
     settings = AutopilotSettings(axis=axis)
     asked, proposal = _channels_of(path, settings)
     flown, flight = _read_flight(path, asked, proposal, settings)
+    assert flight is not None
     loop = flown.loop
     if changed:
         loop = dataclasses.replace(loop, law=dataclasses.replace(loop.law, **changed))
@@ -67,6 +68,7 @@ def test_a_set_point_that_acts_a_loop_later_is_found_and_said(data):
     settings = AutopilotSettings(axis="pitch")
     asked, proposal = _channels_of(path, settings)
     flown, flight = _read_flight(path, asked, proposal, settings)
+    assert flight is not None
     check = check_law(flown.loop, flown.axis, dataclasses.replace(flight, late=0.0))
     assert check.flew and check.shifted and check.late == pytest.approx(1 / 400)
     assert "+2.5 ms after its stamp" in check.text

@@ -116,7 +116,7 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         for section in PT2(cutoff).sections(1 / self.law.dt):
             pole = [1.0, float(np.asarray(section.a1))]
             moved = lfilter([float(np.asarray(section.b0))], pole, moved)
-        return gain * moved
+        return gain * np.asarray(moved)
 
     def integral_share(
         self, mixer_range: Float[np.ndarray, " samples"]

@@ -95,12 +95,12 @@ def replay_terms(
     grid = _Grid(len(setpoint), dt, law.interval())
     r = grid.fine(setpoint, late)
     speed = _speed(flown, grid, r, feed_forward)
-    rows = _Row(
+    rows = _rows(
         r, speed, grid.fine(gyro),
         *_moments(flown, grid, throttle, mixer_range),
         *_restarts(grid, setpoint, integral, restart),
     )  # fmt: skip
-    terms = _replayed(_without_filters(flown), _padded(rows))
+    terms = _replayed(_without_filters(flown), rows)
     return {name: grid.coarse(np.asarray(term)) for name, term in terms.items()}
 
 
@@ -133,12 +133,12 @@ def fly_again(
     r = grid.fine(setpoint, late)[:, None]
     forward = None if feed_forward is None else np.asarray(feed_forward)[:, None]
     added = np.zeros_like(r) if injected is None else grid.fine(injected, late)[:, None]
-    rows = _Row(
+    rows = _rows(
         r, _speed(flown, grid, r, forward), added, *_moments(flown, grid, throttle, None),
         np.zeros_like(r), np.zeros(len(r), bool),
     )  # fmt: skip
     wait = max(int(np.floor(plant.delay / law.interval() + 1e-9)), 0)
-    rates, terms = _flown_again(flown, _held_step(plant, law.interval()), wait, _padded(rows))
+    rates, terms = _flown_again(flown, _held_step(plant, law.interval()), wait, rows)
     whole = {name: grid.coarse(np.asarray(term)[:, 0]) for name, term in terms.items()}
     return grid.coarse(np.asarray(rates)[:, 0]), whole
 
@@ -214,12 +214,12 @@ def _restarts(
     return before, np.arange(grid.loop.size) % every == 0
 
 
-def _padded(rows: _Row) -> _Row:
-    """Up to a whole number of blocks, by the last sample."""
-    count = len(rows.throttle)
+def _rows(*series: np.ndarray) -> _Row:
+    """The series of a `_Row`, up to a whole number of blocks by their last samples."""
+    count = len(series[0])
     more = -(-count // _BLOCK) * _BLOCK - count
     pad = lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)])
-    return jax.tree.map(lambda x: jnp.asarray(pad(x)), rows)
+    return _Row(*(jnp.asarray(pad(x)) for x in series))
 
 
 def _law_at(flown: FlownLoop, row: _Row):

@@ -34,7 +34,8 @@ class AxesProposal:
     @property
     def kind(self) -> Kind:
         """The best of the axes: "proposed" where one of them has gains."""
-        return min((one.kind for one in self.axes.values()), key=_ORDER.index)
+        kinds = {one.kind for one in self.axes.values()}
+        return next(kind for kind in _ORDER if kind in kinds)
 
     @property
     def verdict(self) -> str:

@@ -200,7 +200,7 @@ class RateLoops:
         """What an angle loop with a gain in 1/s gives around the rate loop."""
         loops = self.outer_loops(gains, angle_gain)
         distance = 1 + loops
-        stable = _is_stable(distance.real[None], distance.imag[None])[0]
+        stable = _is_stable(np.real(distance)[None], np.imag(distance)[None])[0]
         peaks = 1 / np.abs(distance).min(axis=1), np.abs(loops / distance).max(axis=1)
         return OuterQualities(stable, *peaks)
 

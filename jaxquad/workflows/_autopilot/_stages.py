@@ -39,7 +39,7 @@ class Stage(NamedTuple):
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
-        return self._asdict() | {"angle": None if self.angle is None else self.angle._asdict()}
+        return {**self._asdict(), "angle": None if self.angle is None else self.angle._asdict()}
 
 
 class OuterStage(NamedTuple):
