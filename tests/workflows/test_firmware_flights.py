@@ -165,3 +165,16 @@ def test_all_axes_come_in_one_page_and_one_file_with_one_save(data, tmp_path, ca
     # The loop that swung in yaw is said to be that, and is not gone towards in steps.
     assert "swung between the motors" in content["axes"]["yaw"]["verdict"]
     assert np.isfinite(content["axes"]["yaw"]["stages"][-1]["delay_margin"])
+
+
+@pytest.mark.slow
+def test_all_axes_are_of_one_flight_of_a_file_with_several(data, tmp_path, capsys):
+    names = ("A_sticks.BFL", "A_chirp_roll.BFL")
+    path = tmp_path / "flash.BFL"
+    path.write_bytes(b"".join((data / BETAFLIGHT / name).read_bytes() for name in names))
+    assert main(["autopilot", str(path), "--out", str(tmp_path / "out")]) == 0
+    content = json.loads((tmp_path / "out" / "autopilot.json").read_text())
+    kinds = {axis: each["kind"] for axis, each in content["axes"].items()}
+    assert kinds == {"roll": "proposed", "pitch": "cannot tell", "yaw": "cannot tell"}
+    for each in content["axes"].values():
+        assert each["identified_with"]["output"].startswith("log2.")

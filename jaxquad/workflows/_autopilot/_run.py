@@ -1,6 +1,7 @@
 """From the log of an autopilot to parameters for it: read, identify, reproduce, tune."""
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -73,7 +74,7 @@ def autopilot(
     if adrc or settings.law == "adrc":
         return tune_adrc(path, asked, proposal, settings)
     if settings.axis == "all":
-        return _tune_axes(path, settings)
+        return _tune_axes(path, _of_one_flight(settings, proposal))
     return _tune_axis(_read_axis(path, settings), {})
 
 
@@ -98,6 +99,14 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
         axes[axis] = _tune_axis(each, filters)
         filters = filters or axes[axis].shared_filters
     return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
+
+
+def _of_one_flight(settings: AutopilotSettings, proposal: Proposal) -> AutopilotSettings:
+    """All axes of a file with several flights are of the one that is proposed."""
+    number = re.match(r"log(\d+)\.", proposal.setup.rate)
+    if number is None or settings.flight is not None:
+        return settings
+    return dataclasses.replace(settings, flight=int(number[1]))
 
 
 class _ReadAxis(NamedTuple):
