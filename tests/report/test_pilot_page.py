@@ -8,7 +8,7 @@ import pytest
 from html_pages import HOSTILE, Page, UNSEEN
 
 from jaxquad.control.autopilots import FilterChain, PT1
-from jaxquad.plot import Spectrum, StepBand
+from jaxquad.plot import FlownAgain, Spectrum, StepBand
 from jaxquad.report import (
     _pilot,
     _pilot_sections,
@@ -73,6 +73,21 @@ def test_what_a_log_does_not_hold_has_no_section(tmp_path):
     text = write_pilot_page(tmp_path / "page.html", bare).read_text(encoding="utf-8")
     ids = [each["id"] for each in Page(text).of("section")]
     assert ids == ["changes", "filters"] and "holds what flew" in text
+
+
+def test_the_page_of_several_axes_has_each_of_them_behind_its_verdict(tmp_path):
+    time = np.linspace(0.0, 1.0, 200)
+    again = FlownAgain(time, np.sin(time), np.sin(time), np.sin(time - 0.01))
+    pages = [dataclasses.replace(page(x), again=again, again_text=f"{x} again") for x in "ab"]
+    pages[0] = dataclasses.replace(pages[0], overview="firmware 1, rate loops")
+    shown = Page(write_pilot_page(tmp_path / "page.html", *pages).read_text(encoding="utf-8"))
+    ids = [each["id"] for each in shown.of("section")]
+    assert not shown.errors and len(set(ids)) == len(ids)
+    assert {"axis-1", "axis-2", "steps-1", "again-2"} <= set(ids)
+    links = {each["href"] for each in shown.of("a") if "href" in each}
+    assert {"#axis-1", "#axis-2"} <= links
+    assert "firmware 1, rate loops" in shown.text("h1")
+    assert all(f"{x} again" in shown.text("section") for x in "ab")
 
 
 @pytest.mark.parametrize("name", sorted(_pilot_sections.SECTIONS))

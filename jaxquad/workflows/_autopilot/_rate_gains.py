@@ -374,16 +374,17 @@ def hold_plants(
 ) -> Complex[np.ndarray, "plants frequencies"]:
     """K e^(-delay s) / ((s + damping) (lag s + 1)) behind a hold: its modified z-transform."""
     lag, delay = np.maximum(lag, 1e-6), np.maximum(delay, 0.0)
-    damping = np.maximum(np.zeros_like(lag) if damping is None else damping, 1e-6)
     whole = np.floor(delay / dt)
     ahead = dt * (whole + 1) - delay  # from the command's arrival to the next sample
     q = np.exp(-1j * omega * dt)[None]
-    # The step's response is 1/damping and two exponentials, at the poles of rate and actuator.
-    apart = 1 - damping * lag
-    apart = np.where(np.abs(apart) < 1e-6, 1e-6, apart)
-    rate = np.exp(-damping * ahead) / (1 - np.exp(-damping * dt) * q)
     actuator = np.exp(-ahead / lag) / (1 - np.exp(-dt / lag) * q)
-    steps = (1 / (1 - q) - (rate - damping * lag * actuator) / apart) / damping
+    if damping is None or not np.any(damping > 0):
+        steps = dt * q / (1 - q) ** 2 + (ahead - lag) / (1 - q) + lag * actuator
+    else:  # the step's response is 1/damping and two exponentials
+        damping = np.maximum(damping, 1e-4)
+        apart = 1 - damping * lag
+        rate = np.exp(-damping * ahead) / (1 - np.exp(-damping * dt) * q)
+        steps = (1 / (1 - q) - (rate - damping * lag * actuator) / apart) / damping
     return gain * (1 - q) * q ** (whole + 1) * steps
 
 
