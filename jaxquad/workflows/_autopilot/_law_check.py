@@ -24,6 +24,7 @@ _SETTLED = 0.3  # s, for filters that start at rest
 _BAND = 0.1  # of the log's rate, beyond which the log does not show what the loop saw
 _LIVELY = 0.02  # of the output's rms, below which a term says nothing of its gain
 _OFF, _LEFT = 0.05, 0.1  # of a term's size, and what may be left of it, for the gains that flew
+_OFF_SLOW, _LEFT_SLOW = 0.03, 0.06  # more of these for each octave that the log is slower
 _SHIFTED = 0.02  # what is left of the output, from which a shift of the set-point is tried
 _BETTER = 0.5  # of that, for a shift to be believed
 _WINDOW = 0.2  # s, from one start of the integral to the next
@@ -38,6 +39,8 @@ class TermReplay(NamedTuple):
         `rounding`: what that explains.
     - `size`: the logged term over the replayed one, by least squares; `size_error`: its standard
         error.
+    - `slower`: octaves by which the log is slower than a quarter of the loop's rate: what happens
+        between its samples is not in the replay.
     """
 
     rms: float
@@ -45,6 +48,7 @@ class TermReplay(NamedTuple):
     rounding: float
     size: float
     size_error: float
+    slower: float = 0.0
 
     @property
     def share(self) -> float:
@@ -55,8 +59,9 @@ class TermReplay(NamedTuple):
     def off(self) -> bool:
         """Whether the term is not that of the gains, beyond its errors."""
         blur = self.rounding / max(self.rms, 1e-300)
-        doubt = max(_OFF, 3 * self.size_error + 2 * blur**2)  # errors of both sides of a slope
-        return bool(abs(self.size - 1) > doubt or self.share > max(_LEFT, doubt))
+        doubt = 3 * self.size_error + 2 * blur**2  # errors of both sides of a slope
+        off, left = _OFF + _OFF_SLOW * self.slower, _LEFT + _LEFT_SLOW * self.slower
+        return bool(abs(self.size - 1) > max(off, doubt) or self.share > max(left, doubt))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,7 +181,8 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
     if output is not None:
         logged["output"] = output if flight.injected is None else output - _late_by(flight, late)
         terms["output"] = terms["P"] + terms["I"] + terms["D"] + terms["F"]
-    compared = {name: _compared(x, terms[name], name, flight) for name, x in logged.items()}
+    slower = max(0.0, float(np.log2(flight.dt / law.law.interval())) - 2)
+    compared = {name: _compared(x, terms[name], name, flight, slower) for name, x in logged.items()}
     slewed = 0.0 if flight.slewed is None else float(1 - np.mean(flight.slewed))
     return LawCheck(compared, {name: terms[name][:, 0] for name in compared}, late, slewed=slewed)
 
@@ -198,7 +204,7 @@ def _rounding_error(signal: Samples, step: float, random: np.random.Generator) -
 
 def _compared(
     logged: Samples, replayed: Float[np.ndarray, "samples copies"], name: str,
-    flight: FlightChannels,
+    flight: FlightChannels, slower: float,
 ) -> TermReplay:  # fmt: skip
     """Of I what it grows by from start to start; of the rest what is below a tenth of the rate."""
     anchored, step = "I" in flight.terms, flight.resolution[1]
