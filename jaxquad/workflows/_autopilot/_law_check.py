@@ -218,7 +218,9 @@ def _compared(
     power = max(float(first @ first), 1e-300)
     independent = max(2 * _BAND * x.size, 1.0)  # samples of a signal in this band
     error = rms(x - first) / np.sqrt(power / x.size) / np.sqrt(independent)
-    return TermReplay(float(np.std(logged)), float(left), rounding, float(x @ first) / power, error)
+    return TermReplay(
+        float(np.std(logged)), float(left), rounding, float(x @ first) / power, float(error), slower
+    )
 
 
 Passed = Callable[[np.ndarray], np.ndarray]
