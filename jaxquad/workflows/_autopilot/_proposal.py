@@ -251,8 +251,8 @@ _WAYS = ("what flew", "a third of the way", "all of it")
 
 _OF_STAGES = """(fresh plants: drawn from what the log leaves possible, not tuned on; Ms and
 resonance: peaks of |S| and of the response to the set-point; torque: the rate after a step of
-torque, noise: that of the command, both over those of what flew; Ms held: without the integral,
-which iterm_relax holds while the set-point moves)"""
+torque, noise: that of the command, both over those of what flew)"""
+_OF_HELD = "(Ms held: without the integral, which iterm_relax holds while the set-point moves)"
 
 
 def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> list[str]:
@@ -282,7 +282,8 @@ def _stage_table(stages: tuple[Stage, ...]) -> str:
         )
         row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"
         rows.append(row + ("" if stage.angle is None else f" {stage.angle.peak:10.2f}"))
-    return "\n".join([*rows, _OF_STAGES, *_of_angle(first.angle)])
+    of_held = [_OF_HELD] if held else []
+    return "\n".join([*rows, _OF_STAGES, *of_held, *_of_angle(first.angle)])
 
 
 def _of_angle(angle: OuterStage | None) -> list[str]:
