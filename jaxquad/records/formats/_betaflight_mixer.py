@@ -22,8 +22,8 @@ _BAND = (1.0, 25.0)  # Hz, where the lag is looked for
 _SHOWN = 0.5  # of the rate's acceleration that the command explains, for a lag to be seen
 _LEVEL = 0.04  # of the throttle, over which the motors' mean is taken
 _ARMED = 0.02  # of the motors' range, from which the propellers carry
-_ALIKE = 0.02  # of the slope from the command to what the motors show
-_SCATTER = 2.0  # units of pidsum, rms, which rounding and a moving throttle make
+_ALIKE = 0.25  # of the slope from the command to what the motors show
+_SCATTER = (2.0, 0.04)  # units of pidsum, rms, which rounding and a moving throttle make; of rms
 _UNLIMITED = 300.0  # units of pidsum, below each limit of the sum
 _FEWEST = 200  # samples with all motors between their limits
 _AT_END = 0.002  # of a motor's range
@@ -50,8 +50,8 @@ def with_mixed_axes(
         return dict(columns)
     low, high = ends
     motors = (np.stack([np.asarray(columns[x], float) for x in names], axis=1) - low) / (high - low)
-    sides = {axis: _side(axis, motors, columns) for axis in _QUAD_X}
-    seen = {axis: side for axis, side in sides.items() if side}
+    slopes = {axis: _shown(axis, motors, columns) for axis in _QUAD_X}
+    seen = {axis: slope for axis, slope in slopes.items() if slope}
     if not seen:
         return dict(columns)
     dt = float(np.median(np.diff(time)))
@@ -59,8 +59,8 @@ def with_mixed_axes(
     thrust = _linear_thrust(motors, _lag_of(columns, motors, seen, dt), dt)
     slope = 1 - _CURVE + 2 * _CURVE * collective
     mixed = {
-        f"axisMixed[{axis}]": side * 250 * (thrust @ np.array(_QUAD_X[axis])) / slope
-        for axis, side in seen.items()
+        f"axisMixed[{axis}]": 250 * (thrust @ np.array(_QUAD_X[axis])) / (shown * slope)
+        for axis, shown in seen.items()
     }
     return {**columns, **mixed, "collective": collective}
 
@@ -83,19 +83,19 @@ def _lagged(motors: np.ndarray, lag: float, dt: float) -> np.ndarray:
 
 
 def _lag_of(
-    columns: Mapping[str, np.ndarray], motors: Motors, sides: Mapping[int, float], dt: float
+    columns: Mapping[str, np.ndarray], motors: Motors, shown: Mapping[int, float], dt: float
 ) -> float:
     """The motors' lag that explains most of an axis' acceleration, of the axis that moved most."""
     from scipy.signal import butter, sosfiltfilt
 
-    rates = {axis: columns.get(f"gyroADC[{axis}]") for axis in sides if axis < 2}
+    rates = {axis: columns.get(f"gyroADC[{axis}]") for axis in shown if axis < 2}
     moved = {axis: np.asarray(rate, float) for axis, rate in rates.items() if rate is not None}
     if not moved or 1 / dt < 4 * _BAND[1]:
         return _USUAL_LAG
     axis = max(moved, key=lambda each: float(np.std(moved[each])))
     sections = butter(2, _BAND, "bandpass", fs=1 / dt, output="sos")
     turned = sosfiltfilt(sections, np.gradient(moved[axis], dt))
-    command = sosfiltfilt(sections, sides[axis] * motors @ np.array(_QUAD_X[axis]))
+    command = sosfiltfilt(sections, shown[axis] * motors @ np.array(_QUAD_X[axis]))
     shares = []
     for lag in _LAGS:
         made = _lagged(command, float(lag), dt)
@@ -105,8 +105,11 @@ def _lag_of(
     return float(_LAGS[best]) if shares[best] > _SHOWN else _USUAL_LAG
 
 
-def _side(axis: int, motors: Motors, columns: Mapping[str, np.ndarray]) -> float:
-    """1 or -1 where the motors show the axis' command, or its negative; 0 where they do not."""
+def _shown(axis: int, motors: Motors, columns: Mapping[str, np.ndarray]) -> float:
+    """By what the motors show of an axis' command, with its sign; 0 where they do not show it.
+
+    It is near 1, and beyond it where the firmware makes up for a battery that sags.
+    """
     command = columns.get(f"axisSum[{axis}]")
     if command is None:
         return 0.0
@@ -117,9 +120,10 @@ def _side(axis: int, motors: Motors, columns: Mapping[str, np.ndarray]) -> float
     if shown.size < _FEWEST or not np.any(command):
         return 0.0
     slope = float(shown @ command) / float(command @ command)
-    side = float(np.sign(slope))
     follows = abs(abs(slope) - 1) < _ALIKE
-    return side if follows and np.std(side * shown - command) < _SCATTER else 0.0
+    least, share = _SCATTER
+    scatter = float(np.std(shown - slope * command))
+    return slope if follows and scatter < max(least, share * float(np.std(command))) else 0.0
 
 
 def _mean_at_throttle(mean: Samples, columns: Mapping[str, np.ndarray]) -> Samples:
