@@ -262,7 +262,7 @@ def test_px4s_rate_set_point_is_of_the_outside_in_acro_alone(tmp_path):
 
 def test_betaflight_and_crazyflie_logs_get_what_their_readme_says(data):
     proposal = propose(data / "betaflight_ar8/LOG00037.BFL", axis="yaw")
-    assert proposal.setup.command == {"axisSum[2]": 1.0}
+    assert proposal.setup.command == {"axisMixed[2]": 1.0}  # of a quadrotor with its motors
     assert (proposal.setup.rate, proposal.setup.reference) == ("gyroADC[2]", "setpoint[2]")
     proposal = propose(data / "crazyflie_rollpitch/log15", axis="roll")
     motors = dict(
