@@ -73,7 +73,7 @@ def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "
         again=None if check is None else FlownAgain(
             check.time, check.setpoint, check.rate, check.again
         ),
-        again_text="" if check is None else f"{check.verdict}.",
+        again_text="" if check is None else f"{check.verdict[0].upper()}{check.verdict[1:]}.",
         overview=overview,
         provenance=origin,
         failures=failures,
