@@ -305,7 +305,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     """
     flown = flown_law(opened)
     filters = () if flown is None or opened.settings.keep_gyro_filters else flown.filters
-    found, others = _identify(opened, compare=True, filters=filters)
+    found, others = _identify(opened, compare=True, filters=filters, vehicle=flown is not None)
     found = dataclasses.replace(found, flown=flown)
     found = _with_fits_again(dataclasses.replace(found, check=_checked(found)))
     return _with_others(found, others)
@@ -328,7 +328,7 @@ def identify_plant(
     path: Path, settings: IdentifySettings, proposal: Proposal, filters: Sequence[KnownFilter]
 ) -> Identification:
     """Likewise, up to what the `filters` of the output were given; its remedies are flights."""
-    found, _ = _identify(open_logs(path, settings, proposal), filters=filters)
+    found, _ = _identify(open_logs(path, settings, proposal), filters=filters, vehicle=True)
     fits = {method: _with_remedy(each, EXCITE) for method, each in found.fits.items()}
     return dataclasses.replace(found, fits=fits)
 
@@ -343,9 +343,13 @@ def _with_remedy(found: Fit, remedy: str) -> Fit:
 
 
 def _identify(
-    opened: OpenedLogs, *, compare: bool = False, filters: Sequence[KnownFilter] = ()
-) -> tuple[Identification, Mapping[str, Later[FrequencyResponse]]]:
-    """The estimate to trust and its fit; the estimates to `compare` it with, by method."""
+    opened: OpenedLogs, *, compare: bool = False, filters: Sequence[KnownFilter] = (),
+    vehicle: bool = False,
+) -> tuple[Identification, Mapping[str, Later[FrequencyResponse]]]:  # fmt: skip
+    """The estimate to trust and its fit; the estimates to `compare` it with, by method.
+
+    The rate of a `vehicle` may be damped by the air.
+    """
     (path, *more), settings, proposal, records = opened
     if sum(record.time.size for record in records) > LONG:
         end_second_process()
@@ -353,8 +357,8 @@ def _identify(
     methods = (best, *(others if compare else ()))
     estimated = fit_best(records, methods, settings, filters)
     fit = estimated.fit
-    if proposal is not None and isinstance(fit.model, LaggedIntegrator) and settings.integrators:
-        fit = fit_damped(fit)  # a vehicle's rate, which air may damp
+    if vehicle and isinstance(fit.model, LaggedIntegrator) and settings.integrators:
+        fit = fit_damped(fit)
     fit = with_units(with_remedies(fit, settings), records[0])
     announce("fits to parts of the band")
     fit, parts = fit_parts(fit, estimated.frf, settings)

@@ -29,8 +29,9 @@ def test_betaflights_loop_is_reproduced_and_its_plant_is_not_told(data, tmp_path
     assert "roll: P 77, I 119, D 55" in text and "not modelled: feedforward_transition 40" in text
     assert text.count("=> this log cannot tell") == 2
     told = [line for line in text.splitlines() if line.startswith("=> this log cannot tell")]
-    assert ["fly a chirp of the rate set-point" in line for line in told] == [True, True]
-    assert text.count("which shows no curve: fly 0.19 and 0.49") == 2
+    assert "law and plant, flown on the logged set-point, miss the rate by" in told[0]
+    assert "debug_mode = CHIRP" in told[1]
+    assert text.count("which shows no curve: fly 0.24 and 0.44") == 2
     off = [float(x) for line in text.splitlines() if line[:4] in ("  P:", "  I:", "  D:")
            for x in line.replace(",", "").split() if x[0].isdigit()]  # fmt: skip
     assert len(off) == 6 and max(off) <= 2 and max(off[:2]) <= 1

@@ -121,7 +121,7 @@ def test_one_throttle_is_enough_for_that_throttle(flown_by_pid, tmp_path, capsys
     options = ["--axis", "roll", "--law", "adrc", "--out", str(tmp_path)]
     assert main(["autopilot", str(path), *options]) == 0
     said = capsys.readouterr().out
-    assert "b0 over the throttle is not known" in said and "fly 0.31 and 0.61" in said
+    assert "b0 over the throttle is not known" in said and "fly 0.36 and 0.56" in said
     new = read_cli(tmp_path / "proposal_100.txt")
     at = float(new["adrc_hover_throttle"]) / 100
     assert at == pytest.approx(0.46, abs=0.011) and new["adrc_b0_law"] == "SQRT"
