@@ -104,14 +104,17 @@ def test_the_unfiltered_gyro_is_ahead_by_the_filters_and_one_gyro_sample(columns
 def test_the_command_finds_the_true_plant_and_shows_where_to_look(tmp_path, capsys):
     code = main(["demo", "--autopilot", "--out", str(tmp_path), "--quiet"])
     printed = capsys.readouterr().out
-    plant = json.loads((tmp_path / "autopilot.json").read_text())["plant"]
+    content = json.loads((tmp_path / "autopilot.json").read_text())
+    plant = content["plant"]
     assert plant["gain"] == pytest.approx(CHIRP_TRUTH["gain"], rel=0.03)
     assert plant["lag"] == pytest.approx(CHIRP_TRUTH["lag"], rel=0.05)
     assert plant["delay"] == pytest.approx(CHIRP_TRUTH["delay"], abs=2e-4)
     assert (tmp_path / "autopilot.html").exists() and (tmp_path / "demo.bfl").exists()
     assert "gain 36, lag 0.025 s, delay 0.000625 s" in printed
     assert printed.split("Look at ")[1].splitlines()[0] == str(tmp_path / "autopilot.html")
-    assert code in (0, 3)
+    assert code == 0 and content["kind"] == "proposed"
+    low, high = plant["intervals_95"]["gain"]
+    assert low < 36 < high and (tmp_path / "proposal_100.txt").exists()
 
 
 def test_a_measured_and_a_simulated_flight_are_not_asked_for_together(capsys):
