@@ -3,12 +3,14 @@
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from jaxquad.cli import main
-from jaxquad.workflows import AutopilotSettings
+from jaxquad.workflows import autopilot, AutopilotSettings, AxesProposal
+from jaxquad.workflows._autopilot import _run
 from jaxquad.workflows._autopilot._law_check import check_law
 from jaxquad.workflows._autopilot._run import _channels_of, _read_flight
 
@@ -178,3 +180,17 @@ def test_all_axes_are_of_one_flight_of_a_file_with_several(data, tmp_path, capsy
     assert kinds == {"roll": "proposed", "pitch": "cannot tell", "yaw": "cannot tell"}
     for each in content["axes"].values():
         assert each["identified_with"]["output"].startswith("log2.")
+
+
+@pytest.mark.usefixtures("without_type_checks")  # of the stand-ins
+def test_an_axis_that_fails_costs_no_other(data, monkeypatch):
+    def tune(axis, filters):
+        if axis.settings.axis == "pitch":
+            raise ValueError("the gain is not above 0")
+        return SimpleNamespace(kind="kept", verdict="as it flew", shared_filters={})
+
+    monkeypatch.setattr(_run, "_tune_axis", tune)
+    found = autopilot(data / ARDUPILOT / "mixer_chirp_roll.BIN")
+    assert isinstance(found, AxesProposal)
+    assert list(found.axes) == ["roll", "yaw"] and found.kind == "kept"
+    assert "pitch: the gain is not above 0" in found.verdict

@@ -81,7 +81,7 @@ def autopilot(
 def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
     """One axis after the other; filters that they share are those of the first that changes them.
 
-    Raises the error of the first axis where none can be read.
+    Raises the error of the first axis where none can be used.
     """
     read: dict[str, _ReadAxis] = {}
     errors: dict[str, ValueError] = {}
@@ -90,14 +90,18 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
             read[axis] = _read_axis(path, dataclasses.replace(settings, axis=axis))
         except ValueError as error:  # the log lacks what this axis needs
             errors[axis] = error
-    if not read:
-        raise next(iter(errors.values()))
     axes: dict[str, AutopilotProposal] = {}
     filters: Mapping[str, float] = {}
     for axis, each in read.items():
         announce(f"{axis}:")
-        axes[axis] = _tune_axis(each, filters)
+        try:
+            axes[axis] = _tune_axis(each, filters)
+        except ValueError as error:  # it costs no other axis
+            errors[axis] = error
+            continue
         filters = filters or axes[axis].shared_filters
+    if not axes:
+        raise next(iter(errors.values()))
     return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
 
 
