@@ -114,7 +114,7 @@ def fly_again(
     feed_forward: Series | None = None,
     injected: Series | None = None,
     late: float = 0.0,
-) -> tuple[Float[np.ndarray, " samples"], dict[str, Float[np.ndarray, " samples"]]]:
+) -> Float[np.ndarray, " samples"]:
     """The rate that law and plant make of a logged set-point: the closed loop in time, undisturbed.
 
     **Arguments:**
@@ -125,8 +125,7 @@ def fly_again(
     - `injected`: what is added to the command behind the law, in its unit.
     - `late`: s after their stamps at which set-point and injection act.
 
-    **Returns:** the rate before the gyro's filters in rad/s, and the law's terms, at the log's
-    samples.
+    **Returns:** the rate before the gyro's filters in rad/s, at the log's samples.
     """
     law = flown.law
     grid = _Grid(len(setpoint), dt, law.interval())
@@ -138,9 +137,8 @@ def fly_again(
         np.zeros_like(r), np.zeros(len(r), bool),
     )  # fmt: skip
     wait = max(int(np.floor(plant.delay / law.interval() + 1e-9)), 0)
-    rates, terms = _flown_again(flown, _held_step(plant, law.interval()), wait, rows)
-    whole = {name: grid.coarse(np.asarray(term)[:, 0]) for name, term in terms.items()}
-    return grid.coarse(np.asarray(rates)[:, 0]), whole
+    rates = _flown_again(flown, _held_step(plant, law.interval()), wait, rows)
+    return grid.coarse(np.asarray(rates)[:, 0])
 
 
 class _Grid:
@@ -274,10 +272,10 @@ def _flown_again(flown: FlownLoop, step: _Step, wait: int, rows: _Row):
         memory, state, queue = carry
         rate = state[1]
         reference = Setpoint(row.setpoint, row.speed, zero)
-        memory, command, terms = _law_at(flown, row).advance(memory, zero, reference, rate)
+        memory, command, _ = _law_at(flown, row).advance(memory, zero, reference, rate)
         queue = jnp.concatenate([(command + row.rate)[None], queue])  # the newest one first
         moved = matrix @ state + jnp.outer(now, queue[-2]) + jnp.outer(before, queue[-1])
-        return (memory, moved, queue[:-1]), (rate, terms)
+        return (memory, moved, queue[:-1]), rate
 
     start = (flown.law.rest(zero), jnp.zeros((2, *zero.shape)), queue)
     return jax.lax.scan(sample, start, rows)[1]

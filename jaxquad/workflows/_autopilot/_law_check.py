@@ -71,14 +71,12 @@ class LawCheck:
     **Attributes:**
 
     - `terms`: "P", "I", "D" where they are logged, and "output", their sum with feed-forward.
-    - `replayed`: the same as series, at the log's samples.
     - `late`: s after its stamp at which the set-point acted; `shifted`: whether that was found in
         this log, and not known of the firmware.
     - `slewed`: by how much a slew limiter (SMAX) lowered P and D on the average, of 1.
     """
 
     terms: Mapping[str, TermReplay]
-    replayed: Mapping[str, Samples]
     late: float = 0.0
     shifted: bool = False
     slewed: float = 0.0
@@ -111,7 +109,7 @@ class LawCheck:
             for name, term in self.terms.items()
             if term.rms > 0
         )
-        kept = f"the law replayed on the logged set-point and gyro leaves {shares}"
+        kept = f"the law replayed on the logged set-point and gyro leaves {shares} beyond rounding"
         if self.shifted:
             kept += f", with the set-point {1e3 * self.late:+.3g} ms after its stamp"
         if self.flew:
@@ -186,7 +184,7 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
     slower = max(0.0, float(np.log2(flight.dt / law.law.interval())) - 2)
     compared = {name: _compared(x, terms[name], name, flight, slower) for name, x in logged.items()}
     slewed = 0.0 if flight.slewed is None else float(1 - np.mean(flight.slewed))
-    return LawCheck(compared, {name: terms[name][:, 0] for name in compared}, late, slewed=slewed)
+    return LawCheck(compared, late, slewed=slewed)
 
 
 def _late_by(flight: FlightChannels, late: float) -> Samples:

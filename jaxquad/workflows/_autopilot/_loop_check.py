@@ -165,7 +165,7 @@ def check_loop(
     """Fly the loop again on the excitation that the log holds."""
     forward, injected = flight.terms.get("F"), flight.injected
     added = flight.not_carried if injected is None else injected
-    again, _ = fly_again(
+    again = fly_again(
         pick_axis(flown.loop, flown.axis), plant_of(found.fit, _unit(found)), flight.setpoint,
         flight.followed, dt=flight.dt, late=law.late, feed_forward=forward, injected=added,
     )  # fmt: skip

@@ -432,7 +432,8 @@ def _judge(
             f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most {limit:g}"
             f"{_around(flown, whole)}. What flew is stable on {100 * flown.stable:.0f} % of them: "
             f"it swung between the motors' limits ({100 * swings:.0f} % of the flight). A third of "
-            "the way would swing, too, so both files hold all of it: hover low with it first"
+            "the way would swing, too, so both files hold all of it, and gains may be further from "
+            f"what flew than {settings.change:g} times (`change`): hover low with it first"
         )
     return "proposed", (
         f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most "
