@@ -9,12 +9,11 @@ from jaxtyping import Float
 from ._clock import clock_start, JITTER, nonuniformity, show_times, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
+from ._log import known_unit
 from ._record import as_tuple, check_distinct, Hold, Record
-from ._repair import check_ranges, repair_values, Valid, within
+from ._repair import check_ranges, repair_values, Valid, within, without_turns
 from ._resample import Channel, resample
 from ._timebase import signal_names, Timebases
-from ._turns import without_turns
-from ._units import known_unit
 from .formats import load_signals
 
 
