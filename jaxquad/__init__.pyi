@@ -61,4 +61,4 @@ from .tuning import (
     Objective as Objective,
     tune as tune,
 )
-from .workflows import load_result as load_result, second_process as second_process
+from .workflows import load_result as load_result

@@ -28,4 +28,3 @@ from ._results import (
     write_json as write_json,
     write_results as write_results,
 )
-from ._sections import draw_sections as draw_sections

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaxquad._core import beside, Later, write_file
+from jaxquad._core import write_file
 from jaxquad.control.autopilots import FilterChain
 from jaxquad.identify import GainBand
 from jaxquad.plot import FlownAgain, Spectrum, StepBand, ThrottleCurve
@@ -91,15 +91,13 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
 
     **Returns:** the path.
     """
-    # The caller has compiled what filters are drawn from: it waits for them first.
-    begun = [{name: beside(attempt, _draw, name, page) for name in _DRAWN} for page in pages]
     first, origin = pages[0], pages[0].provenance
     axes = [
         {
             "title": page.title, "headlines": list(page.headlines), "remarks": list(page.remarks),
-            "sections": _sections(page, drawn),
+            "sections": _sections(page),
         }
-        for page, drawn in zip(pages, begun, strict=True)
+        for page in pages
     ]  # fmt: skip
     text = render_page(
         "pilot.html",
@@ -113,10 +111,10 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
 _DRAWN = ("filters", "again", "noise", "steps", "b0", "balance")
 
 
-def _sections(page: PilotPage, drawn: Mapping[str, Later[object]]) -> dict[str, object]:
+def _sections(page: PilotPage) -> dict[str, object]:
     sections = {
         "changes": {"changes": page.changes, "stages": page.stages},
-        **{name: section.get() for name, section in drawn.items()},
+        **{name: attempt(_draw, name, page) for name in _DRAWN},
         "text": {"text": page.text} if page.text else None,
     }
     sections |= {name: {FAILED: reason} for name, reason in page.failures.items()}

@@ -23,12 +23,10 @@ from ._demo_chirp import (
 from ._identify import (
     Identification as Identification,
     identify as identify,
-    identify_fit as identify_fit,
     identify_opened as identify_opened,
 )
 from ._kinds import SettingsError as SettingsError
 from ._log import (
-    open_again as open_again,
     open_logs as open_logs,
     OpenedLogs as OpenedLogs,
     propose_settings as propose_settings,
@@ -40,11 +38,6 @@ from ._result_file import (
     load_tuning as load_tuning,
     StoredResult as StoredResult,
     StoredTuning as StoredTuning,
-)
-from ._second_process import (
-    import_estimates as import_estimates,
-    import_figures as import_figures,
-    second_process as second_process,
 )
 from ._settings import (
     GROUPS as GROUPS,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, beside
+from jaxquad._core import announce
 from jaxquad.identify import behind_filters, Fit, Verification, verify
 from jaxquad.records import (
     clock_start,
@@ -54,7 +54,6 @@ def write_identification(found: Identification, folder: Path) -> Path:
         **_model_content(found),
     }
     path = write_results(folder, fit=found.fit, frf=found.frf, check=found.check, extra=extra)
-    drawn = beside(_write_figures, found, folder)
     from jaxquad.report import write_report  # here: with it comes matplotlib
 
     others = {f"{name} estimate": found.responses[name] for name in list(found.responses)[1:]}
@@ -73,7 +72,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         formula="; ".join(filter(None, (found.formula, found.filters_text))),
         beside=found.beside,
     )
-    drawn.get()
+    _write_figures(found, folder)
     return path
 
 

@@ -14,7 +14,6 @@ from jaxquad.control.autopilots import Butterworth, FilterChain, Notch, PT1
 from jaxquad.workflows import (
     identify,
     identify_again,
-    identify_fit,
     IdentifySettings,
     load_result,
     open_logs,
@@ -24,6 +23,7 @@ from jaxquad.workflows import (
 )
 from jaxquad.workflows._autopilot._flight_channels import FlightChannels
 from jaxquad.workflows._flown_law import best_filters, FlownLaw, StoredFilters
+from jaxquad.workflows._identify import identify_fit
 from jaxquad.workflows._loop_of_law import loop_of_law
 
 
