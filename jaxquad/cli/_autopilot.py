@@ -79,7 +79,7 @@ def run_autopilot(
 
 def _prepare() -> None:
     """What a second process will need beyond `start_computing`: the laws of autopilots."""
-    import jaxquad.control.autopilots
+    import jaxquad.autopilot
     from jaxquad.workflows import autopilot
 
     del autopilot, jaxquad
