@@ -1,4 +1,5 @@
 from . import (
+    autopilot as autopilot,
     control as control,
     datasets as datasets,
     design as design,

@@ -86,7 +86,7 @@ Then your own log:
 
 
 def _chirp(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import CHIRP_TRUTH, write_chirp_log
+    from jaxquad.autopilot import CHIRP_TRUTH, write_chirp_log
 
     folder = options.out or Path("results/demo_autopilot")
     write = lambda: write_chirp_log(folder / "demo.bfl")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxquad._core import announce
+from jaxquad.autopilot import flown_law, FlownLaw
 from jaxquad.identify import (
     Bands,
     behind_filters,
@@ -44,7 +45,6 @@ from ._fits import (
     with_remedies,
     with_units,
 )
-from ._flown_law import flown_law, FlownLaw
 from ._log import mix_of, open_logs, OpenedLogs, read_records
 from ._result_file import default_folder
 from ._settings import IdentifySettings
@@ -303,7 +303,10 @@ def identify_opened(opened: OpenedLogs) -> Identification:
 
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
-    flown = flown_law(opened)
+    settings = opened.settings
+    flown = flown_law(
+        opened.paths, mix_of(settings.output), mix_of(settings.input), opened.proposal, settings
+    )
     filters = () if flown is None or opened.settings.keep_gyro_filters else flown.filters
     found, delay = _identify(opened, compare=True, filters=filters, vehicle=flown is not None)
     found = dataclasses.replace(found, flown=flown)

@@ -77,10 +77,11 @@ def write_identification(found: Identification, folder: Path) -> Path:
 
 
 def _law_if_any(found: Identification) -> LawLoop | None:
-    from ._loop_of_law import loop_of_law
+    from jaxquad.autopilot import loop_of_law
 
     try:
-        return loop_of_law(found)
+        [unit] = found.records[0].output_units
+        return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
     except Exception as error:  # the record shows its loop without the law, too
         warnings.warn(f"the loop by its law is missing: {reason_of(error)}", PageWarning, 2)
         return None
