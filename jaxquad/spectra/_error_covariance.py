@@ -9,7 +9,7 @@ from jaxtyping import Array, Complex, Float, Int
 from jaxquad._core import pytree_node
 
 from ._atoms import add_effects, Reach, reach_of, sums_of_products, times_drive
-from ._window import coefficients
+from ._windows import coefficients
 
 
 _POINTS = 32  # times to the shortest window, on which overlaps are summed

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from ._window import leaked_power
+from ._windows import leaked_power
 
 
 Grid = Float[np.ndarray, " frequencies"]
