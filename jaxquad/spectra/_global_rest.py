@@ -13,7 +13,8 @@ from ._global_model import (
     highest_modelled,
 )
 from ._local_fit import Bins, left_power, LocalFit, window_slices
-from ._local_noise import Noise, SharedErrors
+from ._local_noise import SharedErrors
+from ._noise import Noise
 
 
 _NEAR, _AROUND = 0.05, 0.7  # a mode's neighbourhood and beyond, in ln(omega)

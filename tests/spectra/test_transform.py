@@ -153,9 +153,7 @@ def test_windows_of_shared_blocks_equal_those_term_by_term_behind_each_derivativ
         np.geomspace(0.004, 0.3, 9),
         (Taper("hann", 3), Taper("hann'", 3, 1), Taper("hann''", 2)),
     )
-    made = fourier_sums(
-        (x[:, :1], x[:, 1:]), angle, SHARED, tapers, detrend=detrend, origin=7.0
-    )
+    made = fourier_sums((x[:, :1], x[:, 1:]), angle, SHARED, tapers, detrend=detrend, origin=7.0)
     for taper, found in zip(tapers, made, strict=True):
         for (length, starts), sums in zip(SHARED[taper.first :], found, strict=True):
             part = x[:, : taper.channels]
