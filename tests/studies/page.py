@@ -32,8 +32,8 @@ ORDER = (
 HEAD = """\
 # Validation: do the error bars hold?
 
-What a user gets without options, measured on plants whose truth is known. NumPy and scipy alone simulate the
-plants and their noise, by code that shares nothing with the library. Each section names its command and its table.
+What a user gets without options, on plants whose truth is known. NumPy and scipy alone simulate plants and noise,
+by code that shares nothing with the library. Each section has its table and its command.
 [notes.txt](validation/notes.txt) says what was simulated. `python tests/studies/page.py` makes this page.
 """
 SHORT = {  # columns of the first table that the page itself shows
@@ -49,8 +49,7 @@ The least possible error is the Cramer-Rao bound; the luck of the draws is taken
 1.06 (coloured noise 1.10), at most 2 % of records with a remark. scipy's `csd` and `least_squares` on the same
 records: 1.5 to 490 times the bound.""",
     "Healthy plants, parameter by parameter": """\
-The same draws. 95 % of 400 draws is known to 2.1 %. Where the model is right, counting model error widens intervals
-by 0 to 12 %.""",
+95 % of 400 draws is known to 2.1 %. Counting model error widens intervals by 0 to 12 % where the model is right.""",
     "Refinement in the time domain": """\
 `jq.refine` reaches 0.92 to 1.05 times the bound with a noise model, in closed loop too. Output error without one
 diverges in a closed loop; with the controller known (`loop=`) it has 3.2 to 7.1 times the bound.""",
@@ -84,8 +83,7 @@ after a torque. The simulated plant has the model's structure.""",
 TAIL = """\
 ## Numbers of others, and measured flights
 
-- CIFER 6.3 printed a fit of a simulated Cessna: gain, zero, pole and frequency agree within one standard error, the
-  damping within 2.2 ([Comparison](comparison.md), `python fits/cessna_navfit.py`).
+- A fit that CIFER 6.3 printed, `python fits/cessna_navfit.py`: [Comparison](comparison.md).
 - Five published flights: [Measured flights](measured.md).
 - Loops and simulations equal python-control's and scipy's: [Comparison](comparison.md).
 - The paper's figures: [equations](equations.md), `python fits/paper.py`.
@@ -142,7 +140,7 @@ def _section(table: dict) -> str:
         cells = [[str(row[table["columns"].index(name)]) for name in SHORT] for row in table["rows"]]
         rows = [[*SHORT.values()], ["---"] * len(SHORT), *cells]
         parts += ["\n".join(f"| {' | '.join(row)} |" for row in rows)]
-    parts += [f"[Table](validation/{_file_name(table)}), `{table['command']}`"]
+    parts += [f"[Table](validation/{_file_name(table)})\n`{table['command']}`"]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
