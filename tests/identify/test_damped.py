@@ -10,8 +10,9 @@ from scipy.linalg import expm
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.identify import _damped, fit_damped
-from jaxquad.identify._half_bands import require_origin
+from jaxquad.identify import fit_damped
+from jaxquad.identify.frequency_domain import _damped
+from jaxquad.identify.frequency_domain._half_bands import require_origin
 from jaxquad.workflows import AutopilotSettings
 
 
