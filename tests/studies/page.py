@@ -1,4 +1,4 @@
-"""Make docs/validation.md and its tables from the results of the studies: python tests/studies/page.py.
+"""Make docs/validation.md and its tables from the studies: python tests/studies/page.py.
 
 The page says of each study what it finds; each table is a CSV file in docs/validation/, and
 notes.txt there holds what was simulated and what a study misses.
@@ -32,9 +32,10 @@ ORDER = (
 HEAD = """\
 # Validation: do the error bars hold?
 
-What a user gets without options, on plants whose truth is known. NumPy and scipy alone simulate plants and noise,
-by code that shares nothing with the library. Each section has its table and its command.
-[notes.txt](validation/notes.txt) says what was simulated. `python tests/studies/page.py` makes this page.
+What a user gets without options, on plants whose truth is known. NumPy and scipy alone simulate
+plants and noise, by code that shares nothing with the library. Each section has its table and its
+command. [notes.txt](validation/notes.txt) says what was simulated. `python tests/studies/page.py`
+makes this page.
 """
 SHORT = {  # columns of the first table that the page itself shows
     "plant": "plant",
@@ -44,41 +45,55 @@ SHORT = {  # columns of the first table that the page itself shows
 }
 FINDINGS = {
     "Healthy plants without options": """\
-400 records of each plant (200 of three inputs), through `jq.frequency_response` and `jq.fit` with their defaults.
-The least possible error is the Cramer-Rao bound; the luck of the draws is taken out. Wanted: 93 to 97 %, at most
-1.06 (coloured noise 1.10), at most 2 % of records with a remark. scipy's `csd` and `least_squares` on the same
-records: 1.5 to 490 times the bound.""",
+400 records of each plant (200 of three inputs), through `jq.frequency_response` and `jq.fit` with
+their defaults. The least possible error is the Cramer-Rao bound; the luck of the draws is taken
+out. Wanted: 93 to 97 %, at most 1.06 (coloured noise 1.10), at most 2 % of records with a remark.
+scipy's `csd` and `least_squares` on the same records: 1.5 to 490 times the bound.
+""",
     "Healthy plants, parameter by parameter": """\
-95 % of 400 draws is known to 2.1 %. Counting model error widens intervals by 0 to 12 % where the model is right.""",
+95 % of 400 draws is known to 2.1 %. Counting model error widens intervals by 0 to 12 % where the
+model is right.
+""",
     "Refinement in the time domain": """\
-`jq.refine` reaches 0.92 to 1.05 times the bound with a noise model, in closed loop too. Output error without one
-diverges in a closed loop; with the controller known (`loop=`) it has 3.2 to 7.1 times the bound.""",
+`jq.refine` reaches 0.92 to 1.05 times the bound with a noise model, in closed loop too. Output
+error without one diverges in a closed loop; with the controller known (`loop=`) it has 3.2 to 7.1
+times the bound.
+""",
     "Ring-down at the end of a record": """\
-A light mode still rings when the record ends: the worst error is 2.0 to 2.5 claimed errors in the median record,
-4.7 at most.""",
+A light mode still rings when the record ends: the worst error is 2.0 to 2.5 claimed errors in the
+median record, 4.7 at most.
+""",
     "The same, no global model": """\
-With local fits alone it is 2.6 to 171 claimed errors, and up to 319 %. Six of nine settings have remarks in 97 % of
-records or more; 3 rad/s at 5 % noise has them in 5 %.""",
+With local fits alone it is 2.6 to 171 claimed errors, and up to 319 %. Six of nine settings have
+remarks in 97 % of records or more; 3 rad/s at 5 % noise has them in 5 %.
+""",
     "The hold of a command": """\
-A command is held for 0.02 s. With the hold stated, 93.5 to 98 % of the intervals hold the truth. Not stated,
-parameters are biased by up to 90 claimed errors, and every record has a remark.""",
+A command is held for 0.02 s. With the hold stated, 93.5 to 98 % of the intervals hold the truth.
+Not stated, parameters are biased by up to 90 claimed errors, and every record has a remark.
+""",
     "Nonlinear actuators": """\
-A deadband of 15 % or a saturation at 80 % is remarked in 100 % of records, a linear actuator in none.""",
+A deadband of 15 % or a saturation at 80 % is remarked in 100 % of records, a linear actuator in
+none.
+""",
     "Short records": """\
-With Student's t, 93.8 to 95 % of intervals hold for one input and 10 to 66 s; 91.2 % for three inputs and 20 s;
-90.5 % for 8 lines over 4 periods.""",
+With Student's t, 93.8 to 95 % of intervals hold for one input and 10 to 66 s; 91.2 % for three
+inputs and 20 s; 90.5 % for 8 lines over 4 periods.
+""",
     "Intervals with model error": """\
-1280 records of plants with one term that the model lacks: the gain's 95 % interval holds in 95.9 % (by noise alone
-in 37 %), that of lag + delay in 89.7 % (15.4 %). An echo, or a lead and lag within the band, bends the phase as a
-lag does and cannot be seen: 70 %.""",
+1280 records of plants with one term that the model lacks: the gain's 95 % interval holds in 95.9
+% (by noise alone in 37 %), that of lag + delay in 89.7 % (15.4 %). An echo, or a lead and lag
+within the band, bends the phase as a lag does and cannot be seen: 70 %.
+""",
     "Tuned designs, judged again": """\
-Other code flies 2000 members of `tests/tuning_case.py`. None of a design by `jq.tune` is unstable or beyond its
-limit Ms <= 3.6; the paper's gains leave 36 to 70 % unstable. With 95 % confidence at most 1.2 % of all members
-exceed the worst of 256.""",
+Other code flies 2000 members of `tests/tuning_case.py`. None of a design by `jq.tune` is unstable
+or beyond its limit Ms <= 3.6; the paper's gains leave 36 to 70 % unstable. With 95 % confidence
+at most 1.2 % of all members exceed the worst of 256.
+""",
     "ADRC parameters from a log, on the true plant": """\
-200 simulated flights of a 5-inch quad. `propose_adrc` keeps Ms at most 1.8 in all; Ms exceeds the worst certified
-value by at most 0.5 %. The guide's "b0 times two" keeps it too, with 58 % of the bandwidth and 1.8 times the rate
-after a torque. The simulated plant has the model's structure.""",
+200 simulated flights of a 5-inch quad. `propose_adrc` keeps Ms at most 1.8 in all; Ms exceeds the
+worst certified value by at most 0.5 %. The guide's "b0 times two" keeps it too, with 58 % of the
+bandwidth and 1.8 times the rate after a torque. The simulated plant has the model's structure.
+""",
 }
 TAIL = """\
 ## Numbers of others, and measured flights
@@ -135,10 +150,11 @@ def _notes(table: dict) -> str:
 
 def _section(table: dict) -> str:
     title = table["title"]
-    parts = [f"## {title}", FINDINGS.get(title, fill(table.get("text", ""), 110))]
+    parts = [f"## {title}", fill(FINDINGS.get(title, table.get("text", "")), 110)]
     if title == "Healthy plants without options":
-        cells = [[str(row[table["columns"].index(name)]) for name in SHORT] for row in table["rows"]]
-        rows = [[*SHORT.values()], ["---"] * len(SHORT), *cells]
+        places = [table["columns"].index(name) for name in SHORT]
+        rows = [[*SHORT.values()], ["---"] * len(SHORT)]
+        rows += [[str(row[place]) for place in places] for row in table["rows"]]
         parts += ["\n".join(f"| {' | '.join(row)} |" for row in rows)]
     parts += [f"[Table](validation/{_file_name(table)})\n`{table['command']}`"]
     return "\n\n".join(part for part in parts if part) + "\n"
