@@ -1,14 +1,3 @@
-from ._compare import compare as compare, Comparison as Comparison
-from ._condition import Changed as Changed
-from ._cost import (
-    coherence_weight as coherence_weight,
-    CoherenceWeighted as CoherenceWeighted,
-    Cost as Cost,
-    MaximumLikelihood as MaximumLikelihood,
-    paper_cost as paper_cost,
-    Points as Points,
-    usable as usable,
-)
 from ._curve_parameters import (
     actuator as actuator,
     B0Law as B0Law,
@@ -17,55 +6,46 @@ from ._curve_parameters import (
     CurveFirmware as CurveFirmware,
     FirmwareValue as FirmwareValue,
 )
-from ._curves import (
-    model_response as model_response,
-    ResponseBand as ResponseBand,
-    step_response as step_response,
-    StepBand as StepBand,
-)
-from ._damped import fit_damped as fit_damped
-from ._derived import Tied as Tied
-from ._discrepancy import Discrepancy as Discrepancy
-from ._draw_models import (
-    check_drawable as check_drawable,
-    draw_models as draw_models,
-    known_covariance as known_covariance,
-)
-from ._explain import Candidate as Candidate, Explanation as Explanation
-from ._factors import Factor as Factor, Factors as Factors, factors as factors
-from ._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
-from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
-from ._fit_remarks import MISFIT as MISFIT
 from ._gain_over_throttle import (
     gain_over_throttle as gain_over_throttle,
     throttle_levels as throttle_levels,
     ThrottledIntegrator as ThrottledIntegrator,
 )
-from ._half_bands import Bands as Bands
-from ._held import as_sampled as as_sampled
 from ._known_filters import (
     behind_filters as behind_filters,
     filter_response as filter_response,
     KnownFilter as KnownFilter,
     without_filters as without_filters,
 )
-from ._known_loop import (
-    KnownController as KnownController,
-    SampledFeedback as SampledFeedback,
-)
 from ._measured_chain import (
     measured_chain as measured_chain,
     MeasuredChain as MeasuredChain,
 )
-from ._noise_model import (
-    ARMA as ARMA,
-    AutoRegressive as AutoRegressive,
-    Noise as Noise,
-    NoiseModel as NoiseModel,
+from ._thrust_curve import (
+    GainBand as GainBand,
+    GainOverThrottle as GainOverThrottle,
+    PlantsOverThrottle as PlantsOverThrottle,
+    ScaledB0 as ScaledB0,
+    ThrottleLevels as ThrottleLevels,
 )
-from ._normal import problem_normal as problem_normal
-from ._output_error import refine as refine
-from ._parameters import (
+from .batch._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
+from .frequency_domain._condition import Changed as Changed
+from .frequency_domain._cost import (
+    coherence_weight as coherence_weight,
+    CoherenceWeighted as CoherenceWeighted,
+    Cost as Cost,
+    MaximumLikelihood as MaximumLikelihood,
+    paper_cost as paper_cost,
+    Points as Points,
+    usable as usable,
+)
+from .frequency_domain._damped import fit_damped as fit_damped
+from .frequency_domain._explain import Candidate as Candidate, Explanation as Explanation
+from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
+from .frequency_domain._half_bands import Bands as Bands
+from .frequency_domain._held import as_sampled as as_sampled
+from .frequency_domain._normal import problem_normal as problem_normal
+from .frequency_domain._parameters import (
     Free as Free,
     name_places as name_places,
     Parameters as Parameters,
@@ -75,38 +55,64 @@ from ._parameters import (
     select_parameters as select_parameters,
     with_values as with_values,
 )
-from ._problem import (
+from .frequency_domain._problem import (
     make_problem as make_problem,
     Prior as Prior,
     Problem as Problem,
     residuals as residuals,
 )
-from ._reduce import reduce_structure as reduce_structure, Reduction as Reduction
-from ._result import Fit as Fit
-from ._simulated import (
-    HasTransferFunction as HasTransferFunction,
-    integrate_plant as integrate_plant,
-    linear_model as linear_model,
-)
-from ._solve import least_squares as least_squares
-from ._starts import (
+from .frequency_domain._reduce import reduce_structure as reduce_structure, Reduction as Reduction
+from .frequency_domain._result import Fit as Fit
+from .frequency_domain._solve import least_squares as least_squares
+from .frequency_domain._starts import (
     Minimum as Minimum,
     solve_from_many as solve_from_many,
     spread_starts as spread_starts,
 )
-from ._thrust_curve import (
-    GainBand as GainBand,
-    GainOverThrottle as GainOverThrottle,
-    PlantsOverThrottle as PlantsOverThrottle,
-    ScaledB0 as ScaledB0,
-    ThrottleLevels as ThrottleLevels,
+from .frequency_domain._transfer_function_fit import fit_transfer_function as fit_transfer_function
+from .frequency_domain._transfer_function_guess import (
+    guess_transfer_function as guess_transfer_function,
 )
-from ._transfer_function_fit import fit_transfer_function as fit_transfer_function
-from ._transfer_function_guess import guess_transfer_function as guess_transfer_function
-from ._verdict import (
+from .output_error._compare import compare as compare, Comparison as Comparison
+from .output_error._known_loop import (
+    KnownController as KnownController,
+    SampledFeedback as SampledFeedback,
+)
+from .output_error._noise_model import (
+    ARMA as ARMA,
+    AutoRegressive as AutoRegressive,
+    Noise as Noise,
+    NoiseModel as NoiseModel,
+)
+from .output_error._refine import refine as refine
+from .output_error._simulated import (
+    HasTransferFunction as HasTransferFunction,
+    integrate_plant as integrate_plant,
+    linear_model as linear_model,
+)
+from .output_error._verify import (
+    Agreement as Agreement,
+    Verification as Verification,
+    verify as verify,
+)
+from .uncertainty._curves import (
+    model_response as model_response,
+    ResponseBand as ResponseBand,
+    step_response as step_response,
+    StepBand as StepBand,
+)
+from .uncertainty._derived import Tied as Tied
+from .uncertainty._discrepancy import Discrepancy as Discrepancy
+from .uncertainty._draw_models import (
+    check_drawable as check_drawable,
+    draw_models as draw_models,
+    known_covariance as known_covariance,
+)
+from .uncertainty._factors import Factor as Factor, Factors as Factors, factors as factors
+from .uncertainty._fit_remarks import MISFIT as MISFIT
+from .uncertainty._verdict import (
     Bound as Bound,
     Combination as Combination,
     UndeterminedError as UndeterminedError,
     Verdict as Verdict,
 )
-from ._verify import Agreement as Agreement, Verification as Verification, verify as verify

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from ._verdict import Combination, reach_of_interval
+from .uncertainty._verdict import Combination, reach_of_interval
 
 
 CurveFirmware = Literal["px4", "ardupilot", "betaflight", "betaflight 2025.12"]

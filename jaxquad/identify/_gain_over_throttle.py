@@ -19,12 +19,12 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
-from ._cost import usable
 from ._curve_parameters import relative_slope
-from ._fit import fit, guess_lagged_integrator
 from ._known_filters import KnownFilter, without_filters
-from ._result import Fit
 from ._thrust_curve import GainOverThrottle, ThrottleLevels
+from .frequency_domain._cost import usable
+from .frequency_domain._fit import fit, guess_lagged_integrator
+from .frequency_domain._result import Fit
 
 
 _FEWEST = 8  # usable frequencies of a level

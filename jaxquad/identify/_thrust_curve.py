@@ -20,10 +20,10 @@ from ._curve_parameters import (
     FirmwareValue,
     parameter_of_curve,
 )
-from ._draw_models import draw_models
-from ._fit_content import counted
-from ._result import Fit
-from ._verdict import Combination, UndeterminedError
+from .frequency_domain._fit_content import counted
+from .frequency_domain._result import Fit
+from .uncertainty._draw_models import draw_models
+from .uncertainty._verdict import Combination, UndeterminedError
 
 
 Levels = Float[np.ndarray, " levels"]

@@ -16,7 +16,7 @@ from airframe import Airframe
 from scipy.optimize import least_squares
 
 from jaxquad.identify import select_parameters
-from jaxquad.identify._fit_batch import solve_batch
+from jaxquad.identify.batch._fit_batch import solve_batch
 
 
 jax.config.update("jax_enable_x64", True)

@@ -17,9 +17,9 @@ from scipy.optimize import least_squares
 
 import jaxquad as jq
 from jaxquad.identify import select_parameters
-from jaxquad.identify._cost import points_of, usable
-from jaxquad.identify._problem import make_problem
-from jaxquad.identify._solve import solve
+from jaxquad.identify.frequency_domain._cost import points_of, usable
+from jaxquad.identify.frequency_domain._problem import make_problem
+from jaxquad.identify.frequency_domain._solve import solve
 
 
 jax.config.update("jax_enable_x64", True)

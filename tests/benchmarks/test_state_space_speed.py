@@ -17,10 +17,10 @@ from scipy.optimize import least_squares
 
 import jaxquad as jq
 from jaxquad.identify import select_parameters
-from jaxquad.identify._cost import points_of, usable
-from jaxquad.identify._fit_batch import solve_batch
-from jaxquad.identify._problem import make_problem
-from jaxquad.identify._solve import solve
+from jaxquad.identify.batch._fit_batch import solve_batch
+from jaxquad.identify.frequency_domain._cost import points_of, usable
+from jaxquad.identify.frequency_domain._problem import make_problem
+from jaxquad.identify.frequency_domain._solve import solve
 from jaxquad.models import simulate_linear, StateSpace
 
 

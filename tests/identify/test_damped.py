@@ -10,8 +10,9 @@ from scipy.linalg import expm
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.identify import _damped, fit_damped
-from jaxquad.identify._half_bands import require_origin
+from jaxquad.identify import fit_damped
+from jaxquad.identify.frequency_domain import _damped
+from jaxquad.identify.frequency_domain._half_bands import require_origin
 from jaxquad.workflows import AutopilotSettings
 
 
@@ -158,7 +159,7 @@ def test_a_firmware_s_gain_is_right_beside_a_small_damping(data, log, without_ty
     axis = log.split("_")[-1]
     path, settings = data / "ardupilot_firmware" / f"{log}.BIN", AutopilotSettings(axis=axis)
     proposal = jq.workflows.autopilot(path, settings)
-    assert isinstance(proposal, jq.workflows.AutopilotProposal)
+    assert isinstance(proposal, jq.autopilot.AutopilotProposal)
     plain = proposal.identification.fit
     if plain.values[0] < 0:
         pytest.skip("the chirp is counted twice in the command of this log")

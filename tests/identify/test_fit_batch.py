@@ -10,9 +10,9 @@ from synthetic import response_of
 import jaxquad as jq
 from jaxquad._xla import arctan2, evaluate_once, in_real_parts, NotInRealPartsError
 from jaxquad.identify import select_parameters
-from jaxquad.identify._condition import UNCHANGED
-from jaxquad.identify._fit_batch import solve_batch
-from jaxquad.identify._problem import Problem, residuals
+from jaxquad.identify.batch._fit_batch import solve_batch
+from jaxquad.identify.frequency_domain._condition import UNCHANGED
+from jaxquad.identify.frequency_domain._problem import Problem, residuals
 
 
 OMEGA = jnp.asarray(np.geomspace(0.6, 40.0, 30))

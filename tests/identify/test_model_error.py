@@ -8,7 +8,7 @@ import pytest
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
-from jaxquad.identify._discrepancy import (
+from jaxquad.identify.uncertainty._discrepancy import (
     _root_by_inverse,
     _root_of_kernel,
     kernel_basis,

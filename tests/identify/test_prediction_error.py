@@ -10,8 +10,13 @@ from scipy.signal import lfilter
 
 import jaxquad as jq
 from jaxquad.identify import ARMA, AutoRegressive, refine
-from jaxquad.identify._noise_model import estimate_noise, NoiseModel, shock_slopes, shocks_of
-from jaxquad.identify._whitening import make_whitener
+from jaxquad.identify.output_error._noise_model import (
+    estimate_noise,
+    NoiseModel,
+    shock_slopes,
+    shocks_of,
+)
+from jaxquad.identify.output_error._whitening import make_whitener
 
 
 DT, SAMPLES = 0.02, 1000

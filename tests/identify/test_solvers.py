@@ -10,10 +10,10 @@ from synthetic import OMEGA, response_of
 
 import jaxquad as jq
 from jaxquad.identify import make_problem, residuals, select_parameters
-from jaxquad.identify._cost import points_of, usable
-from jaxquad.identify._gauss_newton import DampedGaussNewton
-from jaxquad.identify._mixing import mixings_of
-from jaxquad.identify._solve import least_squares as minimum_of, solve
+from jaxquad.identify.frequency_domain._cost import points_of, usable
+from jaxquad.identify.frequency_domain._gauss_newton import DampedGaussNewton
+from jaxquad.identify.frequency_domain._mixing import mixings_of
+from jaxquad.identify.frequency_domain._solve import least_squares as minimum_of, solve
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)

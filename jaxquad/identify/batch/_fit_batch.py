@@ -1,0 +1,448 @@
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+
+from jaxquad._core import (
+    advance,
+    available_cores,
+    begin,
+    CONVERGED,
+    decrement,
+    Descent,
+    Normal,
+    require_x64,
+    RUNNING,
+    settle,
+    STALLED,
+    TOLERANCE,
+)
+from jaxquad._xla import Jit
+from jaxquad.models import evaluate_response, with_arrays
+from jaxquad.spectra import FrequencyResponse
+
+from ..frequency_domain._cost import (
+    Cost,
+    least_coherence,
+    MaximumLikelihood,
+    Points,
+    points_of,
+    Range,
+    usable,
+)
+from ..frequency_domain._fit import check_options
+from ..frequency_domain._held import held, hold_of
+from ..frequency_domain._mixing import Mixing, mixings_of
+from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
+from ..frequency_domain._problem import make_problem
+from ..frequency_domain._result import Fit
+from ..frequency_domain._solve import once_if_alike, solution_at, stopped_early
+from ..uncertainty._assess import assess, Counted, discrepancy_at, records_at
+from ._normal import Batch, Evaluate, evaluates_singly, Member, normal_equations_of
+
+
+_CHUNK = 64  # fits side by side
+_CHUNK_OF_SINGLES = 8  # fits of which each is evaluated by itself
+_CHUNKS = 8  # of one call
+
+
+class BatchSolution(NamedTuple):
+    """Where the fit of every response of a batch stopped."""
+
+    z: Float[Numbers, "batch parameters"]
+    values: Float[Numbers, "batch parameters"]  # physical
+    cost: Float[Numbers, " batch"]  # sum of squares
+    decrement: Float[Numbers, " batch"]  # what one more step would save of half the cost
+    steps: Int[Numbers, " batch"]
+    converged: Bool[Numbers, " batch"]  # stopped, and with nothing left to save
+
+
+Mixings = Sequence[Mixing | None]
+
+
+def solve_batch(
+    model: PyTree,
+    parameters: Parameters,
+    omega: Float[Numbers, " frequencies"],
+    measured: Complex[Numbers, "batch frequencies outputs inputs"],
+    weights: Float[Numbers, "..."],
+    *,
+    mixings: Mixings = (),
+    start: Float[Numbers, "batch parameters"] | None = None,
+    hold: float = 0.0,
+    max_steps: int = 64,
+    tolerance: float = TOLERANCE,
+) -> BatchSolution:
+    """Fit every response of the batch, by Levenberg-Marquardt.
+
+    `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
+    phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count; `mixings`, one for each
+    member or none at all, take points together that share noise. All start from the model's values,
+    or from `start`. The model is evaluated one frequency at a time, with inputs held for `hold` s
+    (0: not held). A member that did not reach a stationary point has `converged` false, and its
+    decrement says how far it is; one in a local minimum shows by its cost alone.
+    Raises ValueError for shapes that do not match, no batch at all, or a response that at one
+    frequency depends on which others are asked for.
+    """
+    if measured.shape[0] == 0 or (*measured.shape, 2) != weights.shape:
+        raise ValueError(
+            f"measured has shape {measured.shape} and weights {weights.shape}: give at least one "
+            "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
+        )
+    omega, count = np.asarray(omega), len(omega)
+    where = Batch(model, parameters, hold, _pad(omega), np.asarray(count))
+    _check_pointwise(where, measured.shape[2:])
+    weights = np.asarray(weights)
+    if evaluates_singly(where):
+        weights = once_if_alike(weights)
+    members = _members(np.asarray(measured), weights, mixings)
+    if start is None:
+        start = np.broadcast_to(
+            parameters.start[: parameters.count], (len(measured), parameters.count)
+        )
+    return _solve_calls(where, members, np.asarray(start), max_steps, tolerance)
+
+
+def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
+    """What the members are fitted to, each on the first axis."""
+    used = np.any(weights > 0, axis=-1)
+    # Points that do not count may hold anything, NaN included.
+    with np.errstate(invalid="ignore"):
+        inverse = _pad(np.where(used, 1 / np.where(used, measured, 1.0), 1.0), 1)
+    weights = _pad(weights, 1)
+    if weights.shape[1] > measured.shape[1]:
+        weights[:, measured.shape[1] :] = 0
+    shared = any(each is not None for each in mixings)
+    parts = np.real(inverse), np.imag(inverse)
+    if not shared:
+        return Member(parts, weights, None)
+    given = measured.shape, inverse.shape[1]
+    return Member(parts, weights, _factors(mixings, *given), _across(mixings, *given))
+
+
+def _factors(
+    mixings: Mixings, shape: tuple[int, ...], length: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Real and imaginary parts; the identity for members whose points share no noise."""
+    batch, count, outputs, inputs = shape
+    real = np.zeros((batch, length, length, outputs, inputs))
+    imag = np.zeros_like(real)
+    for k, mixing in enumerate(mixings):
+        factor = np.eye(count)[:, :, None, None]
+        factor = factor if mixing is None else np.moveaxis(mixing.factor, (0, 1), (2, 3))
+        real[k, :count, :count], imag[k, :count, :count] = np.real(factor), np.imag(factor)
+    return real, imag
+
+
+def _across(
+    mixings: Mixings, shape: tuple[int, ...], length: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Likewise of the pairs at each frequency, where there are several."""
+    batch, count, outputs, inputs = shape
+    pairs = outputs * inputs
+    if pairs == 1:
+        return None
+    whole = np.zeros((batch, length, pairs, pairs), complex)
+    whole[:] = np.eye(pairs)
+    for row, mixing in zip(whole, mixings, strict=True):
+        if mixing is not None and mixing.across is not None:
+            row[:count] = mixing.across
+    return np.real(whole), np.imag(whole)
+
+
+def _padded(size: int) -> int:
+    """The frequencies of a program that takes this many: few lengths, few programs."""
+    step = max(8, 1 << max((size - 1).bit_length() - 3, 0))
+    return size + -size % step
+
+
+def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Filled up with the last frequency; the array itself where it is full."""
+    size = array.shape[axis]
+    if _padded(size) == size:
+        return array
+    return np.take(array, np.minimum(np.arange(_padded(size)), size - 1), axis)
+
+
+def _check_pointwise(where: Batch, shape: tuple[int, ...]) -> None:
+    whole, single = (np.asarray(part) for part in _both_ways(where.model, where.omega))
+    if whole.shape != (*where.omega.shape, *shape):
+        raise ValueError(
+            f"the model's response has shape {whole.shape[1:]}, the measured ones {shape} (outputs,"
+            " inputs): pick channels with jq.records.select, or extend the model"
+        )
+    if not np.allclose(whole, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(whole))):
+        raise ValueError(
+            "the model's response at one frequency depends on the other frequencies that are asked "
+            "for: a batch evaluates it frequency by frequency; fit the responses with jq.fit"
+        )
+
+
+@eqx.filter_jit
+def _both_ways(model, omega):
+    single = jax.vmap(lambda w: evaluate_response(model, w[None])[0])(omega)
+    return evaluate_response(model, omega), single
+
+
+def _calls(batch: int, chunk: int, chunks: int) -> list[Int[np.ndarray, "chunks chunk"]]:
+    """The members that each call solves, by chunks; the last are filled up with the last member."""
+    places = _places(batch, chunk)
+    calls = max(-(-len(places) // chunks), min(len(places), available_cores()))
+    return np.array_split(places, calls)
+
+
+def _places(batch: int, chunk: int) -> Int[np.ndarray, "chunks chunk"]:
+    return np.minimum(np.arange(batch + -batch % chunk), batch - 1).reshape(-1, chunk)
+
+
+def _solve_calls(
+    where: Batch, members: Member, start: np.ndarray, max_steps: int, tolerance: float
+) -> BatchSolution:
+    batch = len(start)
+    chunks = _CHUNKS if members.factor is None else 1  # factors are large
+
+    def solve(places: Int[np.ndarray, "chunks chunk"]) -> BatchSolution:
+        mine, z0 = jax.tree.map(lambda x: _arrange(x, places, chunks), (members, start))
+        options = np.asarray(len(places)), np.asarray(max_steps), tolerance
+        found = _solve_call(where, mine, z0, *options)
+        return BatchSolution(*(np.asarray(part)[: places.size] for part in found))
+
+    calls = _calls(batch, _CHUNK_OF_SINGLES if evaluates_singly(where) else _CHUNK, chunks)
+    if len(calls) > 1:
+        solve(calls[0][:0])  # of no chunk: compiled here, once for all threads
+    # A program runs on one core.
+    with ThreadPoolExecutor(max_workers=min(len(calls), available_cores())) as pool:
+        found = list(pool.map(solve, calls))
+    return BatchSolution(*(np.concatenate(each)[:batch] for each in zip(*found, strict=True)))
+
+
+def _arrange(array: np.ndarray, places: Int[np.ndarray, "chunks chunk"], chunks: int) -> np.ndarray:
+    """Chunks first and members last; all calls have one size, so that few programs are compiled."""
+    mine = np.moveaxis(array[places], 1, -1)
+    filled = np.zeros((chunks, *mine.shape[1:]), mine.dtype)
+    filled[: len(places)] = mine
+    return filled
+
+
+@Jit
+def _solve_call(where, members, z0, chunks, max_steps, tolerance) -> BatchSolution:
+    """Solve the first `chunks` of the chunks that there is room for."""
+
+    def chunk(k):
+        mine, start = jax.tree.map(
+            lambda x: jax.lax.dynamic_index_in_dim(x, k, keepdims=False), (members, z0)
+        )
+        return _descend(normal_equations_of(where, mine), start, max_steps, tolerance)
+
+    def add(k, total):
+        return jax.tree.map(lambda out, x: out.at[k].set(x), total, chunk(k))
+
+    shapes = jax.eval_shape(chunk, jnp.zeros((), int))
+    room = jax.tree.map(lambda x: jnp.zeros((len(z0), *x.shape), x.dtype), shapes)
+    stacked = jax.lax.fori_loop(0, chunks, add, room)
+    z, *facts = (jnp.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1]) for part in stacked)
+    return BatchSolution(z, jax.vmap(where.parameters.values)(z), *facts)
+
+
+class _Walk(NamedTuple):
+    """A descent, and the normal equations at the last point that was evaluated."""
+
+    state: Descent
+    normal: Normal
+    ended: Bool[Array, ""]
+
+
+def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) -> tuple:
+    """Where members stop, with the cost, what is left to save, steps, and whether they converged.
+
+    As `minimise` does, and with one evaluation at the end, in the same loop: it compiles once.
+    """
+
+    def step(walk: _Walk) -> _Walk:
+        state = walk.state
+        active = (state.status == RUNNING) & (state.steps < max_steps)
+        ended = ~jnp.any(active)
+        state = state._replace(change=jnp.where(ended, 0.0, state.change))
+        normal = evaluate(state.z + state.change, active | ended)
+        return _Walk(advance(lambda _: normal, state, max_steps, tolerance), normal, ended)
+
+    start = begin(z0)
+    walk = _Walk(start, start.normal, jnp.asarray(False))
+    state, normal, _ = jax.lax.while_loop(lambda walk: ~walk.ended, step, walk)
+    left = decrement(normal)
+    converged = (settle(state).status == CONVERGED) & (left <= 1e-6 * normal.cost + 1e-12)
+    return state.z, 2 * normal.cost, left, state.steps, converged
+
+
+class BatchFit(eqx.Module):
+    """Fits of one model to many responses; `fit(k)` is the whole result for response k."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Float[np.ndarray, "batch parameters"]
+    costs: Float[np.ndarray, " batch"]
+    decrements: Float[np.ndarray, " batch"]  # what one more step would save of half the cost
+    steps: Int[np.ndarray, " batch"]
+    converged: Bool[np.ndarray, " batch"]
+    model: PyTree
+    parameters: Parameters
+    points: tuple[Points, ...]
+    weights: Float[np.ndarray, "batch frequencies outputs inputs 2"]
+    mixed: bool = eqx.field(static=True)  # whether points that share noise count together
+    z: Float[np.ndarray, "batch parameters"]
+
+    def fit(self, k: int) -> Fit:
+        """The fit of response k, with standard errors, verdict and remarks.
+
+        Its standard errors count what the model leaves unexplained. Its values are those of the
+        batch, where that is no floor on the random error as it is in `jq.fit`: it would take each
+        response through a solution of its own.
+        """
+        points, steps = self.points[k], int(self.steps[k])
+        problem = make_problem(self.model, self.parameters, [points.frf])
+        mixings = mixings_of([points], [self.weights[k]]) if self.mixed else None
+        problem = problem.weighted([self.weights[k]], mixings)
+        message = "" if self.converged[k] else stopped_early(STALLED, steps)
+        solution = solution_at(problem, self.z[k], message, steps)
+        records = records_at(problem, [points], solution)
+        found = discrepancy_at(records, [points], solution)
+        return assess(problem, Counted([points], records, None, None, found), solution)
+
+    def __str__(self) -> str:
+        lost = int(np.sum(~self.converged))
+        lines = [f"{len(self.values)} fits; {lost} of them reached no minimum"]
+        good = self.values[self.converged]
+        if len(good):
+            low, middle, high = np.percentile(good, [5, 50, 95], axis=0)
+            for row in zip(self.names, middle, low, high, strict=True):
+                lines.append("{:<16} median {:11.5g}, 5 to 95 %: {:.5g} .. {:.5g}".format(*row))
+        return "\n".join(lines)
+
+
+class _Data(NamedTuple):
+    """The responses on common arrays."""
+
+    omega: Float[np.ndarray, " frequencies"]
+    measured: np.ndarray
+    points: list[Points]
+    hold: float  # s
+
+
+def fit_batch(
+    model: PyTree,
+    frfs: Sequence[FrequencyResponse],
+    *,
+    free: Free = None,
+    tied: dict[str, Tie] | None = None,
+    cost: Cost = MaximumLikelihood(),
+    band: Range | None = None,
+    min_coherence: float | None = None,
+    max_steps: int = 64,
+) -> BatchFit:
+    """Fit one model to each of many responses on the same frequencies, in one compiled call.
+
+    For fleets, Monte Carlo studies and sliding windows. All fits start from the model's values.
+
+    **Arguments:**
+
+    - `model`, `free`, `tied`, `cost`, `min_coherence`, `max_steps`: as in `jq.fit`.
+    - `frfs`: responses on the same frequencies, with the same channels.
+    - `band`: (low, high) in rad/s.
+
+    **Returns:**
+
+    `jq.identify.BatchFit`.
+
+    **Raises:**
+
+    - `ValueError`: responses on different frequencies or channels, or without a usable frequency.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits.
+    """
+    require_x64("a fit")
+    frfs = list(frfs)
+    if not frfs or not all(isinstance(frf, FrequencyResponse) for frf in frfs):
+        raise ValueError(
+            "fit_batch needs a list of jq.spectra.FrequencyResponse: fit_batch(model, frfs)"
+        )
+    check_options(cost, band, min_coherence, max_steps)
+    model = with_arrays(model)
+    parameters = select_parameters(model, free, tied)
+    least = least_coherence(min_coherence, cost, frfs[0])
+    data = _stack_responses(frfs, band, least)
+    ones = [np.ones(each.used.shape) for each in data.points]
+    weights, mixed = _weights(cost, data, ones), isinstance(cost, MaximumLikelihood)
+    # Without a floor on the errors, they do not depend on the weights.
+    mixings = mixings_of(data.points, list(weights)) if mixed else ()
+    arrays, options = (data.omega, data.measured), {"hold": data.hold, "max_steps": max_steps}
+    found = solve_batch(model, parameters, *arrays, weights, mixings=mixings, **options)
+    again = _weights(cost, data, _ratios(model, parameters, data, found))
+    if not np.allclose(weights, again, rtol=1e-4):
+        weights, start = again, np.where(np.isfinite(found.z), found.z, 0.0)
+        found = solve_batch(
+            model, parameters, *arrays, weights, mixings=mixings, start=start, **options
+        )
+    return BatchFit(
+        parameters.names, *(np.asarray(part) for part in found[1:]),
+        model=model, parameters=parameters, points=tuple(data.points), weights=weights,
+        mixed=mixed, z=np.asarray(found.z),
+    )  # fmt: skip
+
+
+def _stack_responses(frfs: Sequence[FrequencyResponse], band: Range | None, least: float) -> _Data:
+    omega, shape = np.asarray(frfs[0].omega), frfs[0].response.shape
+    for k, frf in enumerate(frfs):
+        if frf.response.shape != shape or not np.allclose(np.asarray(frf.omega), omega):
+            raise ValueError(
+                f"response {k} has shape {frf.response.shape} or other frequencies than the first "
+                f"({shape}): estimate all at one omega, or fit them one by one with jq.fit"
+            )
+    used = [usable(frf, band, least) for frf in frfs]
+    poor = [k for k, mask in enumerate(used) if not np.any(mask)]
+    if poor:
+        raise ValueError(
+            f"{len(poor)} of {len(frfs)} responses have no usable frequency, the first is number "
+            f"{poor[0]}: leave them out, or lower min_coherence"
+        )
+    measured = [np.asarray(frf.response) for frf in frfs]
+    kept = [np.where(mask, each, 1.0) for mask, each in zip(used, measured, strict=True)]
+    return _Data(omega, np.stack(kept), points_of(frfs, used), _shared_hold(frfs))
+
+
+def _shared_hold(frfs: Sequence[FrequencyResponse]) -> float:
+    holds = sorted({hold_of(frf) for frf in frfs})
+    if len(holds) > 1:
+        raise ValueError(
+            f"the inputs of the responses are held for {holds} s: fit those of one hold together"
+        )
+    return holds[0]
+
+
+def _weights(cost: Cost, data: _Data, ratios) -> np.ndarray:
+    rows = zip(data.points, ratios, strict=True)
+    return np.stack([cost.weights(*row) for row in rows])
+
+
+@eqx.filter_jit
+def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
+    def one(z):
+        model = held(where.parameters.insert(where.model, z), where.hold)
+        return jnp.abs(evaluate_response(model, where.omega))
+
+    return jax.vmap(one)(z)
+
+
+def _ratios(
+    model: PyTree, parameters: Parameters, data: _Data, found: BatchSolution
+) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
+    """|model / measurement| of every member; 1 where a fit ran away."""
+    batch, count = len(found.z), data.omega.size
+    where = Batch(model, parameters, data.hold, _pad(data.omega), np.asarray(count))
+    parts = [_sizes(where, found.z[each]) for each in _places(batch, _CHUNK)]
+    sizes = np.concatenate([np.asarray(part) for part in parts])
+    with np.errstate(invalid="ignore"):
+        ratios = sizes[:batch, :count] / np.abs(data.measured)
+    return np.where(np.isfinite(ratios) & (ratios > 0), ratios, 1.0)

@@ -1,0 +1,1 @@
+"""Fits of models to frequency responses: the weighted cost and its Gauss-Newton descent."""

@@ -1,0 +1,386 @@
+import contextlib
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import PyTree
+
+from jaxquad._core import one_blas_thread, require_x64
+from jaxquad.models import LaggedIntegrator, with_arrays
+from jaxquad.spectra import FrequencyResponse
+
+from ..uncertainty._assess import assess, Counted, discrepancy_at, records_at
+from ..uncertainty._fit_remarks import DOUBT
+from ..uncertainty._make_fit import unfitted
+from ..uncertainty._verdict import Verdict, without_numbers
+from ._bounds import settle_at_bounds, solve_within_bounds
+from ._condition import Condition
+from ._cost import (
+    Band,
+    Cost,
+    describe_usable,
+    known_points,
+    least_coherence,
+    Mask,
+    MaximumLikelihood,
+    Points,
+    points_of,
+    Ratio,
+    usable,
+    Weights,
+    widen_band,
+)
+from ._mixing import Mixing, mixings_of
+from ._model_checks import require_model, require_model_response
+from ._origin import Options, Origin
+from ._parameters import Free, Parameters, select_parameters, Tie
+from ._problem import make_problem, Prior, Problem, require_priors
+from ._result import Fit
+from ._solve import Solution
+from ._starts import Minimum, solve_from_many, spread_starts
+
+
+def guess_lagged_integrator(frf: FrequencyResponse, integrators: int) -> LaggedIntegrator:
+    """Starting values for K e^(-delay s) / (s^integrators (lag s + 1)) from a response's shape.
+
+    K comes from the magnitude and the sign of the lower half of the coherent band, lag and delay
+    half each from the slope of the phase. Good enough for `jq.fit` to start from.
+
+    **Arguments:**
+
+    - `frf`: a measured response; its first output and input count.
+    - `integrators`: 1 from a moment to a rate, 2 to an angle.
+
+    **Returns:**
+
+    A `jq.LaggedIntegrator`.
+    """
+    omega, response = np.asarray(frf.omega), np.asarray(frf.response)[:, 0, 0]
+    coherence = np.asarray(frf.coherence)[:, 0, 0]
+    good = coherence >= min(0.6, 0.9 * float(coherence.max()))
+    flat = (response * (1j * omega) ** integrators)[good]
+    slow = flat[: max(flat.size // 2, 1)]
+    sign = 1.0 if np.real(np.sum(slow / np.abs(slow))) >= 0 else -1.0
+    turns = np.angle(flat[1:] / flat[:-1])
+    steps = np.diff(omega[good])
+    slope = -float(np.sum(turns * steps) / np.sum(steps**2)) if steps.size else 0.0
+    late = max(slope, 0.05 / float(omega[good][-1]))
+    return LaggedIntegrator(sign * float(np.median(np.abs(slow))), late / 2, late / 2, integrators)
+
+
+def fit(
+    model: PyTree,
+    frf: FrequencyResponse | Sequence[FrequencyResponse],
+    *,
+    free: Free = None,
+    tied: Mapping[str, Tie] | None = None,
+    cost: Cost = MaximumLikelihood(),
+    conditions: Sequence[Condition | None] | None = None,
+    priors: Sequence[Prior] = (),
+    band: Band = None,
+    min_coherence: float | None = None,
+    starts: int = 1,
+    solver: eqx.Module | None = None,
+    max_steps: int = 256,
+) -> Fit:
+    """Identify the `free` parameters of a model from one or several frequency responses.
+
+    **Arguments:**
+
+    - `model`: any `eqx.Module` with `frequency_response(omega)`; its values are the start.
+    - `frf`: a `jq.spectra.FrequencyResponse`, or a list of them that share the parameters.
+    - `free`: the parameters to fit, by name (`"J_x"`, `"numerator[0]"`,
+        `jq.identify.Real("zero")`) or selected (`lambda m: (m.gain, m.delay)`); `None` for all
+        but a damping of 0. A bare name keeps the sign of its start.
+    - `tied`: parameters that follow from others: `{"F[1][0]": lambda m: -m.F[0, 1]}`.
+    - `cost`: `jq.identify.MaximumLikelihood()`, or `jq.identify.CoherenceWeighted()`: Eq. (14),
+        the paper's and CIFER's.
+    - `conditions`: how the model differs in each response: `None` where it does not, a
+        `jq.identify.Changed`, or a function from the model to the one that this record saw.
+    - `priors`: known values with their standard errors, `jq.identify.Prior`.
+    - `band`: (low, high) in rad/s. A mapping `{("q", "elevator"): (1.0, 30.0)}` gives single pairs
+        of output and input a band of their own, or leaves them out with `None`.
+    - `min_coherence`: frequencies with a lower coherence do not count; by default 0.05, which
+        maximum likelihood can weigh, and 0.6 for other costs, for records with references and for
+        responses that reach 0.6 at fewer than five frequencies. Those with a random error above
+        30 % never count. Both are averaged over a third of an octave.
+    - `starts`: how many starting points, spread around the model's values in a Latin hypercube.
+        `Fit.minima` lists where they ended.
+    - `solver`: any optimistix least-squares solver; Levenberg-Marquardt by default.
+    - `max_steps`: of the solver.
+
+    **Returns:**
+
+    A `jq.identify.Fit`. Its `verdict` says what the record determines; where too few frequencies
+    are usable to fit anything, the result holds the starting values.
+
+    **Raises:**
+
+    - `ValueError`: for names that the model does not have, options that make no sense, and a
+        solver that diverged.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
+
+    !!! example
+
+        ```python
+        fit = jq.fit(jq.LaggedIntegrator(gain=100.0, lag=0.03, delay=0.02), frf, band=(1.0, 30.0))
+        print(fit)
+        ```
+
+    Source: docs/identification.md; Eq. (14) of the paper, as corrected in docs/equations.md.
+    """
+    require_x64("a fit")
+    require_model("fit", model)
+    frfs = require_responses(frf)
+    if conditions is None:
+        require_model_response(model, frfs[0])
+    check_options(cost, band, min_coherence, max_steps)
+    options = Options(
+        free, tied, cost, conditions, priors, band, min_coherence, starts, solver, max_steps
+    )
+    return fit_with(model, frfs, options)
+
+
+_SMALL = 256  # frequencies, up to which a second thread of BLAS waits longer than it works
+
+
+def fit_with(
+    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
+) -> Fit:
+    """Fit as `jq.fit` does.
+
+    **Arguments:**
+
+    - `model`, `frfs`, `options`: as in `jq.fit`.
+    - `rounds`: how often to solve again with what the model leaves unexplained as a floor on the
+        random error; 0 for estimates under the noise alone, whose costs compare structures.
+    """
+    small = all(np.size(one.omega) <= _SMALL for one in frfs)
+    with one_blas_thread() if small else contextlib.nullcontext():
+        return _fit_with(model, frfs, options, rounds)
+
+
+def _fit_with(
+    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int
+) -> Fit:
+    model = with_arrays(model)
+    parameters = select_parameters(model, options.free, options.tied)
+    least = [least_coherence(options.min_coherence, options.cost, one) for one in frfs]
+    used = [usable(one, options.band, limit) for one, limit in zip(frfs, least, strict=True)]
+    _check_priors_against(model, options.priors, options.cost)
+    too_few = _too_few_points(frfs, used, parameters, max(least), options.band)
+    if too_few is not None:
+        remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
+        return unfitted(model, parameters, too_few, tuple(remarks))
+    problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
+    asked, used = used, [m & ~none for m, none in zip(used, problem.silences, strict=True)]
+    points = points_of(frfs, used)
+    problem, solution, minima = _solve_reweighted(problem, points, options)
+    _check_finite(solution)
+    check_priors(problem, solution)
+    problem, solution, counted = _solve_with_floor(problem, points, solution, options, rounds)
+    further = _remarks_on_silence(frfs, asked, problem)
+    origin = Origin(fit_with, tuple(points), options)
+    return assess(problem, counted, solution, minima, further=further, origin=origin)
+
+
+_PRESENT = 0.2  # random error of a response that is there
+
+
+def _remarks_on_silence(
+    frfs: Sequence[FrequencyResponse], asked: Sequence[Mask], problem: Problem
+) -> list[str]:
+    """Remark on responses that were measured, and that the model has none of."""
+    remarks = []
+    for frf, mask, pairs in zip(frfs, asked, problem.silent, strict=True):
+        for o, i in pairs:
+            error = np.asarray(frf.random_error)[mask[:, o, i], o, i]
+            if not error.size or np.mean(error < _PRESENT) < 0.5:
+                continue
+            pair = (frf.output_names[o], frf.input_names[i])
+            remarks.append(
+                f"{pair[0]} answers to {pair[1]} (random error {100 * np.median(error):.2g} % at "
+                f"{error.size} frequencies), but the model's response is zero: these points are "
+                f"left out; free what joins the two, or say band={{{pair}: None}}"
+            )
+    return remarks
+
+
+def _too_few_points(
+    frfs: Sequence[FrequencyResponse],
+    used: Sequence[Mask],
+    parameters: Parameters,
+    least: float,
+    band: Band,
+) -> Verdict | None:
+    points = sum(int(mask.sum()) for mask in used)
+    needed = parameters.count + 2
+    if points >= needed:
+        return None
+    reason = (
+        f"{describe_usable(frfs, points, least)}{f' (band {band} rad/s)' if band else ''}, and "
+        f"{parameters.count} parameters need at least {needed}"
+    )
+    wider = widen_band(frfs, [known_points(frf) for frf in frfs]) if band is None else ""
+    remedies = ("excite the axis (jq.sweep), record longer, or use a longer window",)
+    if wider:
+        remedies = (wider, "fit fewer parameters (free=): a delay, say, known from another source")
+    return without_numbers("too few points", parameters.names, reason, *remedies)
+
+
+def _solve_reweighted(
+    problem: Problem,
+    points: Sequence[Points],
+    options: Options,
+) -> tuple[Problem, Solution, tuple[Minimum, ...]]:
+    """Solve; where the weights depend on the model, solve again under those of the solution."""
+    starts, solver, max_steps = options.starts, options.solver, options.max_steps
+    cost = options.cost
+    weights = _weights(cost, points, [np.ones(each.used.shape) for each in points])
+    problem = _weighted(problem, cost, points, weights)
+    z, minima = np.asarray(problem.parameters.start)[: problem.parameters.count], ()
+    if starts == 1:
+        solution = solve_within_bounds(problem, z, solver, max_steps)
+    else:
+        fastest = max(float(each.frf.omega[-1]) for each in points)
+        spread = spread_starts(problem.parameters, starts, fastest=fastest)
+        solution, minima = solve_from_many(problem, spread, solver, max_steps)
+        solution = settle_at_bounds(problem, solution, solver, max_steps)
+    again = _weights(cost, points, _ratios(solution))
+    if _are_close(weights, again, 1e-4):
+        return problem, solution, minima
+    problem = _weighted(problem, cost, points, again)
+    return problem, solve_within_bounds(problem, solution.z, solver, max_steps), minima
+
+
+_SETTLED = 0.1  # relative change of weights that moves no estimate by more than a fraction of it
+
+
+def _solve_with_floor(
+    problem: Problem,
+    points: Sequence[Points],
+    solution: Solution,
+    options: Options,
+    rounds: int,
+) -> tuple[Problem, Solution, Counted]:
+    """Solve again with what the model leaves unexplained as a floor on the random error.
+
+    Only where it does leave something: for a right model a floor costs efficiency.
+    """
+    records, cost, lifted = records_at(problem, points, solution), options.cost, False
+    found = discrepancy_at(records, points, solution)
+    for _ in range(rounds if found[0].none < DOUBT else 0):
+        raised = [_with_floor(each, found[0].amplitude) for each in points]
+        weights = _weights(cost, raised, _ratios(solution))
+        if _are_close([np.asarray(each) for each in problem.weights], weights, _SETTLED):
+            break
+        problem, lifted = _weighted(problem, cost, raised, weights), True
+        solution = solve_within_bounds(problem, solution.z, options.solver, options.max_steps)
+        _check_finite(solution)
+        records = records_at(problem, points, solution)
+        found = discrepancy_at(records, points, solution)
+    if not lifted:
+        return problem, solution, Counted(points, records, None, None, found)
+    plain = _weights(cost, points, _ratios(solution))
+    mixings = _mixings(cost, points, plain)
+    return problem, solution, Counted(points, records, plain, mixings, found)
+
+
+def _with_floor(points: Points, floor: float) -> Points:
+    return dataclasses.replace(points, floor=np.full(points.used.shape, floor))
+
+
+def _are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
+    pairs = zip(old, new, strict=True)
+    return all(np.all(np.abs(one - other) <= share * np.abs(other)) for one, other in pairs)
+
+
+def _weighted(
+    problem: Problem, cost: Cost, points: Sequence[Points], weights: Sequence[Weights]
+) -> Problem:
+    return problem.weighted(weights, _mixings(cost, points, weights))
+
+
+def _mixings(
+    cost: Cost, points: Sequence[Points], weights: Sequence[Weights]
+) -> tuple[Mixing | None, ...] | None:
+    """Only a likelihood knows what it would mean that points share noise."""
+    return mixings_of(points, weights) if isinstance(cost, MaximumLikelihood) else None
+
+
+def _weights(cost: Cost, points: Sequence[Points], ratios: Sequence[Ratio]) -> list[Weights]:
+    weigh = type(cost).weights  # a bound method of an `eqx.Module` is made like a model
+    return [weigh(cost, *each) for each in zip(points, ratios, strict=True)]
+
+
+def _ratios(solution: Solution) -> list[Ratio]:
+    """|model / measurement| at a solution."""
+    return [np.exp(part[..., 0]) for part in solution.sensitivity.misfits]
+
+
+def require_responses(frf: object) -> list[FrequencyResponse]:
+    """One response or several, as a list. Raise ValueError for anything else, and for repeats."""
+    given = list(frf) if isinstance(frf, Sequence) else [frf]
+    frfs = [one for one in given if isinstance(one, FrequencyResponse)]
+    if not given or len(frfs) < len(given):
+        kinds = ", ".join(sorted({type(one).__name__ for one in given})) or "nothing"
+        raise ValueError(
+            f"a fit needs a jq.spectra.FrequencyResponse or a list of them, not {kinds}: make one "
+            "with jq.frequency_response(record), and call jq.fit(model, response)"
+        )
+    for k, one in enumerate(frfs):
+        for other in frfs[:k]:
+            if np.array_equal(np.asarray(one.response), np.asarray(other.response)):
+                raise ValueError(f"response {k} of {len(frfs)} is given twice: leave it out once")
+    return frfs
+
+
+def check_options(cost: PyTree, band: PyTree, min_coherence: float | None, max_steps: int) -> None:
+    """Check `cost`, `band`, `min_coherence` and `max_steps`; raise ValueError."""
+    if isinstance(cost, type) or not isinstance(cost, Cost):
+        raise ValueError(
+            f"cost={cost!r}: pass an object, jq.identify.MaximumLikelihood() or "
+            "jq.identify.CoherenceWeighted()"
+        )
+    for limits in band.values() if isinstance(band, Mapping) else [band]:
+        if limits is not None and np.shape(limits) != (2,):
+            raise ValueError(f"band={limits!r}: give two frequencies in rad/s, (low, high)")
+    if min_coherence is not None and not 0 < min_coherence < 1:
+        raise ValueError(
+            f"min_coherence is {min_coherence}: give a number between 0 and 1, or None for what "
+            "goes with the cost"
+        )
+    if max_steps < 1:
+        raise ValueError(f"max_steps is {max_steps}: give at least 1")
+
+
+def _check_priors_against(model: PyTree, priors: Sequence[Prior], cost: Cost) -> None:
+    """Raise ValueError for priors under a cost without noise, and as `require_priors` does."""
+    require_priors(model, priors)
+    if priors and not isinstance(cost, MaximumLikelihood):
+        raise ValueError(
+            "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave cost= "
+            "at its default, jq.identify.MaximumLikelihood()"
+        )
+
+
+def _check_finite(solution: Solution) -> None:
+    """Raise ValueError where the solver diverged."""
+    finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
+    if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
+        raise ValueError(
+            f"the fit diverged: {solution.message or 'the response of the model is not finite'}; "
+            "start from other values, or leave solver= at its default"
+        )
+
+
+def check_priors(problem: Problem, solution: Solution) -> None:
+    """Raise ValueError for a prior on a quantity that no free parameter changes."""
+    slopes = np.asarray(solution.sensitivity.prior_slopes)[:, : problem.parameters.count]
+    idle = np.flatnonzero(~np.any(slopes, axis=1))
+    if idle.size:
+        raise ValueError(
+            f"prior {idle[0] + 1} is on a quantity that no free parameter changes: free its "
+            f"parameter, or leave the prior out; free are {', '.join(problem.parameters.names)}"
+        )

@@ -1,0 +1,1 @@
+"""Fits and verification in the time domain."""

@@ -1,0 +1,367 @@
+"""Output error of one output behind one input by filters, where the general way differentiates.
+
+At its samples a rational model is y = B(q) u / A(q), and all slopes of y lie in two signals:
+
+    dy = dB(q) w - dA(q) v,  with  w = u / A  and  v = y / A.
+
+So an evaluation takes two passes over the record, whatever the number of parameters is. Start and
+trim leave the slopes as far as they are orthogonal to what start and trim do, which is all that
+counts of them (variable projection).
+Source: Ljung, System Identification, sec. 10.3; Kaufman (1975), A variable projection method for
+solving separable nonlinear least squares problems, BIT 15.
+"""
+
+import dataclasses
+import functools as ft
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jaxquad._core import Normal
+from jaxquad.models import sample_rational, TransferFunction
+
+from ..frequency_domain._evaluate import evaluate, Frame, take_apart
+from ..frequency_domain._parameters import Numbers
+from ..uncertainty._accuracy import row_products
+from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
+from ._simulated import band_filter, linear_model
+
+
+_MOST = 4  # poles, beyond which the coefficients of A may say too little of them
+_DIGITS = 1e6  # rounding of the output, in units of the last bit of its largest value
+_RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
+_REFINEMENTS = 3
+_CLOSE = 1e-8  # a step, relative to 1 + |z|, whose square is rounding
+_GONE = 1e-20  # of the states, relative to their start
+
+Rows = Float[np.ndarray, "rows samples"]
+
+
+class Sampled(NamedTuple):
+    """A `SampledRational` on the host, and what the parameters do to its coefficients."""
+
+    above: Float[np.ndarray, " zeros"]
+    below: Float[np.ndarray, " poles"]
+    shift: int
+    step: Float[np.ndarray, "both both"]
+    row: Float[np.ndarray, " both"]
+    slopes: Float[np.ndarray, "coefficients parameters"]  # of B and then of A
+
+
+class Columns(NamedTuple):
+    """What start and trim do to a record: a unit shift, then the free motions.
+
+    These are biases and initial values, up to the sample at which nothing is left of them.
+    """
+
+    shift: Float[np.ndarray, " samples"]  # within the band
+    free: Float[np.ndarray, "motions moving"]
+    seen: Float[np.ndarray, "motions moving"]  # these within the band, in which they last longer
+    scale: Float[np.ndarray, " rows"]  # that brings shift and motions to unit length
+    normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
+
+    def products(self, x: Float[np.ndarray, "*series samples"]) -> Float[np.ndarray, "rows ..."]:
+        """Shift and motions times one series, or times each of several."""
+        moving = self.seen.shape[1]
+        return np.concatenate([(x @ self.shift)[None], self.seen @ x[..., :moving].T])
+
+    def taken_off(
+        self, x: Float[np.ndarray, " samples"], unknowns: Float[np.ndarray, " rows"]
+    ) -> Float[np.ndarray, " samples"]:
+        """The series without so much of each."""
+        left = x - unknowns[0] * self.shift
+        left[: self.seen.shape[1]] -= unknowns[1:] @ self.seen
+        return left
+
+    @property
+    def rows(self) -> Rows:
+        """Shift and motions within the band, over all samples."""
+        rows = np.zeros((len(self.scale), self.shift.size))
+        rows[0], rows[1:, : self.seen.shape[1]] = self.shift, self.seen
+        return rows
+
+
+class Simulated(NamedTuple):
+    """One record: what is left of it, and what its slopes are made of."""
+
+    sampled: Sampled
+    driven: Float[np.ndarray, " samples"]  # u / A
+    output: Float[np.ndarray, " samples"]  # with the free motions
+    columns: Columns
+    misfit: Float[np.ndarray, " samples"]  # weighted, and orthogonal to the columns
+
+
+Program = Callable[[Float[np.ndarray, " parameters"]], Sampled]
+
+
+def is_filtered(problem: OutputError) -> bool:
+    """Whether all records are of one output and one input of a rational model, in white noise."""
+    base = problem.base
+    if problem.unknown or any(term.motions is None for term in problem.terms):
+        return False
+    plant = linear_model(base.model)
+    rational = isinstance(plant, TransferFunction) and 2 <= plant.denominator.size <= _MOST + 1
+    return rational and all(
+        term.whitener is None and term.feedback is None for term in problem.terms
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FilteredPoint:
+    """Where a descent by filters stands."""
+
+    problem: OutputError
+    programs: list[Program]  # of each record
+    z: Float[np.ndarray, " parameters"]
+    records: list[Simulated]
+    prior_misfits: Float[np.ndarray, " priors"]
+    prior_slopes: Float[np.ndarray, "priors parameters"]
+    next_to: "FilteredPoint | None" = None  # a point so near that it has the same slopes
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squares; infinite where something is not finite."""
+        parts = [self.prior_misfits, *(one.misfit for one in self.records)]
+        cost = 0.5 * sum(float(part @ part) for part in parts)
+        return cost if np.isfinite(cost) else np.inf
+
+    @ft.cached_property
+    def behind(self) -> list[Float[np.ndarray, " samples"]]:
+        """y / A of each record."""
+        if self.next_to is not None:
+            return self.next_to.behind
+        return [_over(one.sampled.below, one.output) for one in self.records]
+
+    @ft.cached_property
+    def rows(self) -> list[Rows]:
+        """The slopes of each record's misfit, up to what start and trim can do."""
+        if self.next_to is not None:
+            return self.next_to.rows
+        parts = zip(self.problem.terms, self.records, self.behind, strict=True)
+        return [_slope_rows(*each) for each in parts]
+
+    @ft.cached_property
+    def normal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient and Gauss-Newton Hessian."""
+        gradient = self.prior_slopes.T @ self.prior_misfits
+        hessian = self.prior_slopes.T @ self.prior_slopes
+        for one, rows in zip(self.records, self.rows, strict=True):
+            gradient = gradient + rows @ one.misfit
+            hessian = hessian + _without_columns(rows, one.columns)
+        return gradient, hessian
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.normal
+
+    def moved(self, change: Float[np.ndarray, " parameters"]) -> "FilteredPoint":
+        if self._is_last(change):
+            return self._next_to(change)
+        return _point(self.problem, self.programs, self.z + change)
+
+    def _is_last(self, change: Float[np.ndarray, " parameters"]) -> bool:
+        """Whether the misfit after a step of Gauss and Newton is known by its slopes."""
+        if np.max(np.abs(change) / (1 + np.abs(self.z))) > _CLOSE or self.next_to is not None:
+            return False
+        gradient, hessian = self.normal
+        # A step that damping has shortened is none of these, and its cost has to be seen.
+        return np.allclose(hessian @ change, -gradient, rtol=0.1, atol=0.0)
+
+    def _next_to(self, change: Float[np.ndarray, " parameters"]) -> "FilteredPoint":
+        parts = zip(self.records, self.rows, strict=True)
+        misfits = [_project_out(one.misfit + change @ rows, one.columns)[0] for one, rows in parts]
+        return dataclasses.replace(
+            self,
+            z=self.z + change,
+            records=[
+                one._replace(misfit=left) for one, left in zip(self.records, misfits, strict=True)
+            ],
+            prior_misfits=self.prior_misfits + self.prior_slopes @ change,
+            next_to=self,
+        )
+
+    @property
+    def is_precise(self) -> bool:
+        """Whether rounding of the coefficients leaves the digits that a fit needs."""
+        return all(map(_is_precise, self.records, self.behind))
+
+    @property
+    def found(self) -> Evaluation:
+        """As the general way gives it."""
+        misfits = [one.misfit[:, None] for one in self.records]
+        slopes = [rows.T[:, None] for rows in self.rows]
+        columns = [one.columns.rows.T[:, None] for one in self.records]
+        normal = Normal(self.cost, *self.normal)  # pyright: ignore[reportArgumentType]
+        return Evaluation(misfits, slopes, columns, normal)
+
+
+def filtered_point(problem: OutputError, z: Float[np.ndarray, " parameters"]) -> FilteredPoint:
+    """Where a descent begins."""
+    frame, arrays = take_apart(OutputError(problem.base, (), problem.zeros))
+    programs = [_sampler(frame, arrays, term.hold, term.dt) for term in problem.terms]
+    return _point(problem, programs, np.asarray(z))
+
+
+def _point(problem: OutputError, programs: list[Program], z: np.ndarray) -> FilteredPoint:
+    parts = zip(problem.terms, programs, strict=True)
+    records = [_simulated(term, sample(z)) for term, sample in parts]
+    misfits, slopes = np.zeros(0), np.zeros((0, z.size))
+    if problem.base.quantities:
+        priors = evaluate(problem.base, z)
+        misfits, slopes = priors.misfits, priors.slopes.T[:, : z.size]
+    return FilteredPoint(problem, programs, z, records, misfits, slopes)
+
+
+def _sampler(frame: Frame, arrays: list[Numbers], hold: str, dt: float) -> Program:
+    run = _program(frame, hold)
+
+    def sample(z: Float[np.ndarray, " parameters"]) -> Sampled:
+        coefficients, motion, shift = map(np.asarray, run(z, dt, arrays))
+        both = motion.shape[1]
+        above, below = np.split(coefficients[:, 0], [both // 2 + 2])
+        return Sampled(above, below, int(shift), motion[:both], motion[both], coefficients[:, 1:])
+
+    return sample
+
+
+@ft.lru_cache(maxsize=64)
+def _program(frame: Frame, hold: str) -> Callable[[np.ndarray, float, list[Numbers]], PyTree]:
+    """Few arrays come back: each takes longer than its numbers."""
+
+    def run(z: Float[Array, " parameters"], dt: Float[Array, ""], arrays: list[Array]) -> PyTree:
+        problem = frame.filled(arrays)
+
+        def coefficients(z):
+            plant = linear_model(insert_parameters(z, problem))
+            assert isinstance(plant, TransferFunction)
+            model = sample_rational(plant, dt, hold)
+            both = jnp.concatenate([model.above, model.below])
+            return both, (both, jnp.concatenate([model.step, model.rows]), model.shift)
+
+        slopes, (both, motion, shift) = jax.jacfwd(coefficients, has_aux=True)(z)
+        return jnp.concatenate([both[:, None], slopes], axis=1), motion, shift
+
+    return jax.jit(run)
+
+
+def _simulated(term: RecordTerm, sampled: Sampled) -> Simulated:
+    samples = len(term.y)
+    late = _shifted(np.asarray(term.u)[:, 0], sampled.shift)
+    with np.errstate(all="ignore"):  # an unstable model is a failed step
+        driven = _over(sampled.below, late)
+        forced = np.convolve(driven, sampled.above)[:samples]
+        columns = _columns(term, _free_motions(term, sampled, samples))
+        moving = columns.free.shape[1]
+        left = np.asarray(term.y)[:, 0] - _in_band(term, forced)
+        misfit, unknowns = _project_out(left, columns)
+        # A shift stays what it is, whatever A does.
+        forced[:moving] += unknowns[1:] @ columns.free
+    return Simulated(sampled, driven, forced, columns, float(term.weights[0]) * misfit)
+
+
+def _shifted(u: Float[np.ndarray, " samples"], shift: int) -> Float[np.ndarray, " samples"]:
+    """From its first value, so many samples later; after the record it stays as it is."""
+    late, kept = np.zeros(len(u)), max(len(u) - abs(shift), 0)
+    if shift < 0:
+        late[:kept], late[kept:] = u[len(u) - kept :], u[-1]
+        return late - u[0]
+    late[len(u) - kept :] = u[:kept] - u[0]
+    return late
+
+
+def _slope_rows(term: RecordTerm, one: Simulated, behind: Float[np.ndarray, " samples"]) -> Rows:
+    model, driven = one.sampled, -one.driven
+    late = [(driven, k) for k in range(model.above.size)]
+    late += [(behind, k + 1) for k in range(model.below.size)]
+    signals = np.empty((len(late), len(behind)))
+    for row, (signal, k) in zip(signals, late, strict=True):
+        row[:k], row[k:] = 0.0, signal[: len(signal) - k]
+    return _in_band(term, float(term.weights[0]) * model.slopes.T @ signals)
+
+
+def _over(below: Float[np.ndarray, " poles"], x: Float[np.ndarray, " samples"]) -> np.ndarray:
+    """`x` / A, from rest."""
+    from scipy.signal import lfilter
+
+    with np.errstate(all="ignore"):
+        return np.asarray(lfilter(np.ones(1), np.concatenate([[1.0], below]), x))
+
+
+def _in_band(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndarray:
+    return x if term.gain is None else np.asarray(band_filter(x.T, np.asarray(term.gain))).T
+
+
+def _free_motions(
+    term: RecordTerm, sampled: Sampled, samples: int
+) -> Float[np.ndarray, "motions moving"]:
+    """Biases on the slow motions and initial values of the fast ones, as rows."""
+    assert term.motions is not None
+    slow, fast = (np.asarray(each) for each in term.motions)
+    states = len(slow)
+    if not slow.shape[1]:  # the biases are those of no one
+        step, row, ways = sampled.step[:states, :states], sampled.row[:states], fast.T
+    else:
+        step, row = sampled.step, sampled.row
+        ways = np.zeros((slow.shape[1] + fast.shape[1], 2 * states))
+        ways[: slow.shape[1], states:], ways[slow.shape[1] :, :states] = slow.T, fast.T
+    return ways @ _motion(row, step, samples)
+
+
+def _motion(
+    row: Float[np.ndarray, " both"], step: Float[np.ndarray, "both both"], samples: int
+) -> Float[np.ndarray, "both moving"]:
+    """`row` step^k for each sample k, as far as anything is left of it."""
+    found = np.empty((len(row), samples))
+    found[:, 0], done = row, 1
+    power = step.T
+    while done < samples and np.max(np.abs(power)) > _GONE:
+        more = min(done, samples - done)
+        np.matmul(power, found[:, :more], out=found[:, done : done + more])
+        power, done = power @ power, done + more
+    return found[:, :done]
+
+
+def _lengthened(rows: Rows, samples: int) -> Rows:
+    return np.pad(rows, ((0, 0), (0, samples - rows.shape[1])))
+
+
+def _columns(term: RecordTerm, free: Float[np.ndarray, "motions moving"]) -> Columns:
+    samples = len(term.y)
+    shift = _in_band(term, np.ones(samples))
+    seen = free if term.gain is None else _in_band(term, _lengthened(free, samples))
+    normal = np.empty((len(seen) + 1,) * 2)
+    normal[0, 0], normal[1:, 1:] = shift @ shift, row_products(seen)
+    normal[0, 1:] = normal[1:, 0] = seen @ shift[: seen.shape[1]]
+    square = np.diagonal(normal)
+    scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
+    ridged = normal * np.outer(scale, scale) + _RIDGE * np.eye(len(normal))
+    return Columns(shift, free, seen, scale, ridged)
+
+
+def _project_out(
+    misfit: Float[np.ndarray, " samples"], columns: Columns
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " rows"]]:
+    """The misfit that no start, trim or shift explains, and how much of each does explain."""
+    aim, unknowns = columns.scale * columns.products(misfit), np.zeros(len(columns.scale))
+    if not np.all(np.isfinite(aim)):
+        return np.full_like(misfit, np.nan), unknowns
+    plain = columns.normal - _RIDGE * np.eye(len(aim))
+    for _ in range(_REFINEMENTS):
+        unknowns = unknowns + np.linalg.solve(columns.normal, aim - plain @ unknowns)
+    unknowns = columns.scale * unknowns
+    return columns.taken_off(misfit, unknowns), unknowns
+
+
+def _without_columns(rows: Rows, columns: Columns) -> Float[np.ndarray, "parameters parameters"]:
+    """Products of the rows' parts orthogonal to the columns."""
+    shared = columns.scale[:, None] * columns.products(rows)
+    return row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
+
+
+def _is_precise(one: Simulated, behind: Float[np.ndarray, " samples"]) -> bool:
+    above, size = np.sum(np.abs(one.sampled.above)), float(np.max(np.abs(one.output)))
+    needed = max(float(np.max(np.abs(behind))), float(above * np.max(np.abs(one.driven))))
+    return np.isfinite(needed) and needed <= _DIGITS * size

@@ -1,0 +1,1 @@
+"""What a fit is worth: covariance, model error, identifiability, and what follows from them."""
