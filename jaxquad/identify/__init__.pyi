@@ -15,11 +15,9 @@ from ._known_filters import (
     behind_filters as behind_filters,
     filter_response as filter_response,
     KnownFilter as KnownFilter,
-    without_filters as without_filters,
-)
-from ._measured_chain import (
     measured_chain as measured_chain,
     MeasuredChain as MeasuredChain,
+    without_filters as without_filters,
 )
 from ._thrust_curve import (
     GainBand as GainBand,

@@ -214,7 +214,8 @@ def _measured(
     moves = np.ptp(flight.setpoint) > 0
     try:
         return measured_chain(
-            unfiltered, filtered, flight.dt, known=chains, names=(flight.names[1], flight.names[0]),
+            unfiltered, filtered, flight.dt, filters=chains,
+            names=(flight.names[1], flight.names[0]),
             reference=flight.setpoint if moves else None,
         )  # fmt: skip
     except ValueError as error:
