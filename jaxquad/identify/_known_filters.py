@@ -31,7 +31,7 @@ _SHARED = 0.5  # of overlapping windows, that count as if they were independent
 
 @runtime_checkable
 class KnownFilter(Protocol):
-    """A filter of the log's output, as `jq.control.autopilots.FilterChain` is one."""
+    """A filter of the log's output, as `jq.autopilot.FilterChain` is one."""
 
     def response(self, frequency_hz: Frequencies) -> Complex[Array | np.ndarray, " frequencies"]:
         """At frequencies in Hz."""

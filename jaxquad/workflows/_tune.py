@@ -1,25 +1,22 @@
 """Tune a controller on an identified axis: from a result and settings to certified gains."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from jaxquad._core import announce, beside, Later, plain_content
-from jaxquad.control import certainty_equivalence, LADRC, schedule_for_flight, ScheduledLADRC
+from jaxquad._core import announce, plain_content
+from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
 from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
-from jaxquad.models import DecoupledAxes
 from jaxquad.report import provenance, write_json
-from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, simulate, Simulation, Step
+from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Simulation, Step
 from jaxquad.tuning import (
     describe_controller,
-    Evaluation,
     KNOWN_INERTIA,
     Limit,
     Objective,
@@ -60,8 +57,6 @@ class Tuning:
     loop: Loop
     ensemble: Ensemble
     flight: Scenario
-    # Sections of the report, drawn while it was tuned.
-    _drawn: Later[dict[str, object]] = dataclasses.field(repr=False, compare=False)
 
     def content(self) -> dict[str, object]:
         """Gains, certificate and settings, for JSON."""
@@ -95,7 +90,6 @@ class Tuning:
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
-        drawn = beside(_write_figures, folder, tuned, flights)
         from jaxquad.report import write_report  # here: with it comes matplotlib
 
         write_report(
@@ -105,20 +99,14 @@ class Tuning:
             record=found.records[0],
             tuned=tuned,
             flights=flights,
-            drawn=self._drawn.get(),
             provenance=origin,
             formula=found.formula,
         )
-        return [folder / "tuned.json", folder / f"{name}.h", folder / "report.html", *drawn.get()]
+        drawn = _write_figures(folder, tuned, flights)
+        return [folder / "tuned.json", folder / f"{name}.h", folder / "report.html", *drawn]
 
     def __str__(self) -> str:
         return str(self.tuned)
-
-
-def _draw_axis(found: Identification) -> dict[str, object]:
-    from jaxquad.report import draw_sections  # here: with it comes matplotlib
-
-    return draw_sections(fit=found.fit, frf=found.frf, record=found.records[0])
 
 
 def _write_figures(folder: Path, tuned: Tuned, flights: Mapping[str, Simulation]) -> list[Path]:
@@ -204,40 +192,21 @@ def _tuned(
         delay=posterior.delay,
     )  # fmt: skip
     announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
-    flown, drawn = _flight(gain, dt, settings), beside(_draw_axis, found)
-    with ThreadPoolExecutor(1) as thread:
-        tuned = tune_controller(
-            loop,
-            ensemble,
-            flown,
-            objective=_objective(settings),
-            limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
-            free=["ladrc.wc", "map.values"] if held else None,
-            members=settings.members,
-            fresh=settings.fresh,
-            peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
-            key=jax.random.key(settings.seed),
-            progress=progress,
-            listener=_once(lambda: thread.submit(_fly_nominal, loop, plant, flown)),
-        )
-    return Tuning(found, settings, tuned, loop, ensemble, flown, drawn)
-
-
-def _once(begin: Callable[[], object]) -> Callable[[Evaluation], None]:
-    """Call `begin` at the first evaluation, when nothing more is traced or compiled."""
-    begun: list[object] = []
-
-    def listen(_: Evaluation) -> None:
-        if not begun:
-            begun.append(begin())
-
-    return listen
-
-
-def _fly_nominal(loop: Loop, plant: DecoupledAxes, flown: Scenario) -> None:
-    """Compile the nominal flight, which the figures need, while the descent runs."""
-    controller = schedule_for_flight(loop.controller, np.array(plant.inertia))
-    simulate(loop.with_controller(controller), flown)
+    flown = _flight(gain, dt, settings)
+    tuned = tune_controller(
+        loop,
+        ensemble,
+        flown,
+        objective=_objective(settings),
+        limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
+        free=["ladrc.wc", "map.values"] if held else None,
+        members=settings.members,
+        fresh=settings.fresh,
+        peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
+        key=jax.random.key(settings.seed),
+        progress=progress,
+    )
+    return Tuning(found, settings, tuned, loop, ensemble, flown)
 
 
 def _ensemble(posterior: Posterior, settings: TuneSettings) -> Ensemble:
