@@ -60,9 +60,7 @@ class Columns(NamedTuple):
 
     shift: Float[np.ndarray, " samples"]  # within the band
     free: Float[np.ndarray, "motions moving"]
-    filtered: Float[
-        np.ndarray, "motions moving"
-    ]  # within the band, in which they last longer
+    filtered: Float[np.ndarray, "motions moving"]  # within the band, in which they last longer
     scale: Float[np.ndarray, " rows"]  # that brings shift and motions to unit length
     normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
 
