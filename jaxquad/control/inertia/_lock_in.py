@@ -179,9 +179,7 @@ class LockInWindows(eqx.Module):
     def ended(self, sums: WindowSums) -> tuple[Array, Array]:
         """Its correlations [parts, tones, places, signals, ...] and whether it counts."""
         first = sums.index == 0
-        chosen, valid = (
-            jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.valid)
-        )
+        chosen, valid = (jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.valid))
         return chosen.reshape(2, len(self.frequencies), 3, *chosen.shape[2:]), valid
 
     def _place(self, index):
@@ -304,9 +302,7 @@ class LockInInertia(AbstractInertia):
             done[:, :, :, 0], done[:, :, :, 1], windows.square(valid),
             contrast=self.contrast, stiff=bool(self.nuisance),
         )  # fmt: skip
-        new = LastEstimate(
-            solved.inertia, solved.variance, jnp.zeros_like(valid), solved.informed
-        )
+        new = LastEstimate(solved.inertia, solved.variance, jnp.zeros_like(valid), solved.informed)
         renew = ft.partial(jnp.where, (valid > 0) & (solved.informed > 0))
         return jax.tree.map(renew, (new, solved.stiffness), (last, stiffness))
 
