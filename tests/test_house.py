@@ -10,8 +10,8 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "jaxquad"
 ORDER = (
-    "_core", "_xla", "records", "datasets", "excitation", "models", "spectra", "identify",
-    "design", "control", "loops", "simulation", "ensembles", "tuning",
+    "_core", "_xla", "_compile", "records", "datasets", "excitation", "models", "spectra",
+    "identify", "design", "control", "loops", "simulation", "ensembles", "tuning",
     "export", "plot", "report", "workflows", "cli",
 )  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)

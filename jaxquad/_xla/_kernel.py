@@ -6,27 +6,18 @@ internal to XLA, so they are used only where the installed version is known to t
 goes in is bounded; all else is compiled as any other program.
 """
 
-import sys
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from ._accelerator import why_no_device_kernels
 from ._canary import why_not_trusted
-from ._switch import device_kernels, is_off, warn_once
-
-
-try:
-    from ._kernel_limits import WIDEST
-    from ._marks import enter, leave
-except (ImportError, AttributeError) as error:  # JAX's interfaces to its compiler may move.
-    enter = leave = None
-    WIDEST = sys.maxsize
-    _MISSING = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
-else:
-    _MISSING = None
+from ._marks import enter, leave
+from ._switch import device_kernels, is_off, plain_loops, warn_once
 
 
 def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
@@ -35,7 +26,7 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     So are its derivatives: what is differentiated is marked where it enters and where it leaves,
     and each mark is the transpose of the other.
     """
-    if enter is None or leave is None or why_no_kernels() is not None:
+    if why_no_kernels() is not None:
         return function(*args)
 
     def jaxquad_kernel(*args: PyTree) -> PyTree:
@@ -43,18 +34,6 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
 
     entered = jax.tree.map(_marked(enter), args)
     return jax.tree.map(_marked(leave), jax.jit(jaxquad_kernel)(*entered))
-
-
-def apart_in_reverse(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`function` of a kernel, which is kernels of its own where it is computed again and reversed.
-
-    Two cores compile these two at once, and the time of both grows faster than their operations.
-    """
-
-    def jaxquad_block(*args: PyTree) -> PyTree:
-        return function(*args)
-
-    return jax.jit(jaxquad_block)
 
 
 def why_no_kernels() -> str | None:
@@ -65,15 +44,39 @@ def why_no_kernels() -> str | None:
         return f"the platform is {jax.default_backend()}, and kernels are for CPUs"
     if device_kernels.value != "auto":
         return "kernels of a GPU are being tried"
-    if _MISSING is not None:
-        warn_once(_MISSING)
-        return _MISSING
     return why_not_trusted()
 
 
-def most_numbers() -> int:
-    """Of an array in a kernel's arithmetic; where there are no kernels, any number."""
-    return WIDEST - 1 if why_no_kernels() is None else sys.maxsize
+def why_plain() -> str | None:
+    """Why loops are compiled plain here; None if they become kernels, of a CPU or of a GPU."""
+    reason = why_no_kernels()
+    return None if why_no_device_kernels() is None else reason
+
+
+_failed: set[object] = set()
+
+
+def or_plain(name: str, kind: Callable[[], object], run: Callable[[], PyTree]) -> PyTree:
+    """`run()`; with plain loops, and a warning, where it does not compile with kernels.
+
+    The next one of its `kind` is run with plain loops at once.
+    """
+    if _failed and why_plain() is None and kind() in _failed:
+        with plain_loops(True):
+            return run()
+    try:
+        return run()
+    except eqx.EquinoxRuntimeError:  # raised by what runs: it did compile
+        raise
+    except jax.errors.JaxRuntimeError as error:
+        if why_plain() is not None:
+            raise
+        with plain_loops(True):
+            result = run()  # If the kernel is not at fault, this raises too.
+        _failed.add(kind())
+        reason = str(error).strip().splitlines()[0][:200]
+        warn_once(f"{name} did not compile as one kernel ({reason})")
+        return result
 
 
 def _marked(mark: jax.extend.core.Primitive) -> Callable[[Array], Array]:

@@ -49,3 +49,8 @@ def warn_once(what: str) -> None:
 def left_plain() -> tuple[str, ...]:
     """All that was kept since the start of the process, each once."""
     return tuple(_said)
+
+
+def switches() -> tuple:
+    """What tells programs apart that are compiled with kernels or without."""
+    return plain_loops.value, device_kernels.value

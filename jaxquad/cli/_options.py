@@ -206,8 +206,8 @@ def start_computing() -> None:
     prepare_second_process(_prepare)
     prepare_second_process(import_figures, last=True)
     collect_seldom()
+    from jaxquad._compile import enable_compile_cache
     from jaxquad._core import enable_x64
-    from jaxquad._xla import enable_compile_cache
 
     enable_x64()
     enable_compile_cache()

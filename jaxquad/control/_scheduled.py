@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxquad._compile import hasty_options, Jit
 from jaxquad._core import as_float, ensemble_shape, multiply_gains, require_positive, signal_shape
-from jaxquad._xla import hasty_options, Jit
 
 from ._ladrc import LADRC
 from ._pid import PID

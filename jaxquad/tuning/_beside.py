@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from jaxquad._core import thread_settings
-from jaxquad._xla import asked_devices, may_be_several
 from jaxquad.control import Reference
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop
-from jaxquad.simulation import Scenario
+from jaxquad.simulation import asked_devices, may_be_several, Scenario
 
 from ._design_result import DesignResult
 from ._evaluate_design import evaluate_design

@@ -17,7 +17,7 @@ def second_process() -> Iterator[None]:
     `JAXQUAD_SECOND_PROCESS=off` in the environment. A script of many logs has `jaxquad batch`,
     which uses all cores.
     """
-    from jaxquad._xla import own_folder
+    from jaxquad._compile import own_folder
 
     with allowed_second_process():
         start_second_process()
@@ -34,7 +34,7 @@ def _prepare() -> None:
 
 
 def _prepare_with_cache() -> None:
-    from jaxquad._xla import enable_compile_cache
+    from jaxquad._compile import enable_compile_cache
 
     enable_compile_cache()
     _prepare()

@@ -18,10 +18,10 @@ from jaxquad._xla import (
     _segments,
     _switch,
     scan_on_device,
-    sincos,
 )
 from jaxquad._xla._nvrtc import CannotCompile
 from jaxquad._xla._segments import held_bytes, Segments, segments_of
+from jaxquad.models import sincos
 
 
 MEMBERS, SAMPLES = 150, 7  # a block and a part of one; segments of 3, 3 and 1

@@ -13,18 +13,8 @@ import numpy as np
 import pytest
 
 import jaxquad as jq
-from jaxquad._xla import (
-    _canary,
-    _engine,
-    _kernel_limits,
-    _switch,
-    as_one_kernel,
-    brief_options,
-    compiler_options,
-    engine,
-    hasty_options,
-    Jit,
-)
+from jaxquad._compile import brief_options, compiler_options, engine, hasty_options, Jit
+from jaxquad._xla import _canary, _kernel_limits, _options, _switch, as_one_kernel
 
 
 TAG = "xla_cpu_small_call"
@@ -87,30 +77,30 @@ def test_an_outermost_loop_has_the_compilers_options_and_others_have_none():
 def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch):
     here = compiler_options()
     assert engine().vector_bits == here["xla_cpu_prefer_vector_width"]
-    monkeypatch.setattr(_engine, "TESTED", ())
-    monkeypatch.setattr(_engine, "_WIDEST", {"xla_of_another_age": 1})
-    _engine._known.cache_clear()
+    monkeypatch.setattr(_options, "TESTED", ())
+    monkeypatch.setattr(_options, "_WIDEST", {"xla_of_another_age": 1})
+    _options._known.cache_clear()
     with pytest.warns(UserWarning, match="up to a tenth slower.*xla_of_another_age"):
         assert compiler_options() == {}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert engine().vector_bits is None
     monkeypatch.undo()
-    _engine._known.cache_clear()
+    _options._known.cache_clear()
     assert compiler_options() == here
 
 
 def test_tested_versions_are_not_asked_about_options_and_get_those_that_they_know(monkeypatch):
-    options, unknown = _engine._WIDEST | _engine._BRIEF, {"xla_of_another_age": 1}
+    options, unknown = _options._WIDEST | _options._BRIEF, {"xla_of_another_age": 1}
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     with monkeypatch.context() as patch:
-        patch.setattr(_engine, "TESTED", (jaxlib.version.__version__,))
-        assert _engine._refusal(unknown) is None  # nobody asks
+        patch.setattr(_options, "TESTED", (jaxlib.version.__version__,))
+        assert _options._refusal(unknown) is None  # nobody asks
     given = brief_options() | hasty_options()
-    monkeypatch.setattr(_engine, "TESTED", ())
-    assert "xla_of_another_age" in str(_engine._refusal(unknown))
-    known = {k for k, v in options.items() if _engine._refusal({k: v}) is None}
-    assert set(given) == known >= {"xla_backend_optimization_level", *_engine._WIDEST}
+    monkeypatch.setattr(_options, "TESTED", ())
+    assert "xla_of_another_age" in str(_options._refusal(unknown))
+    known = {k for k, v in options.items() if _options._refusal({k: v}) is None}
+    assert set(given) == known >= {"xla_backend_optimization_level", *_options._WIDEST}
 
 
 def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silence, monkeypatch):

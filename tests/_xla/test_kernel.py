@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import _kernel_limits, as_one_kernel, engine
+from jaxquad._compile import engine
+from jaxquad._xla import _kernel_limits, as_one_kernel
 
 
 STEPS = 40
@@ -218,9 +219,7 @@ MISSING = """
 import sys
 import equinox, jax  # equinox needs some of them itself
 {how}
-from jaxquad._xla import as_one_kernel, engine
-from jaxquad._xla._kernel import enter
-assert enter is None
+from jaxquad._compile import _plain, engine
 import warnings
 with warnings.catch_warnings(record=True) as said:
     warnings.simplefilter('always')
@@ -228,7 +227,9 @@ with warnings.catch_warnings(record=True) as said:
 assert not told.one_kernel and 'lacks what kernels are made with' in told.why_not
 assert told.why_not in str(said[-1].message)
 x = jax.numpy.ones(3)
-assert jax.numpy.allclose(jax.jit(lambda x: as_one_kernel(jax.numpy.sin, x))(x), jax.numpy.sin(1.0))
+from jaxquad._compile._door import compilers
+assert compilers() is _plain
+assert jax.numpy.allclose(_plain.as_one_kernel(jax.numpy.sin, x), jax.numpy.sin(1.0))
 print("plain")
 """
 WITHOUT = {

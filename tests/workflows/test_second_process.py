@@ -6,7 +6,7 @@ import jax
 import pytest
 
 import jaxquad as jq
-from jaxquad import _xla
+from jaxquad import _compile
 from jaxquad._core import _beside, behind, beside, has_second_process
 
 
@@ -46,7 +46,7 @@ def test_it_computes_in_64_bits_and_ends_with_the_block(monkeypatch):
 def test_it_keeps_compiled_programs_where_the_script_does(monkeypatch, tmp_path):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv("JAXQUAD_CACHE", str(tmp_path))
-    monkeypatch.setattr(_xla, "own_folder", lambda: tmp_path)
+    monkeypatch.setattr(_compile, "own_folder", lambda: tmp_path)
     with jq.second_process():
         _, _, folder = there(settings)
         assert str(folder).startswith(str(tmp_path / "process-"))
