@@ -31,7 +31,6 @@ from jaxquad.report import (
     _report,
     _sections,
     _tuned,
-    draw_sections,
     provenance,
     reason_of,
     write_report,
@@ -220,16 +219,6 @@ def test_equal_results_give_equal_bytes(tmp_path, frf, fit, log):
     assert origin.date == "2026-01-02T03:04:05+00:00"
     pages = [write_report(tmp_path / name, fit=fit, frf=frf, provenance=origin) for name in "ab"]
     assert pages[0].read_bytes() == pages[1].read_bytes()
-
-
-def test_sections_that_were_drawn_before_are_not_drawn_again(
-    tmp_path, frf, fit, record, monkeypatch
-):
-    given = {"fit": fit, "frf": frf, "record": record, "others": {"direct estimate": frf}}
-    drawn, whole = draw_sections(**given), write_report(tmp_path / "whole", **given)
-    monkeypatch.setattr(_sections, "begin", None)
-    parts = write_report(tmp_path / "parts", **given, drawn=drawn)
-    assert parts.read_bytes() == whole.read_bytes()
 
 
 def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
