@@ -316,9 +316,9 @@ def _write(path: Path, run: jax.stages.Compiled, form: _Form) -> None:
 def _read(path: Path, arguments: int) -> _Call | None:
     try:
         content, count, result = pickle.loads(path.read_bytes())
-        given, results = (([0] * arguments,), {}), [0] * count
-        trees = map(jax.tree.structure, (given, results))
-        run = deserialize_and_load(content, *trees, None, jax.devices()[:1])
+        taken = jax.tree.structure((([0] * arguments,), {}))
+        results = jax.tree.structure([0] * count)
+        run = deserialize_and_load(content, taken, results, None, jax.devices()[:1])
     except Exception as error:  # damaged, or of another making
         warnings.warn(f"{path.name} cannot be read ({error}): it is compiled anew", stacklevel=2)
         return None
@@ -333,7 +333,7 @@ def _kinds(arrays: Sequence[Numbers]) -> tuple:
     return tuple(map(_kind, arrays)), thread_settings(), compilers().switches()
 
 
-def _kind(array: Numbers) -> tuple:
+def _kind(array: Any) -> tuple:
     """Of an array, all but its numbers."""
     kind = jax.typeof(array)
     return kind.shape, kind.dtype, kind.weak_type
