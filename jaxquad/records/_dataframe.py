@@ -45,7 +45,9 @@ def from_dataframe(
     blocks = [np.stack([values[name] for name in role], axis=1) if role else None for role in names]
     inputs, outputs, references = blocks
     if inputs is None or outputs is None:
-        raise RecordError("a record needs at least one input and one output (inputs=, outputs=).")
+        raise RecordError(
+            "a record needs at least one input and one output («inputs=», «outputs=»)."
+        )
     known = _all_units(kept.get("units", {}), units or {}, flat)
     each = [[known[name] for name in role] for role in names]
     return Record(
@@ -63,8 +65,8 @@ def _names_of_roles(
     if all(role is None for role in roles):
         if not all(role in kept for role in _ROLES):
             raise RecordError(
-                "the table does not say which columns are inputs and outputs: name them (inputs=, "
-                f"outputs=). Its columns are {', '.join(map(str, frame.columns))}."
+                "the table does not say which columns are inputs and outputs: name them "
+                f"(«inputs=», «outputs=»). Its columns are {', '.join(map(str, frame.columns))}."
             )
         roles = tuple(kept[role] for role in _ROLES)
     names = [as_tuple(role or ()) for role in roles]
@@ -91,7 +93,7 @@ def _stamps(
     if not found and isinstance(frame.index, RangeIndex):
         raise RecordError(
             f"the table has no time stamps: no column {', '.join(_TIMES)}, and an index that "
-            "counts rows. Name the column (time=), or set the index: frame.set_index(...)."
+            "counts rows. Name the column («time=»), or set the index: frame.set_index(...)."
         )
     if found and found[0] not in frame.columns:
         raise RecordError(f"time: {unknown_name(found[0], map(str, frame.columns))}")
@@ -114,7 +116,7 @@ def _dates(series: "pandas.Series", unit: TimeUnit | None) -> np.ndarray | None:
     if not (is_datetime64_any_dtype(series) or is_timedelta64_dtype(series)):
         return None
     if unit is not None:
-        raise RecordError("the time stamps are dates or durations: leave time_unit= out.")
+        raise RecordError("the time stamps are dates or durations: leave «time_unit=» out.")
     if is_datetime64_any_dtype(series):
         dates = series.to_numpy("datetime64[ns]")  # of any time zone, in UTC
         return dates_in_seconds(dates - dates[:1])

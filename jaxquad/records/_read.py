@@ -260,7 +260,7 @@ def _check_contradiction(
     if said and stated and said != stated and weight == 1 and not others:
         raise RecordError(
             f"the unit of {name!r} is given as {given}, but the log says {logged[source]}: leave "
-            f"it out (units=), or multiply the channel by the factor between the two."
+            f"it out («units=»), or multiply the channel by the factor between the two."
         )
 
 
@@ -282,7 +282,7 @@ def _channels(
 ) -> list[Channel]:
     signals = load_signals(path)
     if not names:
-        raise ReadError(f"{path}: no channels are named. Name them (inputs=, outputs=).")
+        raise ReadError(f"{path}: no channels are named. Name them («inputs=», «outputs=»).")
     try:
         timebases = Timebases(signals, time, time_unit, dt, time_factor)
         return [timebases.channel(name) for name in names]

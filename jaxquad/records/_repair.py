@@ -74,7 +74,7 @@ def check_ranges(valid: Valid, known: Iterable[str]) -> None:
     known = list(known)
     for name in valid:
         if name not in known:
-            raise RecordError(f"valid= names {name!r}: {unknown_name(name, known)}")
+            raise RecordError(f"«valid=» names {name!r}: {unknown_name(name, known)}")
 
 
 def _range(name: str, valid: Range | None) -> Range:
@@ -83,7 +83,7 @@ def _range(name: str, valid: Range | None) -> Range:
     if len(valid) != 2 or not valid[0] < valid[1]:
         raise RecordError(
             f"the valid range of {name!r} is {valid}: give its lowest and highest value, as "
-            f"valid={{{name!r}: (-20, 20)}}."
+            f"«valid=NAME=-20:20|valid={{{name!r}: (-20, 20)}}»."
         )
     return valid
 

@@ -124,7 +124,7 @@ def _raise_for_breaks(
         f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
         f"t = {left - origin:.6g} s to {show_times(right, start=origin)} (limit "
         f"{1e3 * longest:.4g} ms). "
-        f"{choose_range('it')}, or allow it, by its length in s (max_gap=).",
+        f"{choose_range('it')}, or allow it, by its length in s («max_gap=»).",
         [(float(channel.time[i]), float(channel.time[i + 1])) for i in breaks],
     )
 
@@ -318,7 +318,7 @@ def _warn_of_scatter(pieces: Sequence[Channel]) -> None:
             f"the time stamps of {', '.join(names)} lie up to {off:.2g} samples off a clock of "
             f"{rate:.5g} Hz, and steps shorter than half a sample are as frequent as long ones: "
             f"values were interpolated at these times. If the samples were equally spaced, give "
-            f"their interval instead: {1 / rate:.4g} s (dt=).",
+            f"their interval instead: {1 / rate:.4g} s («dt=»).",
             RecordWarning,
             stacklevel=3,
         )

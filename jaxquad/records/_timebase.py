@@ -123,7 +123,7 @@ class Timebases:
             if whole != (len(values) if rows is None else rows.size):
                 raise ReadError(
                     f"channel {name!r} has {len(values)} samples, but its time base {base!r} has "
-                    f"{whole}. Name another time base (time=), or save the channel's own as "
+                    f"{whole}. Name another time base («time=»), or save the channel's own as "
                     f"{'t_' + array!r}."
                 )
         key = base, b"" if rows is None else rows.tobytes()
@@ -162,7 +162,7 @@ class Timebases:
             if base == f"{array}[0]":
                 warnings.warn(
                     f"the time stamps are taken from {base!r}, which rises from row to row. Name "
-                    f"another channel (time=), or give the sampling interval (dt=).",
+                    f"another channel («time=»), or give the sampling interval («dt=»).",
                     RecordWarning,
                     stacklevel=2,
                 )
@@ -172,12 +172,12 @@ class Timebases:
         if self._dt is not None:
             raise ReadError(
                 f"dt is {self._dt:g} s, but the log gives the time of {array!r}: leave dt out "
-                f"(dt=), or name another time base (time=)."
+                f"(«dt=»), or name another time base («time=»)."
             )
         if self._unit not in (None, "s"):
             raise ReadError(
                 f"time_unit is {self._unit!r}, but the log gives the time of {array!r} in s: "
-                f"leave the unit out (time_unit=), or name another time base (time=)."
+                f"leave the unit out («time_unit=»), or name another time base («time=»)."
             )
 
     def _warn_of_others(self, base: str) -> None:
@@ -194,7 +194,7 @@ class Timebases:
         if other:
             warnings.warn(
                 f"the time stamps are taken from {base!r}; {', '.join(map(repr, other))}, of the "
-                f"same length, is not used. Name the right one (time=).",
+                f"same length, is not used. Name the right one («time=»).",
                 RecordWarning,
                 stacklevel=2,
             )
@@ -222,7 +222,7 @@ class Timebases:
             if len(seconds) != len(nanoseconds):
                 raise ReadError(
                     f"the time base {base!r} is of {len(seconds)} seconds and {len(nanoseconds)} "
-                    f"nanoseconds: name two channels of one length (time=SECONDS+NANOSECONDS)."
+                    f"nanoseconds: name two channels of one length («time=SECONDS+NANOSECONDS»)."
                 )
             return seconds + 1e-9 * nanoseconds.astype(np.float64), 0
         array, _ = self._every[base]
@@ -233,7 +233,7 @@ class Timebases:
         if stated and self._unit not in (None, stated) and array in self._signals.titles.values():
             raise ReadError(
                 f"time_unit is {self._unit!r}, but the header says that {array!r} is in {stated}: "
-                f"leave the unit out (time_unit=), or correct the header."
+                f"leave the unit out («time_unit=»), or correct the header."
             )
         return _in_rows(_seconds(base, counter, self._unit or stated or named), signal.rows), wraps
 
@@ -255,7 +255,7 @@ def _check_factor(factor: float | int | None) -> None:
     if factor is not None and not 0.5 <= factor <= 2:
         raise RecordError(
             f"time_factor is {factor:g}: give a number near 1, from 0.5 to 2; units of time are "
-            f"for time_unit (time_unit=)."
+            f"for time_unit («time_unit=»)."
         )
 
 
@@ -263,10 +263,10 @@ def _check_dt(dt: float | int | None, time: str | None, unit: TimeUnit | None) -
     if dt is None:
         return
     if not 0 < dt < np.inf:
-        raise RecordError(f"dt is {dt:g}: give the sampling interval in s, above 0 (dt=).")
+        raise RecordError(f"dt is {dt:g}: give the sampling interval in s, above 0 («dt=»).")
     if time is not None or unit is not None:
         raise RecordError(
-            f"dt is {dt:g} s, and a time base is named as well: keep one of them (dt=, time=)."
+            f"dt is {dt:g} s, and a time base is named as well: keep one of them («dt=», «time=»)."
         )
 
 
@@ -290,7 +290,7 @@ def _held(
     if blank > 0.01 * held.size:
         raise ReadError(
             f"in {blank} of the {held.size} rows in which channel {name!r} has a value, its time "
-            f"base {base!r} is blank. Name the channel's own time base (time=)."
+            f"base {base!r} is blank. Name the channel's own time base («time=»)."
         )
     return held
 
@@ -400,15 +400,15 @@ def time_array(signals: Signals, array: str, time: str | None, clocks: _Clocks) 
     if not found:
         raise ReadError(
             f"no time base for {array!r}: none of {own}, {', '.join(_SHARED)} is among the arrays "
-            f"{listed(signals.arrays)}. Name the array with the time stamps (time=), or the two "
-            f"with seconds and nanoseconds (time=SECONDS+NANOSECONDS), or give the sampling "
-            f"interval of equally spaced rows in s (dt=)."
+            f"{listed(signals.arrays)}. Name the array with the time stamps («time=»), or the two "
+            f"with seconds and nanoseconds («time=SECONDS+NANOSECONDS»), or give the sampling "
+            f"interval of equally spaced rows in s («dt=»)."
         )
     matrix = signals.arrays.get(found)
     if matrix is not None and matrix.values.ndim != 1:
         raise ReadError(
             f"the time base {found!r} has shape {matrix.values.shape}: it must be one column "
-            f"(time={found}[0])."
+            f"(«time={found}[0]»)."
         )
     return found
 

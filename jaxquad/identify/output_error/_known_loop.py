@@ -7,6 +7,7 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxquad._core import Message
 from jaxquad.models import simulate_linear, StateSpace, TransferFunction
 from jaxquad.records import Record
 
@@ -53,17 +54,21 @@ def feedback_response(
         )
     if len(record.input_names) != 1 or len(record.output_names) != 1:
         raise ValueError(
-            "loop= is for one input and one output, the record has "
-            f"{', '.join(record.input_names)} and {', '.join(record.output_names)}: pick channels "
-            "with jq.records.select"
+            Message(
+                "loop= is for one input and one output, the record has "
+                f"{', '.join(record.input_names)} and {', '.join(record.output_names)}: "
+                "«pick channels with jq.records.select»"
+            )
         )
     known = loop.linear()
     if not np.isclose(known.dt, record.dt, rtol=1e-6) or hold != "zero":
         raise ValueError(
-            f"the controller computes every {known.dt:.6g} s a command that it holds, but the "
-            f"record has samples every {record.dt:.6g} s and an input that is "
-            f"{'held' if hold == 'zero' else 'not held'}: give a record at the controller's rate "
-            "with hold= its interval"
+            Message(
+                f"the controller computes every {known.dt:.6g} s a command that it holds, but the "
+                f"record has samples every {record.dt:.6g} s and an input that is "
+                f"{'held' if hold == 'zero' else 'not held'}: give a record at the controller's "
+                "rate with «hold=» its interval"
+            )
         )
     A, B, C = (np.asarray(x, float) for x in (known.A, known.measurement_in, known.C))
     found, state = np.zeros(record.samples), B

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
+from jaxquad._core import keep_freed_memory, Message, one_blas_thread, require_x64
 from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
@@ -143,7 +143,9 @@ def _checked(record: Record | Sequence[Record], max_steps: int) -> list[Record]:
     for one in records:
         still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
         if still:
-            raise ValueError(f"output {still[0]} is constant: leave it out with jq.records.select")
+            raise ValueError(
+                Message(f"output {still[0]} is constant: leave it out« with jq.records.select»")
+            )
     return records
 
 
@@ -227,8 +229,10 @@ def _check_measured(model: DifferentialModel, record: Record) -> None:
     measured = jnp.size(model.measure(model.init()))
     if measured != len(record.output_names):
         raise ValueError(
-            f"the model measures {measured} outputs, the record has "
-            f"{', '.join(record.output_names)}: pick channels with jq.records.select"
+            Message(
+                f"the model measures {measured} outputs, the record has "
+                f"{', '.join(record.output_names)}: «pick channels with jq.records.select»"
+            )
         )
 
 

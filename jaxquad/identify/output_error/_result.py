@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxquad._core import Message
 from jaxquad.records import Record
 
 from ..frequency_domain._result import Fit
@@ -32,7 +33,7 @@ from ..uncertainty._fit_remarks import (
 from ..uncertainty._identifiability import Information
 from ..uncertainty._make_fit import Costs, Estimate, make_fit
 from ..uncertainty._seen import prior_rows, rescale, units_of
-from ..uncertainty._verdict import Verdict
+from ..uncertainty._verdict import NO_MINIMUM, Verdict
 from ._descent import Descent, RecordNoise, with_fixed_slopes
 from ._problem import evaluate_misfits, Evaluation, OutputError, RecordTerm
 
@@ -51,9 +52,12 @@ def remarks_on_output_error(
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
         remarks.append(
-            f"no minimum: one more Gauss-Newton step would lower the cost by {2 * decrement:.3g}, "
-            f"where the noise alone accounts for {taken:.3g}; start from other values, for "
-            "instance those of jq.fit"
+            Message(
+                f"no minimum: one more Gauss-Newton step would lower the cost by "
+                f"{2 * decrement:.3g}, where the noise alone accounts for {taken:.3g}; «start from "
+                "other values», for instance those of jq.fit",
+                NO_MINIMUM,
+            )
         )
     fed = dict.fromkeys(name for record in records for name in record.reference_names)
     closed = any(term.feedback is not None for term in descent.problem.terms)
@@ -61,7 +65,7 @@ def remarks_on_output_error(
         remarks.append(_of_feedback(", ".join(fed), bool(descent.noise)))
     remarks.append(
         "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
-        "model: check the model by jq.verify on another record"
+        "model: check the model by «jq.verify» on another record"
     )
     return remarks
 
@@ -76,7 +80,7 @@ def _of_feedback(references: str, modelled: bool) -> str:
         f"the record has references ({references}), so a loop may have been closed: {doubt} the "
         "joint estimate"
         + (" instead" if not modelled else "")
-        + ", jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())"
+        + "«joint estimate|, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())»"
     )
 
 
@@ -209,7 +213,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     decrement, explained = 0.5 * float(gradient @ step), _explained(projected, problem.terms)
     # In units of what the noise moves: a share of the cost would grow with the record.
     if decrement > count * max(taken, 1.0) or is_unfinished(solution, step, covariance):
-        remedy = "start from other values, for instance those of jq.fit"
+        remedy = "«start from other values», for instance those of jq.fit"
         verdict = by_data = no_minimum(
             parameters.names, decrement, cost, remedy, message=solution.message
         )

@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from jaxquad._core import Message
 from jaxquad._xla import brief_options, Jit
 from jaxquad.models import (
     explicit,
@@ -37,8 +38,10 @@ def band_gain(
     if np.shape(band) != (2,) or not 0 < band[0] < band[1] < nyquist:
         ends = " .. ".join(f"{float(each):.4g}" for each in np.ravel(band))
         raise ValueError(
-            f"band {ends} rad/s must rise and lie between 0 and the record's Nyquist frequency "
-            f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz): give another band (band=)"
+            Message(
+                f"band {ends} rad/s must rise and lie between 0 and the record's Nyquist frequency "
+                f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz): give another band («band=»)"
+            )
         )
     from scipy.signal import butter, sosfreqz
 
@@ -222,9 +225,11 @@ def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None
         inputs, outputs = plant.G.shape[1], len(plant.H0)
     if (len(record.input_names), len(record.output_names)) != (inputs, outputs):
         raise ValueError(
-            f"the model has {_count(inputs, 'input')} and {_count(outputs, 'output')}, the record "
-            f"has {', '.join(record.input_names)} and {', '.join(record.output_names)}: pick "
-            "channels with jq.records.select"
+            Message(
+                f"the model has {_count(inputs, 'input')} and {_count(outputs, 'output')}, the "
+                f"record has {', '.join(record.input_names)} and {', '.join(record.output_names)}: "
+                "«pick channels with jq.records.select»"
+            )
         )
 
 

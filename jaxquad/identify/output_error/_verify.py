@@ -5,7 +5,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxquad._core import require_x64
+from jaxquad._core import Message, require_x64
 from jaxquad.models import StateSpace, TransferFunction
 from jaxquad.records import Record
 
@@ -251,7 +251,9 @@ def _spread(record: Record, measured: np.ndarray) -> Float[np.ndarray, " outputs
     spread = np.std(measured, axis=0)
     for name, one in zip(record.output_names, spread, strict=True):
         if one == 0:
-            raise ValueError(f"output {name} is constant: leave it out with jq.records.select")
+            raise ValueError(
+                Message(f"output {name} is constant: leave it out« with jq.records.select»")
+            )
     return spread
 
 

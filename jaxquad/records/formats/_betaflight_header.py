@@ -80,7 +80,7 @@ def _guarded(data: bytes, start: int, stop: int) -> Header | ReadError:
     try:
         return _header(data, start, stop)
     except ReadError as error:
-        return ReadError(error.args[0], offset=start)
+        return ReadError(error.reason, offset=start)
 
 
 def _header(data: bytes, start: int, stop: int) -> Header:

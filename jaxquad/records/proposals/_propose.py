@@ -3,6 +3,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxquad._core import marked_text
+
 from .._errors import printable, RecordError
 from .._log import flattened, Log, Signals
 from ..formats import load_log
@@ -158,18 +160,18 @@ def propose(
         raise RecordError(
             f"{path}: not a log of a known autopilot ({', '.join(_SETUPS)}), so the meaning of its "
             f"channels is unknown. jaxquad identify takes it all the same: list them (jaxquad "
-            f"channels, jq.records.channels) and name inputs, outputs and references yourself."
+            f"channels«, jq.records.channels») and «name inputs, outputs and references yourself»."
         )
     if chirp is not None and log.vehicle not in _NUMBERED:
         raise RecordError(
-            f"{path}: the chirps of {log.vehicle} have no numbers: leave `chirp` out, and give the "
-            "time (`start`, `stop`) of the one to use."
+            f"{path}: the chirps of {log.vehicle} have no numbers: leave `chirp` out, and give "
+            "the time (`start`, `stop`) of the one to use."
         )
     try:
         low, high = (None if end is None else float(end) for end in (start, stop))
         return _proposed(str(path), log, Selection(axis, chirp, low, high), flight)
     except RecordError as error:
-        raise RecordError(f"{path}: {error}") from error
+        raise RecordError(f"{path}: {marked_text(error)}") from error
     # A log may call anything by the names that its vehicle uses.
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise RecordError(
