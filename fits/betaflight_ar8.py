@@ -12,10 +12,16 @@ from pathlib import Path
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.control.autopilots import betaflight_loop, FilterChain, FlownBetaflight, replay_terms
+from jaxquad.autopilot import (
+    AutopilotProposal,
+    betaflight_loop,
+    FilterChain,
+    FlownBetaflight,
+    replay_terms,
+)
 from jaxquad.records import read_settings
 from jaxquad.records.formats import load_log
-from jaxquad.workflows import autopilot, AutopilotProposal, AutopilotSettings
+from jaxquad.workflows import autopilot, AutopilotSettings
 
 
 jq.enable_x64()
@@ -67,7 +73,7 @@ def at_hover(path: Path, axis: str, flown: FlownBetaflight) -> str:
     found = jq.identify.gain_over_throttle(record, filters=chains)
     names = {"outputs": record.output_names, "references": record.reference_names}
     alone = jq.records.select(record, inputs=record.input_names[0], **names)
-    again = jq.loops.reproduce_flight(
+    again = jq.autopilot.reproduce_flight(
         found.fit, flown.law, alone, plant=lambda model: model.at(0),
         unit="deg/s", filters=chains, axis=AXES.index(axis), band=BAND,
     )  # fmt: skip

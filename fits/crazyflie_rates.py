@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 import jaxquad as jq
-from jaxquad.control.autopilots import CrazyflieRate, list_parameters
+from jaxquad.autopilot import CrazyflieRate, list_parameters
 from jaxquad.report import write_results
 from jaxquad.workflows import Identification, identify, IdentifySettings
 

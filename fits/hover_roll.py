@@ -202,5 +202,4 @@ if __name__ == "__main__":
     gc.set_threshold(500_000, 10, 10)  # a tenth of the time would go to what lives on anyway
     atexit.register(gc.freeze)  # at the end, too
     given = vars(options())
-    with jq.second_process():
-        main(**given)
+    main(**given)

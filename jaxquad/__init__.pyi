@@ -1,4 +1,5 @@
 from . import (
+    autopilot as autopilot,
     control as control,
     datasets as datasets,
     design as design,
@@ -61,4 +62,4 @@ from .tuning import (
     Objective as Objective,
     tune as tune,
 )
-from .workflows import load_result as load_result, second_process as second_process
+from .workflows import load_result as load_result

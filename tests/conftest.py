@@ -3,7 +3,6 @@ import contextlib
 import ctypes
 import gc
 import os
-import pickle
 import shutil
 import tempfile
 from importlib.metadata import version
@@ -12,8 +11,6 @@ from pathlib import Path
 
 # Many small matrices: threads would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# The workers of the tests fill the machine: commands share nothing but in tests of that.
-os.environ.setdefault("JAXQUAD_SECOND_PROCESS", "off")
 
 import equinox as eqx
 import jax
@@ -107,29 +104,3 @@ def without_type_checks():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", before)
-
-
-@pytest.fixture
-def shared(monkeypatch):
-    """Commands have a second process, which can be sent all; whether each lived to its end."""
-    from jaxquad._core import _beside  # here: its types are checked from `pytest_configure` on
-
-    monkeypatch.setenv("JAXQUAD_SECOND_PROCESS", "on")
-    monkeypatch.setattr(_beside, "available_cores", lambda: 2)
-    end, ends = _beside._Second.end, []
-
-    def sent(take):
-        def send(second, later):
-            pickle.loads(pickle.dumps(later.call))  # also what this process will have computed
-            take(second, later)
-
-        return send
-
-    def watch(second):
-        ends.append(second._feeding.is_alive())
-        end(second)
-
-    for name in ("add", "hold"):
-        monkeypatch.setattr(_beside._Second, name, sent(getattr(_beside._Second, name)))
-    monkeypatch.setattr(_beside._Second, "end", watch)
-    return ends

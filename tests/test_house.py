@@ -12,7 +12,7 @@ PACKAGE = ROOT / "jaxquad"
 ORDER = (
     "_core", "_xla", "records", "datasets", "excitation", "models", "spectra", "identify",
     "design", "control", "loops", "simulation", "ensembles", "tuning",
-    "export", "plot", "report", "workflows", "cli",
+    "export", "plot", "report", "autopilot", "workflows", "cli",
 )  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
 

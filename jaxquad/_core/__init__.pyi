@@ -6,16 +6,6 @@ from ._arrays import (
     is_zero as is_zero,
     on_host as on_host,
 )
-from ._beside import (
-    allowed_second_process as allowed_second_process,
-    behind as behind,
-    beside as beside,
-    end_second_process as end_second_process,
-    has_second_process as has_second_process,
-    Later as Later,
-    prepare_second_process as prepare_second_process,
-    start_second_process as start_second_process,
-)
 from ._checks import (
     is_concrete as is_concrete,
     Number as Number,

@@ -2,7 +2,6 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxquad._core import prepare_second_process, start_second_process
 from jaxquad.records import require_file
 from jaxquad.workflows import AutopilotSettings, default_folder, in_options
 
@@ -57,11 +56,9 @@ def run_autopilot(
 ) -> int:
     """Tune the gains of the loop that flew the log, print and write what comes out.
 
-    `log` makes the file while a second process starts; `{page}` in `note` is the page's path.
+    `log` returns the file; `{page}` in `note` is the page's path.
     """
-    start_second_process()
     start_computing()
-    prepare_second_process(_prepare)
     from jaxquad.workflows import autopilot
 
     file = log()
@@ -75,14 +72,6 @@ def run_autopilot(
     if options.json:
         print_json(found.content())
     return _EXIT.get(found.kind, 0)
-
-
-def _prepare() -> None:
-    """What a second process will need beyond `start_computing`: the laws of autopilots."""
-    import jaxquad.control.autopilots
-    from jaxquad.workflows import autopilot
-
-    del autopilot, jaxquad
 
 
 AUTOPILOT = Command(

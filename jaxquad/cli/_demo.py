@@ -3,8 +3,7 @@
 import argparse
 from pathlib import Path
 
-from jaxquad._core import start_second_process
-from jaxquad.workflows import AutopilotSettings, open_logs
+from jaxquad.workflows import AutopilotSettings
 
 from ._autopilot import run_autopilot
 from ._identify import finish_identification
@@ -14,7 +13,6 @@ from ._options import (
     add_out,
     add_output,
     Command,
-    open_beside,
     start_computing,
 )
 from ._progress import add_quiet
@@ -50,7 +48,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _stand(options: argparse.Namespace) -> int:
-    start_second_process()
     start_computing()
     from jaxquad.workflows import DEMO, DEMO_TRUTH, identify, write_demo_log
 
@@ -71,11 +68,11 @@ def _measured(options: argparse.Namespace) -> int:
     from jaxquad.workflows import find_demo_flight
 
     log, settings = find_demo_flight()  # before JAX: it may have nothing to compute
-    opening = open_beside([log], open_logs, log, settings)
-    from jaxquad.workflows import identify_opened
+    start_computing()
+    from jaxquad.workflows import identify
 
     folder = options.out or Path("results/demo_flight")
-    return finish_identification(options, identify_opened(opening.get()), folder, _NEXT_FLIGHT)
+    return finish_identification(options, identify(log, settings), folder, _NEXT_FLIGHT)
 
 
 _NEXT_CHIRP = """
@@ -89,7 +86,7 @@ Then your own log:
 
 
 def _chirp(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import CHIRP_TRUTH, write_chirp_log
+    from jaxquad.autopilot import CHIRP_TRUTH, write_chirp_log
 
     folder = options.out or Path("results/demo_autopilot")
     write = lambda: write_chirp_log(folder / "demo.bfl")

@@ -12,7 +12,6 @@ from jaxquad.workflows import (
     default_folder,
     IdentifySettings,
     in_options,
-    open_again,
     open_logs,
 )
 
@@ -29,7 +28,6 @@ from ._options import (
     Command,
     folder_to_write,
     given_settings,
-    open_beside,
     print_json,
     print_table,
     settings_of,
@@ -135,10 +133,10 @@ def _identify(options: argparse.Namespace) -> int:
     _require_used_units(vars(options).get("units", ()), given)
     if given.verify:
         require_file(given.verify)
-    opening = open_beside(options.file, open_logs, options.file, given)
+    start_computing()
     from jaxquad.workflows import identify_opened
 
-    opened = opening.get()
+    opened = open_logs(options.file, given)
     if opened.proposal is not None:
         with stdout_for_json(options):
             print(f"{opened.proposal}\n", flush=True)
@@ -207,10 +205,10 @@ def _report(options: argparse.Namespace) -> int:
     from jaxquad.workflows import load_result
 
     stored = load_result(options.result)
-    opening = open_beside(stored.logs, open_again, stored, log=options.log)
-    from jaxquad.workflows import identify_opened
+    start_computing()
+    from jaxquad.workflows import identify_again
 
-    found = identify_opened(opening.get())
+    found = identify_again(stored, log=options.log)
     return finish_identification(options, found, options.out or stored.folder)
 
 

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
-from jaxquad._core import allowed_second_process, is_ours
+from jaxquad._core import is_ours
 from jaxquad.records import RecordWarning
 from jaxquad.report import PageWarning
 from jaxquad.workflows import in_options
@@ -83,7 +83,7 @@ def _run(words: Sequence[str]) -> int:
     options, unknown = make_parser().parse_known_args(words)
     if unknown:
         return _fail(_describe_unknown(options, unknown), _UNUSABLE)
-    with warnings.catch_warnings(), shown_stages(options), allowed_second_process():
+    with warnings.catch_warnings(), shown_stages(options):
         for kind in (RecordWarning, PageWarning):
             warnings.simplefilter("always", kind)
         warnings.showwarning = _printer_of_warnings()

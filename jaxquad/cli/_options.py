@@ -3,36 +3,21 @@
 import argparse
 import contextlib
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TYPE_CHECKING, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from jaxquad._core import (
-    announce,
-    beside,
-    collect_seldom,
-    has_second_process,
-    Later,
-    prepare_second_process,
-    start_second_process,
-)
+from jaxquad._core import collect_seldom
 from jaxquad.workflows import (
     AutopilotSettings,
     BatchSettings,
     free_folder,
     GROUPS,
     IdentifySettings,
-    import_estimates,
-    import_figures,
     TuneSettings,
 )
-
-
-if TYPE_CHECKING:
-    from jaxquad.workflows import OpenedLogs
 
 
 Run = Callable[[argparse.Namespace], int]
@@ -201,41 +186,14 @@ def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
 def start_computing() -> None:
     """JAX in 64 bits, and programs that are kept for the next call.
 
-    What a command can say without JAX it says before. A second process does the same.
+    What a command can say without JAX it says before.
     """
-    prepare_second_process(_prepare)
-    prepare_second_process(import_figures, last=True)
     collect_seldom()
     from jaxquad._core import enable_x64
     from jaxquad._xla import enable_compile_cache
 
     enable_x64()
     enable_compile_cache()
-
-
-_LARGEST = 32 << 20  # bytes of logs, which are in the memory of both processes
-
-
-def open_beside(
-    logs: Sequence[Path], opening: Callable[..., "OpenedLogs"], *args: Any, **named: Any
-) -> "Later[OpenedLogs]":
-    """Have a second process open `logs` while this one imports; it helps from there on."""
-    sizes = [path.stat().st_size if path.is_file() else math.inf for path in logs]
-    if sum(sizes) <= _LARGEST:
-        start_second_process()
-    opened = beside(opening, *args, **named)
-    start_computing()
-    opened.check()  # a channel that the log does not have needs no estimates
-    if has_second_process():
-        announce(f"reading {' and '.join(path.name for path in logs)}")
-        import_estimates()  # which takes as long
-    return opened
-
-
-def _prepare() -> None:
-    """What a second process will need first: JAX and estimates."""
-    start_computing()
-    import_estimates()
 
 
 @contextlib.contextmanager

@@ -1,6 +1,6 @@
 import argparse
 
-from jaxquad.workflows import in_options, open_again, TuneSettings
+from jaxquad.workflows import in_options, TuneSettings
 
 from ._options import (
     add_config,
@@ -13,9 +13,9 @@ from ._options import (
     add_settings,
     Command,
     folder_to_write,
-    open_beside,
     print_json,
     settings_of,
+    start_computing,
     stdout_for_json,
 )
 from ._progress import add_quiet
@@ -46,11 +46,10 @@ def _run(options: argparse.Namespace) -> int:
     settings = settings_of(options, TuneSettings)
     stored = load_result(options.result)
     stored.require_radians()  # before anything is imported that takes long
-    opening = open_beside(stored.logs, open_again, stored, log=options.log)
-    from jaxquad.workflows import identify_fit, tune
+    start_computing()
+    from jaxquad.workflows import tune
 
-    axis = identify_fit(opening.get())
-    found = tune(axis, settings, progress=False if options.quiet else None)
+    found = tune(stored, settings, log=options.log, progress=False if options.quiet else None)
     with stdout_for_json(options):
         print(in_options(str(found)))
         print(_WORDS)

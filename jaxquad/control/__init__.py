@@ -1,6 +1,5 @@
 """Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
 
-from . import autopilots as autopilots
 from ._adaptive_ladrc import AdaptiveLADRC as AdaptiveLADRC
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
 from ._observers import (
@@ -23,6 +22,7 @@ from ._protocols import (
     InertiaEstimator as InertiaEstimator,
     LinearController as LinearController,
     LinearisableController as LinearisableController,
+    Member as Member,
     Observer as Observer,
     ObserverController as ObserverController,
     ProbingEstimator as ProbingEstimator,

@@ -16,7 +16,7 @@ Frequencies = Float[np.ndarray, " frequencies"]
 
 @runtime_checkable
 class KnownFilter(Protocol):
-    """A filter of the log's output, as `jq.control.autopilots.FilterChain` is one."""
+    """A filter of the log's output, as `jq.autopilot.FilterChain` is one."""
 
     def response(self, frequency_hz: Frequencies) -> Complex[Array | np.ndarray, " frequencies"]:
         """At frequencies in Hz."""

@@ -10,11 +10,6 @@ from ._analysis import (
     LoopNumbers as LoopNumbers,
     LoopResponse as LoopResponse,
 )
-from ._flown_loop import (
-    FlownController as FlownController,
-    FlownLoop as FlownLoop,
-    reproduce_flight as reproduce_flight,
-)
 from ._gain_window import gain_window as gain_window, GainWindow as GainWindow
 from ._loop import Loop as Loop
 from ._protocols import (

@@ -1,10 +1,10 @@
 """What a pilot looks at: filters and their delay, spectra before and after them, steps, terms."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxquad.control.autopilots import FilterChain
 from jaxquad.identify import GainBand
 
 from ._curves import FlownAgain, Spectrum, StepBand, ThrottleCurve
@@ -18,8 +18,18 @@ _HATCHES = (None, "....", "////", "xxxx", "----")  # of bands, for those who see
 _SPAN = 70.0  # dB that a figure shows below the highest level
 
 
+@runtime_checkable
+class Filters(Protocol):
+    """Filters that a signal passes one after the other, as `jq.autopilot.FilterChain`."""
+
+    @property
+    def rate_hz(self) -> float: ...
+    def response(self, frequency_hz: Any) -> Any: ...
+    def delay_ms(self, frequency_hz: Any) -> Any: ...
+
+
 def filters_figure(
-    chains: Mapping[str, Sequence[FilterChain]], *, ax: Given = None, title: str = ""
+    chains: Mapping[str, Sequence[Filters]], *, ax: Given = None, title: str = ""
 ) -> Panels:
     """Draw magnitude and delay of filters over the frequency.
 

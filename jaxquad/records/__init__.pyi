@@ -5,7 +5,13 @@ from ._errors import (
     RecordError as RecordError,
     RecordWarning as RecordWarning,
 )
-from ._read import channels as channels, ChannelSummary as ChannelSummary, read as read
+from ._read import (
+    channels as channels,
+    ChannelSummary as ChannelSummary,
+    read as read,
+    read_settings as read_settings,
+    Settings as Settings,
+)
 from ._record import Record as Record
 from ._resample import Channel as Channel, resample as resample
 from ._segments import (
@@ -15,7 +21,6 @@ from ._segments import (
     read_segments as read_segments,
     Segment as Segment,
 )
-from ._settings import read_settings as read_settings, Settings as Settings
 from .formats import require_file as require_file
 from .proposals import (
     AXES as AXES,

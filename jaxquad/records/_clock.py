@@ -13,15 +13,14 @@ FEWEST = 16  # samples in a record
 JITTER = 0.02  # of a sample: largest departure from the uniform grid that still counts as uniform
 GAP = 1.5  # nominal samples: a longer step is a gap
 TimeUnit = Literal["s", "ms", "us", "ns"]
+Number = float | int
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _SLOW = 0.25  # s: as large a step may be one of milliseconds
+_DATES = 1e8  # s: stamps from here on are dates, in s since 1970
 _DATE_UNITS = {
     "W": 604800.0, "D": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0,
     "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15, "as": 1e-18,
 }  # fmt: skip
-
-
-_DATES = 1e8  # s: stamps from here on are dates, in s since 1970
 
 
 def clock_start(time: Times) -> float:
@@ -35,8 +34,8 @@ def show_times(*times: float, start: float = 0.0) -> str:
     return f"{text} s after {start:.3f} s" if start else f"{text} s"
 
 
-def in_file_time(time: float | int | None, start: float) -> float | int | None:
-    """A time that was given, which may count from the `start` that is shown (s)."""
+def in_file_time(time: Number | None, start: float) -> Number | None:
+    """A time that a user named, which may count from the `start` that is shown (s)."""
     return start + time if time is not None and start and time < _DATES else time
 
 
@@ -51,11 +50,8 @@ def doubt_of_seconds(stamps: Times) -> str:
     step = float(np.median(np.abs(np.diff(stamps)))) if stamps.size > 1 else 0.0
     if not step >= _SLOW:
         return ""
-    doubt = (
-        "which is probably not in seconds"
-        if step >= 1
-        else f"{1 / step:.3g} Hz if that is in s, {1e3 / step:.4g} Hz in ms"
-    )
+    doubt = f"{1 / step:.3g} Hz if that is in s, {1e3 / step:.4g} Hz in ms"
+    doubt = "which is probably not in seconds" if step >= 1 else doubt
     return (
         f"steps by {step:.6g}, {doubt}. Give its unit («time_unit=»): ms, us or ns, or s if the "
         f"log really is that slow; for a count of rows give the sampling interval («dt=»)"
@@ -99,16 +95,16 @@ def check_increasing(label: str, time: Times) -> None:
         )
 
 
+_SCATTERED = 0.01  # of the steps; fewer are those of single late stamps
+_SPAN = 16  # samples, over which scattered stamps are counted: their ends hardly matter
+
+
 def scatters(time: Times) -> bool:
     """Whether time stamps scatter about a clock: steps are too short as often as too long."""
     step = np.diff(time)
     usual = np.median(step)
     too_long, too_short = np.sum(step > GAP * usual), np.sum(step < (2 - GAP) * usual)
     return bool(too_short > max(0.5 * too_long, _SCATTERED * step.size))
-
-
-_SCATTERED = 0.01  # of the steps; fewer are those of single late stamps
-_SPAN = 16  # samples, over which scattered stamps are counted: their ends hardly matter
 
 
 def longest_step(time: Times) -> float:
@@ -121,8 +117,8 @@ def native_rate(time: Times) -> float:
     count = min(_SPAN, time.size // 2) if scatters(time) else 1
     span = time[count:] - time[:-count]
     usual = float(np.median(np.diff(time)))
-    whole = span[span <= np.median(span) + (longest_step(time) - usual)]
-    return float(count * whole.size / whole.sum())
+    unbroken = span[span <= np.median(span) + (longest_step(time) - usual)]
+    return float(count * unbroken.size / unbroken.sum())
 
 
 def nonuniformity(time: Times) -> float:
@@ -150,7 +146,7 @@ def check_uniform(time: Times) -> None:
         )
 
 
-def window(time: Times, start: float | int | None, stop: float | int | None) -> slice:
+def window(time: Times, start: Number | None, stop: Number | None) -> slice:
     """The samples from `start` to `stop` (s, both included; None is the end of the record).
 
     Where the time stamps are dates, both may count from the first of them.
@@ -176,8 +172,7 @@ def window(time: Times, start: float | int | None, stop: float | int | None) -> 
     return slice(first, last)
 
 
-MOST_DROPPED = 0.01  # of the time stamps; more is not a glitch, and the record is refused
-_WRAP = 2.0**32
+_MOST_DROPPED = 0.01  # of the time stamps; more is not a glitch, and the record is refused
 
 
 class RepairedTime(NamedTuple):
@@ -199,7 +194,7 @@ def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
         steps = np.diff(counter.astype(np.int64))
         wraps = steps < -span / 2
     else:
-        span = _WRAP
+        span = 2.0**32
         wraps = (counter[:-1] > 0.99 * span) & (counter[:-1] < span) & (counter[1:] < 0.01 * span)
         wraps &= counter[1:] >= 0
     if not wraps.any():
@@ -217,11 +212,13 @@ def repair(time: Times) -> RepairedTime:
     if time.size < FEWEST or (good.all() and (np.diff(time) > 0).all()):
         return RepairedTime(time, None, "")
     kept = np.flatnonzero(good)
-    kept = kept[~_spikes(time[kept])]
+    if kept.size > 2:  # what jumps ahead although its neighbours are in order goes alone
+        a, b, c = time[kept][:-2], time[kept][1:-1], time[kept][2:]
+        kept = kept[~np.concatenate([[a[0] > b[0] and b[0] < c[0]], (b > c) & (a < c), [False]])]
     highest = np.maximum.accumulate(time[kept])
     kept = kept[np.concatenate([[True], time[kept][1:] > highest[:-1]])] if kept.size else kept
     dropped = time.size - kept.size
-    if dropped > MOST_DROPPED * time.size:
+    if dropped > _MOST_DROPPED * time.size:
         return RepairedTime(time, None, "")
     mask = np.zeros(time.size, dtype=bool)
     mask[kept] = True
@@ -231,12 +228,3 @@ def repair(time: Times) -> RepairedTime:
         f"first of them row {first} ({time[first]:.9g} s)"
     )
     return RepairedTime(time[mask], mask, remark)
-
-
-def _spikes(time: Times) -> Bool[np.ndarray, " samples"]:
-    """Time stamps that jump ahead although their neighbours are in order."""
-    spike = np.zeros(time.size, dtype=bool)
-    if time.size > 2:
-        spike[1:-1] = (time[1:-1] > time[2:]) & (time[:-2] < time[2:])
-        spike[0] = time[0] > time[1] and time[1] < time[2]
-    return spike

@@ -1,13 +1,14 @@
+import dataclasses
 import functools as ft
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from ._clock import window
+from ._clock import Number, Times, window
 from ._errors import RecordError
-from ._record import as_tuple, Record
+from ._record import as_tuple, assemble, Record
 from ._repair import within
 
 
@@ -15,9 +16,7 @@ Channels = Float[np.ndarray, "samples channels"]
 _ROLES = ("input", "output", "reference")
 
 
-def trim(
-    record: Record, start: float | int | None = None, stop: float | int | None = None
-) -> Record:
+def trim(record: Record, start: Number | None = None, stop: Number | None = None) -> Record:
     """The part of a record from `start` to `stop`.
 
     **Arguments:**
@@ -32,8 +31,17 @@ def trim(
 
     - `RecordError`: where the range leaves the record or holds fewer than 16 samples.
     """
-    kept = window(record.time, start, stop)
-    return _rebuilt(record, record.time[kept], lambda channels: channels[kept])
+    span = window(record.time, start, stop)
+    time = record.time[span]
+    return dataclasses.replace(
+        record,
+        time=time,
+        inputs=record.inputs[span],
+        outputs=record.outputs[span],
+        references=record.references[span],
+        time_unit="s",
+        repaired=within(record.repaired, time[0], time[-1]),
+    )
 
 
 def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
@@ -59,7 +67,13 @@ def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
         slope = (centred * level).sum(axis=0) / (centred**2).sum()
         return level - order * slope * centred
 
-    return _rebuilt(record, record.time, flatten)
+    return dataclasses.replace(
+        record,
+        inputs=flatten(record.inputs),
+        outputs=flatten(record.outputs),
+        references=flatten(record.references),
+        time_unit="s",
+    )
 
 
 def select(
@@ -84,14 +98,22 @@ def select(
     - `RecordError`: for a name that the record lacks or that is given twice.
     """
     roles = [as_tuple(names) for names in (inputs, outputs, references)]
-    hold = _hold_of(record, roles[0])
-    return _assembled(record, roles, record.channel, record.unit, hold)
+    hold = record.hold if set(roles[0]) <= set(record.input_names) else None
+    return assemble(
+        record.time,
+        roles,
+        record.channel,
+        record.unit,
+        source=record.source,
+        hold=hold,
+        repaired=record.repaired,
+    )
 
 
 def mix(
     record: Record,
     name: str,
-    weights: Mapping[str, float | int],
+    weights: Mapping[str, Number],
     *,
     role: Literal["input", "output", "reference"] = "input",
 ) -> Record:
@@ -125,21 +147,23 @@ def mix(
     unit = shared.pop() if len(shared) == 1 else ""
     roles = [record.input_names, record.output_names, record.reference_names]
     roles[_ROLES.index(role)] += (name,)
-    hold = _hold_of(record, weights) if role == "input" else record.hold
-    return _assembled(
-        record,
+    unknown_hold = role == "input" and not set(weights) <= set(record.input_names)
+    return assemble(
+        record.time,
         roles,
-        lambda each: column if each == name else record.channel(each),
-        lambda each: unit if each == name else record.unit(each),
-        hold,
+        lambda channel: column if channel == name else record.channel(channel),
+        lambda channel: unit if channel == name else record.unit(channel),
+        source=record.source,
+        hold=None if unknown_hold else record.hold,
+        repaired=record.repaired,
     )
 
 
 def combine(
     name: str,
-    weights: Mapping[str, float | int],
-    values: Callable[[str], Float[np.ndarray, " samples"]],
-) -> Float[np.ndarray, " samples"]:
+    weights: Mapping[str, Number],
+    values: Callable[[str], Times],
+) -> Times:
     """The weighted sum that makes the channel `name`; a single weight of 1 changes no bit."""
     if not weights:
         raise RecordError(f"the sum {name!r} is empty: give it channels and their weights.")
@@ -149,61 +173,3 @@ def combine(
                 f"the weight of {source!r} in the sum {name!r} is {weight}: use a finite number."
             )
     return ft.reduce(np.add, (weight * values(source) for source, weight in weights.items()))
-
-
-def _hold_of(record: Record, sources: Iterable[str]) -> float | None:
-    """The hold of channels as inputs: known of the record's own inputs alone."""
-    return record.hold if set(sources) <= set(record.input_names) else None
-
-
-def _assembled(
-    record: Record,
-    roles: Sequence[tuple[str, ...]],
-    values: Callable[[str], Float[np.ndarray, " samples"]],
-    unit: Callable[[str], str],
-    hold: float | None,
-) -> Record:
-    blocks = [
-        np.stack([values(name) for name in names], axis=1)
-        if names
-        else np.empty((record.samples, 0))
-        for names in roles
-    ]
-    units = [[unit(name) for name in names] for names in roles]
-    return Record(
-        record.time,
-        *blocks,
-        input_names=roles[0],
-        output_names=roles[1],
-        reference_names=roles[2],
-        input_units=units[0],
-        output_units=units[1],
-        reference_units=units[2],
-        source=record.source,
-        hold=hold,
-        time_unit="s",
-        repaired=record.repaired,
-    )
-
-
-def _rebuilt(
-    record: Record,
-    time: Float[np.ndarray, " kept"],
-    change: Callable[[Channels], Float[np.ndarray, "kept channels"]],
-) -> Record:
-    return Record(
-        time,
-        change(record.inputs),
-        change(record.outputs),
-        change(record.references),
-        input_names=record.input_names,
-        output_names=record.output_names,
-        reference_names=record.reference_names,
-        input_units=record.input_units,
-        output_units=record.output_units,
-        reference_units=record.reference_units,
-        source=record.source,
-        hold=record.hold,
-        time_unit="s",
-        repaired=within(record.repaired, time[0], time[-1]),
-    )

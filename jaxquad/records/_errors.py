@@ -5,9 +5,6 @@ from pathlib import Path
 from jaxquad._core import marked_text, Message
 
 
-_MOST_LISTED = 40  # names
-
-
 class RecordError(ValueError):
     """A record that cannot be used: the message says what is wrong, the value and what to do."""
 
@@ -56,13 +53,13 @@ def located(error: ReadError, path: Path | str) -> ReadError:
     return ReadError(f"{path}: {error.reason}", offset=error.offset)
 
 
-def unknown_name(name: str, known: Iterable[str]) -> str:
-    """What an error says of a `name` that is not among the `known` ones, with the nearest."""
-    known = list(known)
-    plain = {each.lower(): each for each in known}
-    near = difflib.get_close_matches(name.lower(), plain, n=1)
-    guess = f" Did you mean {plain[near[0]]!r}?" if near else ""
-    return f"there is no channel {name!r}.{guess} The channels are: {listed(known)}."
+def unknown_name(name: str, channels: Iterable[str]) -> str:
+    """What an error says of a `name` that is not among the `channels`, with the nearest."""
+    channels = list(channels)
+    names = {channel.lower(): channel for channel in channels}
+    near = difflib.get_close_matches(name.lower(), names, n=1)
+    guess = f" Did you mean {names[near[0]]!r}?" if near else ""
+    return f"there is no channel {name!r}.{guess} The channels are: {listed(channels)}."
 
 
 def choose_range(it: str) -> str:
@@ -72,15 +69,14 @@ def choose_range(it: str) -> str:
 
 def mend_holes(it: str) -> str:
     """Advice where values are missing."""
-    gaps = "let gaps up to some length in s be interpolated («max_gap=»)"
-    return f"{choose_range(it)}, or {gaps}."
+    return f"{choose_range(it)}, or let gaps up to some length in s be interpolated («max_gap=»)."
 
 
 def listed(names: Iterable[str]) -> str:
     """The names, separated by commas; of many, the first 40."""
     names = list(names)
-    more = f", and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
-    return f"{', '.join(names[:_MOST_LISTED]) or 'none'}{more}"
+    more = f", and {len(names) - 40} more" if len(names) > 40 else ""
+    return f"{', '.join(names[:40]) or 'none'}{more}"
 
 
 def printable(text: str) -> str:

@@ -1,7 +1,8 @@
-"""What every reader returns: tables of signals, each on one clock, and remarks on damage."""
+"""What every reader returns: tables of signals, each on one clock, units, remarks on damage."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -89,26 +90,27 @@ def changes_of(
     `time_of` a stamp is in s, None where it has none.
     """
     values: dict[str, str] = {}
-    found: list[SettingChange] = []
+    changes: list[SettingChange] = []
     for stamp, name, value in logged:
         before = values.get(name, value)
         values[name] = value
-        if before != value and len(found) < _MOST_CHANGES:
+        if before != value and len(changes) < _MOST_CHANGES:
             time = time_of(stamp)
             if time is not None and np.isfinite(time):
-                found.append(SettingChange(time, name, before, value))
-    return tuple(sorted(found, key=lambda change: change.time))
+                changes.append(SettingChange(time, name, before, value))
+    return tuple(sorted(changes, key=lambda change: change.time))
 
 
 def flattened(log: Log) -> Signals:
     """The numeric columns of a log with one or two dimensions, by their full names.
 
     In a table with a clock, columns of another length, such as parameters, are left out. In one
-    without, a matrix whose rows are the channels is turned.
+    without, a matrix whose rows are the channels is turned: it has too few rows for a record, or as
+    many columns as other arrays of the file have samples.
     """
     arrays, clocks, titles = {}, {}, {}
     for table_name, table in log.tables.items():
-        lengths = {len(each) for each in table.columns.values() if each.ndim == 1}
+        lengths = {len(values) for values in table.columns.values() if values.ndim == 1}
         clock = "" if table.time is None else f"clock of {table_name}".removesuffix(" of ")
         if table.time is not None:
             clocks[clock] = table.time
@@ -119,19 +121,15 @@ def flattened(log: Log) -> Signals:
             if values.dtype.kind in "mM":
                 seconds = dates_in_seconds(values)
                 values, unit = (values, unit) if seconds is None else (seconds, "s")
-            if is_data(values) and (table.time is None or len(values) == table.time.size):
-                turned = table.time is None and _has_channel_rows(values, lengths)
-                values = values.T if turned else values
+            if values.dtype.kind not in "fiub" or values.ndim not in (1, 2):
+                continue
+            if table.time is None and values.ndim == 2:
+                rows, columns = values.shape
+                alike = columns in lengths and rows not in lengths
+                values = values.T if alike or rows < FEWEST <= columns else values
+            if table.time is None or len(values) == table.time.size:
                 arrays[full] = Signal(values, clock, unit, scale, table.rows.get(name))
     return Signals(arrays, clocks, titles)
-
-
-def _has_channel_rows(matrix: np.ndarray, lengths: set[int]) -> bool:
-    """Too few rows for a record, or as many columns as other arrays of the file have samples."""
-    if matrix.ndim != 2:
-        return False
-    rows, columns = matrix.shape
-    return rows < FEWEST <= columns or (columns in lengths and rows not in lengths)
 
 
 def add_columns(
@@ -144,19 +142,14 @@ def add_columns(
         columns[name] = values
 
 
-def is_data(array: np.ndarray) -> bool:
-    """Real numbers in one or two dimensions."""
-    return array.dtype.kind in "fiub" and array.ndim in (1, 2)
-
-
-LARGEST = 4 * 2**30  # bytes of decoded arrays
+_LARGEST = 4 * 2**30  # bytes of decoded arrays
 _DENSEST = 250  # decoded bytes per byte of the file: real logs stay far below
 _HARMLESS = 64 * 2**20  # bytes that any file may hold
 
 
 def allowance(stored: int) -> int:
     """How many bytes `stored` ones may decode to."""
-    return min(LARGEST, max(_HARMLESS, _DENSEST * stored))
+    return min(_LARGEST, max(_HARMLESS, _DENSEST * stored))
 
 
 def check_size(what: str, declared: int, stored: int, *, offset: int | None = None) -> None:
@@ -187,3 +180,47 @@ def describe_skips(skipped: list[tuple[int, int]], place: int, end: int) -> list
             f"the file is cut off: the last {end - place} bytes, from byte {place} on, were ignored"
         )
     return remarks
+
+
+_UNITS = (
+    "s", "ms", "us", "ns", "Hz", "rad", "deg", "rad/s", "deg/s", "rad/s^2", "deg/s^2",
+    "m", "m/s", "m/s^2", "N", "N m", "V", "rpm",
+)  # fmt: skip
+_SAME = {
+    "sec": "s", "seconds": "s", "msec": "ms", "usec": "us", "\u00b5s": "us", "\u03bcs": "us",
+    "radians": "rad", "degrees": "deg", "\u00b0": "deg",
+    "rad/sec": "rad/s", "deg/sec": "deg/s", "\u00b0/s": "deg/s", "dps": "deg/s",
+    "rad/s2": "rad/s^2", "rad/s\u00b2": "rad/s^2", "rad/s/s": "rad/s^2",
+    "deg/s2": "deg/s^2", "deg/s\u00b2": "deg/s^2", "deg/s/s": "deg/s^2",
+    "m/s2": "m/s^2", "m/s\u00b2": "m/s^2", "m/s/s": "m/s^2",
+    "Nm": "N m", "N*m": "N m", "N.m": "N m", "N\u00b7m": "N m", "RPM": "rpm",
+}  # fmt: skip
+_TITLE = re.compile(r"(.*\S)\s*(?:\[([^\[\]()]+)\]|\(([^\[\]()]+)\))")
+
+
+def known_unit(text: str) -> str:
+    """A unit as this library writes it; empty for one that is not known to be one."""
+    plain = text.strip()
+    return plain if plain in _UNITS else _SAME.get(plain, "")
+
+
+class Column(NamedTuple):
+    """What the cell of a header names, and its unit: empty where it has none."""
+
+    name: str
+    unit: str
+
+
+def columns_of(titles: Sequence[str]) -> dict[str, Column]:
+    """The cells of a header, such as `q [deg/s]` and `time (us)`, as names and units.
+
+    A cell keeps its whole text as a name where it ends in no known unit, and where the name alone
+    would be that of another cell.
+    """
+    parts = {}
+    for title in titles:
+        match = _TITLE.fullmatch(title)
+        unit = known_unit(match[2] or match[3]) if match else ""
+        parts[title] = Column(match[1], unit) if match and unit else Column(title, "")
+    names = [name for name, _ in parts.values()]
+    return {t: p if names.count(p.name) == 1 else Column(t, p.unit) for t, p in parts.items()}

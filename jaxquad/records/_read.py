@@ -1,21 +1,20 @@
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from ._clock import clock_start, JITTER, nonuniformity, show_times, TimeUnit, window
+from ._clock import clock_start, JITTER, nonuniformity, Number, show_times, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
-from ._record import as_tuple, check_distinct, Hold, Record
-from ._repair import check_ranges, repair_values, Valid, within
+from ._log import known_unit
+from ._record import as_tuple, assemble, check_distinct, Hold, Record
+from ._repair import check_ranges, repair_values, Valid, within, without_turns
 from ._resample import Channel, resample
-from ._timebase import signal_names, Timebases
-from ._turns import without_turns
-from ._units import known_unit
-from .formats import load_signals
+from ._timebase import Timebases
+from .formats import load_log, load_signals
 
 
 class ChannelSummary(NamedTuple):
@@ -54,7 +53,7 @@ def channels(
     *,
     time: str | None = None,
     time_unit: TimeUnit | None = None,
-    dt: float | int | None = None,
+    dt: Number | None = None,
 ) -> list[ChannelSummary]:
     """List the channels that `read` can take from a file.
 
@@ -74,21 +73,21 @@ def channels(
         timebases = Timebases(signals, time, time_unit, dt)
     except ReadError as error:
         raise located(error, path) from error
-    return [_summary(timebases, name) for name in signal_names(signals, time, dt)]
+    summaries = []
+    for name in timebases.names:
+        values = timebases.values(name)
+        finite = values[np.isfinite(values)]
+        low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
+        try:
+            clock = timebases.extent(name)
+        except RecordError:  # A list of channels is also for finding out what is wrong with a file.
+            clock = np.nan, np.nan, np.nan
+        unit = timebases.unit(name)
+        summaries.append(ChannelSummary(name, len(values), *clock, low, high, unit))
+    return summaries
 
 
-def _summary(timebases: Timebases, name: str) -> ChannelSummary:
-    values = timebases.values(name)
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
-    try:
-        clock = timebases.extent(name)
-    except RecordError:  # A list of channels is also for finding out what is wrong with a file.
-        clock = np.nan, np.nan, np.nan
-    return ChannelSummary(name, len(values), *clock, low, high, timebases.unit(name))
-
-
-Mixes = Mapping[str, Mapping[str, float | int]]
+Mixes = Mapping[str, Mapping[str, Number]]
 Selection = str | Sequence[str] | Mixes
 
 
@@ -98,14 +97,14 @@ def read(
     inputs: Selection,
     outputs: Selection,
     references: Selection | None = None,
-    sample_rate: float | int | None = None,
-    start: float | int | None = None,
-    stop: float | int | None = None,
+    sample_rate: Number | None = None,
+    start: Number | None = None,
+    stop: Number | None = None,
     time: str | None = None,
     time_unit: TimeUnit | None = None,
-    dt: float | int | None = None,
-    time_factor: float | int | None = None,
-    max_gap: float | int | None = None,
+    dt: Number | None = None,
+    time_factor: Number | None = None,
+    max_gap: Number | None = None,
     units: Mapping[str, str] | None = None,
     hold: Hold = None,
     valid: Valid | None = None,
@@ -166,102 +165,45 @@ def read(
     """
     roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
-    channels = _channels(path, names, time, time_unit, dt, time_factor)
+    signals = load_signals(path)
+    if not names:
+        raise ReadError(f"{path}: no channels are named. Name them («inputs=», «outputs=»).")
+    try:
+        timebases = Timebases(signals, time, time_unit, dt, time_factor)
+        logged = [timebases.channel(name) for name in names]
+    except ReadError as error:
+        raise located(error, path) from error
     check_ranges(valid or {}, names)
-    channels, repaired = _repaired(channels, valid or {}, max_gap)
+    channels, repaired = [], {}
+    for channel in logged:
+        limits = (valid or {}).get(channel.name)
+        values, times = repair_values(channel.name, channel.time, channel.values, limits, max_gap)
+        values = _continuous(channel, values)
+        channels.append(Channel(channel.name, channel.time, values, channel.unit))
+        repaired[channel.name] = times
     span = _shared_grid(channels, start, stop) if sample_rate is None else None
     if span is not None:
         stamps = channels[0].time[span]
-        values = np.stack([channel.values[span] for channel in channels], axis=1)
+        table = np.stack([channel.values[span] for channel in channels], axis=1)
     else:
-        rate = _slowest(channels) if sample_rate is None else sample_rate
-        stamps, values = resample(channels, rate, start=start, stop=stop, max_gap=max_gap)
-    columns = dict(zip(names, values.T, strict=True))
-    logged = {channel.name: channel.unit for channel in channels}
-    units = _all_units(units or {}, logged, roles)
-    return Record(
+        slowest = min(channel.rate for channel in channels)
+        rate = float(f"{slowest:.3g}") if sample_rate is None else sample_rate
+        stamps, table = resample(channels, rate, start=start, stop=stop, max_gap=max_gap)
+        # Input and output pass through one filter: a hold within a sample stays what it is.
+        longest = 1.01 * (stamps[1] - stamps[0])
+        hold = None if isinstance(hold, int | float) and hold > longest else hold
+    columns = dict(zip(names, table.T, strict=True))
+    mixes = {name: mix for role in roles for name, mix in role.items()}
+    units = _units(units or {}, {channel.name: channel.unit for channel in channels}, mixes)
+    return assemble(
         stamps,
-        *(_blend(role, columns, stamps.size) for role in roles),
-        input_names=tuple(roles[0]),
-        output_names=tuple(roles[1]),
-        reference_names=tuple(roles[2]),
-        input_units=[units[name] for name in roles[0]],
-        output_units=[units[name] for name in roles[1]],
-        reference_units=[units[name] for name in roles[2]],
+        roles,
+        lambda name: combine(name, mixes[name], columns.__getitem__),
+        units.__getitem__,
         source=str(path),
-        hold=hold if span is not None else _after_resampling(hold, stamps),
-        time_unit="s",
+        hold=hold,
         repaired=within(repaired, stamps[0], stamps[-1]),
     )
-
-
-def _repaired(
-    channels: Sequence[Channel], valid: Valid, max_gap: float | int | None
-) -> tuple[list[Channel], dict[str, Float[np.ndarray, " repaired"]]]:
-    """The channels with values filled in where that is asked for, and when (s), by channel."""
-    whole, times = [], {}
-    for each in channels:
-        found = repair_values(each.name, each.time, each.values, valid.get(each.name), max_gap)
-        whole.append(_continuous(Channel(each.name, each.time, found.values, each.unit)))
-        times[each.name] = found.times
-    return whole, times
-
-
-def _continuous(channel: Channel) -> Channel:
-    """The channel, an angle without its jumps of a turn."""
-    values, jumps, period = without_turns(channel.values, known_unit(channel.unit) or channel.unit)
-    if not jumps:
-        return channel
-    turn = "360" if period == 360 else "2 pi"
-    times = "once" if jumps == 1 else f"{jumps} times"
-    warnings.warn(
-        f"channel {channel.name!r} jumps by {turn} {times}, as an angle does at the end of its "
-        f"range: it is taken as one that goes on.",
-        RecordWarning,
-        stacklevel=4,
-    )
-    return Channel(channel.name, channel.time, values, channel.unit)
-
-
-def _after_resampling(hold: Hold, stamps: Float[np.ndarray, " samples"]) -> Hold:
-    """Input and output pass through one filter, so that a hold within a sample stays what it is."""
-    longest = 1.01 * (stamps[1] - stamps[0])
-    return None if isinstance(hold, int | float) and hold > longest else hold
-
-
-def _all_units(
-    given: Mapping[str, str], logged: Mapping[str, str], roles: Sequence[Mixes]
-) -> dict[str, str]:
-    """Those given, else the log's where the channels of a mix agree."""
-    mixes = {name: mix for role in roles for name, mix in role.items()}
-    for name in given:
-        if name not in mixes:
-            raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, mixes)}")
-        _check_contradiction(name, given[name], mixes[name], logged)
-    units = {
-        name: {logged[source] for source in mix} if _keeps_units(mix) else {""}
-        for name, mix in mixes.items()
-    }
-    agreed = {name: unit.pop() if len(unit) == 1 else "" for name, unit in units.items()}
-    return agreed | dict(given)
-
-
-def _keeps_units(mix: Mapping[str, float | int]) -> bool:
-    """Whether a mix is in the unit of its channels: a single channel's factor may convert it."""
-    return len(mix) > 1 or all(abs(weight) == 1 for weight in mix.values())
-
-
-def _check_contradiction(
-    name: str, given: str, mix: Mapping[str, float | int], logged: Mapping[str, str]
-) -> None:
-    """Raise RecordError for another unit than the log's of a channel that is taken as it is."""
-    (source, weight), *others = mix.items()
-    said, stated = known_unit(given), known_unit(logged[source])
-    if said and stated and said != stated and weight == 1 and not others:
-        raise RecordError(
-            f"the unit of {name!r} is given as {given}, but the log says {logged[source]}: leave "
-            f"it out («units=»), or multiply the channel by the factor between the two."
-        )
 
 
 def _mixes(selection: Selection) -> Mixes:
@@ -272,31 +214,25 @@ def _mixes(selection: Selection) -> Mixes:
     return {name: {name: 1.0} for name in names}
 
 
-def _channels(
-    path: str | Path,
-    names: Sequence[str],
-    time: str | None,
-    time_unit: TimeUnit | None,
-    dt: float | int | None,
-    time_factor: float | int | None,
-) -> list[Channel]:
-    signals = load_signals(path)
-    if not names:
-        raise ReadError(f"{path}: no channels are named. Name them («inputs=», «outputs=»).")
-    try:
-        timebases = Timebases(signals, time, time_unit, dt, time_factor)
-        return [timebases.channel(name) for name in names]
-    except ReadError as error:
-        raise located(error, path) from error
-
-
-def _slowest(channels: Sequence[Channel]) -> float:
-    return float(f"{min(channel.rate for channel in channels):.3g}")
+def _continuous(channel: Channel, values: np.ndarray) -> np.ndarray:
+    """The values of an angle without its jumps of a turn, of another channel as they are."""
+    values, jumps, period = without_turns(values, known_unit(channel.unit) or channel.unit)
+    if jumps:
+        turn = "360" if period == 360 else "2 pi"
+        times = "once" if jumps == 1 else f"{jumps} times"
+        warnings.warn(
+            f"channel {channel.name!r} jumps by {turn} {times}, as an angle does at the end of its "
+            f"range: it is taken as one that goes on.",
+            RecordWarning,
+            stacklevel=3,
+        )
+    return values
 
 
 def _shared_grid(
-    channels: Sequence[Channel], start: float | int | None, stop: float | int | None
+    channels: Sequence[Channel], start: Number | None, stop: Number | None
 ) -> slice | None:
+    """The samples between `start` and `stop` where all channels share one uniform time base."""
     time = channels[0].time
     if not all(np.array_equal(time, channel.time) for channel in channels):
         return None
@@ -304,8 +240,77 @@ def _shared_grid(
     return span if nonuniformity(time[span]) <= JITTER else None
 
 
-def _blend(
-    role: Mixes, columns: Mapping[str, np.ndarray], samples: int
-) -> Float[np.ndarray, "samples channels"]:
-    mixed = [combine(name, mix, columns.__getitem__) for name, mix in role.items()]
-    return np.stack(mixed, axis=1) if mixed else np.empty((samples, 0))
+def _units(units: Mapping[str, str], logged: Mapping[str, str], mixes: Mixes) -> dict[str, str]:
+    """Those that the user names, else the log's where the channels of a mix agree."""
+    for name, unit in units.items():
+        if name not in mixes:
+            raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, mixes)}")
+        (source, weight), *others = mixes[name].items()
+        said, stated = known_unit(unit), known_unit(logged[source])
+        if said and stated and said != stated and weight == 1 and not others:
+            raise RecordError(
+                f"the unit of {name!r} is given as {unit}, but the log says {logged[source]}: "
+                f"leave it out («units=»), or multiply the channel by the factor between the two."
+            )
+    agreed = {}
+    for name, mix in mixes.items():
+        # A single channel's factor may convert its unit.
+        converted = len(mix) == 1 and any(abs(weight) != 1 for weight in mix.values())
+        shared = {"" if converted else logged[source] for source in mix}
+        agreed[name] = shared.pop() if len(shared) == 1 else ""
+    return agreed | dict(units)
+
+
+class Settings(NamedTuple):
+    """Firmware and parameters of a log, as text.
+
+    **Arguments:**
+
+    - `vehicle`: ardupilot, px4 or betaflight.
+    - `version`: of the firmware, (4, 2, 0); empty where the log does not say.
+    - `values`: by name: a Betaflight header's lines, ArduPilot's PARM, PX4's parameters.
+    """
+
+    vehicle: str
+    version: tuple[int, ...]
+    values: Mapping[str, str]
+
+
+def read_settings(path: str | Path, *, log: str = "", at: Number | None = None) -> Settings:
+    """Read the parameters that a log begins with.
+
+    A parameter that was changed in flight has its value of the time `at`; by default its last one
+    in ArduPilot's and PX4's logs, and its first one in Betaflight's, which say no more.
+
+    **Arguments:**
+
+    - `path`: a log of Betaflight, ArduPilot or PX4.
+    - `log`: of a Betaflight file with several logs, which one: "log2".
+    - `at`: in s of the log's own time, for logs of ArduPilot and PX4.
+
+    **Returns:** the `Settings`.
+
+    **Raises:**
+
+    - `ReadError`: the file cannot be read, is of no autopilot, or holds no parameters.
+    """
+    content = load_log(path)
+    later = [change for change in content.changes if at is not None and change.time > at]
+    values = {**content.settings, **{change.name: change.before for change in reversed(later)}}
+    if log:
+        values = {
+            k.removeprefix(f"{log} "): x for k, x in values.items() if k.startswith(f"{log} ")
+        }
+    if content.vehicle not in ("ardupilot", "px4", "betaflight") or not values:
+        raise ReadError(
+            f"{path}: the file holds no parameters of ArduPilot, PX4 or Betaflight"
+            + (f" under {log!r}" if log else "")
+            + ": give the log that the autopilot wrote, with its parameters logged."
+        )
+    text = values.get("ver_sw_release", values.get("Firmware revision", content.firmware))
+    match = re.search(r"(\d+)\.(\d+)(?:\.(\d+))?", text)
+    if content.vehicle == "px4" and text.isdecimal():  # one byte each
+        version = tuple(int(text) >> shift & 0xFF for shift in (24, 16, 8))
+    else:
+        version = tuple(int(part or 0) for part in match.groups()) if match else ()
+    return Settings(content.vehicle, version, values)

@@ -1,7 +1,7 @@
 import dataclasses
 import functools as ft
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TYPE_CHECKING
 
@@ -17,8 +17,10 @@ from ._clock import (
     dates_in_seconds,
     doubt_of_seconds,
     FEWEST,
+    Number,
     PER_SECOND,
     show_times,
+    Times,
     TimeUnit,
 )
 from ._errors import mend_holes, RecordError, RecordWarning, unknown_name
@@ -30,8 +32,10 @@ if TYPE_CHECKING:
 
 
 Names = str | Sequence[str] | None
-Hold = float | int | Literal["dt"] | None
+Hold = Number | Literal["dt"] | None
 _MOST_REPAIRED = 0.01  # of a channel, without a warning
+_CHANGES = 50  # mean times between changes of an input: no filter smears a hold so far
+_SMALLEST = 1e-20  # of a channel's size: high powers of it are still numbers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,7 +105,7 @@ class Record:
         hold: Hold = None,
         time_unit: TimeUnit | None = None,
         valid: Valid | None = None,
-        max_gap: float | int | None = None,
+        max_gap: Number | None = None,
         repaired: Mapping[str, ArrayLike] | None = None,
     ):
         put = ft.partial(object.__setattr__, self)
@@ -118,12 +122,29 @@ class Record:
         put("output_units", _as_units(output_units, self.output_names))
         put("reference_units", _as_units(reference_units, self.reference_names))
         put("source", source)
-        put("hold", self.dt if isinstance(hold, str) and hold == "dt" else _held(hold))
+        if hold == "dt":
+            hold = self.dt
+        elif hold is not None and (isinstance(hold, str) or not 0 <= float(hold) < np.inf):
+            raise RecordError(
+                f"hold is {hold!r}: give the time in s for which the input keeps each value, 'dt' "
+                f"for the sample interval, 0 for a continuous quantity that was measured, or None "
+                f"where it is unknown."
+            )
+        put("hold", None if hold is None else float(hold))
         check_distinct(self.names)
-        before = {name: np.asarray(each, np.float64) for name, each in (repaired or {}).items()}
-        put("repaired", before | _repair_in_place(self, valid or {}, max_gap))
+        earlier = {name: np.asarray(times, np.float64) for name, times in (repaired or {}).items()}
+        put("repaired", earlier | _repair_in_place(self, valid or {}, max_gap))
         _check_channels(self)
-        _check_hold(self)
+        if self.hold is not None and self.hold > _CHANGES * self.dt:
+            # A hold during which an input changes all the time.
+            share = np.mean(np.diff(self.inputs, axis=0) != 0, axis=0)  # of the samples
+            k = int(np.argmax(share))
+            if share[k] * self.hold > _CHANGES * self.dt:
+                raise RecordError(
+                    f"hold is {self.hold:.4g} s, but the input {self.input_names[k]} changes every "
+                    f"{self.dt / share[k]:.3g} s: give s, so 0.004 for 4 ms, or 'dt' for the "
+                    f"sample interval."
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -151,7 +172,7 @@ class Record:
 
     def channel(self, name: str) -> Float[np.ndarray, " samples"]:
         """The values of one channel, whatever its role."""
-        return _each_channel(self)[_position(self, name)]
+        return _all_channels(self)[_position(self, name)]
 
     def unit(self, name: str) -> str:
         """The unit of one channel, empty where unknown."""
@@ -168,8 +189,8 @@ class Record:
         references: Names = None,
         time: str | None = None,
         time_unit: TimeUnit | None = None,
-        sample_rate: float | int | None = None,
-        max_gap: float | int | None = None,
+        sample_rate: Number | None = None,
+        max_gap: Number | None = None,
         units: Mapping[str, str] | None = None,
         hold: Hold = None,
         source: str = "",
@@ -190,18 +211,11 @@ class Record:
 
         - `RecordError`: as `Record`, and for columns that are missing or hold no numbers.
         """
-        from ._dataframe import from_dataframe
+        from ._interop import from_dataframe
 
+        roles = inputs, outputs, references
         return from_dataframe(
-            frame,
-            (inputs, outputs, references),
-            time=time,
-            time_unit=time_unit,
-            sample_rate=sample_rate,
-            max_gap=max_gap,
-            units=units,
-            hold=hold,
-            source=source,
+            frame, roles, time, time_unit, sample_rate, max_gap, units or {}, hold, source
         )
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -210,7 +224,7 @@ class Record:
         What columns cannot say (roles, units, hold) is in `DataFrame.attrs`, from which
         `from_dataframe` takes it.
         """
-        from ._dataframe import to_dataframe
+        from ._interop import to_dataframe
 
         return to_dataframe(self)
 
@@ -236,7 +250,7 @@ class Record:
         - `ReadError`: the file is damaged, or has no such struct.
         - `RecordError`: as `Record`.
         """
-        from ._iddata import from_iddata
+        from ._interop import from_iddata
 
         return from_iddata(path, variable, references)
 
@@ -252,34 +266,69 @@ class Record:
 
         **Returns:** the path.
         """
-        from ._iddata import to_iddata
+        from ._interop import to_iddata
 
         return to_iddata(self, path, variable)
 
     def __str__(self) -> str:
-        roles = ("inputs", "outputs", "references")
-        names = (self.input_names, self.output_names, self.reference_names)
+        names = {
+            "inputs": self.input_names,
+            "outputs": self.output_names,
+            "references": self.reference_names,
+        }
         lines = [
             f"Record {self.source}".rstrip(),
             f"  {self.samples} samples, {self.duration:.6g} s at {self.sample_rate:.6g} Hz "
             f"(t = {show_times(self.time[0], self.time[-1], start=clock_start(self.time))})",
         ]
-        for role, members in zip(roles, names, strict=True):
+        for role, members in names.items():
             texts = [f"{name} [{self.unit(name)}]" if self.unit(name) else name for name in members]
             lines.append(f"  {role}: {', '.join(texts) or 'none'}")
         if self.hold is not None:
-            lines.append(f"  inputs {_held_text(self.hold)}")
+            hold = f"held for {self.hold:.6g} s" if self.hold else "measured, not held"
+            lines.append(f"  inputs {hold}")
         counts = [f"{name} {times.size} samples" for name, times in self.repaired.items()]
         if counts:
             lines.append(f"  repaired by interpolation: {', '.join(counts)}")
         return "\n".join(lines)
 
 
-def _held_text(hold: float) -> str:
-    return f"held for {hold:.6g} s" if hold else "measured, not held"
+def assemble(
+    time: Times,
+    roles: Sequence[Iterable[str]],
+    values: Callable[[str], Times],
+    unit: Callable[[str], str],
+    *,
+    source: str,
+    hold: Hold,
+    repaired: Mapping[str, ArrayLike] | None = None,
+    max_gap: Number | None = None,
+) -> Record:
+    """A record of the named inputs, outputs and references, by what gives a channel's values."""
+    names = [tuple(role) for role in roles]
+    columns = [
+        np.stack([values(name) for name in role], axis=1) if role else np.empty((time.size, 0))
+        for role in names
+    ]
+    units = [[unit(name) for name in role] for role in names]
+    return Record(
+        time,
+        *columns,
+        input_names=names[0],
+        output_names=names[1],
+        reference_names=names[2],
+        input_units=units[0],
+        output_units=units[1],
+        reference_units=units[2],
+        source=source,
+        hold=hold,
+        time_unit="s",
+        max_gap=max_gap,
+        repaired=repaired,
+    )
 
 
-def _each_channel(record: Record) -> list[Float[np.ndarray, " samples"]]:
+def _all_channels(record: Record) -> list[Float[np.ndarray, " samples"]]:
     return [*record.inputs.T, *record.outputs.T, *record.references.T]
 
 
@@ -289,11 +338,18 @@ def _position(record: Record, name: str) -> int:
     return record.names.index(name)
 
 
-def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Float[np.ndarray, " samples"]:
+def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Times:
     check_unit(unit)
     dates = np.asarray(time)
     if dates.dtype.kind in "mM":
-        stamps = _dated(dates, unit)
+        first = dates.flat[0] if dates.size and dates.dtype.kind == "M" else None
+        # Before they become s, of which a float holds a day of ns but not 50 years of them.
+        stamps = dates_in_seconds(dates if first is None else dates - first)
+        if stamps is None or unit is not None:
+            raise RecordError(
+                f"time has the type {dates.dtype}: give «time_unit=» to plain numbers only, and "
+                f"dates or durations in a unit between weeks and attoseconds."
+            )
     else:
         stamps = as_float64("time", time) / PER_SECOND[unit or "s"]
         doubt = doubt_of_seconds(stamps) if unit is None and stamps.ndim == 1 else ""
@@ -306,47 +362,6 @@ def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Float[np.ndarray, " sampl
     check_increasing("time", stamps)
     check_uniform(stamps)
     return stamps
-
-
-def _held(hold: Hold) -> float | None:
-    if hold is None:
-        return None
-    if isinstance(hold, str) or not 0 <= float(hold) < np.inf:
-        raise RecordError(
-            f"hold is {hold!r}: give the time in s for which the input keeps each value, 'dt' for "
-            f"the sample interval, 0 for a continuous quantity that was measured, or None where it "
-            f"is unknown."
-        )
-    return float(hold)
-
-
-_TIMES = 50  # over the mean time between changes of an input: no filter smears a hold so far
-
-
-def _check_hold(record: Record) -> None:
-    """Raise RecordError for a hold during which an input changes all the time."""
-    if record.hold is None or record.hold <= _TIMES * record.dt:
-        return
-    share = np.mean(np.diff(record.inputs, axis=0) != 0, axis=0)  # of the samples
-    k = int(np.argmax(share))
-    if share[k] * record.hold <= _TIMES * record.dt:
-        return
-    raise RecordError(
-        f"hold is {record.hold:.4g} s, but the input {record.input_names[k]} changes every "
-        f"{record.dt / share[k]:.3g} s: give s, so 0.004 for 4 ms, or 'dt' for the sample interval."
-    )
-
-
-def _dated(dates: np.ndarray, unit: TimeUnit | None) -> np.ndarray:
-    first = dates.flat[0] if dates.size and dates.dtype.kind == "M" else None
-    # Before they become s, of which a float holds a day of nanoseconds but not 50 years of them.
-    seconds = dates_in_seconds(dates if first is None else dates - first)
-    if seconds is None or unit is not None:
-        raise RecordError(
-            f"time has the type {dates.dtype}: give «time_unit=» to plain numbers only, and dates "
-            f"or durations in a unit between weeks and attoseconds."
-        )
-    return seconds
 
 
 def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samples channels"]:
@@ -366,19 +381,16 @@ def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samp
 
 
 def _repair_in_place(
-    record: Record, valid: Valid, max_gap: float | int | None
+    record: Record, valid: Valid, max_gap: Number | None
 ) -> dict[str, Float[np.ndarray, " repaired"]]:
-    """Repairs the columns of a record that is being made; returns when, by channel."""
+    """Repairs the columns of a record that is being built; returns when, by channel."""
     check_ranges(valid, record.names)
     times = {}
-    for name, values in zip(record.names, _each_channel(record), strict=True):
-        values[:], found = repair_values(name, record.time, values, valid.get(name), max_gap)
-        if found.size:
-            times[name] = found
+    for name, values in zip(record.names, _all_channels(record), strict=True):
+        values[:], filled = repair_values(name, record.time, values, valid.get(name), max_gap)
+        if filled.size:
+            times[name] = filled
     return times
-
-
-_SMALLEST = 1e-20  # of a channel's size: high powers of it are still numbers
 
 
 def _check_channels(record: Record) -> None:
@@ -392,7 +404,7 @@ def _check_channels(record: Record) -> None:
                 RecordWarning,
                 stacklevel=4,
             )
-    for name, values in zip(record.names, _each_channel(record), strict=True):
+    for name, values in zip(record.names, _all_channels(record), strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size == values.size:
             raise RecordError(
@@ -401,11 +413,14 @@ def _check_channels(record: Record) -> None:
                 "logged, or choose another channel."
             )
         if bad.size:
+            good = np.isfinite(values)
+            gap = np.max(np.diff(record.time[good])) if good[0] and good[-1] else None
+            longest = "" if gap is None else f", the longest gap {gap:.4g} s"
             raise RecordError(
                 f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
                 f"{np.isinf(values).sum()} inf, the first at t = "
                 f"{show_times(float(record.time[bad[0]]), start=start)}"
-                f"{_longest_hole(record.time, np.isfinite(values))}. {mend_holes('them')}"
+                f"{longest}. {mend_holes('them')}"
             )
         largest = float(np.max(np.abs(values)))
         if largest and not _SMALLEST <= largest <= 1 / _SMALLEST:
@@ -421,13 +436,6 @@ def _check_channels(record: Record) -> None:
                 RecordWarning,
                 stacklevel=4,
             )
-
-
-def _longest_hole(time: np.ndarray, good: np.ndarray) -> str:
-    """How far apart the good neighbours of a hole are; nothing where it reaches an end."""
-    if not (good[0] and good[-1]):
-        return ""
-    return f", the longest gap {np.max(np.diff(time[good])):.4g} s"
 
 
 def _as_names(names: Names, letter: str, count: int) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -15,14 +15,13 @@ from ._clock import (
     longest_step,
     native_rate,
     nonuniformity,
+    Number,
     scatters,
     show_times,
+    Times,
 )
 from ._errors import choose_range, GapError, mend_holes, RecordError, RecordWarning
 from ._repair import as_float64, longest_gap
-
-
-Samples = Float[np.ndarray, " samples"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,7 +47,10 @@ class Channel:
     unit: str
 
     def __init__(self, name: str, time: ArrayLike, values: ArrayLike, unit: str = ""):
-        stamps = _absolute(name, time)
+        stamps = np.asarray(time)
+        dates = dates_in_seconds(stamps) if stamps.dtype.kind in "mM" else None  # s since 1970
+        label = f"the time of channel {name!r}"
+        stamps = as_float64(label, time, copy=False) if dates is None else dates
         numbers = as_float64(f"channel {name!r}", values, copy=False)
         if stamps.ndim != 1 or stamps.shape != numbers.shape:
             raise RecordError(
@@ -68,65 +70,50 @@ class Channel:
         return native_rate(self.time)
 
 
-def _absolute(name: str, time: ArrayLike) -> Samples:
-    """Time stamps in s, of dates since 1970."""
-    stamps = np.asarray(time)
-    dated = dates_in_seconds(stamps) if stamps.dtype.kind in "mM" else None
-    label = f"the time of channel {name!r}"
-    return as_float64(label, time, copy=False) if dated is None else dated
-
-
-def contiguous_part(
-    channel: Channel, begin: float, end: float, *, margin: float, max_gap: float | int | None
+def _contiguous_part(
+    channel: Channel, begin: float, end: float, *, margin: float, max_gap: Number | None
 ) -> Channel:
     """The samples from `begin` to `end` (s), and up to `margin` (s) beyond, without a break.
 
     A break is a gap longer than `max_gap` (s) or a value that is not finite. Outside of
     `begin` .. `end` it ends the part; inside it raises RecordError, a GapError where all are gaps.
     """
-    time = channel.time
+    time, longest = channel.time, longest_gap(channel.time, max_gap)
     bad = ~np.isfinite(channel.values)
-    broken = (np.diff(time) > longest_gap(channel.time, max_gap)) | bad[:-1] | bad[1:]
-    inside = (time[1:] > begin) & (time[:-1] < end)
-    if (broken & inside).any():
-        _raise_for_breaks(channel, np.flatnonzero(broken & inside), max_gap)
+    broken = (np.diff(time) > longest) | bad[:-1] | bad[1:]
+    inside = broken & (time[1:] > begin) & (time[:-1] < end)
+    if inside.any():
+        breaks = np.flatnonzero(inside)
+        holes = bad[breaks] | bad[breaks + 1]
+        index = int(breaks[holes.argmax() if holes.any() else 0])
+        left, right = time[index : index + 2]
+        origin = clock_start(time)
+        if holes.any():
+            i = index if bad[index] else index + 1
+            raise RecordError(
+                f"channel {channel.name!r} is {channel.values[i]} at sample {i}, "
+                f"t = {show_times(time[i], start=origin)}. {mend_holes('it')}"
+            )
+        raise GapError(
+            f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
+            f"t = {left - origin:.6g} s to {show_times(right, start=origin)} (limit "
+            f"{1e3 * longest:.4g} ms). "
+            f"{choose_range('it')}, or allow it, by its length in s («max_gap=»).",
+            [(float(time[i]), float(time[i + 1])) for i in breaks],
+        )
     before = np.flatnonzero(broken & (time[1:] <= begin))
     after = np.flatnonzero(broken & (time[:-1] >= end))
-    reach = margin + longest_gap(channel.time, max_gap)
+    reach = margin + longest
     first = max(np.searchsorted(time, begin - reach), *(before[-1:] + 1), 0)
     last = min(np.searchsorted(time, end + reach, "right"), *(after[:1] + 1), time.size)
     return Channel(channel.name, time[first:last], channel.values[first:last], channel.unit)
 
 
-def gaps(channel: Channel, begin: float, end: float) -> np.ndarray:
+def _gaps(channel: Channel, begin: float, end: float) -> np.ndarray:
     """Indices of the steps within `begin` .. `end` in which samples are missing."""
     step = np.diff(channel.time)
     inside = (channel.time[1:] > begin) & (channel.time[:-1] < end)
     return np.flatnonzero((step > longest_step(channel.time)) & inside)
-
-
-def _raise_for_breaks(
-    channel: Channel, breaks: np.ndarray, max_gap: float | int | None
-) -> None:  # fmt: skip
-    holes = ~np.isfinite(channel.values[breaks]) | ~np.isfinite(channel.values[breaks + 1])
-    index = int(breaks[holes.argmax() if holes.any() else 0])
-    left, right = channel.time[index : index + 2]
-    origin = clock_start(channel.time)
-    if holes.any():
-        pair = channel.values[index : index + 2]
-        i = index + int(np.isfinite(pair[0]))
-        raise RecordError(
-            f"channel {channel.name!r} is {channel.values[i]} at sample {i}, "
-            f"t = {show_times(channel.time[i], start=origin)}. {mend_holes('it')}"
-        )
-    longest = longest_gap(channel.time, max_gap)
-    raise GapError(
-        f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
-        f"t = {left - origin:.6g} s to {show_times(right, start=origin)} (limit "
-        f"{1e3 * longest:.4g} ms). "
-        f"{choose_range('it')}, or allow it, by its length in s («max_gap=»).",
-        [(float(channel.time[i]), float(channel.time[i + 1])) for i in breaks],
-    )
 
 
 # Kaiser's formulas for 72 dB over a transition from 0.3 to 0.5 of the sample rate.
@@ -135,18 +122,13 @@ _HALF = 0.5 * (72 - 7.95) / (2.285 * 2 * np.pi * 0.2)  # samples of the target g
 _CUTOFF = 0.4  # of the target rate, where the filter is down by 6 dB
 
 
-def half_width(sample_rate: float | int) -> float:
-    """How far the filter for `sample_rate` (Hz) looks to either side, in s."""
-    return (_HALF + 1) / sample_rate
-
-
-def lowpass(
-    curve: Callable[[Samples], Samples],
+def _lowpass(
+    curve: Callable[[Times], Times],
     span: tuple[float, float],
-    time: Samples,
-    sample_rate: float | int,
+    time: Times,
+    sample_rate: Number,
     fastest: float,
-) -> Samples:
+) -> Times:
     """`curve` at the times `time` (s, at `sample_rate` in Hz), low-passed against aliasing.
 
     The curve is known over `span` (s) and is continued by reflection about its end points, which
@@ -154,38 +136,32 @@ def lowpass(
     grid twice as fine, the same for all channels.
     """
     fold = int(np.ceil(2 * fastest / sample_rate))
-    taps = _taps(fold)
-    half = taps.size // 2
+    half = int(np.ceil(_HALF * fold))
+    taps = np.sinc(2 * _CUTOFF * (np.arange(-half, half + 1) / fold))
+    taps *= np.kaiser(2 * half + 1, _BETA)
+    taps /= taps.sum()
     fine = fold * sample_rate
     lowest, highest = -half, (time.size - 1) * fold + half
     first = max(lowest, int(np.ceil((span[0] - time[0]) * fine - 1e-6)))
     last = min(highest, int(np.floor((span[1] - time[0]) * fine + 1e-6)))
-    known = curve(np.clip(time[0] + np.arange(first, last + 1) / fine, *span))
+    inside = curve(np.clip(time[0] + np.arange(first, last + 1) / fine, *span))
     padding = (first - lowest, highest - last)
-    padded = np.pad(known, padding, mode="reflect", reflect_type="odd")
+    padded = np.pad(inside, padding, mode="reflect", reflect_type="odd")
     return np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::fold] @ taps
 
 
-def _taps(fold: int) -> Float[np.ndarray, " taps"]:
-    half = int(np.ceil(_HALF * fold))
-    position = np.arange(-half, half + 1) / fold
-    taps = np.sinc(2 * _CUTOFF * position) * np.kaiser(2 * half + 1, _BETA)
-    return taps / taps.sum()
-
-
-Curve = Callable[[Float[np.ndarray, "..."]], Float[np.ndarray, "..."]]
 _SAME = 1.05  # rates closer than this need neither a filter nor a warning
 _MOST = 50_000_000  # samples
 
 
 def resample(
     channels: Sequence[Channel],
-    sample_rate: float | int,
+    sample_rate: Number,
     *,
-    start: float | int | None = None,
-    stop: float | int | None = None,
-    max_gap: float | int | None = None,
-) -> tuple[Samples, Float[np.ndarray, "samples channels"]]:
+    start: Number | None = None,
+    stop: Number | None = None,
+    max_gap: Number | None = None,
+) -> tuple[Times, Float[np.ndarray, "samples channels"]]:
     """Resample channels with different time stamps to one uniform grid.
 
     Where a channel is faster than the grid, every channel passes the same linear-phase filter,
@@ -212,28 +188,38 @@ def resample(
     - `RecordError`: for a longer gap or a value that is not finite within the range, and where the
         channels do not overlap.
     """
-    begin, end = _extent(channels, start, stop)
-    time = _grid(begin, end, sample_rate)
-    margin = half_width(sample_rate) + 20 / min(channel.rate for channel in channels)
-    pieces = [contiguous_part(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
-    _warn_of_gaps(pieces, begin, end)
-    _warn_of_scatter(pieces)
-    _warn_of_slow(channels, sample_rate)
+    begin, end = _common_extent(channels, start, stop)
+    if not (np.isfinite(sample_rate) and sample_rate > 0):
+        raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
+    steps = (end - begin) * sample_rate
+    if not FEWEST - 1 <= steps + 1e-6 < _MOST:
+        raise RecordError(
+            f"a sample rate of {sample_rate:.6g} Hz over {end - begin:.6g} s makes "
+            f"{steps + 1:.6g} samples; {FEWEST} .. {_MOST} are allowed. Choose another rate or "
+            f"range."
+        )
+    time = begin + np.arange(int(steps + 1e-6) + 1) / sample_rate
+    # The filter looks as far to either side, and a spline at its end needs some samples more.
+    margin = (_HALF + 1) / sample_rate + 20 / min(channel.rate for channel in channels)
+    pieces = [_contiguous_part(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
+    for remark in _remarks(pieces, channels, begin, end, sample_rate):
+        warnings.warn(remark, RecordWarning, stacklevel=2)
     fastest = max(channel.rate for channel in channels)
-    curves = [_curve(piece) for piece in pieces]
-    if fastest <= _SAME * sample_rate:
-        return time, np.stack([curve(time) for curve in curves], axis=1)
-    spans = [(piece.time[0], piece.time[-1]) for piece in pieces]
-    columns = [
-        lowpass(curve, span, time, sample_rate, fastest)
-        for curve, span in zip(curves, spans, strict=True)
-    ]
+    columns = []
+    for piece in pieces:
+        curve = _interpolate(piece)
+        if fastest <= _SAME * sample_rate:
+            columns.append(curve(time))
+        else:
+            span = piece.time[0], piece.time[-1]
+            columns.append(_lowpass(curve, span, time, sample_rate, fastest))
     return time, np.stack(columns, axis=1)
 
 
-def _extent(
-    channels: Sequence[Channel], start: float | int | None, stop: float | int | None
+def _common_extent(
+    channels: Sequence[Channel], start: Number | None, stop: Number | None
 ) -> tuple[float, float]:
+    """First and last time (s) of the grid, within the time that all channels share."""
     if not channels:
         raise RecordError("there are no channels to resample: give at least one.")
     latest = max(channels, key=lambda channel: channel.time[0])
@@ -258,79 +244,54 @@ def _extent(
     return max(begin, first), min(end, last)
 
 
-def _grid(begin: float, end: float, sample_rate: float | int) -> Samples:
-    if not (np.isfinite(sample_rate) and sample_rate > 0):
-        raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
-    steps = (end - begin) * sample_rate
-    if not FEWEST - 1 <= steps + 1e-6 < _MOST:
-        raise RecordError(
-            f"a sample rate of {sample_rate:.6g} Hz over {end - begin:.6g} s makes "
-            f"{steps + 1:.6g} samples; {FEWEST} .. {_MOST} are allowed. Choose another rate or "
-            f"range."
-        )
-    return begin + np.arange(int(steps + 1e-6) + 1) / sample_rate
+def _interpolate(piece: Channel) -> Callable[[Times], Times]:
+    """A spline of degree 7, with gaps filled by a cubic: far apart knots make it oscillate."""
+    from scipy.interpolate import CubicSpline, make_interp_spline
 
-
-def _curve(piece: Channel) -> Curve:
-    from scipy.interpolate import make_interp_spline
-
-    time, values = _bridged(piece)
+    holes, time, values = _gaps(piece, -np.inf, np.inf), piece.time, piece.values
+    if holes.size:
+        fill = []
+        for left, right in zip(piece.time[holes], piece.time[holes + 1], strict=True):
+            steps = round((right - left) * piece.rate)
+            fill.append(np.linspace(left, right, steps + 1)[1:-1])
+        time = np.sort(np.concatenate([piece.time, *fill]))
+        values = CubicSpline(piece.time, piece.values)(time)
     return make_interp_spline(time, values, k=7)
 
 
-def _bridged(piece: Channel) -> tuple[Samples, Samples]:
-    """Gaps filled by a cubic, because a spline of degree 7 oscillates where knots are far apart."""
-    from scipy.interpolate import CubicSpline
-
-    holes = gaps(piece, -np.inf, np.inf)
-    if not holes.size:
-        return piece.time, piece.values
-    fill = []
-    for left, right in zip(piece.time[holes], piece.time[holes + 1], strict=True):
-        steps = round((right - left) * piece.rate)
-        fill.append(np.linspace(left, right, steps + 1)[1:-1])
-    time = np.sort(np.concatenate([piece.time, *fill]))
-    return time, CubicSpline(piece.time, piece.values)(time)
-
-
-def _warn_of_gaps(pieces: Sequence[Channel], begin: float, end: float) -> None:
-    texts = []
+def _remarks(
+    pieces: Sequence[Channel],
+    channels: Sequence[Channel],
+    begin: float,
+    end: float,
+    sample_rate: Number,
+) -> Iterator[str]:
+    """What is to be said of gaps, of time stamps that scatter, and of channels that are slow."""
+    gaps = []
     for piece in pieces:
-        holes = gaps(piece, begin, end)
+        holes = _gaps(piece, begin, end)
         if holes.size:
             step = np.diff(piece.time)[holes]
             where = piece.time[holes[step.argmax()]]
             place = show_times(float(where), start=clock_start(piece.time))
             longest = f"longest {1e3 * step.max():.4g} ms at t = {place}"
-            texts.append(f"{piece.name!r} {holes.size}, {longest}")
-    if texts:
-        warnings.warn(
-            f"gaps filled by interpolation: {'; '.join(texts)}.", RecordWarning, stacklevel=3
-        )
-
-
-def _warn_of_scatter(pieces: Sequence[Channel]) -> None:
-    names = [repr(piece.name) for piece in pieces if scatters(piece.time)]
-    if names:
-        off = max(nonuniformity(piece.time) for piece in pieces if scatters(piece.time))
-        rate = min(piece.rate for piece in pieces if scatters(piece.time))
-        warnings.warn(
-            f"the time stamps of {', '.join(names)} lie up to {off:.2g} samples off a clock of "
+            gaps.append(f"{piece.name!r} {holes.size}, {longest}")
+    if gaps:
+        yield f"gaps filled by interpolation: {'; '.join(gaps)}."
+    scattered = [piece for piece in pieces if scatters(piece.time)]
+    if scattered:
+        off = max(nonuniformity(piece.time) for piece in scattered)
+        rate = min(piece.rate for piece in scattered)
+        yield (
+            f"the time stamps of {', '.join(repr(piece.name) for piece in scattered)} lie up to "
+            f"{off:.2g} samples off a clock of "
             f"{rate:.5g} Hz, and steps shorter than half a sample are as frequent as long ones: "
             f"values were interpolated at these times. If the samples were equally spaced, give "
-            f"their interval instead: {1 / rate:.4g} s («dt=»).",
-            RecordWarning,
-            stacklevel=3,
+            f"their interval instead: {1 / rate:.4g} s («dt=»)."
         )
-
-
-def _warn_of_slow(channels: Sequence[Channel], sample_rate: float | int) -> None:
-    slow = [c for c in channels if sample_rate > _SAME * c.rate]
+    slow = [f"{c.name!r} {c.rate:.6g} Hz" for c in channels if sample_rate > _SAME * c.rate]
     if slow:
-        listed = ", ".join(f"{c.name!r} {c.rate:.6g} Hz" for c in slow)
-        warnings.warn(
-            f"resampled to {sample_rate:.6g} Hz, faster than {listed}: such a channel holds no "
-            f"information above half its own rate. Keep the frequency band below that.",
-            RecordWarning,
-            stacklevel=3,
+        yield (
+            f"resampled to {sample_rate:.6g} Hz, faster than {', '.join(slow)}: such a channel "
+            f"holds no information above half its own rate. Keep the frequency band below that."
         )

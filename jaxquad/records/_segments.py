@@ -3,17 +3,15 @@
 import functools as ft
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from ._clock import clock_start, show_times, TimeUnit
+from ._clock import clock_start, Number, show_times, TimeUnit
 from ._errors import GapError, RecordError, RecordWarning
 from ._read import read
-from ._record import Hold, Record
+from ._record import assemble, Hold, Record
 from ._repair import Valid
 
 
@@ -69,22 +67,9 @@ def power_of(term: str) -> tuple[str, int]:
     return (channel, int(power)) if sign and channel and power in set("23456789") else (term, 1)
 
 
-Number = float | int
 Segment = tuple[Number | None, Number | None]  # start and stop in the file's time, s
-Term = tuple[str, int, float]  # channel, power, weight
-
-
-class _Options(NamedTuple):
-    """Options of `read` for a file."""
-
-    time: str | None
-    time_unit: TimeUnit | None
-    dt: float | int | None
-    time_factor: float | int | None
-    units: Mapping[str, str]
-    hold: Hold
-    max_gap: float | int | None
-    valid: Valid
+_MOST_GAPS = 30  # in a segment
+_SHORTEST = 1.0  # s, of a part between two gaps
 
 
 def read_segments(
@@ -125,85 +110,40 @@ def read_segments(
         than 30 gaps in one of them.
     - `ReadError`: as `read` raises it.
     """
-    _check(segments)
+    _check_segments(segments)
     roles = (inputs, outputs, references or {})
-    options = _Options(time, time_unit, dt, time_factor, units or {}, hold, max_gap, valid or {})
+    select = ft.partial(
+        read,
+        path,
+        time=time,
+        time_unit=time_unit,
+        dt=dt,
+        time_factor=time_factor,
+        hold=hold,
+        max_gap=max_gap,
+        valid=valid or {},
+    )
+    mixed = lambda segment, rate: _mixed(
+        ft.partial(select, sample_rate=rate, start=segment[0], stop=segment[1]), roles, units or {}
+    )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        every = [_without_gaps(path, roles, each, sample_rate, options) for each in segments]
-        parts, records = zip(*(each for found in every for each in found), strict=True)
+        parts = [
+            part
+            for segment in segments
+            for part in _without_gaps(lambda span: mixed(span, sample_rate), segment)
+        ]
+        records = [record for _, record in parts]
         slowest = min(record.sample_rate for record in records)
         if max(record.sample_rate for record in records) > (1 + 1e-6) * slowest:
             rate = float(f"{slowest:.3g}")
-            records = [_mixed(path, roles, each, rate, options) for each in parts]
-    for each in {str(one.message): one for one in caught}.values():
-        warnings.warn(str(each.message), each.category, stacklevel=2)
-    return list(records)
+            records = [mixed(segment, rate) for segment, _ in parts]
+    for warning in {str(warning.message): warning for warning in caught}.values():
+        warnings.warn(str(warning.message), warning.category, stacklevel=2)
+    return records
 
 
-_MOST_GAPS = 30  # in a segment
-_SHORTEST = 1.0  # s, of a part between two gaps
-
-
-def _without_gaps(
-    path: Path,
-    roles: Sequence[Mix],
-    segment: Segment,
-    rate: Number | None,
-    options: _Options,
-) -> list[tuple[Segment, Record]]:
-    """The parts of a segment between gaps that are too long to be interpolated."""
-    try:
-        return [(segment, _mixed(path, roles, segment, rate, options))]
-    except GapError as error:
-        gaps = error.gaps
-        begins, ends = (segment[0], *(b for _, b in gaps)), (*(a for a, _ in gaps), segment[1])
-        lasts = [
-            (a, b)
-            for a, b in zip(begins, ends, strict=True)
-            if a is None or b is None or b - a >= _SHORTEST
-        ]
-        if len(gaps) > _MOST_GAPS or not lasts:
-            raise
-        parts = [part for each in lasts for part in _part_if_any(path, roles, each, rate, options)]
-        if not parts:
-            raise
-    origin = min(clock_start(record.time) for _, record in parts)
-    (left, right) = max(gaps, key=lambda each: each[1] - each[0])
-    warnings.warn(
-        f"samples are missing in {'one place' if len(gaps) == 1 else f'{len(gaps)} places'}, for "
-        f"up to {1e3 * (right - left):.4g} ms at t = {show_times(left, start=origin)}: the record "
-        f"is cut there into {len(parts)} segments, {_in_words([record for _, record in parts])}. "
-        f"A gap up to a length in s is bridged instead where that is allowed («max_gap=»).",
-        RecordWarning,
-        stacklevel=4,
-    )
-    return parts
-
-
-def _part_if_any(
-    path: Path,
-    roles: Sequence[Mix],
-    segment: Segment,
-    rate: Number | None,
-    options: _Options,
-) -> list[tuple[Segment, Record]]:
-    """The record of a part, or of its parts; none where it is too short for one."""
-    try:
-        parts = _without_gaps(path, roles, segment, rate, options)
-    except RecordError:  # too few samples between two gaps
-        return []
-    return [part for part in parts if part[1].duration >= _SHORTEST]
-
-
-def _in_words(records: Sequence[Record]) -> str:
-    start = min(clock_start(record.time) for record in records)
-    *others, last = [(float(record.time[0]), float(record.time[-1])) for record in records]
-    spans = [f"{a - start:.6g} .. {b - start:.6g}" for a, b in others]
-    return f"t = {', '.join([*spans, show_times(*last, start=start)])}"
-
-
-def _check(segments: Sequence[Segment]) -> None:
+def _check_segments(segments: Sequence[Segment]) -> None:
     if len(segments) < 2:
         return
     for start, stop in segments:
@@ -220,86 +160,78 @@ def _check(segments: Sequence[Segment]) -> None:
             )
 
 
-def _mixed(
-    path: Path,
-    roles: Sequence[Mix],
-    segment: Segment,
-    rate: Number | None,
-    options: _Options,
-) -> Record:
-    """One segment. Powers are taken of the channels as they are read, after resampling."""
-    select = ft.partial(
-        read,
-        path,
-        sample_rate=rate,
-        start=segment[0],
-        stop=segment[1],
-        time=options.time,
-        time_unit=options.time_unit,
-        dt=options.dt,
-        time_factor=options.time_factor,
-        hold=options.hold,
-        max_gap=options.max_gap,
-        valid=options.valid,
+def _without_gaps(
+    mixed: Callable[[Segment], Record], segment: Segment
+) -> list[tuple[Segment, Record]]:
+    """The parts of a segment between gaps that are too long to be interpolated."""
+    try:
+        return [(segment, mixed(segment))]
+    except GapError as error:
+        gaps = error.gaps
+        begins, ends = (segment[0], *(b for _, b in gaps)), (*(a for a, _ in gaps), segment[1])
+        spans = [
+            (a, b)
+            for a, b in zip(begins, ends, strict=True)
+            if a is None or b is None or b - a >= _SHORTEST
+        ]
+        if len(gaps) > _MOST_GAPS or not spans:
+            raise
+        parts: list[tuple[Segment, Record]] = []
+        for span in spans:
+            try:
+                several = _without_gaps(mixed, span)
+            except RecordError:  # too few samples between two gaps
+                continue
+            parts += [part for part in several if part[1].duration >= _SHORTEST]
+        if not parts:
+            raise
+    records = [record for _, record in parts]
+    origin = min(clock_start(record.time) for record in records)
+    *others, last = [(float(record.time[0]), float(record.time[-1])) for record in records]
+    texts = [f"{a - origin:.6g} .. {b - origin:.6g}" for a, b in others]
+    (left, right) = max(gaps, key=lambda gap: gap[1] - gap[0])
+    warnings.warn(
+        f"samples are missing in {'one place' if len(gaps) == 1 else f'{len(gaps)} places'}, for "
+        f"up to {1e3 * (right - left):.4g} ms at t = {show_times(left, start=origin)}: the record "
+        f"is cut there into {len(parts)} segments, t = "
+        f"{', '.join([*texts, show_times(*last, start=origin)])}. "
+        f"A gap up to a length in s is bridged instead where that is allowed («max_gap=»).",
+        RecordWarning,
+        stacklevel=4,
     )
-    terms = [{name: _terms(name, mix) for name, mix in role.items()} for role in roles]
-    each = [term for role in terms for terms_of in role.values() for term in terms_of]
-    if all(power == 1 for _, power, _ in each):
+    return parts
+
+
+def _mixed(select: Callable[..., Record], roles: Sequence[Mix], units: Mapping[str, str]) -> Record:
+    """One segment. Powers are taken of the channels as they are read, after resampling."""
+    # A single channel may have any name, even one that looks like a power.
+    terms = {
+        name: [(name, 1, 1.0)]
+        if mix == {name: 1.0}
+        else [(*power_of(term), weight) for term, weight in mix.items()]
+        for role in roles
+        for name, mix in role.items()
+    }
+    every = [term for terms_of_one in terms.values() for term in terms_of_one]
+    if all(power == 1 for _, power, _ in every):
         inputs, outputs, references = roles
-        return select(inputs=inputs, outputs=outputs, references=references, units=options.units)
-    names = {channel: {channel: 1.0} for channel, _, _ in each}
+        return select(inputs=inputs, outputs=outputs, references=references, units=units)
+    names = {channel: {channel: 1.0} for channel, _, _ in every}
     any_output = {"any output": dict.fromkeys(list(names)[:1], 1.0)}  # A record needs one.
     raw = select(inputs=names, outputs=any_output)
-    return _assembled(raw, terms, options.units)
-
-
-def _terms(name: str, mix: Mapping[str, float]) -> list[Term]:
-    """A single channel may have any name, even one that looks like a power."""
-    if mix == {name: 1.0}:
-        return [(name, 1, 1.0)]
-    return [(*power_of(term), weight) for term, weight in mix.items()]
-
-
-def _assembled(
-    raw: Record, terms: Sequence[Mapping[str, list[Term]]], given: Mapping[str, str]
-) -> Record:
-    units = {name: _unit(raw, each) for role in terms for name, each in role.items()}
-    if unknown := set(given) - set(units):
+    if unknown := set(units) - set(terms):
         raise RecordError(
-            f"a unit is given for {unknown.pop()!r}, but the channels are {', '.join(units)}."
+            f"a unit is given for {unknown.pop()!r}, but the channels are {', '.join(terms)}."
         )
-    units |= given
-    columns = [
-        np.stack([_sum(raw, each) for each in role.values()], axis=1)
-        if role
-        else np.empty((raw.samples, 0))
-        for role in terms
-    ]
-    inputs, outputs, references = terms
-    return Record(
+    units_of = {name: {raw.unit(c) if p == 1 else "" for c, p, _ in terms[name]} for name in terms}
+    agreed = {name: unit.pop() if len(unit) == 1 else "" for name, unit in units_of.items()}
+    powers = lambda name: (weight * raw.channel(c) ** power for c, power, weight in terms[name])
+    return assemble(
         raw.time,
-        *columns,
-        input_names=tuple(inputs),
-        output_names=tuple(outputs),
-        reference_names=tuple(references),
-        input_units=[units[name] for name in inputs],
-        output_units=[units[name] for name in outputs],
-        reference_units=[units[name] for name in references],
+        roles,
+        lambda name: sum(powers(name), np.zeros(raw.samples)),
+        (agreed | dict(units)).__getitem__,
         source=raw.source,
         hold=raw.hold,
-        time_unit="s",
         repaired=raw.repaired,
-    )
-
-
-def _unit(raw: Record, terms: Sequence[Term]) -> str:
-    """The unit of a sum without powers whose channels agree."""
-    found = {raw.unit(channel) if power == 1 else "" for channel, power, _ in terms}
-    return found.pop() if len(found) == 1 else ""
-
-
-def _sum(raw: Record, terms: Sequence[Term]) -> Float[np.ndarray, " samples"]:
-    return sum(
-        (weight * raw.channel(channel) ** power for channel, power, weight in terms),
-        np.zeros(raw.samples),
     )

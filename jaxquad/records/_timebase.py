@@ -1,14 +1,15 @@
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from ._clock import (
     check_unit,
     doubt_of_seconds,
+    Number,
     PER_SECOND,
     repair,
     RepairedTime,
@@ -22,7 +23,7 @@ from ._resample import Channel
 
 
 _SHARED = ("t", "time", "time_s", "timestamp", "Time", "Timestamp", "TIME")
-_UNIT_OF_NAME: Mapping[str, TimeUnit] = {  # as exporters of ROS bags and ground stations name them
+_UNIT_OF_NAME: dict[str, TimeUnit] = {  # as exporters of ROS bags and ground stations name them
     "__time": "s", "%time": "ns", "rosbagTimestamp": "ns", "timestamp_s": "s",
     **{f"{name}_{unit}": unit for name in ("time", "timestamp") for unit in ("ms", "us", "ns")},
 }  # fmt: skip
@@ -32,63 +33,72 @@ _HEADER = r"(?:header[./_])?(?:stamp[./_])?"
 _SECONDS = re.compile(rf"((?:.*?[./])??){_HEADER}(secs?)", re.IGNORECASE)
 _CLOCK = re.compile(rf"((?:.*?[./])??)(?:header[./_])?({'|'.join(map(re.escape, _KNOWN))})")
 _TOPIC = re.compile(r"(.+_)(t|time|timestamp|stamp|Time)")
+_COUNTED = "rows"  # the time base where dt says how far apart they are
 
 
-def signal_names(
-    signals: Signals, time: str | None, dt: float | int | None = None
-) -> dict[str, tuple[str, int | None]]:
-    """Channel name -> array and column; the columns of `x` are `x[0]`, `x[1]`, ..."""
-    names, clocks = {}, _clocks(signals.arrays)
-    time = _named(signals, time)
-    stamps = _time_names(signals.arrays, clocks, time)
-    for name, signal in signals.arrays.items():
-        if not signal.clock and name in stamps:
-            continue
-        columns = _columns_of(name, signal)
-        alone = time is None and dt is None and not _named_clock(signals.arrays, name, clocks)
-        if alone and _has_own_clock(signal):
-            del columns[f"{name}[0]"]
-        names |= columns
-    return {name: place for name, place in names.items() if name != time}
-
-
-def _named(signals: Signals, time: str | None) -> str | None:
-    """The time base, by its name or by its whole title."""
-    return None if time is None else signals.titles.get(time, time)
-
-
-def _columns_of(name: str, signal: Signal) -> dict[str, tuple[str, int | None]]:
-    if signal.values.ndim == 1:
-        return {name: (name, None)}
-    return {f"{name}[{i}]": (name, i) for i in range(signal.values.shape[1])}
-
-
-_Stamps = tuple[np.ndarray, int]  # in s, and how many overflows were undone
+class _Stamps(NamedTuple):
+    seconds: np.ndarray  # of each row of the table, NaN where the time base is blank
+    wraps: int  # overflows that were undone
 
 
 class Timebases:
-    """The time bases of a log, each repaired once."""
+    """The channels of a log, `names`, and their time bases, each repaired once.
+
+    The columns of a matrix `x` are `x[0]`, `x[1]`, ... The time base of an array is the first that
+    exists of: its own, `t_<array>`; the one named `time`; t, time, time_s, timestamp, ... or
+    seconds and nanoseconds in the same struct, in those around it, in the whole file; those of its
+    topic (`imu_time` for `imu_x`); the first column of a matrix if that rises in steps of nearly
+    one size. Seconds and nanoseconds are `sec+nsec`.
+    """
 
     def __init__(
         self,
         signals: Signals,
         time: str | None,
         time_unit: TimeUnit | None,
-        dt: float | int | None = None,
-        time_factor: float | int | None = None,
+        dt: Number | None = None,
+        time_factor: Number | None = None,
     ):
         check_unit(time_unit)
-        _check_factor(time_factor)
-        _check_dt(dt, time, time_unit)
-        self._signals, self._time, self._dt = signals, _named(signals, time), dt
+        if time_factor is not None and not 0.5 <= time_factor <= 2:
+            raise RecordError(
+                f"time_factor is {time_factor:g}: give a number near 1, from 0.5 to 2; units of "
+                f"time are for time_unit («time_unit=»)."
+            )
+        if dt is not None and not 0 < dt < np.inf:
+            raise RecordError(f"dt is {dt:g}: give the sampling interval in s, above 0 («dt=»).")
+        if dt is not None and (time is not None or time_unit is not None):
+            raise RecordError(
+                f"dt is {dt:g} s, and a time base is named as well: keep one of them («dt=», "
+                "«time=»)."
+            )
+        self._signals, self._arrays, self._dt = signals, signals.arrays, dt
         self._unit: TimeUnit | None = time_unit
         self._factor = 1.0 if time_factor is None else float(time_factor)
-        self._names = signal_names(signals, time, dt)
-        self._every = _all_names(signals)
-        self._clocks = _clocks(signals.arrays)
-        for name in () if self._time is None else self._parts(self._time):
-            if name not in self._every and name not in signals.arrays:
-                raise ReadError(f"time base {name!r}: {unknown_name(name, signals.arrays)}")
+        self._time = None if time is None else signals.titles.get(time, time)
+        self._structs: dict[str, str] = {}  # `imu.` or "": imu.time, or imu.stamp.sec+...nanosec
+        self._topics: dict[str, str] = {}  # `imu_`: imu_time
+        self._find_clocks()
+        self._columns: dict[str, tuple[str, int | None]] = {}  # of all arrays: array and column
+        self.names: dict[str, tuple[str, int | None]] = {}  # of the channels alone
+        stamps = self._time_names()
+        for array, signal in signals.arrays.items():
+            matrix = signal.values
+            columns = {array: (array, None)}
+            if matrix.ndim > 1:
+                columns = {f"{array}[{i}]": (array, i) for i in range(matrix.shape[1])}
+            self._columns |= columns
+            if not signal.clock and array in stamps:
+                continue
+            clocked = time is not None or dt is not None or self._clock_by_name(array)
+            if not clocked and _begins_with_clock(signal):
+                columns = {name: place for name, place in columns.items() if place[1] != 0}
+            self.names |= columns
+        if self._time is not None:
+            self.names.pop(self._time, None)
+            for name in self._parts(self._time):
+                if name not in self._columns and name not in signals.arrays:
+                    raise ReadError(f"time base {name!r}: {unknown_name(name, signals.arrays)}")
         self._read: dict[str, _Stamps] = {}
         self._repaired: dict[tuple[str, bytes], RepairedTime] = {}
         self._rates: dict[tuple[str, bytes], float] = {}
@@ -99,76 +109,76 @@ class Timebases:
         Raises ReadError for an unknown channel and for one without a time base of its length,
         and warns with RecordWarning of time stamps that had to be repaired.
         """
-        values, stamps = self.values(name), self._checked(name)[1]
-        kept = values if stamps.kept is None else values[stamps.kept]
-        return Channel(name, stamps.time, kept, self.unit(name))
+        values, stamps = self.values(name), self._repaired_time(name)[1]
+        values = values if stamps.kept is None else values[stamps.kept]
+        return Channel(name, stamps.time, values, self.unit(name))
 
     def extent(self, name: str) -> tuple[float, float, float]:
         """Rate in Hz, first and last time in s of a channel; raises as `channel` does."""
-        base, stamps = self._checked(name)
+        base, stamps = self._repaired_time(name)
         if base not in self._rates:
             self._rates[base] = self.channel(name).rate
         return self._rates[base], float(stamps.time[0]), float(stamps.time[-1])
 
-    def _checked(self, name: str) -> tuple[tuple[str, bytes], RepairedTime]:
-        """The time base of a channel, of the channel's length."""
-        values, array = self.values(name), self._place(name)[0]
-        base, rows = self._base(array), self._signals.arrays[array].rows
-        if self._dt is not None and base == _COUNTED:
-            count = len(values) if rows is None else rows.size
-            stamps: _Stamps = (np.arange(count) * float(self._dt), 0)
-        else:
-            stamps = self._stamps(base)
-            whole = len(stamps[0])
-            if whole != (len(values) if rows is None else rows.size):
-                raise ReadError(
-                    f"channel {name!r} has {len(values)} samples, but its time base {base!r} has "
-                    f"{whole}. Name another time base («time=»), or save the channel's own as "
-                    f"{'t_' + array!r}."
-                )
-        key = base, b"" if rows is None else rows.tobytes()
-        key = (f"{base} {len(values)}", key[1]) if base == _COUNTED else key
-        if key not in self._repaired:
-            self._repaired[key] = self._repair(base, stamps, _held(name, base, stamps[0], rows))
-        return key, self._repaired[key]
-
     def values(self, name: str) -> np.ndarray:
         """The values of a channel in its unit, without its time stamps."""
-        array, column = self._place(name)
-        return column_values(self._signals.arrays[array], column)
+        return self._column(*self._place(name))
 
     def unit(self, name: str) -> str:
         """The unit of a channel; a whole title has it in its name."""
-        titled = name in self._signals.titles
-        return "" if titled else self._signals.arrays[self._place(name)[0]].unit
+        return "" if name in self._signals.titles else self._arrays[self._place(name)[0]].unit
 
     def _place(self, name: str) -> tuple[str, int | None]:
         """The array and the column of a channel, by its name or by its whole title."""
-        known = name if name in self._names else self._signals.titles.get(name, name)
-        if known not in self._names:
-            raise ReadError(unknown_name(name, self._names))
-        return self._names[known]
+        short = name if name in self.names else self._signals.titles.get(name, name)
+        if short not in self.names:
+            raise ReadError(unknown_name(name, self.names))
+        return self.names[short]
+
+    def _column(self, array: str, column: int | None) -> np.ndarray:
+        signal = self._arrays[array]
+        values = signal.values if column is None else signal.values[:, column]
+        if signal.scale == 1.0:
+            return values
+        return values.astype(np.float64) * signal.scale  # where short ones would overflow
+
+    def _repaired_time(self, name: str) -> tuple[tuple[str, bytes], RepairedTime]:
+        """The time base of a channel, of the channel's length."""
+        values, array = self.values(name), self._place(name)[0]
+        base, rows = self._base(array), self._arrays[array].rows
+        count = len(values) if rows is None else rows.size
+        key = base, b"" if rows is None else rows.tobytes()
+        if self._dt is not None and base == _COUNTED:
+            stamps = _Stamps(np.arange(count) * float(self._dt), 0)
+        else:
+            stamps = self._stamps(base)
+            if len(stamps.seconds) != count:
+                raise ReadError(
+                    f"channel {name!r} has {len(values)} samples, but its time base {base!r} has "
+                    f"{len(stamps.seconds)}. Name another time base («time=»), or save the "
+                    f"channel's own as {'t_' + array!r}."
+                )
+        key = (f"{base} {len(values)}", key[1]) if base == _COUNTED else key
+        if key in self._repaired:
+            return key, self._repaired[key]
+        seconds = stamps.seconds if rows is None else stamps.seconds[rows]
+        blank = 0 if rows is None else int(np.count_nonzero(~np.isfinite(seconds)))
+        if blank > 0.01 * seconds.size:
+            raise ReadError(
+                f"in {blank} of the {seconds.size} rows in which channel {name!r} has a value, its "
+                f"time base {base!r} is blank. Name the channel's own time base («time=»)."
+            )
+        repaired = self._repaired[key] = repair(seconds)
+        times = "once" if stamps.wraps == 1 else f"{stamps.wraps} times"
+        overflow = f"the counter overflowed {times}; this was undone" if stamps.wraps else ""
+        for text in filter(None, (overflow, repaired.remark)):
+            warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
+        return key, repaired
 
     def _base(self, array: str) -> str:
-        known = self._signals.arrays[array].clock
-        if known and self._time is None:
-            self._check_known(array)
-            return known
-        if self._dt is not None:
-            return _COUNTED
-        base = time_array(self._signals, array, self._time, self._clocks)
-        if base not in self._read and self._time is None:
-            self._warn_of_others(base)
-            if base == f"{array}[0]":
-                warnings.warn(
-                    f"the time stamps are taken from {base!r}, which rises from row to row. Name "
-                    f"another channel («time=»), or give the sampling interval («dt=»).",
-                    RecordWarning,
-                    stacklevel=2,
-                )
-        return base
-
-    def _check_known(self, array: str) -> None:
+        clock = self._arrays[array].clock
+        if not clock or self._time is not None:
+            return _COUNTED if self._dt is not None else self._search_base(array)
         if self._dt is not None:
             raise ReadError(
                 f"dt is {self._dt:g} s, but the log gives the time of {array!r}: leave dt out "
@@ -179,248 +189,160 @@ class Timebases:
                 f"time_unit is {self._unit!r}, but the log gives the time of {array!r} in s: "
                 f"leave the unit out («time_unit=»), or name another time base («time=»)."
             )
+        return clock
 
-    def _warn_of_others(self, base: str) -> None:
-        """Of arrays beside the time base that are called like one, and hold something else."""
-        arrays = self._signals.arrays
-        if base not in arrays:
-            return
-        struct, dot, field = base.rpartition(".")
-        names = [f"{struct}{dot}{name}" for name in _SHARED if field in _SHARED and name != field]
-        alike = [
-            n for n in names if n in arrays and len(arrays[n].values) == len(arrays[base].values)
-        ]
-        other = [n for n in alike if not np.array_equal(arrays[n].values, arrays[base].values)]
-        if other:
+    def _search_base(self, array: str) -> str:
+        """The time stamps of an array where the log does not define them; warns of a choice."""
+        struct, dot, field = array.rpartition(".")
+        its_own = f"{struct}{dot}t_{field}"
+        if self._time is None:
+            base = self._clock_by_name(array)
+        else:
+            base = its_own if its_own in self._arrays else self._time
+        from_column = not base and _begins_with_clock(self._arrays[array])
+        base = f"{array}[0]" if from_column else base
+        if not base:
+            raise ReadError(
+                f"no time base for {array!r}: none of {its_own}, {', '.join(_SHARED)} is among the "
+                f"arrays {listed(self._arrays)}. Name the array with the time stamps («time=»), or "
+                f"the two with seconds and nanoseconds («time=SECONDS+NANOSECONDS»), or give the "
+                f"sampling interval of equally spaced rows in s («dt=»)."
+            )
+        stamps = self._arrays.get(base)
+        if stamps is not None and stamps.values.ndim != 1 and not from_column:
+            raise ReadError(
+                f"the time base {base!r} has shape {stamps.values.shape}: it must be one column "
+                f"(«time={base}[0]»)."
+            )
+        if base in self._read or self._time is not None:
+            return base
+        if stamps is not None:  # Others that are called like a time base, and hold something else.
+            struct, dot, field = base.rpartition(".")
+            names = [f"{struct}{dot}{n}" for n in _SHARED if field in _SHARED and n != field]
+            alike = [n for n in names if n in self._arrays]
+            alike = [n for n in alike if len(self._arrays[n].values) == len(stamps.values)]
+            other = [n for n in alike if not np.array_equal(self._arrays[n].values, stamps.values)]
+            if other:
+                warnings.warn(
+                    f"the time stamps are taken from {base!r}; {', '.join(map(repr, other))}, of "
+                    f"the same length, is not used. Name the right one («time=»).",
+                    RecordWarning,
+                    stacklevel=2,
+                )
+        if base == f"{array}[0]":
             warnings.warn(
-                f"the time stamps are taken from {base!r}; {', '.join(map(repr, other))}, of the "
-                f"same length, is not used. Name the right one («time=»).",
+                f"the time stamps are taken from {base!r}, which rises from row to row. Name "
+                f"another channel («time=»), or give the sampling interval («dt=»).",
                 RecordWarning,
                 stacklevel=2,
             )
-
-    def _repair(self, base: str, stamps: _Stamps, held: np.ndarray) -> RepairedTime:
-        repaired = repair(held)
-        times = "once" if stamps[1] == 1 else f"{stamps[1]} times"
-        overflow = f"the counter overflowed {times}; this was undone" if stamps[1] else ""
-        for text in filter(None, (overflow, repaired.remark)):
-            warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
-        return repaired
+        return base
 
     def _stamps(self, base: str) -> _Stamps:
-        """For each row of the table, NaN where the time base is blank."""
         if base not in self._read:
             clock = self._signals.clocks.get(base)
-            stamps, wraps = (clock, 0) if clock is not None else self._counted(base)
-            self._read[base] = (stamps if self._factor == 1 else self._factor * stamps, wraps)
+            stamps, wraps = self._count(base) if clock is None else (clock, 0)
+            stamps = stamps if self._factor == 1 else self._factor * stamps
+            self._read[base] = _Stamps(stamps, wraps)
         return self._read[base]
 
-    def _counted(self, base: str) -> _Stamps:
+    def _count(self, base: str) -> _Stamps:
+        """The time stamps of arrays that the log does not define as a clock."""
         parts = self._parts(base)
         if len(parts) == 2:
-            seconds, nanoseconds = (self._column(part, raw=False) for part in parts)
+            places = [self._columns[part] for part in parts]
+            seconds, nanoseconds = (
+                _in_rows(self._column(*place), self._arrays[place[0]].rows) for place in places
+            )
             if len(seconds) != len(nanoseconds):
                 raise ReadError(
                     f"the time base {base!r} is of {len(seconds)} seconds and {len(nanoseconds)} "
                     f"nanoseconds: name two channels of one length («time=SECONDS+NANOSECONDS»)."
                 )
-            return seconds + 1e-9 * nanoseconds.astype(np.float64), 0
-        array, _ = self._every[base]
-        signal = self._signals.arrays[array]
-        counter, wraps = unwrap(self._column(base, raw=True))
+            return _Stamps(seconds + 1e-9 * nanoseconds.astype(np.float64), 0)
+        array, column = self._columns[base]
+        signal = self._arrays[array]
+        counter, wraps = unwrap(signal.values if column is None else signal.values[:, column])
         stated: TimeUnit | None = signal.unit if signal.unit in PER_SECOND else None  # pyright: ignore[reportAssignmentType]
-        named = _UNIT_OF_NAME.get(re.split(r"[./]", array)[-1])
         if stated and self._unit not in (None, stated) and array in self._signals.titles.values():
             raise ReadError(
                 f"time_unit is {self._unit!r}, but the header says that {array!r} is in {stated}: "
                 f"leave the unit out («time_unit=»), or correct the header."
             )
-        return _in_rows(_seconds(base, counter, self._unit or stated or named), signal.rows), wraps
+        unit = self._unit or stated or _UNIT_OF_NAME.get(re.split(r"[./]", array)[-1])
+        seconds = counter.astype(np.float64) / PER_SECOND[unit or "s"]
+        doubt = doubt_of_seconds(seconds) if unit is None else ""
+        if doubt:
+            raise ReadError(f"the time base {base!r} {doubt}.")
+        return _Stamps(_in_rows(seconds, signal.rows), wraps)
 
     def _parts(self, base: str) -> list[str]:
         """A channel, or those of seconds and of nanoseconds."""
-        return [base] if base in self._every or base.count("+") != 1 else base.split("+")
+        return [base] if base in self._columns or base.count("+") != 1 else base.split("+")
 
-    def _column(self, name: str, *, raw: bool) -> np.ndarray:
-        array, column = self._every[name]
-        signal = self._signals.arrays[array]
-        values = column_values(signal, column, raw=raw)
-        return values if raw else _in_rows(values, signal.rows)
+    def _find_clocks(self) -> None:
+        """The best name of a time base in each struct, and the first one of each topic."""
+        ranks: dict[str, tuple[int, str]] = {}
+        for name in self._arrays:
+            prefix, rank, base = "", 0, ""
+            if match := _CLOCK.fullmatch(name):
+                prefix, rank, base = match[1], _KNOWN.index(match[2]), name
+            elif match := _SECONDS.fullmatch(name):
+                partners = (name.removesuffix(match[2]) + p for p in _PARTNERS.get(match[2], ()))
+                partner = next((other for other in partners if other in self._arrays), None)
+                if partner is not None:
+                    prefix, rank, base = match[1], len(_KNOWN), f"{name}+{partner}"
+            if base and (rank, base) < ranks.get(prefix, (len(_KNOWN) + 1, "")):
+                ranks[prefix] = rank, base
+            elif not base and (topic := _TOPIC.fullmatch(name)):
+                self._topics.setdefault(topic[1], name)
+        self._structs = {prefix: base for prefix, (_, base) in ranks.items()}
+
+    def _clock_by_name(self, array: str) -> str:
+        """The time base that a name gives to an array; empty where none does."""
+        struct, dot, field = array.rpartition(".")
+        its_own = f"{struct}{dot}t_{field}"
+        if its_own in self._arrays:
+            return its_own
+        for prefix in (*_prefixes(array, r"[./]"), ""):
+            if prefix in self._structs:
+                return self._structs[prefix]
+        topics = (self._topics.get(prefix, array) for prefix in _prefixes(array, "_"))
+        return next((base for base in topics if base != array), "")
+
+    def _time_names(self) -> set[str]:
+        """The arrays that hold time stamps rather than a channel."""
+        arrays, stamps = self._arrays, set()
+        for name in arrays:
+            struct, dot, field = name.rpartition(".")
+            if field.startswith("t_") and f"{struct}{dot}{field.removeprefix('t_')}" in arrays:
+                stamps.add(name)
+        if self._time is not None:
+            return stamps | set(self._time.split("+"))
+        stamps |= {name for name in arrays if _CLOCK.fullmatch(name)}
+        pairs = (base.split("+") for base in self._structs.values() if "+" in base)
+        stamps |= {part for pair in pairs for part in pair} & set(arrays)
+        if self._topics:
+            stamps |= {self._clock_by_name(name) for name in arrays} & set(self._topics.values())
+        return stamps
 
 
-_COUNTED = "rows"  # the time base where dt says how far apart they are
+def _prefixes(name: str, separator: str) -> Iterator[str]:
+    """`a.b.` and `a.` for `a.b.c`."""
+    for mark in reversed(list(re.finditer(separator, name))):
+        yield name[: mark.end()]
 
 
-def _check_factor(factor: float | int | None) -> None:
-    if factor is not None and not 0.5 <= factor <= 2:
-        raise RecordError(
-            f"time_factor is {factor:g}: give a number near 1, from 0.5 to 2; units of time are "
-            f"for time_unit («time_unit=»)."
-        )
-
-
-def _check_dt(dt: float | int | None, time: str | None, unit: TimeUnit | None) -> None:
-    if dt is None:
-        return
-    if not 0 < dt < np.inf:
-        raise RecordError(f"dt is {dt:g}: give the sampling interval in s, above 0 («dt=»).")
-    if time is not None or unit is not None:
-        raise RecordError(
-            f"dt is {dt:g} s, and a time base is named as well: keep one of them («dt=», «time=»)."
-        )
+def _begins_with_clock(signal: Signal) -> bool:
+    """Whether the first column of a matrix is a clock, as Simulink's `To File` writes it."""
+    matrix = signal.values
+    return matrix.ndim == 2 and matrix.shape[1] > 1 and steady(matrix[:, 0])
 
 
 def _in_rows(values: np.ndarray, rows: Bool[np.ndarray, " rows"] | None) -> np.ndarray:
     """The values of a column with blank cells at their rows, NaN elsewhere."""
     if rows is None:
         return values
-    whole = np.full(rows.size, np.nan)
-    whole[rows] = values
-    return whole
-
-
-def _held(
-    name: str, base: str, stamps: np.ndarray, rows: Bool[np.ndarray, " rows"] | None
-) -> np.ndarray:
-    """The time stamps of the rows in which a channel has a value."""
-    if rows is None:
-        return stamps
-    held = stamps[rows]
-    blank = int(np.count_nonzero(~np.isfinite(held)))
-    if blank > 0.01 * held.size:
-        raise ReadError(
-            f"in {blank} of the {held.size} rows in which channel {name!r} has a value, its time "
-            f"base {base!r} is blank. Name the channel's own time base («time=»)."
-        )
-    return held
-
-
-def column_values(signal: Signal, column: int | None, *, raw: bool = False) -> np.ndarray:
-    """One column in its unit; `raw` as in the file."""
-    values = signal.values if column is None else signal.values[:, column]
-    if raw or signal.scale == 1.0:
-        return values
-    return values.astype(np.float64) * signal.scale  # where short ones would overflow
-
-
-class _Clocks(NamedTuple):
-    """Time bases by what the names of their channels begin with."""
-
-    structs: Mapping[str, str]  # `imu.` or "": imu.time, or imu.header.stamp.sec+...nanosec
-    topics: Mapping[str, str]  # `imu_`: imu_time
-
-
-def _clocks(arrays: Mapping[str, Signal]) -> _Clocks:
-    structs: dict[str, tuple[int, str]] = {}
-    topics: dict[str, str] = {}
-    for name in arrays:
-        prefix, rank, base = _clock_in(arrays, name)
-        if base and (rank, base) < structs.get(prefix, (len(_KNOWN) + 1, "")):
-            structs[prefix] = rank, base
-        elif not base and (topic := _TOPIC.fullmatch(name)):
-            topics.setdefault(topic[1], name)
-    return _Clocks({prefix: base for prefix, (_, base) in structs.items()}, topics)
-
-
-def _clock_in(arrays: Mapping[str, Signal], name: str) -> tuple[str, int, str]:
-    """The struct that a name gives the time of, how good a name it is, and the time base."""
-    if found := _CLOCK.fullmatch(name):
-        return found[1], _KNOWN.index(found[2]), name
-    if not (found := _SECONDS.fullmatch(name)):
-        return "", 0, ""
-    for partner in _PARTNERS.get(found[2], ()):
-        other = f"{name.removesuffix(found[2])}{partner}"
-        if other in arrays:
-            return found[1], len(_KNOWN), f"{name}+{other}"
-    return "", 0, ""
-
-
-def _enclosing(name: str) -> Iterator[str]:
-    """The structs around a channel: `a.b.` and `a.` and "" for `a.b.c`."""
-    for mark in reversed(list(re.finditer(r"[./]", name))):
-        yield name[: mark.end()]
-    yield ""
-
-
-def _named_clock(arrays: Mapping[str, Signal], array: str, clocks: _Clocks) -> str:
-    """The time base that a name gives to an array; empty where none does."""
-    struct, dot, field = array.rpartition(".")
-    own = f"{struct}{dot}t_{field}"
-    if own in arrays:
-        return own
-    for prefix in _enclosing(array):
-        if prefix in clocks.structs:
-            return clocks.structs[prefix]
-    for mark in reversed(list(re.finditer("_", array))):
-        base = clocks.topics.get(array[: mark.end()], array)
-        if base != array:
-            return base
-    return ""
-
-
-def _time_names(arrays: Mapping[str, Signal], clocks: _Clocks, time: str | None) -> set[str]:
-    """The arrays that hold time stamps rather than a channel."""
-    own = {name for name in arrays if _is_own_time(arrays, name)}
-    if time is not None:
-        return own | set(time.split("+"))
-    named = {name for name in arrays if _CLOCK.fullmatch(name)}
-    pairs = {part for base in clocks.structs.values() if "+" in base for part in base.split("+")}
-    used = {_named_clock(arrays, name, clocks) for name in arrays} if clocks.topics else set()
-    return own | named | (pairs & set(arrays)) | (used & set(clocks.topics.values()))
-
-
-def _is_own_time(arrays: Mapping[str, Signal], name: str) -> bool:
-    struct, dot, field = name.rpartition(".")
-    owner = f"{struct}{dot}{field.removeprefix('t_')}"
-    return field.startswith("t_") and owner in arrays
-
-
-def _has_own_clock(signal: Signal) -> bool:
-    """Whether the first column of a matrix is a clock, as Simulink's `To File` writes it."""
-    matrix = signal.values
-    return matrix.ndim == 2 and matrix.shape[1] > 1 and steady(matrix[:, 0])
-
-
-def time_array(signals: Signals, array: str, time: str | None, clocks: _Clocks) -> str:
-    """The name of the time stamps that belong to `array`.
-
-    The first that exists of: its own, `t_<array>`; the one named `time`; t, time, time_s,
-    timestamp, ... or seconds and nanoseconds in the same struct, in those around it, in the whole
-    file; those of its topic (`imu_time` for `imu_x`); the first column of a matrix if that rises in
-    steps of nearly one size. Seconds and nanoseconds are `sec+nsec`.
-    """
-    struct, dot, field = array.rpartition(".")
-    own = f"{struct}{dot}t_{field}"
-    if time is not None:
-        found = own if own in signals.arrays else time
-    else:
-        found = _named_clock(signals.arrays, array, clocks)
-    if not found and _has_own_clock(signals.arrays[array]):
-        return f"{array}[0]"
-    if not found:
-        raise ReadError(
-            f"no time base for {array!r}: none of {own}, {', '.join(_SHARED)} is among the arrays "
-            f"{listed(signals.arrays)}. Name the array with the time stamps («time=»), or the two "
-            f"with seconds and nanoseconds («time=SECONDS+NANOSECONDS»), or give the sampling "
-            f"interval of equally spaced rows in s («dt=»)."
-        )
-    matrix = signals.arrays.get(found)
-    if matrix is not None and matrix.values.ndim != 1:
-        raise ReadError(
-            f"the time base {found!r} has shape {matrix.values.shape}: it must be one column "
-            f"(«time={found}[0]»)."
-        )
-    return found
-
-
-def _all_names(signals: Signals) -> dict[str, tuple[str, int | None]]:
-    every = (_columns_of(name, signal) for name, signal in signals.arrays.items())
-    return {name: place for names in every for name, place in names.items()}
-
-
-def _seconds(name: str, stamps: np.ndarray, unit: TimeUnit | None) -> Float[np.ndarray, " samples"]:
-    seconds = stamps.astype(np.float64) / PER_SECOND[unit or "s"]
-    doubt = doubt_of_seconds(seconds) if unit is None else ""
-    if doubt:
-        raise ReadError(f"the time base {name!r} {doubt}.")
-    return seconds
+    table = np.full(rows.size, np.nan)
+    table[rows] = values
+    return table

@@ -1,8 +1,10 @@
 from ._attempt import (
     attempt as attempt,
+    FAILED as FAILED,
     PageWarning as PageWarning,
     reason_of as reason_of,
 )
+from ._figure import embed_figure as embed_figure, Section as Section
 from ._fit import compare_fits as compare_fits
 from ._loop import LawLoop as LawLoop
 from ._page import (
@@ -11,14 +13,10 @@ from ._page import (
     render_page as render_page,
     Table as Table,
 )
-from ._pilot import (
-    B0Section as B0Section,
-    PilotPage as PilotPage,
-    write_pilot_page as write_pilot_page,
-)
 from ._provenance import (
     Provenance as Provenance,
     provenance as provenance,
+    provenance_section as provenance_section,
     sha256_of as sha256_of,
     Source as Source,
 )
@@ -28,4 +26,3 @@ from ._results import (
     write_json as write_json,
     write_results as write_results,
 )
-from ._sections import draw_sections as draw_sections

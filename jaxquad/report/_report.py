@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxquad._core import beside as begin, Later, write_file
+from jaxquad._core import write_file
 from jaxquad.identify import Combination, Fit, KnownFilter, MISFIT, Verification
 from jaxquad.models import Model
 from jaxquad.records import Record
@@ -49,7 +49,6 @@ def write_report(
     beside: Mapping[str, str] | None = None,
     tuned: "Tuned | Certificate | None" = None,
     flights: "Mapping[str, Simulation] | None" = None,
-    drawn: Mapping[str, object] | None = None,
     provenance: Provenance | None = None,
     title: str = "",
     formula: str = "",
@@ -80,7 +79,6 @@ def write_report(
     - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
     - `flights`: of these gains, by name, see `jaxquad.tuning.worst_flights`.
-    - `drawn`: what `draw_sections` of the same results returned, by which nothing is drawn twice.
     - `provenance`: where the result comes from, see `jaxquad.report.provenance`.
     - `title`: by default "output / input" of the first response.
     - `formula`: the model in words.
@@ -100,9 +98,6 @@ def write_report(
         headlines += verdict_headlines(tuned)
     first = shown.first
     names = (first.output_names[0], first.input_names[0])
-    begun = {} if tuned is None else _begin_tuned(tuned, flights or {})
-    begun |= shown.begin() if drawn is None else {}
-    begun |= {"verification": begin(attempt, check_section, found)} if found else {}
     record_asked = next(iter(shown.records.values()), None)
     texts = attempt(parameter_section, fit, derived, beside or {}) if fit.verdict.fitted else None
     sections = {
@@ -110,8 +105,14 @@ def write_report(
         "parameters": texts,
         "identifiability": attempt(identifiability_section, fit),
         "provenance": attempt(provenance_section, provenance) if provenance is not None else None,
-        **(drawn or {}),
-    } | {name: section.get() for name, section in begun.items()}
+    }
+    if tuned is not None:
+        from ._tuned import tuned_section
+
+        sections["tuned"] = attempt(tuned_section, tuned, flights or {})
+    sections |= shown.draw()
+    if found:
+        sections["verification"] = attempt(check_section, found)
     text = render_page(
         "report.html",
         title=f"{headlines[0].word}: {title or ' / '.join(names)}",
@@ -123,14 +124,6 @@ def write_report(
         sections={name: sections[name] for name in _ORDER if sections.get(name) is not None},
     )
     return write_file(path, text)
-
-
-def _begin_tuned(
-    tuned: "Tuned | Certificate", flights: "Mapping[str, Simulation]"
-) -> dict[str, Later]:
-    from ._tuned import tuned_section
-
-    return {"tuned": begin(attempt, tuned_section, tuned, flights)}
 
 
 def fit_headline(fit: Fit, remarks: int) -> Headline:

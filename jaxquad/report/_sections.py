@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from jaxquad._core import beside as begin, Later
 from jaxquad.identify import Fit, KnownFilter
 from jaxquad.models import Model
 from jaxquad.records import Record
@@ -44,22 +43,20 @@ class Shown(NamedTuple):
         channels = {*self.first.input_names, *self.first.output_names}
         return next((each for each in self.records.values() if channels <= {*each.names}), None)
 
-    def begin(self) -> dict[str, Later]:
-        """Each section, which a second process draws where a command has one."""
+    def draw(self) -> dict[str, object]:
+        """Each section, by its name."""
         first, flown = self.first, self.flown
-        sections: dict[str, Later] = {
-            "response": begin(attempt, response_section, self.frfs, self.models, self.others)
+        sections: dict[str, object] = {
+            "response": attempt(response_section, self.frfs, self.models, self.others)
         }
         step = None if self.law is None else self.law.step
         if flown is not None:
-            sections["step"] = begin(
-                attempt, step_section, self.fit, first, flown, self.filters, step
-            )
-            sections["loop"] = begin(attempt, loop_section, first, flown, self.law)
+            sections["step"] = attempt(step_section, self.fit, first, flown, self.filters, step)
+            sections["loop"] = attempt(loop_section, first, flown, self.law)
         if (record := flown if self.spectrum is None else self.spectrum) is not None:
-            sections["spectrum"] = begin(attempt, spectrum_section, first, record)
+            sections["spectrum"] = attempt(spectrum_section, first, record)
         if self.records:
-            sections["record"] = begin(attempt, record_section, self.records)
+            sections["record"] = attempt(record_section, self.records)
         return sections
 
 
@@ -91,24 +88,3 @@ def _models(
     if not fit.verdict.fitted:
         return dict(models)
     return {name: models.get(name, fit.model) for name in frfs}
-
-
-def draw_sections(
-    *,
-    fit: Fit,
-    frf: FrequencyResponse | Mapping[str, FrequencyResponse],
-    models: Mapping[str, Model] | None = None,
-    others: Mapping[str, FrequencyResponse] | None = None,
-    record: Record | Mapping[str, Record] | None = None,
-    spectrum: Record | None = None,
-) -> dict[str, object]:
-    """The figures of `write_report`, for who has to wait for the rest of its page.
-
-    **Arguments:** those of `write_report` that these figures show.
-
-    **Returns:** what it takes as `drawn`, beside the same arguments.
-
-    **Raises:** ValueError as it does.
-    """
-    shown = shown_of(fit, frf, models, others, record, spectrum)
-    return {name: section.get() for name, section in shown.begin().items()}

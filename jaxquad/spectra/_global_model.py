@@ -2,13 +2,10 @@
 
 import functools as ft
 import hashlib
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
-
-from jaxquad._core import beside
 
 from ._local_fit import Bins
 from ._model_noise import log_likelihood, noise_left, rough_noise
@@ -117,22 +114,20 @@ def global_models(
         _Task(_equations(bins, places, inputs, output, scale, dt), bins.omega[places], most)
         for output in range(outputs.start, outputs.stop)
     ]
-    # A second process begins with the last; who waits for the first computes it.
-    models = [beside(_identify_kept, task) for task in reversed(tasks)]
     return [
         None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
-        for one in (each.get() for each in reversed(models))
+        for one in map(_identify_kept, tasks)
     ]
 
 
-def begin_weighted_model(
+def weighted_model(
     model: GlobalModel,
     bins: Bins,
     inputs: slice,
     output: int,
     most: int,
     noise: Float[np.ndarray, " places"],
-) -> Callable[[], GlobalModel | None]:
+) -> GlobalModel | None:
     """The model of the same bins that count by `noise`, the output's power at the model's places.
 
     What the first model leaves can hide response: where it fits the loud bins alone, what it leaves
@@ -140,28 +135,13 @@ def begin_weighted_model(
     """
     places, scale = model.places, model.scale
     equations = _equations(bins, places, inputs, output, scale, model.dt)
-    begun = beside(_identify_weighted, equations, bins.omega[places], 1 / np.sqrt(noise), most)
-
-    def finish() -> GlobalModel | None:
-        found = begun.get()
-        if found is None:
-            return None
-        return GlobalModel(*found[:2], scale, model.dt, places, *found[2:], model.reach)
-
-    return finish
-
-
-def _identify_weighted(
-    equations: Equations,
-    omega: Float[np.ndarray, " bins"],
-    weight: Float[np.ndarray, " bins"],
-    most: int,
-) -> "Identified | None":
+    omega, weight = bins.omega[places], 1 / np.sqrt(noise)
     white = equations.weighted(weight).pick(_thin(len(omega), _TRIAL_BINS))
     orders = search_orders(white, most)
     if orders.best == 0:
         return None
-    return _settle(equations, omega, weight, next_order(white, orders, most))
+    settled = _settle(equations, omega, weight, next_order(white, orders, most))
+    return GlobalModel(*settled[:2], scale, model.dt, places, *settled[2:], model.reach)
 
 
 def _equations(

@@ -1,16 +1,16 @@
 """Local fits of what global models leave, and the errors of both together."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from ._global_model import (
-    begin_weighted_model,
     global_models,
     GlobalModel,
     highest_modelled,
+    weighted_model,
 )
 from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_noise import Noise, SharedErrors
@@ -124,20 +124,14 @@ def weighted_models(
     rest: Rest, bins: Bins, which: Bool[np.ndarray, " moved"], noise: Noise, most: int
 ) -> list[GlobalModel | None]:
     """The models, `which` of them fitted to the `bins` again, which now count by the `noise`."""
-
-    def begin(c: int, model: GlobalModel) -> Callable[[], GlobalModel | None]:
+    models = list(rest.models)
+    for c, model in enumerate(rest.models):
+        if model is None or not which[c]:
+            continue
         omega, channel = bins.omega[model.places], rest.moved.start + c
         power = noise._replace(power=noise.power[:, c : c + 1]).power_at(omega)[:, 0]
         power = np.where(omega > noise.omega[-1], model.noise, power)
-        return begin_weighted_model(model, bins, rest.sources, channel, most, power)
-
-    models = list(rest.models)
-    # As in `global_models`, a second process begins with the last.
-    begun = {
-        c: begin(c, m) for c, m in reversed([*enumerate(models)]) if m is not None and which[c]
-    }
-    for c, finish in reversed(begun.items()):
-        models[c] = finish() or models[c]
+        models[c] = weighted_model(model, bins, rest.sources, channel, most, power) or model
     return models
 
 

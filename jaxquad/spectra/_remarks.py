@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxquad._core import beside, has_second_process, Message
+from jaxquad._core import Message
 
 from ._checks import in_hertz
 
@@ -62,11 +62,6 @@ class Remarks(Sequence[Remark]):
     def __init__(self, find: Callable[[], tuple[Remark, ...]]):
         self._find = find
 
-    def begin(self) -> None:
-        """Have a second process find them, before they are looked at."""
-        if "_found" not in vars(self):
-            self._find = beside(self._find).get
-
     @ft.cached_property
     def _found(self) -> tuple[Remark, ...]:
         found = self._find()
@@ -93,12 +88,6 @@ class Remarks(Sequence[Remark]):
 
     def __reduce__(self) -> tuple[type[tuple], tuple[tuple[Remark, ...]]]:
         return tuple, (self._found,)
-
-
-def begin_remarks(remarks: Sequence[Remark]) -> None:
-    """Have a second process, if there is one, find those of a response while others are busy."""
-    if isinstance(remarks, Remarks) and has_second_process():
-        remarks.begin()
 
 
 def _place(omega: tuple[float, ...]) -> str:

@@ -1,8 +1,6 @@
 """Responses and fits of an identification, over the whole band and over parts of it."""
 
 import dataclasses
-import functools as ft
-import multiprocessing
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -10,15 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import (
-    announce,
-    as_messages,
-    behind,
-    has_second_process,
-    Later,
-    map_in_threads,
-    one_blas_thread,
-)
+from jaxquad._core import announce, as_messages
 from jaxquad.identify import (
     CoherenceWeighted,
     Combination,
@@ -35,7 +25,6 @@ from jaxquad.identify import (
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.records import Record
 from jaxquad.spectra import (
-    begin_remarks,
     Composite,
     DOMINATED,
     EARLY,
@@ -56,7 +45,6 @@ _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
-LONG = 10**6  # samples of all records, above which estimates do not share the memory
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
 _RECORD = "excite the axis (jaxquad design sweep), and record what excites it as the reference"
@@ -64,70 +52,48 @@ EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or rec
 
 
 class Estimated(NamedTuple):
-    """The response to trust first and the fit to it; those of the other methods, by method."""
+    """The response to trust and the fit to it; `delay`, in s, was taken out of the response."""
 
     frf: FrequencyResponse
     fit: Fit
-    others: Mapping[str, Later[FrequencyResponse]]
+    delay: float
 
 
 def fit_best(
     records: tuple[Record, ...], methods: Sequence[str], settings: IdentifySettings,
     filters: Sequence[KnownFilter] = (),
 ) -> Estimated:  # fmt: skip
-    """The fit to the first method's response, while the others' are estimated beside it.
+    """The first method's response and the fit to it; `respond` gives those of the other `methods`.
 
-    Taken out of the responses is the delay that a fit to a quick one finds; where the fit to the
-    first one finds another, all are estimated again. Known `filters` of the output are divided out.
+    Taken out of the response is the delay that a fit to a quick one finds; where the fit to the
+    response itself finds another, it is estimated again. Known `filters` are divided out.
     """
-    best, dt = methods[0], records[0].dt
-    [quick] = _responses(records, [best], settings, filters, quick=True)
-    unasked = dataclasses.replace(quick.get(), remarks=())  # to find them takes as long as the fit
+    best, dt, plural = methods[0], records[0].dt, "s" * (len(methods) > 1)
+    announce(f"quick {best} response, for the delay")
+    quick = respond(records, best, settings, filters, quick=True)
+    unasked = dataclasses.replace(quick, remarks=())  # to find them takes as long as the fit
     delay = _delay_of(fit_response(unasked, settings), records)
-    frfs = _responses(records, methods, settings, filters, delay)
+    out = f", {delay:.4g} s of delay taken out" if delay else ""
+    announce(f"{' and '.join(methods)} response{plural}{out}")
+    frf = respond(records, best, settings, filters, delay)
     announce(f"fit to the {best} response")
-    found = _fit_first(frfs, settings)
+    found = fit_response(frf, settings)
     other = _delay_of(found, records)
     if other and abs(other - delay) > _NEAR * dt:
-        frfs = _responses(records, methods, settings, filters, other)
-        found = _fit_first(frfs, settings)
-    return Estimated(frfs[0].get(), found, dict(zip(methods[1:], frfs[1:], strict=True)))
+        delay = other
+        announce(f"{' and '.join(methods)} response{plural}, {delay:.4g} s of delay taken out")
+        frf = respond(records, best, settings, filters, delay)
+        found = fit_response(frf, settings)
+    return Estimated(frf, found, delay)
 
 
-def _fit_first(frfs: Sequence[Later[FrequencyResponse]], settings: IdentifySettings) -> Fit:
-    frf = frfs[0].get()
-    begin_remarks(frf.remarks)
-    return fit_response(frf, settings)
-
-
-def _responses(
-    records: tuple[Record, ...], methods: Sequence[str], settings: IdentifySettings,
+def respond(
+    records: tuple[Record, ...], method: str, settings: IdentifySettings,
     filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
-) -> list[Later[FrequencyResponse]]:  # fmt: skip
-    """By each of the methods; all but the first are ready later."""
-    omega = grid_of(settings)
-    out = ", for the delay" if quick else f", {delay:.4g} s of delay taken out" if delay else ""
-    plural = "s" if len(methods) > 1 else ""
-    announce(f"{'quick ' if quick else ''}{' and '.join(methods)} response{plural}{out}")
-    given = [(_estimator(settings, each, delay, quick=quick), omega, filters) for each in methods]
-    estimate = ft.partial(_estimate, records)
-    # The workers of a batch have one core each.
-    alone = multiprocessing.parent_process() is None and not has_second_process()
-    if alone and sum(record.time.size for record in records) <= LONG:
-        # The BLAS threads are the whole process's: no estimate may set them back for the other.
-        with one_blas_thread():
-            return list(map(Later.known, map_in_threads(lambda each: estimate(*each), given)))
-    others = [behind(_estimate, records, *each) for each in given[1:]]
-    return [Later.known(estimate(*given[0])), *others]
-
-
-def _estimate(
-    records: tuple[Record, ...],
-    estimator: Estimator,
-    omega: Float[np.ndarray, " frequencies"] | None,
-    filters: Sequence[KnownFilter],
-) -> FrequencyResponse:
-    frf = frequency_response(list(records), omega, estimator=estimator)
+) -> FrequencyResponse:  # fmt: skip
+    """The response by a method, `delay` (s) and `filters` of the output taken out."""
+    estimator = _estimator(settings, method, delay, quick=quick)
+    frf = frequency_response(list(records), grid_of(settings), estimator=estimator)
     return without_filters(frf, filters)
 
 

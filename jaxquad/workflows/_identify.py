@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxquad._core import announce, as_messages, end_second_process, Later, marked_text, Message
+from jaxquad._core import announce, as_messages, marked_text, Message
+from jaxquad.autopilot import flown_law, FlownLaw
 from jaxquad.identify import (
     Bands,
     behind_filters,
@@ -39,12 +40,11 @@ from ._fits import (
     fit_parts,
     fit_response,
     in_option_words,
-    LONG,
+    respond,
     sums_of,
     with_remedies,
     with_units,
 )
-from ._flown_law import flown_law, FlownLaw
 from ._log import mix_of, open_logs, OpenedLogs, read_records
 from ._result_file import default_folder
 from ._settings import IdentifySettings
@@ -311,12 +311,15 @@ def identify_opened(opened: OpenedLogs) -> Identification:
 
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
-    flown = flown_law(opened)
+    settings = opened.settings
+    flown = flown_law(
+        opened.paths, mix_of(settings.output), mix_of(settings.input), opened.proposal, settings
+    )
     filters = () if flown is None or opened.settings.keep_gyro_filters else flown.filters
-    found, others = _identify(opened, compare=True, filters=filters, vehicle=flown is not None)
+    found, delay = _identify(opened, compare=True, filters=filters, vehicle=flown is not None)
     found = dataclasses.replace(found, flown=flown)
     found = _with_fits_again(dataclasses.replace(found, check=_checked(found)))
-    return _with_others(found, others)
+    return _with_direct(found, delay) if found.settings.reference else found
 
 
 def identify_fit(opened: OpenedLogs) -> Identification:
@@ -353,14 +356,12 @@ def _with_remedy(found: Fit, remedy: str) -> Fit:
 def _identify(
     opened: OpenedLogs, *, compare: bool = False, filters: Sequence[KnownFilter] = (),
     vehicle: bool = False,
-) -> tuple[Identification, Mapping[str, Later[FrequencyResponse]]]:  # fmt: skip
-    """The estimate to trust and its fit; the estimates to `compare` it with, by method.
+) -> tuple[Identification, float]:  # fmt: skip
+    """The estimate to trust and its fit; the delay in s that is taken out, also to `compare`.
 
     The rate of a `vehicle` may be damped by the air.
     """
     (path, *more), settings, proposal, records = opened
-    if sum(record.time.size for record in records) > LONG:
-        end_second_process()
     best, *others = ("joint", "direct") if settings.reference else ("direct",)
     methods = (best, *(others if compare else ()))
     estimated = fit_best(records, methods, settings, filters)
@@ -374,25 +375,21 @@ def _identify(
     found = Identification(
         path, settings, records, responses, fits, parts, None, proposal, more=tuple(more)
     )
-    return found, estimated.others
+    return found, estimated.delay
 
 
-def _with_others(
-    found: Identification, others: Mapping[str, Later[FrequencyResponse]]
-) -> Identification:
-    """The estimates that are compared with the one to trust, and the fits to them."""
-    responses, fits, failures = dict(found.responses), dict(found.fits), dict(found.failures)
-    for method, later in others.items():
-        announce(f"fit to the {method} response")
-        try:
-            response = later.get()
-            fit = with_remedies(fit_response(response, found.settings), found.settings)
-        except Exception as error:
-            failures[f"The {method} estimate"] = reason_of(error)
-            continue
-        responses[method] = response
-        fits[method] = in_option_words(with_units(fit, found.records[0]))
-    return dataclasses.replace(found, responses=responses, fits=fits, failures=failures)
+def _with_direct(found: Identification, delay: float) -> Identification:
+    """The direct estimate, with `delay` (s) taken out, beside the joint one, and the fit to it."""
+    announce("fit to the direct response")
+    try:
+        response = respond(found.records, "direct", found.settings, found.filters, delay)
+        fit = with_remedies(fit_response(response, found.settings), found.settings)
+    except Exception as error:
+        failures = {**found.failures, "The direct estimate": reason_of(error)}
+        return dataclasses.replace(found, failures=failures)
+    fit = in_option_words(with_units(fit, found.records[0]))
+    responses, fits = {**found.responses, "direct": response}, {**found.fits, "direct": fit}
+    return dataclasses.replace(found, responses=responses, fits=fits)
 
 
 def _with_fits_again(found: Identification) -> Identification:

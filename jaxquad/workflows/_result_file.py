@@ -13,11 +13,10 @@ from ._tune_settings import TuneSettings
 
 
 if TYPE_CHECKING:
+    from jaxquad.autopilot import StoredFilters
     from jaxquad.control import ScheduledLADRC
     from jaxquad.models import LaggedIntegrator, TransferFunction
     from jaxquad.spectra import FrequencyResponse
-
-    from ._flown_law import StoredFilters
 
 
 class StoredResult(NamedTuple):
@@ -111,7 +110,7 @@ class StoredResult(NamedTuple):
     @property
     def filters(self) -> "tuple[StoredFilters, ...]":
         """Those of the gyro up to whose input the model is, see `jq.identify.behind_filters`."""
-        from ._flown_law import StoredFilters
+        from jaxquad.autopilot import StoredFilters
 
         stored = self.content.get("gyro_filters")
         return () if stored is None else (StoredFilters.of(_part(self.content, "gyro_filters")),)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, beside, marked_text
+from jaxquad._core import announce, marked_text
 from jaxquad.identify import behind_filters, Fit, Verification, verify
 from jaxquad.records import (
     clock_start,
@@ -54,7 +54,6 @@ def write_identification(found: Identification, folder: Path) -> Path:
         **_model_content(found),
     }
     path = write_results(folder, fit=found.fit, frf=found.frf, check=found.check, extra=extra)
-    drawn = beside(_write_figures, found, folder)
     from jaxquad.report import write_report  # here: with it comes matplotlib
 
     others = {f"{name} estimate": found.responses[name] for name in list(found.responses)[1:]}
@@ -73,15 +72,16 @@ def write_identification(found: Identification, folder: Path) -> Path:
         formula="; ".join(filter(None, (found.formula, found.filters_text))),
         beside=found.beside,
     )
-    drawn.get()
+    _write_figures(found, folder)
     return path
 
 
 def _law_if_any(found: Identification) -> LawLoop | None:
-    from ._loop_of_law import loop_of_law
+    from jaxquad.autopilot import loop_of_law
 
     try:
-        return loop_of_law(found)
+        [unit] = found.records[0].output_units
+        return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
     except Exception as error:  # the record shows its loop without the law, too
         warnings.warn(
             f"the loop by its law is missing: {marked_text(reason_of(error))}", PageWarning, 2

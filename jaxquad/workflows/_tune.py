@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxquad._core import announce, beside, Later, plain_content
+from jaxquad._core import announce, plain_content
 from jaxquad.control import certainty_equivalence, LADRC, schedule_for_flight, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
@@ -60,8 +60,6 @@ class Tuning:
     loop: Loop
     ensemble: Ensemble
     flight: Scenario
-    # Sections of the report, drawn while it was tuned.
-    _drawn: Later[dict[str, object]] = dataclasses.field(repr=False, compare=False)
 
     def content(self) -> dict[str, object]:
         """Gains, certificate and settings, for JSON."""
@@ -95,7 +93,6 @@ class Tuning:
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
-        drawn = beside(_write_figures, folder, tuned, flights)
         from jaxquad.report import write_report  # here: with it comes matplotlib
 
         write_report(
@@ -105,20 +102,14 @@ class Tuning:
             record=found.records[0],
             tuned=tuned,
             flights=flights,
-            drawn=self._drawn.get(),
             provenance=origin,
             formula=found.formula,
         )
-        return [folder / "tuned.json", folder / f"{name}.h", folder / "report.html", *drawn.get()]
+        drawn = _write_figures(folder, tuned, flights)
+        return [folder / "tuned.json", folder / f"{name}.h", folder / "report.html", *drawn]
 
     def __str__(self) -> str:
         return str(self.tuned)
-
-
-def _draw_axis(found: Identification) -> dict[str, object]:
-    from jaxquad.report import draw_sections  # here: with it comes matplotlib
-
-    return draw_sections(fit=found.fit, frf=found.frf, record=found.records[0])
 
 
 def _write_figures(folder: Path, tuned: Tuned, flights: Mapping[str, Simulation]) -> list[Path]:
@@ -204,7 +195,7 @@ def _tuned(
         delay=posterior.delay,
     )  # fmt: skip
     announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
-    flown, drawn = _flight(gain, dt, settings), beside(_draw_axis, found)
+    flown = _flight(gain, dt, settings)
     with ThreadPoolExecutor(1) as thread:
         tuned = tune_controller(
             loop,
@@ -220,7 +211,7 @@ def _tuned(
             progress=progress,
             listener=_once(lambda: thread.submit(_fly_nominal, loop, plant, flown)),
         )
-    return Tuning(found, settings, tuned, loop, ensemble, flown, drawn)
+    return Tuning(found, settings, tuned, loop, ensemble, flown)
 
 
 def _once(begin: Callable[[], object]) -> Callable[[Evaluation], None]:

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from resource import getrusage, RUSAGE_CHILDREN
 from typing import NamedTuple
@@ -31,7 +31,6 @@ class Job(NamedTuple):
     name: str
     command: Sequence[str]
     after: Sequence[str] = ()
-    told: Mapping[str, str] = {}  # by the environment
 
 
 class Times(NamedTuple):
@@ -45,11 +44,6 @@ JOBS = (
     Job("`import jaxquad`", (sys.executable, "-c", "import jaxquad")),
     Job("`jaxquad --help`", (*COMMAND, "--help")),
     Job("`jaxquad identify`, report and figures", IDENTIFY),
-    Job(
-        "the same in one process, `JAXQUAD_SECOND_PROCESS=off`",
-        IDENTIFY,
-        told={"JAXQUAD_SECOND_PROCESS": "off"},
-    ),
     Job(
         "`jaxquad tune` on its result",
         (*COMMAND, "tune", "antx", "--inertia", "0.0552", "--limit", "1", "--quiet"),
@@ -83,7 +77,7 @@ def _run(job: Job, flight: bytes, told: dict[str, str]) -> Times:
     # Modules are kept compiled, as after an installation.
     other = ("JAX_", "PYTHONDONTWRITEBYTECODE")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(other)}
-    environment |= {**told, **job.told}
+    environment |= told
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / FLIGHT).write_bytes(flight)
         if job.after:

@@ -159,7 +159,7 @@ def test_a_firmware_s_gain_is_right_beside_a_small_damping(data, log, without_ty
     axis = log.split("_")[-1]
     path, settings = data / "ardupilot_firmware" / f"{log}.BIN", AutopilotSettings(axis=axis)
     proposal = jq.workflows.autopilot(path, settings)
-    assert isinstance(proposal, jq.workflows.AutopilotProposal)
+    assert isinstance(proposal, jq.autopilot.AutopilotProposal)
     plain = proposal.identification.fit
     if plain.values[0] < 0:
         pytest.skip("the chirp is counted twice in the command of this log")

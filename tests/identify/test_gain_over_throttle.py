@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 import jaxquad as jq
-from jaxquad.control.autopilots import adrc_b0
+from jaxquad.autopilot import adrc_b0
 from jaxquad.identify import curve_of_parameter, throttle_levels
 
 

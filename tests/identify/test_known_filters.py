@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.control.autopilots import Butterworth, FilterChain, PT1, PT2
+from jaxquad.autopilot import Butterworth, FilterChain, PT1, PT2
 from jaxquad.identify import behind_filters, filter_response, without_filters
 
 

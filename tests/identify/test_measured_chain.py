@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from jaxquad.control.autopilots import betaflight_loop, FilterChain, Notch, PT1
+from jaxquad.autopilot import betaflight_loop, FilterChain, Notch, PT1
 from jaxquad.identify import KnownFilter, measured_chain
 from jaxquad.records import read, read_settings
 

@@ -55,7 +55,7 @@ def test_models_drawn_around_it_keep_its_sign_and_its_order():
 def test_a_firmware_s_chirp_with_a_delay_near_zero_is_identifiable(data):
     log = data / "betaflight_firmware" / "A_chirp_plain.BFL"
     proposal = jq.workflows.autopilot(log, jq.workflows.AutopilotSettings(axis="roll"))
-    assert isinstance(proposal, jq.workflows.AutopilotProposal)
+    assert isinstance(proposal, jq.autopilot.AutopilotProposal)
     fit = proposal.identification.fit
     assert fit.identifiable
     for name, value in {"gain": 36.95, "lag": 0.025, "delay": 125e-6}.items():

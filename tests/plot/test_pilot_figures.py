@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxquad.control.autopilots import FilterChain, Notch, PT1
+from jaxquad.autopilot import FilterChain, Notch, PT1
 from jaxquad.identify import GainBand
 from jaxquad.plot import (
     b0_figure,

@@ -3,7 +3,7 @@
     python tests/studies/adrc.py --flights 200
 
 The flights are those of `throttle.py`: each log gives K over the throttle, lag and delay; from
-these `jq.workflows.propose_adrc` makes wc, wo and b0. The loops are judged by `adrc_loop.py`, which
+these `jq.autopilot.propose_adrc` makes wc, wo and b0. The loops are judged by `adrc_loop.py`, which
 shares nothing with the library, at five throttles between the lowest and the highest flown.
 """
 
@@ -19,8 +19,7 @@ import throttle_flights as simulated
 from result_files import write
 
 import jaxquad as jq
-from jaxquad.control.autopilots import BetaflightPID, FlownBetaflight, PT1
-from jaxquad.workflows import ADRCTargets, propose_adrc
+from jaxquad.autopilot import ADRCTargets, BetaflightPID, FlownBetaflight, propose_adrc, PT1
 
 
 HOVER = 0.3
@@ -154,7 +153,7 @@ def _study(count: int, table: list, excess: np.ndarray, raw: dict) -> dict:
             "gusts, a thrust curve, motors with lag and delay, 30 s with a chirp at each of three "
             "throttles). From each log K over the throttle, lag and delay, and from these wc, wo "
             "and b0 of the ADRC proposed for Betaflight (pull request 15400) by "
-            "`jq.workflows.propose_adrc`, with Ms of at most 1.8. Beside it the guide (b0 of the "
+            "`jq.autopilot.propose_adrc`, with Ms of at most 1.8. Beside it the guide (b0 of the "
             "fit times two, wc 80, wo 90) and the firmware's defaults, which know no log. Each "
             "loop is judged as it was simulated, exactly, with its filters and delays, at five "
             "throttles from the lowest to the highest flown: the worst of a flight counts."

@@ -20,7 +20,8 @@ sys.path.append(str(Path(__file__).parents[1]))
 import px4_flights as simulated  # noqa: E402
 
 import jaxquad as jq  # noqa: E402
-from jaxquad.workflows import autopilot, AutopilotProposal, AutopilotSettings  # noqa: E402
+from jaxquad.autopilot import AutopilotProposal
+from jaxquad.workflows import autopilot, AutopilotSettings
 
 
 SEED = 20261122

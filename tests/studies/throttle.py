@@ -12,7 +12,7 @@ import numpy as np
 import throttle_flights as simulated
 
 import jaxquad as jq
-from jaxquad.control.autopilots import FilterChain, Notch, PT1
+from jaxquad.autopilot import FilterChain, Notch, PT1
 
 
 CHAINS = (FilterChain((PT1(500.0),), 8000.0), FilterChain((Notch(190.0, 3.0), PT1(350.0)), 4000.0))

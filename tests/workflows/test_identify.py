@@ -69,7 +69,7 @@ def test_a_reference_that_moves_nothing_leaves_no_response_and_is_named(poles, t
     assert remark in str(found)
 
 
-def test_what_two_processes_share_can_be_sent(log, found):
+def test_an_identification_can_be_pickled(log, found):
     sent = lambda x: pickle.loads(pickle.dumps(x))
     opened = sent(open_logs(log, found.settings))
     assert opened.settings == found.settings and opened.paths == found.paths

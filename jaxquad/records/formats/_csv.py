@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float
 
 from .._clock import FEWEST
 from .._errors import ReadError
-from .._log import Log, Table
-from .._units import columns_of
+from .._log import columns_of, Log, Table
 
 
 _WORTHWHILE = 1 << 20  # bytes: below, the import takes longer than the parsing

@@ -1,0 +1,143 @@
+from ._adrc import ADRCProposal as ADRCProposal, propose_adrc as propose_adrc
+from ._adrc_loops import Flown as Flown, gyro_filters as gyro_filters
+from ._adrc_result import ADRCAutopilot as ADRCAutopilot
+from ._adrc_stages import ADRCStage as ADRCStage, ADRCTargets as ADRCTargets
+from ._ardupilot import ArduPilotAttitude as ArduPilotAttitude, ArduPilotRate as ArduPilotRate
+from ._axes_proposal import AxesProposal as AxesProposal
+from ._betaflight import (
+    adrc_b0 as adrc_b0,
+    BetaflightADRC as BetaflightADRC,
+    BetaflightAngle as BetaflightAngle,
+    BetaflightPID as BetaflightPID,
+    DMax as DMax,
+    dynamic_cutoff as dynamic_cutoff,
+    ItermRelax as ItermRelax,
+    tpa_factor as tpa_factor,
+)
+from ._choices import (
+    change_filters as change_filters,
+    filter_choices as filter_choices,
+    FilterChoice as FilterChoice,
+    FilterOption as FilterOption,
+    flown_loop as flown_loop,
+)
+from ._crazyflie import CrazyflieAttitude as CrazyflieAttitude, CrazyflieRate as CrazyflieRate
+from ._demo_chirp import CHIRP_TRUTH as CHIRP_TRUTH, write_chirp_log as write_chirp_log
+from ._files import (
+    change_table as change_table,
+    parameter_file as parameter_file,
+    ParameterChange as ParameterChange,
+    ParameterFiles as ParameterFiles,
+    propose_changes as propose_changes,
+    WordChange as WordChange,
+    write_parameter_files as write_parameter_files,
+)
+from ._filters import (
+    ardupilot_notch as ardupilot_notch,
+    BandwidthNotch as BandwidthNotch,
+    betaflight_quality as betaflight_quality,
+    Butterworth as Butterworth,
+    Filter as Filter,
+    FilterChain as FilterChain,
+    FilterShare as FilterShare,
+    Notch as Notch,
+    PT1 as PT1,
+    PT2 as PT2,
+    PT3 as PT3,
+    Section as Section,
+)
+from ._flight_channels import (
+    FlightChannels as FlightChannels,
+    HOVER as HOVER,
+    read_channels_if_any as read_channels_if_any,
+)
+from ._flown import (
+    ardupilot_loop as ardupilot_loop,
+    betaflight_loop as betaflight_loop,
+    FlownArduPilot as FlownArduPilot,
+    FlownBetaflight as FlownBetaflight,
+    FlownLoop as FlownLoop,
+    px4_loop as px4_loop,
+)
+from ._flown_adrc import (
+    adrc_parameters as adrc_parameters,
+    b0_law as b0_law,
+    betaflight_adrc_loop as betaflight_adrc_loop,
+    flies_adrc as flies_adrc,
+    FlownADRC as FlownADRC,
+)
+from ._flown_autopilot import (
+    FlownAutopilot as FlownAutopilot,
+    read_flown as read_flown,
+    settings_of as settings_of,
+)
+from ._flown_law import (
+    best_filters as best_filters,
+    flown_law as flown_law,
+    FlownLaw as FlownLaw,
+    StoredFilters as StoredFilters,
+)
+from ._gains import (
+    Cascade as Cascade,
+    cascade_of as cascade_of,
+    cascade_parameters as cascade_parameters,
+    find_inexpressible as find_inexpressible,
+    ladrc_as_pid as ladrc_as_pid,
+    LADRCAsPID as LADRCAsPID,
+    motor_share as motor_share,
+    pid_of as pid_of,
+    rate_gains as rate_gains,
+    rate_parameters as rate_parameters,
+    RateGains as RateGains,
+    torque_per_unit as torque_per_unit,
+)
+from ._harmonic_notch import (
+    ardupilot_harmonic_notch as ardupilot_harmonic_notch,
+    HarmonicNotch as HarmonicNotch,
+)
+from ._law import (
+    AngleLoop as AngleLoop,
+    FirmwareLoop as FirmwareLoop,
+    LoopState as LoopState,
+    pick_axis as pick_axis,
+)
+from ._law_check import check_law as check_law
+from ._loop_check import check_loop as check_loop
+from ._loop_of_law import loop_of_law as loop_of_law
+from ._over_throttle import study_throttle as study_throttle
+from ._page import (
+    B0Section as B0Section,
+    PilotPage as PilotPage,
+    write_pilot_page as write_pilot_page,
+)
+from ._parameters import (
+    check_ranges as check_ranges,
+    find_parameter as find_parameter,
+    Firmware as Firmware,
+    firmware_of as firmware_of,
+    list_parameters as list_parameters,
+    Parameter as Parameter,
+    PARAMETERS as PARAMETERS,
+    store_parameters as store_parameters,
+    with_parameters as with_parameters,
+)
+from ._proposal import AutopilotProposal as AutopilotProposal
+from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
+from ._rate_design import design_gains as design_gains
+from ._rate_gains import gyro_chains as gyro_chains
+from ._recipe import what_to_fly as what_to_fly
+from ._replay import (
+    fly_again as fly_again,
+    HeldPlant as HeldPlant,
+    replay_terms as replay_terms,
+)
+from ._reproduce import (
+    hold_response as hold_response,
+    predict_loop as predict_loop,
+    without_gyro_filters as without_gyro_filters,
+)
+from ._reproduce_flight import (
+    FlownController as FlownController,
+    reproduce_flight as reproduce_flight,
+    Reproduction as Reproduction,
+)

@@ -1,0 +1,280 @@
+"""What a Betaflight log says for its proposed ADRC: the report, and the files to load."""
+
+import dataclasses
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+
+from jaxquad._core import announce, plain_content, write_file
+from jaxquad.identify import GainOverThrottle
+from jaxquad.records import AXES
+from jaxquad.report import provenance, write_json
+
+from ._adrc import ADRCProposal
+from ._adrc_loops import Flown
+from ._adrc_page import adrc_page
+from ._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
+from ._flight_channels import FlightChannels
+from ._flown_adrc import adrc_parameters, b0_law, FlownADRC
+from ._identified import DesignSettings
+from ._page import write_pilot_page
+from ._parameters import find_parameter
+from ._rate_design import Kind
+from ._reproduce_flight import Reproduction
+
+
+_BUILD = (2026, 6)  # whose names a file of the ADRC has
+_STEM = "proposal"
+_PID = ("p", "i", "d")
+
+
+@dataclasses.dataclass(frozen=True)
+class ADRCAutopilot:
+    """What `autopilot` found in a log, and what it proposes for the ADRC; `str()` is its report.
+
+    **Attributes:**
+
+    - `kind`, `verdict`: as of an `AutopilotProposal`.
+    - `path`: of the log; `version`: of its firmware; `values`: its header's lines.
+    - `flown`: the loop that flew, PID or ADRC.
+    - `plant`: its gain over the throttle; None where no level of throttle determines it.
+    - `reproductions`: the flown loop compared with the flight, by the throttle of each level.
+    - `proposal`: of `propose_adrc`; None where the log cannot tell.
+    - `flight`: the channels that were read.
+    """
+
+    kind: Kind
+    verdict: str
+    settings: DesignSettings
+    path: Path
+    axis: str
+    version: tuple[int, ...]
+    values: Mapping[str, str]
+    flown: Flown
+    plant: GainOverThrottle | None = None
+    reproductions: Mapping[float, Reproduction] = dataclasses.field(default_factory=dict)
+    proposal: ADRCProposal | None = None
+    flight: FlightChannels | None = None
+
+    @property
+    def flew_adrc(self) -> bool:
+        """Whether the ADRC flew, and not the PID."""
+        return isinstance(self.flown, FlownADRC)
+
+    @property
+    def old(self) -> dict[str, float]:
+        """What the firmware held of the parameters that are proposed; its defaults where the log
+        does not say."""
+        known = adrc_parameters(self.values)
+        default = lambda name: float(find_parameter("betaflight", name).default)
+        return {name: known.get(name, default(name)) for name in self.new}
+
+    @property
+    def new(self) -> dict[str, float]:
+        """The parameters that are proposed; empty where nothing is."""
+        return {} if self.proposal is None else dict(self.proposal.parameters)
+
+    @property
+    def changes(self) -> tuple[ParameterChange, ...]:
+        """From what the firmware held to the proposal; where the PID flew all, changed or not."""
+        if self.flew_adrc:
+            return propose_changes("betaflight", self.old, self.new, reasons=self._reasons)
+        old, reasons = self.old, self._reasons
+        return tuple(
+            ParameterChange(find_parameter("betaflight", name), old[name], value, reasons[name])
+            for name, value in self.new.items()
+        )
+
+    @property
+    def words(self) -> tuple[WordChange, ...]:
+        """What switches from the PID to the ADRC; empty where the ADRC flew."""
+        if self.flew_adrc or self.proposal is None or not self.new:
+            return ()
+        law = self.proposal.schedule.law
+        off = {} if self.proposal.scaled is None else self.proposal.scaled.deviations
+        why = (
+            f"nearest to the gain over the throttle: off by {100 * off[law]:.0f} % at most"
+            if off else "the firmware's default: the log does not show b0 over the throttle"
+        )  # fmt: skip
+        return (
+            WordChange("adrc_b0_law", b0_law(self.values) or "SQRT", law, why),
+            WordChange("pid_type", "CLASSIC", "ADRC", "the ADRC of pull request 15400 flies"),
+        )
+
+    @property
+    def _reasons(self) -> dict[str, str]:
+        if self.proposal is None:
+            return {}
+        after, before = self.proposal.stage, self.proposal.stages["what flew"]
+        tuned = (
+            f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of what "
+            f"flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
+        )
+        kept = "the certificate is of this value"
+        return {name: tuned if name.endswith(self.axis) else kept for name in self.new}
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        found = {
+            "kind": self.kind,
+            "verdict": self.verdict,
+            "firmware": "betaflight",
+            "version": self.version,
+            "axis": self.axis,
+            "law": "adrc",
+            "flown_law": "adrc" if self.flew_adrc else "pid",
+            "flown": self.flown.parameters(),
+            "unmodelled": self.flown.unmodelled,
+            "old": self.old,
+            "new": self.new,
+            "words": [each._asdict() for each in self.words],
+            "proposal": None if self.proposal is None else self.proposal.content(),
+            "reproduction": [
+                {"throttle": x} | each.to_dict() for x, each in self.reproductions.items()
+            ],
+            "plant": None if self.plant is None else self.plant.to_dict(),
+            "remarks": self.remarks,
+            "settings": self.settings.content(),
+        }
+        return {key: plain_content(value) for key, value in found.items()}
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a pilot has to know before the file is loaded."""
+        found = []
+        if self.words and "pid_type" not in self.values:
+            version = ".".join(map(str, self.version))
+            found.append(
+                f"the firmware of the log, Betaflight {version}, has no ADRC: only a build of "
+                "Betaflight's pull request 15400 with adrc_b0_law understands the file"
+            )
+        elif self.words and b0_law(self.values) is None:
+            found.append(
+                "the build of the log has no adrc_b0_law, and b0 follows the square of the "
+                "throttle there: load the file into one that has it"
+            )
+        if self.words:
+            others = " and ".join(axis for axis in AXES if axis != self.axis)
+            found.append(
+                "pid_type, adrc_hover_throttle and adrc_b0_law are those of all three axes: before "
+                f"a flight tune {others}, too, from logs of their own with the same hover throttle "
+                f"({self.new['adrc_hover_throttle']:.0f} %), and load all three files"
+            )
+            found.append(
+                "there is no file for a third of the way, because between PID and ADRC there is "
+                "none; the file that reverts it switches back to the PID"
+            )
+        if self.words and not adrc_parameters(self.values):
+            found.append("the log does not hold the old values: they are the firmware's defaults")
+        if (linear := float(self.values.get("thrust_linear", 0.0))) > 0:
+            found.append(
+                f"thrust_linear {linear:g} flew and stays: the gain over the throttle is that with "
+                "it, taken as a straight line"
+            )
+        if self.proposal is not None and self.plant is not None:
+            found += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
+        return tuple(found)
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write the page, `autopilot.json`, and parameter files: without a proposal what flew.
+
+        **Returns:** their paths.
+        """
+        announce("parameter files")
+        folder = Path(folder)
+        known = {k: v for k, v in self.settings.content().items() if v is not None}
+        words = ["jaxquad", "autopilot", str(self.path), *self.settings.words()]
+        origin = provenance(self.path, command=shlex.join(words), settings=known)
+        content = self.content() | {"provenance": origin.content()}
+        stored = write_json(folder / "autopilot.json", content)
+        announce("the page")
+        page = write_pilot_page(folder / "autopilot.html", adrc_page(self, origin))
+        return [page, stored, *(write_file(folder / k, text) for k, text in self._texts().items())]
+
+    def _texts(self) -> dict[str, str]:
+        """The parameter files, and the table of what changes."""
+        if not self.new:
+            return {f"{_STEM}_revert.txt": self._what_flew()}
+        file = lambda changes, title, revert=False: parameter_file(
+            "betaflight", changes, revert=revert, version=_BUILD, profile=None, words=self.words,
+            title="\n".join([title, *self.remarks]),
+        )  # fmt: skip
+        stages, table = {}, []
+        for percent in (33, 100) if self.flew_adrc else (100,):
+            share = 1.0 if percent == 100 else 1 / 3
+            changes = (
+                propose_changes(
+                    "betaflight", self.old, self.new, share=share, reasons=self._reasons
+                )
+                if self.flew_adrc else self.changes
+            )  # fmt: skip
+            title = f"{percent} % of the way from what flew to the proposal"
+            stages[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
+            table.append(f"## {title}\n\n{change_table(changes, self.words)}")
+        back = {f"{_STEM}_revert.txt": file(self.changes, "what flew", True)}
+        return stages | back | {f"{_STEM}.md": "\n".join(table)}
+
+    def _what_flew(self) -> str:
+        """The parameters of the axis that flew, as a file."""
+        start = ("adrc_wc", "adrc_wo", "adrc_b0") if self.flew_adrc else _PID
+        flown, version = self.flown.parameters(), self.version or (2025, 12)
+        same = [
+            ParameterChange(find_parameter("betaflight", name), flown[name], flown[name])
+            for name in (f"{each}_{self.axis}" for each in start)
+        ]
+        return parameter_file(
+            "betaflight", same, revert=True, version=version, profile=None, title="what flew",
+            raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        version, law = ".".join(map(str, self.version)), "ADRC" if self.flew_adrc else "PID"
+        lines = [
+            f"betaflight {version}, rate loop of {self.axis}: the {law} flew".replace(" ,", ",")
+        ]
+        own = {k: x for k, x in self.flown.parameters().items() if k.endswith(f"_{self.axis}")}
+        lines += [f"  {name} = {value:.6g}" for name, value in own.items()]
+        if isinstance(self.flown, FlownADRC):
+            schedule = self.flown.schedule
+            lines.append(f"  adrc_b0_law = {schedule.law}, hover {100 * schedule.hover:.0f} %")
+        lines += [f"  not modelled: {each}" for each in self.flown.unmodelled]
+        lines += ["", str(self.plant)] if self.plant is not None else []
+        again = [
+            f"flown loop at {x:.2f} throttle: {each.verdict}"
+            for x, each in self.reproductions.items()
+            if each.verdict not in self.verdict
+        ]
+        lines += ["", *again] if again else []
+        if self.proposal is not None:
+            lines += ["", self.proposal.table()]
+        if self.new:
+            lines += ["", change_table(self.changes, self.words).rstrip()]
+        lines += ["", *(f"! {each}" for each in self.remarks)] if self.remarks else []
+        return "\n".join([*lines, "", self.verdict])
+
+
+def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) -> list[str]:
+    schedule, scaled = proposal.schedule, proposal.scaled
+    if scaled is None:
+        return [
+            f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
+            f"{'what flew' if flew else 'the default'}: the certificate is of "
+            f"{proposal.throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
+        ]
+    found, most = [], float(schedule.scale(proposal.throttle[-1]))
+    if most >= schedule.high > 1:
+        found.append(
+            f"at {proposal.throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
+        )
+    if flew and scaled.law != schedule.law:
+        off = scaled.deviations
+        found.append(
+            f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
+            f"{100 * off[schedule.law]:.0f} %, and {scaled.law} by {100 * off[scaled.law]:.0f} %"
+        )
+    if scaled.extrapolated:
+        found.append(
+            f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
+            f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
+        )
+    return found

@@ -1,0 +1,155 @@
+from collections.abc import Mapping
+
+import equinox as eqx
+from jaxtyping import Array, Float, PyTree
+
+from jaxquad._core import as_float, as_float_or_none, broadcast_gain, per_member, require_positive
+from jaxquad.control import Reference
+
+from ._filters import Butterworth, FilterChain
+from ._law import (
+    AngleLoop,
+    bounded,
+    DEGREES,
+    filter_gyro,
+    FirmwareLoop,
+    gyro_rest,
+    require_gains,
+    require_gyro_rate,
+    Signal,
+    split_reference,
+    sum_of,
+    Terms,
+)
+
+
+class CrazyflieRate(FirmwareLoop):
+    """The Crazyflie's rate loop (controller 1): rates in rad/s in, the int16 command out.
+
+        u = kp e + ki sat(int e, integral_limit) - kd y' + kff r    in deg/s, before truncation
+
+    The integral is used at once, and its limit is on the integral of the error in deg. Pitch has
+    the firmware's inverted sign. Not modelled: the truncation of u to whole numbers. Source:
+    docs/autopilots.md.
+
+    !!! example
+
+        ```python
+        law = CrazyflieRate(250, 500, 2.5, gyro=FilterChain((Butterworth(80.0),), 1000.0))
+        ```
+
+    **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
+
+    - `kp`, `ki`, `kd`, `kff`: pid_rate.roll_kp and so on.
+    - `gyro`: filters at the gyro's rate, 80 Hz at 1 kHz in the firmware.
+    - `derivative_hz`: of the Butterworth filter of y' (30 Hz where pid_rate.rateFiltEn is 1); None
+        is off.
+    - `integral_limit`: in deg, 33.3 for roll and pitch, 166.7 for yaw.
+    - `limit`: of |u|; `dt`: in s.
+
+    **Raises:**
+
+    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
+        beyond half of its rate.
+    """
+
+    kp: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    ki: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    kd: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    kff: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    gyro: FilterChain = FilterChain()
+    derivative_hz: Float[Array, "..."] | None = per_member(
+        rank=1, converter=as_float_or_none, default=None
+    )
+    integral_limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=33.3)
+    limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=32767.0)
+    dt: float = eqx.field(static=True, default=0.002)  # s
+
+    def __check_init__(self):
+        limits = {"integral_limit": self.integral_limit, "limit": self.limit}
+        require_gains(self.dt, {**self.gains(), "kff": self.kff}, limits)
+        require_gyro_rate(self.gyro, self.dt)
+        self._slope()  # refuses what lies beyond half of the loop's rate
+
+    def interval(self) -> float:
+        return self.dt
+
+    def gains(self) -> dict[str, Array]:
+        return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
+
+    def _slope(self) -> FilterChain:
+        """The low-pass of the derivative."""
+        cutoff = self.derivative_hz
+        return FilterChain(() if cutoff is None else (Butterworth(cutoff),), 1 / self.dt)
+
+    def rest(self, zero: Signal) -> dict[str, PyTree]:
+        slope = self._slope().init(zero)
+        return {"gyro": gyro_rest(self.gyro, zero), "slope": slope, "y": zero, "integral": zero}
+
+    def advance(
+        self,
+        memory: Mapping[str, PyTree],
+        excess: Signal,
+        reference: Reference,
+        measurement: Signal,
+    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        r, _ = split_reference(reference, measurement, self.dt)
+        gyro, (y, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
+        error = DEGREES * r - y
+        slope, falling = self._slope().step(memory["slope"], (memory["y"] - y) / self.dt)
+        integral = bounded(memory["integral"] + error * self.dt, self.integral_limit)
+        at = lambda gain: broadcast_gain(gain, measurement)
+        terms = {
+            "P": at(self.kp) * error, "I": at(self.ki) * integral,
+            "D": at(self.kd) * falling, "F": at(self.kff) * DEGREES * r,
+        }  # fmt: skip
+        next = {"gyro": gyro, "slope": slope, "y": y, "integral": integral}
+        return next, bounded(sum_of(terms), self.limit), terms
+
+
+class CrazyflieAttitude(AngleLoop):
+    """The Crazyflie's angle PID around its rate loop: angles in rad in, the int16 command out.
+
+    The rate that the inner loop sees is the difference of the measured angles over a sample.
+    Source: docs/autopilots.md.
+
+    **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
+
+    - `rate`: the `CrazyflieRate` inside.
+    - `kp`, `ki`, `kd`: pid_attitude.roll_kp and so on, from deg to deg/s.
+    - `integral_limit`: of the integral of the error, in deg s.
+
+    **Raises:**
+
+    - `ValueError`: `kp` is not above 0.
+    """
+
+    rate: CrazyflieRate
+    kp: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=6.0)
+    ki: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=3.0)
+    kd: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    integral_limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=20.0)
+
+    def __check_init__(self):
+        require_positive("kp", self.kp, "give 1/s")
+        limits = {"integral_limit": self.integral_limit}
+        require_gains(self.dt, {"ki": self.ki, "kd": self.kd}, limits)
+
+    def outer_gains(self) -> dict[str, Array]:
+        return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
+
+    def inner(self) -> FirmwareLoop:
+        return self.rate
+
+    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {"integral": zero}
+
+    def wanted_rate(
+        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        at = lambda gain: broadcast_gain(gain, angle)
+        aim, _ = split_reference(reference, angle, self.dt)
+        error = DEGREES * (aim - angle)
+        integral = bounded(memory["integral"] + error * self.dt, self.integral_limit)
+        wanted = at(self.kp) * error + at(self.ki) * integral - at(self.kd) * DEGREES * rate
+        return {"integral": integral}, wanted / DEGREES

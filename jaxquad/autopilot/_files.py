@@ -1,0 +1,331 @@
+"""Parameter files that a ground station or a command line loads into a flight controller."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxquad._core import Number, write_file
+from jaxquad.records import AXES
+
+from ._parameters import (
+    check_ranges,
+    find_parameter,
+    Firmware,
+    Parameter,
+    PARAMETERS,
+    store_parameters,
+)
+
+
+class ParameterChange(NamedTuple):
+    """One parameter, from what flew to what is proposed, as the firmware stores both.
+
+    **Arguments:**
+
+    - `parameter`: its row of `jq.autopilot.PARAMETERS`.
+    - `old`, `new`: the values.
+    - `reason`: why it changes; may be empty.
+    """
+
+    parameter: Parameter
+    old: float
+    new: float
+    reason: str = ""
+
+
+class WordChange(NamedTuple):
+    """A parameter of Betaflight that holds a word, such as pid_type.
+
+    **Arguments:**
+
+    - `name`: as the CLI calls it; `old`, `new`: its words.
+    - `reason`: why it changes; may be empty.
+    """
+
+    name: str
+    old: str
+    new: str
+    reason: str = ""
+
+
+def propose_changes(
+    firmware: Firmware,
+    old: Mapping[str, Number],
+    new: Mapping[str, Number],
+    *,
+    share: Number = 1.0,
+    reasons: Mapping[str, str] | None = None,
+    beyond: Sequence[str] = (),
+    at_once: Sequence[str] = (),
+) -> tuple[ParameterChange, ...]:
+    """What changes between two sets of parameters once both are stored by the firmware.
+
+    **Arguments:**
+
+    - `firmware`: "betaflight", "px4", "ardupilot" or "crazyflie".
+    - `old`: what flew, by name; `new`: what is wanted. Names that are in `old` alone stay.
+    - `share`: how much of the way to go, above 0 and at most 1: 1/3 for a first flight.
+    - `reasons`: by name.
+    - `beyond`: names that may lie beyond their documented range.
+    - `at_once`: names that go all of the way at any share, such as a notch that is switched on.
+
+    **Returns:**
+
+    The changes, in the order of the firmware's table; without those that rounding undoes.
+
+    **Raises:**
+
+    - `ValueError`: a name is unknown or not in `old`, or a value is beyond its documented range.
+    """
+    if not 0 < share <= 1:
+        raise ValueError(f"share is {share}: give the part of the way, above 0 and at most 1.")
+    unknown = [name for name in new if name not in old]
+    if unknown:
+        raise ValueError(
+            f"{', '.join(unknown)} would change, but what flew is not known: give it in `old`, so "
+            "that the change can be reverted."
+        )
+    part = lambda name: 1.0 if name in at_once else share
+    wanted = {name: old[name] + part(name) * (value - old[name]) for name, value in new.items()}
+    stored = store_parameters(firmware, wanted)
+    outside = {name: value for name, value in stored.items() if name not in beyond}
+    if said := check_ranges(firmware, outside):
+        raise ValueError(f"{' '.join(said)} Allow it with beyond=, or change it.")
+    before = store_parameters(firmware, {name: old[name] for name in new})
+    why = reasons or {}
+    names = [name for name in PARAMETERS[firmware] if stored.get(name) != before.get(name)]
+    return tuple(
+        ParameterChange(
+            find_parameter(firmware, name), before[name], stored[name], why.get(name, "")
+        )
+        for name in names
+    )
+
+
+def parameter_file(
+    firmware: Firmware,
+    changes: Sequence[ParameterChange],
+    *,
+    revert: bool = False,
+    version: tuple[int, ...] = (2025, 12),
+    profile: int | None = 0,
+    raised: Sequence[str] = ("roll", "pitch", "yaw"),
+    title: str = "",
+    words: Sequence[WordChange] = (),
+) -> str:
+    """The text to load: Betaflight's CLI, PX4's .params, ArduPilot's .param, Crazyflie's YAML.
+
+    **Arguments:**
+
+    - `changes`: of `propose_changes`.
+    - `revert`: whether to write the old values, to go back to what flew.
+    - `version`: of Betaflight, whose names differ: until 4.5 d is d_min, and the maximum d.
+    - `raised`: of Betaflight until 4.5, the axes on which d_min is in use; on others d is d.
+    - `profile`: of Betaflight, the PID profile that is changed; None is the one in use.
+    - `title`: comment; its lines begin the file.
+    - `words`: of Betaflight, what changes beside numbers; set last.
+
+    **Returns:**
+
+    The text, with the other value of each parameter in a comment where the format allows it.
+
+    **Raises:**
+
+    - `ValueError`: a parameter does not exist in this version of Betaflight, or another firmware
+        is to change words.
+    """
+    if words and firmware != "betaflight":
+        raise ValueError(f"{words[0].name} is a word, and {firmware} stores numbers alone.")
+    values = [(x.parameter, *((x.old, x.new) if revert else (x.new, x.old))) for x in changes]
+    if firmware == "betaflight":
+        names = _betaflight_names([row.name for row, *_ in values], version, raised)
+        pairs = [(x.name, *((x.old, x.new) if revert else (x.new, x.old))) for x in words]
+        return _betaflight(values, names, version, profile, title, pairs)
+    return _FORMATS[firmware](values, title)
+
+
+Values = Sequence[tuple[Parameter, float, float]]  # parameter, the value to set, the other one
+
+
+def _number(value: Number, whole: bool) -> str:
+    """The shortest text that single precision reads back exactly."""
+    if whole:
+        return str(int(value))
+    return np.format_float_positional(np.float32(value), trim="-")
+
+
+def _px4(values: Values, title: str) -> str:
+    head = [f"# {title}"] if title else []
+    head += ["#", "# Vehicle-Id Component-Id Name Value Type"]
+    rows = []
+    for row, value, other in values:
+        rows.append(f"# {row.name} was {_number(other, row.whole)}")
+        kind = 6 if row.whole else 9  # int32, float
+        rows.append(f"1\t1\t{row.name}\t{_number(value, row.whole)}\t{kind}")
+    return _joined(head + rows)
+
+
+def _ardupilot(values: Values, title: str) -> str:
+    head = [f"# {title}"] if title else []
+    rows = []
+    for row, value, other in values:
+        rows.append(f"# {row.name} was {_number(other, row.whole)}")
+        rows.append(f"{row.name},{_number(value, row.whole)}")
+    return _joined(head + rows)
+
+
+def _crazyflie(values: Values, title: str) -> str:
+    head = [f"# {title}"] if title else []
+    rows = ["params:"]
+    for row, value, _ in values:
+        rows += [
+            f"  {row.name}:",
+            f"    default_value: {_number(row.default, row.whole)}",
+            "    is_stored: true",
+            f"    stored_value: {_number(value, row.whole)}",
+        ]
+    return _joined([*head, *rows, "type: persistent_param_state", "version: '1'"])
+
+
+_FORMATS: Mapping[str, Callable[[Values, str], str]] = {
+    "px4": _px4, "ardupilot": _ardupilot, "crazyflie": _crazyflie,
+}  # fmt: skip
+
+
+def _betaflight(
+    values: Values, names: Sequence[str], version: tuple[int, ...], profile: int | None,
+    title: str, words: Sequence[tuple[str, str, str]],
+) -> str:  # fmt: skip
+    rows = [f"# {line}" for line in title.splitlines()]
+    if profile is None:
+        rows.append("# select the PID profile that flew first: the log does not name it")
+    else:
+        rows.append(f"profile {profile}")
+    if version >= (4, 3) and not all(name.startswith("adrc_") for name in names):
+        # Sliders that stay on would rewrite what is set here.
+        rows.append("set simplified_pids_mode = OFF")
+        for part in ("gyro", "dterm"):
+            if any(row.name.startswith(f"{part}_lpf") for row, *_ in values):
+                rows.append(f"set simplified_{part}_filter = OFF")
+    for name, (row, value, other) in zip(names, values, strict=True):
+        rows += [f"# {name} was {_number(other, row.whole)}"]
+        rows += [f"set {name} = {_number(value, row.whole)}"]
+    for name, word, other in words:
+        rows += [f"# {name} was {other}", f"set {name} = {word}"]
+    return _joined([*rows, "save"])
+
+
+def _betaflight_names(
+    names: Sequence[str], version: tuple[int, ...], raised: Sequence[str]
+) -> list[str]:
+    adrc = [name for name in names if name.startswith("adrc_")]
+    if adrc and version < (2026,):
+        raise ValueError(
+            f"{', '.join(adrc)} exist only in builds of pull request 15400: give their version."
+        )
+    if version >= (2025,):
+        return list(names)
+    older = {f"d_{axis}": f"d_min_{axis}" for axis in raised}
+    older |= {f"d_max_{axis}": f"d_{axis}" for axis in raised}
+    if version < (4, 5):
+        older["angle_p_gain"] = "p_level"
+    if version < (4, 3):
+        for part in ("gyro", "dterm"):
+            older[f"{part}_lpf1_dyn_min_hz"] = f"dyn_lpf_{part}_min_hz"
+            older[f"{part}_lpf1_dyn_max_hz"] = f"dyn_lpf_{part}_max_hz"
+            older[f"{part}_lpf1_static_hz"] = f"{part}_lowpass_hz"
+            older[f"{part}_lpf2_static_hz"] = f"{part}_lowpass2_hz"
+    return [older.get(name, name) for name in names]
+
+
+def _joined(rows: Sequence[str]) -> str:
+    return "\n".join([*rows, ""])
+
+
+def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> str:
+    """The changes as a table in Markdown: old, new, unit, documented range and reason."""
+    rows = ["| parameter | old | new | unit | range | reason |", "|---|---|---|---|---|---|"]
+    for row, old, new, reason in changes:
+        bounds = "none documented" if row.low == -_INF else f"{row.low:g} to {row.high:g}"
+        bounds = f"{row.low:g} or above" if row.high == _INF != -row.low else bounds
+        rows.append(
+            f"| {row.name} | {_number(old, row.whole)} | {_number(new, row.whole)} | {row.unit} | "
+            f"{bounds} | {reason} |"
+        )
+    rows += [f"| {name} | {old} | {new} |  |  | {reason} |" for name, old, new, reason in words]
+    return _joined(rows)
+
+
+_INF = float("inf")
+_SUFFIX = {"betaflight": "txt", "px4": "params", "ardupilot": "param", "crazyflie": "yaml"}
+
+
+class ParameterFiles(NamedTuple):
+    """Where a staged proposal was written.
+
+    **Arguments:**
+
+    - `stages`: a file for each share of the way, the smallest first.
+    - `revert`: back to what flew, from any of them.
+    - `table`: old, new, unit, range and reason, for each stage.
+    """
+
+    stages: tuple[Path, ...]
+    revert: Path
+    table: Path
+
+
+def write_parameter_files(
+    folder: str | Path,
+    firmware: Firmware,
+    old: Mapping[str, Number],
+    new: Mapping[str, Number],
+    *,
+    stem: str = "proposal",
+    shares: Sequence[Number] = (1 / 3, 1.0),
+    reasons: Mapping[str, str] | None = None,
+    beyond: Sequence[str] = (),
+    at_once: Sequence[str] = (),
+    version: tuple[int, ...] = (2025, 12),
+    profile: int | None = 0,
+) -> ParameterFiles:
+    """Write a staged proposal, a file that reverts it, and a table of what changes.
+
+    **Arguments:**
+
+    - `folder`: is made where it is missing.
+    - `stem`: begins the files' names; the share in percent follows.
+    - `shares`: of the way, each in a file of its own.
+    - the others: as in `propose_changes` and `parameter_file`.
+
+    **Returns:** the `ParameterFiles`.
+
+    **Raises:**
+
+    - `ValueError`: as in `propose_changes` and `parameter_file`, or nothing changes.
+    """
+    folder, suffix = Path(folder), _SUFFIX[firmware]
+    raised = [x for x in AXES if old.get(f"d_max_{x}", 0.0) > old.get(f"d_{x}", 0.0)]
+    text = lambda changes, title, back=False: parameter_file(
+        firmware, changes, revert=back, version=version, profile=profile, raised=raised, title=title
+    )
+    stages, table, whole = [], [], ()
+    for share in sorted(shares):
+        whole = propose_changes(
+            firmware, old, new, share=share, beyond=beyond, at_once=at_once,
+            reasons=reasons if share >= 1 else {x: f"on the way to {new[x]:.5g}" for x in new},
+        )  # fmt: skip
+        percent = round(100 * share)
+        title = f"{percent} % of the way from what flew to the proposal"
+        stages.append((folder / f"{stem}_{percent:03d}.{suffix}", text(whole, title)))
+        table.append(f"## {title}\n\n{change_table(whole)}")
+    if not whole:
+        raise ValueError(
+            "Nothing changes: what is proposed is stored as the values that flew. Propose more, or "
+            "leave the files out."
+        )
+    back = write_file(folder / f"{stem}_revert.{suffix}", text(whole, "what flew", True))
+    written = tuple(write_file(path, content) for path, content in stages)
+    return ParameterFiles(written, back, write_file(folder / f"{stem}.md", "\n".join(table)))

@@ -1,0 +1,231 @@
+"""What the log of an autopilot says of the loop around a plant: the gyro's filters, and the law."""
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jaxquad._core import announce
+from jaxquad.identify import KnownFilter, measured_chain, MeasuredChain
+from jaxquad.records import AXES, Mix, Proposal, propose
+from jaxquad.report import reason_of
+
+from ._identified import RecordSettings
+
+
+if TYPE_CHECKING:
+    from ._filters import FilterChain
+    from ._flight_channels import FlightChannels
+    from ._rate_gains import RateLaw
+
+Frequencies = Float[np.ndarray, " frequencies"]
+_RATES = (
+    re.compile(r"(?:.*\.)?gyroADC\[([012])\]"),
+    re.compile(r"RATE\.([RPY])"),
+    re.compile(r"vehicle_angular_velocity\.xyz\[([012])\]"),
+)  # that are behind the filters of a gyro
+_AXES = {"0": 0, "1": 1, "2": 2, "R": 0, "P": 1, "Y": 2}
+_CUTOFFS = {  # of which a log that tells its gyro's filters holds one
+    "betaflight": ("gyro_lpf1_static_hz", "gyro_lowpass_hz"),
+    "px4": ("IMU_GYRO_CUTOFF",),
+    "ardupilot": ("INS_GYRO_FILTER",),
+}
+_SHOWN = 10.0  # Hz, of the delay in print
+_SAME = 1e-3  # of the response of filters, by which those of several logs may differ
+_AT = np.array([3.0, 10.0, 30.0])  # Hz
+
+
+@dataclasses.dataclass(frozen=True)
+class FlownLaw:
+    """The filters of the gyro and the rate loop of a log, by its parameters.
+
+    **Attributes:**
+
+    - `filters`: of the gyro, in front of the logged rate; none where all are off or unknown.
+    - `chains`: those that the parameters describe.
+    - `text`: what is divided out, or why nothing is.
+    - `law`: the rate loop from the identified output to the identified input; None where the log
+      does not tell it.
+    - `axis`: 0, 1 or 2.
+    - `unmodelled`: what of the firmware the law leaves out.
+    """
+
+    filters: tuple[KnownFilter, ...]
+    text: str
+    law: "RateLaw | None" = None
+    axis: int = 0
+    unmodelled: tuple[str, ...] = ()
+    chains: "tuple[FilterChain, ...]" = ()
+
+    def content(self) -> dict[str, object]:
+        """For `result.json`; `StoredFilters.of` reads the filters."""
+        measured = [each for each in self.filters if isinstance(each, MeasuredChain)]
+        chains = [
+            {"rate_hz": x.rate_hz, "sections": [_numbers(each) for each in x.sections()]}
+            for x in self.chains
+        ]
+        correction = [{"delay_s": each.delay, "lag_s": each.lag} for each in measured]
+        return {"text": self.text, "chains": chains, "correction": (*correction, {})[0]}
+
+
+def _numbers(section: Sequence[object]) -> list[float]:
+    return [0.0 if x is None else float(np.ravel(np.asarray(x))[0]) for x in section]
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredFilters:
+    """Filters of a stored result: difference equations, behind them a delay and a lag in s."""
+
+    chains: tuple[tuple[float, tuple[tuple[float, ...], ...]], ...]
+    delay: float = 0.0
+    lag: float = 0.0
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> "StoredFilters":
+        """From what `FlownLaw.content` has stored. Raises ValueError for anything else."""
+        try:
+            chains = tuple(
+                (float(x["rate_hz"]), tuple(tuple(map(float, each)) for each in x["sections"]))
+                for x in content["chains"]
+            )
+            correction = content["correction"]
+            ends = (float(correction.get(key, 0.0)) for key in ("delay_s", "lag_s"))
+            return cls(chains, *ends)
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"the result's gyro filters are incomplete ({error}): identify again"
+            ) from error
+
+    def response(self, frequency_hz: Frequencies) -> Complex[np.ndarray, " frequencies"]:
+        """At frequencies in Hz."""
+        hertz = np.asarray(frequency_hz, float)
+        turn = 2j * np.pi * hertz
+        passed = np.exp(-turn * self.delay) / (1 + turn * self.lag)
+        for rate, sections in self.chains:
+            back = np.exp(-turn / rate)
+            for b0, b1, a1, b2, a2 in sections:
+                passed = passed * (b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2))
+        return passed
+
+
+def flown_law(
+    paths: Sequence[Path], output: Mix, command: Mix, proposal: Proposal | None,
+    settings: RecordSettings,
+) -> FlownLaw | None:  # fmt: skip
+    """Of the rate that is identified; None where that is no logged rate of a known autopilot.
+
+    `output` and `command` are the channels that are identified.
+
+    What a log does not tell costs nothing but itself: `text` says why.
+    """
+    [channels] = output.values() or [{}]
+    matches = [each.fullmatch(name) for name in channels for each in _RATES]
+    axes = [_AXES[each[1]] for each in matches if each]
+    if len(channels) != 1 or not axes:
+        return None
+    [rate], axis = channels, axes[0]
+    announce("the gyro's filters")
+    try:
+        laws = [
+            _law_of(path, rate, axis, command, proposal if path == paths[0] else None, settings)
+            for path in paths
+        ]
+    except Exception as error:
+        return FlownLaw((), f"the gyro's filters are in the model: {reason_of(error)}")
+    first, *others = laws
+    if first is None or any(_differs(first, each) for each in others):
+        text = "the gyro's filters are in the model: those of the logs differ"
+        return None if first is None else FlownLaw((), text)
+    return first
+
+
+def _differs(one: FlownLaw, other: FlownLaw | None) -> bool:
+    if other is None:
+        return True
+    both = [np.prod([x.response(_AT) for x in each.filters], axis=0) for each in (one, other)]
+    return bool(np.max(np.abs(np.asarray(both[0]) / np.asarray(both[1]) - 1)) > _SAME)
+
+
+def _law_of(
+    path: Path, rate: str, axis: int, command: Mix, proposal: Proposal | None,
+    settings: RecordSettings,
+) -> FlownLaw | None:  # fmt: skip
+    if proposal is None:
+        try:
+            proposal = propose(path, axis=AXES[axis])
+        except ValueError:  # a table whose channels have these names
+            return None
+    if proposal.setup.rate != rate or proposal.vehicle not in _CUTOFFS:
+        return None
+    return _read_law(path, axis, command, proposal, settings)
+
+
+def _read_law(
+    path: Path, axis: int, command: Mix, proposal: Proposal, settings: RecordSettings
+) -> FlownLaw:
+    from ._choices import flown_loop
+    from ._flight_channels import HOVER, read_channels_if_any
+    from ._flown_adrc import flies_adrc
+    from ._flown_autopilot import settings_of
+    from ._rate_gains import gyro_chains
+
+    logged = settings_of(path, proposal)
+    if not any(name in logged.values for name in _CUTOFFS[proposal.vehicle]):
+        names = " or ".join(_CUTOFFS[proposal.vehicle])
+        return FlownLaw((), f"the gyro's filters are in the model: the log does not hold {names}")
+    flight = read_channels_if_any(path, proposal, settings, logged.values)
+    middle = None if flight is None else flight.middle
+    tracked = {} if flight is None else flight.tracked_hz
+    loop = flown_loop(
+        proposal.vehicle, logged.values, logged.version,  # pyright: ignore[reportArgumentType]
+        throttle=HOVER if middle is None else middle, tracked_hz=tracked,
+    )  # fmt: skip
+    chains = tuple(each for each in gyro_chains(loop.law) if each.filters)
+    filters, text = best_filters(chains, loop.unmodelled, flight, axis)
+    adrc = proposal.vehicle == "betaflight" and flies_adrc(logged.values)
+    [channels] = command.values()
+    law = loop.law if not adrc and channels == dict(proposal.setup.command) else None
+    return FlownLaw(filters, text, law, axis, tuple(loop.unmodelled), chains)
+
+
+def best_filters(
+    chains: "tuple[FilterChain, ...]",
+    unmodelled: Sequence[str],
+    flight: "FlightChannels | None",
+    axis: int,
+) -> tuple[tuple[KnownFilter, ...], str]:
+    """As measured where notches follow motors or spectrum, else those of the parameters."""
+    hidden = [each for each in unmodelled if "notch" in each and "D term" not in each]
+    missing = "" if not hidden else f" (not {'; '.join(each.partition(':')[0] for each in hidden)})"
+    if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
+        measured = _measured(chains, flight, axis)
+        if isinstance(measured, MeasuredChain):
+            return (measured,), f"the gyro's filters are divided out, {measured.description}"
+        missing = f"{missing[:-1]}, which could not be measured: {measured})"
+    if not chains:
+        return (), f"the gyro has no filter that is known{missing}"
+    words = ", ".join(each.in_words() for chain in chains for each in chain.filters)
+    late = sum(float(chain.delay_ms([_SHOWN])[0]) for chain in chains)
+    text = f"the gyro's filters, {words}{missing}, are divided out: {late:.2g} ms at {_SHOWN:g} Hz"
+    return chains, text
+
+
+def _measured(
+    chains: "tuple[FilterChain, ...]", flight: "FlightChannels", axis: int
+) -> MeasuredChain | str:
+    """The reason where the log does not show it."""
+    unfiltered, filtered = flight.unfiltered[axis], flight.rates[axis]
+    if len(unfiltered) != len(filtered):
+        return "both rates have other instants"
+    moves = np.ptp(flight.setpoint) > 0
+    try:
+        return measured_chain(
+            unfiltered, filtered, flight.dt, known=chains, names=(flight.names[1], flight.names[0]),
+            reference=flight.setpoint if moves else None,
+        )  # fmt: skip
+    except ValueError as error:
+        return str(error)

@@ -1,0 +1,268 @@
+"""What the loops of all firmwares share: state, linear form, and the filters of the gyro."""
+
+import abc
+from collections.abc import Mapping
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from jaxquad._core import (
+    broadcast_gain,
+    ensemble_shape,
+    is_concrete,
+    match_reference,
+    pick_gain,
+    require_common_shape,
+    require_finite,
+    require_nonnegative,
+    require_sample_interval,
+    signal_shape,
+)
+from jaxquad.control import LinearController, Member, Reference, Setpoint, Transform
+
+from ._filters import FilterChain, Memory, rest_of, run_between, Section
+
+
+DEGREES = 180 / np.pi  # per radian
+Signal = Float[Array, " axes *ensemble"]
+Terms = Mapping[str, Signal]
+
+
+class LoopState(NamedTuple):
+    """What the loop of a firmware remembers from the last sample."""
+
+    memory: Mapping[str, PyTree]  # filters, integrals, last samples
+    command: Signal  # in the firmware's unit
+    excess: Signal  # of it beyond what the drive gave
+    terms: Terms  # P, I, D and F of the last sample, in units of the command
+
+
+class FirmwareLoop(eqx.Module):
+    """A control law of a firmware, one `step` per sample. Its linear form is its exact derivative.
+
+    Subclasses are final: they say what the law remembers at rest, and how it advances.
+    """
+
+    @abc.abstractmethod
+    def interval(self) -> float:
+        """The interval of its samples in s."""
+
+    @abc.abstractmethod
+    def rest(self, zero: Signal) -> dict[str, PyTree]:
+        """What the law remembers at rest, for signals like `zero`."""
+
+    @abc.abstractmethod
+    def advance(
+        self,
+        memory: Mapping[str, PyTree],
+        excess: Signal,
+        reference: Reference,
+        measurement: Signal,
+    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        """Memory, command and its terms, one sample later."""
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the gains, () for one controller."""
+        return ensemble_shape(self)
+
+    def init(self, like: Signal) -> LoopState:
+        """At rest; shaped as the measurement `like` and the ensemble of the gains."""
+        zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
+        terms = {name: zero for name in "PIDF"}
+        return LoopState(self.rest(zero), zero, zero, terms)
+
+    def step(
+        self, state: LoopState, reference: Reference, measurement: Signal
+    ) -> tuple[LoopState, Signal]:
+        """One sample: the command to hold until the next one, in the firmware's unit."""
+        reference = match_reference(reference, measurement, state.command)
+        memory, command, terms = self.advance(state.memory, state.excess, reference, measurement)
+        return LoopState(memory, command, jnp.zeros_like(command), terms), command
+
+    def applied(self, state: LoopState, achieved: Signal) -> LoopState:
+        """The state with what the drive really gave: what a firmware learns from its mixer."""
+        return state._replace(excess=state.command - achieved)
+
+    def signals(self, state: LoopState) -> dict[str, Array]:
+        """The terms "P", "I", "D" and "F" of the command, in its unit, as a log has them."""
+        return dict(state.terms)
+
+    def linear(self, axis: int = 0, member: Member = None) -> LinearController:
+        """One axis for small signals: the law's derivative at rest; `member` picks one member."""
+        return _derivative(pick_axis(self, axis, member))
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The gains of P, I and D that are not 0."""
+        return dict.fromkeys(name for name, gain in self.gains().items() if _all_set(gain))
+
+    @abc.abstractmethod
+    def gains(self) -> dict[str, Array]:
+        """What `tunable` names unless it is 0."""
+
+
+class AngleLoop(FirmwareLoop):
+    """An angle loop of a firmware around its rate loop: angles in rad in.
+
+    The rate that the inner loop sees is the difference of the measured angles over a sample.
+    Subclasses are final: they say what rate they ask for.
+    """
+
+    rate: eqx.AbstractVar[FirmwareLoop]
+
+    @property
+    def dt(self) -> float:
+        return self.rate.interval()
+
+    def interval(self) -> float:
+        return self.dt
+
+    def gains(self) -> dict[str, Array]:
+        return self.outer_gains() | {f"rate.{name}": x for name, x in self.rate.gains().items()}
+
+    def rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {"rate": self.inner().rest(zero), "angle": zero, **self.outer_rest(zero)}
+
+    def advance(
+        self,
+        memory: Mapping[str, PyTree],
+        excess: Signal,
+        reference: Reference,
+        measurement: Signal,
+    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        rate = (measurement - memory["angle"]) / self.dt
+        outer, wanted = self.wanted_rate(memory, reference, measurement, rate)
+        inner, command, terms = self.inner().advance(memory["rate"], excess, wanted, rate)
+        return {"rate": inner, "angle": measurement, **outer}, command, terms
+
+    @abc.abstractmethod
+    def outer_gains(self) -> dict[str, Array]:
+        """The gains of the angle alone."""
+
+    @abc.abstractmethod
+    def inner(self) -> FirmwareLoop:
+        """The rate loop as it is inside this one."""
+
+    @abc.abstractmethod
+    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
+        """What the angle loop remembers at rest besides the last angle."""
+
+    @abc.abstractmethod
+    def wanted_rate(
+        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        """What the angle loop remembers, and the set-point of the rate in rad/s."""
+
+
+Law = TypeVar("Law", bound=eqx.Module)
+
+
+def pick_axis(law: Law, axis: int, member: Member = None) -> Law:
+    """The law of one axis of one member, all of its numbers scalars."""
+    return jax.tree.map(lambda gain: pick_gain(gain, axis, member), law)
+
+
+@eqx.filter_jit
+def _derivative(law: FirmwareLoop) -> LinearController:
+    zero = jnp.zeros((1,), jax.tree.leaves(law)[0].dtype)
+    rest, unravel = ravel_pytree(law.rest(zero))
+    states = len(rest)
+
+    def advance(x: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        memory, command, _ = law.advance(unravel(x[:-2]), zero, x[-2:-1], x[-1:])
+        return jnp.concatenate([ravel_pytree(memory)[0], command])
+
+    slopes = jax.jacfwd(advance)(jnp.zeros(states + 2, zero.dtype))
+    return LinearController(
+        A=slopes[:states, :states],
+        reference_in=slopes[:states, states],
+        measurement_in=slopes[:states, states + 1],
+        C=slopes[states, :states],
+        reference_through=slopes[states, states],
+        measurement_through=slopes[states, states + 1],
+        dt=law.interval(),
+    )
+
+
+def _all_set(gain: Array) -> bool:
+    return bool(np.all(np.asarray(gain) != 0))
+
+
+def require_gains(dt: float, gains: Mapping[str, Array], limits: Mapping[str, Array]) -> None:
+    """Raises ValueError for gains that are not finite, limits below 0, shapes that do not fit."""
+    require_sample_interval(dt)
+    for name, gain in gains.items():
+        require_finite(name, gain)
+    for name, limit in limits.items():
+        if is_concrete(limit):
+            require_nonnegative(name, np.where(np.isinf(limit), 0.0, limit))
+    require_common_shape({**gains, **limits})
+
+
+def require_gyro_rate(chain: FilterChain, dt: float) -> None:
+    """Raises ValueError for filters whose rate is no multiple of the loop's."""
+    if chain.filters:
+        samples_between(chain, dt)
+
+
+def samples_between(chain: FilterChain, dt: float) -> int:
+    """How many samples of the gyro there are in `dt` seconds. Raises ValueError for a part."""
+    count = chain.rate_hz * dt
+    if not (count > 0.5 and abs(count - round(count)) < 1e-3):
+        raise ValueError(
+            f"the gyro's filters run at {chain.rate_hz:g} Hz, which is {count:.4g} samples in "
+            f"dt = {dt:g} s: give FilterChain a rate_hz that is a whole number of times "
+            f"{1 / dt:g} Hz."
+        )
+    return round(count)
+
+
+def filter_gyro(
+    chain: FilterChain, dt: float, memory: Mapping[str, PyTree], rate: Signal, *more: Section
+) -> tuple[dict[str, PyTree], tuple[Signal, Signal]]:
+    """The filtered rate at this sample, and it through the sections `more` at the gyro's rate.
+
+    Between two samples of the loop the rate is taken as straight.
+    """
+    groups = chain.sections(), more
+    count = samples_between(chain, dt) if chain.filters or more else 1
+    memories, (smooth, further) = run_between(
+        groups, (memory["gyro"], memory["derivative"]), memory["rate"], rate, count
+    )
+    return {"gyro": memories[0], "derivative": memories[1], "rate": rate}, (smooth, further)
+
+
+def gyro_rest(chain: FilterChain, zero: Signal, *more: Section) -> dict[str, PyTree]:
+    """What `filter_gyro` remembers at rest."""
+    derivative: Memory = rest_of(more, zero)
+    return {"gyro": chain.init(zero), "derivative": derivative, "rate": zero}
+
+
+def split_reference(reference: Reference, before: Signal, dt: float) -> tuple[Signal, Signal]:
+    """The reference and its rate of change: a set-point's own, else the last difference."""
+    if isinstance(reference, Setpoint):
+        return reference.angle, reference.rate
+    return reference, (reference - before) / dt
+
+
+def sum_of(terms: Terms) -> Signal:
+    """P + I + D + F."""
+    return terms["P"] + terms["I"] + terms["D"] + terms["F"]
+
+
+def bounded(value: Signal, limit: Array) -> Signal:
+    """`value` within +-`limit`."""
+    most = broadcast_gain(limit, value)
+    return jnp.clip(value, -most, most)
+
+
+def low_pass_share(cutoff_hz: Array, dt: float, like: Signal) -> Array:
+    """k of x += k (u - x), 1 for a cutoff of 0: the alpha of PX4 and ArduPilot."""
+    on = cutoff_hz > 0
+    w = 2 * np.pi * dt * jnp.where(on, cutoff_hz, 1.0)
+    return broadcast_gain(jnp.where(on, w / (w + 1), 1.0), like)

@@ -1,0 +1,294 @@
+"""Over which throttles gains hold: the gain over the throttle of a log, and the thrust curve."""
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from jaxquad._core import announce
+from jaxquad.identify import (
+    actuator,
+    curve_of_parameter,
+    CurveFirmware,
+    FirmwareValue,
+    gain_over_throttle,
+    GainOverThrottle,
+    KnownFilter,
+    throttle_levels,
+    ThrottleLevels,
+    UndeterminedError,
+)
+from jaxquad.records import Proposal, Record, RecordWarning
+
+from ._files import ParameterChange, propose_changes
+from ._flown_autopilot import FlownAutopilot
+from ._identified import IdentifiedPlant
+from ._parameters import find_parameter, Firmware
+from ._plants import PlantSource
+
+
+_PARAMETERS: Mapping[Firmware, str] = {
+    "betaflight": "thrust_linear", "px4": "THR_MDL_FAC", "ardupilot": "MOT_THST_EXPO",
+}  # fmt: skip
+_KINDS: Mapping[Firmware, CurveFirmware] = {
+    "betaflight": "betaflight", "px4": "px4", "ardupilot": "ardupilot",
+}  # fmt: skip
+_SAME_SHAPE = (2026, 6)  # of Betaflight, from which on thrust_linear is of the others' family
+ReadBeside = Callable[[Mapping[str, Mapping[str, float]]], Sequence[Record]]
+_DRAWN, _SEED = 1000, 5  # of the ratio of gains
+_VAGUE = 0.4  # half of the relative 95 % interval of a gain from which plants are not drawn
+
+
+@dataclasses.dataclass(frozen=True)
+class CurveVerdict:
+    """The thrust curve's parameter: what flew, and what the log shows.
+
+    **Attributes:**
+
+    - `name`: of the firmware's parameter.
+    - `flown`: its value, or None where the log does not hold it.
+    - `found`: with its 95 % interval; None where the log holds too little of the curve.
+    - `change`: what its own files hold; None where what flew is as good, or is not known.
+    - `text`: all of it in words.
+    """
+
+    name: str
+    flown: float | None
+    found: FirmwareValue | None
+    change: ParameterChange | None
+    text: str
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        found = self.found
+        return {
+            "parameter": self.name,
+            "flown": self.flown,
+            "value": None if found is None else found.value,
+            "standard_error": None if found is None else found.standard_error,
+            "interval_95": None if found is None else list(found.interval),
+            "proposed": self.change is not None,
+            "text": self.text,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class ThrottleVerdict:
+    """At which throttles the gains of a proposal hold.
+
+    **Attributes:**
+
+    - `text`: in words.
+    - `gains`: over the throttle, where the log holds several levels of it: plants are drawn from
+      these.
+    - `span`: the lowest and the highest throttle of the levels.
+    - `logged`: the throttles at which gains are certified, as the log has them.
+    - `ratio`: the gain at the highest over that at the lowest, with its 95 % interval.
+    - `curve`: of thrust.
+    """
+
+    text: str
+    gains: GainOverThrottle | None = None
+    span: tuple[float, float] = (0.0, 1.0)
+    logged: tuple[float, ...] = ()
+    ratio: tuple[float, float, float] | None = None
+    curve: CurveVerdict | None = None
+
+    @property
+    def certified(self) -> tuple[float, ...]:
+        """The throttles at which gains are certified; empty without a gain over the throttle."""
+        low, high = self.span
+        return () if self.gains is None else (low, (low + high) / 2, high)
+
+    def plants(
+        self, found: IdentifiedPlant, measured: Sequence[KnownFilter] | None = None
+    ) -> PlantSource:
+        """What plants are drawn from, behind the gyro's filters as `measured`."""
+        unit = found.records[0].output_units[0]
+        return PlantSource(found.fit, unit, self.gains, self.span, measured)
+
+    @property
+    def table(self) -> str:
+        """The gain over the throttle, without other firmwares' parameters."""
+        names = tuple(_PARAMETERS.values())
+        return "\n".join(x for x in str(self.gains).splitlines() if not x.startswith(names))
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        return {
+            "text": self.text,
+            "certified_at": list(self.logged),
+            "ratio_of_gains": None if self.ratio is None else list(self.ratio),
+            "gain_over_throttle": None if self.gains is None else self.gains.to_dict(),
+            "thrust_curve": None if self.curve is None else self.curve.content(),
+        }
+
+
+def study_throttle(
+    found: IdentifiedPlant, proposal: Proposal, flown: FlownAutopilot, read: ReadBeside
+) -> ThrottleVerdict:
+    """The gain over the throttle, where the log holds at least two levels of it.
+
+    `read` gives the identified records with further inputs.
+    """
+    if not proposal.setup.throttle:
+        return ThrottleVerdict(
+            "it is not in the log, so the gains hold near what was flown: log it, and fly two or "
+            "three levels between 0.2 and 0.8 for gains that hold at each of them"
+        )
+    parameter = _flown_parameter(flown)
+    try:
+        records = _read(read, proposal, flown, parameter)
+        levels = throttle_levels(records)
+    except ValueError as error:  # of reading, too
+        return ThrottleVerdict(f"gains hold for the throttles of the log taken together: {error}")
+    shown = lambda x: _as_logged(flown, float(x), parameter.curve)
+    if levels.throttle.size == 1:
+        return ThrottleVerdict(
+            f"gains hold near throttle {shown(levels.throttle[0]):.2f}, the only level of the log: "
+            f"{levels.what_to_fly()}, for gains that hold over the throttle"
+        )
+    announce("the gain over the throttle")
+    try:
+        gains = gain_over_throttle(
+            records, filters=flown.filters, flown_curve=parameter.curve,
+            band=_band(found, levels),
+        )  # fmt: skip
+        span = float(gains.low.min()), float(gains.high.max())
+        ratio = _ratio(gains, span)
+    except (UndeterminedError, ValueError) as error:
+        return ThrottleVerdict(
+            f"gains hold for the throttles of the log taken together, not for each: {error}"
+        )
+    ends = [shown(x) for x in span]
+    text = _in_words(gains, ends, ratio)
+    if flown.firmware == "betaflight" and parameter.curve:
+        text += ". Below, throttle is the thrust that the firmware makes of it, 0 to 1"
+    return ThrottleVerdict(
+        text, gains, span,
+        (ends[0], shown(sum(span) / 2), ends[1]), ratio, _curve_verdict(gains, flown, parameter),
+    )  # fmt: skip
+
+
+def _band(found: IdentifiedPlant, levels: ThrottleLevels) -> tuple[float, float] | None:
+    """In rad/s, where one is known; from 3 cycles of the shortest level, at least 1.5 Hz."""
+    if found.settings.band is None:
+        return None
+    low, high = found.settings.band
+    low = max(low, 1.5, 3 / float(levels.seconds.min()))
+    return (2 * np.pi * low, 2 * np.pi * min(high, 45.0)) if low < high else None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Parameter:
+    """The thrust curve's parameter as it flew."""
+
+    name: str
+    kind: CurveFirmware
+    value: float | None  # None where the log does not hold it
+    curve: float
+
+
+def _flown_parameter(flown: FlownAutopilot) -> _Parameter:
+    name = _PARAMETERS[flown.firmware]
+    cubic = flown.firmware == "betaflight" and flown.version < _SAME_SHAPE
+    kind = "betaflight 2025.12" if cubic else _KINDS[flown.firmware]
+    logged = float(flown.values[name]) if name in flown.values else None
+    assumed = find_parameter(flown.firmware, name).default if logged is None else logged
+    return _Parameter(name, kind, logged, curve_of_parameter(kind, assumed))
+
+
+def _read(
+    read: ReadBeside, proposal: Proposal, flown: FlownAutopilot, parameter: _Parameter
+) -> list[Record]:
+    """The records that were identified, with the thrust that the throttle asks for beside them.
+
+    Betaflight asks for less where it inverts a curve, so that the motors get the throttle itself.
+    """
+    [(channel, factor)] = proposal.setup.throttle.items()
+    mix = {channel: factor}
+    if flown.firmware == "betaflight" and parameter.curve:
+        f = parameter.curve
+        mix = {channel: (1 - f) * factor, f"{channel}^2": f * factor**2}
+    with warnings.catch_warnings():  # identification has said what there is; the throttle is slow
+        warnings.simplefilter("ignore", RecordWarning)
+        return list(read({"throttle": mix}))
+
+
+def _as_logged(flown: FlownAutopilot, thrust: float, curve: float) -> float:
+    """The throttle in the log that asks for a thrust."""
+    return float(actuator(thrust, curve)) if flown.firmware == "betaflight" else float(thrust)
+
+
+def _ratio(gains: GainOverThrottle, span: tuple[float, float]) -> tuple[float, float, float]:
+    """Of the gain at the highest throttle to that at the lowest, with its 95 % interval."""
+    ends = gains.over(np.array(span))
+    reach = float(np.max((ends.high - ends.low) / 2 / np.abs(ends.value)))
+    if reach > _VAGUE:
+        raise ValueError(
+            f"it shows the gain at the ends of {span[0]:.2f} .. {span[1]:.2f} within +- "
+            f"{100 * reach:.0f} % (95 %). Excite more or longer at each"
+        )
+    low, high = ends.value
+    drawn = gains.draw(np.array(span), _DRAWN, seed=_SEED).gain
+    least, most = np.percentile(drawn[1] / drawn[0], [2.5, 97.5])
+    return float(high / low), float(least), float(most)
+
+
+def _in_words(gains: GainOverThrottle, span: list[float], ratio: tuple[float, float, float]) -> str:
+    value, low, high = ratio
+    return (
+        f"gains hold from throttle {span[0]:.2f} to {span[1]:.2f}, of which the log has "
+        f"{gains.throttle.size} levels: plants are drawn over all of it, and certified at both "
+        f"ends and between. The gain at the highest is {value:.2f} times that at the lowest "
+        f"(95 %: {low:.2f} .. {high:.2f})"
+    )
+
+
+def _curve_verdict(
+    gains: GainOverThrottle, flown: FlownAutopilot, parameter: _Parameter
+) -> CurveVerdict:
+    name, value = parameter.name, parameter.value
+    verdict = lambda text, found=None, change=None: CurveVerdict(name, value, found, change, text)
+    try:
+        found = gains.firmware_value(parameter.kind)
+    except UndeterminedError as error:
+        return verdict(str(error))
+    low, high = found.interval
+    shows = f"the log shows {found.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
+    if value is None:
+        return verdict(f"{name}: {shows}, not what flew, so that no file has it", found)
+    if low <= value <= high:
+        return verdict(f"{name} {value:g} flew, and {shows}: it is kept", found)
+    reason = f"proposal of its own: 95 % {low:.3g} .. {high:.3g}; all loops change with it"
+    changes = propose_changes(
+        flown.firmware, {name: value}, {name: round(found.value, 3)}, reasons={name: reason}
+    )
+    if not changes:
+        return verdict(f"{name} {value:g} flew, and {shows}, stored as the same", found)
+    text = (
+        f"{name} {value:g} flew, but {shows}. It is a proposal in files of its own, apart from "
+        f"the gains, which hold with the curve that flew: {_consequences(gains, flown)}. Load it "
+        "alone, fly, and tune the gains on that log"
+    )
+    return verdict(text, found, changes[0])
+
+
+def _consequences(gains: GainOverThrottle, flown: FlownAutopilot) -> str:
+    """Of inverting the curve: one gain at every throttle, and another throttle at hover."""
+    straight, curve = gains.straight_gain, gains.curve
+    if straight is None or curve is None:
+        raise UndeterminedError(gains.what_to_fly())
+    middle = float(np.median(gains.throttle))
+    times = straight.value / float(gains.over(np.array([middle])).value[0])
+    at = _as_logged(flown, middle, gains.flown)
+    moved = (
+        f"with it the gain of all axes is the same at every throttle, {times:.2f} times that at "
+        f"{at:.2f}"
+    )
+    if flown.firmware == "betaflight":
+        return moved
+    x = float(actuator(middle, gains.flown))
+    hover = curve.value * x**2 + (1 - curve.value) * x
+    return f"{moved}, and what throttle {middle:.2f} lifts then takes {hover:.2f}"

@@ -1,0 +1,344 @@
+"""The page of a proposal for an autopilot, from what `autopilot` found."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TYPE_CHECKING, TypeVar
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jaxquad._core import Number
+from jaxquad.plot import FlownAgain, Spectrum, StepBand
+from jaxquad.records import AXES
+from jaxquad.report import Cell, Headline, Provenance, reason_of, Table
+
+from ._ardupilot import ArduPilotRate
+from ._betaflight import BetaflightPID
+from ._files import ParameterChange, WordChange
+from ._filters import FilterChain, PT1
+from ._flight_channels import FlightChannels
+from ._gyro_noise import gyro_noise, GyroNoise
+from ._limits import limits_text
+from ._page import PilotPage
+from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, RateLaw
+from ._stages import margin_text, Stage
+
+
+if TYPE_CHECKING:
+    from ._proposal import AutopilotProposal
+
+Chains = dict[str, tuple[FilterChain, ...]]
+_PLANTS, _SEED = 100, 77  # of the steps' bands
+_PERIOD, _SHOWN, _FINEST = 8.0, 1.2, 1 / 400  # s, of a computed step, of a shown one, of a sample
+_WINDOW = 4.0  # s, of computed terms
+_NEAR = 0.005  # of a motor's range, from its ends
+_SLOWEST = 20.0  # Hz, below which motion is taken for noise
+_UNITS = {"betaflight": "pidsum", "px4": "torque set-point", "ardupilot": "ROut"}
+
+
+def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "") -> PilotPage:
+    """All that the page shows; what cannot be computed says why. `overview` is of all axes."""
+    flown, axis = found.flown, found.flown.axis
+    after, failures = _proposed_law(found), dict[str, str]()
+    noise = _tried(failures, "noise", lambda: _noise_shown(found), None)
+    designs = {"flown": (flown.law, gains_of(flown.law, axis))}
+    if after is not None:
+        designs["proposed"] = (after, gains_in(flown.law, axis, found.new))
+    spectra = lambda: ({}, {}) if noise is None else _spectra(noise, axis, designs)
+    gyro, derivative = _tried(failures, "noise", spectra, ({}, {}))
+    steps = lambda: _steps(found, designs) if found.identification.fit.identifiable else {}
+    terms, terms_are = _tried(
+        failures, "balance", lambda: _terms(found.flight, flown.law, axis), ({}, "")
+    )
+    version, check = ".".join(map(str, flown.version)), found.reproduction
+    return PilotPage(
+        title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
+        headlines=_headlines(found),
+        remarks=[
+            *(f"not modelled: {each}" for each in flown.unmodelled),
+            *([flown.filters_text] if flown.filters_text else []),
+            *([limits_text(found.settings)] if found.new else []),
+        ],
+        filters=_filters(flown.law, after, axis),
+        gyro=gyro,
+        derivative=derivative,
+        noise="" if noise is None else (
+            f"Noise of {noise.source}, less what the set-point explains. Below "
+            f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
+        ),
+        steps=_tried(failures, "steps", steps, {}),
+        terms=terms,
+        terms_are=terms_are,
+        motors=[] if found.flight is None else motor_rows(found.flight),
+        stages=_stage_rows(found) if found.stages else None,
+        changes=change_rows(found.changes) if found.new else None,
+        text=str(found),
+        unit=_UNITS[flown.firmware],
+        again=None if check is None else FlownAgain(
+            check.time, check.setpoint, check.rate, check.again
+        ),
+        again_text="" if check is None else f"{check.verdict[0].upper()}{check.verdict[1:]}.",
+        overview=overview,
+        provenance=origin,
+        failures=failures,
+    )  # fmt: skip
+
+
+Part = TypeVar("Part")
+
+
+def _tried(
+    failures: dict[str, str], section: str, compute: Callable[[], Part], missing: Part
+) -> Part:
+    """A section's content; why it could not be computed goes to `failures`."""
+    try:
+        return compute()
+    except Exception as error:  # the page holds the rest
+        failures[section] = reason_of(error)
+        return missing
+
+
+def _noise_shown(found: "AutopilotProposal") -> GyroNoise | None:
+    if found.noise is not None or found.flight is None:
+        return found.noise
+    told = gyro_noise(found.flight, found.flown.law, found.flown.axis, _SLOWEST)
+    return told if isinstance(told, GyroNoise) else None
+
+
+VERDICTS = {
+    "proposed": ("good", "PROPOSED"), "kept": ("good", "WHAT FLEW IS KEPT"),
+    "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
+}  # fmt: skip
+
+
+def _headlines(found: "AutopilotProposal") -> list[Headline]:
+    headlines = [Headline(*VERDICTS[found.kind], found.verdict)]
+    again = found.reproduction
+    if again is not None and again.verdict not in found.verdict:
+        flew = again.kind == "flown"
+        word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
+        level = "good" if flew else "bad"
+        headlines.append(Headline(level, word, again.verdict))
+    if found.filters is not None:
+        level = "good" if found.filters.flown else "warn"
+        headlines.append(Headline(level, "FILTERS", found.filters.text))
+    if found.throttle is not None:
+        level = "warn" if found.throttle.gains is None else "good"
+        headlines.append(Headline(level, "THROTTLE", found.throttle.text))
+        if found.throttle.curve is not None:
+            level = "warn" if found.throttle.curve.change else "good"
+            headlines.append(Headline(level, "THRUST CURVE", found.throttle.curve.text))
+    return headlines
+
+
+def _proposed_law(found: "AutopilotProposal") -> RateLaw | None:
+    """The law with the proposed filters; None where nothing is proposed."""
+    if not found.new:
+        return None
+    filters = {} if found.filters is None else dict(found.filters.flown)
+    if not filters:
+        return found.flown.law
+    return found.flown.with_filters({name: found.new[name] for name in filters})
+
+
+def _filters(law: RateLaw, after: RateLaw | None, axis: int) -> dict[str, Chains]:
+    before = chains_of(law, axis)
+    if after is None or after is law:
+        return {"flown": before}
+    return {"flown": before, "proposed": chains_of(after, axis)}
+
+
+def chains_of(law: RateLaw, axis: int) -> Chains:
+    """The filters of the gyro and those of the D term alone."""
+    rate = 1 / law.dt
+    if isinstance(law, BetaflightPID):
+        gyro, slope = (law.gyro, FilterChain(law.filters, rate)), FilterChain(law.dterm, rate)
+    else:
+        cutoff = float(np.broadcast_to(law.derivative_hz, (3,))[axis])
+        own = rate if isinstance(law, ArduPilotRate) else law.gyro.rate_hz
+        gyro, slope = (law.gyro,), FilterChain((PT1(cutoff),) if cutoff > 0 else (), own)
+    chains: Chains = {"gyro": tuple(each for each in gyro if each.filters)}
+    if slope.filters and gains_of(law, axis)[2] > 0:
+        chains["D term"] = (slope,)
+    return chains
+
+
+Designs = Mapping[str, tuple[RateLaw, Float[np.ndarray, " gains"]]]
+
+
+def _spectra(
+    noise: GyroNoise, axis: int, designs: Designs
+) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
+    """Of gyro and D term: before all filters, then behind those of each design."""
+    seen = (noise.before.hertz > 1.0) & (noise.before.hertz <= noise.known_hz)
+    hertz, before = noise.before.hertz[seen], noise.before.power[seen]
+    behind = noise.behind.power[seen]
+    omega = 2 * np.pi * np.minimum(hertz, 0.4999 / designs["flown"][0].dt)
+    law, gains = designs["flown"]
+    gyro, derivative = {"before the filters": Spectrum(hertz, before)}, {}
+    chain = gyro_chain_response(law, omega)
+    for name, (each, own) in designs.items():
+        changed = np.abs(gyro_chain_response(each, omega) / chain) ** 2
+        if name == "flown" or each is not law:
+            gyro[name] = Spectrum(hertz, behind * changed)
+        through = np.abs(own[2] * law_paths(each, axis, omega)[0][2]) ** 2
+        if name == "flown" and gains[2] > 0:
+            slope = _response(chains_of(law, axis).get("D term", ()), hertz)
+            open = before * through / np.abs(slope) ** 2
+            derivative["before the filters"] = Spectrum(hertz, open)
+        if own[2] > 0:
+            derivative[name] = Spectrum(hertz, behind * changed * through)
+    return gyro, derivative
+
+
+def _response(
+    chains: Sequence[FilterChain], hertz: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, " frequencies"]:
+    found = np.ones(hertz.size, complex)
+    for each in chains:
+        found = found * np.asarray(each.response(hertz))
+    return found
+
+
+def _steps(found: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
+    """From set-point to rate, of plants drawn from the fit: by their responses."""
+    flown, axis = found.flown, found.flown.axis
+    grid, seed = StepGrid.of(flown.law.dt), found.settings.seed + _SEED
+    loops = found.plants.loops(flown.law, axis, _PLANTS, seed, omega=grid.omega)
+    steps = {}
+    for name, (law, gains) in designs.items():
+        mine = loops if law is flown.law else loops.of_law(law, axis)
+        [back], [ahead] = mine.paths(gains[None])
+        steps[name] = grid.band(ahead * mine.plants / (1 + back * mine.plants))
+    return steps
+
+
+class StepGrid(NamedTuple):
+    """Frequencies from whose closed responses steps are computed.
+
+    **Attributes:**
+
+    - `dt`: of the computed step in s; `omega`: rad/s.
+    - `fade`: of the responses, where the law runs faster than the step is computed.
+    """
+
+    dt: float
+    omega: Float[np.ndarray, " frequencies"]
+    fade: Float[np.ndarray, " frequencies"]
+
+    @classmethod
+    def of(cls, dt: float) -> "StepGrid":
+        """For a law of this interval."""
+        coarse = max(dt, _FINEST)
+        count = 2 * int(_PERIOD / coarse / 2)
+        omega = 2 * np.pi * np.arange(1, count // 2) / (count * coarse)
+        fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2
+        return cls(coarse, omega, fade if coarse > dt else np.ones(omega.size))
+
+    def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
+        """Of the responses from set-point to rate: median and 95 % of the plants."""
+        ends = np.ones((len(closed), 1)), np.zeros((len(closed), 1))
+        whole = np.concatenate([ends[0], self.fade * closed, ends[1]], axis=1)
+        impulse = np.fft.irfft(whole, 2 * (self.omega.size + 1), axis=1)
+        shown = int(_SHOWN / self.dt)
+        low, middle, high = np.percentile(
+            np.cumsum(impulse, axis=1)[:, :shown], [2.5, 50.0, 97.5], axis=0
+        )
+        return StepBand(np.arange(shown) * self.dt, middle, low, high)
+
+
+def _terms(flight: FlightChannels | None, law: RateLaw, axis: int) -> tuple[dict[str, float], str]:
+    """Root mean squares of the terms, and where they are from."""
+    if flight is None:
+        return {}, ""
+    if {"P", "I"} <= set(flight.terms):
+        return logged_terms(flight), "as logged"
+    return _computed_terms(flight, law, axis), "computed by the law from set-point and rate"
+
+
+def logged_terms(flight: FlightChannels) -> dict[str, float]:
+    """Root mean squares of P, I, D and F as they were logged, I without its mean."""
+    moved = {name: x - x.mean() if name == "I" else x for name, x in flight.terms.items()}
+    return {name: float(np.sqrt(np.mean(x**2))) for name, x in moved.items()}
+
+
+def _computed_terms(flight: FlightChannels, law: RateLaw, axis: int) -> dict[str, float]:
+    size = min(int(_WINDOW / flight.dt), len(flight.setpoint))
+    hertz = np.fft.rfftfreq(size, flight.dt)
+    seen = (hertz > 0) & (hertz < 0.4999 / law.dt)
+    back, ahead = law_paths(law, axis, 2 * np.pi * hertz[seen])
+    places = np.arange(0, len(flight.setpoint) - size + 1, size // 2)[:, None] + np.arange(size)
+    taper = np.hanning(size)
+    rate = flight.rates[min(axis, len(flight.rates) - 1)]
+    r, y = (
+        np.fft.rfft((x[places] - x[places].mean(axis=1, keepdims=True)) * taper, axis=1)[:, seen]
+        for x in (flight.setpoint, rate)
+    )
+    found = {}
+    for k, (name, gain) in enumerate(zip("PID", gains_of(law, axis), strict=True)):
+        power = np.mean(np.sum(np.abs(gain * (ahead[k] * r - back[k] * y)) ** 2, axis=1))
+        found[name] = float(np.sqrt(2 * power / (size * np.sum(taper**2))))
+    return found
+
+
+def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
+    """Each motor's shares of samples at the lowest and at the highest command."""
+    if flight.motors is None:
+        return []
+    low, high = flight.motor_ends
+    near = _NEAR * (high - low)
+    return [
+        (f"motor {k + 1}", float(np.mean(x <= low + near)), float(np.mean(x >= high - near)))
+        for k, x in enumerate(flight.motors.T)
+    ]
+
+
+def _stage_rows(found: "AutopilotProposal") -> Table:
+    names = ["what flew", "a third of the way", "all of it"]
+    stages = list(found.stages)
+    levels = () if found.throttle is None else found.throttle.logged
+    if found.filters is not None and found.filters.flown and found.filters.gains_alone:
+        names.append("gains alone, filters as flown")
+        stages.append(found.filters.gains_alone)
+    rows: list[list[str | Cell]] = [
+        [
+            name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
+            f"{x.crossover / (2 * np.pi):.1f}", margin_text(x),
+            f"{x.rejection:.2f}", f"{x.noise:.2f}", *_further(x),
+            *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
+        ]
+        for name, x in zip(names, stages, strict=True)
+    ]  # fmt: skip
+    first = stages[0]
+    heads = (
+        "gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "delay margin, ms",
+        "torque", "noise", *(("Ms, integral held",) if first.relaxed is not None else ()),
+        *(("Ms, angle loop", "peak, angle loop") if first.angle is not None else ()),
+        *(f"Ms at throttle {each:.2f}" for each in levels),
+    )  # fmt: skip
+    return Table(f"On {found.settings.fresh} fresh plants", heads, rows)
+
+
+def _further(stage: Stage) -> list[str]:
+    """With the integral held, and of the angle loop, where there are such."""
+    held = [] if stage.relaxed is None else [f"{stage.relaxed:.2f}"]
+    angle = stage.angle
+    return held if angle is None else [*held, f"{angle.peak:.2f}", f"{angle.resonance:.2f}"]
+
+
+def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
+    """Old, new, unit, range and reason, for the page."""
+    rows: list[list[str | Cell]] = [
+        [
+            Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, _range(row.low, row.high), reason,
+        ]
+        for row, old, new, reason in changes
+    ]  # fmt: skip
+    rows += [[Cell(each.name), each.old, each.new, "", "", each.reason] for each in words]
+    heads = ("parameter", "old", "new", "unit", "range", "reason")
+    return Table("From what flew to the proposal", heads, rows)
+
+
+def _range(low: Number, high: Number) -> str:
+    if not np.isfinite(low):
+        return "none documented"
+    return f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} or above"

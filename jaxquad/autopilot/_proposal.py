@@ -1,0 +1,294 @@
+"""What `autopilot` found in a log: its report as text, its JSON, and the files that it writes."""
+
+import dataclasses
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxquad._core import announce, plain_content
+from jaxquad.records import AXES
+from jaxquad.report import Provenance, provenance, write_json
+
+from ._files import change_table, ParameterChange
+from ._flight_channels import FlightChannels
+from ._flown_autopilot import FlownAutopilot
+from ._gyro_noise import GyroNoise
+from ._identified import DesignSettings, IdentifiedPlant
+from ._limits import limits_text
+from ._loop_check import LoopCheck
+from ._over_throttle import ThrottleVerdict
+from ._page import write_pilot_page
+from ._pilot_page import pilot_page
+from ._plants import PlantSource
+from ._proposed_parameters import ProposedParameters
+from ._rate_design import FilterVerdict, Kind
+from ._stages import margin_text, OuterStage, Stage
+
+
+_CURVE = "thrust_curve"
+_FAR = 0.98  # of the factor by which a gain may change
+_SHORT = ("RLL", "PIT", "YAW")  # of ArduPilot's parameters of one axis
+
+
+@dataclasses.dataclass(frozen=True)
+class AutopilotProposal:
+    """What `autopilot` found in a log, and what it proposes; `str()` is its report as text.
+
+    **Attributes:**
+
+    - `kind`: "proposed"; "kept" where what flew is as good; "cannot tell" where the log does not
+      show the plant or the loop; "not to be flown" where no gains keep the limits.
+    - `verdict`: the same in words, and what to do.
+    - `identification`: of the plant, in the firmware's units, with the gyro's filters divided out.
+    - `flown`: the loop that flew.
+    - `reproduction`: that loop and plant compared with the flight; None without a plant.
+    - `stages`: on fresh plants what flew, then a third of the way and all of it; empty where the
+      log cannot tell.
+    - `old`, `new`: the parameters by name; `new` is empty where nothing is proposed.
+    - `filters`: what freeing the filters brings, or why they stay as they flew; None without a
+      search.
+    - `noise`: of the gyros, where the log shows it; `flight`: the channels that were read.
+    - `throttle`: at which throttles the gains hold, and the thrust curve, which is proposed apart
+      from them; None where the log cannot tell.
+    """
+
+    kind: Kind
+    verdict: str
+    settings: DesignSettings
+    identification: IdentifiedPlant
+    flown: FlownAutopilot
+    reproduction: LoopCheck | None
+    stages: tuple[Stage, ...] = ()
+    new: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    filters: FilterVerdict | None = None
+    noise: GyroNoise | None = None
+    flight: FlightChannels | None = None
+    throttle: ThrottleVerdict | None = None
+
+    @property
+    def plants(self) -> PlantSource:
+        """What the log leaves possible."""
+        found = self.identification
+        if self.throttle is not None:
+            return self.throttle.plants(found, self.flown.measured)
+        unit = found.records[0].output_units[0]
+        return PlantSource(found.fit, unit, filters=self.flown.measured)
+
+    @property
+    def old(self) -> dict[str, float]:
+        """What flew, of the gains and of filters that change."""
+        angle = self.flown.angle
+        around = {} if angle is None or angle.name not in self.new else {angle.name: angle.value}
+        filters = {} if self.filters is None else dict(self.filters.flown)
+        return self.flown.old | filters | around
+
+    @property
+    def parameters(self) -> ProposedParameters:
+        """Old and new values by the firmware's names."""
+        at_once = () if self.filters is None else self.filters.at_once
+        if self.stages and self.stages[1].stable < 1:
+            at_once = tuple(self.new)
+        return ProposedParameters(
+            self.flown.firmware, self.flown.version, self.old, dict(self.new), self._reasons,
+            at_once,
+        )  # fmt: skip
+
+    @property
+    def shared_filters(self) -> dict[str, float]:
+        """New filters that the other axes have, too."""
+        if self.filters is None or not self.new:
+            return {}
+        own = f"_{_SHORT[self.flown.axis]}_"
+        return {name: self.new[name] for name in self.filters.flown if own not in name}
+
+    @property
+    def changes(self) -> tuple[ParameterChange, ...]:
+        """From what flew to the proposal."""
+        return self.parameters.changes
+
+    @property
+    def _reasons(self) -> dict[str, str]:
+        if not self.stages:
+            return {}
+        before, *_, after = self.stages
+        why = (
+            f"effect of a step of torque {after.rejection:.2f}, command noise {after.noise:.2f} of "
+            f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
+        )
+        reasons = dict.fromkeys(self.new, why)
+        for name in self._at_limit:
+            reasons[name] += f"; at the limit of a factor of {self.settings.change:g} (`change`)"
+        if self.filters is not None:
+            reasons |= dict.fromkeys(self.filters.flown, self.filters.reason)
+        if before.angle is not None and after.angle is not None:
+            reasons[after.angle.parameter] = (
+                f"Ms of the angle loop {before.angle.peak:.2f} -> {after.angle.peak:.2f}"
+            )
+        return {name: reason for name, reason in reasons.items() if name in self.new}
+
+    @property
+    def _at_limit(self) -> list[str]:
+        """Gains that are as far from what flew as `change` lets them be."""
+        flown, far = self.flown.old, _FAR * self.settings.change
+        away = {name: self.new[name] / old for name, old in flown.items() if name in self.new}
+        return [name for name, factor in away.items() if max(factor, 1 / factor) >= far]
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        found = {
+            "kind": self.kind,
+            "verdict": self.verdict,
+            "firmware": self.flown.firmware,
+            "version": self.flown.version,
+            "axis": AXES[self.flown.axis],
+            "flown": dict(self.flown.parameters),
+            "unmodelled": self.flown.unmodelled,
+            "gyro_filters": self.flown.filters_text,
+            "old": self.old,
+            "new": dict(self.new),
+            "stages": [stage.content() for stage in self.stages],
+            "filters": None if self.filters is None else self.filters.content(),
+            "noise": None if self.noise is None else self.noise.content(),
+            "throttle": None if self.throttle is None else self.throttle.content(),
+            "reproduction": None if self.reproduction is None else self.reproduction.content(),
+            "plant": self._plant,
+            "settings": self.settings.content(),
+            "identified_with": self.identification.settings.content(),
+        }
+        return {key: plain_content(value) for key, value in found.items()}
+
+    @property
+    def _plant(self) -> dict[str, object]:
+        fit = self.identification.fit
+        if not fit.verdict.fitted:
+            return {"verdict": fit.verdict.summary}
+        errors = zip(fit.names, map(float, fit.standard_errors), strict=True)
+        return {
+            "verdict": fit.verdict.summary,
+            **dict(zip(fit.names, map(float, fit.values), strict=True)),
+            "standard_errors": dict(errors),
+            "intervals_95": {name: list(map(float, fit.interval(name))) for name in fit.names},
+            "units": dict(zip(fit.names, fit.parameter_units, strict=True)),
+            "band_rad_s": list(self.identification.band),
+            "misfit_over_errors": float(np.sqrt(fit.chi_squared)),
+        }
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write the page, `autopilot.json`, and parameter files: without a proposal what flew.
+
+        **Returns:** their paths.
+        """
+        announce("parameter files")
+        folder, origin = Path(folder), self.provenance(self.settings)
+        stored = write_json(
+            folder / "autopilot.json", self.content() | {"provenance": origin.content()}
+        )
+        announce("the page")
+        page = write_pilot_page(folder / "autopilot.html", pilot_page(self, origin))
+        return [page, stored, *self.write_curve(folder), *self.parameters.write(folder)]
+
+    def provenance(self, settings: DesignSettings) -> Provenance:
+        """Of a result with these settings."""
+        known = {k: v for k, v in settings.content().items() if v is not None}
+        log = self.identification.path
+        words = ["jaxquad", "autopilot", str(log), *settings.words()]
+        return provenance(log, command=shlex.join(words), settings=known)
+
+    def write_curve(self, folder: Path) -> list[Path]:
+        """The thrust curve's parameter and what flew of it, never in a file with gains."""
+        curve = None if self.throttle is None else self.throttle.curve
+        if curve is None or curve.change is None:
+            return []
+        titles = {
+            "": f"{curve.name} alone: all loops and the throttle at hover change with it",
+            "_revert": f"the {curve.name} that flew",
+        }
+        return [
+            self.parameters.write_one(
+                f"{_CURVE}{end}", [curve.change], title, folder, revert=bool(end)
+            )
+            for end, title in titles.items()
+        ]
+
+    def __str__(self) -> str:
+        flown = self.flown
+        version = ".".join(map(str, flown.version))
+        lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
+        lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
+        lines += [f"  not modelled: {each}" for each in flown.unmodelled]
+        lines += [f"  {flown.filters_text}"] if flown.filters_text else []
+        plant = "plant up to the gyro's filters, in the firmware's units"
+        lines += ["", f"{plant}:\n{self.identification.fit}"]
+        again = self.reproduction
+        if again is not None and again.verdict not in self.verdict:
+            lines += ["", f"flown loop: {again.verdict}"]
+        if self.stages:
+            lines += ["", _stage_table(self.stages)]
+        if self.throttle is not None:
+            lines += ["", *_throttle_lines(self.throttle, self.stages)]
+        if self.filters is not None:
+            lines += ["", f"filters: {self.filters.text}"]
+        if self.kind == "proposed":
+            lines += ["", change_table(self.changes).rstrip(), "", limits_text(self.settings)]
+        curve = None if self.throttle is None else self.throttle.curve
+        if curve is not None:
+            lines += ["", f"thrust curve: {curve.text}"]
+            if curve.change is not None:
+                lines += ["", change_table([curve.change]).rstrip()]
+        return "\n".join([*lines, "", self._verdict_below_the_plant])
+
+    @property
+    def _verdict_below_the_plant(self) -> str:
+        """The verdict, without what was just said of the plant."""
+        fit = self.identification.fit.verdict
+        return self.verdict.replace(fit.summary, "it does not determine the plant (above)")
+
+
+_WAYS = ("what flew", "a third of the way", "all of it")
+
+
+_OF_STAGES = """(fresh plants: drawn from what the log leaves possible, not tuned on; Ms and
+resonance: peaks of |S| and of the response to the set-point; torque: the rate after a step of
+torque, noise: that of the command, both over those of what flew)"""
+_OF_HELD = "(Ms held: without the integral, which iterm_relax holds while the set-point moves)"
+
+
+def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> list[str]:
+    lines = [f"throttle: {throttle.text}"]
+    if throttle.gains is None:
+        return lines
+    lines.append(throttle.table)
+    if stages:
+        heads = " ".join(f"{each:6.2f}" for each in throttle.logged)
+        lines += ["", f"{'worst Ms at throttle':<20} {heads}"]
+        for name, stage in zip(_WAYS, stages, strict=False):
+            lines.append(f"{name:<20} " + " ".join(f"{peak:6.2f}" for peak in stage.peaks))
+    return lines
+
+
+def _stage_table(stages: tuple[Stage, ...]) -> str:
+    first = stages[0]
+    held = "   Ms held" if first.relaxed is not None else ""
+    angle = "   Ms angle" if first.angle is not None else ""
+    heads = "stable   worst Ms   resonance   crossover   delay margin   torque   noise"
+    rows = [f"{'on fresh plants':<20} {heads}{held}{angle}"]
+    for name, stage in zip(_WAYS, stages, strict=False):
+        row = (
+            f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
+            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {margin_text(stage):>9} ms "
+            f"{stage.rejection:8.2f} {stage.noise:7.2f}"
+        )
+        row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"
+        rows.append(row + ("" if stage.angle is None else f" {stage.angle.peak:10.2f}"))
+    of_held = [_OF_HELD] if held else []
+    return "\n".join([*rows, _OF_STAGES, *of_held, *_of_angle(first.angle)])
+
+
+def _of_angle(angle: OuterStage | None) -> list[str]:
+    """Which angle loop is meant, and whether it flew."""
+    if angle is None:
+        return []
+    flew = "as it flew" if angle.closed else "which was open in this flight"
+    return [f"(Ms angle: of the angle loop around it, {angle.parameter} {angle.value:.3g}, {flew})"]

@@ -1,0 +1,282 @@
+"""A logged flight again, sample by sample at the loop's rate: the law's terms, and the whole loop.
+
+What is not linear in a law, such as a relaxed or limited integral, is in its equations and so in
+its replay. Source: docs/autopilots.md, "Which gains flew".
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad.control import Setpoint
+
+from ._betaflight import F_SCALE
+from ._flown import FlownBetaflight, FlownLoop
+from ._law import DEGREES
+from ._reproduce import without_gyro_filters
+
+
+Samples = Float[Array | np.ndarray, "samples axes"]
+Series = Float[Array | np.ndarray, " samples"]
+_BLOCK = 1 << 15  # samples of the loop: programs of other lengths would be compiled anew
+
+
+class HeldPlant(NamedTuple):
+    """K e^(-delay s) / ((s + damping) (lag s + 1)), from a held command to the rate in rad/s."""
+
+    gain: float  # rad/s^2 per unit of the command
+    lag: float  # s
+    delay: float = 0.0  # s
+    damping: float = 0.0  # 1/s
+
+
+class _Row(NamedTuple):
+    """What a law sees at one sample of the loop, and where its integral begins anew."""
+
+    setpoint: Array
+    speed: Array
+    rate: Array
+    throttle: Array
+    surge: Array
+    integral_share: Array
+    integral: Array
+    anew: Array
+
+
+def replay_terms(
+    flown: FlownLoop,
+    setpoint: Samples,
+    gyro: Samples,
+    throttle: Series,
+    *,
+    dt: float,
+    feed_forward: Samples | None = None,
+    integral: Samples | None = None,
+    mixer_range: Series | None = None,
+    late: float = 0.0,
+    restart: float = 0.5,
+) -> dict[str, Float[np.ndarray, "samples axes"]]:
+    """P, I, D and F of a log again, from its set-point and its filtered gyro.
+
+    The law runs at the loop's rate; between the samples of the log its signals are taken as
+    straight. A log rounds them, and the integral of what is lost drifts away: with `integral`, the
+    I term of the log, it starts anew from the log every `restart` seconds. Filters start at rest.
+
+    **Arguments:**
+
+    - `flown`: of the log's parameters, `betaflight_loop`, `px4_loop` or `ardupilot_loop`.
+    - `setpoint`, `gyro`: in rad/s; `gyro` as it was logged, behind the gyro's filters.
+    - `throttle`: 0 to 1.
+    - `dt`: the interval of the log in s.
+    - `feed_forward`: the logged F of Betaflight, which takes it from the sticks between their
+        samples and raises D by its speed; None takes the slope of the set-point.
+    - `integral`: the logged I term; None lets the integral run freely from 0.
+    - `mixer_range`: highest less lowest motor over the mixer's range, which until Betaflight 4.5
+        slows the integral.
+    - `late`: s after its stamp at which the set-point acts.
+    - `restart`: in s.
+
+    **Returns:** the terms "P", "I", "D" and "F" in the firmware's units, at the log's samples.
+
+    **Raises:**
+
+    - `ValueError`: the log's interval is below the loop's.
+    """
+    law = flown.law
+    if dt < 0.5 * law.interval():
+        raise ValueError(
+            f"the log's interval is {dt:g} s, below the loop's {law.interval():g} s: read the log "
+            "at the loop's rate or below"
+        )
+    grid = _Grid(len(setpoint), dt, law.interval())
+    r = grid.fine(setpoint, late)
+    speed = _speed(flown, grid, r, feed_forward)
+    rows = _rows(
+        r, speed, grid.fine(gyro),
+        *_moments(flown, grid, throttle, mixer_range),
+        *_restarts(grid, setpoint, integral, restart),
+    )  # fmt: skip
+    terms = _replayed(_without_filters(flown), rows)
+    return {name: grid.coarse(np.asarray(term)) for name, term in terms.items()}
+
+
+def fly_again(
+    flown: FlownLoop,
+    plant: HeldPlant,
+    setpoint: Series,
+    throttle: Series,
+    *,
+    dt: float,
+    feed_forward: Series | None = None,
+    injected: Series | None = None,
+    late: float = 0.0,
+) -> Float[np.ndarray, " samples"]:
+    """The rate that law and plant make of a logged set-point: the closed loop in time, undisturbed.
+
+    **Arguments:**
+
+    - `flown`: of one axis, with the gyro's filters; `plant`: up to what these are given.
+    - `setpoint`: in rad/s; `throttle`: 0 to 1; `dt`: the interval of the log in s.
+    - `feed_forward`: as for `replay_terms`.
+    - `injected`: what is added to the command behind the law, in its unit.
+    - `late`: s after their stamps at which set-point and injection act.
+
+    **Returns:** the rate before the gyro's filters in rad/s, at the log's samples.
+    """
+    law = flown.law
+    grid = _Grid(len(setpoint), dt, law.interval())
+    r = grid.fine(setpoint, late)[:, None]
+    forward = None if feed_forward is None else np.asarray(feed_forward)[:, None]
+    added = np.zeros_like(r) if injected is None else grid.fine(injected, late)[:, None]
+    rows = _rows(
+        r, _speed(flown, grid, r, forward), added, *_moments(flown, grid, throttle, None),
+        np.zeros_like(r), np.zeros(len(r), bool),
+    )  # fmt: skip
+    wait = max(int(np.floor(plant.delay / law.interval() + 1e-9)), 0)
+    rates = _flown_again(flown, _held_step(plant, law.interval()), wait, rows)
+    return grid.coarse(np.asarray(rates)[:, 0])
+
+
+class _Grid:
+    """The loop's samples in the span of a log, and signals on either."""
+
+    def __init__(self, count: int, dt: float, interval: float):
+        self.log = dt * np.arange(count)
+        self.interval = interval
+        self.loop = interval * np.arange(int(np.floor(self.log[-1] / interval + 1e-6)) + 1)
+
+    def fine(self, signal: Samples | Series, late: float = 0.0) -> np.ndarray:
+        """At the loop's samples; what is `late` acts so long after its stamp."""
+        at, signal = self.loop - late, np.asarray(signal, float)
+        if signal.ndim == 1:
+            return np.interp(at, self.log, signal)
+        return np.stack([np.interp(at, self.log, column) for column in signal.T], axis=1)
+
+    def coarse(self, signal: np.ndarray) -> np.ndarray:
+        """At the log's samples, of a series that may have been padded."""
+        signal = signal[: self.loop.size]
+        if signal.ndim == 1:
+            return np.interp(self.log, self.loop, signal)
+        return np.stack([np.interp(self.log, self.loop, column) for column in signal.T], axis=1)
+
+
+def _without_filters(flown: FlownLoop) -> FlownLoop:
+    """The law as it acts on the logged rate."""
+    bare = dataclasses.replace(flown, law=without_gyro_filters(flown.law))
+    return dataclasses.replace(bare, gyro_dynamic=None) if _is_betaflight(bare) else bare
+
+
+def _is_betaflight(flown: FlownLoop) -> bool:
+    return isinstance(flown, FlownBetaflight)
+
+
+def _speed(
+    flown: FlownLoop, grid: _Grid, r: np.ndarray, feed_forward: Samples | None
+) -> np.ndarray:
+    """The set-point's speed in rad/s^2, of Betaflight's logged F where that has a gain."""
+    slope = np.diff(r, axis=0, prepend=r[:1]) / grid.interval
+    if feed_forward is None or not _is_betaflight(flown):
+        return slope
+    weight = F_SCALE * DEGREES * np.asarray(flown.law.f)
+    weight = np.broadcast_to(weight, r.shape[1:])
+    known = weight > 0
+    scaled = grid.fine(feed_forward) / np.where(known, weight, 1.0)
+    return np.where(known, scaled, np.where(np.any(feed_forward, axis=0), slope, 0.0))
+
+
+def _moments(
+    flown: FlownLoop, grid: _Grid, throttle: Series, mixer_range: Series | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Throttle, anti-gravity's surge and the integral's share: of the loop before, as they act."""
+    x = grid.fine(throttle, grid.interval)
+    rested = np.zeros_like(x), np.ones_like(x)
+    if not isinstance(flown, FlownBetaflight):
+        return x, *rested
+    surge = flown.surge(grid.fine(throttle))
+    spread = None if mixer_range is None else grid.fine(mixer_range, grid.interval)
+    share = rested[1] if spread is None else flown.integral_share(spread)
+    return x, np.concatenate([[0.0], surge[:-1]]), share
+
+
+def _restarts(
+    grid: _Grid, like: Samples, integral: Samples | None, restart: float
+) -> tuple[np.ndarray, np.ndarray]:
+    if integral is None:
+        return np.zeros((grid.loop.size, *np.shape(like)[1:])), np.zeros(grid.loop.size, bool)
+    every = max(1, round(restart / grid.interval))
+    before = grid.fine(integral, grid.interval)  # what the law adds to at this sample
+    return before, np.arange(grid.loop.size) % every == 0
+
+
+def _rows(*series: np.ndarray) -> _Row:
+    """The series of a `_Row`, up to a whole number of blocks by their last samples."""
+    count = len(series[0])
+    more = -(-count // _BLOCK) * _BLOCK - count
+    pad = lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)])
+    return _Row(*(jnp.asarray(pad(x)) for x in series))
+
+
+def _law_at(flown: FlownLoop, row: _Row):
+    if isinstance(flown, FlownBetaflight):
+        return flown.at(row.throttle, surge=row.surge, integral_share=row.integral_share)
+    return flown.law
+
+
+@eqx.filter_jit
+def _replayed(flown: FlownLoop, rows: _Row):
+    zero = jnp.zeros_like(rows.rate[0])
+
+    def sample(memory, row: _Row):
+        memory = {**memory, "integral": jnp.where(row.anew, row.integral, memory["integral"])}
+        reference = Setpoint(row.setpoint, row.speed, zero)
+        memory, _, terms = _law_at(flown, row).advance(memory, zero, reference, row.rate)
+        return memory, terms
+
+    return jax.lax.scan(sample, flown.law.rest(zero), rows)[1]
+
+
+class _Step(NamedTuple):
+    """The held plant over a sample: the state's matrix, and those of the command before and now."""
+
+    state: Float[np.ndarray, "2 2"]
+    before: Float[np.ndarray, " 2"]
+    now: Float[np.ndarray, " 2"]
+
+
+def _held_step(plant: HeldPlant, dt: float) -> _Step:
+    """Exactly, with the part of a sample by which the command comes late."""
+    from scipy.linalg import expm
+
+    lag = max(plant.lag, 1e-3 * dt)
+    generator = np.zeros((3, 3))  # torque, rate, command
+    generator[0, 0], generator[0, 2] = -1 / lag, plant.gain / lag
+    generator[1, 0], generator[1, 1] = 1.0, -plant.damping
+    late = plant.delay % dt
+    over = lambda span: expm(span * generator)
+    whole, rest = over(dt), over(dt - late)
+    before = rest[:2, :2] @ over(late)[:2, 2]
+    return _Step(whole[:2, :2], before, rest[:2, 2])
+
+
+@eqx.filter_jit
+def _flown_again(flown: FlownLoop, step: _Step, wait: int, rows: _Row):
+    zero = jnp.zeros_like(rows.setpoint[0])
+    queue = jnp.zeros((wait + 1, *zero.shape))
+    matrix, before, now = map(jnp.asarray, step)
+
+    def sample(carry, row: _Row):
+        memory, state, queue = carry
+        rate = state[1]
+        reference = Setpoint(row.setpoint, row.speed, zero)
+        memory, command, _ = _law_at(flown, row).advance(memory, zero, reference, rate)
+        queue = jnp.concatenate([(command + row.rate)[None], queue])  # the newest one first
+        moved = matrix @ state + jnp.outer(now, queue[-2]) + jnp.outer(before, queue[-1])
+        return (memory, moved, queue[:-1]), rate
+
+    start = (flown.law.rest(zero), jnp.zeros((2, *zero.shape)), queue)
+    return jax.lax.scan(sample, start, rows)[1]

@@ -1,0 +1,278 @@
+"""Records from and to tables of pandas, and MAT files with the fields of an `iddata` of MATLAB."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ._clock import dates_in_seconds, doubt_of_seconds, Number, PER_SECOND, Times, TimeUnit
+from ._errors import ReadError, RecordError, unknown_name
+from ._record import as_tuple, assemble, check_distinct, Hold, Names, Record
+from ._repair import repair_values
+from ._resample import Channel, resample
+from .formats import load_log
+
+
+if TYPE_CHECKING:
+    import pandas
+
+
+_ATTRIBUTES = "jaxquad"  # entry of `DataFrame.attrs` with what columns cannot say
+_TIMES = ("t", "time", "time_s", "timestamp")
+_ROLES = ("inputs", "outputs", "references")
+
+
+def from_dataframe(
+    frame: "pandas.DataFrame",
+    roles: tuple[Names, Names, Names],
+    time: str | None,
+    time_unit: TimeUnit | None,
+    sample_rate: Number | None,
+    max_gap: Number | None,
+    units: Mapping[str, str],
+    hold: Hold,
+    source: str,
+) -> Record:
+    """`Record.from_dataframe`, where the arguments are described."""
+    stored = frame.attrs.get(_ATTRIBUTES, {})
+    if all(role is None for role in roles):
+        if not all(role in stored for role in _ROLES):
+            raise RecordError(
+                "the table does not say which columns are inputs and outputs: name them "
+                f"(«inputs=», «outputs=»). Its columns are {', '.join(map(str, frame.columns))}."
+            )
+        roles = tuple(stored[role] for role in _ROLES)
+    names = [as_tuple(role or ()) for role in roles]
+    flat = [name for role in names for name in role]
+    check_distinct(flat)
+    values = {}
+    for name in flat:
+        if name not in frame.columns:
+            raise ReadError(unknown_name(name, map(str, frame.columns)))
+        values[name] = _numbers(name, _column(frame, name))
+    stamps = _stamps(frame, time, time_unit)
+    if sample_rate is not None:
+        channels = [
+            Channel(name, stamps, repair_values(name, stamps, column, None, max_gap).values)
+            for name, column in values.items()
+        ]
+        stamps, table = resample(channels, sample_rate, max_gap=max_gap)
+        values = dict(zip(values, table.T, strict=True))
+    if not names[0] or not names[1]:
+        raise RecordError(
+            "a record needs at least one input and one output («inputs=», «outputs=»)."
+        )
+    for name in units:
+        if name not in flat:
+            raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, flat)}")
+    units = {**stored.get("units", {}), **units}
+    return assemble(
+        stamps,
+        names,
+        values.__getitem__,
+        lambda name: units.get(name, ""),
+        hold=stored.get("hold") if hold is None else hold,
+        source=source or stored.get("source", ""),
+        max_gap=max_gap,
+    )
+
+
+def _stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | None) -> Times:
+    """Time stamps (s): of the column `time`, of one that is called like that, or of the index."""
+    from pandas import RangeIndex
+    from pandas.api.types import is_datetime64_any_dtype, is_timedelta64_dtype
+
+    clocks = [name for name in _TIMES if name in frame.columns] if time is None else [time]
+    if not clocks and isinstance(frame.index, RangeIndex):
+        raise RecordError(
+            f"the table has no time stamps: no column {', '.join(_TIMES)}, and an index that "
+            "counts rows. Name the column («time=»), or set the index: frame.set_index(...)."
+        )
+    if clocks and clocks[0] not in frame.columns:
+        raise RecordError(f"time: {unknown_name(clocks[0], map(str, frame.columns))}")
+    label = clocks[0] if clocks else "the index"
+    series = _column(frame, label) if clocks else frame.index.to_series()
+    dated = is_datetime64_any_dtype(series)
+    if dated or is_timedelta64_dtype(series):
+        if unit is not None:
+            raise RecordError("the time stamps are dates or durations: leave «time_unit=» out.")
+        # Dates of any time zone, in UTC.
+        stamps = series.to_numpy("datetime64[ns]" if dated else "timedelta64[ns]")
+        seconds = dates_in_seconds(stamps - stamps[:1] if dated else stamps)
+        assert seconds is not None  # as nanoseconds have a fixed length
+        return seconds
+    seconds = _numbers(label, series) / PER_SECOND[unit or "s"]
+    doubt = doubt_of_seconds(seconds) if unit is None else ""
+    if doubt:
+        raise RecordError(f"the time base {label!r} {doubt}.")
+    return seconds
+
+
+def _column(frame: "pandas.DataFrame", name: str) -> "pandas.Series":
+    from pandas import Series
+
+    column = frame[name]
+    if not isinstance(column, Series):
+        raise RecordError(f"the table has several columns {name!r}: give each its own name.")
+    return column
+
+
+def _numbers(label: str, series: "pandas.Series") -> Times:
+    """What is missing becomes NaN."""
+    try:
+        return series.to_numpy(np.float64, na_value=np.nan)
+    except (TypeError, ValueError) as error:
+        raise RecordError(
+            f"column {label!r} holds {series.dtype}, not numbers: convert it (pandas.to_numeric)."
+        ) from error
+
+
+def to_dataframe(record: Record) -> "pandas.DataFrame":
+    """`Record.to_dataframe`."""
+    import pandas
+
+    table = np.concatenate([record.inputs, record.outputs, record.references], axis=1)
+    index = pandas.Index(record.time, name="time")
+    frame = pandas.DataFrame(table, index=index, columns=pandas.Index(record.names))
+    frame.attrs[_ATTRIBUTES] = {
+        "inputs": record.input_names,
+        "outputs": record.output_names,
+        "references": record.reference_names,
+        "units": {name: record.unit(name) for name in record.names},
+        "hold": record.hold,
+        "source": record.source,
+    }
+    return frame
+
+
+_UNITS = {
+    "seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9,
+    "minutes": 60.0, "hours": 3600.0,
+}  # fmt: skip
+_SAVE = "s = get(z); save('z.mat', 's', '-v7')"
+
+
+def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
+    """`Record.from_iddata`, where the arguments are described."""
+    fields = _fields(path, variable)
+    y, u = (_matrix(path, fields, *names) for names in (("y", "OutputData"), ("u", "InputData")))
+    time, dt = _uniform_time(path, fields, len(y))
+    inputs = _labels(fields, "InputName", u, "u")
+    input_units = _labels(fields, "InputUnit", u, "")
+    outer = as_tuple(references or ())
+    for name in outer:
+        if name not in inputs:
+            raise RecordError(f"{path}: there is no input {name!r}; it has {', '.join(inputs)}.")
+    is_outer = np.array([name in outer for name in inputs], bool)
+    pick = lambda texts, chosen: [t for t, c in zip(texts, chosen, strict=True) if c]
+    kinds = set(_texts(fields, "InterSample"))
+    # Held, or measured within the band.
+    hold = {"zoh": dt, "bl": 0.0}.get(kinds.pop()) if len(kinds) == 1 else None
+    return Record(
+        time,
+        u[:, ~is_outer],
+        y,
+        u[:, is_outer] if outer else None,
+        input_names=pick(inputs, ~is_outer),
+        output_names=_labels(fields, "OutputName", y, "y"),
+        reference_names=pick(inputs, is_outer),
+        input_units=pick(input_units, ~is_outer),
+        output_units=_labels(fields, "OutputUnit", y, ""),
+        reference_units=pick(input_units, is_outer),
+        source=str(path),
+        hold=hold,
+        time_unit="s",
+    )
+
+
+def _fields(path: str | Path, variable: str | None) -> Mapping:
+    """The struct with y and u: the variable of that name, the only one, or the file itself."""
+    load_log(path)  # which refuses what is damaged, before scipy reads it
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
+        raise ReadError(
+            f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
+            f"save it in MATLAB with {_SAVE}"
+        ) from error
+    is_iddata = lambda value: (
+        isinstance(value, Mapping)
+        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
+    )
+    structs = {name: value for name, value in content.items() if is_iddata(value)}
+    if variable is None and is_iddata(content):
+        return content
+    if variable is None and len(structs) == 1:
+        return next(iter(structs.values()))
+    if variable in structs:
+        return structs[variable]
+    which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
+    raise ReadError(
+        f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata object "
+        f"cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
+    )
+
+
+def _matrix(path: str | Path, fields: Mapping, *names: str) -> np.ndarray:
+    name = next(name for name in names if name in fields)
+    array = fields[name]
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+        raise ReadError(
+            f"{path}: {name} is no matrix of numbers: of several experiments, take one with "
+            "getexp(z, 1)"
+        )
+    return array.reshape(len(array), -1).astype(np.float64)
+
+
+def _uniform_time(path: str | Path, fields: Mapping, samples: int) -> tuple[np.ndarray, float]:
+    """Time stamps and the sample interval, both in s."""
+    unit = str(fields.get("TimeUnit", "seconds"))
+    if unit not in _UNITS:
+        raise ReadError(f"{path}: TimeUnit is {unit!r}: use one of {', '.join(_UNITS)}")
+    stamps, dt, start = (
+        np.atleast_1d(np.asarray(fields.get(name, []), np.float64))
+        for name in ("SamplingInstants", "Ts", "Tstart")
+    )
+    if stamps.size == samples:
+        return _UNITS[unit] * stamps, float(np.mean(np.diff(stamps))) * _UNITS[unit]
+    if dt.size != 1 or not dt[0] > 0:
+        raise ReadError(f"{path}: Ts is {dt.tolist()}: give the sample interval, in {unit}")
+    first = float(start[0]) if start.size else 0.0
+    return _UNITS[unit] * (first + dt[0] * np.arange(samples)), float(_UNITS[unit] * dt[0])
+
+
+def _texts(fields: Mapping, name: str) -> list[str]:
+    return [str(text) for text in np.atleast_1d(np.asarray(fields.get(name, []), object))]
+
+
+def _labels(fields: Mapping, name: str, columns: np.ndarray, letter: str) -> list[str]:
+    """Names or units, one for each column; numbered letters or nothing where there are none."""
+    texts, count = _texts(fields, name), columns.shape[1]
+    if len(texts) == count:
+        return texts
+    return [f"{letter}{k + 1}" if letter and count > 1 else letter for k in range(count)]
+
+
+def to_iddata(record: Record, path: str | Path, variable: str) -> Path:
+    """`Record.to_iddata`."""
+    from scipy.io import savemat
+
+    cell = lambda texts: np.array(texts, dtype=object).reshape(-1, 1)
+    inter_sample = "bl" if record.hold == 0 else "zoh"
+    fields = {
+        "y": record.outputs,
+        "u": np.concatenate([record.inputs, record.references], axis=1),
+        "Ts": record.dt,
+        "Tstart": record.time[0],
+        "TimeUnit": "seconds",
+        "InputName": cell(record.input_names + record.reference_names),
+        "OutputName": cell(record.output_names),
+        "InputUnit": cell(record.input_units + record.reference_units),
+        "OutputUnit": cell(record.output_units),
+        "InterSample": "foh" if record.hold is None else inter_sample,
+    }
+    savemat(path, {variable: fields}, do_compression=True)
+    return Path(path)

@@ -1,0 +1,197 @@
+"""From the log of an autopilot to parameters for it: read, identify, reproduce, tune."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxquad._core import announce
+from jaxquad.autopilot import (
+    ADRCAutopilot,
+    AutopilotProposal,
+    AxesProposal,
+    best_filters,
+    check_law,
+    check_loop,
+    design_gains,
+    FlightChannels,
+    FlownAutopilot,
+    gyro_chains,
+    read_channels_if_any,
+    read_flown,
+    settings_of,
+    study_throttle,
+    what_to_fly,
+)
+from jaxquad.records import AXES, Proposal
+
+from ._autopilot_adrc import flew_adrc, tune_adrc
+from ._identify import identify_plant
+from ._kinds import SettingsError
+from ._log import propose_settings, read_records
+from ._settings import IdentifySettings
+from ._tune_settings import AutopilotSettings
+
+
+def autopilot(
+    path: str | Path, settings: AutopilotSettings | None = None
+) -> AutopilotProposal | AxesProposal | ADRCAutopilot:
+    """Tune the gains of the autopilot that flew a log, as `jaxquad autopilot` does.
+
+    Gains and filters are read from the log, and the law is replayed on its set-point and gyro to
+    tell whether they flew. The plant is identified in the firmware's own units up to what the
+    gyro's filters are given, and both are flown again in time. P, I and D of the rate loop are
+    searched over the plants that the fit leaves uncertain: least rate after a step of torque, with
+    limits on the peak of |S|, on the command's noise and on the crossover, which stays in the
+    identified band. Where the log shows the gyro's noise, cutoffs and notches are searched with
+    them. The rounded numbers are certified on fresh plants, as is a third of the way: with the
+    integral as set and held, and with the angle loop around the rate loop, whose gain is lowered
+    where it spoils that. Where the log holds several levels of throttle, plants have the gain that
+    it shows at each of them. Source: docs/autopilots.md.
+
+    **Arguments:**
+
+    - `path`: a log of Betaflight, PX4 or ArduPilot.
+    - `settings`: the axis, and what is kept.
+
+    **Returns:** an `AxesProposal` of all axes that the log holds, an `AutopilotProposal` where
+    `axis` names one, or an `ADRCAutopilot` where the ADRC flew or is asked for by `law`; nothing is
+    written before its `.write(folder)`.
+
+    **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
+    ValueError for one without the parameters of the loop.
+
+    !!! example
+
+        ```python
+        settings = jq.workflows.AutopilotSettings(axis="roll")
+        found = jq.workflows.autopilot("flight.bbl", settings)
+        print(found)
+        found.write("results/flight/autopilot")
+        ```
+    """
+    path, settings = Path(path), settings or AutopilotSettings()
+    asked, proposal = _channels_of(path, settings)
+    adrc = flew_adrc(path, proposal)
+    if adrc and settings.law == "pid":
+        raise SettingsError(f"`law` is pid, but the ADRC flew {path} (pid_type): leave it out")
+    if adrc or settings.law == "adrc":
+        return tune_adrc(path, asked, proposal, settings)
+    if settings.axis == "all":
+        return _tune_axes(path, _of_one_flight(settings, proposal))
+    return _tune_axis(_read_axis(path, settings), {})
+
+
+def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
+    """One axis after the other; filters that they share are those of the first that changes them.
+
+    Raises the error of the first axis where none can be used.
+    """
+    read: dict[str, _ReadAxis] = {}
+    errors: dict[str, ValueError] = {}
+    for axis in AXES:
+        try:
+            read[axis] = _read_axis(path, dataclasses.replace(settings, axis=axis))
+        except ValueError as error:  # the log lacks what this axis needs
+            errors[axis] = error
+    axes: dict[str, AutopilotProposal] = {}
+    filters: Mapping[str, float] = {}
+    for axis, each in read.items():
+        announce(f"{axis}:")
+        try:
+            axes[axis] = _tune_axis(each, filters)
+        except ValueError as error:  # it costs no other axis
+            errors[axis] = error
+            continue
+        filters = filters or axes[axis].shared_filters
+    if not axes:
+        raise next(iter(errors.values()))
+    return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
+
+
+def _of_one_flight(settings: AutopilotSettings, proposal: Proposal) -> AutopilotSettings:
+    """All axes of a file with several flights are of the one that is proposed."""
+    number = re.match(r"log(\d+)\.", proposal.setup.rate)
+    if number is None or settings.flight is not None:
+        return settings
+    return dataclasses.replace(settings, flight=int(number[1]))
+
+
+class _ReadAxis(NamedTuple):
+    """What a log holds of one axis."""
+
+    path: Path
+    settings: AutopilotSettings
+    asked: IdentifySettings
+    proposal: Proposal
+    flown: FlownAutopilot
+    flight: FlightChannels | None
+
+
+def _read_axis(path: Path, settings: AutopilotSettings) -> _ReadAxis:
+    announce("gains and filters that flew")
+    asked, proposal = _channels_of(path, settings)
+    flown, flight = _read_flight(path, asked, proposal, settings)
+    return _ReadAxis(path, settings, asked, proposal, flown, flight)
+
+
+def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotProposal:
+    """The gains of one axis, with `filters` that are changed already."""
+    path, settings, asked, proposal, flown, flight = axis
+    plant = identify_plant(path, asked, proposal, flown.filters)
+    known = (settings, plant, flown)
+    unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
+    recipe = what_to_fly(flown.firmware, AXES[flown.axis])
+    if not plant.fit.identifiable:
+        summary = plant.fit.verdict.summary
+        return unsure(f"this log cannot tell: {summary}. {recipe}", None)
+    if flight is None:
+        return unsure(_NO_SETPOINT, None)
+    announce("the flown loop again")
+    law = check_law(flown.loop, flown.axis, flight)
+    again = check_loop(plant, flown, flight, law)
+    if again.kind == "unknown":
+        return unsure(f"this log cannot tell: {again.verdict}. {recipe}", again)
+    if again.kind != "flown":
+        return unsure(f"this log cannot tell: {again.verdict}", again)
+    read = lambda inputs: read_records(path, plant.settings, beside=inputs)
+    throttle = study_throttle(plant, proposal, flown, read)
+    made = design_gains(settings, plant, flown, flight, throttle, filters)
+    return AutopilotProposal(
+        made.kind, made.verdict, *known, again, made.stages,
+        made.new if made.kind == "proposed" else {}, made.filters, made.noise, flight, throttle,
+    )  # fmt: skip
+
+
+_NO_SETPOINT = (
+    "this log cannot tell: it holds no set-point of the rate beside the gyro, so nothing says "
+    "whether these gains flew: log both"
+)
+
+
+def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
+    """What the log itself says is command, rate and reference."""
+    asked = IdentifySettings(
+        axis=None if settings.axis == "all" else settings.axis, chirp=settings.chirp,
+        flight=settings.flight, start=settings.start, stop=settings.stop, band=settings.band,
+    )  # fmt: skip
+    found, proposal = propose_settings(path, asked)
+    if proposal is None:
+        raise SettingsError(f"{path} proposes no channels: give the log of an autopilot")
+    return found, proposal
+
+
+def _read_flight(
+    path: Path, asked: IdentifySettings, proposal: Proposal, settings: AutopilotSettings
+) -> tuple[FlownAutopilot, FlightChannels | None]:
+    """The loop that flew, at the throttle of the log, and the channels beside the record's."""
+    values = settings_of(path, proposal).values
+    flight = read_channels_if_any(path, proposal, asked, values)
+    if settings.throttle is None and flight is not None:
+        settings = dataclasses.replace(settings, throttle=flight.middle)
+    tracked = {} if flight is None else flight.tracked_hz
+    flown = read_flown(path, proposal, settings, tracked)
+    chains = tuple(each for each in gyro_chains(flown.law) if each.filters)
+    filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
+    return dataclasses.replace(flown, filters=filters, filters_text=text), flight

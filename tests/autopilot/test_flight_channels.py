@@ -1,0 +1,39 @@
+"""What a proposal reads beside the record."""
+
+import numpy as np
+import pytest
+from flight_logs import ardupilot
+
+from jaxquad.autopilot._flight_channels import read_channels
+from jaxquad.records import propose, read_settings
+from jaxquad.workflows import IdentifySettings
+
+
+@pytest.mark.parametrize(
+    ("gyros", "core", "parameters", "used"),
+    [
+        ((0, 1), None, (), 0),
+        ((0, 1), 1, (), 1),
+        (
+            (0, 1),
+            1,
+            (("EK3_IMU_MASK", 2.0),),
+            0,
+        ),  # there is one filter, of IMU 1
+        ((0, 1), 0, (("EK3_IMU_MASK", 2.0),), 1),
+        ((1,), None, (("INS_RAW_LOG_OPT", 1.0),), 1),
+        ((1, 3), None, (("INS_RAW_LOG_OPT", 9.0),), 1),  # 3 is behind the filters
+        ((0,), None, (("INS_RAW_LOG_OPT", 6.0),), None),  # behind the filters only
+        ((), None, (), None),
+    ],
+)
+def test_ardupilots_unfiltered_gyro_is_that_which_flew(tmp_path, gyros, core, parameters, used):
+    path = ardupilot(tmp_path, 10, gyros=gyros, core=core, settings=parameters)
+    settings = IdentifySettings(start=22, stop=30)
+    flight = read_channels(path, propose(path), settings, read_settings(path).values)
+    if used is None:
+        assert flight.unfiltered == () and flight.names == ("RATE.R", "")
+        return
+    assert flight.names == ("RATE.R", f"GYR[{used}].GyrX")
+    assert len(flight.unfiltered) == 3
+    assert np.mean(flight.unfiltered[0]) == pytest.approx(used, abs=0.1)
