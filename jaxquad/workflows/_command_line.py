@@ -64,8 +64,8 @@ def in_options(text: str | BaseException) -> Message:
 
 
 def _word(term: str) -> str:
-    key = term.partition("|")[0]
-    if key in _WORDS:
-        return _WORDS[key]
+    key, _, python = term.rpartition("|")
+    key = key or python
     name, _, value = key.partition("=")
-    return f"{_ARGUMENTS[name]} {value}".rstrip()
+    flag = _ARGUMENTS.get(name)
+    return _WORDS.get(key, python if flag is None else f"{flag} {value}".rstrip())

@@ -57,6 +57,11 @@ def test_blocks_of_python_are_python(path):
 
 @pytest.mark.parametrize("path", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
 def test_lines_fit_a_screen(path):
-    tables = path.name == "validation.md"  # it is made, and rows of tables cannot be wrapped
-    lines = path.read_text().splitlines()
-    assert not [x for x in lines if len(x) >= 120 and not (tables and x.startswith("| "))]
+    assert not [line for line in path.read_text().splitlines() if len(line) >= 120]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_functions_are_in_the_files_that_a_page_names(path):
+    for file, name in re.findall(r"`([\w/]+\.py):(\w+)`", path.read_text()):
+        source = (ROOT / "jaxquad" / file).read_text()
+        assert re.search(rf"^\s*(?:def|class) {name}\b", source, flags=re.M), f"{file}:{name}"

@@ -1,4 +1,4 @@
-"""docs/validation.md is what the kept results of the studies say."""
+"""docs/validation.md and docs/validation/ are what the kept results of the studies say."""
 
 import json
 import sys
@@ -11,12 +11,14 @@ from conftest import ROOT
 
 STUDIES = ROOT / "tests" / "studies"
 sys.path.insert(0, str(STUDIES))  # tests/benchmarks has a page.py, too
-from page import page, studies  # noqa: E402  # pyright: ignore
+from page import files, page, studies  # noqa: E402  # pyright: ignore
 
 
-def test_the_page_is_made_from_the_results():
+def test_the_page_and_its_tables_are_made_from_the_results():
     # Else: python tests/studies/page.py
     assert (ROOT / "docs" / "validation.md").read_text() == page()
+    folder = ROOT / "docs" / "validation"
+    assert {path.name: path.read_text() for path in folder.iterdir()} == files()
 
 
 @pytest.mark.parametrize("name", studies())

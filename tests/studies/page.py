@@ -1,6 +1,13 @@
-"""Make docs/validation.md from the results of the studies: python tests/studies/page.py."""
+"""Make docs/validation.md and its tables from the studies: python tests/studies/page.py.
 
+The page says of each study what it finds; each table is a CSV file in docs/validation/, and
+notes.txt there holds what was simulated and what a study misses.
+"""
+
+import csv
+import io
 import json
+import re
 from pathlib import Path
 from textwrap import fill
 
@@ -9,6 +16,7 @@ from result_files import FOLDER, tables
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation.md"
+NOTES = "notes.txt"
 ORDER = (
     "healthy",
     "refined",
@@ -22,31 +30,90 @@ ORDER = (
     "adrc",
 )
 HEAD = """\
-# Validation
+# Validation: do the error bars hold?
 
-What a user gets without options, measured on plants whose truth is known. The page is made by
-`python tests/studies/page.py` from the files in `tests/studies/results/`; each section names the
-command that made its numbers. Plants and noise are simulated by NumPy and scipy alone, by code
-that shares nothing with the library.
+What a user gets without options, on plants whose truth is known. NumPy and scipy alone simulate
+plants and noise, by code that shares nothing with the library. Each section has its table and its
+command. [notes.txt](validation/notes.txt) says what was simulated. `python tests/studies/page.py`
+makes this page.
 """
+SHORT = {  # columns of the first table that the page itself shows
+    "plant": "plant",
+    "coverage %, with model error": "95 % intervals hold, %",
+    "rmse / bound, without luck": "error / least possible",
+    "remarks %": "remarks, %",
+}
+FINDINGS = {
+    "Healthy plants without options": """\
+400 records of each plant (200 of three inputs), through `jq.frequency_response` and `jq.fit` with
+their defaults. The least possible error is the Cramer-Rao bound; the luck of the draws is taken
+out. Wanted: 93 to 97 %, at most 1.06 (coloured noise 1.10), at most 2 % of records with a remark.
+scipy's `csd` and `least_squares` on the same records: 1.5 to 490 times the bound.
+""",
+    "Healthy plants, parameter by parameter": """\
+95 % of 400 draws is known to 2.1 %. Counting model error widens intervals by 0 to 12 % where the
+model is right.
+""",
+    "Refinement in the time domain": """\
+`jq.refine` reaches 0.92 to 1.05 times the bound with a noise model, in closed loop too. Output
+error without one diverges in a closed loop; with the controller known (`loop=`) it has 3.2 to 7.1
+times the bound.
+""",
+    "Ring-down at the end of a record": """\
+A light mode still rings when the record ends: the worst error is 2.0 to 2.5 claimed errors in the
+median record, 4.7 at most.
+""",
+    "The same, no global model": """\
+With local fits alone it is 2.6 to 171 claimed errors, and up to 319 %. Six of nine settings have
+remarks in 97 % of records or more; 3 rad/s at 5 % noise has them in 5 %.
+""",
+    "The hold of a command": """\
+A command is held for 0.02 s. With the hold stated, 93.5 to 98 % of the intervals hold the truth.
+Not stated, parameters are biased by up to 90 claimed errors, and every record has a remark.
+""",
+    "Nonlinear actuators": """\
+A deadband of 15 % or a saturation at 80 % is remarked in 100 % of records, a linear actuator in
+none.
+""",
+    "Short records": """\
+With Student's t, 93.8 to 95 % of intervals hold for one input and 10 to 66 s; 91.2 % for three
+inputs and 20 s; 90.5 % for 8 lines over 4 periods.
+""",
+    "Intervals with model error": """\
+1280 records of plants with one term that the model lacks: the gain's 95 % interval holds in 95.9
+% (by noise alone in 37 %), that of lag + delay in 89.7 % (15.4 %). An echo, or a lead and lag
+within the band, bends the phase as a lag does and cannot be seen: 70 %.
+""",
+    "Tuned designs, judged again": """\
+Other code flies 2000 members of `tests/tuning_case.py`. None of a design by `jq.tune` is unstable
+or beyond its limit Ms <= 3.6; the paper's gains leave 36 to 70 % unstable. With 95 % confidence
+at most 1.2 % of all members exceed the worst of 256.
+""",
+    "ADRC parameters from a log, on the true plant": """\
+200 simulated flights of a 5-inch quad. `propose_adrc` keeps Ms at most 1.8 in all; Ms exceeds the
+worst certified value by at most 0.5 %. The guide's "b0 times two" keeps it too, with 58 % of the
+bandwidth and 1.8 times the rate after a torque. The simulated plant has the model's structure.
+""",
+}
 TAIL = """\
 ## Numbers of others, and measured flights
 
-- CIFER 6.3 printed a fit of a simulated Cessna's pitch rate to its elevator: gain, zero, pole and
-  frequency of jaxquad agree with it within one standard error, the damping within 2.2
-  ([Beside other tools](comparison.md), `python fits/cessna_navfit.py`).
-- Five flights that others have published, among them a test stand, a Crazyflie and logs without
-  any excitation: [Measured flights](measured.md) shows the commands and what they answer.
-- The 29 equations of the paper, and its figures: [The paper's equations](equations.md),
-  `python fits/paper.py`.
-- Loops, margins and simulations equal python-control's and scipy's:
-  [Beside other tools](comparison.md).
+- A fit that CIFER 6.3 printed, `python fits/cessna_navfit.py`: [Comparison](comparison.md).
+- Five published flights: [Measured flights](measured.md).
+- Loops and simulations equal python-control's and scipy's: [Comparison](comparison.md).
+- The paper's figures: [equations](equations.md), `python fits/paper.py`.
 """
 
 
 def page() -> str:
     """The whole page."""
-    return "\n".join([HEAD, *(_section(table) for name in studies() for table in _of(name)), TAIL])
+    return "\n".join([HEAD, *(_section(table) for table in _tables()), TAIL])
+
+
+def files() -> dict[str, str]:
+    """Text of the files in docs/validation/ by name."""
+    made = {_file_name(table): _as_csv(table) for table in _tables()}
+    return made | {NOTES: "\n".join(_notes(table) for table in _tables())}
 
 
 def studies() -> list[str]:
@@ -55,21 +122,47 @@ def studies() -> list[str]:
     return [name for name in ORDER if name in there] + [n for n in there if n not in ORDER]
 
 
-def _of(name: str) -> list[dict]:
-    return tables(json.loads((FOLDER / f"{name}.json").read_text()))
+def _tables() -> list[dict]:
+    return [
+        table
+        for name in studies()
+        for table in tables(json.loads((FOLDER / f"{name}.json").read_text()))
+    ]
+
+
+def _file_name(table: dict) -> str:
+    return re.sub(r"\W+", "_", table["title"].lower()) + ".csv"
+
+
+def _as_csv(table: dict) -> str:
+    text = io.StringIO()
+    rows = [[shown(cell) for cell in row] for row in table["rows"]]
+    csv.writer(text, lineterminator="\n").writerows([table["columns"], *rows])
+    return text.getvalue()
+
+
+def _notes(table: dict) -> str:
+    title = table["title"]
+    parts = [title, "=" * len(title), table["command"], "", fill(table.get("text", ""), 110)]
+    parts += [fill(f"- {note}", 110, subsequent_indent="  ") for note in table.get("notes", ())]
+    return "\n".join(parts) + "\n"
 
 
 def _section(table: dict) -> str:
-    rows = [table["columns"], ["---"] * len(table["columns"])]
-    # [0][1] would be a link.
-    rows += [[shown(cell).replace("[", "\\[") for cell in row] for row in table["rows"]]
-    parts = [f"## {table['title']}", f"`{table['command']}`", fill(table.get("text", ""), 110)]
-    parts += ["\n".join(f"| {' | '.join(row)} |" for row in rows)]
-    notes = [fill(f"- {note}", 110, subsequent_indent="  ") for note in table.get("notes", ())]
-    parts += ["\n".join(notes)]
+    title = table["title"]
+    parts = [f"## {title}", fill(FINDINGS.get(title, table.get("text", "")), 110)]
+    if title == "Healthy plants without options":
+        places = [table["columns"].index(name) for name in SHORT]
+        rows = [[*SHORT.values()], ["---"] * len(SHORT)]
+        rows += [[str(row[place]) for place in places] for row in table["rows"]]
+        parts += ["\n".join(f"| {' | '.join(row)} |" for row in rows)]
+    parts += [f"[Table](validation/{_file_name(table)})\n`{table['command']}`"]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 if __name__ == "__main__":
     PAGE.write_text(page())
+    PAGE.with_suffix("").mkdir(exist_ok=True)
+    for name, text in files().items():
+        (PAGE.with_suffix("") / name).write_text(text)
     print(PAGE)
