@@ -128,6 +128,5 @@ def _values_and_gradients(
         return value
 
     function = jax.value_and_grad(of_values)
-    try:
-        found = [function(jnp.asarray(values), arrays) for values in places]
+    found = [function(jnp.asarray(values), arrays) for values in places]
     return [(float(value), np.asarray(gradient)) for value, gradient in found]
