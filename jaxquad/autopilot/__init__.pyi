@@ -2,18 +2,7 @@ from ._adrc import ADRCProposal as ADRCProposal, propose_adrc as propose_adrc
 from ._adrc_loops import Flown as Flown, gyro_filters as gyro_filters
 from ._adrc_result import ADRCAutopilot as ADRCAutopilot
 from ._adrc_stages import ADRCStage as ADRCStage, ADRCTargets as ADRCTargets
-from ._ardupilot import ArduPilotAttitude as ArduPilotAttitude, ArduPilotRate as ArduPilotRate
 from ._axes_proposal import AxesProposal as AxesProposal
-from ._betaflight import (
-    adrc_b0 as adrc_b0,
-    BetaflightADRC as BetaflightADRC,
-    BetaflightAngle as BetaflightAngle,
-    BetaflightPID as BetaflightPID,
-    DMax as DMax,
-    dynamic_cutoff as dynamic_cutoff,
-    ItermRelax as ItermRelax,
-    tpa_factor as tpa_factor,
-)
 from ._choices import (
     change_filters as change_filters,
     filter_choices as filter_choices,
@@ -21,8 +10,6 @@ from ._choices import (
     FilterOption as FilterOption,
     flown_loop as flown_loop,
 )
-from ._crazyflie import CrazyflieAttitude as CrazyflieAttitude, CrazyflieRate as CrazyflieRate
-from ._demo_chirp import CHIRP_TRUTH as CHIRP_TRUTH, write_chirp_log as write_chirp_log
 from ._files import (
     change_table as change_table,
     parameter_file as parameter_file,
@@ -59,13 +46,6 @@ from ._flown import (
     FlownLoop as FlownLoop,
     px4_loop as px4_loop,
 )
-from ._flown_adrc import (
-    adrc_parameters as adrc_parameters,
-    b0_law as b0_law,
-    betaflight_adrc_loop as betaflight_adrc_loop,
-    flies_adrc as flies_adrc,
-    FlownADRC as FlownADRC,
-)
 from ._flown_autopilot import (
     FlownAutopilot as FlownAutopilot,
     read_flown as read_flown,
@@ -90,10 +70,6 @@ from ._gains import (
     rate_parameters as rate_parameters,
     RateGains as RateGains,
     torque_per_unit as torque_per_unit,
-)
-from ._harmonic_notch import (
-    ardupilot_harmonic_notch as ardupilot_harmonic_notch,
-    HarmonicNotch as HarmonicNotch,
 )
 from ._law import (
     AngleLoop as AngleLoop,
@@ -122,7 +98,6 @@ from ._parameters import (
     with_parameters as with_parameters,
 )
 from ._proposal import AutopilotProposal as AutopilotProposal
-from ._px4 import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
 from ._rate_design import design_gains as design_gains
 from ._rate_gains import gyro_chains as gyro_chains
 from ._recipe import what_to_fly as what_to_fly
@@ -141,3 +116,31 @@ from ._reproduce_flight import (
     reproduce_flight as reproduce_flight,
     Reproduction as Reproduction,
 )
+from .ardupilot._harmonic_notch import (
+    ardupilot_harmonic_notch as ardupilot_harmonic_notch,
+    HarmonicNotch as HarmonicNotch,
+)
+from .ardupilot._law import ArduPilotAttitude as ArduPilotAttitude, ArduPilotRate as ArduPilotRate
+from .betaflight._demo_flight import CHIRP_TRUTH as CHIRP_TRUTH, write_chirp_log as write_chirp_log
+from .betaflight._flown_adrc import (
+    adrc_parameters as adrc_parameters,
+    b0_law as b0_law,
+    betaflight_adrc_loop as betaflight_adrc_loop,
+    flies_adrc as flies_adrc,
+    FlownADRC as FlownADRC,
+)
+from .betaflight._law import (
+    adrc_b0 as adrc_b0,
+    BetaflightADRC as BetaflightADRC,
+    BetaflightAngle as BetaflightAngle,
+    BetaflightPID as BetaflightPID,
+    DMax as DMax,
+    dynamic_cutoff as dynamic_cutoff,
+    ItermRelax as ItermRelax,
+    tpa_factor as tpa_factor,
+)
+from .crazyflie._firmware import (
+    CrazyflieAttitude as CrazyflieAttitude,
+    CrazyflieRate as CrazyflieRate,
+)
+from .px4._firmware import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate

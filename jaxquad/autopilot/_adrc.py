@@ -26,10 +26,10 @@ from ._adrc_stages import (
     rows_of,
     stages_of,
 )
-from ._flown_adrc import FlownADRC
 from ._parameters import store_parameters
 from ._rate_design import Kind
 from ._rate_gains import LoopQualities
+from .betaflight._flown_adrc import FlownADRC
 
 
 _LAW: B0Law = "SQRT"  # of the firmware by default

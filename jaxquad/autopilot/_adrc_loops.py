@@ -12,8 +12,8 @@ from jaxquad.identify import B0Schedule, draw_models, GainOverThrottle
 
 from ._filters import FilterChain, PT2
 from ._flown import FlownBetaflight
-from ._flown_adrc import FlownADRC
 from ._rate_gains import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
+from .betaflight._flown_adrc import FlownADRC
 
 
 Designs = Float[np.ndarray, "designs 3"]  # wc, wo, b0

@@ -12,7 +12,6 @@ from jaxquad.report import Headline, Provenance, Table
 from ._adrc import ADRCProposal
 from ._adrc_loops import ADRCFrame, make_adrc_loop
 from ._filters import FilterChain, PT2
-from ._flown_adrc import FlownADRC
 from ._page import B0Section, PilotPage
 from ._pilot_page import (
     Chains,
@@ -23,6 +22,7 @@ from ._pilot_page import (
     StepGrid,
     VERDICTS,
 )
+from .betaflight._flown_adrc import FlownADRC
 
 
 if TYPE_CHECKING:

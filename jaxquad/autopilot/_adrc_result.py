@@ -15,12 +15,12 @@ from ._adrc_loops import Flown
 from ._adrc_page import adrc_page
 from ._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from ._flight_channels import FlightChannels
-from ._flown_adrc import adrc_parameters, b0_law, FlownADRC
 from ._identified import DesignSettings
 from ._page import write_pilot_page
 from ._parameters import find_parameter
 from ._rate_design import Kind
 from ._reproduce_flight import Reproduction
+from .betaflight._flown_adrc import adrc_parameters, b0_law, FlownADRC
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has

@@ -10,15 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from ._ardupilot import ArduPilotRate
-from ._betaflight import (
-    BetaflightADRC,
-    BetaflightPID,
-    DMax,
-    dynamic_cutoff,
-    ItermRelax,
-    tpa_factor,
-)
 from ._filters import (
     BandwidthNotch,
     betaflight_quality,
@@ -30,9 +21,18 @@ from ._filters import (
     PT2,
     PT3,
 )
-from ._harmonic_notch import HarmonicNotch, read_harmonic_notches, Tracking
 from ._parameters import list_parameters
-from ._px4 import PX4Rate
+from .ardupilot._harmonic_notch import HarmonicNotch, read_harmonic_notches, Tracking
+from .ardupilot._law import ArduPilotRate
+from .betaflight._law import (
+    BetaflightADRC,
+    BetaflightPID,
+    DMax,
+    dynamic_cutoff,
+    ItermRelax,
+    tpa_factor,
+)
+from .px4._firmware import PX4Rate
 
 
 RateLaw = TypeVar("RateLaw", BetaflightPID, BetaflightADRC, PX4Rate, ArduPilotRate)

@@ -11,13 +11,13 @@ from jaxquad.identify import KnownFilter, MeasuredChain
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
 from ._angle_loop import angle_loop_of, AngleLoop
-from ._betaflight import BetaflightPID
 from ._choices import change_filters, flown_loop
 from ._flight_channels import HOVER
 from ._flown import FlownLoop
 from ._identified import DesignSettings
 from ._parameters import Firmware
 from ._rate_gains import gains_of, parameters_of, RateLaw
+from .betaflight._law import BetaflightPID
 
 
 @dataclasses.dataclass(frozen=True)

@@ -169,9 +169,9 @@ def _read_law(
 ) -> FlownLaw:
     from ._choices import flown_loop
     from ._flight_channels import HOVER, read_channels_if_any
-    from ._flown_adrc import flies_adrc
     from ._flown_autopilot import settings_of
     from ._rate_gains import gyro_chains
+    from .betaflight._flown_adrc import flies_adrc
 
     logged = settings_of(path, proposal)
     if not any(name in logged.values for name in _CUTOFFS[proposal.vehicle]):
@@ -224,7 +224,8 @@ def _measured(
     moves = np.ptp(flight.setpoint) > 0
     try:
         return measured_chain(
-            unfiltered, filtered, flight.dt, known=chains, names=(flight.names[1], flight.names[0]),
+            unfiltered, filtered, flight.dt, filters=chains,
+            names=(flight.names[1], flight.names[0]),
             reference=flight.setpoint if moves else None,
         )  # fmt: skip
     except ValueError as error:

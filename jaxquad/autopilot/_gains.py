@@ -11,9 +11,9 @@ from jaxquad._core import as_float, Number, pick_gain, require_positive
 from jaxquad.control import AdaptiveLADRC, LADRC, PID, ScheduledLADRC
 from jaxquad.records import AXES
 
-from ._betaflight import D_SCALE, I_SCALE, P_SCALE
 from ._law import DEGREES
 from ._parameters import Firmware
+from .betaflight._law import D_SCALE, I_SCALE, P_SCALE
 
 
 class RateGains(NamedTuple):

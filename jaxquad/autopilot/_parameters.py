@@ -12,11 +12,11 @@ from jaxtyping import Array
 from jaxquad._core import Number
 from jaxquad.records import AXES
 
-from ._ardupilot import ArduPilotAttitude, ArduPilotRate
-from ._betaflight import BetaflightADRC, BetaflightAngle, BetaflightPID
-from ._crazyflie import CrazyflieAttitude, CrazyflieRate
 from ._filters import Butterworth
-from ._px4 import PX4Attitude, PX4Rate
+from .ardupilot._law import ArduPilotAttitude, ArduPilotRate
+from .betaflight._law import BetaflightADRC, BetaflightAngle, BetaflightPID
+from .crazyflie._firmware import CrazyflieAttitude, CrazyflieRate
+from .px4._firmware import PX4Attitude, PX4Rate
 
 
 Firmware = Literal["betaflight", "px4", "ardupilot", "crazyflie"]

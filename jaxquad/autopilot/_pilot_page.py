@@ -11,8 +11,6 @@ from jaxquad.plot import FlownAgain, Spectrum, StepBand
 from jaxquad.records import AXES
 from jaxquad.report import Cell, Headline, Provenance, reason_of, Table
 
-from ._ardupilot import ArduPilotRate
-from ._betaflight import BetaflightPID
 from ._files import ParameterChange, WordChange
 from ._filters import FilterChain, PT1
 from ._flight_channels import FlightChannels
@@ -21,6 +19,8 @@ from ._limits import limits_text
 from ._page import PilotPage
 from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, RateLaw
 from ._stages import margin_text, Stage
+from .ardupilot._law import ArduPilotRate
+from .betaflight._law import BetaflightPID
 
 
 if TYPE_CHECKING:

@@ -19,12 +19,12 @@ from jaxquad.identify import filter_response
 from jaxquad.records import AXES
 
 from ._angle_loop import OuterQualities
-from ._ardupilot import ArduPilotRate
-from ._betaflight import BetaflightADRC, BetaflightPID
 from ._filters import FilterChain
 from ._parameters import Firmware, firmware_of, Parameter, PARAMETERS, store_parameters
-from ._px4 import PX4Rate
 from ._reproduce import without_gyro_filters
+from .ardupilot._law import ArduPilotRate
+from .betaflight._law import BetaflightADRC, BetaflightPID
+from .px4._firmware import PX4Rate
 
 
 RateLaw = BetaflightPID | PX4Rate | ArduPilotRate

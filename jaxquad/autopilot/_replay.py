@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 
 from jaxquad.control import Setpoint
 
-from ._betaflight import F_SCALE
 from ._flown import FlownBetaflight, FlownLoop
 from ._law import DEGREES
 from ._reproduce import without_gyro_filters
+from .betaflight._law import F_SCALE
 
 
 Samples = Float[Array | np.ndarray, "samples axes"]

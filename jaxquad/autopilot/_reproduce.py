@@ -11,11 +11,11 @@ from jaxtyping import Array, Complex, Float
 
 from jaxquad.control import LinearController
 
-from ._ardupilot import ArduPilotRate
-from ._betaflight import BetaflightADRC, BetaflightPID
-from ._crazyflie import CrazyflieRate
 from ._filters import FilterChain, PT1
-from ._px4 import PX4Rate
+from .ardupilot._law import ArduPilotRate
+from .betaflight._law import BetaflightADRC, BetaflightPID
+from .crazyflie._firmware import CrazyflieRate
+from .px4._firmware import PX4Rate
 
 
 Rate = TypeVar(

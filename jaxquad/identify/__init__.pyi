@@ -15,11 +15,9 @@ from ._known_filters import (
     behind_filters as behind_filters,
     filter_response as filter_response,
     KnownFilter as KnownFilter,
-    without_filters as without_filters,
-)
-from ._measured_chain import (
     measured_chain as measured_chain,
     MeasuredChain as MeasuredChain,
+    without_filters as without_filters,
 )
 from ._thrust_curve import (
     GainBand as GainBand,
@@ -73,16 +71,15 @@ from .frequency_domain._transfer_function_fit import fit_transfer_function as fi
 from .frequency_domain._transfer_function_guess import (
     guess_transfer_function as guess_transfer_function,
 )
-from .output_error._compare import compare as compare, Comparison as Comparison
-from .output_error._known_loop import (
-    KnownController as KnownController,
-    SampledFeedback as SampledFeedback,
-)
-from .output_error._noise_model import (
+from .output_error._noise import (
     ARMA as ARMA,
     AutoRegressive as AutoRegressive,
     Noise as Noise,
     NoiseModel as NoiseModel,
+)
+from .output_error._problem import (
+    KnownController as KnownController,
+    SampledFeedback as SampledFeedback,
 )
 from .output_error._refine import refine as refine
 from .output_error._simulated import (
@@ -92,6 +89,8 @@ from .output_error._simulated import (
 )
 from .output_error._verify import (
     Agreement as Agreement,
+    compare as compare,
+    Comparison as Comparison,
     Verification as Verification,
     verify as verify,
 )

@@ -9,6 +9,7 @@ import numpy as np
 from ._clock import clock_start, JITTER, nonuniformity, Number, show_times, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
+from ._firmwares import firmware_log
 from ._log import known_unit
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
 from ._repair import check_ranges, repair_values, Valid, within, without_turns
@@ -301,15 +302,16 @@ def read_settings(path: str | Path, *, log: str = "", at: Number | None = None) 
         values = {
             k.removeprefix(f"{log} "): x for k, x in values.items() if k.startswith(f"{log} ")
         }
-    if content.vehicle not in ("ardupilot", "px4", "betaflight") or not values:
+    firmware = firmware_log(content.vehicle)
+    if firmware is None or not firmware.settings or not values:
         raise ReadError(
             f"{path}: the file holds no parameters of ArduPilot, PX4 or Betaflight"
             + (f" under {log!r}" if log else "")
             + ": give the log that the autopilot wrote, with its parameters logged."
         )
-    text = values.get("ver_sw_release", values.get("Firmware revision", content.firmware))
+    text = values.get(firmware.release, content.firmware)
     match = re.search(r"(\d+)\.(\d+)(?:\.(\d+))?", text)
-    if content.vehicle == "px4" and text.isdecimal():  # one byte each
+    if text.isdecimal():  # one byte each, as PX4 has them
         version = tuple(int(text) >> shift & 0xFF for shift in (24, 16, 8))
     else:
         version = tuple(int(part or 0) for part in match.groups()) if match else ()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from ._leakage import find_bias, Fit, power_of, Slopes, without_leakage
-from ._noise_root import noise_root
+from ._noise import noise_root
 
 
 _TINY = 1e-300

@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad.records import Record
 
-from ._window import window
+from ._windows import window
 
 
 class LocalPolynomial(eqx.Module):

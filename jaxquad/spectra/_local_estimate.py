@@ -26,7 +26,6 @@ from ._local_fit import (
     LocalFit,
     recolour,
     record_bins,
-    replace_rows,
     transformed_columns,
     window_slices,
 )
@@ -34,14 +33,12 @@ from ._local_noise import (
     error_covariance,
     multiple_coherence,
     partial_coherence,
-    smooth_noise,
-    undetermined,
     unresolved,
 )
 from ._local_width import choose_widths, reach, Respond
 from ._local_windows import Grid, make_windows
-from ._narrow_fit import fit_narrow, Method, Narrow, rows_of, Setup
-from ._noise_freedom import covariance_of_bands, smoothed
+from ._narrow_fit import fit_narrow, Method, Narrow, Setup
+from ._noise import covariance_of_bands, smooth_noise, smoothed
 from ._remarks import Remark
 
 
@@ -78,7 +75,11 @@ def estimate_local_polynomial(
     width, rational = _choose(setup, narrow, options.width)
     moved = _fit_chosen(omega, width, rational, setup.to_moved(narrow.rest))
     doubts = _doubt(setup, narrow, moved, options.width)
-    moved = replace_rows(moved, doubts.lost, undetermined(rows_of(moved, doubts.lost)))
+    lost = moved.rows(doubts.lost)
+    blank = {
+        name: getattr(lost, name) * np.nan for name in ("response", "effect", "gain", "scatter")
+    }
+    moved = moved.replace_rows(doubts.lost, lost._replace(**blank, freedom=0 * lost.freedom))
     plant = setup.plant(moved)
     back = recolour(omega, options.integrators, options.delay, dt)[:, None, None]
     coherence, direct, multiple = _coherence(setup, narrow)
@@ -137,7 +138,7 @@ def _fit_chosen(
     fit = respond(omega, width, "polynomial")
     if not np.any(rational):
         return fit
-    return replace_rows(fit, rational, respond(omega[rational], width[rational], "rational"))
+    return fit.replace_rows(rational, respond(omega[rational], width[rational], "rational"))
 
 
 class _Doubts(NamedTuple):

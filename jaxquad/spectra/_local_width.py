@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ._local_fit import Bins, LocalFit, replace_rows, window_slices
-from ._local_noise import Noise
+from ._local_fit import Bins, LocalFit, window_slices
+from ._noise import Noise
 
 
 _RATIO = 1.8  # of successive half-widths
@@ -44,7 +44,7 @@ def choose_widths(
     for below, width in zip(widths[:-1], widths[1:], strict=True):
         wider = width > below
         part = _without_effect(respond(omega[wider], width[wider], "polynomial"))
-        fits.append(replace_rows(fits[-1], wider, part))
+        fits.append(fits[-1].replace_rows(wider, part))
     rational = _resonant(fits, respond(omega, least, "rational"), noise)
     step, each = _widest_unbiased(omega, widths, fits, noise), np.arange(omega.size)
     gain = np.stack([np.mean(fit.gain, axis=(1, 2)) for fit in fits])

@@ -12,8 +12,7 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance
 from ._estimators import Periodic
 from ._frequency_response import Distortion
-from ._local_noise import smooth_noise
-from ._noise_freedom import smoothed
+from ._noise import smooth_noise, smoothed
 from ._remarks import Remark
 
 

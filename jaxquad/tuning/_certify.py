@@ -8,17 +8,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
+from jaxquad.control import Reference
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop
 from jaxquad.simulation import Authority, beyond_authority, find_authority, Scenario
 
-from ._beside import Beside, evaluate_beside
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
 from ._design_result import measure_distances
 from ._evaluate_design import analyse_further, evaluate_design, member_facts
 from ._objective import Limit
-from ._problem import decouple, DeviceChoice, TimeSpan
+from ._problem import decouple, DeviceChoice, require_same_rate, TimeSpan
 from ._quantities import QUANTITIES
+
+
+class _Idle(eqx.Module):
+    """The controller that does nothing."""
+
+    def init(self, like: Float[Array, " axes *ensemble"]) -> None:
+        """It remembers nothing."""
+        return None
+
+    def step(
+        self, state: None, reference: Reference, measurement: Float[Array, " axes *ensemble"]
+    ) -> tuple[None, Float[Array, " axes *ensemble"]]:
+        """The command 0."""
+        return None, jnp.zeros_like(measurement)
 
 
 def certify(
@@ -86,34 +100,18 @@ def certify(
             f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
             "jq.ensembles.Members of it"
         )
-    span = TimeSpan(tuple(events), start, stop, load_start)
-    beside = evaluate_beside(
-        loop, ensemble, scenario, key, peers=_named(peers or {}, name), begun=begun,
-        members=members, span=span, devices=devices,
-    )  # fmt: skip
-    return certify_beside(
-        loop, ensemble, scenario, beside, limits=limits, linear_members=linear_members, key=key,
-        span=span, name=name, devices=devices,
-    )  # fmt: skip
-
-
-def certify_beside(
-    loop: Loop,
-    ensemble: Ensemble | Members,
-    scenario: Scenario,
-    beside: Beside,
-    *,
-    limits: Sequence[Limit],
-    linear_members: int | None,
-    key: Key[Array, ""],
-    span: TimeSpan,
-    name: str,
-    devices: DeviceChoice,
-) -> Certificate:
-    """The certificate of `loop.controller`, on the members that other designs were evaluated on."""
-    given, drawn, flight = isinstance(ensemble, Members), beside.drawn, beside.flight
-    design = evaluate_design(loop.controller, drawn, flight, span, devices)
-    results = {name: design} | beside.peers
+    span, peers = TimeSpan(tuple(events), start, stop, load_start), dict(peers or {})
+    if name in peers:
+        raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")
+    # Independent draws, as the bound of a share needs.
+    given = isinstance(ensemble, Members)
+    drawn = ensemble if given else ensemble.fresh(loop, members, key)
+    require_same_rate(loop, drawn)
+    flight = drawn.flight(scenario)
+    evaluate = lambda design: evaluate_design(design, drawn, flight, span, devices)
+    error_at_start = None if begun is None else evaluate(begun)
+    others = {peer: evaluate(controller) for peer, controller in peers.items()}
+    idle, design = evaluate(_Idle()), evaluate(loop.controller)
     further = None
     if isinstance(ensemble, Ensemble) and design.unstable is not None:  # it has a linear loop
         further = analyse_further(
@@ -123,14 +121,14 @@ def certify_beside(
     known["linear_members"] = 0 if further is None else further.design.members
     known["controller"] = describe_controller(loop.controller)
     found = Certificate(
-        designs=results,
+        designs={name: design} | others,
         distances=measure_distances(design, limits, independent=not given, further=further),
         facts=member_facts(drawn),
         nominal=_nominal_inertia(loop) if isinstance(ensemble, Ensemble) else None,
         provenance=known,
         remarks=(),
-        idle=beside.idle,
-        start=beside.start,
+        idle=idle,
+        start=error_at_start,
         error="itae" if _moves(flight) else "rms",
         further=further,
     )
@@ -184,12 +182,6 @@ def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[s
         for name, value in rates.items()
         if value > _ROUNDED * band[1]
     ]
-
-
-def _named(peers: Mapping[str, PyTree], name: str) -> dict[str, PyTree]:
-    if name in peers:
-        raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")
-    return dict(peers)
 
 
 def _nominal_inertia(loop: Loop) -> Float[np.ndarray, " axes"]:

@@ -1,7 +1,6 @@
 """Members that a controller is tuned on, and those that are searched for the worst."""
 
 import dataclasses
-import functools as ft
 from typing import NamedTuple
 
 import jax
@@ -103,7 +102,7 @@ def make_search(
     flights = FlightSearch(
         lambda k: fresh(_FLOWN + k, size), around, problem, fresh(_GUARDING, GUARDS), size
     )
-    loops = ft.cache(lambda k: linear_loops(fresh(_FIRST + k, SLICE), job.devices))
+    loops = lambda k: linear_loops(fresh(_FIRST + k, SLICE), job.devices)
     small = min(reserve, _MARGIN)
     aimed = [tighten(x, small if isinstance(x.over, Worst) else reserve) for x in limits]
     return Search(

@@ -1,7 +1,7 @@
 """Stabilise, then optimise: all problems in lockstep, limits by an augmented Lagrangian."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -76,13 +76,10 @@ def solve(
     rate: float,
     progress: Progress,
     search: Search | None = None,
-    traced: Callable[[], None] = lambda: None,
 ) -> Solution:
     """Both phases of all problems: `objectives` and `limits` hold arrays [problems, ...].
 
     A `search` finds members that are beyond limits, and the problems descend again with these.
-    `traced` is called when all that is left is to compile and to run: another thread that began
-    before would share the interpreter with the tracing, and both would end later.
 
     A problem whose members cannot all be made to decay at `rate` (1/s, negative) stays with the
     first phase's best if one of them is unstable. Otherwise no step is taken to where one is, and
@@ -92,8 +89,6 @@ def solve(
     runner = _Runner(
         coordinates, problem, objectives, tuple(limits), method, rate, progress, memory
     )
-    runner.trace(np.asarray(start, float))
-    traced()
     first = runner.stabilise(np.asarray(start, float))
     slowest = runner.slowest(first.z)
     stable = slowest < 0
@@ -200,11 +195,6 @@ class _Runner(eqx.Module):
     rate: float  # 1/s
     progress: Progress
     memory: _Memory
-
-    def trace(self, z: np.ndarray) -> None:
-        """Trace and lower the program of all evaluations, which the first one compiles."""
-        multipliers = initial_multipliers(self.problem, self.limits, len(z))
-        evaluate_cost.begin(*self._given(z, np.ones(len(z), bool), False, multipliers))
 
     def evaluate(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers

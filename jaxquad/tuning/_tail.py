@@ -135,14 +135,6 @@ def search_tail(
     return found
 
 
-def prepare_search(search: Search, coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> None:
-    """Draw the linear loops of the first search, and compile what evaluates them."""
-    if search.linear is None:
-        return
-    slices = [search.linear(k) for k in range(_LOOPS // SLICE)]
-    _levels(as_array(z), coordinates, slices[0], take_problem(search.limits, 0))
-
-
 Slice = TypeVar("Slice")
 Ranked = list[tuple[float, tuple[int, int]]]  # levels, the worst first: slice, and place in it
 

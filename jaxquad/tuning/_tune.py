@@ -1,9 +1,8 @@
 """Gains tuned by gradient through the closed loops of an ensemble, with a certificate."""
 
 import dataclasses
-import functools as ft
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,9 +16,8 @@ from jaxquad.identify import Free
 from jaxquad.loops import Loop
 from jaxquad.simulation import Scenario
 
-from ._beside import begin_evaluating, Beside, evaluate_beside
 from ._certificate import Certificate, lag_remark
-from ._certify import certify_beside
+from ._certify import certify
 from ._cost import Listener, Progress, stack_copies
 from ._drawn import draw_or_take, Job, make_search, pose_problem, tighten
 from ._evaluate_design import certified_members
@@ -31,7 +29,7 @@ from ._phases import go_on, Solution, solve
 from ._problem import DeviceChoice, Problem, TimeSpan
 from ._refusal import find_bounds
 from ._requirements import require_fresh, require_kinds, require_steps
-from ._tail import certified_beyond, prepare_search, Search
+from ._tail import certified_beyond, Search
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
 from ._verdict import Bound, judge_convergence, Verdict
 
@@ -130,95 +128,20 @@ def tune(
     search = make_search(job, drawn, reserve=reserve, starts=starts, size=size)
     problem = pose_problem(job, drawn, search)
     require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
-    certifier = _make_certifier(job, coordinates, watched, fresh, peers or {})
     tightened = tuple(tighten(limit, reserve) for limit in limits)
-
-    def traced() -> None:
-        if certifier is not None:
-            certifier.begin(search)
-
     solution = solve(
         coordinates, problem, scatter_starts(coordinates.start, starts, scatter, seed=0),
         stack_copies(objective, starts), stack_copies(tightened, starts), method=method,
-        rate=stabilising_rate(objective), progress=watched, search=search, traced=traced,
+        rate=stabilising_rate(objective), progress=watched, search=search,
     )  # fmt: skip
     best, seconds = _best(solution), watched.seconds
-    certified = _certify(certifier, solution, best, search if isinstance(fresh, int) else None)
+    certified = _certify(job, coordinates, watched, fresh, peers, solution, best, search)
     return _tuned(job, coordinates, problem, certified, best, watched, seconds)
 
 
 _SIZE = 256  # flights in a slice
 _CERTIFICATES = 3  # at most
 _AGAIN = 0xCE57  # folded into the key of certificates after the first
-
-
-class _Certifier:
-    """Certificates of a design, each on members of its own, beside peers and the start."""
-
-    def __init__(
-        self,
-        job: Job,
-        coordinates: Coordinates,
-        watched: Progress,
-        others: Ensemble | Members,
-        count: int,
-        peers: Mapping[str, PyTree],
-    ):
-        self.job, self.others, self.count = job, others, count
-        self._coordinates, self._watched = coordinates, watched
-        self._beside = ft.partial(
-            evaluate_beside, job.loop, others, job.scenario, peers=peers,
-            begun=job.loop.controller, members=count, span=job.span, devices=job.devices,
-        )  # fmt: skip
-        self._first: Callable[[], Beside] | None = None
-
-    def begin(self, search: Search | None) -> None:
-        """Begin, in a thread, with what the search needs and what stands beside the design."""
-
-        def prepare() -> None:
-            if search is not None:
-                prepare_search(search, self._coordinates, self._coordinates.start)
-
-        key, devices = self.job.key, self.job.devices
-        self._first = begin_evaluating(lambda: self._beside(key), devices, before=prepare)
-
-    def first(self, z: Float[np.ndarray, " n"]) -> Certificate:
-        """On members of the job's key."""
-        assert self._first is not None
-        return self._judge(z, self.job.key, self._first())
-
-    def again(self, z: Float[np.ndarray, " n"], key: Key[Array, ""]) -> Certificate:
-        """On members of another key."""
-        return self._judge(z, key, self._beside(key))
-
-    def members(self, key: Key[Array, ""]) -> list[Members]:
-        """Those of the certificate of that key; of an ensemble."""
-        assert isinstance(self.others, Ensemble)
-        return certified_members(self.job.loop, self.others, key, flown=self.count)
-
-    def _judge(self, z: Float[np.ndarray, " n"], key: Key[Array, ""], found: Beside) -> Certificate:
-        self._watched.say("certificate on fresh members ...")
-        job, design = self.job, build_design(self._coordinates, as_array(z))
-        return certify_beside(
-            job.loop.with_controller(design), self.others, job.scenario, found,
-            limits=job.limits, linear_members=None, key=key, span=job.span, name="tuned",
-            devices=job.devices,
-        )  # fmt: skip
-
-
-def _make_certifier(
-    job: Job,
-    coordinates: Coordinates,
-    watched: Progress,
-    fresh: int | Members | None,
-    peers: Mapping[str, PyTree],
-) -> _Certifier | None:
-    """`None` where no certificate is asked for, or nothing is left to draw it from."""
-    if isinstance(fresh, Members):
-        return _Certifier(job, coordinates, watched, fresh, 0, peers)
-    if fresh is None or isinstance(job.ensemble, Members):
-        return None
-    return _Certifier(job, coordinates, watched, job.ensemble, fresh, peers)
 
 
 class _Certified(NamedTuple):
@@ -231,28 +154,46 @@ class _Certified(NamedTuple):
 
 
 def _certify(
-    certifier: _Certifier | None, solution: Solution, best: int, search: Search | None
+    job: Job,
+    coordinates: Coordinates,
+    watched: Progress,
+    fresh: int | Members | None,
+    peers: Mapping[str, PyTree] | None,
+    solution: Solution,
+    best: int,
+    search: Search | None,
 ) -> _Certified:
     """A certificate; and where it has members beyond a limit, tune on these and certify again.
 
-    Without a `search` there is one certificate.
+    Members that are given have one certificate. None where none is asked for, or where nothing is
+    left to draw it from.
     """
-    if certifier is None:
+    ensemble = fresh if isinstance(fresh, Members) else job.ensemble
+    if fresh is None or isinstance(fresh, int) and isinstance(ensemble, Members):
         return _Certified(solution, None, 0, 0.0)
-    found = _Certified(solution, certifier.first(solution.z[best]), 1, 0.0)
-    own = certifier.job.key
-    while search is not None and found.certificates < _CERTIFICATES:
-        assert found.certificate is not None
-        worst = certified_beyond(found.certificate, certifier.members(own))
+    count = 0 if isinstance(fresh, Members) else fresh
+
+    def certificate(z: Float[np.ndarray, " n"], key: Key[Array, ""]) -> Certificate:
+        watched.say("certificate on fresh members ...")
+        design = job.loop.with_controller(build_design(coordinates, as_array(z)))
+        return certify(
+            design, ensemble, job.scenario, limits=job.limits, peers=peers, members=count,
+            begun=job.loop.controller, key=key, devices=job.devices, **job.span._asdict(),
+        )  # fmt: skip
+
+    key, made, seconds = job.key, 1, 0.0
+    latest = certificate(solution.z[best], key)
+    while search is not None and isinstance(ensemble, Ensemble) and made < _CERTIFICATES:
+        members = certified_members(job.loop, ensemble, key, flown=count)
+        worst = certified_beyond(latest, members)
         if not worst.added:
             break
         began = time.perf_counter()
-        solution = go_on(found.solution, worst, search, best)
-        seconds = found.seconds + time.perf_counter() - began
-        own = jax.random.fold_in(certifier.job.key, _AGAIN + found.certificates)
-        certificate = certifier.again(solution.z[best], own)
-        found = _Certified(solution, certificate, found.certificates + 1, seconds)
-    return found
+        solution = go_on(solution, worst, search, best)
+        seconds += time.perf_counter() - began
+        key = jax.random.fold_in(job.key, _AGAIN + made)
+        latest, made = certificate(solution.z[best], key), made + 1
+    return _Certified(solution, latest, made, seconds)
 
 
 def _tuned(

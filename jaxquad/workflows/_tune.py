@@ -1,25 +1,22 @@
 """Tune a controller on an identified axis: from a result and settings to certified gains."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from jaxquad._core import announce, plain_content
-from jaxquad.control import certainty_equivalence, LADRC, schedule_for_flight, ScheduledLADRC
+from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
 from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
-from jaxquad.models import DecoupledAxes
 from jaxquad.report import provenance, write_json
-from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, simulate, Simulation, Step
+from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Simulation, Step
 from jaxquad.tuning import (
     describe_controller,
-    Evaluation,
     KNOWN_INERTIA,
     Limit,
     Objective,
@@ -196,39 +193,20 @@ def _tuned(
     )  # fmt: skip
     announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
     flown = _flight(gain, dt, settings)
-    with ThreadPoolExecutor(1) as thread:
-        tuned = tune_controller(
-            loop,
-            ensemble,
-            flown,
-            objective=_objective(settings),
-            limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
-            free=["ladrc.wc", "map.values"] if held else None,
-            members=settings.members,
-            fresh=settings.fresh,
-            peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
-            key=jax.random.key(settings.seed),
-            progress=progress,
-            listener=_once(lambda: thread.submit(_fly_nominal, loop, plant, flown)),
-        )
+    tuned = tune_controller(
+        loop,
+        ensemble,
+        flown,
+        objective=_objective(settings),
+        limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
+        free=["ladrc.wc", "map.values"] if held else None,
+        members=settings.members,
+        fresh=settings.fresh,
+        peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
+        key=jax.random.key(settings.seed),
+        progress=progress,
+    )
     return Tuning(found, settings, tuned, loop, ensemble, flown)
-
-
-def _once(begin: Callable[[], object]) -> Callable[[Evaluation], None]:
-    """Call `begin` at the first evaluation, when nothing more is traced or compiled."""
-    begun: list[object] = []
-
-    def listen(_: Evaluation) -> None:
-        if not begun:
-            begun.append(begin())
-
-    return listen
-
-
-def _fly_nominal(loop: Loop, plant: DecoupledAxes, flown: Scenario) -> None:
-    """Compile the nominal flight, which the figures need, while the descent runs."""
-    controller = schedule_for_flight(loop.controller, np.array(plant.inertia))
-    simulate(loop.with_controller(controller), flown)
 
 
 def _ensemble(posterior: Posterior, settings: TuneSettings) -> Ensemble:

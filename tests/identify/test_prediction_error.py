@@ -10,13 +10,13 @@ from scipy.signal import lfilter
 
 import jaxquad as jq
 from jaxquad.identify import ARMA, AutoRegressive, refine
-from jaxquad.identify.output_error._noise_model import (
+from jaxquad.identify.output_error._noise import (
     estimate_noise,
+    make_whitener,
     NoiseModel,
     shock_slopes,
     shocks_of,
 )
-from jaxquad.identify.output_error._whitening import make_whitener
 
 
 DT, SAMPLES = 0.02, 1000

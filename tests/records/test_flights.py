@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from blackbox_rows import clock
 
+from jaxquad.autopilot.betaflight._log import betaflight_setup, chirps, command_hold
 from jaxquad.cli import main
 from jaxquad.records import (
     flights,
@@ -18,12 +19,10 @@ from jaxquad.records import (
     RecordError,
     RecordWarning,
 )
+from jaxquad.records.firmware import Selection
 from jaxquad.records.formats import load_log
 from jaxquad.records.formats._betaflight_header import with_derived
-from jaxquad.records.proposals._betaflight import betaflight_setup
-from jaxquad.records.proposals._chirps import chirps
 from jaxquad.records.proposals._flown_span import flown_span, in_flight
-from jaxquad.records.proposals._hold import command_hold
 from jaxquad.spectra import frequency_response, JointInputOutput
 from jaxquad.workflows import autopilot, AutopilotSettings, IdentifySettings, SettingsError
 from jaxquad.workflows._log import open_logs, propose_settings, read_logs
@@ -262,7 +261,7 @@ def test_a_chirp_whose_phase_alone_is_logged_is_the_same_chirp(data, name):
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_allclose([a.start, a.stop], [b.start, b.stop], atol=0.05)
         np.testing.assert_allclose([a.low, a.high], [b.low, b.high], rtol=0.2)
-    setup = betaflight_setup(of_phase_alone(log), None)
+    setup = betaflight_setup(of_phase_alone(log), Selection())
     assert setup.reference == "chirp" and len(setup.remarks) == len(theirs)
 
 

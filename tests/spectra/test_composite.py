@@ -10,7 +10,7 @@ from jaxquad.excitation import sweep
 from jaxquad.records import Record
 from jaxquad.spectra import Composite, frequency_response, Welch
 from jaxquad.spectra._average import combine, Conditioned
-from jaxquad.spectra._noise_freedom import kept_if_few
+from jaxquad.spectra._noise import kept_if_few
 
 
 RATE = 250.0

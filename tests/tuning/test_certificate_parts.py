@@ -16,7 +16,6 @@ from jaxquad._core import map_in_threads
 from jaxquad.control import schedule_for_analysis
 from jaxquad.loops import loop_numbers
 from jaxquad.tuning import paper_designs, peers, share_interval, upper_bound
-from jaxquad.tuning._beside import begin_evaluating, Beside
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -82,20 +81,6 @@ def test_the_papers_gains_are_3_and_1_6_on_the_rig_and_in_proportion_elsewhere()
 def test_certainty_equivalence_is_the_gain_over_the_inertia_given():
     scheduled = peers(RIG)["b0 = KT/J"].scheduled_at(jnp.array([[0.01, 0.0552, 0.5]]))
     np.testing.assert_allclose(scheduled.b0, 0.0468 / np.array([[0.01, 0.0552, 0.5]]), rtol=1e-12)
-
-
-def test_a_thread_evaluates_only_where_jax_is_set_as_for_its_caller():
-    """A `with` of JAX holds for one thread: another one would compute other numbers."""
-    threads = []
-
-    def evaluate():
-        threads.append(threading.get_ident())
-        return tuple.__new__(Beside, ())
-
-    begin_evaluating(evaluate, 1)()
-    with jax.default_matmul_precision("float32"):
-        begin_evaluating(evaluate, 1)()
-    assert threads[0] != threading.get_ident() == threads[1]
 
 
 def test_what_threads_do_comes_in_order_and_as_jax_is_set_for_their_caller():

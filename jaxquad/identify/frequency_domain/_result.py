@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Key, PyTree
 from jaxquad._core import plain_content, pytree_node
 from jaxquad.records import Record
 
-from ..output_error._noise_model import NoiseModel
+from ..output_error._noise import NoiseModel
 from ..output_error._simulated import linear_model
 from ..output_error._verify import Verification, verify
 from ..uncertainty._accuracy import Matrix

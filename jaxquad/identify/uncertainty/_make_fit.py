@@ -12,6 +12,7 @@ from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._result import Fit
 from ..frequency_domain._solve import Solution
 from ..frequency_domain._starts import Minimum
+from ..output_error._noise import NoiseModel
 from ._accuracy import condition_number, cramer_rao, insensitivity, Matrix
 from ._discrepancy import Discrepancy
 from ._fit_remarks import is_fed_back, runaways
@@ -51,6 +52,7 @@ def make_fit(
     freedom: Float[np.ndarray, " parameters"] | None = None,
     discrepancy: Discrepancy | None = None,
     origin: Origin | None = None,
+    noise_models: tuple[tuple[NoiseModel, ...], ...] = (),
 ) -> Fit:
     """A result in physical units; `freedom` is that of the noise estimate, infinite without."""
     bread, covariance, _, units, verdict, decrement = estimate
@@ -88,6 +90,7 @@ def make_fit(
         minima=minima,
         degrees_of_freedom=freedom,
         discrepancy=discrepancy,
+        noise_models=noise_models,
         origin=origin,
     )
 

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._errors import located, printable, ReadError, RecordWarning
+from .._firmwares import registered_logs
 from .._log import allowance, flattened, Log, oversize, Signals, Table
 from . import (
     _betaflight,
@@ -209,8 +210,9 @@ def _choose_reader(path: Path) -> Reader:
     """By the first bytes of the file, else by the ending of its name."""
     head = _head(path)
     suffix = path.suffix.lower()
-    by_content = (reader for reader in READERS.values() if reader.sniff(head, path))
-    by_name = (reader for reader in READERS.values() if suffix in reader.suffixes)
+    readers = [*(log.reader for log in registered_logs() if log.reader), *READERS.values()]
+    by_content = (reader for reader in readers if reader.sniff(head, path))
+    by_name = (reader for reader in readers if suffix in reader.suffixes)
     reader = next(by_content, None) or next(by_name, None)
     if reader is None:
         if path.is_dir():

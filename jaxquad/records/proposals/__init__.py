@@ -1,3 +1,5 @@
-from ._flights import Flight as Flight, flights as flights
-from ._proposal import AXES as AXES, Proposal as Proposal
+from ._firmware_log import FirmwareLog as FirmwareLog, Flight as Flight
+from ._flights import flights as flights
+from ._proposal import Proposal as Proposal
 from ._propose import propose as propose
+from ._setup import AXES as AXES

@@ -1,75 +1,13 @@
 """The flights of a file: a flash chip holds one log for each arming."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
-import numpy as np
-
-from .._clock import FEWEST
 from .._errors import RecordError
-from .._log import Log, Table
+from .._firmwares import firmware_log
+from .._log import Log
 from ..formats import load_log
-from ._chirps import Chirp, chirps
-from ._proposal import AXES
-
-
-class Flight(NamedTuple):
-    """One flight of a file, as `flights` lists it; it prints as one line.
-
-    **Arguments:**
-
-    - `number`: in the file, from 1; what `propose` takes as `flight`.
-    - `log`: what its channels begin with, `log2` for `log2.gyroADC[0]`; empty for a single one.
-    - `start`, `stop`: s of the file's time.
-    - `throttle`: lowest and highest, 0 to 1; None where it is not logged.
-    - `chirps`: seconds of injected sweeps, by axis.
-    - `sticks`: how much each stick moves, RMS about its mean as a share of full deflection.
-    """
-
-    number: int
-    log: str
-    start: float
-    stop: float
-    throttle: tuple[float, float] | None
-    chirps: Mapping[str, float]
-    sticks: Mapping[str, float]
-
-    @property
-    def duration(self) -> float:
-        """In s."""
-        return self.stop - self.start
-
-    @property
-    def excitation(self) -> str:
-        """In words: the chirps, else how much the sticks move."""
-        if self.chirps:
-            return ", ".join(f"chirp on {axis} {time:.3g} s" for axis, time in self.chirps.items())
-        if not self.sticks:
-            return "sticks not logged"
-        return "sticks " + ", ".join(f"{a} {100 * x:.0f} %" for a, x in self.sticks.items())
-
-    def is_excited(self, axis: str | None = None) -> bool:
-        """Whether a chirp or the sticks excite the `axis`, by default any axis."""
-        return self._rank(axis) > 0
-
-    def _rank(self, axis: str | None) -> int:
-        """2 with a chirp, 1 with sticks that move, else 0."""
-        if axis in self.chirps or (axis is None and self.chirps):
-            return 2
-        sticks = self.sticks if axis is None else {axis: self.sticks.get(axis, 0.0)}
-        return int(max(sticks.values(), default=0.0) > _MOVING)
-
-    def __str__(self) -> str:
-        throttle = "" if self.throttle is None else "throttle {:.2f} .. {:.2f}, ".format(
-            *self.throttle
-        )  # fmt: skip
-        return f"flight {self.number}: {self.duration:.3g} s, {throttle}{self.excitation}"
-
-
-_MOVING = 0.03  # of full deflection; corrections of a hover stay below
-_FULL = 500.0  # of rcCommand
+from ._firmware_log import Flight, one_flight
 
 
 def flights(path: str | Path) -> list[Flight]:
@@ -93,51 +31,8 @@ def flights(path: str | Path) -> list[Flight]:
 
 def flights_of(log: Log) -> tuple[Flight, ...]:
     """Those that have enough samples for a record."""
-    if log.vehicle != "betaflight":
-        clocks = [t.time for t in log.tables.values() if t.time is not None and t.time.size]
-        if not clocks:
-            return ()
-        span = min(float(t[0]) for t in clocks), max(float(t[-1]) for t in clocks)
-        return (Flight(1, "", *span, None, {}, {}),)
-    tables = {
-        name: table
-        for name, table in log.tables.items()
-        if not name.endswith(("slow", "gps")) and table.time is not None
-    }
-    return tuple(
-        _flight(name, table, table.time)
-        for name, table in tables.items()
-        if table.time is not None and table.time.size >= FEWEST
-    )
-
-
-def _flight(name: str, table: Table, time: np.ndarray) -> Flight:
-    number = int(name.removeprefix("log")) if name else 1
-    throttle = _scaled(table, "setpoint[3]")
-    ends = None if throttle is None else (throttle.min() / 1e3, throttle.max() / 1e3)
-    sticks = {axis: _scaled(table, f"rcCommand[{i}]") for i, axis in enumerate(AXES)}
-    return Flight(
-        number, name, float(time[0]), float(time[-1]),
-        None if ends is None else (float(ends[0]), float(ends[1])), _durations(chirps(table)),
-        {axis: float(np.std(x) / _FULL) for axis, x in sticks.items() if x is not None},
-    )  # fmt: skip
-
-
-def _durations(sweeps: Sequence[Chirp]) -> dict[str, float]:
-    lasting: dict[str, float] = {}
-    for sweep in sweeps:
-        axis = AXES[sweep.axis]
-        lasting[axis] = lasting.get(axis, 0.0) + sweep.stop - sweep.start
-    return lasting
-
-
-def _scaled(table: Table, name: str) -> np.ndarray | None:
-    values = table.columns.get(name)
-    if values is None:
-        return None
-    finite = np.asarray(values, np.float64)
-    finite = finite[np.isfinite(finite)] * table.scales.get(name, 1.0)
-    return finite if finite.size else None
+    firmware = firmware_log(log.vehicle)
+    return one_flight(log) if firmware is None else firmware.flights(log)
 
 
 def choose_flight(log: Log, axis: str | None, number: int | None) -> tuple[Log, tuple[str, ...]]:
@@ -151,7 +46,7 @@ def choose_flight(log: Log, axis: str | None, number: int | None) -> tuple[Log, 
     if not every and number is None:
         return log, ()
     if number is None:
-        chosen = max(every, key=lambda each: (each._rank(axis), each.duration))
+        chosen = max(every, key=lambda flight: (flight.rank(axis), flight.duration))
     else:
         chosen = next((each for each in every if each.number == number), None)
     if chosen is None:
@@ -171,7 +66,7 @@ def _reason(chosen: Flight, axis: str | None) -> str:
     on = f" on {axis}" if axis else ""
     longest = "the longest"
     kinds = (f"{longest}, as none is excited{on}", f"{longest} with sticks that move{on}")
-    return (*kinds, f"{longest} with a chirp{on}")[chosen._rank(axis)]
+    return (*kinds, f"{longest} with a chirp{on}")[chosen.rank(axis)]
 
 
 def _log_of(log: Log, name: str) -> Log:

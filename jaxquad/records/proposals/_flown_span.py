@@ -1,13 +1,15 @@
 """When a vehicle flies: ground, landing and crash at the ends of a log are no flight."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._firmwares import firmware_log
 from .._log import flattened, Log, Signals
-from ._proposal import Setup, throttle_of, values_of
+from ._firmware_log import throttle_of
+from ._setup import Setup, values_of
 
 
 class FlownSpan(NamedTuple):
@@ -25,19 +27,6 @@ _IDLE = 0.05  # of the throttle
 _REST = 2.0  # times what the gyro shows at rest; propellers that lift shake it more
 _LOST = 300.0  # deg/s RMS between set-point and rate: more than any manoeuvre that a loop follows
 _SHORTEST = 2.0  # s of a flight, and windows at rest that are counted on
-_CHANNELS: Mapping[str, tuple[Sequence[str], Sequence[str]]] = {  # rates, their set-points
-    "betaflight": (
-        [f"gyroADC[{i}]" for i in range(3)], [f"setpoint[{i}]" for i in range(3)],
-    ),
-    "ardupilot": (
-        [f"RATE.{x}" for x in "RPY"], [f"RATE.{x}Des" for x in "RPY"],
-    ),
-    "px4": (
-        [f"vehicle_angular_velocity.xyz[{i}]" for i in range(3)],
-        [f"vehicle_rates_setpoint.{x}" for x in ("roll", "pitch", "yaw")],
-    ),
-    "crazyflie": ([f"gyro.{x}" for x in "xyz"], []),
-}  # fmt: skip
 
 
 def in_flight(
@@ -82,9 +71,11 @@ def flown_span(log: Log) -> FlownSpan:
     300 deg/s RMS off their set-points are a crash.
     """
     signals = flattened(log)
-    throttle = throttle_of(log, signals, asked=True)
-    rates, setpoints = _CHANNELS.get(log.vehicle, ((), ()))
-    names = [name for each in rates if (name := _logged(signals, each))]
+    firmware = firmware_log(log.vehicle)
+    if firmware is None:
+        return FlownSpan()
+    throttle = throttle_of(firmware, signals, wanted=True)
+    names = [name for rate in firmware.rates if (name := _logged(signals, rate))]
     if not throttle or not names:
         return FlownSpan()
     grid = _Windows.of(signals, names[0])
@@ -96,7 +87,7 @@ def flown_span(log: Log) -> FlownSpan:
         remark = f"the throttle stays below {100 * _IDLE:.0f} %: the log seems to hold no flight"
         return FlownSpan(remarks=(remark,))
     flying = powered & _is_moving(grid, signals, names, powered)
-    lost = _is_lost(grid, signals, names, [_logged(signals, each) for each in setpoints])
+    lost = _is_lost(grid, signals, names, [_logged(signals, x) for x in firmware.setpoints])
     return _span(grid, flying, flying & ~lost)
 
 

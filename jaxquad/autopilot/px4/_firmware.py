@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
 
-from ._filters import FilterChain, PT1, Section
-from ._law import (
+from .._filters import FilterChain, PT1, Section
+from .._law import (
     AngleLoop,
     bounded,
     filter_gyro,

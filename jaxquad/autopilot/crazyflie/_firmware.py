@@ -6,8 +6,8 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import as_float, as_float_or_none, broadcast_gain, per_member, require_positive
 from jaxquad.control import Reference
 
-from ._filters import Butterworth, FilterChain
-from ._law import (
+from .._filters import Butterworth, FilterChain
+from .._law import (
     AngleLoop,
     bounded,
     DEGREES,

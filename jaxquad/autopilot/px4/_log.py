@@ -2,15 +2,19 @@
 
 import numpy as np
 
-from .._errors import RecordError
-from .._log import flattened, Log, Signals
-from ._proposal import (
-    AXES,
+from jaxquad.records import AXES, RecordError
+from jaxquad.records.firmware import (
+    FirmwareLog,
     first_logged,
+    flattened,
+    hold_by_rate,
     Injection,
+    Log,
     most_active_axis,
     moves,
+    Selection,
     Setup,
+    Signals,
     with_injections,
 )
 
@@ -27,9 +31,9 @@ _STICKS = {
 }
 
 
-def px4_setup(log: Log, axis: str | None) -> Setup:
+def px4_setup(log: Log, wanted: Selection) -> Setup:
     """The set-up for autotune's excitation; without it, with the set-point if flown in acro."""
-    signals = flattened(log)
+    signals, axis = flattened(log), wanted.axis
     rates = {each: _rate(signals, i) for i, each in enumerate(AXES)}
     if not any(rates.values()):
         raise RecordError(
@@ -101,3 +105,14 @@ def _always_acro(log: Log) -> bool:
     table = log.tables.get("vehicle_status")
     states = table.columns.get("nav_state") if table is not None else None
     return states is not None and states.size > 0 and bool((states == _ACRO).all())
+
+
+LOG = FirmwareLog(
+    name="px4", title="PX4", setup=px4_setup,
+    rates=[f"vehicle_angular_velocity.xyz[{i}]" for i in range(3)],
+    setpoints=[f"{_RATE_SETPOINT}.{x}" for x in AXES],
+    throttle=(("vehicle_thrust_setpoint.xyz[2]", -1.0), ("actuator_controls_0.control[3]", 1.0)),
+    hold=lambda log: hold_by_rate(log, "IMU_GYRO_RATEMAX"),
+    of_loop=("MC_", "IMU_GYRO_", "IMU_DGYRO_", "THR_MDL_FAC", "CA_", "PWM_", "DSHOT_"),
+    release="ver_sw_release",
+)  # fmt: skip

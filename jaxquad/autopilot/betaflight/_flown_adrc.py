@@ -8,10 +8,10 @@ import equinox as eqx
 from jaxquad.identify import B0Law, B0Schedule
 from jaxquad.records import AXES
 
-from ._betaflight import BetaflightADRC
-from ._filters import PT2
-from ._flown import betaflight_loop, FlownBetaflight, FlownLoop
-from ._parameters import list_parameters
+from .._filters import PT2
+from .._flown import betaflight_loop, FlownBetaflight, FlownLoop
+from .._parameters import list_parameters
+from ._law import BetaflightADRC
 
 
 _NUMBERED: tuple[B0Law, ...] = ("QUADRATIC", "SQRT", "LINEAR", "FIXED")  # as the header counts them

@@ -9,8 +9,8 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
 from jaxquad.control import Reference
 
-from ._filters import Filter, FilterChain, PT2, PT3
-from ._law import (
+from .._filters import Filter, FilterChain, PT2, PT3
+from .._law import (
     AngleLoop,
     bounded,
     DEGREES,

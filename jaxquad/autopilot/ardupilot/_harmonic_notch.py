@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import as_float, is_concrete, per_member, require_positive
 
-from ._filters import Notch, Section
+from .._filters import Notch, Section
 
 
 Composite = Literal[1, 2, 3, 5]  # notches at each harmonic

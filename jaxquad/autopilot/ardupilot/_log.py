@@ -11,19 +11,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._errors import RecordError
-from .._log import flattened, Log, Signals, Table
-from ._proposal import (
-    AXES,
+from jaxquad.records import AXES, RecordError
+from jaxquad.records.firmware import (
     channel_rate,
+    choose_chirps,
+    FirmwareLog,
     first_logged,
+    flattened,
+    hold_by_rate,
     Injection,
+    Log,
     most_active_axis,
+    NumberedChirp,
+    Point,
+    Selection,
     Setup,
+    Signals,
+    Table,
     values_of,
     with_injections,
 )
-from ._selection import choose_chirps, NumberedChirp, Point, Selection
 
 
 _LETTERS: dict[str, str] = dict(zip(AXES, "RPY", strict=True))
@@ -206,3 +213,16 @@ def _without_chirp(signals: Signals, axis: str, rates: dict[str, str]) -> Setup:
                 f"feedback: use --reference {stick} if it moved enough"
             )
     return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
+
+
+LOG = FirmwareLog(
+    name="ardupilot", title="ArduPilot", setup=ardupilot_setup,
+    rates=[f"RATE.{x}" for x in "RPY"], setpoints=[f"RATE.{x}Des" for x in "RPY"],
+    throttle=(("RATE.AOut", 1.0), ("CTUN.ThO", 1.0)),
+    hold=lambda log: hold_by_rate(log, "SCHED_LOOP_RATE"),
+    of_loop=(
+        "ATC_", "INS_GYRO_", "INS_HNTC", "MOT_", "SCHED_LOOP_RATE", "PSC_", "FSTRATE_",
+    ),
+    learned=("MOT_THST_HOVER",),  # in flight, and stored at the end of it: the hover's throttle
+    numbers_chirps=True,
+)  # fmt: skip

@@ -1,0 +1,323 @@
+"""Betaflight: PID sum, filtered gyro, set-point, and the chirp mode's debug channels."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxquad.records import AXES, Flight, RecordError
+from jaxquad.records.firmware import (
+    FEWEST,
+    FirmwareLog,
+    first_logged,
+    flattened,
+    Injection,
+    Log,
+    most_active_axis,
+    moves,
+    number_of,
+    plausible_hold,
+    Selection,
+    Setup,
+    Table,
+    values_of,
+    with_injections,
+)
+
+
+_SELF_LEVELLING = 0b110  # ANGLE and HORIZON in the flight mode flags
+
+
+def betaflight_setup(log: Log, wanted: Selection) -> Setup:
+    """The set-up for the longest chirp of a log that holds one flight.
+
+    Without a chirp the reference is the set-point if flown in acro, else the stick.
+    """
+    prefix, table = _main_table(log)
+    signals, axis = flattened(log), wanted.axis
+    rates = {each: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, each in enumerate(AXES)}
+    if not any(rates.values()):
+        raise RecordError("the log has no gyroADC.")
+    sweeps = [each for each in chirps(table) if axis in (None, AXES[each.axis])]
+    best = max(sweeps, key=lambda each: each.stop - each.start, default=None)
+    axis = axis or (most_active_axis(signals, rates) if best is None else AXES[best.axis])
+    i = AXES.index(axis)
+    command = first_logged(signals, [f"{prefix}axisMixed[{i}]", f"{prefix}axisSum[{i}]"])
+    if not command or not rates[axis]:
+        raise RecordError(f"the log has no PID terms or no gyro for {axis}.")
+    levelled = _levelled(log, prefix)
+    remarks = [
+        f"{rates[axis]} is measured after the gyro filters, which identify divides out where the "
+        "log has their parameters"
+    ]
+    if best is not None:
+        others = [each for each in sweeps if each.axis != best.axis]
+        remarks += [
+            f"another chirp on the set-point of {AXES[each.axis]}, "
+            f"t = {each.start:.6g} .. {each.stop:.6g} s"
+            for each in others
+        ]
+        alike = [Injection(*each[1:5]) for each in sweeps if each.axis == best.axis]
+        setup = Setup(
+            axis, {command: 1.0}, rates[axis], f"{prefix}{best.channel}", remarks=tuple(remarks),
+            injected_at="rate", levelled=bool(levelled),
+        )  # fmt: skip
+        return with_injections(setup, alike, "chirp on the rate set-point")
+    setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
+    if setpoint and not moves(signals, setpoint):
+        remarks.append(
+            f"{setpoint} never moves, so nothing from outside excites {axis}: fly the chirp mode "
+            f"(debug_mode = CHIRP), or stick pulses of different widths"
+        )
+        return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
+    if setpoint and levelled is False:
+        remarks.append("flown in acro, where the set-point comes from the pilot only")
+        return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=tuple(remarks))
+    if setpoint:
+        remarks.append(
+            f"self-levelling was on or is unknown: {setpoint} is then computed from the attitude, "
+            f"contains feedback and cannot be the external reference"
+        )
+    stick = first_logged(signals, [f"{prefix}rcCommand[{i}]"])
+    reference = stick if stick and np.ptp(values_of(signals, stick)) else ""
+    return Setup(
+        axis, {command: 1.0}, rates[axis], reference, remarks=tuple(remarks),
+        levelled=bool(levelled),
+    )  # fmt: skip
+
+
+def _main_table(log: Log) -> tuple[str, Table]:
+    """The main table of a log, and what precedes its channels."""
+    main = {
+        name: table
+        for name, table in log.tables.items()
+        if not name.endswith(("slow", "gps")) and table.time is not None and table.time.size
+    }
+    if not main:
+        raise RecordError("the log has no main frames.")
+    name, table = next(iter(main.items()))
+    return f"{name}." if name else "", table
+
+
+def _levelled(log: Log, prefix: str) -> bool | None:
+    """Whether a self-levelling mode was on at any time; None where that is unknown."""
+    flags = log.tables.get(f"{prefix}slow")
+    modes = None if flags is None else flags.columns.get("flightModeFlags")
+    if modes is None or not modes.size or modes.dtype.kind not in "iuf":
+        return None
+    return bool((modes.astype(np.int64) & _SELF_LEVELLING).any())
+
+
+def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> tuple[str, ...]:
+    """A remark on samples within the `spans` (s) where the firmware limits the PID sum."""
+    name = "pidsum_limit_yaw" if setup.axis == "yaw" else "pidsum_limit"
+    text = log.settings.get(name, "")
+    prefix, table = _main_table(log)
+    if not (text.isdecimal() and len(text) < 9) or table.time is None:
+        return ()
+    asked = f"{prefix}axisSum[{AXES.index(setup.axis)}]"
+    command = values_of(flattened(log), asked)
+    used = np.zeros(command.size, bool)
+    for start, stop in spans:
+        used |= (table.time >= start) & (table.time <= stop)
+    beyond = int((np.abs(command[used]) > int(text)).sum())
+    share = f"{beyond} of {used.sum()} samples of the command"
+    return (f"{share} exceed {name} = {text}, where it saturates",) if beyond else ()
+
+
+class Chirp(NamedTuple):
+    """A sweep that Betaflight's chirp mode injected, on axis 0 (roll), 1 (pitch) or 2 (yaw)."""
+
+    axis: int
+    start: float  # s
+    stop: float
+    low: float  # Hz
+    high: float
+    channel: str = "debug[3]"  # of the excitation
+
+
+_AXES = (0, 1, 2)
+_SHORTEST = 1.0  # s
+_MOST_EDGES = 10_000
+
+
+def chirps(table: Table) -> list[Chirp]:
+    """The sweeps in a log whose debug channels are those of debug mode CHIRP.
+
+    There, debug[1] is the axis (-1 when idle), debug[2] the frequency in 0.1 Hz and debug[3] the
+    excitation (betaflight pull request 15113). The number of that mode depends on the version, so
+    the data decide: a frequency that only rises while the axis stays the same. Earlier firmware
+    has debug[0] alone, from which the reader makes the channel `chirp`.
+    """
+    debug = [table.columns.get(f"debug[{i}]") for i in range(4)]
+    if table.time is None:
+        return []
+    if "chirp" in table.columns:
+        return _chirps_of_phase(table, table.time)
+    if any(each is None for each in debug):
+        return []
+    _, axis, tenths, excitation = (np.asarray(each, np.float64) for each in debug)
+    active = np.where(tenths > 0, axis, -1)
+    edges = np.flatnonzero(np.diff(active)) + 1
+    if not np.isin(axis, (-1, *_AXES)).all() or edges.size > _MOST_EDGES:
+        return []
+    sweeps = []
+    for first, end in zip([0, *edges], [*edges, axis.size], strict=True):
+        frequency, time = tenths[first:end] / 10, table.time[first:end]
+        rises = (np.diff(frequency) >= 0).all() and frequency[-1] > frequency[0]
+        moves = rises and np.ptp(excitation[first:end]) > 0
+        if active[first] in _AXES and moves and time[-1] - time[0] >= _SHORTEST:
+            ends = (float(time[0]), float(time[-1]), float(frequency[0]), float(frequency[-1]))
+            sweeps.append(Chirp(int(active[first]), *ends))
+    return sweeps
+
+
+_PAUSE = 0.2  # s of a phase of 0: another sweep; within one, single samples pass through 0
+_DRIVEN = 0.1  # of its variance that a sweep explains, at least, in the set-point of its axis
+
+
+def _chirps_of_phase(table: Table, time: np.ndarray) -> list[Chirp]:
+    """The sweeps of a log that has their phase alone (debug[0], 5000 a radian).
+
+    The axis is the one whose set-point holds the sweep.
+    """
+    phase = np.asarray(table.columns["debug[0]"], np.float64) / 5e3
+    rows = np.flatnonzero(phase > 0)
+    cuts = np.flatnonzero(np.diff(time[rows]) > _PAUSE) + 1
+    sweeps = []
+    for part in np.split(rows, cuts):
+        if not part.size or time[part[-1]] - time[part[0]] < _SHORTEST:
+            continue
+        inside = slice(part[0], part[-1] + 1)
+        axis = _driven_axis(table, inside)
+        if axis is not None:
+            band = _band(phase[inside], time[inside])
+            sweeps.append(Chirp(axis, float(time[part[0]]), float(time[part[-1]]), *band, "chirp"))
+    return sweeps
+
+
+def _driven_axis(table: Table, inside: slice) -> int | None:
+    """The axis whose set-point is most coherent with the sweep, whatever its lead or lag."""
+    phase = np.asarray(table.columns["debug[0]"][inside], np.float64) / 5e3
+    wave = np.exp(1j * phase) * (phase > 0)
+    shares = {}
+    for axis in _AXES:
+        name = f"setpoint[{axis}]"
+        if name in table.columns:
+            values = np.asarray(table.columns[name][inside], np.float64)
+            values = np.nan_to_num(values - np.nanmean(values))
+            power = float(np.mean(values**2))
+            if power > 0:
+                shares[axis] = 2 * abs(np.mean(values * wave.conj())) ** 2 / power
+    best = max(shares, key=lambda axis: shares[axis], default=None)
+    return best if best is not None and shares[best] > _DRIVEN else None
+
+
+_EDGE = 20  # of the samples of a sweep, one part: its begin and its end
+
+
+def _band(phase: np.ndarray, time: np.ndarray) -> tuple[float, float]:
+    """The lowest and highest frequency in Hz; the phase, in rad, is known modulo 2 pi."""
+    speed = np.mod(np.diff(phase), 2 * np.pi) / np.diff(time) / (2 * np.pi)
+    part = max(1, speed.size // _EDGE)
+    low, high = float(np.min(_medians(speed[:part]))), float(np.median(speed[-part:]))
+    return max(low, 0.1), high
+
+
+def _medians(speed: np.ndarray) -> np.ndarray:
+    """Of short pieces: single steps are rounded, and those through 0 are wrong."""
+    pieces = np.array_split(speed, max(1, speed.size // 50))
+    return np.array([np.median(piece) for piece in pieces])
+
+
+_TOLERANCE = 0.05  # between the header's period and that of the stamps
+_STRIDE = 256  # rows, over which stamps that jitter give a period
+
+
+def command_hold(log: Log) -> tuple[float | None, tuple[str, ...]]:
+    """The period of the rate loop in s, None where the log does not say it, and remarks.
+
+    The header has it, and `loopIteration` counts the loops between two stamps: where they
+    contradict each other by more than 5 %, the stamps are right.
+    """
+    # us, and loops of the gyro for one of the PID
+    period = 1e-6 * number_of(log, "looptime") * number_of(log, "pid_process_denom", 1.0)
+    stated, stamped = plausible_hold(period), plausible_hold(_period_of_stamps(log))
+    if stated is None or stamped is None or abs(stamped / stated - 1) < _TOLERANCE:
+        return stated, ()
+    remark = (
+        f"the header says a loop of {1e6 * stated:.6g} us (looptime, pid_process_denom), but the "
+        f"time stamps say {1e6 * stamped:.6g} us for each loopIteration: the stamps are taken for "
+        f"how long the command is held (--hold takes another)"
+    )
+    return float(f"{stamped:.6g}"), (remark,)
+
+
+def _period_of_stamps(log: Log) -> float:
+    """The median time for one loopIteration in s; 0 where the log does not count them."""
+    for table in log.tables.values():
+        counter = table.columns.get("loopIteration")
+        if counter is not None and table.time is not None:
+            stride = min(_STRIDE, table.time.size - 1)
+            loops = np.asarray(counter, np.float64)
+            loops, time = (
+                loops[stride:] - loops[:-stride],
+                table.time[stride:] - table.time[:-stride],
+            )
+            good = (loops > 0) & (time > 0)
+            return float(np.median(time[good] / loops[good])) if good.any() else 0.0
+    return 0.0
+
+
+_FULL = 500.0  # of rcCommand
+
+
+def flights_of(log: Log) -> tuple[Flight, ...]:
+    """One for each arming that has enough samples for a record."""
+    tables = {
+        name: table
+        for name, table in log.tables.items()
+        if not name.endswith(("slow", "gps")) and table.time is not None
+    }
+    return tuple(
+        _flight(name, table, table.time)
+        for name, table in tables.items()
+        if table.time is not None and table.time.size >= FEWEST
+    )
+
+
+def _flight(name: str, table: Table, time: np.ndarray) -> Flight:
+    number = int(name.removeprefix("log")) if name else 1
+    throttle = _scaled(table, "setpoint[3]")
+    ends = None if throttle is None else (throttle.min() / 1e3, throttle.max() / 1e3)
+    sticks = {axis: _scaled(table, f"rcCommand[{i}]") for i, axis in enumerate(AXES)}
+    return Flight(
+        number, name, float(time[0]), float(time[-1]),
+        None if ends is None else (float(ends[0]), float(ends[1])), _durations(chirps(table)),
+        {axis: float(np.std(x) / _FULL) for axis, x in sticks.items() if x is not None},
+    )  # fmt: skip
+
+
+def _durations(sweeps: Sequence[Chirp]) -> dict[str, float]:
+    lasting: dict[str, float] = {}
+    for sweep in sweeps:
+        axis = AXES[sweep.axis]
+        lasting[axis] = lasting.get(axis, 0.0) + sweep.stop - sweep.start
+    return lasting
+
+
+def _scaled(table: Table, name: str) -> np.ndarray | None:
+    values = table.columns.get(name)
+    if values is None:
+        return None
+    finite = np.asarray(values, np.float64)
+    finite = finite[np.isfinite(finite)] * table.scales.get(name, 1.0)
+    return finite if finite.size else None
+
+
+LOG = FirmwareLog(
+    name="betaflight", title="Betaflight", setup=betaflight_setup,
+    rates=[f"gyroADC[{i}]" for i in range(3)], setpoints=[f"setpoint[{i}]" for i in range(3)],
+    throttle=(("collective", 1.0), ("setpoint[3]", 1e-3)), hold=command_hold,
+    release="Firmware revision", flights=flights_of, remarks_on=saturation,
+)  # fmt: skip

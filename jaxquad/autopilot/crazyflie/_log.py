@@ -1,0 +1,101 @@
+"""Crazyflie: PID outputs or motor commands, and the gyro."""
+
+from jaxquad.records import AXES, RecordError
+from jaxquad.records.firmware import (
+    channel_rate,
+    FirmwareLog,
+    first_logged,
+    flattened,
+    Log,
+    most_active_axis,
+    moves,
+    Selection,
+    Setup,
+    Signals,
+)
+
+
+_MOTORS = {"roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}
+_GYRO: dict[str, str] = dict(zip(AXES, "xyz", strict=True))
+
+
+def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
+    """Of a Crazyflie, for the axis that moves most; its firmware has no chirp and no reference."""
+    signals = flattened(log)
+    prefixes = [f"{name}." if name else "" for name in log.tables]
+    found = {
+        each: next(filter(None, (_rate(signals, prefix, each) for prefix in prefixes)), "")
+        for each in AXES
+    }
+    if not any(found.values()):
+        raise RecordError("the log has no gyro.x, gyro.y, gyro.z or controller.r_roll, ...")
+    axis = wanted.axis or most_active_axis(signals, found)
+    command = next(filter(None, (_command(signals, prefix, axis) for prefix in prefixes)), None)
+    if not found[axis] or command is None:
+        raise RecordError(
+            f"the log has no command (controller.cmd_{axis}, or motor.m1 .. m4) or no rate for "
+            f"{axis}."
+        )
+    remarks = [
+        "no channel of the stock firmware can be the external reference: the rate set-points are "
+        "computed by the attitude loop and contain feedback",
+        "for an external reference, log a signal that your own code injects, and name it with "
+        "--reference",
+    ]
+    remarks += _slow_stamps(signals, found[axis])
+    target = next(
+        (f"{p}ctrltarget.{axis}" for p in prefixes if moves(signals, f"{p}ctrltarget.{axis}")), ""
+    )
+    if target:
+        remarks.append(
+            f"in manual flight the pilot's {target} is not affected by feedback: use --reference "
+            f"{target}"
+        )
+    if len(command) > 1:
+        remarks.append(
+            "the motor commands are not linear in thrust: where the thrust curve is known, use "
+            "powers (--input 'NAME=0.1*a^2')"
+        )
+    return Setup(axis, command, found[axis], remarks=tuple(remarks))
+
+
+_SLOW_STAMPS = 85 / 84  # by which rates of the micro-SD deck's stamps are too high
+_NOMINAL = (50, 100, 125, 200, 250, 333.333, 400, 500, 800, 1000)  # Hz
+_NEAR = 0.004  # events come late or are lost
+
+
+def _slow_stamps(signals: Signals, rate: str) -> list[str]:
+    """A remark where the rate of the log is that of stamps which run 84/85 slow."""
+    hertz = channel_rate(signals, rate)
+    nominal = next((x for x in _NOMINAL if abs(hertz / x / _SLOW_STAMPS - 1) < _NEAR), None)
+    if nominal is None:
+        return []
+    return [
+        f"the time stamps say {hertz:.5g} Hz, 85/84 of {nominal:.6g} Hz: firmware before August "
+        f"2026 wrote them that much slow, so that the gain to a rate is 1.2 % too high, lag and "
+        f"delay 1.2 % too short. Where the log is of such firmware, --time-factor 1.0119 corrects "
+        f"it"
+    ]
+
+
+def _rate(signals: Signals, prefix: str, axis: str) -> str:
+    names = [f"{prefix}gyro.{_GYRO[axis]}", f"{prefix}controller.r_{axis}"]
+    return first_logged(signals, names)
+
+
+def _command(signals: Signals, prefix: str, axis: str) -> dict[str, float] | None:
+    name = f"{prefix}controller.cmd_{axis}"
+    if moves(signals, name):
+        return {name: 1.0}
+    motors = [f"{prefix}motor.m{i}" for i in range(1, 5)]
+    if not all(moves(signals, motor) for motor in motors):
+        return None
+    return dict(zip(motors, map(float, _MOTORS[axis]), strict=True))
+
+
+LOG = FirmwareLog(
+    name="crazyflie", title="Crazyflie", setup=crazyflie_setup,
+    rates=[f"gyro.{x}" for x in "xyz"],
+    throttle=(("controller.cmd_thrust", 1 / 65535), ("stabilizer.thrust", 1 / 65535)),
+    settings=False,
+)  # fmt: skip

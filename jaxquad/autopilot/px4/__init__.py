@@ -1,0 +1,1 @@
+"""PX4: `_log` says what its channels mean, `_firmware` what it flies."""

@@ -1,0 +1,43 @@
+"""Firmwares whose logs are understood: each says what its channels mean, and no reader has to.
+
+What comes with the package is offered by the name of a module, which is imported when a log of that
+firmware is read. This file is imported with jaxquad itself, so it imports nothing else.
+"""
+
+import importlib
+from collections.abc import Iterator
+
+
+TYPE_CHECKING = False  # for checkers, without the time to import typing
+if TYPE_CHECKING:
+    from .proposals import FirmwareLog
+
+_OFFERED: dict[str, "str | FirmwareLog"] = {}  # by the `vehicle` of logs
+
+
+def offer(name: str, module: str) -> None:
+    """Let a module's `LOG` say what the logs of a firmware mean."""
+    _OFFERED[name] = module
+
+
+def register_log(log: "FirmwareLog") -> None:
+    """Let `jq.propose`, `jq.read` and the others understand the logs of a further firmware."""
+    _OFFERED[log.name] = log
+
+
+def firmware_names() -> tuple[str, ...]:
+    """All that are offered or registered."""
+    return tuple(_OFFERED)
+
+
+def firmware_log(name: str) -> "FirmwareLog | None":
+    """What the logs of a firmware mean; None for others."""
+    offered = _OFFERED.get(name)
+    if isinstance(offered, str):
+        offered = _OFFERED[name] = importlib.import_module(offered).LOG
+    return offered
+
+
+def registered_logs() -> "Iterator[FirmwareLog]":
+    """Those from outside of the package."""
+    return (log for log in tuple(_OFFERED.values()) if not isinstance(log, str))
