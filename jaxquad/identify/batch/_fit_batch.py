@@ -15,6 +15,7 @@ from jaxquad._core import (
     CONVERGED,
     decrement,
     Descent,
+    Message,
     Normal,
     require_x64,
     RUNNING,
@@ -173,8 +174,10 @@ def _check_pointwise(where: Batch, shape: tuple[int, ...]) -> None:
     whole, single = (np.asarray(part) for part in _both_ways(where.model, where.omega))
     if whole.shape != (*where.omega.shape, *shape):
         raise ValueError(
-            f"the model's response has shape {whole.shape[1:]}, the measured ones {shape} (outputs,"
-            " inputs): pick channels with jq.records.select, or extend the model"
+            Message(
+                f"the model's response has shape {whole.shape[1:]}, the measured ones {shape} "
+                "(outputs, inputs): «pick channels with jq.records.select», or extend the model"
+            )
         )
     if not np.allclose(whole, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(whole))):
         raise ValueError(
