@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, PyTree
 
-from ..frequency_domain._origin import Origin
 from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
+from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._solve import Solution
 from ..frequency_domain._starts import Minimum
