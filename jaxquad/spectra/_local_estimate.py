@@ -235,7 +235,7 @@ def _remark_on_lost(omega: Grid, setup: Setup, given: float | None) -> tuple[Rem
     )
     if given is not None:
         enough = np.max(setup.windows.least[np.searchsorted(setup.windows.grid, omega)])
-        remark += f"; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins"
+        remark += f"«wider|; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins»"
     return (Remark(remark, omega),)
 
 
@@ -271,7 +271,7 @@ def _remark_on_ringing(omega: Grid) -> tuple[Remark, ...]:
     text = (
         "the output still moves when the record ends, and a global model leaves more than ten "
         "times the noise {where}: a mode that rings there, or a line (a tone, as of a rotor or the "
-        "mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider, or "
-        "raise global_order; leave the frequencies of a line out"
+        "mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider"
+        "«, or raise global_order»; leave the frequencies of a line out"
     )
     return (Remark(text, omega),)

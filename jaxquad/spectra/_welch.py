@@ -260,8 +260,8 @@ def remarks_on_leakage(
             text = (
                 f"leakage through the window biases the response by about "
                 f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
-                "include it. Use jq.spectra.LocalPolynomial(), which estimates leakage, a longer "
-                "window, or integrators= where the plant integrates"
+                "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
+                "window, or «integrators=» where the plant integrates"
             )
             remarks.append(Remark(text, omega[leaked], (output, source)))
     return tuple(remarks)
