@@ -36,6 +36,7 @@ from .frequency_domain._cost import (
     paper_cost as paper_cost,
     Points as Points,
     usable as usable,
+    WIDER_BAND as WIDER_BAND,
 )
 from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from .frequency_domain._held import as_sampled as as_sampled

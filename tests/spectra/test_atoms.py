@@ -7,7 +7,7 @@ import pytest
 
 import jaxquad as jq
 from jaxquad.spectra import ErrorCovariance
-from jaxquad.spectra._atoms import add_effects, reach_of
+from jaxquad.spectra._error_covariance import add_effects, reach_of
 
 
 FREQUENCIES, OUTPUTS, INPUTS, PARAMETERS = 70, 2, 3, 4

@@ -7,13 +7,13 @@ import pytest
 
 from jaxquad.records import read, RecordWarning
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
-from jaxquad.spectra._model_order import search_orders
 from jaxquad.spectra._rational_fit import (
     Basis,
     descend,
     Equations,
     make_basis,
     parts_of,
+    search_orders,
     solve_linear,
 )
 
