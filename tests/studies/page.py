@@ -149,8 +149,8 @@ def _notes(table: dict) -> str:
 
 
 def _section(table: dict) -> str:
-    title = table["title"]
-    parts = [f"## {title}", fill(FINDINGS.get(title, table.get("text", "")), 110)]
+    title = str(table["title"])
+    parts = [f"## {title}", fill(FINDINGS.get(title) or table.get("text", ""), 110)]
     if title == "Healthy plants without options":
         places = [table["columns"].index(name) for name in SHORT]
         rows = [[*SHORT.values()], ["---"] * len(SHORT)]

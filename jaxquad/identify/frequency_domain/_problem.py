@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
+from jaxquad._compile import no_fuse
 from jaxquad._core import Message, on_host, pytree_node
-from jaxquad._xla import no_fuse
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 

@@ -9,8 +9,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import Message
-from jaxquad._xla import brief_options, Jit
 from jaxquad.models import (
     explicit,
     free_responses,

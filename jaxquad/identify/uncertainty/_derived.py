@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import run_shared
-
 from ..frequency_domain._parameters import number_at
 from ._identifiability import LIMIT
 from ._verdict import Combination, reach_of_interval, UndeterminedError, USUAL
@@ -130,8 +128,5 @@ def _values_and_gradients(
         return value
 
     function = jax.value_and_grad(of_values)
-    try:
-        found = run_shared(function, [(values, arrays) for values in places])
-    except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
-        found = [function(jnp.asarray(values), arrays) for values in places]
+    found = [function(jnp.asarray(values), arrays) for values in places]
     return [(float(value), np.asarray(gradient)) for value, gradient in found]
