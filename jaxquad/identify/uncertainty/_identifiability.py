@@ -105,12 +105,12 @@ def _product(powers: Vector, named: Named) -> Combination:
 def _sum(weights: Vector, named: Named) -> Combination:
     weights = weights * np.sign(weights[np.argmax(np.abs(weights * named.units))])
     value = float(np.sum(weights * named.values))
-    name = ""
-    for w, n in zip(weights, named.names, strict=True):
-        if w:
-            sign = ("- " if w < 0 else "") if not name else (" - " if w < 0 else " + ")
-            name += sign + (n if abs(w) == 1 else f"{abs(w):g} {n}")
-    return Combination(name, value, named.error(weights * named.units))
+    name, terms = "", [(w, n) for w, n in zip(weights, named.names, strict=True) if w]
+    for w, n in terms:
+        sign = ("- " if w < 0 else "") if not name else (" - " if w < 0 else " + ")
+        name += sign + (n if abs(w) == 1 else f"{abs(w):g} {n}")
+    error = named.error(weights * named.units)
+    return Combination(name, value, error, sum_of=tuple(n for _, n in terms))
 
 
 class Information(NamedTuple):
