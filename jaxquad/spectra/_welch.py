@@ -399,7 +399,7 @@ def _remarks(
     measured = omega, response, error, coherence, direct
     remarks = remarks_on_feedback(records, method, *measured, names)
     remarks += remarks_on_linearity(records, omega, response, coherence, method)
-    shared = 1 - np.nan_to_num(found.own_share)
+    shared = 1 - np.nan_to_num(found.alone)
     remarks += remarks_on_inputs(omega, shared, first.input_names)
     remarks += remarks_on_leakage(omega, found.leakage(), error, names)
     few = max(independent) < 3

@@ -16,9 +16,9 @@ from jaxquad.records import Record
 
 from ..frequency_domain._fit import check_priors
 from ..frequency_domain._model_checks import require_model
-from ..frequency_domain._origin import free_again
 from ..frequency_domain._parameters import Free, select_parameters, Tie
 from ..frequency_domain._problem import make_problem, Prior, require_priors
+from ..frequency_domain._refits import free_again
 from ..frequency_domain._result import Fit
 from ._descent import descend_by_turns, descend_with_noise
 from ._noise import ARMA, AutoRegressive, Noise
