@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_array
-from jaxquad._xla import brief_options, Devices, Jit
 from jaxquad.loops import Loop
 from jaxquad.simulation import (
     check_run,
+    Devices,
     find_authority,
     find_steps,
     FlightMetrics,

@@ -65,7 +65,7 @@ def headers(data: bytes) -> list[Header | ReadError]:
         try:
             logs.append(_header(data, start, stop))
         except ReadError as error:
-            logs.append(ReadError(error.args[0], offset=start))
+            logs.append(ReadError(error.reason, offset=start))
     return logs
 
 
