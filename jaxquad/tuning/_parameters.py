@@ -1,6 +1,6 @@
 """Which numbers of a controller are tuned, and the coordinates in which they are."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import equinox as eqx
 import jax
@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_array, ensemble_shape
-from jaxquad.control import find_transform, Transform, Tunable
+from jaxquad.control import find_transform, ObserverController, Transform, Tunable
 from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
+
+from ._verdict import Bound
 
 
 class Block(eqx.Module):
@@ -142,3 +144,51 @@ def _block(controller: PyTree, name: str, places: list[Place]) -> Block | None:
     values = np.asarray(leaves[mine[0].leaf])
     start = np.asarray(transform.inverse(values))
     return Block(mine, values.shape, transform, as_array(start.reshape(-1)))
+
+
+_NEAR, _FLAT = 0.02, 1e-3  # nepers to a bound, and the slope per neper that pushes against it
+
+
+def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
+    """Why the controller at `z` cannot be built or must not be flown; empty if it can."""
+    return refusal_of(build_design(coordinates, as_array(z)))
+
+
+def refusal_of(controller: PyTree) -> str:
+    """As `find_refusal`, of a controller that was not checked when it was made."""
+    for part in _iter_modules(controller):
+        try:
+            _check_again(part)
+        except ValueError as error:
+            return str(error)
+    if not isinstance(controller, ObserverController):
+        return ""
+    return controller.observer_instability() or controller.observer_slowness()
+
+
+def find_bounds(
+    coordinates: Coordinates, z: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]
+) -> tuple[Bound, ...]:
+    """The numbers that could lower the cost if the controller allowed them a small step more."""
+    found, values = [], coordinates.values(z)
+    for k, name in enumerate(values):
+        step = np.zeros_like(z)
+        step[k] = -_NEAR * np.sign(gradient[k])
+        if abs(gradient[k]) > _FLAT and (why := find_refusal(coordinates, z + step)):
+            found.append(Bound(name, values[name], why))
+    return tuple(found)
+
+
+def _check_again(module: eqx.Module) -> None:
+    """Raise ValueError where the module would refuse to be built with the values it has."""
+    for kind in type(module).__mro__:
+        if "__check_init__" in vars(kind):
+            vars(kind)["__check_init__"](module)
+
+
+def _iter_modules(tree: PyTree) -> Iterator[eqx.Module]:
+    """`tree` and the modules in it."""
+    if isinstance(tree, eqx.Module):
+        yield tree
+        for part in vars(tree).values():
+            yield from _iter_modules(part)

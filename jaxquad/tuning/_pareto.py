@@ -16,16 +16,14 @@ from ._certificate import Certificate
 from ._certify import certify
 from ._cost import Progress, stack_copies
 from ._design_result import DesignResult, DesignSummary, front_point, summarise_design
-from ._drawn import draw_or_take, tighten
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty
-from ._parameters import build_design, Coordinates, select_coordinates
+from ._parameters import build_design, Coordinates, find_bounds, select_coordinates
 from ._phases import Solution, solve
 from ._problem import DeviceChoice, make_problem, TimeSpan
 from ._quantities import QUANTITIES
-from ._refusal import find_bounds
-from ._requirements import require_kinds
-from ._tune import judge_descent, stabilising_rate
+from ._tail import draw_or_take, tighten
+from ._tune import judge_descent, require_kinds, stabilising_rate
 from ._verdict import Verdict
 
 

@@ -16,18 +16,20 @@ from ._cost import (
     CostResult,
     evaluate_cost,
     Evaluation,
+    initial_multipliers,
+    MET,
     Multipliers,
     Progress,
+    Rounds,
     Subproblem,
     take_problem,
+    update_multipliers,
 )
 from ._gauss_newton import GaussNewton, minimise_squares
 from ._lbfgs import Descent, Evaluate, LBFGS, minimise, Pairs
-from ._multipliers import initial_multipliers, MET, Rounds, update_multipliers
 from ._objective import Limit, Objective
-from ._parameters import build_design, Coordinates
+from ._parameters import build_design, Coordinates, refusal_of
 from ._problem import Problem
-from ._refusal import refusal_of
 from ._tail import (
     Beyond,
     half_of_reserve,
