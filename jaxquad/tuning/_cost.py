@@ -85,8 +85,8 @@ def evaluate_cost(
     arrays, rest = eqx.partition(subproblem, eqx.is_array)
     if len(z) == 1:
         alone = eqx.combine(jax.tree.map(lambda x: x[0], arrays), rest)
-        found = _evaluate_one(z[0], coordinates, problem, alone)
-        return jax.tree.map(lambda x: x[None], found)
+        result = _evaluate_one(z[0], coordinates, problem, alone)
+        return jax.tree.map(lambda x: x[None], result)
     common, fixed = eqx.partition((coordinates, problem), eqx.is_array)
 
     @jax.jit  # traced once, for its shapes and for its use
@@ -94,8 +94,8 @@ def evaluate_cost(
         of, members = eqx.combine(common, fixed)
         return _evaluate_one(z, of, members, eqx.combine(mine, rest))
 
-    def one(given: tuple[Array, Array, PyTree]) -> CostResult:
-        z, on, mine = given
+    def one(arguments: tuple[Array, Array, PyTree]) -> CostResult:
+        z, on, mine = arguments
         shapes = jax.eval_shape(run, z, mine, common)
         skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         return jax.lax.cond(on, run, skip, z, mine, common)
@@ -131,26 +131,25 @@ def _cost(
         fly = lambda c: problem.in_time(c, in_flight)
         numbers |= jax.lax.cond(subproblem.fly, fly, lambda c: unknown, controller)
     costs = objective.costs({name: x[:, : problem.counted] for name, x in numbers.items()})
-    seen = {name: QUANTITIES[name].combine_axes(x, worst=True) for name, x in numbers.items()}
-    limited = _limited(controller, problem, limits, seen)
+    worst = {name: QUANTITIES[name].combine_axes(x, worst=True) for name, x in numbers.items()}
+    # Limits of the linear loop, which is cheap, are kept on many more members.
+    bounded, names = dict(worst), {x.quantity for x in limits if QUANTITIES[x.quantity].linear}
+    if problem.limited is not None and names:
+        wide = problem.limited.numbers(controller, names, SMOOTHING)
+        bounded |= {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
+    limited = tuple(bounded[x.quantity][: count_members(problem, x)] for x in limits)
     beyond = tuple(limit.beyond(x) for limit, x in zip(limits, limited, strict=True))
     cost = objective.risk(costs)
     settling = jnp.mean(soft(slowest - subproblem.rate))
-    constrained = cost + _lagrangian(beyond, subproblem.multipliers)
-    total = jnp.where(subproblem.fly, constrained, settling)
-    return total, (cost, costs, seen, limited, beyond)
-
-
-def _limited(
-    controller: PyTree, problem: Problem, limits: Sequence[Limit], seen: dict[str, Array]
-) -> tuple[Array, ...]:
-    """The quantity of each limit: of the linear loop, which is cheap, on many more members."""
-    names = {limit.quantity for limit in limits if QUANTITIES[limit.quantity].linear}
-    found = dict(seen)
-    if problem.limited is not None and names:
-        wide = problem.limited.numbers(controller, names, SMOOTHING)
-        found |= {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
-    return tuple(found[limit.quantity][: count_members(problem, limit)] for limit in limits)
+    # The augmented Lagrangian of Powell, Hestenes and Rockafellar.
+    penalty = jnp.zeros(())
+    for k, levels in enumerate(beyond):
+        multiplier = subproblem.multipliers.values[k]
+        stiffness = subproblem.multipliers.stiffness[k]
+        forced = jnp.maximum(multiplier + stiffness * levels, 0)
+        penalty = penalty + jnp.sum(forced**2 - multiplier**2) / (2 * stiffness)
+    total = jnp.where(subproblem.fly, cost + penalty, settling)
+    return total, (cost, costs, worst, limited, beyond)
 
 
 def count_members(problem: Problem, limit: Limit) -> int:
@@ -158,16 +157,6 @@ def count_members(problem: Problem, limit: Limit) -> int:
     if QUANTITIES[limit.quantity].linear and problem.limited is not None:
         return problem.limited.members
     return problem.members if isinstance(limit.over, Worst) else problem.counted
-
-
-def _lagrangian(beyond: Sequence[Array], multipliers: Multipliers) -> Float[Array, ""]:
-    """What limits add, by the augmented Lagrangian of Powell, Hestenes and Rockafellar."""
-    total = jnp.zeros(())
-    for k, levels in enumerate(beyond):
-        multiplier, stiffness = multipliers.values[k], multipliers.stiffness[k]
-        forced = jnp.maximum(multiplier + stiffness * levels, 0)
-        total = total + jnp.sum(forced**2 - multiplier**2) / (2 * stiffness)
-    return total
 
 
 class Evaluation(NamedTuple):
@@ -212,11 +201,11 @@ class Progress:
 
 def describe_evaluation(count: int, now: Evaluation) -> str:
     """One line of text of an evaluation; of several problems, the best one's numbers."""
-    known = np.isfinite(now.cost)
-    best = int(np.argmin(np.where(known, now.cost, np.inf)))
+    running = np.isfinite(now.cost)
+    best = int(np.argmin(np.where(running, now.cost, np.inf)))
     parts = [f"{now.phase} {count:3d}", f"cost {now.cost[best]:9.5f}"]
-    if known.size > 1:
-        parts.append(f"(best of {known.sum()} running)")
+    if running.size > 1:
+        parts.append(f"(best of {running.sum()} running)")
     if "itae" in now.means and now.phase == "optimise":
         parts.append(f"ITAE {np.degrees(now.means['itae'][best]):.4g} deg s^2")
     parts.append(f"stable {100 * now.stable[best]:.3g} %")

@@ -178,9 +178,9 @@ def _certify(
             begun=job.loop.controller, key=key, devices=job.devices, **job.span._asdict(),
         )  # fmt: skip
 
-    key, made, seconds = job.key, 1, 0.0
+    key, certificates, seconds = job.key, 1, 0.0
     latest = certificate(solution.z[best], key)
-    while search is not None and isinstance(ensemble, Ensemble) and made < _CERTIFICATES:
+    while search is not None and isinstance(ensemble, Ensemble) and certificates < _CERTIFICATES:
         members = certified_members(job.loop, ensemble, key, flown=count)
         worst = certified_beyond(latest, members)
         if not worst.added:
@@ -188,9 +188,9 @@ def _certify(
         began = time.perf_counter()
         solution = go_on(solution, worst, search, best)
         seconds += time.perf_counter() - began
-        key = jax.random.fold_in(job.key, _AGAIN + made)
-        latest, made = certificate(solution.z[best], key), made + 1
-    return _Certified(solution, latest, made, seconds)
+        key = jax.random.fold_in(job.key, _AGAIN + certificates)
+        latest, certificates = certificate(solution.z[best], key), certificates + 1
+    return _Certified(solution, latest, certificates, seconds)
 
 
 def _tuned(
@@ -204,9 +204,9 @@ def _tuned(
 ) -> Tuned:
     solution, certificate = certified.solution, certified.certificate
     tuned = build_design(coordinates, as_array(solution.z[best]))
-    found = _limit_results(job.limits, solution, best)
+    limits = _limit_results(job.limits, solution, best)
     bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
-    convergence = judge_descent(solution, best, bounds, found)
+    convergence = judge_descent(solution, best, bounds, limits)
     if certificate is not None:
         certificate = dataclasses.replace(certificate, convergence=convergence)
     return Tuned(
@@ -218,14 +218,14 @@ def _tuned(
         converged=bool(solution.converged[best]),
         cost=float(solution.cost[best]),
         values=coordinates.values(solution.z[best]),
-        limits=found,
+        limits=limits,
         minima=distinct_optima(solution, coordinates),
         evaluations=int(solution.evaluations[best]),
         stabilising=int(solution.stabilising[best]),
         tail=solution.tail._replace(certificates=certified.certificates),
         history=tuple(watched.history),
         seconds=seconds + certified.seconds,
-        remarks=tuple(_remarks(tuned, problem, solution, best, found)),
+        remarks=tuple(_remarks(tuned, problem, solution, best, limits)),
     )
 
 
@@ -259,9 +259,9 @@ def _limit_results(
     for k, limit in enumerate(limits):
         values = as_array(solution.result.limited[k][index])
         excess = float(_excess(limit, values))
-        found = float(limit.bound) + limit.sign * excess
+        reached = float(limit.bound) + limit.sign * excess
         active = float(np.asarray(solution.multipliers.values[k])[index].sum()) > _ACTIVE
-        results.append(LimitResult(limit, found, excess <= 0, active))
+        results.append(LimitResult(limit, reached, excess <= 0, active))
     return tuple(results)
 
 
@@ -280,7 +280,7 @@ def judge_descent(
         gradient=float(np.max(np.abs(solution.gradient[index]))),
         evaluations=int(solution.evaluations[index]),
         bounds=bounds,
-        missed=[f"{x.limit} cannot be met: {x.found:.4g} at best" for x in limits if not x.met],
+        missed=[f"{x.limit} cannot be met: {x.reached:.4g} at best" for x in limits if not x.met],
     )
 
 

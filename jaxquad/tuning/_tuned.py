@@ -58,27 +58,27 @@ def scatter_starts(
 
 def distinct_optima(solution: Solution, coordinates: Coordinates) -> tuple[Optimum, ...]:
     """The distinct points at which the starts ended, the best first."""
-    found: list[Optimum] = []
+    optima: list[Optimum] = []
     cost, z = solution.cost, solution.z
     for k in np.argsort(np.where(np.isnan(cost), np.inf, cost), kind="stable"):
         same = [
-            i for i, o in enumerate(found)
+            i for i, o in enumerate(optima)
             if abs(o.cost - cost[k]) < _COST and np.max(np.abs(o.z - z[k])) < _PLACE
         ]  # fmt: skip
         if same:
-            old = found[same[0]]
-            found[same[0]] = old._replace(starts=(*old.starts, int(k)))
+            old = optima[same[0]]
+            optima[same[0]] = old._replace(starts=(*old.starts, int(k)))
         else:
             values, done = coordinates.values(z[k]), bool(solution.converged[k])
-            found.append(Optimum(float(cost[k]), z[k], values, (int(k),), done))
-    return tuple(found)
+            optima.append(Optimum(float(cost[k]), z[k], values, (int(k),), done))
+    return tuple(optima)
 
 
 class LimitResult(NamedTuple):
     """How a limit ended on the members that were tuned on."""
 
     limit: Limit
-    found: float  # in the limit's unit
+    reached: float  # in the limit's unit
     met: bool
     active: bool  # the cost would be lower without it
 
@@ -134,7 +134,7 @@ class Tuned(eqx.Module):
     @property
     def holds(self) -> bool:
         """Whether all three verdicts hold: only then the design may be flown."""
-        return all(each.holds is True for each in self.verdicts)
+        return all(verdict.holds is True for verdict in self.verdicts)
 
     def __str__(self) -> str:
         first, *rest = ["NOT CERTIFIED: no fresh members were asked for", *self.verdicts]
@@ -166,13 +166,13 @@ def _describe_effort(tuned: Tuned) -> str:
 
 def _describe_limit(one: LimitResult) -> str:
     if not one.met:
-        beyond = abs(one.found - float(one.limit.bound))
+        beyond = abs(one.reached - float(one.limit.bound))
         return (
-            f"limit on {one.limit}: {one.found:.4g} (by {beyond:.3g}) on the members tuned on, "
+            f"limit on {one.limit}: {one.reached:.4g} (by {beyond:.3g}) on the members tuned on, "
             "MISSED: it cannot be met together with the others"
         )
     state = "active" if one.active else "not active"
-    return f"limit on {one.limit}: {one.found:.4g} on the members tuned on, {state}"
+    return f"limit on {one.limit}: {one.reached:.4g} on the members tuned on, {state}"
 
 
 def describe_tail(tail: Tail) -> str:
@@ -239,8 +239,8 @@ def worst_flights(
     flights = {"nominal": _nominal(certificate, loop, controller, scenario)}
     if worst:
         members = _members(certificate, loop, ensemble).take(list(worst))
-        found = simulate(members.loop(controller), members.flight(scenario))
-        flights |= {text: _member(found, k) for k, text in enumerate(worst.values())}
+        flown = simulate(members.loop(controller), members.flight(scenario))
+        flights |= {text: _member(flown, k) for k, text in enumerate(worst.values())}
     return flights
 
 
@@ -248,14 +248,14 @@ def _worst(certificate: Certificate, quantities: Sequence[str]) -> dict[int, str
     """The worst members, with the quantities in which they are."""
     unknown = [name for name in quantities if name not in certificate.design.by_axis]
     if unknown or not quantities:
-        known = ", ".join(certificate.design.by_axis)
-        raise ValueError(f"no quantities {unknown} in the certificate: choose from {known}")
-    found: dict[int, list[str]] = {}
+        computed = ", ".join(certificate.design.by_axis)
+        raise ValueError(f"no quantities {unknown} in the certificate: choose from {computed}")
+    worst: dict[int, list[str]] = {}
     for name in quantities:
         index = certificate.design.worst_member(name)
         if index is not None:
-            found.setdefault(index, []).append(QUANTITIES[name].title)
-    return {k: f"worst {' and '.join(names)} (member {k})" for k, names in found.items()}
+            worst.setdefault(index, []).append(QUANTITIES[name].title)
+    return {k: f"worst {' and '.join(names)} (member {k})" for k, names in worst.items()}
 
 
 def _members(certificate: Certificate, loop: Loop, ensemble: Ensemble | Members) -> Members:
@@ -269,25 +269,25 @@ def _members(certificate: Certificate, loop: Loop, ensemble: Ensemble | Members)
             )
         key = jax.random.wrap_key_data(as_array(np.asarray(data, np.uint32)))
         members = ensemble.fresh(loop, certificate.members, key)
-    known = certificate.facts["assumed_inertia"].shape
-    if members.assumed_inertia.shape != known:
+    shape = certificate.facts["assumed_inertia"].shape
+    if members.assumed_inertia.shape != shape:
         raise ValueError(
             f"the members have the shape {members.assumed_inertia.shape}, but the certificate was "
-            f"made on {known}: give the loop and ensemble that it was made with"
+            f"made on {shape}: give the loop and ensemble that it was made with"
         )
     return members
 
 
-def _member(found: Simulation, k: int) -> Simulation:
+def _member(flights: Simulation, k: int) -> Simulation:
     """One of an ensemble of simulations. Compiles nothing."""
-    count = found.diverged.shape
+    count = flights.diverged.shape
     at = lambda x: as_array(np.asarray(x)[..., k])
     pick = lambda x: at(x) if x.shape[-1:] == count and x.ndim > 2 else x
-    parts = {name: pick(part) for name, part in found.scenario.parts.items()}
+    parts = {name: pick(part) for name, part in flights.scenario.parts.items()}
     return Simulation(
-        found.time, at(found.angle), at(found.measurement), at(found.command),
-        at(found.saturated), {}, at(found.diverged), Scenario(**parts, dt=found.scenario.dt),
-        found.dt,
+        flights.time, at(flights.angle), at(flights.measurement), at(flights.command),
+        at(flights.saturated), {}, at(flights.diverged), Scenario(**parts, dt=flights.scenario.dt),
+        flights.dt,
     )  # fmt: skip
 
 

@@ -96,7 +96,7 @@ def _minimise(cost, z, bound: float, worst: WorstLoops, others) -> np.ndarray:
         found = cost(z)
         return float(found.value[0]), np.asarray(found.gradient[0])
 
-    constraints, count = [], len(worst.found)
+    constraints, count = [], len(worst.places)
     if count:
         loops = worst.put_into(others, np.arange(count))
         level = lambda z: bound - np.asarray(peaks(jnp.asarray(z), COORDINATES, loops))[:count]
