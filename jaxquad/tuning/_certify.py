@@ -107,7 +107,8 @@ def certify(
     if name in peers:
         raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")
     # Independent draws, as the bound of a share needs.
-    given_members, nominal = isinstance(ensemble, Members), decouple(loop.plant)
+    given_members = isinstance(ensemble, Members)
+    nominal = decouple(loop.plant)
     drawn = ensemble if given_members else ensemble.fresh(loop, members, key)
     require_same_rate(loop, drawn)
     flight = drawn.flight(scenario)

@@ -238,7 +238,7 @@ class Distance(NamedTuple):
     member: int | None  # the worst one
     beyond_at_most: float | None = None  # share of all members, with 95 % confidence
 
-    def content(self) -> dict[str, object]:
+    def content(self) -> Mapping[str, object]:
         """Everything, for `jaxquad.report.write_json`."""
         names = {"reached": "found"}  # as result files have it
         plain = {names.get(name, name): value for name, value in self._asdict().items()}
