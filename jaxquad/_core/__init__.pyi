@@ -54,6 +54,7 @@ from ._members import (
     mark_members as mark_members,
     per_member as per_member,
 )
+from ._message import as_messages as as_messages, marked_text as marked_text, Message as Message
 from ._ours import is_ours as is_ours
 from ._process import (
     enable_x64 as enable_x64,

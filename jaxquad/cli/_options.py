@@ -189,8 +189,8 @@ def start_computing() -> None:
     What a command can say without JAX it says before.
     """
     collect_seldom()
+    from jaxquad._compile import enable_compile_cache
     from jaxquad._core import enable_x64
-    from jaxquad._xla import enable_compile_cache
 
     enable_x64()
     enable_compile_cache()

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from jaxquad._compile import hasty_options, Jit
 from jaxquad._core import (
     as_float,
     broadcast_gain,
@@ -19,7 +20,6 @@ from jaxquad._core import (
     require_positive,
     signal_shape,
 )
-from jaxquad._xla import hasty_options, Jit
 
 from ._ladrc import LADRC, LADRCLaw, LADRCState
 from ._pid import PID

@@ -36,6 +36,7 @@ from .frequency_domain._cost import (
     paper_cost as paper_cost,
     Points as Points,
     usable as usable,
+    WIDER_BAND as WIDER_BAND,
 )
 from .frequency_domain._damped import fit_damped as fit_damped
 from .frequency_domain._explain import Candidate as Candidate, Explanation as Explanation

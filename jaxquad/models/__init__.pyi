@@ -45,3 +45,4 @@ from ._transfer_function import (
     TransferFunction as TransferFunction,
 )
 from ._units import is_optional as is_optional, parameter_units as parameter_units
+from ._vector_functions import arctan2 as arctan2, sincos as sincos

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxquad._xla import no_fuse
+from jaxquad._compile import no_fuse
 
 from ._response import inverse_by_diagonal, Matrices, output_of, solve_states, Split
 

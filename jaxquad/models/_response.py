@@ -7,7 +7,9 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxquad._xla import no_fuse, sincos
+from jaxquad._compile import no_fuse
+
+from ._vector_functions import sincos
 
 
 class Split(NamedTuple):

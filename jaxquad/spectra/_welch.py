@@ -260,8 +260,8 @@ def remarks_on_leakage(
             text = (
                 f"leakage through the window biases the response by about "
                 f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
-                "include it. Use jq.spectra.LocalPolynomial(), which estimates leakage, a longer "
-                "window, or integrators= where the plant integrates"
+                "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
+                "window, or «integrators=» where the plant integrates"
             )
             remarks.append(Remark(text, omega[leaked], (output, source)))
     return tuple(remarks)
@@ -401,7 +401,7 @@ def _remarks(
     measured = omega, response, error, coherence, direct
     remarks = remarks_on_feedback(records, method, *measured, names)
     remarks += remarks_on_linearity(records, omega, response, coherence, method)
-    shared = 1 - np.nan_to_num(found.own_share)
+    shared = 1 - np.nan_to_num(found.alone)
     remarks += remarks_on_inputs(omega, shared, first.input_names)
     remarks += remarks_on_leakage(omega, found.leakage(), error, names)
     few = max(independent) < 3

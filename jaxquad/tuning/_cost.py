@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_array
-from jaxquad._xla import brief_options, Jit
 from jaxquad.control import ObserverController
 
 from ._objective import Limit, Objective, soft, Worst

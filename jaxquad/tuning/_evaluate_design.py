@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_array, map_in_threads
-from jaxquad._xla import brief_options, Devices, Jit
 from jaxquad.control import (
     LADRC,
     LinearisableController,
@@ -24,6 +24,7 @@ from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop, loop_numbers, LoopNumbers
 from jaxquad.simulation import (
     check_run,
+    Devices,
     find_authority,
     find_steps,
     FlightMetrics,

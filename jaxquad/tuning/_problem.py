@@ -11,13 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxquad._core import as_array, mark_members
-from jaxquad._xla import asked_devices, Devices, devices_for
 from jaxquad.control import schedule_for_analysis, schedule_for_flight
 from jaxquad.ensembles import Members
 from jaxquad.loops import linear_numbers, Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.simulation import (
+    asked_devices,
     check_run,
+    Devices,
+    devices_for,
     find_authority,
     find_steps,
     FlightMetrics,

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_array, mark_members, on_host
-from jaxquad._xla import brief_options, Jit
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop
 from jaxquad.simulation import Scenario

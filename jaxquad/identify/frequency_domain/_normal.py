@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from jaxquad._compile import evaluate_once, FEW, no_fuse
 from jaxquad._core import Normal, normal_equations
-from jaxquad._xla import arctan2, evaluate_once, FEW, no_fuse
-from jaxquad.models import Entry, factor_slopes, matrices_of, Split, StateSpace
+from jaxquad.models import arctan2, Entry, factor_slopes, matrices_of, Split, StateSpace
 
 from ._condition import is_unchanged
 from ._mixing import mix_parts

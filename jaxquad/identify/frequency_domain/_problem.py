@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from jaxquad._core import on_host, pytree_node
-from jaxquad._xla import no_fuse
+from jaxquad._compile import no_fuse
+from jaxquad._core import Message, on_host, pytree_node
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
@@ -261,9 +261,11 @@ def _of_same_shape(
     # Broadcasting would fit one output to all of them silently.
     if model.shape != measured.shape:
         raise ValueError(
-            f"the model's response has shape {model.shape}, the measured one {measured.shape} "
-            "(frequencies, outputs, inputs): pick channels with jq.records.select, or extend the "
-            "model"
+            Message(
+                f"the model's response has shape {model.shape}, the measured one {measured.shape} "
+                "(frequencies, outputs, inputs): «pick channels with jq.records.select», or extend "
+                "the model"
+            )
         )
     return model
 

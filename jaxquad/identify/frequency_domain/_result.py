@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Key, PyTree
 
-from jaxquad._core import plain_content, pytree_node
+from jaxquad._core import Message, plain_content, pytree_node
 from jaxquad.records import Record
 
 from ..output_error._noise import NoiseModel
@@ -70,7 +70,7 @@ class Fit:
     points: int  # frequencies used, over all responses
     steps: int
     verdict: Verdict
-    remarks: tuple[str, ...] = eqx.field(static=True)
+    remarks: tuple[Message, ...] = eqx.field(static=True)
     parameters: Parameters
     units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
     relative_covariance: Float[np.ndarray, "parameters parameters"]

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxquad._compile import hasty_options, KeptPrograms
 from jaxquad._core import Normal, RUNNING, STALLED, TOLERANCE
-from jaxquad._xla import hasty_options, KeptPrograms
 
 from ._aside import costs_aside
 from ._evaluate import (

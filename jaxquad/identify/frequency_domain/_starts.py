@@ -242,8 +242,8 @@ def remarks_on_minima(
     remarks = []
     if falls_aside:
         remarks.append(
-            "stationary, but no minimum: the cost falls to one side; start from other values, or "
-            "give starts=20"
+            "stationary, but no minimum: the cost falls to one side; «start from other values»"
+            "«, or give starts=20»"
         )
     found = [point for point in minima if point.is_minimum]
     rivals = [p for p in found[1:] if p.cost <= _NEAR * found[0].cost]

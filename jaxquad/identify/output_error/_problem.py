@@ -11,7 +11,7 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxquad._core import Normal, solve_definite
+from jaxquad._core import Message, Normal, solve_definite
 from jaxquad.models import simulate_linear, StateSpace, TransferFunction
 from jaxquad.records import Record
 
@@ -75,17 +75,21 @@ def feedback_response(
         )
     if len(record.input_names) != 1 or len(record.output_names) != 1:
         raise ValueError(
-            "loop= is for one input and one output, the record has "
-            f"{', '.join(record.input_names)} and {', '.join(record.output_names)}: pick channels "
-            "with jq.records.select"
+            Message(
+                "loop= is for one input and one output, the record has "
+                f"{', '.join(record.input_names)} and {', '.join(record.output_names)}: "
+                "«pick channels with jq.records.select»"
+            )
         )
     controller = loop.linear()
     if not np.isclose(controller.dt, record.dt, rtol=1e-6) or hold != "zero":
         raise ValueError(
-            f"the controller computes every {controller.dt:.6g} s a command that it holds, but the "
-            f"record has samples every {record.dt:.6g} s and an input that is "
-            f"{'held' if hold == 'zero' else 'not held'}: give a record at the controller's rate "
-            "with hold= its interval"
+            Message(
+                f"the controller computes every {controller.dt:.6g} s a command that it holds, but "
+                f"the record has samples every {record.dt:.6g} s and an input that is "
+                f"{'held' if hold == 'zero' else 'not held'}: give a record at the controller's "
+                "rate with «hold=» its interval"
+            )
         )
     parts = (controller.A, controller.measurement_in, controller.C)
     A, state, C = (np.asarray(part, float) for part in parts)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
+from jaxquad._core import keep_freed_memory, Message, one_blas_thread, require_x64
 from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
@@ -160,7 +160,9 @@ def _check(
     for one in records:
         still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
         if still:
-            raise ValueError(f"output {still[0]} is constant: leave it out with jq.records.select")
+            raise ValueError(
+                Message(f"output {still[0]} is constant: leave it out« with jq.records.select»")
+            )
     if not (noise in (None, "auto") or isinstance(noise, AutoRegressive | ARMA)):
         raise ValueError(
             f"noise is {noise!r}: give None (white), jq.identify.AutoRegressive(order), "
@@ -198,8 +200,10 @@ def _term(
         measured = jnp.size(model.measure(model.init()))
         if measured != len(record.output_names):
             raise ValueError(
-                f"the model measures {measured} outputs, the record has "
-                f"{', '.join(record.output_names)}: pick channels with jq.records.select"
+                Message(
+                    f"the model measures {measured} outputs, the record has "
+                    f"{', '.join(record.output_names)}: «pick channels with jq.records.select»"
+                )
             )
     else:
         plant = linear_model(model)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxquad._core import Message
 from jaxquad.records import Record
 
 from ..frequency_domain._result import Fit
@@ -31,7 +32,7 @@ from ..uncertainty._fit_remarks import (
 from ..uncertainty._identifiability import Information
 from ..uncertainty._make_fit import Costs, Estimate, make_fit
 from ..uncertainty._seen import prior_rows, rescale, units_of
-from ..uncertainty._verdict import Verdict
+from ..uncertainty._verdict import NO_MINIMUM, Verdict
 from ._descent import Descent, with_fixed_slopes
 from ._problem import evaluate_misfits, Evaluation, RecordTerm
 
@@ -80,7 +81,7 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     decrement, explained = 0.5 * float(gradient @ step), _explained(projected, problem.terms)
     # In units of what the noise moves: a share of the cost would grow with the record.
     if decrement > count * max(taken, 1.0) or is_unfinished(solution, step, covariance):
-        remedy = "start from other values, for instance those of jq.fit"
+        remedy = "«start from other values», for instance those of jq.fit"
         verdict = by_data = no_minimum(
             parameters.names, decrement, cost, remedy, message=solution.message
         )
@@ -234,9 +235,12 @@ def _remarks_on_output_error(
         remarks.append(f"the solver stopped early: {solution.message}")
     if no_minimum:
         remarks.append(
-            f"no minimum: one more Gauss-Newton step would lower the cost by {2 * decrement:.3g}, "
-            f"where the noise alone accounts for {taken:.3g}; start from other values, for "
-            "instance those of jq.fit"
+            Message(
+                f"no minimum: one more Gauss-Newton step would lower the cost by "
+                f"{2 * decrement:.3g}, where the noise alone accounts for {taken:.3g}; «start from "
+                "other values», for instance those of jq.fit",
+                NO_MINIMUM,
+            )
         )
     names = dict.fromkeys(name for record in records for name in record.reference_names)
     closed = any(term.feedback is not None for term in descent.problem.terms)
@@ -254,11 +258,11 @@ def _remarks_on_output_error(
         remarks.append(
             f"the record has references ({', '.join(names)}), so a loop may have been closed: "
             f"{doubt} the joint estimate{instead}"
-            ", jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())"
+            "«joint estimate|, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())»"
         )
     remarks.append(
         "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
-        "model: check the model by jq.verify on another record"
+        "model: check the model by «jq.verify» on another record"
     )
     return remarks
 

@@ -9,7 +9,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import brief_options, Jit
+from jaxquad._compile import brief_options, Jit
+from jaxquad._core import Message
 from jaxquad.models import (
     explicit,
     free_responses,
@@ -37,8 +38,10 @@ def band_gain(
     if np.shape(band) != (2,) or not 0 < band[0] < band[1] < nyquist:
         ends = " .. ".join(f"{float(end):.4g}" for end in np.ravel(band))
         raise ValueError(
-            f"band {ends} rad/s must rise and lie between 0 and the record's Nyquist frequency "
-            f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz): give another band (band=)"
+            Message(
+                f"band {ends} rad/s must rise and lie between 0 and the record's Nyquist frequency "
+                f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz): give another band («band=»)"
+            )
         )
     from scipy.signal import butter, sosfreqz
 
@@ -223,9 +226,11 @@ def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None
     if (len(record.input_names), len(record.output_names)) != (inputs, outputs):
         count = lambda number, what: f"one {what}" if number == 1 else f"{number} {what}s"
         raise ValueError(
-            f"the model has {count(inputs, 'input')} and {count(outputs, 'output')}, the record "
-            f"has {', '.join(record.input_names)} and {', '.join(record.output_names)}: pick "
-            "channels with jq.records.select"
+            Message(
+                f"the model has {count(inputs, 'input')} and {count(outputs, 'output')}, the "
+                f"record has {', '.join(record.input_names)} and {', '.join(record.output_names)}: "
+                "«pick channels with jq.records.select»"
+            )
         )
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxquad._core import require_x64
+from jaxquad._core import Message, require_x64
 from jaxquad.records import Record
 
 from ..uncertainty._accuracy import orthonormal, projected_noise
@@ -193,7 +193,9 @@ def verify(
     spread = np.std(measured, axis=0)
     for name, size in zip(record.output_names, spread, strict=True):
         if size == 0:
-            raise ValueError(f"output {name} is constant: leave it out with jq.records.select")
+            raise ValueError(
+                Message(f"output {name} is constant: leave it out« with jq.records.select»")
+            )
     scaled = columns / spread[None, :, None]
     unknowns = _significant_unknowns((measured - driven) / spread[None], scaled, motions)
     simulated = driven + columns[:, :, : unknowns.size] @ unknowns

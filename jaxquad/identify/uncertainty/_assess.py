@@ -220,7 +220,7 @@ def _judge(
     if 2 * dominated > used:
         verdict = fed_back(names, dominated, used)
     elif decrement > _NO_MINIMUM * max(cost, 1e-9) or is_unfinished(solution, step, seen.by_noise):
-        remedies = ("start from other values", "try many starts at once (starts=20)")
+        remedies = ("«start from other values»", "try many starts at once (starts=20)")
         verdict = no_minimum(names, decrement, cost, *remedies, message=solution.message)
     elif seen.discrepancy.amplitude > NO_MODEL:
         verdict = no_model(names, seen.discrepancy.amplitude)

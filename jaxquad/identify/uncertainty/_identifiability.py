@@ -113,12 +113,12 @@ def _power(name: str, power: float) -> str:
 def _sum(weights: Float[np.ndarray, " parameters"], named: Named) -> Combination:
     weights = weights * np.sign(weights[np.argmax(np.abs(weights * named.units))])
     value = float(np.sum(weights * named.values))
-    name = ""
-    for w, n in zip(weights, named.names, strict=True):
-        if w:
-            sign = ("- " if w < 0 else "") if not name else (" - " if w < 0 else " + ")
-            name += sign + (n if abs(w) == 1 else f"{abs(w):g} {n}")
-    return Combination(name, value, _spread(weights * named.units, named))
+    name, terms = "", [(w, n) for w, n in zip(weights, named.names, strict=True) if w]
+    for w, n in terms:
+        sign = ("- " if w < 0 else "") if not name else (" - " if w < 0 else " + ")
+        name += sign + (n if abs(w) == 1 else f"{abs(w):g} {n}")
+    error = _spread(weights * named.units, named)
+    return Combination(name, value, error, sum_of=tuple(n for _, n in terms))
 
 
 LIMIT = 0.5  # standard error, relative, above which a parameter counts as undetermined

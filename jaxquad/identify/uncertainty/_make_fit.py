@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, PyTree
 
+from jaxquad._core import as_messages
+
 from ..frequency_domain._origin import Origin
 from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
@@ -82,7 +84,7 @@ def make_fit(
         points=points,
         steps=solution.steps,
         verdict=verdict,
-        remarks=remarks,
+        remarks=as_messages(remarks),
         parameters=problem.parameters,
         units=units,
         relative_covariance=covariance,
@@ -162,7 +164,7 @@ def unfitted(
         points=0,
         steps=0,
         verdict=verdict,
-        remarks=remarks,
+        remarks=as_messages(remarks),
         parameters=parameters,
         units=np.asarray(parameters.slopes(parameters.start[:count])),
         relative_covariance=np.full((count, count), np.nan),

@@ -6,14 +6,18 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import pytree_node
+from jaxquad._core import as_messages, Message, pytree_node
 
 
 Kind = Literal["identifiable", "not identifiable", "no minimum", "no model", "too few points"]
+NO_MINIMUM: Kind = "no minimum"  # of a remark, too
 
 
 class UndeterminedError(ValueError):
     """A number was asked for that the record does not determine; a ValueError."""
+
+    def __init__(self, reason: str):
+        super().__init__(Message(reason))
 
 
 USUAL = 0.95  # level of an interval
@@ -61,6 +65,7 @@ class Combination(NamedTuple):
     standard_error: float
     degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard error
     unit: str = ""  # where it is known
+    sum_of: tuple[str, ...] = ()  # the parameters of a sum
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -125,8 +130,8 @@ class Verdict:
     undetermined: tuple[str, ...] = eqx.field(static=True)  # parameters
     combinations: tuple[Combination, ...]  # what is determined of the undetermined ones
     null_directions: tuple[dict[str, float], ...]  # unit vectors of relative changes
-    reasons: tuple[str, ...] = eqx.field(static=True)
-    remedies: tuple[str, ...] = eqx.field(static=True)
+    reasons: tuple[Message, ...] = eqx.field(static=True)
+    remedies: tuple[Message, ...] = eqx.field(static=True)
     exact: Float[np.ndarray, "null parameters"]  # null directions that no noise explains
     alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
     curved: tuple[str, ...] = eqx.field(static=True)  # determined as neither a product nor a sum
@@ -206,15 +211,16 @@ class Verdict:
         return [f"  to resolve it: {first}", *(f"  or {other}" for other in others)]
 
 
-def remedies_for(lost: tuple[str, ...]) -> tuple[str, ...]:
+def remedies_for(lost: tuple[str, ...]) -> tuple[Message, ...]:
     """What determines parameters that one record leaves open."""
     names = " or ".join(lost)
-    return (
-        f"fix {names} at a measured value (leave it out of free=)",
+    texts = (
+        f"fix {names} at a measured value« (leave it out of free=)»",
         "give a known value: priors=[jq.identify.Prior(name or function, value, standard error)]",
         f"fit a second record under a known change of {names}: "
         "conditions=(None, jq.identify.Changed(name, change))",
     )
+    return as_messages(texts)
 
 
 def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: str) -> Verdict:
@@ -224,8 +230,8 @@ def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: 
         undetermined=names,
         combinations=(),
         null_directions=(),
-        reasons=(reason,),
-        remedies=remedies,
+        reasons=as_messages([reason]),
+        remedies=as_messages(remedies),
         exact=np.eye(len(names)),
         alternatives=(),
         curved=(),

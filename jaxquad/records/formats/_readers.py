@@ -221,7 +221,7 @@ def _choose_reader(path: Path) -> Reader:
         ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
         raise ReadError(
             f"{path}: unknown file format: neither the first bytes nor the {ending} are those of "
-            f"a known one ({known}). Convert the file, or build a jq.Record from its arrays."
+            f"a known one ({known}). Convert the file«, or build a jq.Record from its arrays»."
         )
     return reader
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from jaxquad import LADRC
-from jaxquad._xla import _kept_programs
-from jaxquad._xla._kept_programs import KeptPrograms
+from jaxquad._compile import _programs, Jit, KeptPrograms
 
 
 ARGUMENTS = LADRC(10.0, 30.0, 0.85, dt=0.002), jnp.arange(3.0)
@@ -43,37 +42,37 @@ class Foreign(eqx.Module):
 @pytest.fixture
 def traced(monkeypatch, tmp_path):
     """What was traced, by functions whose programs are kept in a folder of this test."""
-    monkeypatch.setattr(_kept_programs, "_folder", lambda: tmp_path)
+    monkeypatch.setattr(_programs, "_folder", lambda: tmp_path)
     return []
 
 
-def kept(traced):
+def scaled_by(traced):
     def scaled(controller, values, power=2):
         traced.append(power)
         return {"values": controller.wc * values.astype(float) ** power, "wc": controller.wc}
 
-    return KeptPrograms(scaled, dict)
+    return scaled
 
 
-def run(programs, arguments):
-    program = programs.find(arguments)
-    assert program is not None
-    return program(arguments)
+def kept(traced):
+    return KeptPrograms(scaled_by(traced), dict)
 
 
 def test_a_program_is_found_again_without_tracing(traced):
-    first = run(kept(traced), ARGUMENTS)
-    again = run(kept(traced), ARGUMENTS)
+    first = kept(traced)(*ARGUMENTS)
+    again = kept(traced)(*ARGUMENTS)
     assert traced == [2]
     np.testing.assert_array_equal(first["values"], 10 * np.arange(3.0) ** 2)
     assert first["wc"] == again["wc"] and np.array_equal(first["values"], again["values"])
 
 
 def test_what_was_begun_is_compiled_by_the_first_call(traced):
-    programs = kept(traced)
-    assert programs.begin(ARGUMENTS) and traced == [2]
-    assert run(programs, ARGUMENTS)["wc"] == 10.0 and traced == [2]
-    assert kept(traced).begin(ARGUMENTS) and traced == [2]
+    begun = Jit(scaled_by(traced), dict)
+    begun.begin(*ARGUMENTS)
+    assert begun(*ARGUMENTS)["wc"] == 10.0 and traced == [2]
+    again = Jit(scaled_by(traced), dict)
+    again.begin(*ARGUMENTS)
+    assert again(*ARGUMENTS)["wc"] == 10.0 and traced == [2]
 
 
 def filled(arrays):
@@ -109,16 +108,16 @@ def test_arrays_out_of_order_are_refused(traced):
     ids=["shape", "type", "number", "setting"],
 )
 def test_a_program_is_for_what_it_was_traced_from(traced, other):
-    kept(traced).find(ARGUMENTS)
-    found = run(kept(traced), other)
+    kept(traced)(*ARGUMENTS)
+    found = kept(traced)(*other)
     assert len(traced) == 2
     np.testing.assert_allclose(found["values"], 10.0 * np.asarray(other[1], float) ** traced[1])
 
 
 def test_numbers_of_arrays_are_given_to_the_same_program(traced):
-    kept(traced).find(ARGUMENTS)
+    kept(traced)(*ARGUMENTS)
     other = LADRC(5.0, 30.0, 0.85, dt=0.002), jnp.ones(3)
-    assert run(kept(traced), other)["wc"] == 5.0
+    assert kept(traced)(*other)["wc"] == 5.0
     assert len(traced) == 1
 
 
@@ -128,8 +127,9 @@ def test_numbers_of_arrays_are_given_to_the_same_program(traced):
     ids=["class", "function", "function with a name"],
 )
 def test_what_another_has_made_is_not_kept(traced, foreign, tmp_path):
-    assert kept(traced).find(foreign) is None and not kept(traced).begin(foreign)
-    assert not traced and not any(tmp_path.iterdir())
+    programs = KeptPrograms(lambda *args: args[1] + 1, dict)
+    np.testing.assert_array_equal(programs(*foreign), np.arange(3.0) + 1)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_program_that_calls_lapack_is_not_kept(traced, tmp_path):
@@ -138,30 +138,31 @@ def test_a_program_that_calls_lapack_is_not_kept(traced, tmp_path):
     def eigenvalues(matrix):
         return jnp.linalg.eigvalsh(matrix)
 
-    program = KeptPrograms(eigenvalues, dict).find((jnp.eye(2),))
-    assert program is not None and not any(tmp_path.iterdir())
-    np.testing.assert_array_equal(program((jnp.eye(2),)), [1.0, 1.0])
+    found = KeptPrograms(eigenvalues, dict)(jnp.eye(2))
+    assert not any(tmp_path.iterdir())
+    np.testing.assert_array_equal(found, [1.0, 1.0])
 
 
 def test_a_change_of_the_source_makes_another_name(monkeypatch):
-    name = lambda: _kept_programs._name(test_a_program_is_found_again_without_tracing, {}, ())
+    name = lambda: _programs._name(test_a_program_is_found_again_without_tracing, {}, ())
     before = name()
-    monkeypatch.setattr(_kept_programs, "_makers", lambda: b"another source")
+    monkeypatch.setattr(_programs, "_makers", lambda: b"another source")
     assert name() != before
 
 
 def test_a_damaged_file_is_compiled_anew(traced, tmp_path):
-    kept(traced).find(ARGUMENTS)
+    kept(traced)(*ARGUMENTS)
     [path] = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:100])
     with pytest.warns(UserWarning, match="compiled anew"):
-        assert run(kept(traced), ARGUMENTS)["wc"] == 10.0
-    assert run(kept(traced), ARGUMENTS)["wc"] == 10.0
+        assert kept(traced)(*ARGUMENTS)["wc"] == 10.0
+    assert kept(traced)(*ARGUMENTS)["wc"] == 10.0
     assert len(traced) == 2
 
 
-def test_without_a_folder_no_program_is_kept():
-    assert KeptPrograms(lambda x: x, dict).find(ARGUMENTS) is None
+def test_without_a_folder_no_program_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(_programs, "_write", lambda *_: pytest.fail("a program is kept"))
+    assert KeptPrograms(lambda _, x: x, dict)(*ARGUMENTS)[2] == 2.0
 
 
 def test_a_second_process_traces_neither_flight_nor_fit_and_finds_the_same(tmp_path):

@@ -1,66 +1,93 @@
-"""Long scans in blocks, large ensembles in chunks: what keeps gradients and caches small."""
+"""Scans over the members of an ensemble: the one entry to kernels, and what needs no compiler.
+
+Long scans run in blocks and large ensembles in chunks, which keeps gradients and caches small.
+"""
 
 import math
 import sys
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
-from jaxquad._xla import (
-    apart_in_reverse,
-    as_one_kernel,
-    most_numbers,
-    scan_on_device,
-    why_no_device_kernels,
-)
-
-from ._delay import Queue
-from ._guard import KEPT
+from ._door import compilers
 
 
+# What reverse mode keeps of a sample, by `checkpoint_name`. Otherwise it would compute each sample
+# twice, for these numbers and for the derivatives.
+KEPT = "kept_of_sample"
 _POLICY = jax.checkpoint_policies.save_only_these_names(KEPT)
 _SHORT = 128  # samples that need no blocks
 SINGLE, _SOME = 8, 64  # members up to which a loop is compiled as a single one, and briefly
 Step = Callable[..., tuple[PyTree, PyTree]]
 
 
+class Queue(NamedTuple):
+    """Inputs on their way to the plant, for as many samples as every member waits."""
+
+    rows: Float[Array, "rows inputs *ensemble"] | None  # in the order of their places; None for one
+    newest: Float[Array, " inputs *ensemble"]
+
+    def exchange(self, index: Int[Array, ""]) -> tuple["Queue", Array]:
+        """At sample `index` the newest input takes the oldest one's place. Also the oldest."""
+        if self.rows is None:
+            return self, self.newest
+        place = index % len(self.rows)
+        oldest = jax.lax.dynamic_index_in_dim(self.rows, place, 0, keepdims=False)
+        rows = jax.lax.dynamic_update_index_in_dim(self.rows, self.newest, place, 0)
+        return Queue(rows, self.newest), oldest
+
+    def in_order(self) -> tuple[Array, ...]:
+        """The inputs, the oldest first."""
+        return (*(() if self.rows is None else self.rows), self.newest)
+
+
 def scan_members(
     step: Step,
     carry: PyTree,
-    xs: PyTree,
-    count: int,
-    members: int | None,
+    parts: PyTree,
+    signals: PyTree,
+    *,
+    members: int | None = None,
     queue: Queue | None = None,
 ) -> tuple[PyTree, PyTree]:
-    """`scan_in_blocks` of an ensemble, which an accelerator runs as one kernel if it can.
+    """`jax.lax.scan` of `step(carry, parts, now)`: the last carry, and what each sample stored.
 
-    `members` are on the last axis of the carry; None for a single loop, or for more axes.
+    A CPU runs it as one kernel, and an NVIDIA GPU the loop of an ensemble, where the compilers can
+    make them; else it is a plain scan of the same numbers. All arguments but `step` are arrays.
+
+    **Arguments:**
+
+    - `parts`: what does not change with time.
+    - `signals`: [samples, ...], of which `now` is one sample.
+    - `members`: on the last axis of the carry; None for a single loop, or for more axes.
+    - `queue`: then `step(carry, parts, now, oldest)` returns (carry, (newest, stored)).
     """
     few = members is not None and are_few(members)
-    if members is None or why_no_device_kernels() is not None:
-        return scan_in_blocks(step, carry, xs, count, queue, few)
-    plain = lambda step, carry, xs: scan_in_blocks(step, carry, xs, count)
-    if queue is None:
-        found = scan_on_device(step, carry, xs, members, plain)
-    else:
-        begun = (_in_order(queue), carry)
-        found = scan_on_device(_with_rows(step), begun, xs, members, plain)
-        found = found and (found[0][1], found[1])
-    return scan_in_blocks(step, carry, xs, count, queue, few) if found is None else found
+
+    def blocks(
+        carry: PyTree, parts: PyTree, signals: PyTree, queue: Queue | None
+    ) -> tuple[PyTree, PyTree]:
+        advance = lambda carry, *now: step(carry, parts, *now)
+        return scan_in_blocks(advance, carry, signals, queue, few)
+
+    if members is not None and compilers().why_no_device_kernels() is None:
+        advance, begun = lambda carry, *now: step(carry, parts, *now), carry
+        if queue is not None:
+            advance, begun = _with_rows(advance), (queue.in_order(), carry)
+        result = compilers().scan_on_device(advance, begun, signals, members, scan_in_blocks)
+        if result is not None:
+            return result if queue is None else (result[0][1], result[1])
+    return compilers().as_one_kernel(blocks, carry, parts, signals, queue)
 
 
 def are_few(members: int) -> bool:
     """Whether a loop of so many takes longer to compile than to run, and is no single loop."""
     return SINGLE < members <= _SOME
-
-
-def _in_order(queue: Queue) -> tuple[Array, ...]:
-    """The inputs on their way, the oldest first."""
-    return (*(() if queue.rows is None else queue.rows), queue.newest)
 
 
 def _with_rows(step: Step) -> Step:
@@ -75,19 +102,15 @@ def _with_rows(step: Step) -> Step:
 
 
 def scan_in_blocks(
-    step: Step,
-    carry: PyTree,
-    xs: PyTree,
-    count: int,
-    queue: Queue | None = None,
-    few: bool = False,
+    step: Step, carry: PyTree, xs: PyTree, queue: Queue | None = None, few: bool = False
 ) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` whose reverse keeps the carry of blocks only, and of the one it is in.
 
-    Twice the square root of `count` carries instead of all, for one forward pass more. With a
-    `queue`, of which only blocks are kept, `step(carry, x, oldest)` returns (carry, (newest, y)).
-    The reverse of `few` members is kernels that two cores compile at once.
+    Twice the square root of the samples' number of carries instead of all, for one forward pass
+    more. With a `queue`, of which only blocks are kept, `step(carry, x, oldest)` returns
+    (carry, (newest, y)). The reverse of `few` members is kernels that two cores compile at once.
     """
+    count = len(jax.tree.leaves(xs)[0])
     size = _block_size(count)
     length = -(-count // size) * size
     if length > count:
@@ -97,10 +120,12 @@ def scan_in_blocks(
     if queue is not None:
         step, carry, xs = _with_queue(step), (queue, carry), (jnp.arange(length), xs)
 
-    def block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
+    def jaxquad_block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
         return jax.lax.scan(step, carry, xs)
 
-    block = jax.checkpoint(apart_in_reverse(block) if few else block, prevent_cse=False)
+    # A function of this name becomes kernels of its own where it is computed again and reversed:
+    # two cores compile these two at once, and the time of both grows faster than their operations.
+    block = jax.checkpoint(jax.jit(jaxquad_block) if few else jaxquad_block, prevent_cse=False)
 
     if length == size:
         carry, out = block(carry, xs)
@@ -153,6 +178,7 @@ def _block_size(count: int) -> int:
 
 _CHUNK = 128  # members: some hundred arrays of them fit a core's second cache
 _VECTOR = 16  # members that are computed at once
+_WIDEST = 4095  # numbers of an array in a kernel
 
 
 def run_ensemble(
@@ -185,16 +211,13 @@ def run_ensemble(
     **Raises:** ValueError for a result that does not have the members on its last axis.
     """
 
-    def loop(given: PyTree) -> tuple[PyTree, PyTree]:
+    def scan(given: PyTree) -> tuple[PyTree, PyTree]:
         carry, (parts, signals) = given
-        count = jax.tree.leaves(signals)[0].shape[0]
         members = jax.tree.leaves(carry)[0].shape[-1]
-        advance = lambda carry, now: step(carry, parts, now)
-        return scan_members(advance, carry, signals, count, members)
+        return scan_members(step, carry, parts, signals, members=members)
 
-    theirs = (True, own)
     chunk = chunk or most_at_once(carry, jax.tree.leaves(carry)[0].shape[-1])
-    return in_chunks(lambda x: as_one_kernel(loop, x), (carry, (parts, signals)), theirs, chunk)
+    return in_chunks(scan, (carry, (parts, signals)), (True, own), chunk)
 
 
 def in_chunks(
@@ -235,7 +258,7 @@ def most_at_once(carry: PyTree = None, members: int = 1) -> int:
     if jax.default_backend() != "cpu":
         return sys.maxsize
     theirs = [x.size for x in jax.tree.leaves(carry) if x.shape[-1:] == (members,)]
-    fitting = most_numbers() * members // max(theirs, default=members) // _VECTOR * _VECTOR
+    fitting = _WIDEST * members // max(theirs, default=members) // _VECTOR * _VECTOR
     return min(_CHUNK, fitting) or _CHUNK
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import Jit
+from jaxquad._compile import Jit
 
 
 ONES = jnp.ones(3)
