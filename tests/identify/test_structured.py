@@ -108,6 +108,7 @@ def both_products(model, scale, weight, misfit):
     return slopes.normal_products(weight, misfit), (gradient, sum(row @ row.T for row in rows))
 
 
+@pytest.mark.slow
 def test_products_of_slopes_need_no_slopes():
     rng = np.random.default_rng(4)
     scale, shape = jnp.asarray(rng.uniform(0.5, 2.0, len(ENTRIES))), (2, 2, OMEGA.size)
