@@ -44,3 +44,11 @@ def test_a_room_imports_lower_ones_only_and_through_their_faces(room):
             assert ORDER.index(name[1]) < ORDER.index(room), f"{path} imports {'.'.join(name)}"
             private = [part for part in name[2:] if part.startswith("_")]
             assert not private, f"{path} imports {'.'.join(name)}"
+
+
+def test_no_file_but_its_own_asks_whether_a_firmware_is_the_one():
+    firmwares = {"ardupilot", "px4", "betaflight", "crazyflie"}
+    for path in (path for path in FILES if not {*firmwares, "formats"} & {*path.parts}):
+        for node in ast.walk(ast.parse(path.read_text())):
+            words = [x.value for x in ast.walk(node) if isinstance(x, ast.Constant)]
+            assert not (isinstance(node, ast.Compare) and firmwares & {*words}), (path, node.lineno)
