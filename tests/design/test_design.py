@@ -268,7 +268,7 @@ def test_noise_is_taken_from_what_an_input_does_not_explain():
     u, v = rng.standard_normal((2, 20000))
     record = jq.Record(np.arange(u.size) / RATE, u, 3.0 * u + 0.2 * v)
     density = jq.spectra.spectral_density(record, np.geomspace(2.0, 100.0, 20))
-    noise = MeasuredNoise(density, ("y",), given=("u",))
+    noise = MeasuredNoise(density, ("y",), removed=("u",))
     levels = np.real(noise(np.linspace(3.0, 90.0, 7))[:, 0, 0])
     # White noise of 0.2 at 50 Hz; 80 windows of half the samples leave a scatter of 15 %.
     np.testing.assert_allclose(np.mean(levels), 2 * 0.04 / RATE, rtol=0.2)

@@ -11,8 +11,8 @@ from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad.identify import fit_damped
-from jaxquad.identify.frequency_domain import _damped
-from jaxquad.identify.frequency_domain._half_bands import require_origin
+from jaxquad.identify.frequency_domain._refits import Origin, require_origin
+from jaxquad.identify.frequency_domain._structure import damping_by_phase
 from jaxquad.workflows import AutopilotSettings
 
 
@@ -103,14 +103,14 @@ def test_a_flown_chirp_shows_a_damping_where_there_is_one(damping):
 
 def test_a_strong_damping_starts_from_the_phase_at_the_lowest_frequencies():
     plain = jq.fit(START, flown(1.0, seed=0))
-    start = _damped._starts(plain, require_origin(plain))[0]
+    start = damping_by_phase(plain, require_origin(plain))
     assert 0.4 < start < 1.5
 
 
 def test_one_more_fit_is_made_where_the_first_one_ends_well(monkeypatch):
     plain, calls = jq.fit(START, flown(2.1, seed=0)), []
-    run = _damped._run
-    monkeypatch.setattr(_damped, "_run", lambda *args: calls.append(args) or run(*args))
+    run = Origin.fit_again
+    monkeypatch.setattr(Origin, "fit_again", lambda *args: calls.append(args) or run(*args))
     fit_damped(plain)
     assert len(calls) == 1
 
