@@ -43,7 +43,6 @@ from .frequency_domain._explain import Candidate as Candidate, Explanation as Ex
 from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from .frequency_domain._half_bands import Bands as Bands
 from .frequency_domain._held import as_sampled as as_sampled
-from .frequency_domain._normal import problem_normal as problem_normal
 from .frequency_domain._parameters import (
     Free as Free,
     name_places as name_places,
