@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from jaxquad._core import as_messages, Message
+
 from ._filters import (
     BandwidthNotch,
     betaflight_quality,
@@ -44,11 +46,11 @@ class FlownLoop(eqx.Module, Generic[RateLaw]):
     **Arguments:**
 
     - `law`: the rate loop at hover (for Betaflight, with throttle-dependent cutoffs at 30 %).
-    - `unmodelled`: sentences.
+    - `unmodelled`: sentences; their kind is "notch", "anti-gravity", "feedforward" or empty.
     """
 
     law: RateLaw
-    unmodelled: tuple[str, ...] = eqx.field(static=True, default=())
+    unmodelled: tuple[Message, ...] = eqx.field(static=True, default=())
 
     def parameters(self) -> dict[str, float]:
         """The values that flew, by the names of `PARAMETERS`."""
@@ -338,24 +340,27 @@ class _Header:
         cutoff = self.number("iterm_relax_cutoff", default=15.0)
         return ItermRelax(cutoff, 40.0, share, kind, mode in (3, 4))
 
-    def unmodelled(self) -> tuple[str, ...]:
-        found = []
+    def unmodelled(self) -> tuple[Message, ...]:
+        found: list[str] = []
         if self.version < (4, 4):
-            found.append("anti-gravity: the integral grows faster while the throttle moves")
+            text = "anti-gravity: the integral grows faster while the throttle moves"
+            found.append(Message(text, "anti-gravity"))
         harmonics = self.number("rpm_filter_harmonics", "gyro_rpm_notch_harmonics", default=0.0)
         if harmonics > 0:
-            found.append(f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors")
+            text = f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors"
+            found.append(Message(text, "notch"))
         if self.number("dyn_notch_count", "dyn_notch_q", default=0.0) > 0:
-            found.append("dynamic notches on the gyro: they follow its spectrum")
+            found.append(Message("dynamic notches on the gyro: they follow its spectrum", "notch"))
         if (transition := self.number("feedforward_transition", default=0.0)) > 0:
-            found.append(
+            text = (
                 f"feedforward_transition {transition:g}: F grows with the sticks' deflection; the "
                 "law is that of centred sticks, without F"
             )
+            found.append(Message(text, "feedforward"))
         for name, words in _UNUSUAL.items():
             if self.number(name, default=0.0) > 0:
                 found.append(f"{name}: {words}")
-        return tuple(found)
+        return as_messages(found)
 
 
 _UNUSUAL = {
@@ -402,9 +407,11 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
     )  # fmt: skip
     unmodelled = []
     if read.number("IMU_GYRO_DNF_EN", 0.0) > 0:
-        unmodelled.append("IMU_GYRO_DNF_EN: dynamic notches follow motors or spectrum")
+        text = "IMU_GYRO_DNF_EN: dynamic notches follow motors or spectrum"
+        unmodelled.append(Message(text, "notch"))
     if read.number("MC_BAT_SCALE_EN", 0.0) > 0:
-        unmodelled.append("MC_BAT_SCALE_EN: the torque is scaled by the battery's voltage")
+        text = "MC_BAT_SCALE_EN: the torque is scaled by the battery's voltage"
+        unmodelled.append(Message(text))
     return FlownLoop(law, tuple(unmodelled))
 
 
@@ -468,10 +475,18 @@ def ardupilot_loop(
     )  # fmt: skip
     switched = {
         **{f"ATC_RAT_{x}_SMAX": "the slew limiter lowers P and D" for x in ("RLL", "PIT", "YAW")},
-        **{f"ATC_RAT_{x}_{n}": "a notch" for x in ("RLL", "PIT", "YAW") for n in ("NTF", "NEF")},
+        **{
+            f"ATC_RAT_{x}_{n}": Message("a notch", "notch")
+            for x in ("RLL", "PIT", "YAW")
+            for n in ("NTF", "NEF")
+        },
         "FSTRATE_ENABLE": "the rate loop runs faster than SCHED_LOOP_RATE",
     }
-    found = [f"{k}: {words}" for k, words in switched.items() if read.number(k, 0.0) > 0]
+    found = [
+        Message(f"{name}: {what}", Message(what).kind)
+        for name, what in switched.items()
+        if read.number(name, 0.0) > 0
+    ]
     flown = FlownArduPilot(law, (*found, *notches.unmodelled), notches.tracking)
     return dataclasses.replace(flown, law=flown.at(throttle))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, plain_content
+from jaxquad._core import announce, Message, plain_content
 from jaxquad.records import AXES
 from jaxquad.report import Provenance, provenance, write_json
 
@@ -242,8 +242,9 @@ class AutopilotProposal:
     @property
     def _verdict_below_the_plant(self) -> str:
         """The verdict, without what was just said of the plant."""
-        fit = self.identification.fit.verdict
-        return self.verdict.replace(fit.summary, "it does not determine the plant (above)")
+        return Message(self.verdict).in_words(
+            lambda term: "it does not determine the plant (above)"
+        )
 
 
 _WAYS = ("what flew", "a third of the way", "all of it")

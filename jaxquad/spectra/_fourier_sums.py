@@ -124,7 +124,9 @@ class _Waves(NamedTuple):
     odd: Float[np.ndarray, "frequencies odd"]
     phase: Complex[np.ndarray, "frequencies blocks"]  # at the blocks' middles
 
-    def sums(self, coefficients: Sequence[Float[np.ndarray, "functions blocks"]]) -> np.ndarray:
+    def sums(
+        self, coefficients: Sequence[Float[np.ndarray, "_ blocks"]]
+    ) -> Complex[np.ndarray, "_ blocks"]:
         """Fourier sums of blocks, but for the phase of their middles."""
         sums = np.empty((len(self.even), coefficients[0].shape[1]), complex)
         sums.real, sums.imag = self.even @ coefficients[0], self.odd @ coefficients[1]

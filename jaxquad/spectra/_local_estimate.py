@@ -35,8 +35,7 @@ from ._local_noise import (
     partial_coherence,
     unresolved,
 )
-from ._local_width import choose_widths, reach, Respond
-from ._local_windows import Grid, make_windows
+from ._local_windows import choose_widths, Grid, make_windows, reach, Respond
 from ._narrow_fit import fit_narrow, Method, Narrow, Setup
 from ._noise import covariance_of_bands, smooth_noise, smoothed
 from ._remarks import Remark
@@ -154,7 +153,7 @@ class _Doubts(NamedTuple):
 
 
 def _doubt(setup: Setup, narrow: Narrow, moved: LocalFit, given: float | None) -> _Doubts:
-    omega, at = setup.windows.asked, setup.windows.at
+    omega, at = setup.windows.omega, setup.windows.at
     noise, rest = narrow.sources, narrow.rest
     far = unresolved(omega, moved, noise, at, setup.bins, rest.moved) & (given is None)
     if setup.method == "direct":
@@ -203,7 +202,7 @@ def _errors(
     plant: LocalFit,
     back: Complex[np.ndarray, "frequencies 1 1"],
 ) -> ErrorCovariance:
-    omega, at, sources = setup.windows.asked, setup.windows.at, narrow.sources
+    omega, at, sources = setup.windows.omega, setup.windows.at, narrow.sources
     left, right = setup.factors(moved)
     models = shared_errors(narrow.rest, setup.bins, omega, moved, sources, left, right)
     return error_covariance(omega, plant, narrow.noise, at, setup.bins, back, sources, left, models)

@@ -9,8 +9,7 @@ from ._global_rest import response_left, Rest, subtract_models, take_off, weight
 from ._joint import joint_factors, joint_fit
 from ._local_fit import Bins, local_fit, LocalFit
 from ._local_noise import coloured_gain
-from ._local_width import Respond, Shape
-from ._local_windows import WIDENED, WIDENINGS, Windows
+from ._local_windows import Respond, Shape, WIDENED, WIDENINGS, Windows
 from ._noise import Noise, smooth_noise
 
 

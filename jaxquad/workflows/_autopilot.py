@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxquad._core import announce
+from jaxquad._core import announce, Message
 from jaxquad.autopilot import (
     ADRCAutopilot,
     AutopilotProposal,
@@ -27,6 +27,7 @@ from jaxquad.autopilot import (
 from jaxquad.records import AXES, Proposal
 
 from ._autopilot_adrc import flew_adrc, tune_adrc
+from ._command_line import in_options
 from ._identify import identify_plant
 from ._kinds import SettingsError
 from ._log import propose_settings, read_records
@@ -107,7 +108,7 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
         filters = filters or axes[axis].shared_filters
     if not axes:
         raise next(iter(errors.values()))
-    return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
+    return AxesProposal(settings, axes, {axis: in_options(error) for axis, error in errors.items()})
 
 
 def _of_one_flight(settings: AutopilotSettings, proposal: Proposal) -> AutopilotSettings:
@@ -145,7 +146,7 @@ def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotPropos
     recipe = what_to_fly(flown.firmware, AXES[flown.axis])
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
-        return unsure(f"this log cannot tell: {summary}. {recipe}", None)
+        return unsure(Message(f"this log cannot tell: «plant|{summary}». {recipe}"), None)
     if flight is None:
         return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")

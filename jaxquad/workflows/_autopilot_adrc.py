@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, marked_text, Message
 from jaxquad.autopilot import (
     ADRCAutopilot,
     ADRCTargets,
@@ -77,7 +77,7 @@ def tune_adrc(
             band=None if settings.band is None else _in_radians(settings.band),
         )  # fmt: skip
     except ValueError as error:  # says what to fly
-        return _unsure(found, str(error))
+        return _unsure(found, error)
     return _tuned(dataclasses.replace(found, plant=plant), plant, asked)
 
 
@@ -93,19 +93,20 @@ def _tuned(found: ADRCAutopilot, plant: GainOverThrottle, asked: IdentifySetting
         }
         found = dataclasses.replace(found, reproductions=again)
         if why := _doubt(again):
-            return _unsure(found, why)
+            return dataclasses.replace(found, verdict=why)
         made = propose_adrc(
             plant, found.flown, found.axis, hover=settings.hover, members=settings.members,
             fresh=settings.fresh, seed=settings.seed, targets=_targets(settings),
         )  # fmt: skip
     except UndeterminedError as error:
-        return _unsure(found, str(error))
+        return _unsure(found, error)
     return dataclasses.replace(found, kind=made.kind, verdict=made.verdict, proposal=made)
 
 
-def _unsure(found: ADRCAutopilot, why: str) -> ADRCAutopilot:
-    start = "" if why.startswith("this log cannot tell") else "this log cannot tell: "
-    return dataclasses.replace(found, verdict=f"{start}{why}")
+def _unsure(found: ADRCAutopilot, error: ValueError) -> ADRCAutopilot:
+    return dataclasses.replace(
+        found, verdict=Message(f"this log cannot tell: {marked_text(error)}")
+    )
 
 
 def _chains(found: ADRCAutopilot) -> list[FilterChain]:
@@ -200,7 +201,7 @@ def _doubt(again: Mapping[float, Reproduction]) -> str:
     """Why the flown loop is not reproduced; empty where it is at one level, and off at none."""
     for throttle, each in again.items():
         if each.kind == "not flown":
-            return f"at {throttle:.2f} throttle {each.verdict}"
+            return f"this log cannot tell: at {throttle:.2f} throttle {each.verdict}"
     if all(each.kind == "unknown" for each in again.values()):
         return next(each.verdict for each in again.values())
     return ""

@@ -1,7 +1,6 @@
 """Responses and fits of an identification, over the whole band and over parts of it."""
 
 import dataclasses
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -11,7 +10,6 @@ from jaxtyping import Array, Float
 from jaxquad._core import announce, as_messages
 from jaxquad.identify import (
     CoherenceWeighted,
-    Combination,
     Fit,
     fit,
     fit_transfer_function,
@@ -271,16 +269,10 @@ def with_units(fit: Fit, record: Record) -> Fit:
         output=output or record.output_names[0], input=source or record.input_names[0],
     )  # fmt: skip
     known = dict(zip(fit.names, units, strict=True))
-    combinations = tuple(each._replace(unit=_unit_of_sum(each, known)) for each in fit.combinations)
-    verdict = dataclasses.replace(fit.verdict, combinations=combinations)
+    combinations = []
+    for each in fit.combinations:
+        of_terms = {known.get(name, "") for name in each.sum_of}
+        alike = len(each.sum_of) > 1 and len(of_terms) == 1
+        combinations.append(each._replace(unit=of_terms.pop() if alike else ""))
+    verdict = dataclasses.replace(fit.verdict, combinations=tuple(combinations))
     return dataclasses.replace(fit, parameter_units=units, verdict=verdict)
-
-
-_TERM = r"(?:[\d.]+ )?(\S+)"  # of a sum: `lag`, `2 lag`
-
-
-def _unit_of_sum(sum_of: Combination, units: Mapping[str, str]) -> str:
-    """The unit that all parameters in a sum have; empty for products, and where there is none."""
-    terms = [re.fullmatch(_TERM, term) for term in re.split(r" [+-] ", sum_of.name)]
-    found = {units.get(term[1], "") if term else "" for term in terms}
-    return found.pop() if len(terms) > 1 and len(found) == 1 else ""

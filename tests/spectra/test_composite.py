@@ -86,7 +86,7 @@ def spectra(seed, groups=3, frequencies=7):
         response=response,
         solver=np.zeros((groups, frequencies, 1, 1), complex),
         power=gain,
-        own_share=ones,
+        alone=ones,
         output_power=np.abs(response) ** 2 * gain[..., None] / coherence,
         coherence=coherence,
         instrument_share=ones,

@@ -65,6 +65,7 @@ class Combination(NamedTuple):
     standard_error: float
     degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard error
     unit: str = ""  # where it is known
+    sum_of: tuple[str, ...] = ()  # the parameters of a sum
 
     @property
     def interval(self) -> tuple[float, float]:
