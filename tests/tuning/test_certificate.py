@@ -42,6 +42,7 @@ def certificate():
     return judged(peers=peers(RIG) | {"twin": FIXED})
 
 
+@pytest.mark.slow
 def test_members_are_unstable_where_the_eigenvalues_of_an_independent_loop_leave_the_circle(
     certificate,
 ):
