@@ -67,6 +67,10 @@ class Combination(NamedTuple):
     unit: str = ""  # where it is known
     sum_of: tuple[str, ...] = ()  # the parameters of a sum
 
+    def content(self) -> dict[str, object]:
+        """Its numbers and its unit, for JSON."""
+        return {name: value for name, value in self._asdict().items() if name != "sum_of"}
+
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval."""
