@@ -17,8 +17,8 @@ from . import (
     tuning as tuning,
     workflows as workflows,
 )
+from ._compile import enable_compile_cache as enable_compile_cache, engine as engine
 from ._core import enable_x64 as enable_x64
-from ._xla import enable_compile_cache as enable_compile_cache, engine as engine
 from .control import (
     AdaptiveLADRC as AdaptiveLADRC,
     LADRC as LADRC,

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxquad._xla import _device_trial, _kernel_memory, _nvrtc, _switch
+from jaxquad._xla import _kernel_memory, _nvrtc, _switch
 
 
 _HOST = """
@@ -51,7 +51,7 @@ def run_on_host(monkeypatch):
         pytest.skip("needs g++")
     monkeypatch.setattr(_kernel_memory, "launch", _launch)
     monkeypatch.setattr(_kernel_memory, "WARP", 1)
-    monkeypatch.setattr(_device_trial, "ptx_of", lambda text, architecture: "")
+    monkeypatch.setattr(_nvrtc, "ptx_of", lambda text, architecture: "")
 
 
 def for_cuda(function, *args):

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxquad._xla import devices_for, where_put
 from jaxquad.control import LADRC, PD
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
@@ -27,6 +26,7 @@ from jaxquad.simulation import (
     Window,
 )
 from jaxquad.simulation._evaluate import _run
+from jaxquad.simulation._over_devices import devices_for, where_put
 
 
 MEMBERS, SAMPLES = 67, 120  # no multiple of two

@@ -10,8 +10,8 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "jaxquad"
 ORDER = (
-    "_core", "_xla", "records", "datasets", "excitation", "models", "spectra", "identify",
-    "design", "control", "loops", "simulation", "ensembles", "tuning",
+    "_core", "_xla", "_compile", "records", "datasets", "excitation", "models", "spectra",
+    "identify", "design", "control", "loops", "simulation", "ensembles", "tuning",
     "export", "plot", "report", "autopilot", "workflows", "cli",
 )  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
@@ -44,6 +44,13 @@ def test_a_room_imports_lower_ones_only_and_through_their_faces(room):
             assert ORDER.index(name[1]) < ORDER.index(room), f"{path} imports {'.'.join(name)}"
             private = [part for part in name[2:] if part.startswith("_")]
             assert not private, f"{path} imports {'.'.join(name)}"
+
+
+def test_what_knows_the_compilers_has_one_door():
+    outside = [x for x in FILES if x.relative_to(PACKAGE).parts[0] not in ("_xla", "_compile")]
+    for path in outside:
+        names = {".".join(name[:2]) for name in imports(path)}
+        assert "jaxquad._xla" not in names, f"{path} imports jaxquad._xla"
 
 
 def test_no_file_but_its_own_asks_whether_a_firmware_is_the_one():

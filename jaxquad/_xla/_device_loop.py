@@ -1,7 +1,7 @@
 """The time loop of an ensemble as one kernel on an accelerator, with its derivatives.
 
 XLA launches some kernels for every sample there, and the launches take longer than the arithmetic.
-Forward and reverse mode are one kernel each (`_loop_kernels`). Forward-mode derivatives, second
+Forward and reverse mode are one kernel each (`_loop`). Forward-mode derivatives, second
 ones and batches of ensembles run as plain scans.
 """
 
@@ -17,24 +17,23 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from ._accelerator import Result, Scan, Step
-from ._forward_kernel import run_forward
-from ._invariants import without_invariants
 from ._kernel_memory import BLOCK, kept_avals, memory_type
 from ._lanes import NotInLanes, NUMBERS, numbers
-from ._loop_kernels import (
+from ._loop import (
     Flat,
+    held_bytes,
     is_float,
     Loop,
     reverse_in_lanes,
+    segments_of,
     size,
     split,
     step_in_lanes,
+    without_invariants,
 )
 from ._nvrtc import CannotCompile
-from ._reverse_kernel import holds_cotangents, run_reverse
-from ._segments import held_bytes, segments_of
-from ._switch import note, warn_once
+from ._passes import holds_cotangents, run_forward, run_reverse
+from ._switch import note, Result, Scan, Step, warn_once
 
 
 def scan_in_kernel(

@@ -6,27 +6,39 @@ internal to XLA, so they are used only where the installed version is known to t
 goes in is bounded; all else is compiled as any other program.
 """
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import TypeGuard
 
+import equinox as eqx
 import jax
-import jax.extend
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.extend.mlir import ir
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from ._canary import why_not_trusted
-from ._switch import device_kernels, is_off, warn_once
-
-
-try:
-    from ._kernel_limits import WIDEST
-    from ._marks import enter, leave
-except (ImportError, AttributeError) as error:  # JAX's interfaces to its compiler may move.
-    enter = leave = None
-    WIDEST = sys.maxsize
-    _MISSING = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
-else:
-    _MISSING = None
+from ._stablehlo import (
+    ATTRIBUTE,
+    calls_within,
+    hold_in_kernel,
+    in_parts,
+    Op,
+    operations_in,
+    text,
+    why_not,
+)
+from ._switch import (
+    device_kernels,
+    is_off,
+    MOST_CELLS,
+    note,
+    plain_loops,
+    Result,
+    Scan,
+    Step,
+    warn_once,
+)
+from ._trial import why_no_trust_in_gpu, why_not_trusted
 
 
 def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
@@ -35,7 +47,7 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     So are its derivatives: what is differentiated is marked where it enters and where it leaves,
     and each mark is the transpose of the other.
     """
-    if enter is None or leave is None or why_no_kernels() is not None:
+    if why_no_kernels() is not None:
         return function(*args)
 
     def jaxquad_kernel(*args: PyTree) -> PyTree:
@@ -43,18 +55,6 @@ def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
 
     entered = jax.tree.map(_marked(enter), args)
     return jax.tree.map(_marked(leave), jax.jit(jaxquad_kernel)(*entered))
-
-
-def apart_in_reverse(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`function` of a kernel, which is kernels of its own where it is computed again and reversed.
-
-    Two cores compile these two at once, and the time of both grows faster than their operations.
-    """
-
-    def jaxquad_block(*args: PyTree) -> PyTree:
-        return function(*args)
-
-    return jax.jit(jaxquad_block)
 
 
 def why_no_kernels() -> str | None:
@@ -65,16 +65,167 @@ def why_no_kernels() -> str | None:
         return f"the platform is {jax.default_backend()}, and kernels are for CPUs"
     if device_kernels.value != "auto":
         return "kernels of a GPU are being tried"
-    if _MISSING is not None:
-        warn_once(_MISSING)
-        return _MISSING
     return why_not_trusted()
 
 
-def most_numbers() -> int:
-    """Of an array in a kernel's arithmetic; where there are no kernels, any number."""
-    return WIDEST - 1 if why_no_kernels() is None else sys.maxsize
+def why_plain() -> str | None:
+    """Why loops are compiled plain here; None if they become kernels, of a CPU or of a GPU."""
+    reason = why_no_kernels()
+    return None if why_no_device_kernels() is None else reason
 
 
-def _marked(mark: jax.extend.core.Primitive) -> Callable[[Array], Array]:
+_failed: set[object] = set()
+
+
+def or_plain(name: str, kind: Callable[[], object], run: Callable[[], PyTree]) -> PyTree:
+    """`run()`; with plain loops, and a warning, where it does not compile with kernels.
+
+    The next one of its `kind` is run with plain loops at once.
+    """
+    if _failed and why_plain() is None and kind() in _failed:
+        with plain_loops(True):
+            return run()
+    try:
+        return run()
+    except eqx.EquinoxRuntimeError:  # raised by what runs: it did compile
+        raise
+    except jax.errors.JaxRuntimeError as error:
+        if why_plain() is not None:
+            raise
+        with plain_loops(True):
+            result = run()  # If the kernel is not at fault, this raises too.
+        _failed.add(kind())
+        reason = str(error).strip().splitlines()[0][:200]
+        warn_once(f"{name} did not compile as one kernel ({reason})")
+        return result
+
+
+def _marked(mark: Primitive) -> Callable[[Array], Array]:
     return lambda x: mark.bind(x) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+
+def why_no_device_kernels() -> str | None:
+    """Why loops of ensembles are compiled plain on this platform; None if they become kernels."""
+    if is_off():
+        return "switched off"
+    if device_kernels.value != "auto":
+        return None
+    if jax.default_backend() != "gpu":
+        return f"the platform is {jax.default_backend()}, and these kernels are for GPUs"
+    reason = why_no_trust_in_gpu()
+    if reason is not None:
+        warn_once(reason)
+    return reason
+
+
+def scan_on_device(
+    step: Step, carry: PyTree, signals: PyTree, members: int, scan: Scan
+) -> Result | None:
+    """`scan(step, carry, signals)` as one kernel of an accelerator; None where that cannot be.
+
+    An axis as long as the ensemble is the members' axis. No mistake is possible where there are
+    more members than an array in a kernel has numbers, and smaller ensembles gain little.
+    """
+    fewest = MOST_CELLS if device_kernels.value == "auto" else 1
+    if members <= fewest or why_no_device_kernels() is not None:
+        return None
+    from ._device_loop import scan_in_kernel
+
+    return scan_in_kernel(step, carry, signals, members, scan)
+
+
+_TAGS = {"inlineable": "false", "xla_cpu_small_call": "true"}
+_SEEN = {"jaxquad_kernel": "false"}  # tells XLA nothing, and this module not to look again
+
+
+def _identity(name: str) -> Primitive:
+    mark = Primitive(name)
+    mark.def_impl(lambda x: x)
+    mark.def_abstract_eval(lambda x: x)
+    batching.defvectorized(mark)
+    return mark
+
+
+def _transposed(mark: Primitive) -> Callable[..., tuple]:
+    return lambda ct, _: (ct if isinstance(ct, ad.Zero) else mark.bind(ct),)
+
+
+# Where a differentiated array enters a kernel, and where it leaves it.
+enter, leave = _identity("enter_kernel"), _identity("leave_kernel")
+ad.deflinear2(enter, _transposed(leave))
+ad.deflinear2(leave, _transposed(enter))
+
+
+def _tag(ctx: mlir.LoweringRuleContext, x: ir.Value) -> list[ir.Value]:
+    """Turn the call that `x` comes from, by now differentiated and batched, into a kernel."""
+    whole = ctx.module_context
+    try:
+        call = _owner(x)
+        if _is_plain_call(call) and _is_for_one_cpu(whole):
+            for found in (call, *_forward_passes(call, whole)):
+                _make_kernel(found, whole)
+    except Exception as error:  # The compiler's interfaces have changed: do without the kernel.
+        warn_once(f"JAX {jax.__version__} cannot mark a kernel ({type(error).__name__}: {error})")
+    return [x]
+
+
+def _owner(x: ir.Value) -> Op | ir.Block:
+    return getattr(x.owner, "operation", x.owner)
+
+
+def _forward_passes(call: Op, whole: mlir.ModuleContext) -> Iterator[Op]:
+    """The calls whose results a call takes, without their marks where nothing else was asked of.
+
+    What is in a function takes them as its arguments; its forward pass is in one written before.
+    """
+    owners = [_owner(operand) for operand in call.operands]
+    yield from filter(_is_plain_call, owners)
+    alone = isinstance(whole.axis_context, mlir.ShardingContext)  # then all functions are for one
+    if alone and any(isinstance(owner, ir.Block) for owner in owners):
+        before = [op for f in whole.module.body.operations for op in operations_in(f)]
+        yield from filter(_is_plain_call, before)
+
+
+def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:
+    if not _is_plain_call(call):
+        return
+    reason = why_not(call, whole.module)
+    if reason is not None:
+        note(f"a kernel does not hold {reason}")
+        call.attributes[ATTRIBUTE] = _attributes(_SEEN)
+        return
+    name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
+    call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
+    parts = calls_within(name, "jaxquad_block", whole.module)
+    if len(parts) > 1:  # a block computed again, and reversed
+        call.attributes[ATTRIBUTE] = _attributes(_SEEN)
+    else:
+        parts = [call]
+    for part in parts:
+        hold_in_kernel(part, whole.module, whole.symbol_table, _attributes(_TAGS))
+
+
+def _attributes(texts: dict[str, str]) -> ir.Attribute:
+    named: dict[str, ir.Attribute] = {name: ir.StringAttr.get(x) for name, x in texts.items()}
+    return ir.DictAttr.get(named)
+
+
+def _is_plain_call(op: Op | ir.Block) -> TypeGuard[ir.Operation]:
+    """Whether this is a call to make a kernel of; one that is given nothing is a constant."""
+    if not isinstance(op, ir.Operation) or op.name != "func.call" or ATTRIBUTE in op.attributes:
+        return False
+    return text(op, "callee").startswith("jaxquad_kernel") and len(op.operands) > 0
+
+
+def _is_for_one_cpu(whole: mlir.ModuleContext) -> bool:
+    """Whether XLA has nothing to split among devices: a kernel cannot be split."""
+    where = whole.axis_context
+    if isinstance(where, mlir.SPMDAxisContext):
+        alone = where.manual_axes == frozenset(where.mesh.axis_names)
+    else:
+        alone = isinstance(where, mlir.ShardingContext) and where.num_devices == 1
+    return alone and tuple(whole.platforms) == ("cpu",)
+
+
+mlir.register_lowering(enter, lambda ctx, x: [x])
+mlir.register_lowering(leave, _tag, cacheable=False)

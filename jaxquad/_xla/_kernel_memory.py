@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from ._cuda_text import PRELUDE, type_of
-from ._loop_kernels import Flat, is_wide, Loop, Shaped, size, split
+from ._loop import BLOCKS, Flat, is_wide, Loop, Shaped, size, split
 from ._nvrtc import launch
-from ._segments import BLOCKS
 
 
 BLOCK = 128  # threads that are started together

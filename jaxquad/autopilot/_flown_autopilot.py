@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import Number
+from jaxquad._core import Message, Number
 from jaxquad.identify import KnownFilter, MeasuredChain
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
@@ -35,7 +35,7 @@ class FlownAutopilot:
     loop: FlownLoop
     law: RateLoop
     parameters: Mapping[str, float]
-    unmodelled: tuple[str, ...]
+    unmodelled: tuple[Message, ...]
     values: Mapping[str, str] = dataclasses.field(default_factory=dict)
     throttle: float = 0.3
     tracked_hz: Mapping[int, Sequence[float]] = dataclasses.field(default_factory=dict)

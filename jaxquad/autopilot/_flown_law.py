@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from jaxquad._core import announce
+from jaxquad._core import announce, Message
 from jaxquad.identify import KnownFilter, measured_chain, MeasuredChain
 from jaxquad.records import AXES, Mix, Proposal, propose
 from jaxquad.records.firmware import firmware_log, firmware_names
@@ -47,7 +47,7 @@ class FlownLaw:
     text: str
     law: RateLoop | None = None
     axis: int = 0
-    unmodelled: tuple[str, ...] = ()
+    unmodelled: tuple[Message, ...] = ()
     chains: tuple[FilterChain, ...] = ()
 
     def content(self) -> dict[str, object]:
@@ -185,12 +185,12 @@ def _read_law(
 
 def best_filters(
     chains: tuple[FilterChain, ...],
-    unmodelled: Sequence[str],
+    unmodelled: Sequence[Message],
     flight: FlightChannels | None,
     axis: int,
 ) -> tuple[tuple[KnownFilter, ...], str]:
     """As measured where notches follow motors or spectrum, else those of the parameters."""
-    hidden = [each for each in unmodelled if "notch" in each and "D term" not in each]
+    hidden = [each for each in unmodelled if each.kind == "notch"]
     missing = "" if not hidden else f" (not {'; '.join(each.partition(':')[0] for each in hidden)})"
     if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
         measured = _measured(chains, flight, axis)
@@ -215,7 +215,8 @@ def _measured(
     moves = np.ptp(flight.setpoint) > 0
     try:
         return measured_chain(
-            unfiltered, filtered, flight.dt, known=chains, names=(flight.names[1], flight.names[0]),
+            unfiltered, filtered, flight.dt, filters=chains,
+            names=(flight.names[1], flight.names[0]),
             reference=flight.setpoint if moves else None,
         )  # fmt: skip
     except ValueError as error:

@@ -13,10 +13,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import (
+    as_messages,
     broadcast_gain,
     ensemble_shape,
     is_concrete,
     match_reference,
+    Message,
     pick_gain,
     require_common_shape,
     require_finite,
@@ -157,11 +159,11 @@ class FlownLoop(eqx.Module, Generic[RateLaw]):
     **Arguments:**
 
     - `law`: the rate loop at hover (for Betaflight, with throttle-dependent cutoffs at 30 %).
-    - `unmodelled`: sentences.
+    - `unmodelled`: sentences; their kind is "notch", "anti-gravity", "feedforward" or empty.
     """
 
     law: RateLaw
-    unmodelled: tuple[str, ...] = eqx.field(static=True, default=())
+    unmodelled: tuple[Message, ...] = eqx.field(static=True, converter=as_messages, default=())
 
     def parameters(self) -> dict[str, float]:
         """The values that flew, by the names of `PARAMETERS`."""

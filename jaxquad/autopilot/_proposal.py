@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, plain_content
+from jaxquad._core import announce, Message, plain_content
 from jaxquad.records import AXES
 from jaxquad.report import Provenance, provenance, write_json
 
@@ -222,7 +222,7 @@ class AutopilotProposal:
         plant = "plant up to the gyro's filters, in the firmware's units"
         lines += ["", f"{plant}:\n{self.identification.fit}"]
         again = self.reproduction
-        if again is not None and again.verdict not in self.verdict:
+        if again is not None and again.kind == "flown":  # else the verdict says it
             lines += ["", f"flown loop: {again.verdict}"]
         if self.stages:
             lines += ["", _stage_table(self.stages)]
@@ -242,8 +242,9 @@ class AutopilotProposal:
     @property
     def _verdict_below_the_plant(self) -> str:
         """The verdict, without what was just said of the plant."""
-        fit = self.identification.fit.verdict
-        return self.verdict.replace(fit.summary, "it does not determine the plant (above)")
+        return Message(self.verdict).in_words(
+            lambda term: "it does not determine the plant (above)"
+        )
 
 
 _WAYS = ("what flew", "a third of the way", "all of it")

@@ -100,7 +100,7 @@ def finish_identification(
     sources = [*found.paths, *([verified] if verified else [])]
     same = {"settings": found.settings.content()}
     with stdout_for_json(options):
-        print(in_options(str(found)), flush=True)
+        print(in_options(found.message()), flush=True)
         path = found.write(folder_to_write(options, folder, "result.json", same, sources))
         drawn = [name for name in found.figure_names if path.with_name(name).exists()]
         names = ", ".join(["report.html", *drawn])

@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(_in_words(error), _UNUSABLE)
     except ValueError as error:
         code = NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE
-        return _fail(in_options(str(error)), code)
+        return _fail(in_options(error), code)
     except KeyboardInterrupt:
         print("jaxquad: interrupted", file=sys.stderr)
         return _INTERRUPTED
@@ -132,7 +132,7 @@ def _printer_of_warnings() -> Callable[..., None]:
     printed: set[str] = set()
 
     def show(message: Warning | str, kind: type[Warning], *_: object) -> None:
-        text = " ".join(in_options(str(message)).split())
+        text = " ".join(in_options(message).split())
         if is_ours(kind) and text not in printed:
             printed.add(text)
             print("!", text, file=sys.stderr)

@@ -1,6 +1,5 @@
 """Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
 
-from ._adaptive_ladrc import AdaptiveLADRC as AdaptiveLADRC
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
 from ._observers import (
     CurrentObserver as CurrentObserver,
@@ -34,7 +33,11 @@ from ._protocols import (
     Transform as Transform,
     Tunable as Tunable,
 )
-from ._scheduled import ScheduledLADRC as ScheduledLADRC, ScheduledPID as ScheduledPID
+from ._scheduled import (
+    AdaptiveLADRC as AdaptiveLADRC,
+    ScheduledLADRC as ScheduledLADRC,
+    ScheduledPID as ScheduledPID,
+)
 from .inertia import (
     certainty_equivalence as certainty_equivalence,
     Falling as Falling,

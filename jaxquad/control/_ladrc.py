@@ -332,10 +332,10 @@ class LADRC(eqx.Module):
     def linear(self, axis: int = 0, member: Member = None) -> LinearController:
         """One axis without its limit, exactly; `member` picks one member of an ensemble."""
         at = lambda gain: pick_gain(gain, axis, member)
-        whole = self.gains
-        correction = jnp.stack([at(row) for row in whole.correction])
-        slope = None if whole.derivative is None else at(whole.derivative)
-        gains = LADRCGains(at(whole.proportional), slope, correction)
+        all_gains = self.gains
+        correction = jnp.stack([at(row) for row in all_gains.correction])
+        slope = None if all_gains.derivative is None else at(all_gains.derivative)
+        gains = LADRCGains(at(all_gains.proportional), slope, correction)
         return linear_ladrc(gains, at(self.b0), self.observer, self.dt)
 
     def tunable(self) -> dict[str, Transform | None]:
@@ -367,8 +367,8 @@ class LADRC(eqx.Module):
         """
         if not any(name.partition("[")[0] == "observer_factor" for name in free):
             return jnp.zeros(())
-        whole = dataclasses.replace(self, observer_factor=jnp.ones(()))
-        return barrier(self._error, whole._error, self.wc, self.dt)
+        full = dataclasses.replace(self, observer_factor=jnp.ones(()))
+        return barrier(self._error, full._error, self.wc, self.dt)
 
     @property
     def _error(self) -> Float[Array, "... states states"]:

@@ -38,7 +38,7 @@ class CurrentObserver(eqx.Module):
     def predict(
         self, estimate: Sequence[Float[Array, "..."]], drive: Float[Array, "..."], dt: float
     ) -> list[Float[Array, "..."]]:
-        return _held(estimate, drive, dt)
+        return _zero_order_hold(estimate, drive, dt)
 
 
 class PredictiveObserver(eqx.Module):
@@ -70,7 +70,7 @@ class PredictiveObserver(eqx.Module):
     def predict(
         self, estimate: Sequence[Float[Array, "..."]], drive: Float[Array, "..."], dt: float
     ) -> list[Float[Array, "..."]]:
-        return _held(estimate, drive, dt)
+        return _zero_order_hold(estimate, drive, dt)
 
 
 class EulerObserver(eqx.Module):
@@ -103,9 +103,9 @@ class EulerObserver(eqx.Module):
     def predict(
         self, estimate: Sequence[Float[Array, "..."]], drive: Float[Array, "..."], dt: float
     ) -> list[Float[Array, "..."]]:
-        *known, unknown = estimate
-        slopes = [*known[1:], unknown + drive]
-        return [*(x + dt * v for x, v in zip(known, slopes, strict=True)), unknown]
+        *derivatives, unknown = estimate
+        slopes = [*derivatives[1:], unknown + drive]
+        return [*(x + dt * v for x, v in zip(derivatives, slopes, strict=True)), unknown]
 
 
 def continuous_gains(wo: Float[Array, "..."], order: int) -> Float[Array, "states ..."]:
@@ -127,7 +127,7 @@ def _current_gains(wo: Float[Array, "..."], dt: float, order: int) -> Float[Arra
     return jnp.stack([first, 1.5 / dt * off**2 * (2 - off), off**3 / dt**2])
 
 
-def _held(
+def _zero_order_hold(
     estimate: Sequence[Float[Array, "..."]], drive: Float[Array, "..."], dt: float
 ) -> list[Float[Array, "..."]]:
     """A sample later, with the drive and the disturbance held."""
@@ -147,8 +147,8 @@ def error_dynamics(
     unit = jnp.eye(len(correction), dtype=rows.dtype)
     predict = jnp.stack(observer.predict(list(unit), jnp.zeros_like(unit[0]), dt))
     shape = (*rows.shape, len(unit))
-    seen = rows[..., None] * jnp.broadcast_to(predict[0], shape)
-    return jnp.broadcast_to(predict, shape) - seen
+    observed = rows[..., None] * jnp.broadcast_to(predict[0], shape)
+    return jnp.broadcast_to(predict, shape) - observed
 
 
 _STABLE = 1 - 1e-9  # the spectral radius below which an error of the observer decays
@@ -190,7 +190,7 @@ def barrier(
     where it is unstable. NaN for a slower observer.
     """
     pairs = zip(_room(error, wc, dt), _room(full, 0 * wc, dt), strict=True)
-    share = [multiply_gains(x, 1 / whole) for x, whole in pairs]
+    share = [multiply_gains(x, 1 / full_room) for x, full_room in pairs]
     return sum((jnp.mean(0.5 * jnp.log1p(x**2) - jnp.log(x)) for x in share), jnp.zeros(()))
 
 
@@ -215,5 +215,5 @@ def _radius(error: Float[Array, "... states states"]) -> Float[np.ndarray, "..."
 
 def list_range(values: Float[Array, "..."]) -> str:
     """One number, or the lowest and the highest of several."""
-    each = np.unique(np.asarray(values))
-    return f"{each[0]:.4g}" if each.size == 1 else f"{each[0]:.4g} .. {each[-1]:.4g}"
+    low, high = np.min(np.asarray(values)), np.max(np.asarray(values))
+    return f"{low:.4g}" if low == high else f"{low:.4g} .. {high:.4g}"

@@ -36,10 +36,10 @@ class Clamping(eqx.Module):
         self,
         growth: Float[Array, " axes *ensemble"],
         wanted: Float[Array, " axes *ensemble"],
-        given: Float[Array, " axes *ensemble"],
+        bounded: Float[Array, " axes *ensemble"],
         dt: float,
     ) -> Float[Array, " axes *ensemble"]:
-        return jnp.where((wanted - given) * growth > 0, jnp.zeros_like(growth), growth)
+        return jnp.where((wanted - bounded) * growth > 0, jnp.zeros_like(growth), growth)
 
 
 class BackCalculation(eqx.Module):
@@ -67,13 +67,13 @@ class BackCalculation(eqx.Module):
         self,
         growth: Float[Array, " axes *ensemble"],
         wanted: Float[Array, " axes *ensemble"],
-        given: Float[Array, " axes *ensemble"],
+        bounded: Float[Array, " axes *ensemble"],
         dt: float,
     ) -> Float[Array, " axes *ensemble"]:
         follow = -jnp.expm1(
-            -dt / broadcast_gain(self.time, given)
+            -dt / broadcast_gain(self.time, bounded)
         )  # a sample's part, whatever the time
-        return growth + follow * (given - wanted)
+        return growth + follow * (bounded - wanted)
 
 
 Transition = Float[Array, "2 2 ..."]
@@ -142,17 +142,17 @@ class PIDLaw(eqx.Module):
         reference = match_reference(reference, measurement, state.integral)
         gain = lambda name: broadcast_gain(self.gains[name], measurement)
         angle = reference.angle if isinstance(reference, Setpoint) else reference
-        smooth, seen = state.filtered, measurement
+        smooth, output = state.filtered, measurement
         if self.transition is not None and smooth is not None:
             smooth = filtered(self.transition, smooth, measurement)
-            seen = smooth[0]
-        half = 0.5 * self.dt * gain("ki") * (angle - seen)
+            output = smooth[0]
+        half = 0.5 * self.dt * gain("ki") * (angle - output)
         if smooth is None:
             integral, ahead = state.integral + state.started * half, half
         else:
             integral, ahead = state.integral + 2 * half, jnp.zeros_like(half)
         memory, rate = self._rate(state, reference, measurement, smooth)
-        wanted = gain("kp") * (gain("proportional_weight") * angle - seen)
+        wanted = gain("kp") * (gain("proportional_weight") * angle - output)
         wanted = wanted + integral + gain("kd") * rate
         if isinstance(reference, Setpoint):
             wanted = wanted + gain("feedforward") * reference.acceleration
@@ -170,13 +170,13 @@ class PIDLaw(eqx.Module):
         differenced = measurement if smooth is None else jnp.zeros_like(measurement)
         if isinstance(reference, Setpoint):
             # Half a sample back, where the difference of the measurements is.
-            ahead = reference.rate - 0.5 * self.dt * reference.acceleration
-            change, given = -differenced, (1 - keep) * ahead
+            halfway = reference.rate - 0.5 * self.dt * reference.acceleration
+            change, ahead = -differenced, (1 - keep) * halfway
         else:
             weight = broadcast_gain(self.gains["derivative_weight"], measurement)
             change = weight * reference - differenced
-            given = jnp.zeros_like(measurement)
-        rate = state.started * (state.rate + sharp * change + given)
+            ahead = jnp.zeros_like(measurement)
+        rate = state.started * (state.rate + sharp * change + ahead)
         memory = keep * rate - sharp * change
         return memory, rate if smooth is None else rate - smooth[1]
 

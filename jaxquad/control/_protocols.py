@@ -121,8 +121,8 @@ class ObserverController(Protocol):
 
 def find_transform(part: object, name: str) -> Transform | None:
     """The coordinates of the array `name`, as `part` or the innermost part that owns it says."""
-    if isinstance(part, Tunable) and (found := part.tunable().get(name)) is not None:
-        return found
+    if isinstance(part, Tunable) and (transform := part.tunable().get(name)) is not None:
+        return transform
     owner, dot, rest = name.partition(".")
     return find_transform(getattr(part, owner, None), rest) if dot else None
 
@@ -182,14 +182,14 @@ class Observer(Protocol):
 class AntiWindup(Protocol):
     """Decides what a sample adds to the integral of a bounded controller, in units of the command.
 
-    `growth` is what the error asks for, `wanted` the command before its limit, `given` after it.
+    `growth` is what the error asks for, `wanted` the command before its limit, `bounded` after it.
     """
 
     def __call__(
         self,
         growth: Float[Array, " axes *ensemble"],
         wanted: Float[Array, " axes *ensemble"],
-        given: Float[Array, " axes *ensemble"],
+        bounded: Float[Array, " axes *ensemble"],
         dt: float,
     ) -> Float[Array, " axes *ensemble"]: ...
 

@@ -1,19 +1,29 @@
-"""Controllers whose gains follow from an inertia that they are given."""
+"""Controllers whose gains follow from an inertia: given, or estimated in flight."""
 
 import dataclasses
 import functools as ft
+import math
 from collections.abc import Callable, Collection
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import as_float, ensemble_shape, multiply_gains, require_positive, signal_shape
-from jaxquad._xla import hasty_options, Jit
+from jaxquad._compile import hasty_options, Jit
+from jaxquad._core import (
+    as_float,
+    broadcast_gain,
+    ensemble_shape,
+    multiply_gains,
+    require_all_positive,
+    require_positive,
+    signal_shape,
+)
 
-from ._ladrc import LADRC
+from ._ladrc import LADRC, LADRCLaw, LADRCState
 from ._pid import PID
-from ._protocols import Transform, Tunable
+from ._protocols import InertiaEstimator, ProbingEstimator, Reference, Transform, Tunable
 
 
 InertiaToGain = Callable[[Array], Array]  # kg m^2 to b0 in rad/s^2 per unit of command
@@ -146,8 +156,8 @@ def _evaluate_map(
 
 def tunable_of(owner: str, part: object) -> dict[str, Transform | None]:
     """What `part` says, named as seen from the controller whose field `owner` it is."""
-    found = part.tunable() if isinstance(part, Tunable) else {}
-    return {f"{owner}.{name}": transform for name, transform in found.items()}
+    transforms = part.tunable() if isinstance(part, Tunable) else {}
+    return {f"{owner}.{name}": transform for name, transform in transforms.items()}
 
 
 def tunable_bandwidths(owner: str, ladrc: object) -> dict[str, Transform | None]:
@@ -158,3 +168,176 @@ def tunable_bandwidths(owner: str, ladrc: object) -> dict[str, Transform | None]
 def names_within(owner: str, names: Collection[str]) -> list[str]:
     """The names of what is in the field `owner`, as seen from there."""
     return [name.removeprefix(f"{owner}.") for name in names if name.startswith(f"{owner}.")]
+
+
+class AdaptiveLADRCState(NamedTuple):
+    """What an adaptive LADRC remembers from the last sample."""
+
+    ladrc: LADRCState
+    estimator: PyTree
+
+
+@runtime_checkable
+class _Sampled(Protocol):
+    @property
+    def dt(self) -> float: ...
+
+
+class AdaptiveLADRC(eqx.Module):
+    """A `LADRC` of order 2 whose b0 follows the inertia that an estimator finds in flight.
+
+    b0 starts as the `ladrc`'s. While the estimate is trusted, b0 moves towards `map(inertia)` by a
+    first-order filter of time constant `settling`; otherwise it stays where it is. The estimator
+    gets what was applied, saturated and with any test signal; its own test signal is added to the
+    command within the ladrc's limit. A change of b0 does not change the command: the estimate of
+    the disturbance changes instead (`LADRC.step_with`).
+    Source: section 4.2 and Eq. (25) of the paper, docs/equations.md.
+
+    **Arguments:**
+
+    - `ladrc`: of order 2.
+    - `estimator`: any `InertiaEstimator`, such as `LockInInertia`.
+    - `map`: from an inertia in kg m^2 to b0, such as `certainty_equivalence(..)`.
+    - `settling`: in s.
+
+    **Raises:**
+
+    - `ValueError`: the estimator was made for another `dt`, or the ladrc is of order 1.
+    """
+
+    ladrc: LADRC | LADRCLaw
+    estimator: InertiaEstimator
+    map: Callable[[Array], Array]  # kg m^2 to rad/s^2 per unit of command
+    settling: float = eqx.field(static=True, default=0.5)  # s
+
+    def __check_init__(self):
+        require_all_positive(settling=self.settling)
+        if not isinstance(self.estimator, InertiaEstimator):
+            raise ValueError(
+                f"estimator is {self.estimator!r}: give an object with the methods init, update "
+                "and estimate, as jq.control.InertiaEstimator describes them."
+            )
+        if self.ladrc.order != 2:
+            raise ValueError(
+                f"The ladrc is of order {self.ladrc.order}, but b0 = KT/J is the gain to an angle: "
+                "take order=2."
+            )
+        made_for = self.estimator.dt if isinstance(self.estimator, _Sampled) else self.dt
+        if not math.isclose(made_for, self.dt, rel_tol=1e-6):
+            raise ValueError(
+                f"The estimator was made for samples of {made_for} s, the ladrc for {self.dt} s: "
+                "give both the same dt."
+            )
+
+    @property
+    def dt(self) -> float:
+        return self.ladrc.dt
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of all gains, () for one controller."""
+        return ensemble_shape(self)
+
+    @property
+    def limit(self) -> Float[Array, "..."]:
+        """Of the command, either sign: that of the `ladrc`."""
+        return self.ladrc.limit
+
+    def prepared(self) -> "AdaptiveLADRC":
+        """The same controller with the gains of its ladrc computed: what to run in a loop."""
+        if isinstance(self.ladrc, LADRCLaw):
+            return self
+        return AdaptiveLADRC(self.ladrc.prepared(), self.estimator, self.map, self.settling)
+
+    def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
+        """The LADRC that it is while its estimate is `inertia`, for a linear analysis.
+
+        **Arguments:**
+
+        - `inertia`: in kg m^2, one value per axis, or `[axes, *ensemble]`.
+
+        **Raises:**
+
+        - `ValueError`: the inertia is not above 0 or does not fit the axes of the map, or the
+            controller has been prepared.
+        """
+        if isinstance(self.ladrc, LADRCLaw):
+            raise ValueError(
+                "A prepared controller has no wc and wo: schedule the one that it was made of."
+            )
+        return dataclasses.replace(self.ladrc, b0=gain_at(self.map, inertia))
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The bandwidths of the `ladrc` and what the map says."""
+        return tunable_bandwidths("ladrc", self.ladrc) | tunable_of("map", self.map)
+
+    def observer_instability(self) -> str:
+        """As `LADRC.observer_instability`; a prepared controller is not looked at."""
+        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_instability()
+
+    def observer_slowness(self) -> str:
+        """As `LADRC.observer_slowness`; a prepared controller is not looked at."""
+        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_slowness()
+
+    def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
+        """As `LADRC.observer_barrier`."""
+        if isinstance(self.ladrc, LADRCLaw):
+            return jnp.zeros(())
+        return self.ladrc.observer_barrier(names_within("ladrc", free))
+
+    def init(
+        self,
+        like: Float[Array, " axes *ensemble"],
+        measurement: Float[Array, " axes *ensemble"] | None = None,
+    ) -> AdaptiveLADRCState:
+        """At rest at angle 0, or at `measurement` in rad; shaped as `like` and the ensemble."""
+        full = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
+        return AdaptiveLADRCState(self.ladrc.init(full, measurement), self.estimator.init(full))
+
+    def step(
+        self,
+        state: AdaptiveLADRCState,
+        reference: Reference,
+        measurement: Float[Array, " axes *ensemble"],
+    ) -> tuple[AdaptiveLADRCState, Float[Array, " axes *ensemble"]]:
+        """One sample: the command to hold until the next one, with the test signal in it."""
+        memory = self.estimator.update(state.estimator, state.ladrc.command, measurement)
+        b0 = self._adapt(state.ladrc.b0, memory)
+        ladrc, command = self.ladrc.step_with(state.ladrc, reference, measurement, b0)
+        if isinstance(self.estimator, ProbingEstimator):
+            limit = broadcast_gain(self.ladrc.limit, command)
+            command = jnp.clip(command + self.estimator.probe(memory), -limit, limit)
+            ladrc = self.ladrc.applied(ladrc, command)
+        return AdaptiveLADRCState(ladrc, memory), command
+
+    def _adapt(
+        self, b0: Float[Array, " axes *ensemble"], memory: PyTree
+    ) -> Float[Array, " axes *ensemble"]:
+        estimate = self.estimator.estimate(memory)
+        share = estimate.trusted * -math.expm1(-self.dt / self.settling)
+        inertia = jnp.where(estimate.trusted > 0, estimate.inertia, jnp.ones_like(estimate.inertia))
+        return b0 + share * (self.map(inertia) - b0)
+
+    def applied(
+        self, state: AdaptiveLADRCState, achieved: Float[Array, " axes *ensemble"]
+    ) -> AdaptiveLADRCState:
+        """What the drive really gave since the last `step`, for ladrc and estimator."""
+        return state._replace(ladrc=self.ladrc.applied(state.ladrc, achieved))
+
+    def excite(self, state: AdaptiveLADRCState) -> AdaptiveLADRCState:
+        """Put the estimate in doubt, as after a change of payload: the test signal starts."""
+        if not isinstance(self.estimator, ProbingEstimator):
+            raise ValueError(
+                f"A {type(self.estimator).__name__} has no test signal: give an estimator with the "
+                "methods probe and excite, as jq.control.ProbingEstimator describes them."
+            )
+        return state._replace(estimator=self.estimator.excite(state.estimator))
+
+    def signals(self, state: AdaptiveLADRCState) -> dict[str, Array]:
+        """ "disturbance" as `LADRC.signals`; "b0" in force; "inertia" and its deviation, kg m^2."""
+        estimate = self.estimator.estimate(state.estimator)
+        return self.ladrc.signals(state.ladrc) | {
+            "b0": state.ladrc.b0,
+            "inertia": estimate.inertia,
+            "inertia_deviation": estimate.deviation,
+        }

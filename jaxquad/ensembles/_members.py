@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_float, is_concrete, mark_members, per_member
-from jaxquad._xla import brief_options, Jit
 from jaxquad.control import schedule_for_flight
 from jaxquad.loops import Drive, Loop, Sensor
 from jaxquad.models import Allocation, Attitude, DecoupledAxes, MotorLag, Multirotor

@@ -84,10 +84,10 @@ def _source_of(controller: object, axes: int | None, precision: Precision) -> So
         )
     source = _SOURCES.get(type(controller))
     if source is None:
-        known = ", ".join(kind.__name__ for kind in _SOURCES)
+        classes = ", ".join(kind.__name__ for kind in _SOURCES)
         raise ValueError(
-            f"The controller is a {type(controller).__name__}, but only {known} can be written in "
-            "C. Give a class of your own a method c_source(axes, precision) that returns a "
+            f"The controller is a {type(controller).__name__}, but only {classes} can be written "
+            "in C. Give a class of your own a method c_source(axes, precision) that returns a "
             "jq.export.Source."
         )
     return source(controller, axes, precision)

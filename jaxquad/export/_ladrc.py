@@ -170,8 +170,8 @@ def _gains_of(
     ladrc: LADRC, axes: int | None, precision: Precision, more: Mapping[str, Array | np.ndarray]
 ) -> tuple[int, dict[str, np.ndarray]]:
     if type(ladrc.observer) not in _OBSERVERS:
-        known = ", ".join(f"{kind.__name__}()" for kind in _OBSERVERS)
-        raise ValueError(f"observer is {ladrc.observer!r}, but only {known} can be written in C.")
+        classes = ", ".join(f"{kind.__name__}()" for kind in _OBSERVERS)
+        raise ValueError(f"observer is {ladrc.observer!r}, but only {classes} can be written in C.")
     gains = on_host(_computed_gains(ladrc))
     values = {"kp": gains.proportional}
     values |= {} if gains.derivative is None else {"kd": gains.derivative}
@@ -191,8 +191,8 @@ def _settings(ladrc: LADRC, with_b0: bool) -> dict[str, str]:
     units = {"wc": " rad/s", "wo": " rad/s", "feedback_factor": "", "observer_factor": ""}
     units |= {"b0": f" {_UNITS[ladrc.order]}"} if with_b0 else {}
     units |= {"limit": " of |command|"}
-    found = {n: f"{np.asarray(vars(ladrc)[n]).tolist()}{unit}" for n, unit in units.items()}
-    return found | {"observer": type(ladrc.observer).__name__, "placement": ladrc.placement}
+    settings = {n: f"{np.asarray(vars(ladrc)[n]).tolist()}{unit}" for n, unit in units.items()}
+    return settings | {"observer": type(ladrc.observer).__name__, "placement": ladrc.placement}
 
 
 def _starting(ladrc: LADRC, more: str) -> tuple[str, ...]:

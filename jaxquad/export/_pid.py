@@ -171,14 +171,14 @@ def _samples_of(pid: PID, precision: Precision) -> dict[str, Array]:
     # In the header's precision, as `PID.step` does: what is lost of 1 - keep is then the same.
     kind = type_of(precision)
     keep = jnp.exp(-pid.dt * pid.filter.astype(kind))
-    found = {"keep": keep, "sharp": (1 - keep) / pid.dt}
+    samples = {"keep": keep, "sharp": (1 - keep) / pid.dt}
     if isinstance(pid.anti_windup, BackCalculation):
-        found["follow"] = -jnp.expm1(-pid.dt / pid.anti_windup.time.astype(kind))
+        samples["follow"] = -jnp.expm1(-pid.dt / pid.anti_windup.time.astype(kind))
     transition = pid.prepared().transition
     if transition is None:
-        return found
+        return samples
     names = ("angle_angle", "angle_rate", "rate_angle", "rate_rate")
-    return found | dict(zip(names, (x for row in transition for x in row), strict=True))
+    return samples | dict(zip(names, (x for row in transition for x in row), strict=True))
 
 
 def _members(gains: dict[str, np.ndarray]) -> dict[str, Gain]:
@@ -186,13 +186,13 @@ def _members(gains: dict[str, np.ndarray]) -> dict[str, Gain]:
 
 
 def _states(pid: PID) -> dict[str, str]:
-    found = {
+    states = {
         "integral": "units of the command",
         "rate": "of the derivative's filter, rad/s",
     } | COMMAND
     if pid.measurement_filter is None:
-        return found
-    return found | {
+        return states
+    return states | {
         "angle": "of the measurement's filter, rad",
         "slope": "of that angle, rad/s",
     }
@@ -206,8 +206,8 @@ def _starting(pid: PID, more: str) -> tuple[str, ...]:
 def _settings(pid: PID) -> dict[str, str]:
     units = {"kp": "per rad", "ki": "per rad s", "kd": "per rad/s", "filter": "rad/s",
              "measurement_filter": "rad/s", "limit": "of |command|"}  # fmt: skip
-    found = {name: vars(pid)[name] for name in units}
-    text = {n: f"{np.asarray(x).tolist()} {units[n]}" for n, x in found.items() if x is not None}
+    values = {name: vars(pid)[name] for name in units}
+    text = {n: f"{np.asarray(x).tolist()} {units[n]}" for n, x in values.items() if x is not None}
     rule = pid.anti_windup
     time = f"({np.asarray(rule.time).tolist()} s)" if isinstance(rule, BackCalculation) else ""
     return text | {"anti-windup": "none" if rule is None else type(rule).__name__ + time}

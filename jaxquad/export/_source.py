@@ -127,15 +127,15 @@ def per_axis(values: Mapping[str, jax.Array | np.ndarray], axes: int | None) -> 
 
     Raises ValueError for an ensemble, and where nothing says how many axes there are.
     """
-    found = {name: np.asarray(value) for name, value in values.items()}
-    wide = {name: x.shape for name, x in found.items() if x.ndim > 1}
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    wide = {name: x.shape for name, x in arrays.items() if x.ndim > 1}
     if wide:
         text = ", ".join(f"{name} {shape}" for name, shape in wide.items())
         raise ValueError(
             f"The gains are those of an ensemble, {text}, but a header holds one controller: pick "
             "a member, as jax.tree.map(lambda x: x[:, 0] if x.ndim > 1 else x, controller)."
         )
-    count = {len(x) for x in found.values() if x.ndim} or ({axes} if axes else set())
+    count = {len(x) for x in arrays.values() if x.ndim} or ({axes} if axes else set())
     if not count:
         raise ValueError(
             "All gains are scalars, which fit any number of axes: give axes, as axes=3."
@@ -143,7 +143,7 @@ def per_axis(values: Mapping[str, jax.Array | np.ndarray], axes: int | None) -> 
     if len(count | ({axes} if axes else set())) > 1:
         raise ValueError(f"axes is {axes}, but the gains are for {sorted(count)}.")
     [axes] = count
-    return axes, {name: np.broadcast_to(x, (axes,)) for name, x in found.items()}
+    return axes, {name: np.broadcast_to(x, (axes,)) for name, x in arrays.items()}
 
 
 def require_precision(values: Mapping[str, jax.Array | np.ndarray], precision: Precision) -> None:
@@ -191,7 +191,7 @@ def _comment(source: Source, precision: Precision, version: str) -> str:
 
 def _top(source: Source) -> str:
     headers = ["float.h", *["math.h"] * source.needs_libm, "stdint.h", "string.h"]
-    includes = [f"#include <{each}>" for each in headers]
+    includes = [f"#include <{header}>" for header in headers]
     lines = ["#ifndef ${NAME}_H", "#define ${NAME}_H", "", *includes, ""]
     lines += ["#define ${NAME}_AXES $axes", "#define ${NAME}_DT $dt /* s */"]
     return "\n".join(lines)
@@ -249,10 +249,10 @@ def update(members: Mapping[str, str], checked: Iterable[str]) -> list[str]:
 
     A sample that is not finite, or that makes one of the `checked` variables overflow, keeps all.
     """
-    found = ["${name}_usable(reference, reference_rate, reference_acceleration, measurement, k)"]
-    found += [f"${{name}}_finite(&{name})" for name in checked]
+    finite = ["${name}_usable(reference, reference_rate, reference_acceleration, measurement, k)"]
+    finite += [f"${{name}}_finite(&{name})" for name in checked]
     return [
-        "if (" + "\n                && ".join(found) + ") {",
+        "if (" + "\n                && ".join(finite) + ") {",
         *(f"    state->{name}[k] = {value};" for name, value in members.items()),
         "}",
         "command[k] = state->command[k];",

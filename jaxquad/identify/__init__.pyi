@@ -15,11 +15,9 @@ from ._known_filters import (
     behind_filters as behind_filters,
     filter_response as filter_response,
     KnownFilter as KnownFilter,
-    without_filters as without_filters,
-)
-from ._measured_chain import (
     measured_chain as measured_chain,
     MeasuredChain as MeasuredChain,
+    without_filters as without_filters,
 )
 from ._thrust_curve import (
     GainBand as GainBand,
@@ -38,13 +36,10 @@ from .frequency_domain._cost import (
     paper_cost as paper_cost,
     Points as Points,
     usable as usable,
+    WIDER_BAND as WIDER_BAND,
 )
-from .frequency_domain._damped import fit_damped as fit_damped
-from .frequency_domain._explain import Candidate as Candidate, Explanation as Explanation
 from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
-from .frequency_domain._half_bands import Bands as Bands
 from .frequency_domain._held import as_sampled as as_sampled
-from .frequency_domain._normal import problem_normal as problem_normal
 from .frequency_domain._parameters import (
     Free as Free,
     name_places as name_places,
@@ -61,7 +56,11 @@ from .frequency_domain._problem import (
     Problem as Problem,
     residuals as residuals,
 )
-from .frequency_domain._reduce import reduce_structure as reduce_structure, Reduction as Reduction
+from .frequency_domain._refits import (
+    Bands as Bands,
+    Candidate as Candidate,
+    Explanation as Explanation,
+)
 from .frequency_domain._result import Fit as Fit
 from .frequency_domain._solve import least_squares as least_squares
 from .frequency_domain._starts import (
@@ -69,20 +68,24 @@ from .frequency_domain._starts import (
     solve_from_many as solve_from_many,
     spread_starts as spread_starts,
 )
+from .frequency_domain._structure import (
+    fit_damped as fit_damped,
+    reduce_structure as reduce_structure,
+    Reduction as Reduction,
+)
 from .frequency_domain._transfer_function_fit import fit_transfer_function as fit_transfer_function
 from .frequency_domain._transfer_function_guess import (
     guess_transfer_function as guess_transfer_function,
 )
-from .output_error._compare import compare as compare, Comparison as Comparison
-from .output_error._known_loop import (
-    KnownController as KnownController,
-    SampledFeedback as SampledFeedback,
-)
-from .output_error._noise_model import (
+from .output_error._noise import (
     ARMA as ARMA,
     AutoRegressive as AutoRegressive,
     Noise as Noise,
     NoiseModel as NoiseModel,
+)
+from .output_error._problem import (
+    KnownController as KnownController,
+    SampledFeedback as SampledFeedback,
 )
 from .output_error._refine import refine as refine
 from .output_error._simulated import (
@@ -92,6 +95,8 @@ from .output_error._simulated import (
 )
 from .output_error._verify import (
     Agreement as Agreement,
+    compare as compare,
+    Comparison as Comparison,
     Verification as Verification,
     verify as verify,
 )

@@ -49,9 +49,9 @@ class FirmwareValue(NamedTuple):
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
-        kept: dict[str, object] = dict(self._asdict())
-        kept["interval_95"] = kept.pop("interval")
-        return kept
+        content: dict[str, object] = dict(self._asdict())
+        content["interval_95"] = content.pop("interval")
+        return content
 
 
 def curve_parameter(firmware: CurveFirmware) -> str:
@@ -64,16 +64,12 @@ def curve_parameter(firmware: CurveFirmware) -> str:
 def parameter_of_curve(firmware: CurveFirmware, curve: Combination) -> FirmwareValue:
     """The parameter that inverts this f, with the error of f."""
     name, factor, least, most = _PARAMETERS[firmware]
-    convert = _cubic if firmware == "betaflight 2025.12" else _same
+    convert = _cubic if firmware == "betaflight 2025.12" else float
     slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
     value, error = factor * convert(curve.value), factor * abs(slope) * curve.standard_error
     reach = reach_of_interval(curve.degrees_of_freedom) * error
-    kept = float(np.clip(value, least, most))
-    return FirmwareValue(name, kept, error, (value - reach, value + reach))
-
-
-def _same(curve: float) -> float:
-    return curve
+    interval = (value - reach, value + reach)
+    return FirmwareValue(name, float(np.clip(value, least, most)), error, interval)
 
 
 def _cubic(curve: float) -> float:
@@ -103,7 +99,7 @@ def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
     share = float(value) / _PARAMETERS[firmware][1]
     if firmware == "betaflight 2025.12":
         curves = np.linspace(0.0, 1.0, 201)
-        return float(np.interp(share, [_cubic(float(each)) for each in curves], curves))
+        return float(np.interp(share, [_cubic(float(curve)) for curve in curves], curves))
     return float(np.clip(share, -1.0, 1.0))
 
 

@@ -1,8 +1,8 @@
 """The gain over the throttle: levels of throttle in records, one lag and delay, a gain for each."""
 
+import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -24,7 +24,6 @@ from ._known_filters import KnownFilter, without_filters
 from ._thrust_curve import GainOverThrottle, ThrottleLevels
 from .frequency_domain._cost import usable
 from .frequency_domain._fit import fit, guess_lagged_integrator
-from .frequency_domain._result import Fit
 
 
 _FEWEST = 8  # usable frequencies of a level
@@ -56,43 +55,32 @@ class _AtLevel:
         return model.at(self.level)
 
 
-class _Signals(NamedTuple):
-    """Command, rate and references of a record on one clock, beside the throttle from 0 to 1."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Segment:
+    """Samples `first` to before `end` of a record on one clock, at almost one throttle."""
 
-    record: Record
-    throttle: Float[np.ndarray, " samples"]
-
-
-class _Piece(NamedTuple):
-    """Samples `first` to before `end` of the signals, at almost one throttle."""
-
-    signals: _Signals
+    record: Record  # command, rate and references
+    flown: Float[np.ndarray, " samples"]  # throttle of the whole record, 0 to 1
     first: int
     end: int
 
     @property
     def throttle(self) -> Float[np.ndarray, " samples"]:
-        return self.signals.throttle[self.first : self.end]
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """In the record's time, in s."""
-        time = self.signals.record.time
-        return float(time[self.first]), float(time[self.end - 1])
+        return self.flown[self.first : self.end]
 
     @property
     def seconds(self) -> float:
-        return (self.end - self.first) * self.signals.record.dt
+        return (self.end - self.first) * self.record.dt
 
     @property
-    def drive(self) -> float:
+    def excitation(self) -> float:
         """Standard deviation of the reference, of the input where there is none."""
-        record = self.signals.record
-        moved = record.references if record.reference_names else record.inputs
-        return float(moved[self.first : self.end].std())
+        record = self.record
+        signal = record.references if record.reference_names else record.inputs
+        return float(signal[self.first : self.end].std())
 
 
-_Level = list[_Piece]
+_Level = list[_Segment]
 
 
 def gain_over_throttle(
@@ -150,29 +138,34 @@ def gain_over_throttle(
     fastest = records[0].sample_rate
     high = 2 * np.pi * min(45.0, fastest / 8) if band is None else band[1]
     rate = min(fastest, _OVERSAMPLED * high / (2 * np.pi))
-    signals = [_on_one_clock(each, throttle, throttle_range, rate) for each in records]
-    pieces = [piece for each in signals for piece in _pieces(each, width, shortest)]
-    levels, remarks = _levels(pieces, width, shortest)
-    brief = min(piece.seconds for level in levels for piece in level)
+    levels, remarks = _find_levels(records, throttle, throttle_range, rate, width, shortest)
+    brief = min(segment.seconds for level in levels for segment in level)
     low = 2 * np.pi * max(1.5, 3 / brief) if band is None else band[0]
     omega = np.geomspace(low, high, _LINES)
-    chosen = estimator or _default(records[0], throttle)
-    respond = lambda level, curve: _respond(level, omega, chosen, filters, curve, flown_curve)
-    heard, unheard = [], []
-    for level in levels:
-        response = respond(level, flown_curve)
-        enough = usable(response, None, 0.6).sum() >= _FEWEST
-        (heard if enough else unheard).append((level, response))
-    if unheard:
-        remarks += (_inaudible([level for level, _ in unheard]),)
-    if not heard:
-        raise ValueError(f"no level of throttle determines a gain: {remarks[-1]}")
-    levels = [level for level, _ in heard]
-    found = _result(levels, [response for _, response in heard], flown_curve, remarks)
-    if found.curve is None or found.curve.standard_error > 1:
-        return found
-    curve = float(np.clip(found.curve.value, -0.9, 0.95))
-    return _result(levels, [respond(level, curve) for level in levels], flown_curve, remarks)
+    if estimator is None and set(records[0].reference_names) - {throttle}:
+        # In a loop transients are short and need no model of the whole record, as 1/s alone does.
+        estimator = JointInputOutput(LocalPolynomial(global_order=0))
+    estimator = estimator or LocalPolynomial()
+    respond = lambda level, curve: _respond(level, omega, estimator, filters, curve, flown_curve)
+    responses = [respond(level, flown_curve) for level in levels]
+    enough = [usable(response, None, 0.6).sum() >= _FEWEST for response in responses]
+    if not all(enough):
+        weak = (level for level, clear in zip(levels, enough, strict=True) if not clear)
+        remark = (
+            f"the excitation at throttle {', '.join(f'{_mean(level):.2f}' for level in weak)} is "
+            f"too weak for a gain (fewer than {_FEWEST} frequencies with a coherence of 0.6): "
+            "excite more or longer there"
+        )
+        if not any(enough):
+            raise ValueError(f"no level of throttle determines a gain: {remark}")
+        remarks += (remark,)
+    levels = [level for level, clear in zip(levels, enough, strict=True) if clear]
+    responses = [response for response, clear in zip(responses, enough, strict=True) if clear]
+    result = _fit_levels(levels, responses, flown_curve, remarks)
+    if result.curve is None or result.curve.standard_error > 1:
+        return result
+    curve = float(np.clip(result.curve.value, -0.9, 0.95))
+    return _fit_levels(levels, [respond(level, curve) for level in levels], flown_curve, remarks)
 
 
 def throttle_levels(
@@ -195,26 +188,18 @@ def throttle_levels(
     """
     records = [record] if isinstance(record, Record) else list(record)
     _check(records, throttle_range, 0.0, width, shortest)
-    signals = [_on_one_clock(each, throttle, throttle_range, _SLOW_RATE) for each in records]
-    pieces = [piece for each in signals for piece in _pieces(each, width, shortest)]
-    return _extent(_levels(pieces, width, shortest)[0])
+    options = (throttle, throttle_range, _SLOW_RATE, width, shortest)
+    return _extent(_find_levels(records, *options)[0])
 
 
 def _extent(levels: Sequence[_Level]) -> ThrottleLevels:
-    throttle = [np.concatenate([piece.throttle for piece in level]) for level in levels]
+    throttle = [np.concatenate([segment.throttle for segment in level]) for level in levels]
     return ThrottleLevels(
-        np.array([each.mean() for each in throttle]),
-        np.array([each.min() for each in throttle]),
-        np.array([each.max() for each in throttle]),
-        np.array([sum(piece.seconds for piece in level) for level in levels]),
+        np.array([values.mean() for values in throttle]),
+        np.array([values.min() for values in throttle]),
+        np.array([values.max() for values in throttle]),
+        np.array([sum(segment.seconds for segment in level) for level in levels]),
     )
-
-
-def _default(record: Record, throttle: str) -> Estimator:
-    """In a loop transients are short and need no model of the whole record, as 1/s alone does."""
-    if set(record.reference_names) - {throttle}:
-        return JointInputOutput(LocalPolynomial(global_order=0))
-    return LocalPolynomial()
 
 
 def _check(
@@ -240,8 +225,8 @@ def _check(
 
 def _on_one_clock(
     record: Record, throttle: str, span: tuple[float, float], rate: float
-) -> _Signals:
-    """Command, rate and reference apart from the throttle, at a lower sample rate."""
+) -> tuple[Record, Float[np.ndarray, " samples"]]:
+    """Command, rate and reference without the throttle at a lower sample rate, and the throttle."""
     level = (record.channel(throttle) - span[0]) / (span[1] - span[0])
     if not (-0.05 <= level.min() and level.max() <= 1.05):
         raise ValueError(
@@ -249,32 +234,31 @@ def _on_one_clock(
             "throttle_range=, its values at no and at full throttle, such as (0.0, 1000.0)"
         )
     without = lambda names: tuple(name for name in names if name != throttle)
-    sides = [without(each) for each in (record.input_names, record.output_names)]
-    referred = without(record.reference_names)
-    if len(sides[0]) != 1 or len(sides[1]) != 1 or len(referred) > 1:
+    sides = [without(names) for names in (record.input_names, record.output_names)]
+    references = without(record.reference_names)
+    if len(sides[0]) != 1 or len(sides[1]) != 1 or len(references) > 1:
         raise ValueError(
             f"gain_over_throttle needs one input, one output and at most one reference beside "
-            f"{throttle!r}, but the record has {sides[0]}, {sides[1]} and {referred}: choose "
+            f"{throttle!r}, but the record has {sides[0]}, {sides[1]} and {references}: choose "
             "channels with jq.records.select"
         )
-    kept = select(record, inputs=sides[0], outputs=sides[1], references=referred)
-    kept = _copied(kept, kept.time, np.concatenate(_blocks(kept), axis=1), record.hold)
+    axis = select(record, inputs=sides[0], outputs=sides[1], references=references)
+    axis = _with_columns(axis, axis.time, _columns(axis), record.hold)
     if record.sample_rate <= 1.2 * rate:
-        return _Signals(kept, level)
-    columns = [*np.concatenate(_blocks(kept), axis=1).T, level]
-    channels = [Channel(str(k), kept.time, each) for k, each in enumerate(columns)]
+        return axis, level
+    columns = [*_columns(axis).T, level]
+    channels = [Channel(str(k), axis.time, column) for k, column in enumerate(columns)]
     time, values = resample(channels, rate)
-    return _Signals(_copied(kept, time, values[:, :-1], record.hold), values[:, -1])
+    return _with_columns(axis, time, values[:, :-1], record.hold), values[:, -1]
 
 
-def _blocks(record: Record) -> tuple[Float[np.ndarray, "samples channels"], ...]:
-    return record.inputs, record.outputs, record.references
+def _columns(record: Record) -> Float[np.ndarray, "samples channels"]:
+    return np.concatenate((record.inputs, record.outputs, record.references), axis=1)
 
 
-def _copied(
-    like: Record, time: np.ndarray, columns: Float[np.ndarray, "samples channels"], hold
+def _with_columns(
+    record: Record, time: np.ndarray, columns: Float[np.ndarray, "samples channels"], hold
 ) -> Record:
-    """A record with the names of another, whose channels are these columns."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RecordWarning)  # of what was repaired or is constant
         return Record(
@@ -282,73 +266,67 @@ def _copied(
             columns[:, :1],
             columns[:, 1:2],
             columns[:, 2:],
-            input_names=like.input_names,
-            output_names=like.output_names,
-            reference_names=like.reference_names,
-            input_units=like.input_units,
-            output_units=like.output_units,
-            reference_units=like.reference_units,
-            source=like.source,
+            input_names=record.input_names,
+            output_names=record.output_names,
+            reference_names=record.reference_names,
+            input_units=record.input_units,
+            output_units=record.output_units,
+            reference_units=record.reference_units,
+            source=record.source,
             hold=hold,
             time_unit="s",
         )
 
 
-def _pieces(signals: _Signals, width: float, shortest: float) -> list[_Piece]:
-    """Stretches of at least `shortest` s within which the throttle moves by at most `width`."""
-    values, found, first = signals.throttle, [], 0
-    low = high = values[0]
-    for k, value in enumerate(values):
-        low, high = min(low, value), max(high, value)
-        if high - low > width:
-            found.append(_Piece(signals, first, k))
-            first, low, high = k, value, value
-    found.append(_Piece(signals, first, values.size))
-    return [piece for piece in found if piece.seconds >= shortest]
-
-
-def _levels(
-    pieces: Sequence[_Piece], width: float, shortest: float
+def _find_levels(
+    records: Sequence[Record],
+    throttle: str,
+    span: tuple[float, float],
+    rate: float,
+    width: float,
+    shortest: float,
 ) -> tuple[list[_Level], tuple[str, ...]]:
-    """Pieces of nearly the same mean together, in the order of throttle; and what was left out."""
-    if not pieces:
+    """Segments of nearly the same mean together, in the order of throttle; and what is left out.
+
+    A segment lasts at least `shortest` s, and the throttle moves by at most `width` within it.
+    """
+    segments: list[_Segment] = []
+    for record in records:
+        axis, values = _on_one_clock(record, throttle, span, rate)
+        first, low, high = 0, values[0], values[0]
+        for k, value in enumerate(values):
+            low, high = min(low, value), max(high, value)
+            if high - low > width:
+                segments.append(_Segment(axis, values, first, k))
+                first, low, high = k, value, value
+        segments.append(_Segment(axis, values, first, values.size))
+    segments = [segment for segment in segments if segment.seconds >= shortest]
+    if not segments:
         raise ValueError(
             f"the throttle never stayed within {width:g} for {shortest:g} s: hold it at two or "
             f"three levels between 0.2 and 0.8 for 5 to 10 s each with an excitation, or give "
             "width= and shortest="
         )
-    strongest = max(piece.drive for piece in pieces)
-    driven = [piece for piece in pieces if piece.drive > _QUIET * strongest]
-    if not driven:
+    strongest = max(segment.excitation for segment in segments)
+    excited = [segment for segment in segments if segment.excitation > _QUIET * strongest]
+    if not excited:
         raise ValueError(
             "nothing excited the axis at any level of throttle: its reference or input is constant "
             "there. Fly a chirp, or stick doublets"
         )
     levels: list[_Level] = []
-    for piece in sorted(driven, key=lambda each: each.throttle.mean()):
-        middle = piece.throttle.mean()
-        if levels and middle - levels[-1][0].throttle.mean() <= width / 2:
-            levels[-1].append(piece)
+    for segment in sorted(excited, key=lambda segment: segment.throttle.mean()):
+        if levels and segment.throttle.mean() - levels[-1][0].throttle.mean() <= width / 2:
+            levels[-1].append(segment)
         else:
-            levels.append([piece])
-    return levels, _left_out(len(pieces) - len(driven))
-
-
-def _left_out(count: int) -> tuple[str, ...]:
+            levels.append([segment])
+    count = len(segments) - len(excited)
     text = f"{count} stretches of steady throttle had no excitation and are left out"
-    return (text,) if count else ()
-
-
-def _inaudible(levels: Sequence[_Level]) -> str:
-    middles = ", ".join(f"{_mean(level):.2f}" for level in levels)
-    return (
-        f"the excitation at throttle {middles} is too weak for a gain (fewer than {_FEWEST} "
-        "frequencies with a coherence of 0.6): excite more or longer there"
-    )
+    return levels, (text,) if count else ()
 
 
 def _mean(level: _Level) -> float:
-    return float(np.concatenate([piece.throttle for piece in level]).mean())
+    return float(np.concatenate([segment.throttle for segment in level]).mean())
 
 
 def _respond(
@@ -362,39 +340,34 @@ def _respond(
     """The response at one level, with the command weighted by the curve around its mean."""
     middle = relative_slope(_mean(level), curve, flown)
     records = []
-    for piece in level:
-        record, inside = piece.signals.record, slice(piece.first, piece.end)
-        columns = np.concatenate(_blocks(record), axis=1)[inside]
-        columns[:, 0] *= relative_slope(piece.throttle, curve, flown) / middle
-        records.append(_copied(record, record.time[inside], columns, record.hold))
-    found = frequency_response(records, omega, estimator=estimator)
-    return without_filters(found, filters)
+    for segment in level:
+        record, inside = segment.record, slice(segment.first, segment.end)
+        columns = _columns(record)[inside]
+        columns[:, 0] *= relative_slope(segment.throttle, curve, flown) / middle
+        records.append(_with_columns(record, record.time[inside], columns, record.hold))
+    return without_filters(frequency_response(records, omega, estimator=estimator), filters)
 
 
-def _result(
+def _fit_levels(
     levels: Sequence[_Level],
     responses: Sequence[FrequencyResponse],
     flown: float,
     remarks: tuple[str, ...],
 ) -> GainOverThrottle:
-    found = _fitted(responses)
-    record = levels[0][0].signals.record
+    """One fit of all levels, from guesses of each."""
+    guesses = [guess_lagged_integrator(response, 1) for response in responses]
+    middle = lambda name: float(np.median([float(vars(guess)[name]) for guess in guesses]))
+    gains = np.array([float(guess.gain) for guess in guesses])
+    start = ThrottledIntegrator(gains, middle("lag"), middle("delay"))
+    conditions = [_AtLevel(k) for k in range(len(responses))]
+    result = fit(start, list(responses), conditions=conditions)
+    span = lambda one: (float(one.record.time[one.first]), float(one.record.time[one.end - 1]))
     return GainOverThrottle(
         **_extent(levels)._asdict(),
-        fit=found,
+        fit=result,
         flown=flown,
-        input_unit=record.input_units[0],
-        output_unit=record.output_units[0],
-        stretches=tuple(tuple(piece.span for piece in level) for level in levels),
-        remarks=remarks + found.remarks,
+        input_unit=levels[0][0].record.input_units[0],
+        output_unit=levels[0][0].record.output_units[0],
+        stretches=tuple(tuple(span(segment) for segment in level) for level in levels),
+        remarks=remarks + result.remarks,
     )
-
-
-def _fitted(responses: Sequence[FrequencyResponse]) -> Fit:
-    guesses = [guess_lagged_integrator(each, 1) for each in responses]
-    middle = lambda name: float(np.median([float(vars(each)[name]) for each in guesses]))
-    start = ThrottledIntegrator(
-        np.array([float(each.gain) for each in guesses]), middle("lag"), middle("delay")
-    )
-    conditions = [_AtLevel(k) for k in range(len(responses))]
-    return fit(start, list(responses), conditions=conditions)

@@ -1,6 +1,6 @@
 """The gain over the throttle by the thrust curve t = f x^2 + (1 - f) x, and b0."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -81,7 +81,7 @@ class ThrottleLevels(NamedTuple):
         """In words, for gains at other throttles; empty where there are several levels."""
         if self.throttle.size > 1:
             return ""
-        return _beside_one(float(self.throttle[0]), float(self.seconds[0]))
+        return _two_more_levels(float(self.throttle[0]), float(self.seconds[0]))
 
 
 class PlantsOverThrottle(NamedTuple):
@@ -151,7 +151,7 @@ class GainOverThrottle(eqx.Module):
             return None
         (a, b), total = line.ends, line.ends[0] + line.ends[1] / 2
         slope = np.array([-b / 2, a / 2]) / total**2
-        return self._by_law("f", float(b / 2 / total), slope @ line.weights, 0.0)
+        return self._combine("f", float(b / 2 / total), slope @ line.weights, 0.0)
 
     @property
     def straight_gain(self) -> Combination | None:
@@ -160,7 +160,7 @@ class GainOverThrottle(eqx.Module):
         if line is None:
             return None
         half = np.array([1.0, 0.5])
-        return self._by_law("gain", float(half @ line.ends), half @ line.weights, 0.0)
+        return self._combine("gain", float(half @ line.ends), half @ line.weights, 0.0)
 
     def over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
         """The gain by the thrust curve, at any throttle.
@@ -169,7 +169,7 @@ class GainOverThrottle(eqx.Module):
 
         - `UndeterminedError`: fewer than two levels were flown.
         """
-        return self._band(throttle, self._gain_at)
+        return self._band(throttle, over_lag=False)
 
     def b0_over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
         """gain / lag by the thrust curve, at any throttle; as `b0`.
@@ -179,7 +179,7 @@ class GainOverThrottle(eqx.Module):
         - `UndeterminedError`: as `over`, and as `b0`.
         """
         self._require_lag()
-        return self._band(throttle, self._b0_at)
+        return self._band(throttle, over_lag=True)
 
     def draw(
         self, throttle: Float[ArrayLike, " throttles"], plants: int, *, seed: int = 0
@@ -199,18 +199,14 @@ class GainOverThrottle(eqx.Module):
 
         - `UndeterminedError`: as `over`, and as `b0`.
         """
-        line = self._line()
-        if line is None:
-            raise UndeterminedError(self.what_to_fly())
+        line = self._require_line()
         self._require_lag()
         scores = np.random.default_rng(seed).standard_normal((len(self.fit.names), plants))
         models = draw_models(self.fit, jnp.asarray(scores))
         wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
-        away = line.weights @ (np.asarray(models.gain) - self.gain[:, None])
-        x = actuator(np.atleast_1d(throttle), self.flown)
-        rows = np.stack([np.ones_like(x), x], axis=1)
-        rows /= (1 - self.flown + 2 * self.flown * x)[:, None]
-        gain = rows @ (line.ends[:, None] + self._widening(line) * away)
+        change = line.weights @ (np.asarray(models.gain) - self.gain[:, None])
+        rows = self._rows(np.atleast_1d(throttle))
+        gain = rows @ (line.ends[:, None] + self._widening(line) * change)
         return PlantsOverThrottle(gain, wide(models.lag), wide(models.delay))
 
     def firmware_value(self, firmware: CurveFirmware) -> FirmwareValue:
@@ -254,35 +250,34 @@ class GainOverThrottle(eqx.Module):
             raise ValueError(f"hover is {hover}: give the throttle at hover, above 0 and up to 1")
         self._require_lag()
         factor = _DEGREES[self.output_unit]
-        value, error, freedom = self._b0_at(hover)[1:4]
+        value, error, freedom = self._by_curve(hover, over_lag=True)[1:4]
         b0 = Combination("b0", factor * value, factor * error, freedom)
         grid = np.linspace(self.low.min(), self.high.max(), 41)
         measured = self.b0_over(grid).value / value
-        far: dict[B0Law, float] = {
-            law: _distance(B0Schedule(law, hover, high=largest).scale(grid), measured)
-            for law in B0_POWERS
-        }
+        deviations: dict[B0Law, float] = {}
+        for law in B0_POWERS:
+            scale = B0Schedule(law, hover, high=largest).scale(grid)
+            deviations[law] = float(np.max(np.abs(scale / measured - 1)))
         outside = not self.low.min() <= hover <= self.high.max()
-        return ScaledB0(hover, b0, min(far, key=lambda law: far[law]), far, outside)
+        return ScaledB0(hover, b0, min(deviations, key=deviations.__getitem__), deviations, outside)
 
     def what_to_fly(self) -> str:
         """In words: whether the record holds enough of the thrust curve, and what to fly if not."""
         seconds = float(np.median(self.seconds))
         first, last = float(self.throttle[0]), float(self.throttle[-1])
-        fly = _with_the_same(seconds)
         curve = self.curve
         if curve is None:
             return (
                 f"the log holds one level of throttle ({first:.2f}), which shows no curve: "
-                f"{_beside_one(first, seconds)}"
+                f"{_two_more_levels(first, seconds)}"
             )
         reach = _reach(curve)
         if reach <= _SHARP:
             return f"the log holds enough of the thrust curve ({first:.2f} .. {last:.2f} throttle)"
         wanted = (last - first) * reach / _SHARP
         if wanted <= 0.6:
-            lower, upper = _around((first + last) / 2, wanted)
-            advice = f"fly from {lower:.2f} to {upper:.2f}, {fly}"
+            lower, upper = _levels_around((first + last) / 2, wanted)
+            advice = f"fly from {lower:.2f} to {upper:.2f}, {_same_excitation(seconds)}"
         else:
             advice = (
                 f"fly from 0.20 to 0.80, with {wanted / 0.6:.1f} times the amplitude or "
@@ -296,6 +291,7 @@ class GainOverThrottle(eqx.Module):
     def to_dict(self) -> dict[str, object]:
         """All numbers as JSON holds them: None for what is not finite or not determined."""
         curve, line = self.curve, self._line()
+        content = lambda number: {**number.content(), "interval_95": number.interval}
         levels = [
             {
                 "throttle": self.throttle[k],
@@ -304,28 +300,29 @@ class GainOverThrottle(eqx.Module):
                 "gain": self.gain[k],
                 "gain_standard_error": self.gain_errors[k],
                 "gain_interval_95": self.fit.interval(f"gain[{k}]"),
-                "b0": _content(self.b0(k)) if self._knows_lag else None,
+                "b0": content(self.b0(k)) if self._knows_lag else None,
             }
             for k in range(self.throttle.size)
         ]
-        found = {
-            "input_unit": self.input_unit,
-            "output_unit": self.output_unit,
-            "levels": levels,
-            "curve": None if curve is None else _content(curve),
-            "curve_flown": self.flown,
-            "probability_of_curve": None if line is None else line.probability,
-            "firmware": [each.content() for each in self._firmware_values()],
-            "advice": self.what_to_fly(),
-            "fit": self.fit.to_dict(),
-            "remarks": self.remarks,
-        }
-        return plain_content(found)
+        return plain_content(
+            {
+                "input_unit": self.input_unit,
+                "output_unit": self.output_unit,
+                "levels": levels,
+                "curve": None if curve is None else content(curve),
+                "curve_flown": self.flown,
+                "probability_of_curve": None if line is None else line.probability,
+                "firmware": [value.content() for value in self._firmware_values()],
+                "advice": self.what_to_fly(),
+                "fit": self.fit.to_dict(),
+                "remarks": self.remarks,
+            }
+        )
 
     def __str__(self) -> str:
-        parts = [f"gain over throttle: {counted(self.throttle.size, 'level')}, {self._times()}"]
+        lines = [f"gain over throttle: {counted(self.throttle.size, 'level')}, {self._times()}"]
         per = f"{self.output_unit or 'output'} per s, per {self.input_unit or 'unit of input'}"
-        parts.append(f"{'throttle':>8} {'from':>5} {'to':>5} {'s':>6} {'K':>10} {'+- 95 %':>9}"
+        lines.append(f"{'throttle':>8} {'from':>5} {'to':>5} {'s':>6} {'K':>10} {'+- 95 %':>9}"
                      f" {'K/lag':>10} {'+- 95 %':>9}   [K in {per}]")  # fmt: skip
         for k, row in enumerate(zip(self.throttle, self.low, self.high, self.seconds, strict=True)):
             middle, low, high, seconds = row
@@ -333,38 +330,34 @@ class GainOverThrottle(eqx.Module):
             cells = f"{middle:8.3f} {low:5.2f} {high:5.2f} {seconds:6.1f} {self.gain[k]:10.5g} "
             b0 = self.b0(k) if self._knows_lag else None
             end = f"{'-':>10} {'-':>9}" if b0 is None else f"{b0.value:10.5g} {_reach(b0):9.2g}"
-            parts.append(f"{cells}{reach:9.2g} {end}")
-        return "\n".join(parts + self._curve_in_words() + [f"! {each}" for each in self.remarks])
-
-    def _times(self) -> str:
-        if not self._knows_lag:
-            both = [str(each) for each in self.fit.combinations]
-            return "lag and delay not determined separately" + (f" ({both[0]})" if both else "")
-        known = [name for name in ("lag", "delay") if name not in self.fit.verdict.undetermined]
-        times = [
-            f"{name} {1e3 * self.fit[name]:.2f} +- {1e3 * _half(*self.fit.interval(name)):.2g} ms"
-            for name in known
-        ]
-        return f"{', '.join(times)} (95 %){'' if 'delay' in known else ', delay not determined'}"
-
-    def _curve_in_words(self) -> list[str]:
-        curve, line = self.curve, self._line()
-        values = [str(each) for each in self._firmware_values()]
-        words = []
-        if curve is not None:
-            words.append(f"thrust curve t = f x^2 + (1 - f) x: {curve}")
-        if line is not None and line.probability < 0.05:
-            words.append(
+            lines.append(f"{cells}{reach:9.2g} {end}")
+        if (curve := self.curve) is not None:
+            lines.append(f"thrust curve t = f x^2 + (1 - f) x: {curve}")
+        if (line := self._line()) is not None and line.probability < 0.05:
+            lines.append(
                 f"! the curve does not pass through the gains within their errors (probability "
                 f"{100 * line.probability:.2g} %): its errors are widened by the misfit"
             )
-        return words + [self.what_to_fly(), *values]
+        lines += [self.what_to_fly(), *map(str, self._firmware_values())]
+        return "\n".join(lines + [f"! {remark}" for remark in self.remarks])
+
+    def _times(self) -> str:
+        if not self._knows_lag:
+            sums = [str(combination) for combination in self.fit.combinations]
+            return "lag and delay not determined separately" + (f" ({sums[0]})" if sums else "")
+        determined = [n for n in ("lag", "delay") if n not in self.fit.verdict.undetermined]
+        times = []
+        for name in determined:
+            low, high = self.fit.interval(name)
+            times.append(f"{name} {1e3 * self.fit[name]:.2f} +- {1e3 * ((high - low) / 2):.2g} ms")
+        end = "" if "delay" in determined else ", delay not determined"
+        return f"{', '.join(times)} (95 %){end}"
 
     def _firmware_values(self) -> list[FirmwareValue]:
         curve = self.curve
         if curve is None or _reach(curve) > _SHARP:
             return []
-        return [self.firmware_value(each) for each in ("px4", "ardupilot", "betaflight")]
+        return [self.firmware_value(name) for name in ("px4", "ardupilot", "betaflight")]
 
     def _line(self) -> _Line | None:
         n = self.throttle.size
@@ -377,15 +370,27 @@ class GainOverThrottle(eqx.Module):
         gains = self.gain * scale
         covariance = np.asarray(self.fit.covariance)[:n, :n] * np.outer(scale, scale)
         columns = np.stack([np.ones(n), x], axis=1)
-        known = np.linalg.solve(covariance, columns)
-        gather = np.linalg.solve(columns.T @ known, known.T)
+        weighted = np.linalg.solve(covariance, columns)
+        gather = np.linalg.solve(columns.T @ weighted, weighted.T)
         ends = gather @ gains
         rest = gains - columns @ ends
         misfit = float(rest @ np.linalg.solve(covariance, rest))
         probability = float(chdtrc(n - 2, misfit)) if n > 2 else 1.0
         return _Line(ends, gather * scale, misfit, probability)
 
-    def _by_law(self, name: str, value: float, by_gain: Levels, by_lag: float) -> Combination:
+    def _require_line(self) -> _Line:
+        line = self._line()
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
+        return line
+
+    def _rows(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "... 2"]:
+        """The gain at a throttle is this times the line's ends."""
+        x = actuator(throttle, self.flown)
+        scale = 1 - self.flown + 2 * self.flown * x
+        return np.stack([np.ones_like(x), x], axis=-1) / np.asarray(scale)[..., None]
+
+    def _combine(self, name: str, value: float, by_gain: Levels, by_lag: float) -> Combination:
         """By the covariance of all parameters, widened where the law itself does not fit."""
         line = self._line()
         slope = np.concatenate([by_gain, [by_lag, 0.0]]) * self.fit.units
@@ -399,30 +404,19 @@ class GainOverThrottle(eqx.Module):
             return 1.0
         return float(np.sqrt(line.misfit / (self.throttle.size - 2)))
 
-    def _gain_at(self, throttle: float) -> Combination:
-        line = self._line()
-        if line is None:
-            raise UndeterminedError(self.what_to_fly())
-        x = float(actuator(throttle, self.flown))
-        row = np.array([1.0, x]) / (1 - self.flown + 2 * self.flown * x)
-        return self._by_law("gain", float(row @ line.ends), row @ line.weights, 0.0)
+    def _by_curve(self, throttle: float, *, over_lag: bool) -> Combination:
+        """The gain at a throttle, or gain / lag."""
+        line, lag = self._require_line(), self.fit["lag"] if over_lag else 1.0
+        row = self._rows(throttle)
+        value, by_gain = float(row @ line.ends) / lag, row @ line.weights / lag
+        by_lag = -float(row @ line.ends) / lag**2 if over_lag else 0.0
+        return self._combine("b0" if over_lag else "gain", value, by_gain, by_lag)
 
-    def _b0_at(self, throttle: float) -> Combination:
-        line, lag = self._line(), self.fit["lag"]
-        if line is None:
-            raise UndeterminedError(self.what_to_fly())
-        x = float(actuator(throttle, self.flown))
-        row = np.array([1.0, x]) / (1 - self.flown + 2 * self.flown * x)
-        gain = float(row @ line.ends)
-        return self._by_law("b0", gain / lag, row @ line.weights / lag, -gain / lag**2)
-
-    def _band(
-        self, throttle: Float[ArrayLike, " points"], at: Callable[[float], Combination]
-    ) -> GainBand:
+    def _band(self, throttle: Float[ArrayLike, " points"], *, over_lag: bool) -> GainBand:
         grid = np.atleast_1d(np.asarray(throttle, float))
-        found = [at(float(each)) for each in grid]
-        low, high = np.array([each.interval for each in found]).T
-        return GainBand(grid, np.array([each.value for each in found]), low, high)
+        points = [self._by_curve(float(x), over_lag=over_lag) for x in grid]
+        low, high = np.array([point.interval for point in points]).T
+        return GainBand(grid, np.array([point.value for point in points]), low, high)
 
     @property
     def _knows_lag(self) -> bool:
@@ -436,36 +430,23 @@ class GainOverThrottle(eqx.Module):
             )
 
 
-def _around(middle: float, span: float) -> tuple[float, float]:
+def _levels_around(middle: float, span: float) -> tuple[float, float]:
     """A range of throttle of this span that can be flown."""
     lower = float(np.clip(middle - span / 2, 0.15, 0.85 - min(span, 0.7)))
     return lower, min(lower + span, 0.85)
 
 
-def _beside_one(throttle: float, seconds: float) -> str:
-    """What to fly beside one level."""
-    lower, upper = _around(throttle, 0.2)
-    return f"fly {lower:.2f} and {upper:.2f} as well, {_with_the_same(seconds)}"
+def _two_more_levels(throttle: float, seconds: float) -> str:
+    lower, upper = _levels_around(throttle, 0.2)
+    return f"fly {lower:.2f} and {upper:.2f} as well, {_same_excitation(seconds)}"
 
 
-def _with_the_same(seconds: float) -> str:
+def _same_excitation(seconds: float) -> str:
     turns = ", in turns of about 8 s, as the vehicle sinks or climbs" if seconds > 10 else ""
     return f"with the same excitation for {seconds:.0f} s at each{turns}"
 
 
-def _half(low: float, high: float) -> float:
-    return (high - low) / 2
-
-
-def _reach(found: Combination) -> float:
+def _reach(number: Combination) -> float:
     """Half of the 95 % interval."""
-    return _half(*found.interval)
-
-
-def _content(found: Combination) -> dict[str, object]:
-    return {**found._asdict(), "interval_95": found.interval}
-
-
-def _distance(scale: Float[np.ndarray, " points"], measured: Float[np.ndarray, " points"]) -> float:
-    """The largest relative distance."""
-    return float(np.max(np.abs(scale / measured - 1)))
+    low, high = number.interval
+    return (high - low) / 2

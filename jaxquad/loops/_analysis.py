@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from jaxquad._xla import brief_options, Jit
+from jaxquad._compile import brief_options, Jit
 
 from ._closed_loop import close, ClosedLoopMatrix, join, OpenLoop
 from ._linear_parts import axis_index, linear_parts, LinearParts

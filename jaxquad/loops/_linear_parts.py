@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import ensemble_shape
-from jaxquad._xla import brief_options, Jit
 from jaxquad.control import LinearController, LinearisableController
 from jaxquad.models import LinearAxis, matrix_exponential, split_delay
 from jaxquad.records import AXES

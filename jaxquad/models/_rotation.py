@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxquad._xla import arctan2, sincos
+from ._vector_functions import arctan2, sincos
 
 
 def euler_rates_matrix(euler: Float[Array, " 3 *ensemble"]) -> Float[Array, " 3 3 *ensemble"]:

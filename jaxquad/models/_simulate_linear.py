@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import require_all_positive
-from jaxquad._xla import brief_options, Jit
 
 from ._connect import realise
 from ._exponential import dot, matrix_exponential, small_dot

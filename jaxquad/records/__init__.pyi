@@ -16,6 +16,7 @@ from ._record import Record as Record
 from ._resample import Channel as Channel, resample as resample
 from ._segments import (
     Mix as Mix,
+    MixError as MixError,
     parse_mix as parse_mix,
     read_segments as read_segments,
     Segment as Segment,

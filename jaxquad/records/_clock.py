@@ -53,8 +53,8 @@ def doubt_of_seconds(stamps: Times) -> str:
     doubt = f"{1 / step:.3g} Hz if that is in s, {1e3 / step:.4g} Hz in ms"
     doubt = "which is probably not in seconds" if step >= 1 else doubt
     return (
-        f"steps by {step:.6g}, {doubt}. Give its unit (time_unit=): ms, us or ns, or s if the log "
-        f"really is that slow; for a count of rows give the sampling interval (dt=)"
+        f"steps by {step:.6g}, {doubt}. Give its unit («time_unit=»): ms, us or ns, or s if the "
+        f"log really is that slow; for a count of rows give the sampling interval («dt=»)"
     )
 
 
@@ -134,14 +134,15 @@ def check_uniform(time: Times) -> None:
         step = np.diff(time)
         i = int(np.abs(step - np.median(step)).argmax())
         missing = step[i] > longest_step(time)
-        gap = "; as rows are missing, state there how long a gap may be (max_gap=, in s)"
+        gap = "; as rows are missing, state there how long a gap may be («max_gap=», in s)"
         raise RecordError(
             f"time is not uniformly sampled: the time stamps lie up to {worst:.3g} samples off a "
             f"uniform grid (limit {JITTER}); the most unusual step is {step[i]:.6g} s at "
             f"t = {show_times(time[i], start=clock_start(time))}, the median step "
             f"{np.median(step):.6g} s. "
-            "Resample it with jq.read(..., sample_rate=), jq.Record.from_dataframe(..., "
-            f"sample_rate=) or jq.records.resample{gap if missing else ''}."
+            "Resample it with «sample_rate=|jq.read(..., sample_rate=), "
+            "jq.Record.from_dataframe(..., sample_rate=) or "
+            f"jq.records.resample»{gap if missing else ''}."
         )
 
 

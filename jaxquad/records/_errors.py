@@ -2,9 +2,14 @@ import difflib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from jaxquad._core import marked_text, Message
+
 
 class RecordError(ValueError):
     """A record that cannot be used: the message says what is wrong, the value and what to do."""
+
+    def __init__(self, reason: str):
+        super().__init__(Message(reason))
 
 
 class ReadError(RecordError):
@@ -17,12 +22,9 @@ class ReadError(RecordError):
     """
 
     def __init__(self, reason: str, *, offset: int | None = None):
-        super().__init__(reason)
-        self.offset = offset
-
-    def __str__(self) -> str:
-        where = "" if self.offset is None else f" (at byte {self.offset})"
-        return f"{str(self.args[0]).rstrip('.')}{where}."
+        self.reason, self.offset = marked_text(reason), offset
+        where = "" if offset is None else f" (at byte {offset})"
+        super().__init__(f"{self.reason.rstrip('.')}{where}.")
 
 
 class GapError(RecordError):
@@ -42,10 +44,13 @@ class GapError(RecordError):
 class RecordWarning(UserWarning):
     """A record can be used, but something in it was repaired, left out or looks wrong."""
 
+    def __init__(self, reason: str):
+        super().__init__(Message(reason))
+
 
 def located(error: ReadError, path: Path | str) -> ReadError:
     """The same error, with the file named."""
-    return ReadError(f"{path}: {error.args[0]}", offset=error.offset)
+    return ReadError(f"{path}: {error.reason}", offset=error.offset)
 
 
 def unknown_name(name: str, channels: Iterable[str]) -> str:
@@ -59,12 +64,12 @@ def unknown_name(name: str, channels: Iterable[str]) -> str:
 
 def choose_range(it: str) -> str:
     """Advice to leave a part of the data out."""
-    return f"Choose a range without {it} (start=, stop=) in jq.read, or cut the arrays"
+    return f"Choose a range without {it} («start=», «stop=»)« in jq.read, or cut the arrays»"
 
 
 def mend_holes(it: str) -> str:
     """Advice where values are missing."""
-    return f"{choose_range(it)}, or let gaps up to some length in s be interpolated (max_gap=)."
+    return f"{choose_range(it)}, or let gaps up to some length in s be interpolated («max_gap=»)."
 
 
 def listed(names: Iterable[str]) -> str:

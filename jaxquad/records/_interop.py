@@ -39,8 +39,8 @@ def from_dataframe(
     if all(role is None for role in roles):
         if not all(role in stored for role in _ROLES):
             raise RecordError(
-                "the table does not say which columns are inputs and outputs: name them (inputs=, "
-                f"outputs=). Its columns are {', '.join(map(str, frame.columns))}."
+                "the table does not say which columns are inputs and outputs: name them "
+                f"(«inputs=», «outputs=»). Its columns are {', '.join(map(str, frame.columns))}."
             )
         roles = tuple(stored[role] for role in _ROLES)
     names = [as_tuple(role or ()) for role in roles]
@@ -60,7 +60,9 @@ def from_dataframe(
         stamps, table = resample(channels, sample_rate, max_gap=max_gap)
         values = dict(zip(values, table.T, strict=True))
     if not names[0] or not names[1]:
-        raise RecordError("a record needs at least one input and one output (inputs=, outputs=).")
+        raise RecordError(
+            "a record needs at least one input and one output («inputs=», «outputs=»)."
+        )
     for name in units:
         if name not in flat:
             raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, flat)}")
@@ -85,7 +87,7 @@ def _stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | None) 
     if not clocks and isinstance(frame.index, RangeIndex):
         raise RecordError(
             f"the table has no time stamps: no column {', '.join(_TIMES)}, and an index that "
-            "counts rows. Name the column (time=), or set the index: frame.set_index(...)."
+            "counts rows. Name the column («time=»), or set the index: frame.set_index(...)."
         )
     if clocks and clocks[0] not in frame.columns:
         raise RecordError(f"time: {unknown_name(clocks[0], map(str, frame.columns))}")
@@ -94,7 +96,7 @@ def _stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | None) 
     dated = is_datetime64_any_dtype(series)
     if dated or is_timedelta64_dtype(series):
         if unit is not None:
-            raise RecordError("the time stamps are dates or durations: leave time_unit= out.")
+            raise RecordError("the time stamps are dates or durations: leave «time_unit=» out.")
         # Dates of any time zone, in UTC.
         stamps = series.to_numpy("datetime64[ns]" if dated else "timedelta64[ns]")
         seconds = dates_in_seconds(stamps - stamps[:1] if dated else stamps)

@@ -168,7 +168,7 @@ def read(
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
     signals = load_signals(path)
     if not names:
-        raise ReadError(f"{path}: no channels are named. Name them (inputs=, outputs=).")
+        raise ReadError(f"{path}: no channels are named. Name them («inputs=», «outputs=»).")
     try:
         timebases = Timebases(signals, time, time_unit, dt, time_factor)
         logged = [timebases.channel(name) for name in names]
@@ -251,7 +251,7 @@ def _units(units: Mapping[str, str], logged: Mapping[str, str], mixes: Mixes) ->
         if said and stated and said != stated and weight == 1 and not others:
             raise RecordError(
                 f"the unit of {name!r} is given as {unit}, but the log says {logged[source]}: "
-                f"leave it out (units=), or multiply the channel by the factor between the two."
+                f"leave it out («units=»), or multiply the channel by the factor between the two."
             )
     agreed = {}
     for name, mix in mixes.items():

@@ -347,7 +347,7 @@ def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Times:
         stamps = dates_in_seconds(dates if first is None else dates - first)
         if stamps is None or unit is not None:
             raise RecordError(
-                f"time has the type {dates.dtype}: give time_unit= to plain numbers only, and "
+                f"time has the type {dates.dtype}: give «time_unit=» to plain numbers only, and "
                 f"dates or durations in a unit between weeks and attoseconds."
             )
     else:
@@ -399,7 +399,7 @@ def _check_channels(record: Record) -> None:
         if times.size > _MOST_REPAIRED * record.samples:
             warnings.warn(
                 f"channel {name!r}: {times.size} of {record.samples} samples are interpolated, the "
-                f"first at t = {show_times(times.min(), start=start)}. Check valid= and the "
+                f"first at t = {show_times(times.min(), start=start)}. Check «valid=» and the "
                 "sensor.",
                 RecordWarning,
                 stacklevel=4,
@@ -409,7 +409,7 @@ def _check_channels(record: Record) -> None:
         if bad.size == values.size:
             raise RecordError(
                 f"channel {name!r} holds no usable number: all {values.size} samples are "
-                f"{values[0]}, or out of the range that it was given (valid=). Check that it was "
+                f"{values[0]}, or out of the range that it was given («valid=»). Check that it was "
                 "logged, or choose another channel."
             )
         if bad.size:

@@ -45,7 +45,7 @@ def repair_values(
         if len(valid) != 2 or not valid[0] < valid[1]:
             raise RecordError(
                 f"the valid range of {name!r} is {valid}: give its lowest and highest value, as "
-                f"valid={{{name!r}: (-20, 20)}}."
+                f"«valid=NAME=-20:20|valid={{{name!r}: (-20, 20)}}»."
             )
         good &= (values >= valid[0]) & (values <= valid[1])
     if good.all() or (valid is None and max_gap is None):
@@ -78,7 +78,7 @@ def check_ranges(valid: Valid, channels: Iterable[str]) -> None:
     names = list(channels)
     for name in valid:
         if name not in names:
-            raise RecordError(f"valid= names {name!r}: {unknown_name(name, names)}")
+            raise RecordError(f"«valid=» names {name!r}: {unknown_name(name, names)}")
 
 
 def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarray:

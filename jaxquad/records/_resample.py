@@ -98,7 +98,7 @@ def _contiguous_part(
             f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
             f"t = {left - origin:.6g} s to {show_times(right, start=origin)} (limit "
             f"{1e3 * longest:.4g} ms). "
-            f"{choose_range('it')}, or allow it, by its length in s (max_gap=).",
+            f"{choose_range('it')}, or allow it, by its length in s («max_gap=»).",
             [(float(time[i]), float(time[i + 1])) for i in breaks],
         )
     before = np.flatnonzero(broken & (time[1:] <= begin))
@@ -287,7 +287,7 @@ def _remarks(
             f"{off:.2g} samples off a clock of "
             f"{rate:.5g} Hz, and steps shorter than half a sample are as frequent as long ones: "
             f"values were interpolated at these times. If the samples were equally spaced, give "
-            f"their interval instead: {1 / rate:.4g} s (dt=)."
+            f"their interval instead: {1 / rate:.4g} s («dt=»)."
         )
     slow = [f"{c.name!r} {c.rate:.6g} Hz" for c in channels if sample_rate > _SAME * c.rate]
     if slow:

@@ -22,6 +22,14 @@ _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _TERM = re.compile(rf"\s*([+-]?)\s*(?:({_NUMBER})\s*\*\s*)?({_NAME})\s*(\^\s*[2-9](?![\d.]))?\s*")
 
 
+class MixError(ValueError):
+    """A weighted sum that cannot be read, and the `reason` without its text."""
+
+    def __init__(self, text: str, reason: str):
+        super().__init__(f"{text!r}: {reason}")
+        self.reason = reason
+
+
 def parse_mix(text: str) -> Mix:
     """Parse the name of a channel, or a weighted sum of channels and of their powers.
 
@@ -41,8 +49,8 @@ def parse_mix(text: str) -> Mix:
     while place < len(terms):
         term = _TERM.match(terms, place)
         if not term or (place and not term[1]):
-            raise ValueError(
-                f"{text!r}: cannot read {terms[place:]!r}; write NAME=-a+b+0.5*c, or 0.1*c^2"
+            raise MixError(
+                text, f"cannot read {terms[place:]!r}; write NAME=-a+b+0.5*c, or 0.1*c^2"
             )
         power = f"^{term[4][1:].strip()}" if term[4] else ""
         weight, channel = float(f"{term[1]}{term[2] or 1}"), f"{term[3]}{power}"
@@ -187,7 +195,7 @@ def _without_gaps(
         f"up to {1e3 * (right - left):.4g} ms at t = {show_times(left, start=origin)}: the record "
         f"is cut there into {len(parts)} segments, t = "
         f"{', '.join([*texts, show_times(*last, start=origin)])}. "
-        f"A gap up to a length in s is bridged instead where that is allowed (max_gap=).",
+        f"A gap up to a length in s is bridged instead where that is allowed («max_gap=»).",
         RecordWarning,
         stacklevel=4,
     )

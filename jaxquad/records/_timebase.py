@@ -63,13 +63,14 @@ class Timebases:
         if time_factor is not None and not 0.5 <= time_factor <= 2:
             raise RecordError(
                 f"time_factor is {time_factor:g}: give a number near 1, from 0.5 to 2; units of "
-                f"time are for time_unit (time_unit=)."
+                f"time are for time_unit («time_unit=»)."
             )
         if dt is not None and not 0 < dt < np.inf:
-            raise RecordError(f"dt is {dt:g}: give the sampling interval in s, above 0 (dt=).")
+            raise RecordError(f"dt is {dt:g}: give the sampling interval in s, above 0 («dt=»).")
         if dt is not None and (time is not None or time_unit is not None):
             raise RecordError(
-                f"dt is {dt:g} s, and a time base is named as well: keep one of them (dt=, time=)."
+                f"dt is {dt:g} s, and a time base is named as well: keep one of them («dt=», "
+                "«time=»)."
             )
         self._signals, self._arrays, self._dt = signals, signals.arrays, dt
         self._unit: TimeUnit | None = time_unit
@@ -154,8 +155,8 @@ class Timebases:
             if len(stamps.seconds) != count:
                 raise ReadError(
                     f"channel {name!r} has {len(values)} samples, but its time base {base!r} has "
-                    f"{len(stamps.seconds)}. Name another time base (time=), or save the channel's "
-                    f"own as {'t_' + array!r}."
+                    f"{len(stamps.seconds)}. Name another time base («time=»), or save the "
+                    f"channel's own as {'t_' + array!r}."
                 )
         key = (f"{base} {len(values)}", key[1]) if base == _COUNTED else key
         if key in self._repaired:
@@ -165,7 +166,7 @@ class Timebases:
         if blank > 0.01 * seconds.size:
             raise ReadError(
                 f"in {blank} of the {seconds.size} rows in which channel {name!r} has a value, its "
-                f"time base {base!r} is blank. Name the channel's own time base (time=)."
+                f"time base {base!r} is blank. Name the channel's own time base («time=»)."
             )
         repaired = self._repaired[key] = repair(seconds)
         times = "once" if stamps.wraps == 1 else f"{stamps.wraps} times"
@@ -181,12 +182,12 @@ class Timebases:
         if self._dt is not None:
             raise ReadError(
                 f"dt is {self._dt:g} s, but the log gives the time of {array!r}: leave dt out "
-                f"(dt=), or name another time base (time=)."
+                f"(«dt=»), or name another time base («time=»)."
             )
         if self._unit not in (None, "s"):
             raise ReadError(
                 f"time_unit is {self._unit!r}, but the log gives the time of {array!r} in s: "
-                f"leave the unit out (time_unit=), or name another time base (time=)."
+                f"leave the unit out («time_unit=»), or name another time base («time=»)."
             )
         return clock
 
@@ -203,15 +204,15 @@ class Timebases:
         if not base:
             raise ReadError(
                 f"no time base for {array!r}: none of {its_own}, {', '.join(_SHARED)} is among the "
-                f"arrays {listed(self._arrays)}. Name the array with the time stamps (time=), or "
-                f"the two with seconds and nanoseconds (time=SECONDS+NANOSECONDS), or give the "
-                f"sampling interval of equally spaced rows in s (dt=)."
+                f"arrays {listed(self._arrays)}. Name the array with the time stamps («time=»), or "
+                f"the two with seconds and nanoseconds («time=SECONDS+NANOSECONDS»), or give the "
+                f"sampling interval of equally spaced rows in s («dt=»)."
             )
         stamps = self._arrays.get(base)
         if stamps is not None and stamps.values.ndim != 1 and not from_column:
             raise ReadError(
                 f"the time base {base!r} has shape {stamps.values.shape}: it must be one column "
-                f"(time={base}[0])."
+                f"(«time={base}[0]»)."
             )
         if base in self._read or self._time is not None:
             return base
@@ -224,14 +225,14 @@ class Timebases:
             if other:
                 warnings.warn(
                     f"the time stamps are taken from {base!r}; {', '.join(map(repr, other))}, of "
-                    f"the same length, is not used. Name the right one (time=).",
+                    f"the same length, is not used. Name the right one («time=»).",
                     RecordWarning,
                     stacklevel=2,
                 )
         if base == f"{array}[0]":
             warnings.warn(
                 f"the time stamps are taken from {base!r}, which rises from row to row. Name "
-                f"another channel (time=), or give the sampling interval (dt=).",
+                f"another channel («time=»), or give the sampling interval («dt=»).",
                 RecordWarning,
                 stacklevel=2,
             )
@@ -256,7 +257,7 @@ class Timebases:
             if len(seconds) != len(nanoseconds):
                 raise ReadError(
                     f"the time base {base!r} is of {len(seconds)} seconds and {len(nanoseconds)} "
-                    f"nanoseconds: name two channels of one length (time=SECONDS+NANOSECONDS)."
+                    f"nanoseconds: name two channels of one length («time=SECONDS+NANOSECONDS»)."
                 )
             return _Stamps(seconds + 1e-9 * nanoseconds.astype(np.float64), 0)
         array, column = self._columns[base]
@@ -266,7 +267,7 @@ class Timebases:
         if stated and self._unit not in (None, stated) and array in self._signals.titles.values():
             raise ReadError(
                 f"time_unit is {self._unit!r}, but the header says that {array!r} is in {stated}: "
-                f"leave the unit out (time_unit=), or correct the header."
+                f"leave the unit out («time_unit=»), or correct the header."
             )
         unit = self._unit or stated or _UNIT_OF_NAME.get(re.split(r"[./]", array)[-1])
         seconds = counter.astype(np.float64) / PER_SECOND[unit or "s"]

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-from jaxquad._core import is_ours
+from jaxquad._core import is_ours, marked_text, Message
 
 
 Arguments = ParamSpec("Arguments")
@@ -14,13 +14,16 @@ FAILED = "failed"  # key of the reason, in what templates show instead of a sect
 class PageWarning(UserWarning):
     """A part of a result could not be computed; the rest is written."""
 
+    def __init__(self, reason: str):
+        super().__init__(Message(reason))
 
-def reason_of(error: Exception) -> str:
+
+def reason_of(error: Exception) -> Message:
     """Why something could not be computed: the text of our errors, with the kind of all others."""
-    text = " ".join(str(error).split())
+    text = " ".join(marked_text(error).split())
     if text and is_ours(type(error)):
-        return text
-    return f"{type(error).__name__}{f': {text}' if text else ''}"
+        return Message(text)
+    return Message(f"{type(error).__name__}{f': {text}' if text else ''}")
 
 
 def attempt(

@@ -1,5 +1,7 @@
 """Closed loops in time: scenarios, signals, sensors, drives, metrics."""
 
+from jaxquad._compile import run_ensemble as run_ensemble
+
 from ._authority import (
     Authority as Authority,
     authority as authority,
@@ -7,7 +9,6 @@ from ._authority import (
     beyond_authority as beyond_authority,
     find_authority as find_authority,
 )
-from ._blocks import run_ensemble as run_ensemble
 from ._disturbances import (
     ceti_gust as ceti_gust,
     gauss_markov as gauss_markov,
@@ -32,7 +33,11 @@ from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
 from ._over_cores import over_cores as over_cores
 from ._over_devices import (
+    asked_devices as asked_devices,
+    Devices as Devices,
+    devices_for as devices_for,
     loop_over_devices as loop_over_devices,
+    may_be_several as may_be_several,
     over_devices as over_devices,
     placed as placed,
 )

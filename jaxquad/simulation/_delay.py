@@ -1,26 +1,10 @@
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from jaxquad._compile import Queue
 from jaxquad._core import per_member
-from jaxquad._xla import swap_row
 from jaxquad.loops import Loop
-
-
-class Queue(NamedTuple):
-    """Inputs on their way to the plant, for as many samples as every member waits."""
-
-    rows: Float[Array, "rows inputs *ensemble"] | None  # in the order of their places; None for one
-    newest: Float[Array, " inputs *ensemble"]
-
-    def exchange(self, index: Int[Array, ""]) -> tuple["Queue", Array]:
-        """At sample `index` the newest input takes the oldest one's place. Also the oldest."""
-        if self.rows is None:
-            return self, self.newest
-        rows, oldest = swap_row(self.rows, self.newest, index % len(self.rows))
-        return Queue(rows, self.newest), oldest
 
 
 class DelayLine(eqx.Module):

@@ -1,14 +1,12 @@
-import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from jaxquad._compile import Jit, scan_members
 from jaxquad._core import as_float
-from jaxquad._xla import as_one_kernel, Devices, Jit
 from jaxquad.loops import Loop
 
 from ._authority import Authority, find_authority, warn_beyond_authority
@@ -23,7 +21,7 @@ from ._flight_metrics import (
 )
 from ._metrics import Metrics, NUMBERS
 from ._over_cores import over_cores
-from ._over_devices import DeviceChoice, loop_over_devices, placed, Run
+from ._over_devices import DeviceChoice, Devices, loop_over_devices, placed, Run
 from ._run import check_run, scan_loop
 from ._scenario import Scenario
 from ._simulate import Simulation
@@ -144,22 +142,18 @@ def _replay(simulation: Simulation, span: Window, gain: Array | None) -> dict[st
     sums = _accumulator(scenario, span, simulation.dt, found, gain)
     index = jnp.arange(simulation.angle.shape[0])
     stored = (simulation.angle, simulation.command, simulation.saturated, simulation.signals)
-    given = (index, scenario.reference, scenario.disturbance, *stored)
-    arrays, rest = eqx.partition((sums, given), eqx.is_array)
-    total = as_one_kernel(ft.partial(_add_up, rest), arrays)
-    return _numbers(sums, total, simulation.diverged, scenario, found)
+    signals = (index, scenario.reference, scenario.disturbance, *stored)
+    arrays, static = eqx.partition(sums, eqx.is_array)
 
-
-def _add_up(rest: PyTree, arrays: PyTree) -> Sums:
-    sums, given = eqx.combine(arrays, rest)
-    like = jnp.zeros_like(given[3][0])
-
-    def sample(total: Sums, now: tuple) -> tuple[Sums, None]:
+    def sample(total: Sums, arrays: PyTree, now: tuple) -> tuple[Sums, None]:
         index, reference, disturbance, angle, command, saturated, signals = now
-        parts = (angle, widened(reference, like), widened(disturbance, like), command, saturated)
-        return sums.update(total, _Sample(index, *parts, signals))
+        wide = widened(reference, angle), widened(disturbance, angle)
+        sums = eqx.combine(arrays, static)
+        return sums.update(total, _Sample(index, angle, *wide, command, saturated, signals))
 
-    return jax.lax.scan(jax.checkpoint(sample), sums.begin(like), given)[0]
+    start = sums.begin(jnp.zeros_like(simulation.angle[0]))
+    total, _ = scan_members(sample, start, arrays, signals)
+    return _numbers(sums, total, simulation.diverged, scenario, found)
 
 
 def _accumulator(

@@ -12,10 +12,8 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._compile import KEPT
 
-# What reverse mode keeps of a sample: who runs and what was measured. Otherwise it would compute
-# each sample twice, for these and for the derivatives.
-KEPT = "kept_of_sample"
 
 # In SI units no angle, rate, voltage or squared rotor speed comes near it.
 VAST = 1e9
@@ -36,7 +34,7 @@ def are_numbers(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, "*ensemb
     return _members(tree, ensemble, lambda x: ~jnp.isnan(x))
 
 
-def are_sound(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, ""]:
+def are_sound(tree: PyTree) -> Bool[Array, ""]:
     """Whether the first number of every array is one."""
     firsts = [jnp.ravel(x)[:1] for x in jax.tree.leaves(tree)]
     checks = [jnp.all(x == x) for x in firsts]
@@ -87,6 +85,7 @@ def _guarded_jvp(sample, ensemble, primals, tangents):
 
 
 def _keep(x: Array) -> Array:
+    """For reverse mode: who runs, and what was measured."""
     return checkpoint_name(x, KEPT)
 
 

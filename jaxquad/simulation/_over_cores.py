@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from jaxquad._compile import are_few, Jit, SINGLE
 from jaxquad._core import available_cores, ensemble_shape, map_in_threads, mark_members
-from jaxquad._xla import Devices, gathered, Jit, may_be_several
 
-from ._blocks import are_few, SINGLE
-from ._over_devices import Run
+from ._over_devices import Devices, gathered, may_be_several, Run
 
 
 _VECTOR, _FEWEST, _USUAL = 16, 32, 128  # members that are computed at once, and of a part

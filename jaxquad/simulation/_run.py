@@ -1,6 +1,5 @@
 """A loop in a scenario, from the first sample to the last."""
 
-import functools as ft
 import math
 from typing import Protocol, runtime_checkable
 
@@ -10,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._compile import in_chunks, most_at_once, scan_members
 from jaxquad._core import ensemble_shape, is_concrete, mark_members
-from jaxquad._xla import as_one_kernel
 from jaxquad.loops import CarriesPayload, Loop, Plant
 
-from ._blocks import in_chunks, most_at_once, scan_members
 from ._guard import are_sound, guarded
 from ._scenario import Scenario
 from ._step import Carry, LoopStep, make_step, require_runnable, SampleResult
@@ -119,10 +117,31 @@ def _begin(given: _Given, ensemble: tuple[int, ...]) -> tuple[LoopStep, tuple[Ca
 def _run(
     given: _Given, ensemble: tuple[int, ...]
 ) -> tuple[PyTree, PyTree, Bool[Array, "*ensemble"]]:
-    step, carry = _begin(given, ensemble)
+    step, (start, total) = _begin(given, ensemble)
     _, scenario, accumulator = given
-    arrays, rest = eqx.partition((step, carry, scenario, accumulator), eqx.is_array)
-    carried, stored = as_one_kernel(ft.partial(_scan, rest), arrays)
+    sound = are_sound(eqx.filter((step, start, total, scenario, accumulator), eqx.is_array))
+    queue, start = start.queue, start._replace(running=start.running & sound, queue=None)
+    arrays, static = eqx.partition((step, accumulator), eqx.is_array)
+
+    def sample(inner: Carry, parts: PyTree, now: PyTree) -> tuple[Carry, SampleResult]:
+        step, _ = eqx.combine(parts, static)
+        return step.sample(inner, *now)
+
+    def advance(carry: PyTree, parts: PyTree, now: PyTree, *oldest: Array) -> tuple[PyTree, PyTree]:
+        parts, at_rest = parts
+        inner, result = guarded(sample, ensemble, at_rest, carry[0], parts, (*now, *oldest))
+        _, accumulator = eqx.combine(parts, static)
+        total, output = accumulator.update(carry[1], result)
+        if oldest:
+            output = inner.queue.newest, output
+        return (inner._replace(queue=None), total), output
+
+    parts = arrays, jax.lax.stop_gradient(start)
+    signals = jnp.arange(len(scenario.reference)), scenario
+    members = ensemble[0] if len(ensemble) == 1 else None
+    carried, stored = scan_members(
+        advance, (start, total), parts, signals, members=members, queue=queue
+    )
     return carried[1], stored, carried[0].running
 
 
@@ -145,28 +164,3 @@ def _at_rest(
         "make fields that differ between members by jq.loops.per_member, and let "
         "init(euler, ensemble=...) give a state as wide as the ensemble"
     )
-
-
-def _scan(rest: PyTree, arrays: PyTree) -> tuple[PyTree, PyTree]:
-    step, carry, scenario, accumulator = eqx.combine(arrays, rest)
-    parts, static = eqx.partition(step, eqx.is_array)
-    # Not a nan in sight; and an argument that is not used at all would end the kernel's compiler.
-    sound = are_sound(arrays, step.ensemble)
-    queue = carry[0].queue
-    start = carry[0]._replace(running=carry[0].running & sound, queue=None)
-    at_rest = jax.lax.stop_gradient(start)
-
-    def sample(inner: Carry, parts: LoopStep, now: PyTree) -> tuple[Carry, SampleResult]:
-        return eqx.combine(parts, static).sample(inner, *now)
-
-    def advance(carry: PyTree, now: PyTree, *oldest: Array) -> tuple[PyTree, PyTree]:
-        inner, result = guarded(sample, step.ensemble, at_rest, carry[0], parts, (*now, *oldest))
-        total, output = accumulator.update(carry[1], result)
-        if oldest:
-            output = inner.queue.newest, output
-        return (inner._replace(queue=None), total), output
-
-    count = scenario.reference.shape[0]
-    members = step.ensemble[0] if len(step.ensemble) == 1 else None
-    signals = jnp.arange(count), scenario
-    return scan_members(advance, (start, carry[1]), signals, count, members, queue)

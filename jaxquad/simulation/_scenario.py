@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_float, ensemble_shape, per_member, require_all_positive, whole_samples
-from jaxquad._xla import brief_options, Jit
 from jaxquad.excitation import Excitation
 from jaxquad.records import AXES
 

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._compile import Jit
 from jaxquad._core import align, pytree_node
-from jaxquad._xla import Devices, Jit
 from jaxquad.loops import Loop
 from jaxquad.records import AXES, Record
 
 from ._authority import Authority, find_authority, warn_beyond_authority
 from ._memory import require_memory, size_of
 from ._over_cores import over_cores
-from ._over_devices import DeviceChoice, loop_over_devices, placed, Run
+from ._over_devices import DeviceChoice, Devices, loop_over_devices, placed, Run
 from ._run import check_run, scan_loop
 from ._scenario import Scenario
 from ._step import SampleResult

@@ -23,5 +23,5 @@ from ._estimators import (
 )
 from ._frequency_response import Distortion as Distortion, FrequencyResponse as FrequencyResponse
 from ._lines import find_line as find_line, SpectralLine as SpectralLine
-from ._remarks import Remark as Remark
+from ._remarks import DOMINATED as DOMINATED, EARLY as EARLY, Remark as Remark
 from ._step_response import estimate_step as estimate_step, StepResponse as StepResponse

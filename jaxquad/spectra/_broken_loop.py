@@ -5,6 +5,7 @@ from typing import get_args, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from jaxquad._core import Message
 from jaxquad.records import Record
 
 
@@ -109,7 +110,9 @@ def estimate_broken_loop(
         raise ValueError(f"entry is {entry!r}: say where the reference enters, {known}")
     if reference is None and not record.reference_names:
         raise ValueError(
-            "the record has no reference, so its loop is not known: name one (reference=)"
+            Message(
+                "the record has no reference, so its loop is not known: name one («reference=»)"
+            )
         )
     source = reference or record.reference_names[0]
     answer = output or record.output_names[0]

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from jaxquad._core import Message
 from jaxquad.records import Record
 
 
@@ -31,16 +32,21 @@ def check_compatible(records: Sequence[Record]) -> None:
     for other in records[1:]:
         if not math.isclose(other.dt, first.dt, rel_tol=1e-6):
             raise ValueError(
-                f"the records are sampled at {first.sample_rate:.6g} and {other.sample_rate:.6g} "
-                "Hz: read them with the same sample rate (sample_rate=)"
+                Message(
+                    f"the records are sampled at {first.sample_rate:.6g} and "
+                    f"{other.sample_rate:.6g} Hz: read them with the same sample rate "
+                    "(«sample_rate=»)"
+                )
             )
         names = (other.input_names, other.output_names, other.reference_names)
         if names != (first.input_names, first.output_names, first.reference_names):
             raise ValueError(f"the records have different channels: {first} and {other}")
         if other.hold != first.hold:
             raise ValueError(
-                f"the inputs of the records are held for {first.hold} and {other.hold} s: give all "
-                "records of one response the same hold (hold=)"
+                Message(
+                    f"the inputs of the records are held for {first.hold} and {other.hold} s: give "
+                    "all records of one response the same hold («hold=»)"
+                )
             )
 
 
@@ -72,10 +78,13 @@ def check_references(records: Sequence[Record]) -> None:
     names, inputs = records[0].reference_names, records[0].input_names
     if len(names) != len(inputs):
         raise ValueError(
-            f"the joint estimate needs one external reference for each input, but the record has "
-            f"{len(names)} references {list(names)} for {len(inputs)} inputs {list(inputs)}. Name "
-            "them (references=), select other channels with jq.records.select, or use "
-            "a direct estimate (estimator=jq.spectra.LocalPolynomial())"
+            Message(
+                "the joint estimate needs one external reference for each input, but the record "
+                f"has {len(names)} references {list(names)} for {len(inputs)} inputs "
+                f"{list(inputs)}. Name them («references=»), «select other channels with "
+                "jq.records.select, or »use a direct estimate« "
+                "(estimator=jq.spectra.LocalPolynomial())»"
+            )
         )
 
 

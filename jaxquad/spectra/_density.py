@@ -12,7 +12,7 @@ from ._checks import check_compatible
 from ._estimators import Welch
 from ._leakage import cross_products
 from ._welch import frequencies_for, transform_records
-from ._window import coefficients
+from ._windows import coefficients
 
 
 class SpectralDensity(eqx.Module):

@@ -1,19 +1,21 @@
+"""Covariance of the random errors of responses, stored as the effect of independent noise."""
+
 import dataclasses
 import functools as ft
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad._core import pytree_node
 
-from ._atoms import add_effects, Reach, reach_of, sums_of_products, times_drive
-from ._window import coefficients
+from ._windows import coefficients, Layout
 
 
 _POINTS = 32  # times to the shortest window, on which overlaps are summed
-_APART = 8  # window resolutions beyond which a tapered window has no response to a frequency
+_FAR = 8  # window resolutions beyond which a tapered window has no response to a frequency
 
 
 class Placement(eqx.Module):
@@ -27,49 +29,48 @@ class Placement(eqx.Module):
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "windows times"]:
         """Values of all windows, scaled so that a sum over `self.times` equals one over samples."""
-        level, cosine = coefficients(self.shape)
-        into = (times[None, :] - self.starts[:, None]) / self.lengths[:, None]
-        values = level - cosine * np.cos(2 * np.pi * into)
         step = (self.times[1] - self.times[0]) / self.dt
-        return np.where((into >= 0) & (into < 1), values, 0.0) * np.sqrt(step)
+        place = (times[None, :] - self.starts[:, None]) / self.lengths[:, None]
+        return _window_at(self.shape, place) * np.sqrt(step)
+
+
+def _window_at(shape: str, place: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """At a place from 0 to 1 in the window; 0 beyond."""
+    level, cosine = coefficients(shape)
+    values = level - cosine * np.cos(2 * np.pi * place)
+    return np.where((place >= 0) & (place < 1), values, 0.0)
 
 
 @ft.lru_cache(maxsize=16)
-def place_windows(
-    groups: tuple[tuple[int, tuple[int, ...]], ...], shape: str, dt: float, band: float
-) -> Placement:
+def place_windows(groups: Layout, shape: str, dt: float, band: float) -> Placement:
     """The places of windows of several lengths (samples); `band` is the range of omega, rad/s."""
     starts = np.concatenate([np.asarray(mine, float) for _, mine in groups]) * dt
     lengths = np.concatenate([np.full(len(mine), float(n)) for n, mine in groups]) * dt
     shortest, end = lengths.min(), np.max(starts + lengths)
-    rate = band / (2 * np.pi) + 2 * _APART / shortest
+    rate = band / (2 * np.pi) + 2 * _FAR / shortest
     step = 1 / max(rate, _POINTS / shortest)
     times = np.arange(starts.min(), end, min(step, (end - starts.min()) / 2))
     return Placement(starts, lengths, times, dt, shape)
 
 
 @ft.lru_cache(maxsize=16)
-def window_products(
-    groups: tuple[tuple[int, tuple[int, ...]], ...], shape: str
-) -> Float[np.ndarray, "windows windows"]:
+def window_products(groups: Layout, shape: str) -> Float[np.ndarray, "windows windows"]:
     """Sums over samples of the product of any two windows."""
-    level, cosine = coefficients(shape)
     step = max(min(length for length, _ in groups) / _POINTS, 1.0)
     last = max(mine[-1] + length for length, mine in groups)
     times = np.arange(min(mine[0] for _, mine in groups), last, step)
-    rows = []
-    for length, mine in groups:
-        into = (times[None, :] - np.asarray(mine)[:, None]) / length
-        inside = (into >= 0) & (into < 1)
-        rows.append(np.where(inside, level - cosine * np.cos(2 * np.pi * into), 0.0))
-    values = np.concatenate(rows)
+    places = [(times[None, :] - np.asarray(mine)[:, None]) / n for n, mine in groups]
+    values = np.concatenate([_window_at(shape, place) for place in places])
     return step * (values @ values.T)
 
 
 Numbers = Array | np.ndarray
+Effect = Complex[np.ndarray, "frequencies inputs width"]
 
 _CHUNK = 512  # times taken at once, so that a long record fits the memory
 _ATOMS = 8192  # the same of atoms without windows
+_TOGETHER = 32  # frequencies that are multiplied at once
+_NARROW = 4  # atoms of an effect, up to which places are fewer steps than frequencies
 
 
 @pytree_node
@@ -110,14 +111,44 @@ class ErrorCovariance:
     ) -> Float[np.ndarray, "columns columns"]:
         """Covariance of Re(sum of `conj(columns) dT`) over frequencies, outputs and inputs."""
         columns, count = np.asarray(columns), columns.shape[3]
-        weighted = columns.conj()[..., None, :] * _share(self)[..., None]  # f o i g p
+        weighted = columns.conj()[..., None, :] * self._shares[..., None]  # f o i g p
         drawn = np.einsum("foigp,foc->figcp", weighted, np.asarray(self.noise))
-        parts = _by_atoms(self, drawn, columns) if self.windows is None else _by_times(self, drawn)
         total = np.zeros((count, count))
-        for part in parts:
+        for part in self._drawn(drawn, columns):
             part = part.reshape(-1, count)
             total += 0.5 * np.real(part.T @ part.conj())
         return total
+
+    def _drawn(
+        self,
+        drawn: Complex[np.ndarray, "frequencies inputs groups roots columns"],
+        columns: Complex[np.ndarray, "frequencies outputs inputs columns"],
+    ) -> Iterator[Complex[np.ndarray, "atoms roots_columns"]]:
+        """What noise of unit power does to Re(sum of `conj(columns) dT`), a piece at a time.
+
+        The pieces are some of the times that windows overlap, or some of the atoms.
+        """
+        if self.windows is not None:
+            along = np.swapaxes(drawn, 1, 2).reshape(-1, drawn.shape[3] * drawn.shape[4])
+            for k in range(0, self.windows.times.size, _CHUNK):
+                effect = self._at(self.windows.times[k : k + _CHUNK])
+                yield effect.reshape(-1, effect.shape[3]).T @ along
+            return
+        effect, reach, driven = np.asarray(self.effect), self._reach, self._driven
+        values, moved, drive = drawn.reshape(*effect.shape[:2], -1), None, None
+        begin, end = int(np.min(reach.first)), int(np.max(reach.last))
+        if self.sensitivity is not None and self.drive is not None:
+            slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
+            moved = np.real(np.tensordot(slope, columns.conj(), axes=((0, 1, 2), (0, 1, 2))))
+            begin, end = min(begin, int(driven[0])), max(end, int(driven[-1]) + 1)
+        for low in range(begin, end, _ATOMS):
+            part = np.zeros((min(_ATOMS, end - low), values.shape[2]), complex)
+            add_effects(part, low, effect, reach, values)
+            if drive is not None:
+                taken = slice(*np.searchsorted(driven, (low, low + len(part))))
+                both = np.einsum("nac,np->acp", drive[:, taken], moved)
+                part[driven[taken] - low] += both.reshape(len(both), part.shape[1])
+            yield part
 
     def variance(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
@@ -127,36 +158,35 @@ class ErrorCovariance:
                 "errors.between(pair, pair)"
             )
         effect, noise = np.asarray(self.effect), np.asarray(self.noise)
-        gain, power = (np.vecdot(each, each).real for each in (effect, noise))
-        total = power[:, :, None] * gain[:, None, :] * _share(self)[..., 0] ** 2
+        gain, power = (np.vecdot(x, x).real for x in (effect, noise))
+        total = power[:, :, None] * gain[:, None, :] * self._shares[..., 0] ** 2
         if self.sensitivity is None or self.drive is None:
             return total
         slope = np.asarray(self.sensitivity)
-        both = np.sum(_with_parameters(self) * np.conj(slope), axis=3)
-        own = np.sum(slope @ _products_of_drives(self) * np.conj(slope), axis=3)
-        return np.maximum(total + np.real(both + own), 0.0)
+        crossed = np.sum(self._with_parameters() * np.conj(slope), axis=3)
+        moved = np.sum(slope @ self._parameters() * np.conj(slope), axis=3)
+        return np.maximum(total + np.real(crossed + moved), 0.0)
 
     def between(
         self, first: tuple[int, int], second: tuple[int, int]
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
         """Covariance E[dT dT^H] of two pairs (output, input) between all pairs of frequencies."""
-        noise, share = np.asarray(self.noise), _share(self)
+        noise, share = np.asarray(self.noise), self._shares
         pairs = (first,) if first == second else (first, second)
         if self.windows is None:
-            effect = np.asarray(self.effect)
-            seen = [effect[:, i] * share[:, o, i] for o, i in pairs]
-            total = sums_of_products(seen[0], seen[-1], _reach(self))
+            effects = [np.asarray(self.effect)[:, i] * share[:, o, i] for o, i in pairs]
+            total = sums_of_products(effects[0], effects[-1], self._reach)
         else:
-            at = _at(self, self.windows.times)
-            seen = [np.einsum("fgt,fg->ft", at[:, :, i], share[:, o, i]) for o, i in pairs]
-            total = seen[0] @ seen[-1].conj().T
+            at = self._at(self.windows.times)
+            effects = [np.einsum("fgt,fg->ft", at[:, :, i], share[:, o, i]) for o, i in pairs]
+            total = effects[0] @ effects[-1].conj().T
         total *= noise[:, first[0]] @ noise[:, second[0]].conj().T
         if self.sensitivity is None or self.drive is None:
             return total
-        mine, its = (np.asarray(self.sensitivity)[:, o, i] for o, i in (first, second))
-        both = [_with_parameters(self.pair(*each))[:, 0, 0] for each in pairs]
-        moved = mine @ _products_of_drives(self) @ its.conj().T
-        mixed = both[0] @ its.conj().T + mine @ both[-1].conj().T
+        slopes = [np.asarray(self.sensitivity)[:, o, i] for o, i in (first, second)]
+        crossed = [self.pair(*pair)._with_parameters()[:, 0, 0] for pair in pairs]
+        moved = slopes[0] @ self._parameters() @ slopes[1].conj().T
+        mixed = crossed[0] @ slopes[1].conj().T + slopes[0] @ crossed[-1].conj().T
         return total + moved + 0.5 * mixed
 
     def independent(self, input: int, rows: Int[np.ndarray, " some"]) -> bool:
@@ -164,31 +194,34 @@ class ErrorCovariance:
         if self.windows is not None or self.sensitivity is not None:
             return False
         first = None if self.first is None else np.asarray(self.first)[rows]
-        return reach_of(np.asarray(self.effect)[rows, input, None], first).disjoint()
+        reach = reach_of(np.asarray(self.effect)[rows, input, None], first)
+        order = np.argsort(reach.first, kind="stable")
+        begin, end = reach.first[order], reach.last[order]
+        return bool(np.all(begin[1:] >= np.maximum.accumulate(end)[:-1]))
 
     def at_each_frequency(self) -> Complex[np.ndarray, "frequencies pairs pairs"]:
         """Covariance E[dT dT^H] of all pairs (output, input), output by output."""
-        noise, share = np.asarray(self.noise), _share(self)
+        noise, share = np.asarray(self.noise), self._shares
         shape = (len(noise), share.shape[1] * share.shape[2])
         spread = noise @ np.conj(np.swapaxes(noise, 1, 2))
         if self.windows is None:
-            effect = share[:, :, :, 0, None] * np.asarray(self.effect)[:, None]
-            parts = iter((effect.reshape(*shape, -1),))
+            parts = iter([share[:, :, :, 0, None] * np.asarray(self.effect)[:, None]])
         else:
-            seen = (_at(self, times) for times in _chunks(self))
-            parts = (np.einsum("foig,fgit->foit", share, e).reshape(*shape, -1) for e in seen)
+            times = self.windows.times
+            at = (self._at(times[k : k + _CHUNK]) for k in range(0, times.size, _CHUNK))
+            parts = (np.einsum("foig,fgit->foit", share, effect) for effect in at)
         total = np.zeros((*shape, shape[1]), complex)
         for part in parts:
+            part = part.reshape(*shape, -1)
             total += part @ np.conj(np.swapaxes(part, 1, 2))
         total = total.reshape(-1, *2 * share.shape[1:3]) * spread[:, :, None, :, None]
         total = total.reshape(*shape, -1)
         if self.sensitivity is None or self.drive is None:
             return total
-        both = _with_parameters(self).reshape(*shape, -1)
         slope = np.asarray(self.sensitivity).reshape(*shape, -1)
         adjoint = np.conj(np.swapaxes(slope, 1, 2))
-        moved = slope @ _products_of_drives(self) @ adjoint
-        mixed = 0.5 * (both @ adjoint)
+        moved = slope @ self._parameters() @ adjoint
+        mixed = 0.5 * (self._with_parameters().reshape(*shape, -1) @ adjoint)
         return total + moved + mixed + np.conj(np.swapaxes(mixed, 1, 2))
 
     def pair(self, output: int, input: int) -> "ErrorCovariance":
@@ -209,87 +242,51 @@ class ErrorCovariance:
         effect = np.asarray(self.effect) * columns
         return dataclasses.replace(self, effect=effect, sensitivity=turned)
 
+    @property
+    def _shares(self) -> Float[np.ndarray, "frequencies outputs inputs groups"]:
+        shape = (*self.noise.shape[:2], self.effect.shape[1], 1)
+        return np.ones(shape) if self.share is None else np.asarray(self.share)
 
-def _reach(errors: ErrorCovariance) -> Reach:
-    return reach_of(np.asarray(errors.effect), errors.first)
+    @property
+    def _reach(self) -> "Reach":
+        return reach_of(np.asarray(self.effect), self.first)
 
+    @property
+    def _driven(self) -> Int[np.ndarray, " driven"]:
+        if self.drive is None:
+            return np.zeros(0, int)
+        return np.arange(self.drive.shape[1]) if self.driven is None else np.asarray(self.driven)
 
-def _driven(errors: ErrorCovariance) -> Int[np.ndarray, " driven"]:
-    if errors.drive is None:
-        return np.zeros(0, int)
-    return np.arange(errors.drive.shape[1]) if errors.driven is None else np.asarray(errors.driven)
+    def _parameters(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Covariance of the real parameters."""
+        drive = np.ascontiguousarray(self.drive)
+        parts = drive.reshape(len(drive), -1).view(float)  # real and imaginary ones in turn
+        return 0.5 * (parts @ parts.T)
 
+    def _with_parameters(self) -> Complex[np.ndarray, "frequencies outputs inputs parameters"]:
+        """Twice the covariance of what atoms do to each response with the real parameters."""
+        effect, reach, driven = np.asarray(self.effect), self._reach, self._driven
+        parameters, _, roots = np.shape(self.drive)
+        rows = np.conj(np.swapaxes(np.asarray(self.drive), 0, 1))
+        rows = np.ascontiguousarray(rows).reshape(driven.size, -1)
+        crossed = np.zeros((*effect.shape[:2], parameters * roots), complex)
+        begins, ends = np.searchsorted(driven, reach.first), np.searchsorted(driven, reach.last)
+        for f in np.flatnonzero(begins < ends):
+            taken = slice(begins[f], ends[f])
+            crossed[f] = effect[f][:, driven[taken] - reach.first[f]] @ rows[taken]
+        crossed = crossed.reshape(*effect.shape[:2], parameters, roots)
+        return np.einsum("finc,foc->foin", crossed, np.asarray(self.noise), optimize=True)
 
-def _by_atoms(
-    errors: ErrorCovariance,
-    drawn: Complex[np.ndarray, "frequencies inputs 1 roots columns"],
-    columns: Complex[np.ndarray, "frequencies outputs inputs columns"],
-) -> Iterator[Complex[np.ndarray, "atoms roots_columns"]]:
-    """What atoms of unit power do to Re(sum of `conj(columns) dT`), some atoms at a time."""
-    effect, reach, driven = np.asarray(errors.effect), _reach(errors), _driven(errors)
-    values, moved = drawn.reshape(*effect.shape[:2], -1), None
-    begin, end = int(np.min(reach.first)), int(np.max(reach.last))
-    if errors.sensitivity is not None and errors.drive is not None:
-        slope, drive = np.asarray(errors.sensitivity), np.asarray(errors.drive)
-        moved = np.real(np.tensordot(slope, columns.conj(), axes=((0, 1, 2), (0, 1, 2))))
-        begin, end = min(begin, int(driven[0])), max(end, int(driven[-1]) + 1)
-    for low in range(begin, end, _ATOMS):
-        part = np.zeros((min(_ATOMS, end - low), values.shape[2]), complex)
-        add_effects(part, low, effect, reach, values)
-        if moved is not None:
-            taken = slice(*np.searchsorted(driven, (low, low + len(part))))
-            both = np.einsum("nac,np->acp", drive[:, taken], moved)
-            part[driven[taken] - low] += both.reshape(len(both), part.shape[1])
-        yield part
-
-
-def _by_times(
-    errors: ErrorCovariance, drawn: Complex[np.ndarray, "frequencies inputs groups roots columns"]
-) -> Iterator[Complex[np.ndarray, "times roots_columns"]]:
-    """The same of the noise at the times that windows overlap."""
-    along = np.swapaxes(drawn, 1, 2).reshape(-1, drawn.shape[3] * drawn.shape[4])
-    for times in _chunks(errors):
-        seen = _at(errors, times)
-        yield seen.reshape(-1, seen.shape[3]).T @ along
-
-
-def _products_of_drives(errors: ErrorCovariance) -> Float[np.ndarray, "parameters parameters"]:
-    """Covariance of the real parameters."""
-    drive = np.ascontiguousarray(errors.drive)
-    parts = drive.reshape(len(drive), -1).view(float)  # real and imaginary ones in turn
-    return 0.5 * (parts @ parts.T)
-
-
-def _with_parameters(
-    errors: ErrorCovariance,
-) -> Complex[np.ndarray, "frequencies outputs inputs parameters"]:
-    """Twice the covariance of what atoms do to each response with the real parameters."""
-    drive = np.asarray(errors.drive)
-    both = times_drive(np.asarray(errors.effect), _reach(errors), _driven(errors), drive)
-    return np.einsum("finc,foc->foin", both, np.asarray(errors.noise), optimize=True)
-
-
-def _share(errors: ErrorCovariance) -> Float[np.ndarray, "frequencies outputs inputs groups"]:
-    shape = (*errors.noise.shape[:2], errors.effect.shape[1], 1)
-    return np.ones(shape) if errors.share is None else np.asarray(errors.share)
-
-
-def _chunks(errors: ErrorCovariance) -> list[Float[np.ndarray, " times"]]:
-    assert errors.windows is not None
-    times = errors.windows.times
-    return [times[k : k + _CHUNK] for k in range(0, times.size, _CHUNK)]
-
-
-def _at(
-    errors: ErrorCovariance, times: Float[np.ndarray, " times"]
-) -> Complex[np.ndarray, "frequencies groups inputs times"]:
-    """Contribution of unit noise at these times to the errors, by group of windows."""
-    assert errors.windows is not None
-    effect, seen = np.asarray(errors.effect), errors.windows.at(times)
-    turned = np.exp(-1j * np.asarray(errors.omega)[:, None] * times[None, :])
-    ends = np.cumsum(errors.counts or (effect.shape[2],))
-    groups = zip(np.split(effect, ends[:-1], axis=2), np.split(seen, ends[:-1]), strict=True)
-    return np.stack([part @ windows for part, windows in groups], axis=1) * turned[:, None, None]
+    def _at(
+        self, times: Float[np.ndarray, " times"]
+    ) -> Complex[np.ndarray, "frequencies groups inputs times"]:
+        """Contribution of unit noise at these times to the errors, by group of windows."""
+        assert self.windows is not None
+        effect, windows = np.asarray(self.effect), self.windows.at(times)
+        turned = np.exp(-1j * np.asarray(self.omega)[:, None] * times[None, :])
+        ends = np.cumsum(self.counts or (effect.shape[2],))[:-1]
+        groups = zip(np.split(effect, ends, axis=2), np.split(windows, ends), strict=True)
+        return np.stack([part @ few for part, few in groups], axis=1) * turned[:, None, None]
 
 
 def independent_errors(
@@ -310,3 +307,75 @@ def independent_errors(
     noise = np.broadcast_to(np.eye(outputs, dtype=complex), (count, outputs, outputs))
     first = inputs * np.arange(count)
     return ErrorCovariance(np.asarray(omega), effect, noise, share[:, :, :, None], first=first)
+
+
+class Reach(NamedTuple):
+    """The atoms from `first` to before `last` that have an effect at each frequency."""
+
+    first: Int[np.ndarray, " frequencies"]
+    last: Int[np.ndarray, " frequencies"]
+
+    def reached(self, count: int) -> Bool[np.ndarray, " count"]:
+        """Which of `count` atoms have an effect on any frequency."""
+        edges = np.bincount(self.first, minlength=count + 1).astype(int)
+        edges -= np.bincount(self.last, minlength=count + 1)
+        return np.cumsum(edges)[:count] > 0
+
+
+def reach_of(effect: Effect, first: Int[Numbers, " frequencies"] | None) -> Reach:
+    """Of effects that begin with the atom `first`; all with the same one, without it."""
+    used = np.any(effect != 0, axis=1)
+    width = np.where(np.any(used, axis=1), used.shape[1] - np.argmax(used[:, ::-1], axis=1), 0)
+    begin = np.zeros(len(effect), int) if first is None else np.asarray(first)
+    return Reach(begin, begin + width)
+
+
+def sums_of_products(
+    one: Complex[np.ndarray, "frequencies width"],
+    other: Complex[np.ndarray, "frequencies width"],
+    reach: Reach,
+) -> Complex[np.ndarray, "frequencies frequencies"]:
+    """Of `one` and the conjugate `other`, over the atoms that two frequencies share."""
+
+    def by_atom(effect: np.ndarray, rows: np.ndarray, low: int, high: int) -> np.ndarray:
+        """The effects of the atoms from `low` to before `high` at some frequencies."""
+        aligned = np.zeros((rows.size, high - low), complex)
+        for row, f in zip(aligned, rows, strict=True):
+            begin, end = max(reach.first[f], low), min(reach.last[f], high)
+            row[begin - low : end - low] = effect[f, begin - reach.first[f] : end - reach.first[f]]
+        return aligned
+
+    total = np.zeros((len(one), len(one)), complex)
+    for begin in range(0, len(one), _TOGETHER):
+        rows = np.arange(begin, min(begin + _TOGETHER, len(one)))
+        low, high = int(np.min(reach.first[rows])), int(np.max(reach.last[rows]))
+        near = np.flatnonzero((reach.first < high) & (reach.last > low))
+        if one is other:  # the half above the diagonal says all
+            near = near[near >= begin]
+        both = by_atom(one, rows, low, high), by_atom(other, near, low, high)
+        total[np.ix_(rows, near)] = both[0] @ both[1].conj().T
+    if one is other:
+        below = np.tril_indices(len(one), -1)
+        total[below] = total.T[below].conj()
+    return total
+
+
+def add_effects(
+    into: Complex[np.ndarray, "atoms columns"],
+    low: int,
+    effect: Effect,
+    reach: Reach,
+    values: Complex[np.ndarray, "frequencies inputs columns"],
+) -> None:
+    """Add effects times `values`, over frequencies and inputs, to the atoms from `low` on."""
+    high = low + len(into)
+    if effect.shape[2] <= _NARROW and np.all(np.diff(reach.first) > 0):
+        for place in range(effect.shape[2]):  # at which no two frequencies have the same atom
+            atoms = reach.first + place
+            here = (atoms >= low) & (atoms < high) & (atoms < reach.last)
+            into[atoms[here] - low] += np.einsum("fi,fip->fp", effect[here, :, place], values[here])
+        return
+    for f in np.flatnonzero((reach.first < high) & (reach.last > low)):
+        begin, end = max(reach.first[f], low), min(reach.last[f], high)
+        part = effect[f, :, begin - reach.first[f] : end - reach.first[f]]
+        into[begin - low : end - low] += part.T @ values[f]

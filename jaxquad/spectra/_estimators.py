@@ -5,9 +5,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from jaxquad._core import Message
 from jaxquad.records import Record
 
-from ._window import window
+from ._windows import window
 
 
 class LocalPolynomial(eqx.Module):
@@ -135,9 +136,11 @@ class Welch(eqx.Module):
         length, dt = Welch.length(self, records), records[0].dt
         if length <= 30:
             raise ValueError(
-                f"a window of {length} samples is too short for frequencies up to a tenth of the "
-                "sample rate: use a longer window (window_length=), or give the "
-                "frequencies (omega=)"
+                Message(
+                    f"a window of {length} samples is too short for frequencies up to a tenth of "
+                    "the sample rate: use a longer window («window_length=»)«, or give the "
+                    "frequencies (omega=)»"
+                )
             )
         return _log_spaced(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt)).copy()
 

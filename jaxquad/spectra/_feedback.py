@@ -178,14 +178,15 @@ def _remarks_on_phase(
     rises = _is_rise(slope, pair.response, covariance, clear)
     if method == "joint":
         text = _EARLY.format(lead=1e3 * slope.value)
-        return [Remark(text, pair.coherent, pair.names)] if rises else []
+        return [Remark(text, pair.coherent, pair.names, EARLY)] if rises else []
     share = _share_from_output(records, pair)
     made = _is_made_by_controller(pair, share)
     if rises:
         text = _RISES.format(lead=1e3 * slope.value)
-        return [Remark(text, pair.coherent if made else pair.omega[slope.top], pair.names)]
+        omega = pair.coherent if made else pair.omega[slope.top]
+        return [Remark(text, omega, pair.names, DOMINATED)]
     text = _FED_BACK.format(share=100 * np.median(share.output_first), where="{where}")
-    return [Remark(text, pair.coherent, pair.names)] if made else []
+    return [Remark(text, pair.coherent, pair.names, DOMINATED)] if made else []
 
 
 def _share_from_output(records: Sequence[Record], pair: _Pair) -> Share:
@@ -213,22 +214,22 @@ def _is_made_by_controller(pair: _Pair, share: Share) -> bool:
 
 
 _RISES = (
-    f"{DOMINATED}: the phase increases with frequency at the top of the coherent "
+    "feedback-dominated: the phase increases with frequency at the top of the coherent "
     "band, like that of -1/C and unlike that of any actuator; the coherence there "
     "comes from the controller. Add excitation, and name it as the reference. Without a "
     "controller, input and output are swapped, or the output's time stamps are at least "
     "{lead:.2g} ms early"
 )
 _EARLY = (
-    f"{EARLY} at the top of the coherent band, unlike that of any actuator, as if the output "
-    "came at least {lead:.2g} ms before the input: exchange input and output if they are swapped, "
-    "or correct their time stamps"
+    "the phase increases with frequency at the top of the coherent band, unlike that of any "
+    "actuator, as if the output came at least {lead:.2g} ms before the input: exchange input and "
+    "output if they are swapped, or correct their time stamps"
 )
 _FED_BACK = (
-    f"{DOMINATED}: {{share:.0f}} % of the input's power (median) {{where}} comes from the output's "
-    "own disturbances and noise: most of the response there is -1/C, that of the controller, and "
-    "not the plant's (one without any lag in this band would look alike). Name the external "
-    "reference; without one, excite the axis, and record what excites it"
+    "feedback-dominated: {share:.0f} % of the input's power (median) {where} comes from the "
+    "output's own disturbances and noise: most of the response there is -1/C, that of the "
+    "controller, and not the plant's (one without any lag in this band would look alike). Name the "
+    "external reference; without one, excite the axis, and record what excites it"
 )
 
 
@@ -239,9 +240,9 @@ def _explained_by_reference(
     if 2 * np.sum(dominated) <= np.sum(direct >= COHERENT):
         return []
     text = (
-        f"{DOMINATED}: input and output are coherent at {np.sum(direct >= COHERENT)} "
+        f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
         f"frequencies, but at {np.sum(dominated)} of them, {in_hertz(omega[dominated])}, the "
         "reference explains neither. There the controller feeds back noise, and the record holds "
         "no information on the plant. Excite these frequencies by the reference"
     )
-    return [Remark(text, pair=pair)]
+    return [Remark(text, pair=pair, kind=DOMINATED)]

@@ -8,15 +8,17 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ._local_fit import Bins
-from ._model_noise import log_likelihood, noise_left, rough_noise
-from ._model_order import next_order, Orders, PRICE, refine_orders, search_orders
 from ._rational_fit import (
     columns_of,
     descend,
     Equations,
     make_basis,
+    next_order,
     parts_of,
     powers_of,
+    PRICE,
+    refine_orders,
+    search_orders,
     slopes_of,
     Solved,
 )
@@ -27,6 +29,13 @@ _MOST_BINS = 20000  # that a model is fitted to
 _TRIAL_BINS = 4000  # with which its order is chosen
 _SETTLED = 1e-6  # relative gain of a step at which the descent ends
 _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
+_BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of running powers: in ln(omega), and bins a side at least
+_LEAST = 1e-6  # input, or noise, to its root mean square over the bins
+_LIKELIER = 10.0  # twice the logarithm of a ratio of likelihoods that chance seldom reaches
+
+Grid = Float[np.ndarray, " frequencies"]
+Places = Int[np.ndarray, " places"]
+Levels = Float[np.ndarray, " bins"]
 
 
 class GlobalModel(NamedTuple):
@@ -39,29 +48,27 @@ class GlobalModel(NamedTuple):
 
     solved: Solved
     fixed: int  # the power whose coefficient in A sets the common factor
-    scale: float
-    dt: float  # s
-    places: Int[np.ndarray, " places"]
     drive: Complex[np.ndarray, "parameters places"]
     follow: Complex[np.ndarray, "places parameters"]  # orthonormal: what the model takes of noise
     noise: Float[np.ndarray, " places"]  # its power, smoothed, from what the model leaves
+    scale: float
+    dt: float  # s
+    places: Places
     reach: int  # number of bins, the lowest, that it describes
 
     @property
     def order(self) -> int:
         """Degree of the denominator."""
-        return len(self.solved.denominator) - 1
+        return self.solved.order
 
-    def response(
-        self, omega: Float[np.ndarray, " frequencies"], inputs: int
-    ) -> Complex[np.ndarray, "frequencies inputs"]:
+    def response(self, omega: Grid, inputs: int) -> Complex[np.ndarray, "frequencies inputs"]:
         """B_i / A."""
         powers = self._powers(omega)
-        above = self._numerators(inputs) @ powers
-        return (above / (self.solved.denominator @ powers)).T
+        numerators = self.solved.linear[: inputs * (self.order + 1)].reshape(inputs, -1)
+        return (numerators @ powers / (self.solved.denominator @ powers)).T
 
     def response_slopes(
-        self, omega: Float[np.ndarray, " frequencies"], inputs: int
+        self, omega: Grid, inputs: int
     ) -> Complex[np.ndarray, "frequencies inputs parameters"]:
         """Derivatives of `response` with respect to the parameters."""
         powers, size = self._powers(omega), self.order + 1
@@ -78,19 +85,13 @@ class GlobalModel(NamedTuple):
     def at_bins(self, bins: Bins, inputs: slice, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """The modelled output at some bins, and its derivatives with respect to the parameters."""
         powers = self._powers(bins.omega[rows])
-        u, own = bins.values[rows, inputs].T, _own(bins.record[rows], bins.records)
         powers /= self.solved.denominator @ powers
-        columns = columns_of(powers, u, own)
+        columns = columns_of(powers, bins.values[rows, inputs].T, _owner(bins, rows))
         output = self.solved.linear @ columns
         turned = -np.delete(powers, self.fixed, axis=0)
         return output, np.concatenate([columns, output * turned]).T
 
-    def _numerators(self, inputs: int) -> Float[np.ndarray, "inputs powers"]:
-        return self.solved.linear[: inputs * (self.order + 1)].reshape(inputs, -1)
-
-    def _powers(
-        self, omega: Float[np.ndarray, " frequencies"]
-    ) -> Complex[np.ndarray, "powers frequencies"]:
+    def _powers(self, omega: Grid) -> Complex[np.ndarray, "powers frequencies"]:
         return powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
 
 
@@ -110,14 +111,12 @@ def global_models(
     reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
     places = _thin(reach, _MOST_BINS)
     scale = float(np.abs(np.exp(-1j * dt * bins.omega[places[-1]]) - 1)) / 2
-    tasks = [
-        _Task(_equations(bins, places, inputs, output, scale, dt), bins.omega[places], most)
-        for output in range(outputs.start, outputs.stop)
-    ]
-    return [
-        None if one is None else GlobalModel(*one[:2], scale, dt, places, *one[2:], reach)
-        for one in map(_identify_kept, tasks)
-    ]
+    models = []
+    for output in range(outputs.start, outputs.stop):
+        equations = _equations(bins, places, inputs, output, scale, dt)
+        settled = _identify_kept(_Task(equations, bins.omega[places], most))
+        models.append(None if settled is None else GlobalModel(*settled, scale, dt, places, reach))
+    return models
 
 
 def weighted_model(
@@ -133,29 +132,27 @@ def weighted_model(
     What the first model leaves can hide response: where it fits the loud bins alone, what it leaves
     of the others counts as their noise, and they never matter.
     """
-    places, scale = model.places, model.scale
-    equations = _equations(bins, places, inputs, output, scale, model.dt)
-    omega, weight = bins.omega[places], 1 / np.sqrt(noise)
+    equations = _equations(bins, model.places, inputs, output, model.scale, model.dt)
+    omega, weight = bins.omega[model.places], 1 / np.sqrt(noise)
     white = equations.weighted(weight).pick(_thin(len(omega), _TRIAL_BINS))
     orders = search_orders(white, most)
     if orders.best == 0:
         return None
     settled = _settle(equations, omega, weight, next_order(white, orders, most))
-    return GlobalModel(*settled[:2], scale, model.dt, places, *settled[2:], model.reach)
+    return GlobalModel(*settled, model.scale, model.dt, model.places, model.reach)
 
 
 def _equations(
-    bins: Bins,
-    places: Int[np.ndarray, " places"],
-    inputs: slice,
-    output: int,
-    scale: float,
-    dt: float,
+    bins: Bins, places: Places, inputs: slice, output: int, scale: float, dt: float
 ) -> Equations:
     lag = np.exp(-1j * dt * bins.omega[places]) - 1
-    own = _own(bins.record[places], bins.records)
     u = np.ascontiguousarray(bins.values[places, inputs].T)
-    return Equations(lag / scale, u, own, bins.values[places, output])
+    return Equations(lag / scale, u, _owner(bins, places), bins.values[places, output])
+
+
+def _owner(bins: Bins, rows: Places | slice) -> Float[np.ndarray, "records bins"]:
+    """1 in the row of each bin's record."""
+    return (bins.record[rows] == np.arange(bins.records)[:, None]).astype(float)
 
 
 def highest_modelled(highest: float) -> float:
@@ -163,7 +160,7 @@ def highest_modelled(highest: float) -> float:
     return _BEYOND * highest
 
 
-def _thin(count: int, most: int) -> Int[np.ndarray, " places"]:
+def _thin(count: int, most: int) -> Places:
     """At most so many of `count` bins, one of each n neighbours.
 
     Not every n-th: of a periodic input's lines it would take all, or none.
@@ -174,16 +171,17 @@ def _thin(count: int, most: int) -> Int[np.ndarray, " places"]:
     return np.minimum(first + shift, count - 1)
 
 
-Identified = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
+# A solution, the fixed power, the drive of errors, what follows noise, and the noise's power.
+Settled = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
 
 
 class _Task:
     """Equations to solve, equal to others of the same content."""
 
-    def __init__(self, equations: Equations, omega: Float[np.ndarray, " bins"], most: int):
+    def __init__(self, equations: Equations, omega: Levels, most: int):
         self.identify = ft.partial(_identify, equations, omega, most)
-        whole = b"".join(each.tobytes() for each in (*equations, omega))
-        self.content = hashlib.blake2b(whole).digest(), equations.own.shape, most
+        data = b"".join(part.tobytes() for part in (*equations, omega))
+        self.content = hashlib.blake2b(data).digest(), equations.owner.shape, most
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Task) and self.content == other.content
@@ -193,7 +191,7 @@ class _Task:
 
 
 @ft.lru_cache(maxsize=2)
-def _identify_kept(task: _Task) -> Identified | None:
+def _identify_kept(task: _Task) -> Settled | None:
     """A fit with another delay of the outputs asks for the model of the inputs once more.
 
     One of 20000 bins takes 20 MB.
@@ -201,19 +199,31 @@ def _identify_kept(task: _Task) -> Identified | None:
     return task.identify()
 
 
-def _identify(
-    equations: Equations, omega: Float[np.ndarray, " bins"], most: int
-) -> Identified | None:
+def _identify(equations: Equations, omega: Levels, most: int) -> Settled | None:
     """A model whose bins count by what a first one leaves."""
     every = _thin(len(omega), _TRIAL_BINS)
-    few = equations.pick(every)
+    few, grid = equations.pick(every), omega[every]
     # Unweighted, it would fit the loud bins alone.
-    rough = rough_noise(few, omega[every])
-    found = search_orders(few.weighted(1 / np.sqrt(rough)), most)
-    if found.best == 0:
+    rough = rough_noise(few, grid)
+    first = search_orders(few.weighted(1 / np.sqrt(rough)), most)
+    if first.best == 0:
         return None
-    first = found._replace(best=_likeliest(few, omega[every], rough, found))
-    noise = _noise_after(equations, omega, first.solved[first.best])
+
+    def value(order: int) -> float:
+        """Price and likelihood of an order's model and smoothed noise together.
+
+        In weights without the peak that gusts make through a light mode, further poles describe it.
+        """
+        left = first.solved[order].left * np.sqrt(rough)
+        noise = noise_left(grid, left, first.solved[order].below, np.ones_like(grid))
+        return PRICE * equations.parameters(order) - 2 * _log_likelihood(left, noise)
+
+    first = first._replace(best=min((order for order in first.solved if order > 0), key=value))
+    solved = first.solved[first.best]
+    basis = make_basis(equations, len(solved.denominator))
+    below = solved.denominator @ basis.powers
+    left = equations.y - solved.linear @ basis.columns / below
+    noise = noise_left(omega, left, below, np.ones_like(omega))
     weight = 1 / np.sqrt(noise)
     if np.max(noise) < _EVEN * np.min(noise):
         weight = np.full_like(noise, np.mean(weight))
@@ -224,43 +234,10 @@ def _identify(
     return _settle(equations, omega, weight, next_order(white, orders, most))
 
 
-def _likeliest(
-    equations: Equations,
-    omega: Float[np.ndarray, " bins"],
-    rough: Float[np.ndarray, " bins"],
-    orders: Orders,
-) -> int:
-    """The order whose model and smoothed noise are likeliest together, at the same price.
-
-    In weights without the peak that gusts make through a light mode, further poles describe it.
-    """
-
-    def value(order: int) -> float:
-        solved, even = orders.solved[order], np.ones_like(omega)
-        left = solved.left * np.sqrt(rough)
-        noise = noise_left(omega, left, solved.below, even)
-        return PRICE * equations.parameters(order) - 2 * log_likelihood(left, noise)
-
-    return min((order for order in orders.solved if order > 0), key=value)
-
-
-def _noise_after(
-    equations: Equations, omega: Float[np.ndarray, " bins"], solved: Solved
-) -> Float[np.ndarray, " bins"]:
-    """The noise, from what a solution leaves of all bins."""
-    basis = make_basis(equations, len(solved.denominator))
-    below = solved.denominator @ basis.powers
-    left = equations.y - solved.linear @ basis.columns / below
-    return noise_left(omega, left, below, np.ones_like(omega))
-
-
 def _settle(
-    equations: Equations,
-    omega: Float[np.ndarray, " bins"],
-    weight: Float[np.ndarray, " bins"],
-    start: Float[np.ndarray, " powers"],
-) -> Identified:
-    """A descent from `start`, the fixed power, drive of errors, what follows noise, its power."""
+    equations: Equations, omega: Levels, weight: Levels, start: Float[np.ndarray, " powers"]
+) -> Settled:
+    """A descent from `start`, and how noise moves its parameters."""
     white = equations.weighted(weight)
     basis = make_basis(white, start.size)
     solved = descend(white, basis, start, _SETTLED)
@@ -276,5 +253,61 @@ def _settle(
     return solved, fixed, drive * weight, follow.T, noise
 
 
-def _own(record: Int[np.ndarray, " bins"], records: int) -> Float[np.ndarray, "records bins"]:
-    return (record == np.arange(records)[:, None]).astype(float)
+def rough_noise(equations: Equations, omega: Levels) -> Levels:
+    """Power of what local rational functions, of one pole in a few bins, leave of the output.
+
+    Without a pole a light mode would leave much, and its bins would hardly count.
+    """
+    factors = np.concatenate([equations.u, equations.owner])
+    count, columns = omega.size, 2 * len(factors) + 1
+    length = min(2 * columns, count)
+    blocks = np.arange(-(-count // length) * length).reshape(-1, length)
+    inside = np.minimum(blocks, count - 1)
+    # What the factors, and all times the bin's place, span in each block.
+    y, driven = equations.y[inside][:, :, None], np.moveaxis(factors[:, inside], 0, 2)
+    place = np.linspace(-1.0, 1.0, length)[:, None]
+    rows = np.concatenate([driven, driven * place, y * place], axis=2)
+    # Where no input moves the bins, their rounding must not count as one.
+    least = np.diag(_LEAST * np.sqrt(np.mean(np.abs(rows) ** 2, axis=(0, 1))))
+    ridge = np.broadcast_to(least, (len(rows), *least.shape))
+    basis = np.linalg.qr(np.concatenate([rows, ridge], axis=1))[0][:, :length]
+    left = y - basis @ (np.conj(np.swapaxes(basis, 1, 2)) @ y)
+    freedom = 1 - np.sum(np.abs(basis) ** 2, axis=2)
+    power = running_power(omega, left.ravel()[:count], freedom.ravel()[:count])
+    return power + _LEAST**2 * np.mean(np.abs(equations.y) ** 2)
+
+
+def noise_left(
+    omega: Levels,
+    left: Complex[np.ndarray, " bins"],
+    below: Complex[np.ndarray, " bins"],
+    freedom: Levels,
+) -> Levels:
+    """Running power of what a model leaves; that before its poles where it is clearly likelier.
+
+    `below` are the values of the model's denominator: gusts pass the poles of the plant, and a
+    light mode makes a peak of them that is narrower than a running power.
+    """
+    after = running_power(omega, left, freedom)
+    before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
+    gain = _log_likelihood(left, before) - _log_likelihood(left, after)
+    return before if 2 * gain > _LIKELIER else after
+
+
+def _log_likelihood(left: Complex[np.ndarray, " bins"], power: Levels) -> float:
+    """Of circular normal noise of this power, but for a constant."""
+    power = np.maximum(power, np.finfo(float).tiny)
+    return -float(np.sum(np.log(power) + np.abs(left) ** 2 / power))
+
+
+def running_power(omega: Levels, values: Complex[np.ndarray, " bins"], freedom: Levels) -> Levels:
+    """Sum of |values|^2 over that of `freedom`, within a fifth of a neper of each bin."""
+    place = np.arange(omega.size)
+    first = np.searchsorted(omega, omega * np.exp(-_BANDWIDTH))
+    last = np.searchsorted(omega, omega * np.exp(_BANDWIDTH), "right")
+    first = np.maximum(np.minimum(first, place - _NEIGHBOURS), 0)
+    last = np.minimum(np.maximum(last, place + _NEIGHBOURS + 1), omega.size)
+    power, count = (
+        np.concatenate([[0.0], np.cumsum(part)]) for part in (np.abs(values) ** 2, freedom)
+    )
+    return (power[last] - power[first]) / np.maximum(count[last] - count[first], 1.0)

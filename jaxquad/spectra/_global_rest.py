@@ -4,21 +4,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 
-from ._global_model import (
-    global_models,
-    GlobalModel,
-    highest_modelled,
-    weighted_model,
-)
+from ._global_model import global_models, GlobalModel, highest_modelled, weighted_model
 from ._local_fit import Bins, left_power, LocalFit, window_slices
-from ._local_noise import Noise, SharedErrors
+from ._local_noise import SharedErrors
+from ._noise import Noise
 
 
 _NEAR, _AROUND = 0.05, 0.7  # a mode's neighbourhood and beyond, in ln(omega)
 _MOST_FOLLOWED = 0.8  # share of the residuals' freedom
-_PIECE = 8192  # bins whose slopes are held at once
+_PIECE = 8192  # bins whose slopes are taken at once
+_END, _FEWEST = 0.05, 20  # share of a record, and samples, that count as its end
+_MOVING, _LARGE = 4.0, 10.0  # ratios of powers to the noise's: of the end, and of what models leave
 
 Grid = Float[np.ndarray, " frequencies"]
 
@@ -31,11 +29,6 @@ class Rest(NamedTuple):
     sources: slice
     moved: slice
 
-    @property
-    def parameters(self) -> int:
-        """Of all models."""
-        return sum(model.drive.shape[0] for model in self.models if model is not None)
-
     def without_followed(
         self, omega: Grid, half_width: Grid, order: int, fit: LocalFit
     ) -> LocalFit:
@@ -45,31 +38,25 @@ class Rest(NamedTuple):
         have followed by itself is counted already.
         """
         scatter, freedom = np.array(fit.scatter), fit.freedom
+        # A long record has many times the bins that the windows reach.
+        reach = int(np.max(window_slices(omega, half_width, self.bins)[1]))
+        sources = Bins(
+            self.bins.omega[:reach], self.bins.record[:reach],
+            self.bins.values[:reach, self.sources], self.bins.records,
+            self.bins.largest[self.sources],
+        )  # fmt: skip
         for c, model in enumerate(self.models):
             if model is None:
                 continue
-            lost = self._followed(model, omega, half_width, order)
+            inside = model.places < reach
+            follow = np.zeros((reach, model.follow.shape[1]), complex)
+            follow[model.places[inside]] = model.follow[inside]
+            lost = 0.5 * left_power(omega, half_width, sources, follow, order)
             share = np.minimum(lost / np.maximum(fit.freedom, 1.0), _MOST_FOLLOWED)
             scatter[:, c] /= np.sqrt(1 - share)[:, None]
             scatter[:, :, c] /= np.sqrt(1 - share)[:, None]
             freedom = np.minimum(freedom, fit.freedom * (1 - share))
         return fit._replace(scatter=scatter, freedom=freedom)
-
-    def _followed(self, model: GlobalModel, omega: Grid, half_width: Grid, order: int) -> Grid:
-        """Complex degrees of freedom of local residuals that the model has taken."""
-        # A long record has many times the bins that the windows reach.
-        reached = slice(0, int(np.max(window_slices(omega, half_width, self.bins)[1])))
-        inside = model.places < reached.stop
-        follow = np.zeros((reached.stop, model.follow.shape[1]), complex)
-        follow[model.places[inside]] = model.follow[inside]
-        sources = Bins(
-            self.bins.omega[reached],
-            self.bins.record[reached],
-            self.bins.values[reached, self.sources],
-            self.bins.records,
-            self.bins.largest[self.sources],
-        )
-        return 0.5 * left_power(omega, half_width, sources, follow, order)
 
     def add_models(self, omega: Grid, fit: LocalFit) -> LocalFit:
         """The fit with the models' responses added back."""
@@ -115,9 +102,9 @@ def response_left(
     running = np.concatenate([np.zeros((1, running.shape[1])), running])
     power = (running[last] - running[first]) / np.maximum(last - first, 1)[:, None]
     noise = np.real(np.diagonal(fit.scatter, axis1=1, axis2=2))
-    known = (fit.freedom > 0)[:, None] & (noise > 0)
-    known = known & np.array([model is not None for model in rest.models])
-    return np.max(np.where(known, power / np.where(known, noise, 1.0), 0.0), axis=0)
+    modelled = (fit.freedom > 0)[:, None] & (noise > 0)
+    modelled = modelled & np.array([model is not None for model in rest.models])
+    return np.max(np.where(modelled, power / np.where(modelled, noise, 1.0), 0.0), axis=0)
 
 
 def weighted_models(
@@ -135,49 +122,6 @@ def weighted_models(
     return models
 
 
-def model_slopes(
-    rest: Rest, bins: Bins, omega: Grid, fit: LocalFit
-) -> Complex[np.ndarray, "frequencies moved inputs parameters"]:
-    """How the models' parameters move the sum of the models and the local fits.
-
-    A local fit follows what a wrong parameter leaves in its window, so that only the difference of
-    the model's own change at the frequency and of the change that the local fit sees remains.
-    `fit` is from the sources to the moved channels.
-    """
-    inputs = fit.response.shape[2]
-    slopes = np.zeros((omega.size, len(rest.models), inputs, rest.parameters), complex)
-    effect = np.nan_to_num(fit.effect)
-    end = 0
-    for c, model in enumerate(rest.models):
-        if model is None:
-            continue
-        own, end = slice(end, end + model.drive.shape[0]), end + model.drive.shape[0]
-        slopes[:, c, :, own] = model.response_slopes(omega, inputs)
-        slopes[:, c, :, own] -= _seen(model, bins, rest.sources, effect, fit.first)
-    return slopes
-
-
-def _seen(
-    model: GlobalModel,
-    bins: Bins,
-    sources: slice,
-    effect: Complex[np.ndarray, "frequencies inputs window"],
-    first: Int[np.ndarray, " frequencies"],
-) -> Complex[np.ndarray, "frequencies inputs parameters"]:
-    """The local fits' response to the model's slopes at the bins."""
-    total = np.zeros((*effect.shape[:2], model.drive.shape[0]), complex)
-    length = effect.shape[2]
-    for start in range(0, model.reach, _PIECE):
-        stop = min(start + _PIECE, model.reach)
-        slopes = model.at_bins(bins, sources, slice(start, stop))[1]
-        for f in np.flatnonzero((first < stop) & (first + length > start)):
-            low, high = max(first[f], start), min(first[f] + length, stop)
-            total[f] += (
-                effect[f, :, low - first[f] : high - first[f]] @ slopes[low - start : high - start]
-            )
-    return total
-
-
 def shared_errors(
     rest: Rest,
     bins: Bins,
@@ -189,21 +133,37 @@ def shared_errors(
 ) -> SharedErrors | None:
     """Errors of the models' parameters in left (models + `fit`) right; `None` without models.
 
-    `noise` is that of the moved channels.
+    `noise` is that of the moved channels, and `fit` is from the sources to these. A local fit
+    follows what a wrong parameter leaves in its window, so that only the difference of the model's
+    own change at the frequency and of the change that the local fit sees remains.
     """
-    used = [model for model in rest.models if model is not None]
+    used = [(c, model) for c, model in enumerate(rest.models) if model is not None]
     if not used:
         return None
-    slopes = model_slopes(rest, bins, omega, fit)
+    counts = [0 if model is None else len(model.drive) for model in rest.models]
+    ends, inputs = np.cumsum([0, *counts]).tolist(), fit.response.shape[2]
+    slopes = np.zeros((omega.size, len(counts), inputs, ends[-1]), complex)
+    effect = np.nan_to_num(fit.effect)
+    first, last = fit.first, fit.first + effect.shape[2]
+    for c, model in used:
+        followed = np.zeros((*effect.shape[:2], counts[c]), complex)
+        for start in range(0, model.reach, _PIECE):
+            stop = min(start + _PIECE, model.reach)
+            at_bins = model.at_bins(bins, rest.sources, slice(start, stop))[1]
+            for f in np.flatnonzero((first < stop) & (last > start)):
+                low, high = max(first[f], start), min(last[f], stop)
+                part = effect[f, :, low - first[f] : high - first[f]]
+                followed[f] += part @ at_bins[low - start : high - start]
+        slopes[:, c, :, ends[c] : ends[c + 1]] = model.response_slopes(omega, inputs) - followed
     slopes = np.einsum("foc,fcsp,fsi->foip", left, slopes, right, optimize=True)
-    places = used[0].places
+    places = used[0][1].places
     roots = noise.root_at(bins.omega[places])
     lines = roots / np.maximum(np.linalg.norm(roots, axis=2, keepdims=True), 1e-300)
     for c, model in enumerate(rest.models):
         lines[:, c] *= 0.0 if model is None else np.sqrt(model.noise)[:, None]
-    counts = [0 if model is None else len(model.drive) for model in rest.models]
-    line, drive = np.repeat(np.arange(len(counts)), counts), [model.drive for model in used]
-    return SharedErrors(slopes, np.concatenate(drive), lines, line, places)
+    line = np.repeat(np.arange(len(counts)), counts)
+    drive = np.concatenate([model.drive for _, model in used])
+    return SharedErrors(slopes, drive, lines, line, places)
 
 
 def highest_looked_at(highest: float, grid: Grid) -> float:
@@ -212,10 +172,6 @@ def highest_looked_at(highest: float, grid: Grid) -> float:
     The models are those of responses up to `highest`.
     """
     return max(highest_modelled(highest), np.exp(_AROUND) * grid[-1])
-
-
-_END, _FEWEST = 0.05, 20  # share of a record, and samples, that count as its end
-_MOVING, _LARGE = 4.0, 10.0  # ratios of powers to the noise's: of the end, and of what models leave
 
 
 def left_moving(
@@ -227,7 +183,8 @@ def left_moving(
     of a mode narrower than their windows. `ends` are those of the records' channels as transformed,
     and `noise` is that of the moved channels on the `grid`.
     """
-    found, bins = np.zeros(grid.size, bool), rest.bins
+    ringing, bins = np.zeros(grid.size, bool), rest.bins
+    place = np.log(bins.omega)
     for c in range(len(rest.models)):
         power = noise._replace(power=noise.power[:, c : c + 1]).power_at(bins.omega)[:, 0]
         # All bins that were left out have the power of the last one.
@@ -235,25 +192,15 @@ def left_moving(
         if not any(np.var(end[:, rest.moved.start + c]) > _MOVING * level for end in ends):
             continue
         values = np.abs(bins.values[:, rest.moved.start + c]) ** 2 / power
-        found |= _peaks(np.log(bins.omega), values, np.log(grid))
-    return found
-
-
-def _peaks(
-    place: Float[np.ndarray, " bins"],
-    values: Float[np.ndarray, " bins"],
-    grid: Grid,
-) -> Bool[np.ndarray, " grid"]:
-    """Where `values` are large, and much larger than they are around."""
-    found = np.zeros(grid.size, bool)
-    for f, centre in enumerate(grid):
-        near, around = (
-            values[np.searchsorted(place, centre - far) : np.searchsorted(place, centre + far)]
-            for far in (_NEAR, _AROUND)
-        )
-        level = float(np.mean(near)) if near.size else 0.0
-        found[f] = level > _LARGE * max(1.0, float(np.median(around)) if around.size else 1.0)
-    return found
+        for f, centre in enumerate(np.log(grid)):
+            near, around = (
+                values[np.searchsorted(place, centre - far) : np.searchsorted(place, centre + far)]
+                for far in (_NEAR, _AROUND)
+            )
+            peak = float(np.mean(near)) if near.size else 0.0
+            usual = max(1.0, float(np.median(around)) if around.size else 1.0)
+            ringing[f] |= peak > _LARGE * usual
+    return ringing
 
 
 def end_of(columns: Float[np.ndarray, "samples channels"]) -> Float[np.ndarray, "last channels"]:

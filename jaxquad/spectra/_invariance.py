@@ -406,9 +406,9 @@ def _change(left: _LeftOver, omega: Grid, method: Method) -> str:
     at = int(np.argmax(change / np.sqrt(doubt)))
     if not change[at] > _SMALLEST:
         return ""
-    loop = "; in a closed loop, name a reference (references=)" if method == "direct" else ""
+    loop = "; in a closed loop, name a reference («references=»)" if method == "direct" else ""
     return (
         f"the response changes during the record: by about {100 * change[at]:.2g} % "
         f"near {in_hertz(omega[[at]])} from its first half to its second, which the error bars "
-        f"do not include. Identify the parts by themselves (start=, stop=){loop}"
+        f"do not include. Identify the parts by themselves («start=», «stop=»){loop}"
     )

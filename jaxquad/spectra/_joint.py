@@ -6,7 +6,8 @@ from jaxtyping import Bool, Complex, Float, Int
 from jaxquad.records import Record
 
 from ._local_fit import LocalFit
-from ._local_noise import Noise, partial_coherence, power_alone, smooth_noise
+from ._local_noise import partial_coherence, power_alone
+from ._noise import Noise, smooth_noise
 
 
 _DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest

@@ -1,4 +1,4 @@
-"""Leakage through windows, apart from noise.
+"""Leakage through windows, told from noise.
 
 Behind a window w, y = g * x has the transform sum_n j^n / n! G^(n) X_n, with X_n that of x behind
 the n-th derivative of w: the part beyond G X_0 is leakage, of the slope and the curvature of G. It
@@ -15,13 +15,14 @@ from jaxtyping import Bool, Complex, Float
 
 
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
-_SEEN = 1e-7  # of a residual: the square is below rounding
+_ROUNDING = 1e-7  # of a residual: the square is below rounding
 _WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well adds nothing
-
+_FEW = 16  # windows taken at once: few others overlap them
 
 Rows = Complex[np.ndarray, "frequencies _ windows"]
 Gram = Complex[np.ndarray, "frequencies columns columns"]
-Sizes = Float[np.ndarray, "frequencies _"]
+Groups = Float[np.ndarray, "frequencies outputs groups"]
+Overlap = Float[np.ndarray, "windows windows"]  # sums of the product of any two windows
 
 
 class Slopes(NamedTuple):
@@ -39,9 +40,38 @@ class Rest(NamedTuple):
     """
 
     products: Complex[np.ndarray, "frequencies outputs outputs groups"]
-    trace: Float[np.ndarray, "frequencies outputs groups"]
-    freedom: Float[np.ndarray, "frequencies outputs groups"]  # complex
+    trace: Groups
+    freedom: Groups  # complex
     fits: "tuple[Fit, ...]"
+
+
+class Fit(NamedTuple):
+    """Least squares of the outputs on inputs and leakage in windows of one length.
+
+    An output's slope counts only for this output: q is what the common columns A leave of it, of
+    unit length. Products with the overlap O of the windows say what noise does.
+    """
+
+    solver: Gram
+    fitted: Complex[np.ndarray, "frequencies columns both"]  # of the outputs, then of their slopes
+    inverse: Float[np.ndarray, "frequencies slopes"]  # of the length of q before
+    along: Complex[np.ndarray, "frequencies slopes"]  # coefficients of q
+    aa: Gram  # A^H O A
+    aq: Complex[np.ndarray, "frequencies columns slopes"]  # A^H O q
+    qq: Float[np.ndarray, "frequencies slopes"]  # q^H O q
+
+    def bias(self, outputs: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
+        """What leakage adds to the response, and its mean square under unit noise."""
+        # The response took too much of the inputs: the first coefficients of what is left, less
+        # `through` times those to its own column.
+        taken, through = np.split(np.swapaxes(self.fitted[:, :inputs], 1, 2), [outputs], axis=1)
+        through, to_x = through * self.inverse[:, :, None], self.solver[:, :inputs]
+        plain = np.real(np.sum((to_x @ self.aa) * np.conj(to_x), axis=2))[:, None]
+        if not through.shape[1]:
+            return -taken, np.repeat(np.maximum(plain, 0.0), outputs, axis=1)
+        mixed = 2 * np.real(np.conj(through) * np.swapaxes(to_x @ self.aq, 1, 2))
+        square = plain - mixed + power_of(through) * self.qq[:, :, None]
+        return through * self.along[:, :, None] - taken, np.maximum(square, 0.0)
 
 
 def shows_leakage(windows: int, inputs: int) -> bool:
@@ -58,7 +88,7 @@ def without_leakage(
     ],
     response: Complex[np.ndarray, "frequencies outputs inputs"],
     slopes: Sequence[Slopes],
-    overlap: Float[np.ndarray, "windows windows"],
+    overlap: Overlap,
     resolved: Bool[np.ndarray, "groups frequencies"],
 ) -> Rest:
     """Outputs less all that inputs and leakage explain, one window length after the other.
@@ -67,192 +97,107 @@ def without_leakage(
     `resolved`: from a frequency on, and the first everywhere. A length with too few windows for its
     leakage keeps it, as noise; its slopes do not matter.
     """
-    found, first = [], 0
-    for given, derived, known in zip(windows, slopes, resolved, strict=True):
+    parts, first = [], 0
+    for pair, derivatives, where in zip(windows, slopes, resolved, strict=True):
         # What a window does not resolve lies below what it does, and has no weight.
-        few = slice(int(np.argmax(known)), None)
-        x, y, once, twice = (np.swapaxes(each[few], 1, 2) for each in (*given, *derived))
+        few = slice(int(np.argmax(where)), None)
+        x, y, x1, x2 = (np.swapaxes(part[few], 1, 2) for part in (*pair, *derivatives))
         inputs, count = x.shape[1:]
         columns, both = x, y - response[few] @ x
         if shows_leakage(count, inputs):
-            columns = np.concatenate([x, once[:, :inputs], twice], axis=1)
-            both = np.concatenate([both, once[:, inputs:]], axis=1)
+            columns = np.concatenate([x, x1[:, :inputs], x2], axis=1)
+            both = np.concatenate([both, x1[:, inputs:]], axis=1)
         mine = slice(first, first + count)
         columns = np.ascontiguousarray(columns)
-        found.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
+        parts.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
         first += count
-    *parts, fits = zip(*found, strict=True)
-    products, trace, freedom = (_padded(each, len(response)) for each in parts)
+    *sums, fits = zip(*parts, strict=True)
+    products, trace, freedom = (_padded(part, len(response)) for part in sums)
     return Rest(products, np.where(trace > 0, trace, 1.0), np.maximum(freedom, 0.5), fits)
+
+
+def find_bias(fits: Sequence[Fit], outputs: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
+    """What leakage adds to the response of each length, and its mean square under unit noise.
+
+    Both by frequency, output, input and length.
+    """
+    parts = [fit.bias(outputs, inputs) for fit in fits]
+    frequencies = max(len(fit.solver) for fit in fits)
+    bias, square = (_padded(part, frequencies) for part in zip(*parts, strict=True))
+    return bias, square
 
 
 def _padded(parts: Sequence[np.ndarray], frequencies: int) -> np.ndarray:
     """Side by side, with zeros at the lowest frequencies that some lack."""
-    whole = np.zeros((frequencies, *parts[0].shape[1:], len(parts)), parts[0].dtype)
+    joined = np.zeros((frequencies, *parts[0].shape[1:], len(parts)), parts[0].dtype)
     for k, part in enumerate(parts):
-        whole[frequencies - len(part) :, ..., k] = part
-    return whole
+        joined[frequencies - len(part) :, ..., k] = part
+    return joined
 
 
 def _least_squares(
     both: Rows,
     columns: Complex[np.ndarray, "frequencies columns windows"],
     outputs: int,
-    overlap: Float[np.ndarray, "windows windows"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, "Fit"]:
-    """`Rest` of one length: each output on the columns, and on its own one behind it in `both`.
+    overlap: Overlap,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Fit]:
+    """`Rest` of one length: each output on the columns, and on its own slope, behind it in `both`.
 
     With P = P0 - q q^H the projection, P0 that of the common columns A, and O the overlap: the
     trace of P O, the degrees of freedom tr(P O)^2 / tr(P O P O).
     """
-    count, near, adjoint = columns.shape[1], _near(overlap), np.conj(columns)
-    weighed = _weigh(near, columns)
+    count, adjoint = columns.shape[1], np.conj(columns)
+    weighed = _times_overlap(columns, overlap)
     # One product of all: many small ones take as long to begin as to make.
     stacked = adjoint @ np.swapaxes(np.concatenate([columns, weighed, both], axis=1), 1, 2)
-    gram, solver = stacked[:, :, :count], _solver(stacked[:, :, :count])
+    gram, aa = stacked[:, :, :count], stacked[:, :, count : 2 * count]
+    power = np.real(np.diagonal(gram, axis1=1, axis2=2))
+    units = 1 / np.maximum(np.sqrt(power), 1e-100)
+    units = units[:, :, None] * units[:, None, :]
+    solver = np.linalg.inv(gram * units + _RIDGE * np.eye(count)) * units
     fitted = solver @ stacked[:, :, 2 * count :]
     rest = both - np.swapaxes(fitted, 1, 2) @ columns
-    whole, left = _size(both), _size(rest)
-    if _shows_rounding(gram, solver, whole, left):
+    size, left = (np.sqrt(_inner(part, part)) for part in (both, rest))
+    # Nearly dependent columns leave a part of themselves: orthogonal to all else, so its square
+    # counts.
+    least = np.real(np.diagonal(solver, axis1=1, axis2=2)) * power
+    if np.any(2e-16 * np.max(least, axis=1, keepdims=True) * size > _ROUNDING * left):
         rest -= np.swapaxes(solver @ (adjoint @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
-        left = _size(rest)
+        left = np.sqrt(_inner(rest, rest))
     rest, q, length = rest[:, :outputs], rest[:, outputs:], left[:, outputs:]
-    inverse = np.where(length > _WITHIN * whole[:, outputs:], 1 / np.maximum(length, 1e-300), 0.0)
+    inverse = np.where(length > _WITHIN * size[:, outputs:], 1 / np.maximum(length, 1e-300), 0.0)
     q = q * inverse[:, :, None]
     along = np.vecdot(q, rest[:, : q.shape[1]])
     if q.shape[1]:
         rest = rest - q * along[:, :, None]
-    seen = _Seen.of(stacked[:, :, count : 2 * count], weighed, q, near)
-    trace, freedom = _noise_left(solver, seen, overlap)
+    weighed_q = _times_overlap(q, overlap)
+    products = np.conj(weighed) @ np.swapaxes(np.concatenate([weighed, q], axis=1), 1, 2)
+    aa_twice, aq = products[:, :, :count], products[:, :, count:]
+    qq, qq_twice = _inner(q, weighed_q), _inner(weighed_q, weighed_q)
+    through = solver @ aa
+    trace = (np.trace(overlap) - _trace(solver, aa))[:, None]
+    square = np.sum(overlap**2) - 2 * _trace(solver, aa_twice)
+    square = (square + _trace(through, np.conj(np.swapaxes(through, 1, 2))))[:, None]
+    if q.shape[1]:
+        crossed = qq_twice - np.sum(np.conj(aq) * (solver @ aq), axis=1).real
+        trace, square = trace - qq, square - 2 * crossed + qq**2
+    freedom = np.maximum(trace**2 / square, 0.5)
     if not q.shape[1]:
-        trace, freedom = (np.repeat(each, outputs, axis=1) for each in (trace, freedom))
+        trace, freedom = (np.repeat(part, outputs, axis=1) for part in (trace, freedom))
     products = np.conj(rest) @ np.swapaxes(rest, 1, 2)
-    return products, trace, freedom, Fit(solver, fitted, inverse, along, seen)
+    return products, trace, freedom, Fit(solver, fitted, inverse, along, aa, aq, qq)
 
 
-def _solver(gram: Gram) -> Gram:
-    """The inverse of `gram`, with a ridge relative to the size of the columns."""
-    power = np.real(np.diagonal(gram, axis1=1, axis2=2))
-    inverse = 1 / np.maximum(np.sqrt(power), 1e-100)
-    units = inverse[:, :, None] * inverse[:, None, :]
-    return np.linalg.inv(gram * units + _RIDGE * np.eye(gram.shape[1])) * units
-
-
-def _shows_rounding(gram: Gram, solver: Gram, whole: Sizes, left: Sizes) -> bool:
-    """Whether nearly dependent columns leave a part of themselves in what is left.
-
-    It is orthogonal to all else, so its square counts.
-    """
-    least = np.real(np.diagonal(solver, axis1=1, axis2=2) * np.diagonal(gram, axis1=1, axis2=2))
-    part = 2e-16 * np.max(least, axis=1, keepdims=True) * whole
-    return bool(np.any(part > _SEEN * left))
-
-
-class _Seen(NamedTuple):
-    """Products with the overlap O of the windows between the columns A and the rests q."""
-
-    aa: Gram  # A^H O A
-    aa_twice: Gram  # A^H O O A
-    aq: Complex[np.ndarray, "frequencies columns own"]  # A^H O q
-    qq: Float[np.ndarray, "frequencies own"]  # q^H O q, of each output
-    qq_twice: Float[np.ndarray, "frequencies own"]  # q^H O O q
-
-    @classmethod
-    def of(
-        cls,
-        aa: Gram,
-        weighed: Complex[np.ndarray, "frequencies columns windows"],  # O A
-        q: Complex[np.ndarray, "frequencies own windows"],
-        near: "Sequence[_Near]",
-    ) -> "_Seen":
-        rest, count = _weigh(near, q), weighed.shape[1]
-        found = np.conj(weighed) @ np.swapaxes(np.concatenate([weighed, q], axis=1), 1, 2)
-        return cls(
-            aa, found[:, :, :count], found[:, :, count:], _inner(q, rest), _inner(rest, rest)
-        )
-
-
-_FEW = 16  # windows taken at once: few others overlap them
-
-
-class _Near(NamedTuple):
-    """The overlap of a few windows with those that overlap them."""
-
-    few: slice
-    others: slice
-    overlap: Complex[np.ndarray, "others few"]
-
-
-def _near(overlap: Float[np.ndarray, "windows windows"]) -> list[_Near]:
-    found = []
+def _times_overlap(rows: Rows, overlap: Overlap) -> Rows:
+    """Rows times the overlap of the windows, a few windows with those that overlap them."""
+    flat = rows.reshape(-1, rows.shape[2])
+    weighed = np.empty_like(flat)
     for first in range(0, len(overlap), _FEW):
         few = slice(first, first + _FEW)
         places = np.flatnonzero(np.any(overlap[few], axis=0))
         others = slice(places[0], places[-1] + 1)
-        found.append(_Near(few, others, overlap[others, few].astype(complex)))
-    return found
-
-
-def _weigh(near: Sequence[_Near], rows: Rows) -> Rows:
-    """Rows times the overlap of the windows."""
-    flat = rows.reshape(-1, rows.shape[2])
-    weighed = np.empty_like(flat)
-    for few, others, overlap in near:
-        weighed[:, few] = flat[:, others] @ overlap
+        weighed[:, few] = flat[:, others] @ overlap[others, few].astype(complex)
     return weighed.reshape(rows.shape)
-
-
-def _noise_left(
-    solver: Gram, seen: _Seen, overlap: Float[np.ndarray, "windows windows"]
-) -> tuple[Float[np.ndarray, "frequencies _"], Float[np.ndarray, "frequencies _"]]:
-    """Trace and degrees of freedom of unit noise behind the projection."""
-    once = solver @ seen.aa
-    left = (np.trace(overlap) - _trace(solver, seen.aa))[:, None]
-    across = np.conj(np.swapaxes(once, 1, 2))
-    square = np.sum(overlap**2) - 2 * _trace(solver, seen.aa_twice) + _trace(once, across)
-    square = square[:, None]
-    if seen.qq.shape[1]:
-        crossed = seen.qq_twice - np.sum(np.conj(seen.aq) * (solver @ seen.aq), axis=1).real
-        left = left - seen.qq
-        square = square - 2 * crossed + seen.qq**2
-    return left, np.maximum(left**2 / square, 0.5)
-
-
-class Fit(NamedTuple):
-    """Least squares of the outputs on inputs and leakage in windows of one length."""
-
-    solver: Gram
-    fitted: Complex[np.ndarray, "frequencies columns both"]  # of the outputs, then of their slopes
-    inverse: Float[np.ndarray, "frequencies own"]  # of the size of q
-    along: Complex[np.ndarray, "frequencies own"]  # coefficients of q
-    seen: _Seen
-
-
-Biases = Complex[np.ndarray, "frequencies outputs inputs groups"]
-
-
-def find_bias(
-    fits: Sequence[Fit], outputs: int, inputs: int
-) -> tuple[Biases, Float[np.ndarray, "frequencies outputs inputs groups"]]:
-    """What leakage adds to the response of each length, and its mean square under unit noise."""
-    found = [_bias(fit, outputs, inputs) for fit in fits]
-    frequencies = max(len(fit.solver) for fit in fits)
-    bias, doubt = (_padded(each, frequencies) for each in zip(*found, strict=True))
-    return bias, doubt
-
-
-def _bias(fit: Fit, outputs: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
-    # The response took too much of the inputs: the first coefficients of what is left, less
-    # `through` times those to its own column.
-    taken, through = np.split(np.swapaxes(fit.fitted[:, :inputs], 1, 2), [outputs], axis=1)
-    through, to_x, seen = through * fit.inverse[:, :, None], fit.solver[:, :inputs], fit.seen
-    plain = np.real(np.sum((to_x @ seen.aa) * np.conj(to_x), axis=2))[:, None]
-    if not through.shape[1]:
-        return -taken, np.repeat(np.maximum(plain, 0.0), outputs, axis=1)
-    crossed = np.swapaxes(to_x @ seen.aq, 1, 2)
-    mixed = 2 * np.real(np.conj(through) * crossed)
-    own = power_of(through) * seen.qq[:, :, None]
-    return through * fit.along[:, :, None] - taken, np.maximum(plain - mixed + own, 0.0)
 
 
 def cross_products(
@@ -274,13 +219,7 @@ def _inner(
     return np.vecdot(a.view(float), b.view(float))
 
 
-def _size(rows: Rows) -> Sizes:
-    return np.sqrt(_inner(rows, rows))
-
-
-def _trace(
-    a: Complex[np.ndarray, "frequencies n n"], b: Complex[np.ndarray, "frequencies n n"]
-) -> Float[np.ndarray, " frequencies"]:
+def _trace(a: Gram, b: Gram) -> Float[np.ndarray, " frequencies"]:
     """The real part of the trace of the product of `a` with the adjoint of `b`."""
-    a, b = (np.ascontiguousarray(each).reshape(len(each), -1) for each in (a, b))
+    a, b = (np.ascontiguousarray(part).reshape(len(part), -1) for part in (a, b))
     return _inner(a, b)

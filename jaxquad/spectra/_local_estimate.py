@@ -26,7 +26,6 @@ from ._local_fit import (
     LocalFit,
     recolour,
     record_bins,
-    replace_rows,
     transformed_columns,
     window_slices,
 )
@@ -34,14 +33,11 @@ from ._local_noise import (
     error_covariance,
     multiple_coherence,
     partial_coherence,
-    smooth_noise,
-    undetermined,
     unresolved,
 )
-from ._local_width import choose_widths, reach, Respond
-from ._local_windows import Grid, make_windows
-from ._narrow_fit import fit_narrow, Method, Narrow, rows_of, Setup
-from ._noise_freedom import covariance_of_bands, smoothed
+from ._local_windows import choose_widths, Grid, make_windows, reach, Respond
+from ._narrow_fit import fit_narrow, Method, Narrow, Setup
+from ._noise import covariance_of_bands, smooth_noise, smoothed
 from ._remarks import Remark
 
 
@@ -78,7 +74,11 @@ def estimate_local_polynomial(
     width, rational = _choose(setup, narrow, options.width)
     moved = _fit_chosen(omega, width, rational, setup.to_moved(narrow.rest))
     doubts = _doubt(setup, narrow, moved, options.width)
-    moved = replace_rows(moved, doubts.lost, undetermined(rows_of(moved, doubts.lost)))
+    lost = moved.rows(doubts.lost)
+    blank = {
+        name: getattr(lost, name) * np.nan for name in ("response", "effect", "gain", "scatter")
+    }
+    moved = moved.replace_rows(doubts.lost, lost._replace(**blank, freedom=0 * lost.freedom))
     plant = setup.plant(moved)
     back = recolour(omega, options.integrators, options.delay, dt)[:, None, None]
     coherence, direct, multiple = _coherence(setup, narrow)
@@ -137,7 +137,7 @@ def _fit_chosen(
     fit = respond(omega, width, "polynomial")
     if not np.any(rational):
         return fit
-    return replace_rows(fit, rational, respond(omega[rational], width[rational], "rational"))
+    return fit.replace_rows(rational, respond(omega[rational], width[rational], "rational"))
 
 
 class _Doubts(NamedTuple):
@@ -153,7 +153,7 @@ class _Doubts(NamedTuple):
 
 
 def _doubt(setup: Setup, narrow: Narrow, moved: LocalFit, given: float | None) -> _Doubts:
-    omega, at = setup.windows.asked, setup.windows.at
+    omega, at = setup.windows.omega, setup.windows.at
     noise, rest = narrow.sources, narrow.rest
     far = unresolved(omega, moved, noise, at, setup.bins, rest.moved) & (given is None)
     if setup.method == "direct":
@@ -202,7 +202,7 @@ def _errors(
     plant: LocalFit,
     back: Complex[np.ndarray, "frequencies 1 1"],
 ) -> ErrorCovariance:
-    omega, at, sources = setup.windows.asked, setup.windows.at, narrow.sources
+    omega, at, sources = setup.windows.omega, setup.windows.at, narrow.sources
     left, right = setup.factors(moved)
     models = shared_errors(narrow.rest, setup.bins, omega, moved, sources, left, right)
     return error_covariance(omega, plant, narrow.noise, at, setup.bins, back, sources, left, models)
@@ -235,7 +235,7 @@ def _remark_on_lost(omega: Grid, setup: Setup, given: float | None) -> tuple[Rem
     )
     if given is not None:
         enough = np.max(setup.windows.least[np.searchsorted(setup.windows.grid, omega)])
-        remark += f"; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins"
+        remark += f"«wider|; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins»"
     return (Remark(remark, omega),)
 
 
@@ -271,7 +271,7 @@ def _remark_on_ringing(omega: Grid) -> tuple[Remark, ...]:
     text = (
         "the output still moves when the record ends, and a global model leaves more than ten "
         "times the noise {where}: a mode that rings there, or a line (a tone, as of a rotor or the "
-        "mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider, or "
-        "raise global_order; leave the frequencies of a line out"
+        "mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider"
+        "«, or raise global_order»; leave the frequencies of a line out"
     )
     return (Remark(text, omega),)

@@ -1,12 +1,14 @@
 """The frequencies at which local fits are made, and how wide their windows may be."""
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ._estimators import LocalPolynomial
-from ._local_fit import Bins, check_bins, smallest_widths
+from ._local_fit import Bins, check_bins, LocalFit, smallest_widths, window_slices
+from ._noise import Noise
 
 
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
@@ -15,22 +17,34 @@ WIDENED, WIDENINGS = 1.5, 6  # ratio and number of the steps from a window that 
 _WIDEST, _LEAST_SPAN = 1.2, 3.0  # widest: relative to the frequency, or to the least window
 _MOST = 4096  # Fourier bins of a window, unless more lie around a frequency of the grid
 _PER_OCTAVE = 4  # further frequencies, which help to choose the widths
+_RATIO = 1.8  # of successive half-widths
+_SMOOTHING = 0.2  # of the tests for bias, in ln(omega)
+_CHANCE = 3e-4  # of refusing a window whose differences, averaged over neighbours, are noise
+_CHANCE_ALONE = 1e-5  # of refusing it for the difference at one frequency
+_NOISIER = 4.0  # ratio of variances from which a narrower window counts for less
+_QUIETER = 0.7  # ratio of variances from which a narrower window is preferred
+_ACCURATE = 0.1  # largest relative error of a rational function that is used
+_DOMINATED = 30.0  # ratio of input powers from which a window's side outweighs its centre
+_STEP = 1.3  # of the half-widths that are tried
 
 Grid = Float[np.ndarray, " frequencies"]
+Where = Bool[np.ndarray, " frequencies"]
+Shape = Literal["polynomial", "rational"]
+Respond = Callable[[Grid, Grid, Shape], LocalFit]
 
 
 class Windows(NamedTuple):
     """Frequencies and half-widths in rad/s; those beyond the band help to choose the widths."""
 
-    grid: Grid  # frequencies asked for, and others to an octave beyond them
-    at: Int[np.ndarray, " asked"]  # places in the grid of those asked for
+    grid: Grid  # frequencies of the response, and others to an octave beyond them
+    at: Int[np.ndarray, " response"]  # places in the grid of those of the response
     least: Grid  # half-widths that hold enough bins
     narrow: Grid  # at which noise and powers are estimated
     most: Grid  # beyond which a window only costs memory and time
 
     @property
-    def asked(self) -> Float[np.ndarray, " asked"]:
-        """The frequencies asked for."""
+    def omega(self) -> Float[np.ndarray, " response"]:
+        """The frequencies of the response."""
         return self.grid[self.at]
 
     @property
@@ -44,33 +58,149 @@ class Windows(NamedTuple):
         return float(np.max(self.grid + np.maximum(widest, width or 0.0)))
 
 
-def make_windows(omega: Grid, bins: Bins, options: LocalPolynomial, inputs: int) -> Windows:
+def make_windows(
+    omega: Float[np.ndarray, " response"], bins: Bins, options: LocalPolynomial, inputs: int
+) -> Windows:
     """Around increasing `omega`. Raises `ValueError` where the bins are too few."""
     coefficients, transients = inputs * (options.order + 1), options.order + 1
     check_bins(omega, bins, coefficients, transients, _FREEDOM)
-    grid, at = _with_neighbours(omega, bins)
-    least = smallest_widths(grid, bins, coefficients, transients, _FREEDOM)
-    most = np.maximum(least, _most(grid, bins))
-    return Windows(grid, at, least, np.clip(_NARROW * grid, least, most), most)
-
-
-def _with_neighbours(
-    omega: Grid, bins: Bins
-) -> tuple[Float[np.ndarray, " grid"], Int[np.ndarray, " frequencies"]]:
-    """A grid of `omega` and others to an octave beyond, and the places of `omega` in it."""
     first, last = max(omega[0] / 2, bins.omega[0]), min(omega[-1] * 2, bins.omega[-1])
     steps = _PER_OCTAVE * np.log2([first, last])
-    lattice = 2 ** (np.arange(np.ceil(steps[0]), np.floor(steps[1]) + 1) / _PER_OCTAVE)
-    grid = np.union1d(omega, lattice)
-    return grid, np.searchsorted(grid, omega)
-
-
-def _most(grid: Grid, bins: Bins) -> Grid:
-    """Half-widths beyond which a window of a long record only costs memory and time.
-
-    Windows that reach half of the way to the next frequency leave nothing of the record out.
-    """
+    octaves = np.arange(np.ceil(steps[0]), np.floor(steps[1]) + 1) / _PER_OCTAVE
+    grid = np.union1d(omega, 2**octaves)
+    least = smallest_widths(grid, bins, coefficients, transients, _FREEDOM)
+    # Windows that reach half of the way to the next frequency leave nothing of a record out.
     density = bins.omega.size / (bins.omega[-1] - bins.omega[0])
-    steps = np.diff(grid)
-    spacing = np.maximum(np.append(steps, steps[-1:]), np.insert(steps, 0, steps[:1]))
-    return np.maximum(spacing, _MOST / density) / 2
+    gaps = np.diff(grid)
+    spacing = np.maximum(np.append(gaps, gaps[-1:]), np.insert(gaps, 0, gaps[:1]))
+    most = np.maximum(least, np.maximum(spacing, _MOST / density) / 2)
+    narrow = np.clip(_NARROW * grid, least, most)
+    return Windows(grid, np.searchsorted(grid, omega), least, narrow, most)
+
+
+def choose_widths(
+    omega: Grid, least: Grid, reach: Grid, noise: Noise, respond: Respond
+) -> tuple[Grid, Where]:
+    """Half-widths from `least` to `reach`, by intersecting confidence intervals.
+
+    Also returns where a rational function is used.
+    A wider window is used while its response agrees with those of all narrower ones within the
+    variance of their difference (Goldenshluger and Nemirovski, 1997), at the frequency and on
+    average over its neighbours. This test cannot see a bias of the size of the noise, so the window
+    used is one step smaller, where the bias is about five times smaller. Where the smallest window
+    leaves more than noise, as at a resonance, a rational function replaces the polynomial, if it is
+    accurate there.
+    """
+    widest = np.maximum(reach, least)
+    steps = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
+    widths = np.stack([np.minimum(least * _RATIO**m, widest) for m in range(steps)])
+    fits = [_without_effect(respond(omega, widths[0], "polynomial"))]
+    for below, width in zip(widths[:-1], widths[1:], strict=True):
+        wider = width > below
+        part = _without_effect(respond(omega[wider], width[wider], "polynomial"))
+        fits.append(fits[-1].replace_rows(wider, part))
+    rational = _resonant(fits, respond(omega, least, "rational"), noise)
+    step, place = _widest_unbiased(omega, widths, fits, noise), np.arange(omega.size)
+    gain = np.stack([np.mean(fit.gain, axis=(1, 2)) for fit in fits])
+    gain = np.where(np.isfinite(gain), gain, np.inf)
+    # At the lowest frequencies one step less can cost more than any bias.
+    below = gain[np.maximum(step - 1, 0), place]
+    costly = ~(below <= _NOISIER * gain[step, place])
+    climbed = np.maximum(widths[step, place] / np.where(costly, 1.0, _RATIO), least)
+    # In noise that rises steeply to one side, wider is not always better.
+    kept = np.where((widths < climbed) & (gain < _QUIETER * below), gain, np.inf)
+    quiet = np.min(kept, axis=0) < np.inf
+    climbed = np.where(quiet, widths[np.argmin(kept, axis=0), place], climbed)
+    return np.where(rational, least, climbed), rational
+
+
+def _without_effect(fit: LocalFit) -> LocalFit:
+    """The fit without its largest array: the tests look at all widths at once."""
+    return fit._replace(effect=fit.effect[:, :, :0])
+
+
+def _resonant(fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise) -> Where:
+    """Where a polynomial is wrong and a rational function accurate.
+
+    The error of a rational function is linear in the noise only while it is small.
+    """
+    pairs = noise.power.shape[1] * sharp.response.shape[2]
+    left = np.real(np.diagonal(fits[0].scatter, axis1=1, axis2=2)) / noise.power
+    wrong = np.any(left > _quantile(fits[0].freedom, noise, _CHANCE_ALONE)[:, None], axis=1)
+    for wide in fits[1:2]:
+        statistic, count = _differences(wide, fits[0], noise)
+        alone = _quantile(np.full(len(left), float(pairs)), noise, _CHANCE_ALONE)
+        wrong |= statistic > alone * np.maximum(count, 1)
+    error = noise.power[:, :, None] * sharp.gain
+    return wrong & np.all(error < _ACCURATE**2 * np.abs(sharp.response) ** 2, axis=(1, 2))
+
+
+def _widest_unbiased(
+    omega: Grid,
+    widths: Float[np.ndarray, "steps frequencies"],
+    fits: Sequence[LocalFit],
+    noise: Noise,
+) -> Int[np.ndarray, " frequencies"]:
+    step, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
+    kernel = np.exp(-0.5 * ((np.log(omega)[:, None] - np.log(omega)) / _SMOOTHING) ** 2)
+    pairs = noise.power.shape[1] * fits[0].response.shape[2]
+    alone = _quantile(np.full(omega.size, float(pairs)), noise, _CHANCE_ALONE)
+    for m in range(1, len(fits)):
+        windows = 1 + np.sqrt(np.pi) * _SMOOTHING * omega / widths[m]
+        shared = _quantile(pairs * windows, noise, _CHANCE)
+        for narrow in fits[:m]:
+            statistic, count = _differences(fits[m], narrow, noise)
+            # One frequency far off, as beside a resonance, says nothing about its neighbours.
+            total = kernel @ np.minimum(statistic, alone * count)
+            going &= total <= shared * (kernel @ count)
+            going &= statistic <= alone * pairs
+        step = np.where(going, m, step)
+    return step
+
+
+def _quantile(count: Grid, noise: Noise, chance: float) -> Grid:
+    """Quantile of the mean of `count` squared differences over their estimated variance."""
+    from scipy.special import fdtri
+
+    return fdtri(2 * count, 2 * np.maximum(noise.freedom, 1.0), 1 - chance)
+
+
+def _differences(wide: LocalFit, narrow: LocalFit, noise: Noise) -> tuple[Grid, Grid]:
+    """Sums over the pairs of squared differences over their variance, and how many pairs count."""
+    power = noise.power
+    # A narrow window much noisier than the wide one says little about its bias.
+    doubt = np.maximum(1.0, narrow.gain / (_NOISIER * np.maximum(wide.gain, 1e-300)))
+    variance = power[:, :, None] * (narrow.gain - wide.gain) * doubt
+    tested = variance > 0.02 * power[:, :, None] * wide.gain
+    tested &= np.isfinite(wide.response) & np.isfinite(narrow.response)
+    difference = np.abs(wide.response - narrow.response) ** 2
+    statistic = np.where(tested, difference / np.where(tested, variance, 1.0), 0.0)
+    return np.sum(statistic, axis=(1, 2)), np.sum(tested, axis=(1, 2)).astype(float)
+
+
+def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -> Grid:
+    """Half-widths in rad/s within which the excitation is even, `widest` at most.
+
+    Beyond the end of a sweep, a window that reaches back into the sweep's band takes the response
+    from there: smooth, with a small error, and wrong. So the mean power of each of the `columns` on
+    one side of `centre` (half-width) must not outweigh that at the centre, unless both sides do, as
+    between the lines of a multisine, where the response is interpolated.
+    """
+    running = np.cumsum(np.abs(bins.values[:, columns]) ** 2, axis=0)
+    running = np.concatenate([np.zeros((1, running.shape[1])), running])
+
+    def mean(first: np.ndarray, last: np.ndarray) -> Float[np.ndarray, "frequencies columns"]:
+        """Power per bin from `first` to before `last`; 0 where there is none."""
+        return (running[last] - running[first]) / np.maximum(last - first, 1)[:, None]
+
+    inner = window_slices(omega, centre, bins)
+    middle = mean(*inner)
+    far, going = np.minimum(centre, widest), np.ones(omega.size, bool)
+    while np.any(going):
+        wider = np.minimum(_STEP * far, widest)
+        first, last = window_slices(omega, wider, bins)
+        low, high = mean(first, inner[0]), mean(inner[1], last)
+        even = np.maximum(middle, np.minimum(low, high))
+        going &= np.all(np.maximum(low, high) <= _DOMINATED * even, axis=1)
+        far, going = np.where(going, wider, far), going & (wider < widest)
+    return far

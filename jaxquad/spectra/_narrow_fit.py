@@ -3,14 +3,14 @@
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 
 from ._global_rest import response_left, Rest, subtract_models, take_off, weighted_models
 from ._joint import joint_factors, joint_fit
-from ._local_fit import Bins, local_fit, LocalFit, replace_rows
-from ._local_noise import coloured_gain, Noise, smooth_noise
-from ._local_width import Respond, Shape
-from ._local_windows import WIDENED, WIDENINGS, Windows
+from ._local_fit import Bins, local_fit, LocalFit
+from ._local_noise import coloured_gain
+from ._local_windows import Respond, Shape, WIDENED, WIDENINGS, Windows
+from ._noise import Noise, smooth_noise
 
 
 _SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
@@ -152,12 +152,7 @@ def _smaller_residual(polynomial: LocalFit, rational: LocalFit) -> LocalFit:
         sharper = np.any(left[1] < _SHARPER * left[0], axis=1)
     if not np.any(sharper):
         return polynomial
-    return replace_rows(polynomial, sharper, rows_of(rational, sharper))
-
-
-def rows_of(fit: LocalFit, rows: Bool[np.ndarray, " frequencies"]) -> LocalFit:
-    """The fit at some of its frequencies."""
-    return LocalFit(*(field[rows] for field in fit))
+    return polynomial.replace_rows(sharper, rational.rows(sharper))
 
 
 def _widened(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
@@ -168,5 +163,5 @@ def _widened(grid: Grid, width: Grid, respond: Respond) -> LocalFit:
         if not np.any(lost):
             break
         width = np.where(lost, WIDENED * width, width)
-        fit = replace_rows(fit, lost, respond(grid[lost], width[lost], "polynomial"))
+        fit = fit.replace_rows(lost, respond(grid[lost], width[lost], "polynomial"))
     return fit

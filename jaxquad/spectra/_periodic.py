@@ -7,13 +7,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from jaxquad._core import Message
 from jaxquad.records import Record
 
 from ._error_covariance import ErrorCovariance
 from ._estimators import Periodic
 from ._frequency_response import Distortion
-from ._local_noise import smooth_noise
-from ._noise_freedom import smoothed
+from ._noise import smooth_noise, smoothed
 from ._remarks import Remark
 
 
@@ -275,8 +275,11 @@ def _check(
         )
     if len(records) < inputs:
         raise ValueError(
-            f"{inputs} simultaneous inputs need at least as many records with different phases; "
-            f"there are {len(records)}. Record more, or use jq.spectra.LocalPolynomial()"
+            Message(
+                f"{inputs} simultaneous inputs need at least as many records with different "
+                f"phases; there are {len(records)}. Record more, or use "
+                "«jq.spectra.LocalPolynomial()»"
+            )
         )
     count = records[0].references.shape[1]
     if method == "joint" and count != inputs:

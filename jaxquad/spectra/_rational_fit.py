@@ -1,9 +1,10 @@
-"""Ratios of polynomials fitted to bins by least squares: their linear parts, and descents.
+"""Ratios of polynomials fitted to bins by least squares: linear parts, descents, and their order.
 
 A row of complex values at the bins counts as that of their real and imaginary parts, of twice the
 length: coefficients are real, and so are the products of rows.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,22 +13,23 @@ from jaxtyping import Complex, Float, Int
 
 _STEPS = 20  # of Gauss and Newton
 _NEAREST = 1e-9  # size of the denominator, to its terms', so that no pole falls onto a bin
-EXACT = 1e-20  # share of the output's power that is rounding
+_EXACT = 1e-20  # share of the output's power that is rounding
 _LEAST_CONDITION = 1e-10  # reciprocal, of normal equations that leave digits enough
 _DEPENDENT = 1e-13  # singular value, to the largest, of a direction that is left alone
 
+Powers = Float[np.ndarray, " powers"]
+Bins = Complex[np.ndarray, " bins"]
 Vector = Float[np.ndarray, " parameters"]
 Rows = Float[np.ndarray, "rows parts"]
-Parts = Float[np.ndarray, " parts"]
 
 
 class Equations(NamedTuple):
     """What relates one output to the inputs at some bins, each times the weight of its bin."""
 
-    x: Complex[np.ndarray, " bins"]  # (exp(-j omega dt) - 1) / scale
+    x: Bins  # (exp(-j omega dt) - 1) / scale
     u: Complex[np.ndarray, "inputs bins"]
-    own: Float[np.ndarray, "records bins"]  # the weight in the row of the bin's record, else 0
-    y: Complex[np.ndarray, " bins"]
+    owner: Float[np.ndarray, "records bins"]  # the weight in the row of the bin's record, else 0
+    y: Bins
 
     def pick(self, bins: Int[np.ndarray, " some"] | slice) -> "Equations":
         """Some of the bins."""
@@ -35,21 +37,30 @@ class Equations(NamedTuple):
 
     def weighted(self, weight: Float[np.ndarray, " bins"]) -> "Equations":
         """Equations whose noise is `weight` times as large."""
-        return Equations(self.x, self.u * weight, self.own * weight, self.y * weight)
+        return Equations(self.x, self.u * weight, self.owner * weight, self.y * weight)
 
     def parameters(self, order: int) -> int:
         """Real coefficients of a model of this order, without the common factor."""
-        return len(self.u) * (order + 1) + len(self.own) * order + order
+        return len(self.u) * (order + 1) + len(self.owner) * order + order
+
+    @property
+    def rounding(self) -> float:
+        """What rounding may leave of the output's sum of squares."""
+        return _EXACT * float(np.sum(np.abs(self.y) ** 2))
 
 
 class Solved(NamedTuple):
     """Coefficients, and what they leave of the output."""
 
-    denominator: Float[np.ndarray, " powers"]  # of rising powers of x
+    denominator: Powers  # of rising powers of x
     linear: Vector  # numerators, input by input; then transients, record by record
-    below: Complex[np.ndarray, " bins"]  # the denominator's values
-    left: Complex[np.ndarray, " bins"]  # of the output
+    below: Bins  # the denominator's values
+    left: Bins  # of the output
     cost: float  # sum of squared residuals
+
+    @property
+    def order(self) -> int:
+        return len(self.denominator) - 1
 
 
 class Basis(NamedTuple):
@@ -59,18 +70,18 @@ class Basis(NamedTuple):
     columns: Complex[np.ndarray, "parameters bins"]  # of the numerators and transients
     magnitude: Float[np.ndarray, "powers bins"]  # of the powers
 
-    def largest(self, denominator: Float[np.ndarray, " powers"]) -> int:
+    def largest(self, denominator: Powers) -> int:
         """The power whose term is largest over the bins."""
         return int(np.argmax(np.abs(denominator) * np.mean(self.magnitude, axis=1)))
 
 
 def make_basis(equations: Equations, size: int) -> Basis:
     powers = powers_of(equations.x, size)
-    columns = columns_of(powers, equations.u, equations.own)
+    columns = columns_of(powers, equations.u, equations.owner)
     return Basis(powers, columns, np.abs(powers))
 
 
-def powers_of(x: Complex[np.ndarray, " bins"], size: int) -> Complex[np.ndarray, "powers bins"]:
+def powers_of(x: Bins, size: int) -> Complex[np.ndarray, "powers bins"]:
     """From 1 upwards."""
     powers = np.empty((size, len(x)), complex)
     powers[0] = 1.0
@@ -82,40 +93,42 @@ def powers_of(x: Complex[np.ndarray, " bins"], size: int) -> Complex[np.ndarray,
 def columns_of(
     powers: Complex[np.ndarray, "powers bins"],
     u: Complex[np.ndarray, "inputs bins"],
-    own: Float[np.ndarray, "records bins"],
+    owner: Float[np.ndarray, "records bins"],
 ) -> Complex[np.ndarray, "parameters bins"]:
     """Powers times inputs, then all powers but the last times records."""
     few = powers[:-1]
-    ends = np.cumsum([0, *[len(powers)] * len(u), *[len(few)] * len(own)])
+    ends = np.cumsum([0, *[len(powers)] * len(u), *[len(few)] * len(owner)])
     columns = np.empty((ends[-1], powers.shape[1]), complex)
-    pairs = [*((powers, each) for each in u), *((few, each) for each in own)]
+    pairs = [*((powers, row) for row in u), *((few, row) for row in owner)]
     for (factor, values), start, end in zip(pairs, ends[:-1], ends[1:], strict=True):
         np.multiply(factor, values, out=columns[start:end])
     return columns
 
 
-def descend(
-    equations: Equations,
-    basis: Basis,
-    denominator: Float[np.ndarray, " powers"],
-    least_gain: float,
-) -> Solved:
+def descend(equations: Equations, basis: Basis, denominator: Powers, least_gain: float) -> Solved:
     """Gauss-Newton steps of the denominator, until one gains too little; the rest is linear.
 
     Source: variable projection (Golub and Pereyra, 1973) as simplified by Kaufman (1975).
     """
+    from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
+
     solved, span = _project(equations, basis, denominator)
-    floor = EXACT * float(np.sum(np.abs(equations.y) ** 2))
     for _ in range(_STEPS):
         fixed = basis.largest(solved.denominator)
-        _, rows = span.nearest(parts_of(_turned(equations, basis, solved, fixed)))
-        step = np.insert(_least_squares(rows, parts_of(solved.left)), fixed, 0.0)
+        slopes = parts_of(_denominator_slopes(equations, basis, solved, fixed))
+        rows = np.concatenate([span.nearest(slopes)[1], parts_of(solved.left)[None]])
+        length = _lengths(rows)
+        # R of the QR decomposition of unit columns; numpy's takes twice the time.
+        unit = dgeqrf((rows / length[:, None]).T, overwrite_a=True)[0]
+        triangle = np.triu(unit[: len(rows)])
+        step = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=_DEPENDENT)[0]
+        step = np.insert(step * length[-1] / length[:-1], fixed, 0.0)
         trials = (_project(equations, basis, solved.denominator + step / 3**k) for k in range(6))
-        better = next((each for each in trials if each[0].cost < solved.cost), None)
+        better = next((trial for trial in trials if trial[0].cost < solved.cost), None)
         if better is None:
             break
         gain, (solved, span) = 1 - better[0].cost / solved.cost, better
-        if gain < least_gain or solved.cost < floor:
+        if gain < least_gain or solved.cost < equations.rounding:
             break
     return solved
 
@@ -132,6 +145,27 @@ class _Span(NamedTuple):
     factor: Float[np.ndarray, "parameters parameters"]  # of Cholesky, or R
     orthonormal: Rows | None  # Q, with R
 
+    @classmethod
+    def of(cls, rows: Rows) -> "_Span":
+        from scipy.linalg import lapack
+
+        products = rows @ rows.T
+        length = np.sqrt(np.diagonal(products))
+        length = np.where(length > 0, length, 1.0)
+        products /= np.outer(length, length)
+        factor, failed = lapack.dpotrf(products)  # pyright: ignore[reportAttributeAccessIssue]
+        condition = 0.0
+        if not failed:
+            norm = np.max(np.sum(np.abs(products), axis=0))
+            condition, _ = lapack.dpocon(factor, norm)  # pyright: ignore[reportAttributeAccessIssue]
+        if condition >= _LEAST_CONDITION:
+            return cls(rows, length, factor, None)
+        unit = (rows / length[:, None]).T
+        qr, tau, *_ = lapack.dgeqrf(unit, overwrite_a=True)  # pyright: ignore
+        triangle = np.triu(qr[: len(rows)])
+        orthonormal, *_ = lapack.dorgqr(qr, tau, overwrite_a=True)  # pyright: ignore
+        return cls(rows, length, triangle, orthonormal.T)
+
     def coefficients(
         self, values: Float[np.ndarray, "*some parts"]
     ) -> Float[np.ndarray, "*some parameters"]:
@@ -142,81 +176,34 @@ class _Span(NamedTuple):
             along = self.orthonormal @ values.T
             return np.linalg.lstsq(self.factor, along, rcond=_DEPENDENT)[0].T / self.length
         right = self.rows @ values.T
-        found, _ = dpotrs(self.factor, (right.T / self.length).T)
-        return found.T / self.length
+        solution, _ = dpotrs(self.factor, (right.T / self.length).T)
+        return solution.T / self.length
 
     def nearest(
         self, values: Float[np.ndarray, "*some parts"]
     ) -> tuple[Float[np.ndarray, "*some parameters"], Float[np.ndarray, "*some parts"]]:
         """The `coefficients`, and what they leave of `values`; of single ones to the last digit."""
-        found = self.coefficients(values)
-        rest = values - found @ self.rows
+        linear = self.coefficients(values)
+        rest = values - linear @ self.rows
         if values.ndim == 2 or self.orthonormal is not None:
-            return found, rest
+            return linear, rest
         more = self.coefficients(rest)
-        return found + more, rest - more @ self.rows
+        return linear + more, rest - more @ self.rows
 
 
-def _span_of(rows: Rows) -> _Span:
-    from scipy.linalg.lapack import dpocon, dpotrf  # pyright: ignore[reportAttributeAccessIssue]
-
-    products = rows @ rows.T
-    length = np.sqrt(np.diagonal(products))
-    length = np.where(length > 0, length, 1.0)
-    products /= np.outer(length, length)
-    factor, failed = dpotrf(products)
-    condition = 0.0
-    if not failed:
-        condition, _ = dpocon(factor, np.max(np.sum(np.abs(products), axis=0)))
-    if condition < _LEAST_CONDITION:
-        return _decomposed(rows, length)
-    return _Span(rows, length, factor, None)
-
-
-def _decomposed(rows: Rows, length: Vector) -> _Span:
-    from scipy.linalg.lapack import dgeqrf, dorgqr  # pyright: ignore[reportAttributeAccessIssue]
-
-    qr, tau, *_ = dgeqrf((rows / length[:, None]).T, overwrite_a=True)
-    triangle = np.triu(qr[: len(rows)])
-    orthonormal, *_ = dorgqr(qr, tau, overwrite_a=True)
-    return _Span(rows, length, triangle, orthonormal.T)
-
-
-def solve_linear(
-    equations: Equations, basis: Basis, denominator: Float[np.ndarray, " powers"]
-) -> Solved:
+def solve_linear(equations: Equations, basis: Basis, denominator: Powers) -> Solved:
     return _project(equations, basis, denominator)[0]
 
 
-def _project(
-    equations: Equations, basis: Basis, denominator: Float[np.ndarray, " powers"]
-) -> tuple[Solved, _Span]:
+def _project(equations: Equations, basis: Basis, denominator: Powers) -> tuple[Solved, _Span]:
     """The best linear coefficients under a denominator, and what their columns span."""
     below = denominator @ basis.powers
     least = _NEAREST * (np.abs(denominator) @ basis.magnitude)
     below = np.where(np.abs(below) < least, least, below)
-    span, y = _span_of(parts_of(basis.columns * (1 / below))), parts_of(equations.y)
+    span, y = _Span.of(parts_of(basis.columns * (1 / below))), parts_of(equations.y)
     linear, left = span.nearest(y)
     solved = Solved(denominator, linear, below, left.view(complex), float(left @ left))
     return solved, span
-
-
-def cost_with_pole(
-    equations: Equations, basis: Basis, solved: Solved, places: Float[np.ndarray, " places"]
-) -> Float[np.ndarray, " places"]:
-    """What is left with one more pole, at each of some places on the real axis of x.
-
-    Polynomials over A (1 - x/p) are those of one degree less over A, and a constant over the same.
-    """
-    _, span = _project(equations, basis, solved.denominator)
-    driven = np.concatenate([equations.u, equations.own]) / solved.below
-    driven = driven / (1 - equations.x / places[:, None])[:, None]
-    _, rows = span.nearest(parts_of(driven.reshape(-1, len(equations.x))))
-    rows /= _lengths(rows)[:, None]
-    rows = rows.reshape(len(places), -1, rows.shape[1])
-    along = rows @ parts_of(solved.left)
-    products = rows @ np.swapaxes(rows, 1, 2) + _LEAST_CONDITION * np.eye(rows.shape[1])
-    return solved.cost - np.vecdot(along, np.linalg.solve(products, along[:, :, None])[:, :, 0])
 
 
 def parts_of(rows: Complex[np.ndarray, "*rows bins"]) -> Float[np.ndarray, "*rows parts"]:
@@ -224,7 +211,7 @@ def parts_of(rows: Complex[np.ndarray, "*rows bins"]) -> Float[np.ndarray, "*row
     return np.ascontiguousarray(rows).view(float)
 
 
-def _turned(
+def _denominator_slopes(
     equations: Equations, basis: Basis, solved: Solved, fixed: int
 ) -> Complex[np.ndarray, "rows bins"]:
     """Derivatives of the fitted output by the denominator's coefficients but the fixed one."""
@@ -236,27 +223,139 @@ def slopes_of(
     equations: Equations, basis: Basis, solved: Solved, fixed: int
 ) -> Complex[np.ndarray, "rows bins"]:
     """Derivatives of the fitted output, all coefficients but the fixed one."""
-    turned = _turned(equations, basis, solved, fixed)
+    turned = _denominator_slopes(equations, basis, solved, fixed)
     return np.concatenate([basis.columns / solved.below, turned])
-
-
-def _least_squares(rows: Rows, values: Parts) -> Vector:
-    """Coefficients of the sum of rows that lies nearest to `values`."""
-    joined = np.concatenate([rows, values[None]])
-    length = _lengths(joined)
-    triangle = _triangle(joined / length[:, None])
-    found = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=_DEPENDENT)[0]
-    return found * length[-1] / length[:-1]
-
-
-def _triangle(rows: Rows) -> Float[np.ndarray, "rows rows"]:
-    """R of the QR decomposition of the columns that the rows are; numpy's takes twice the time."""
-    from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
-
-    return np.triu(dgeqrf(rows.T, overwrite_a=True)[0][: len(rows)])
 
 
 def _lengths(rows: Rows) -> Vector:
     """Euclidean norms; 1 for rows of zeros."""
     length = np.sqrt(np.vecdot(rows, rows))
     return np.where(length > 0, length, 1.0)
+
+
+_TRIAL = 1e-3  # relative gain of a step at which a descent ends
+_PER_PARAMETER = 6  # real equations
+_THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
+_DOUBTED = 2  # orders in a row no better that end the search around an order
+PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
+_PLACES = 5  # at which one more pole is tried
+
+
+class Orders(NamedTuple):
+    """Solutions by their order, and the order of the least criterion; 0 where none explains."""
+
+    solved: dict[int, Solved]
+    best: int
+
+    @classmethod
+    def of(cls, equations: Equations, solved: dict[int, Solved]) -> "Orders":
+        return cls(solved, min(solved, key=lambda order: _criterion(equations, solved[order])))
+
+
+def search_orders(equations: Equations, most: int) -> Orders:
+    """From 0 upwards, each order from the one below with one pole more.
+
+    Linear estimates of every order are no better places to begin: the noise draws their poles to
+    the stability limit, or beyond it, and the last digit of a record chooses among them.
+    """
+    solved = {0: solve_linear(equations, make_basis(equations, 1), np.ones(1))}
+    _climb(equations, solved, most, {}, _THOROUGH, _PATIENCE)
+    return Orders.of(equations, solved)
+
+
+def refine_orders(equations: Equations, before: Orders, most: int) -> Orders:
+    """Of the same equations in other weights: orders around the best one `before`."""
+    first, starts = before.best, before.solved
+    solved = {first: _descend(equations, starts[first].denominator)}
+    _climb(equations, solved, most, starts, first, _DOUBTED)
+    for order in range(first - 1, 0, -1):
+        solved[order] = _descend(equations, starts[order].denominator)
+        if Orders.of(equations, solved).best != order:
+            break
+    return Orders.of(equations, solved)
+
+
+def _climb(
+    equations: Equations,
+    solved: dict[int, Solved],
+    most: int,
+    starts: Mapping[int, Solved],
+    thorough: int,
+    patience: int,
+) -> None:
+    """Add orders to those `solved` until too many in a row have no better criterion.
+
+    Each begins with a pole more than the one below, or with that of `starts`, of other weights,
+    where it leaves less.
+    """
+    order, worse = max(solved), 0
+    least = _criterion(equations, solved[order])
+    while order < _most(equations, most) and not _is_exact(equations, solved[order]):
+        if worse >= patience and order >= thorough:
+            break
+        order += 1
+        start = _with_pole(equations, solved[order - 1])
+        if order in starts:
+            basis = make_basis(equations, start.size)
+            start = min(
+                (starts[order].denominator, start),
+                key=lambda trial, basis=basis: solve_linear(equations, basis, trial).cost,
+            )
+        solved[order] = _descend(equations, start)
+        value = _criterion(equations, solved[order])
+        worse, least = (0, value) if value < least else (worse + 1, least)
+
+
+def next_order(equations: Equations, orders: Orders, most: int) -> Powers:
+    """Where a descent of the order next above the best one begins: its new pole is at infinity.
+
+    That is where half a sample of a delay is. The best order's where a higher one is too much, or
+    where it leaves rounding alone.
+    """
+    best = orders.solved[orders.best]
+    if orders.best >= _most(equations, most) or _is_exact(equations, best):
+        return best.denominator
+    return np.pad(best.denominator, (0, 1))
+
+
+def _with_pole(equations: Equations, solved: Solved) -> Powers:
+    """The denominator with a real pole more, at that of a few places where it leaves least.
+
+    Polynomials over A (1 - x/p) are those of one degree less over A, and a constant over the same.
+    """
+    size = np.abs(equations.x)
+    places = np.geomspace(np.min(size), np.max(size), _PLACES)
+    basis = make_basis(equations, len(solved.denominator))
+    _, span = _project(equations, basis, solved.denominator)
+    driven = np.concatenate([equations.u, equations.owner]) / solved.below
+    driven = driven / (1 - equations.x / places[:, None])[:, None]
+    _, rows = span.nearest(parts_of(driven.reshape(-1, len(equations.x))))
+    rows /= _lengths(rows)[:, None]
+    rows = rows.reshape(_PLACES, -1, rows.shape[1])
+    along = rows @ parts_of(solved.left)
+    products = rows @ np.swapaxes(rows, 1, 2) + _LEAST_CONDITION * np.eye(rows.shape[1])
+    gain = np.vecdot(along, np.linalg.solve(products, along[:, :, None])[:, :, 0])
+    return np.convolve(solved.denominator, [1.0, -1.0 / places[np.argmin(solved.cost - gain)]])
+
+
+def _descend(equations: Equations, start: Powers) -> Solved:
+    return descend(equations, make_basis(equations, start.size), start, _TRIAL)
+
+
+def _most(equations: Equations, most: int) -> int:
+    """The highest order, up to `most`, of which there are equations enough."""
+    for order in range(1, most + 1):
+        if equations.parameters(order) * _PER_PARAMETER > 2 * len(equations.y):
+            return order - 1
+    return most
+
+
+def _criterion(equations: Equations, solved: Solved) -> float:
+    count = 2 * len(equations.y)
+    parameters = equations.parameters(solved.order) if solved.order else 1
+    cost = max(solved.cost + 0.01 * equations.rounding, 1e-300)
+    return count * np.log(cost / count) + PRICE * parameters
+
+
+def _is_exact(equations: Equations, solved: Solved) -> bool:
+    return solved.cost <= equations.rounding

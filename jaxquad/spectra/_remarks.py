@@ -7,15 +7,16 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxquad._core import Message
+
 from ._checks import in_hertz
 
 
 Pair = tuple[str, str]  # output, input
-DOMINATED = "feedback-dominated"  # as remarks begin on coherence that a controller made
-EARLY = "the phase increases with frequency"  # and on an output that comes before its input
+DOMINATED, EARLY = "feedback-dominated", "output before input"  # kinds of remarks
 
 
-class Remark(str):
+class Remark(Message):
     """A sentence about a response that knows which frequencies it is about.
 
     It is the text itself, so it prints, joins and compares like any other string.
@@ -25,6 +26,7 @@ class Remark(str):
     - `text`: what happened, the number, and what to do. `{where}` stands for the frequencies.
     - `omega`: the frequencies that it is about, in rad/s; none for the response as a whole.
     - `pair`: names of the output and the input that it is about; `None` for all pairs.
+    - `kind`: what it is about, for code that decides by it.
     """
 
     text: str
@@ -36,21 +38,22 @@ class Remark(str):
         text: str,
         omega: Sequence[float] | Float[np.ndarray, " points"] = (),
         pair: Pair | None = None,
+        kind: str = "",
     ) -> "Remark":
         points = tuple(float(x) for x in omega)
-        self = super().__new__(cls, text.replace("{where}", _place(points)))
+        self = super().__new__(cls, text.replace("{where}", _place(points)), kind)
         self.text, self.omega, self.pair = text, points, pair
         return self
 
-    def __getnewargs__(self) -> tuple[str, tuple[float, ...], Pair | None]:
-        return self.text, self.omega, self.pair
+    def __getnewargs__(self) -> tuple[str, tuple[float, ...], Pair | None, str]:
+        return self.text, self.omega, self.pair, self.kind
 
     def within(self, omega: Float[np.ndarray, " used"]) -> "Remark | None":
         """The same about those of its frequencies that are in `omega`; `None` for none of them."""
         if not self.omega:
             return self
         kept = [x for x in self.omega if np.any(np.abs(omega - x) <= 1e-9 * x)]
-        return Remark(self.text, kept, self.pair) if kept else None
+        return Remark(self.text, kept, self.pair, self.kind) if kept else None
 
 
 class Remarks(Sequence[Remark]):
@@ -120,7 +123,7 @@ def points_dominated(
     """Points that remarks name as dominated by feedback."""
     found = np.zeros((omega.size, len(outputs), len(inputs)), bool)
     for remark in remarks:
-        if not remark.startswith(DOMINATED) or not isinstance(remark, Remark):
+        if remark.kind != DOMINATED:
             continue
         here = np.isin(omega, remark.omega)
         pairs = [remark.pair] if remark.pair else itertools.product(outputs, inputs)

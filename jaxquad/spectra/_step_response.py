@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from jaxquad._core import Message
 from jaxquad.records import Record
 
 
@@ -196,8 +197,10 @@ def estimate_step(
 def _names(record: Record, reference: str | None, output: str | None) -> tuple[str, str]:
     if reference is None and not record.reference_names:
         raise ValueError(
-            "the record has no reference, to which a step response could be found: name a channel, "
-            "reference="
+            Message(
+                "the record has no reference, to which a step response could be found: name a "
+                "channel, «reference=»"
+            )
         )
     return reference or record.reference_names[0], output or record.output_names[0]
 

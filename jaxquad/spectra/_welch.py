@@ -9,25 +9,21 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Complex, Float
 
-from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
+from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._average import average, Averaged, Channels
-from ._blocks import lattice_windows
 from ._checks import check_band, check_excitation, in_hertz
 from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
+from ._fourier_sums import fourier_sums, Taper
 from ._frequency_response import FrequencyResponse
 from ._invariance import remarks_on_linearity
 from ._leakage import cross_products, shows_leakage, Slopes
-from ._noise_freedom import covariance_of_windows, smoothed
+from ._noise import covariance_of_windows, smoothed
 from ._remarks import Remark, Remarks
-from ._transform import Taper, transform_tapers
-from ._window import coefficients, segment_starts
-
-
-Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
+from ._windows import coefficients, lattice_windows, Layout, segment_starts
 
 
 class Segments(NamedTuple):
@@ -114,9 +110,9 @@ def _layouts(
     overlap = members[0].overlap
     if len(members) == 1:
         return [((lengths[0], segment_starts(n, lengths[0], overlap)),) for n in samples]
-    angle = omega * records[0].dt
-    shared = tuple(n for n, _ in lattice_windows(min(samples), lengths, overlap, angle))
-    return [lattice_windows(n, shared, overlap, angle) for n in samples]
+    highest = float(np.max(omega)) * records[0].dt
+    shared = tuple(n for n, _ in lattice_windows(min(samples), lengths, overlap, highest))
+    return [lattice_windows(n, shared, overlap, highest) for n in samples]
 
 
 def _transform_record(
@@ -129,7 +125,7 @@ def _transform_record(
 ) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
     """By taper and then by length."""
     columns = _columns(record, welch)
-    made = transform_tapers(
+    made = fourier_sums(
         columns, omega * record.dt, layout, tapers, detrend=welch.detrend, origin=float(origin)
     )
     n, late = welch.integrators, Welch.delay_samples(welch, record)
@@ -264,15 +260,14 @@ def remarks_on_leakage(
             text = (
                 f"leakage through the window biases the response by about "
                 f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
-                "include it. Use jq.spectra.LocalPolynomial(), which estimates leakage, a longer "
-                "window, or integrators= where the plant integrates"
+                "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
+                "window, or «integrators=» where the plant integrates"
             )
             remarks.append(Remark(text, omega[leaked], (output, source)))
     return tuple(remarks)
 
 
 Method = Literal["direct", "joint"]
-_HELD = 4  # numbers to each sample of a channel that an estimate holds at a time
 _CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
     "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
@@ -292,7 +287,6 @@ def average_windows(
         (spectra,) if isinstance(spectra, Welch) else Composite.windowed(spectra, records, omega)
     )
     omega = frequencies_for(omega, records, members[0])
-    keep_freed_memory(8 * _HELD * sum(record.samples * len(record.names) for record in records))
     segments = transform_records(records, omega, members, derivatives=2)
     channels = _channels(records[0], method)
     independent = _independent(records, segments.groups)
@@ -405,7 +399,7 @@ def _remarks(
     measured = omega, response, error, coherence, direct
     remarks = remarks_on_feedback(records, method, *measured, names)
     remarks += remarks_on_linearity(records, omega, response, coherence, method)
-    shared = 1 - np.nan_to_num(found.own_share)
+    shared = 1 - np.nan_to_num(found.alone)
     remarks += remarks_on_inputs(omega, shared, first.input_names)
     remarks += remarks_on_leakage(omega, found.leakage(), error, names)
     few = max(independent) < 3

@@ -2,6 +2,7 @@ from ._autopilot import autopilot as autopilot
 from ._batch._jobs import Job as Job
 from ._batch._run import batch as batch, find_logs as find_logs
 from ._batch._settings import BatchSettings as BatchSettings, Override as Override
+from ._command_line import in_options as in_options
 from ._demo import (
     DEMO as DEMO,
     DEMO_TRUTH as DEMO_TRUTH,
@@ -40,4 +41,3 @@ from ._tune_settings import (
     AutopilotSettings as AutopilotSettings,
     TuneSettings as TuneSettings,
 )
-from ._words import in_options as in_options

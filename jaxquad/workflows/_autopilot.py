@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxquad._core import announce
+from jaxquad._core import announce, Message
 from jaxquad.autopilot import (
     ADRCAutopilot,
     AutopilotProposal,
@@ -26,6 +26,7 @@ from jaxquad.autopilot import (
 from jaxquad.records import AXES, Proposal
 
 from ._autopilot_adrc import flew_adrc, tune_adrc
+from ._command_line import in_options
 from ._identify import identify_plant
 from ._kinds import SettingsError
 from ._log import propose_settings, read_records
@@ -106,7 +107,7 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
         filters = filters or axes[axis].shared_filters
     if not axes:
         raise next(iter(errors.values()))
-    return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
+    return AxesProposal(settings, axes, {axis: in_options(error) for axis, error in errors.items()})
 
 
 def _of_one_flight(settings: AutopilotSettings, proposal: Proposal) -> AutopilotSettings:
@@ -144,7 +145,7 @@ def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotPropos
     recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
-        return unsure(f"this log cannot tell: {summary}. {recipe}", None)
+        return unsure(Message(f"this log cannot tell: «plant|{summary}». {recipe}"), None)
     if flight is None:
         return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")

@@ -1,17 +1,15 @@
 """Responses and fits of an identification, over the whole band and over parts of it."""
 
 import dataclasses
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import announce
+from jaxquad._core import announce, as_messages
 from jaxquad.identify import (
     CoherenceWeighted,
-    Combination,
     Fit,
     fit,
     fit_transfer_function,
@@ -19,12 +17,15 @@ from jaxquad.identify import (
     KnownFilter,
     MaximumLikelihood,
     usable,
+    WIDER_BAND,
     without_filters,
 )
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.records import Record
 from jaxquad.spectra import (
     Composite,
+    DOMINATED,
+    EARLY,
     Estimator,
     frequency_response,
     FrequencyResponse,
@@ -33,8 +34,8 @@ from jaxquad.spectra import (
     Welch,
 )
 
+from ._command_line import in_options
 from ._settings import IdentifySettings
-from ._words import in_options
 
 
 Model = LaggedIntegrator | TransferFunction
@@ -44,10 +45,8 @@ _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
-_DOMINATED, _EARLY = "feedback-dominated", "the phase increases"  # as remarks begin
 _RECORD = "excite the axis (jaxquad design sweep), and record what excites it as the reference"
 EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
-_WIDER = "excite the axis (jq.sweep) over more than"  # as the remedy of `jq.fit` begins
 
 
 class Estimated(NamedTuple):
@@ -172,17 +171,18 @@ def sums_of(settings: IdentifySettings) -> Mapping[str, Callable[[Model], Float[
 def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
     """The same fit, whose remedies are options of `jaxquad identify`."""
     kind, lost = found.verdict.kind, found.verdict.undetermined
+    remarked = {remark.kind for remark in found.remarks}
     if kind == "identifiable":
         return found
-    wider = [each for each in found.verdict.remedies if each.startswith(_WIDER)]
+    wider = [remedy for remedy in found.verdict.remedies if remedy.kind == WIDER_BAND]
     excite = in_options(wider[0]) if wider else EXCITE
     remedies = [excite]
     if kind == "too few points":
         remedies += ["use longer windows (--estimator welch --window S)"]
-    elif kind == "no model" and any(each.startswith(_DOMINATED) for each in found.remarks):
+    elif kind == "no model" and DOMINATED in remarked:
         named = [] if settings.reference else ["name the external reference (--reference)"]
         remedies = [*named, _RECORD]
-    elif kind == "no model" and any(each.startswith(_EARLY) for each in found.remarks):
+    elif kind == "no model" and EARLY in remarked:
         remedies = ["exchange --input and --output if they are swapped, or correct time stamps"]
     elif kind == "no model":
         remedies = [
@@ -193,7 +193,7 @@ def with_remedies(found: Fit, settings: IdentifySettings) -> Fit:
         remedies = ["fit fewer poles and zeros (--poles, --zeros)", excite]
     elif {"lag", "delay"} & set(lost) and settings.lag and settings.delay:
         remedies = ["fit without the lag (--no-lag) or without the delay (--no-delay)", excite]
-    verdict = dataclasses.replace(found.verdict, remedies=tuple(remedies))
+    verdict = dataclasses.replace(found.verdict, remedies=as_messages(remedies))
     return dataclasses.replace(found, verdict=verdict)
 
 
@@ -207,7 +207,7 @@ def fit_parts(
     response that feedback dominates or whose phase rises: no part of it would be better.
     """
     small = not found.chi_squared >= _MISFIT**2 or not isinstance(found.model, LaggedIntegrator)
-    no_plant = any(remark.startswith((_DOMINATED, _EARLY)) for remark in frf.remarks)
+    no_plant = any(remark.kind in (DOMINATED, EARLY) for remark in frf.remarks)
     if not found.verdict.fitted or small or no_plant:
         return found, {}
     used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
@@ -218,7 +218,9 @@ def fit_parts(
     }
     parts = {name: _refitted(found, frf, settings, band) for name, band in bands.items()}
     remarks = [_gain_change(name, part, found) for name, part in parts.items()]
-    found = dataclasses.replace(found, remarks=(*found.remarks, *filter(None, remarks)))
+    found = dataclasses.replace(
+        found, remarks=(*found.remarks, *as_messages(filter(None, remarks)))
+    )
     whole = f"{low:.3g} .. {high:.3g} rad/s ({low / (2 * np.pi):.3g} .. {_hertz(high)})"
     return found, {whole: found} | parts
 
@@ -267,16 +269,10 @@ def with_units(fit: Fit, record: Record) -> Fit:
         output=output or record.output_names[0], input=source or record.input_names[0],
     )  # fmt: skip
     known = dict(zip(fit.names, units, strict=True))
-    combinations = tuple(each._replace(unit=_unit_of_sum(each, known)) for each in fit.combinations)
-    verdict = dataclasses.replace(fit.verdict, combinations=combinations)
+    combinations = []
+    for each in fit.combinations:
+        of_terms = {known.get(name, "") for name in each.sum_of}
+        alike = len(each.sum_of) > 1 and len(of_terms) == 1
+        combinations.append(each._replace(unit=of_terms.pop() if alike else ""))
+    verdict = dataclasses.replace(fit.verdict, combinations=tuple(combinations))
     return dataclasses.replace(fit, parameter_units=units, verdict=verdict)
-
-
-_TERM = r"(?:[\d.]+ )?(\S+)"  # of a sum: `lag`, `2 lag`
-
-
-def _unit_of_sum(sum_of: Combination, units: Mapping[str, str]) -> str:
-    """The unit that all parameters in a sum have; empty for products, and where there is none."""
-    terms = [re.fullmatch(_TERM, term) for term in re.split(r" [+-] ", sum_of.name)]
-    found = {units.get(term[1], "") if term else "" for term in terms}
-    return found.pop() if len(terms) > 1 and len(found) == 1 else ""

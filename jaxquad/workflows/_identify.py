@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, as_messages, marked_text, Message
 from jaxquad.autopilot import flown_law, FlownLaw
 from jaxquad.identify import (
     Bands,
@@ -171,7 +171,10 @@ class Identification:
             _EXPLAINED: self.explanation,
         }
         texts = {title: str(each) for title, each in found.items() if each is not None}
-        return texts | {x: f"could not be computed: {why}" for x, why in self.failures.items()}
+        return texts | {
+            title: Message(f"could not be computed: {marked_text(why)}")
+            for title, why in self.failures.items()
+        }
 
     @property
     def figure_names(self) -> tuple[str, ...]:
@@ -210,6 +213,10 @@ class Identification:
         return write_identification(self, Path(folder or default_folder(self.path)))
 
     def __str__(self) -> str:
+        return str(self.message())
+
+    def message(self) -> Message:
+        """What it prints, as a message that the command line puts into its own words."""
         from jaxquad.report import compare_fits  # here: with it come the templates of pages
 
         first, *others = map(str, self.records)
@@ -230,8 +237,9 @@ class Identification:
         parts += _on_negative_gain(self.fit, self.frf)
         if self.parts:
             parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, sums)}"]
-        parts += [f"\n{title}:\n{text}" for title, text in self.beside.items()]
-        return "\n".join([*parts, *([f"\n{self.check}"] if self.check else [])])
+        parts += [f"\n{title}:\n{marked_text(text)}" for title, text in self.beside.items()]
+        parts += [f"\n{self.check}"] if self.check else []
+        return Message("\n".join(map(marked_text, parts)))
 
 
 _HALVES, _EXPLAINED = "Lower and upper half of the band", "What explains the misfit"
@@ -254,7 +262,7 @@ def _text_or_reason(made: Callable[[], object]) -> str:
     try:
         return str(made())
     except UndeterminedError as error:
-        return str(error)
+        return marked_text(error)
 
 
 def identify(
@@ -341,7 +349,7 @@ def _with_remedy(found: Fit, remedy: str) -> Fit:
     verdict = found.verdict
     if verdict.kind == "identifiable":
         return found
-    verdict = dataclasses.replace(verdict, remedies=(remedy,))
+    verdict = dataclasses.replace(verdict, remedies=as_messages([remedy]))
     return dataclasses.replace(found, verdict=verdict)
 
 

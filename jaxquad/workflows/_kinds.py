@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from jaxquad.records import AXES, parse_mix
+from jaxquad.records import AXES, MixError, parse_mix
 
 
 Pair = tuple[float, float]
@@ -116,8 +116,8 @@ def _mix(value: object) -> str:
         raise ValueError('give a channel, or a weighted sum such as "roll=-m1+0.5*m2"')
     try:
         parse_mix(text)
-    except ValueError as error:
-        raise ValueError(str(error).removeprefix(f"{text!r}: ")) from error
+    except MixError as error:
+        raise ValueError(error.reason) from error
     return text
 
 

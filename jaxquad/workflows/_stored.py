@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, marked_text
 from jaxquad.identify import behind_filters, Fit, Verification, verify
 from jaxquad.records import (
     clock_start,
@@ -47,7 +47,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         "band_rad_per_s": found.band,
         "band_hz": [omega / (2 * np.pi) for omega in found.band],
         "used_band_rad_per_s": found.fit.used_band,
-        "derived": [each._asdict() for each in found.combinations],
+        "derived": [each.content() for each in found.combinations],
         "provenance": origin.content(),
         **({"gyro_filters": found.flown.content()} if found.flown and found.filters else {}),
         **_content_beside(found),
@@ -83,7 +83,9 @@ def _law_if_any(found: Identification) -> LawLoop | None:
         [unit] = found.records[0].output_units
         return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
     except Exception as error:  # the record shows its loop without the law, too
-        warnings.warn(f"the loop by its law is missing: {reason_of(error)}", PageWarning, 2)
+        warnings.warn(
+            f"the loop by its law is missing: {marked_text(reason_of(error))}", PageWarning, 2
+        )
         return None
 
 
@@ -122,7 +124,9 @@ def _write_figures(found: Identification, folder: Path) -> None:
             raise
         except Exception as error:
             (folder / name).unlink(missing_ok=True)
-            warnings.warn(f"{name} could not be drawn: {reason_of(error)}", PageWarning, 2)
+            warnings.warn(
+                f"{name} could not be drawn: {marked_text(reason_of(error))}", PageWarning, 2
+            )
 
 
 def _content_beside(found: Identification) -> dict[str, object]:

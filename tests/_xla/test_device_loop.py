@@ -12,16 +12,16 @@ import pytest
 from cuda_on_host import for_cuda, run_on_host
 
 from jaxquad._xla import (
-    _device_trial,
     _kernel_memory,
+    _loop,
     _nvrtc,
-    _segments,
     _switch,
+    _trial,
     scan_on_device,
-    sincos,
 )
+from jaxquad._xla._loop import held_bytes, Segments, segments_of
 from jaxquad._xla._nvrtc import CannotCompile
-from jaxquad._xla._segments import held_bytes, Segments, segments_of
+from jaxquad.models import sincos
 
 
 MEMBERS, SAMPLES = 150, 7  # a block and a part of one; segments of 3, 3 and 1
@@ -88,7 +88,7 @@ def given():
 
 def have_memory(monkeypatch):
     """That of a GPU which keeps every second carry, and shares its memory among threads."""
-    monkeypatch.setattr(_segments, "_memory", lambda: (10**9, 228 * 1024))
+    monkeypatch.setattr(_loop, "_memory", lambda: (10**9, 228 * 1024))
 
 
 @pytest.mark.parametrize("memory", ["little", "much", "much, few registers", "few registers"])
@@ -97,9 +97,9 @@ def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
     if "much" in memory:
         have_memory(monkeypatch)
     if memory == "few registers":
-        monkeypatch.setattr(_segments, "_memory", lambda: (1, 228 * 1024))
+        monkeypatch.setattr(_loop, "_memory", lambda: (1, 228 * 1024))
     if "registers" in memory:
-        monkeypatch.setattr(_segments, "_HELD", 0)
+        monkeypatch.setattr(_loop, "_HELD", 0)
         reverse = written(jax.grad(lambda *args: total(kernel, *args)[0], range(5)), *given())[1]
         assert all(f"held[{k * _kernel_memory.BLOCK}]" in reverse for k in range(20))
         assert ("again_float64 = " in reverse) == ("much" in memory)
@@ -120,16 +120,16 @@ def test_carries_are_kept_as_often_as_a_part_of_the_memory_allows(monkeypatch):
         (80e9, Segments(count, 6, True)),
         (70e9, Segments(count, 71, False)),  # 7 carries of a block take more than 113 kB
     ):
-        monkeypatch.setattr(_segments, "_memory", lambda room=room: (int(room), 228 * 1024))
+        monkeypatch.setattr(_loop, "_memory", lambda room=room: (int(room), 228 * 1024))
         assert segments_of(count, carry, members, block) == expected
-    monkeypatch.setattr(_segments, "_memory", lambda: (10**12, 64 * 1024))
+    monkeypatch.setattr(_loop, "_memory", lambda: (10**12, 64 * 1024))
     assert not segments_of(count, carry, members, block).are_shared  # not even two of them fit
     assert segments_of(count, 40, members, block) == Segments(count, 2, True)
 
 
 def test_what_registers_have_no_room_for_is_held_in_shared_memory(monkeypatch):
     assert held_bytes(944, 664, 128) == 0  # no GPU
-    monkeypatch.setattr(_segments, "_memory", lambda: (10**12, 228 * 1024))
+    monkeypatch.setattr(_loop, "_memory", lambda: (10**12, 228 * 1024))
     assert held_bytes(944, 664, 128) == 664 and held_bytes(472, 0, 128) == 0
     assert held_bytes(680, 500, 128) == 0 and held_bytes(684, 500, 128) == 500
     assert held_bytes(4000, 2000, 128) == 0  # more than a block has
@@ -374,17 +374,17 @@ def test_without_a_gpu_no_loop_is_given_to_one():
 
 def trial():
     with _switch.device_kernels("forced"):
-        return _device_trial.why_not_trusted.__wrapped__()
+        return _trial.why_no_trust_in_gpu.__wrapped__()
 
 
 def test_kernels_are_compared_with_a_plain_loop_before_they_are_trusted(monkeypatch):
     said = []
     jax.jit(lambda x: said.append(trial()))(1.0)  # while another program is traced
     assert said == [None]
-    monkeypatch.setattr(_device_trial, "_by_kernel", lambda *args: plain(args[0], *args[1:]))
+    monkeypatch.setattr(_trial, "_by_kernel", lambda *args: plain(args[0], *args[1:]))
     assert trial() is None
     wrong = lambda step, carry, signals: plain(step, carry, signals[::-1])
-    monkeypatch.setattr(_device_trial, "_by_kernel", wrong)
+    monkeypatch.setattr(_trial, "_by_kernel", wrong)
     assert "differs from a plain loop" in str(trial())
 
 
@@ -392,5 +392,5 @@ def test_a_trial_that_fails_tells_why(monkeypatch):
     def fails(*_):
         raise RuntimeError("no such instruction")
 
-    monkeypatch.setattr(_device_trial, "_by_kernel", fails)
+    monkeypatch.setattr(_trial, "_by_kernel", fails)
     assert "no such instruction" in str(trial())

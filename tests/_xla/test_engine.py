@@ -13,18 +13,8 @@ import numpy as np
 import pytest
 
 import jaxquad as jq
-from jaxquad._xla import (
-    _canary,
-    _engine,
-    _kernel_limits,
-    _switch,
-    as_one_kernel,
-    brief_options,
-    compiler_options,
-    engine,
-    hasty_options,
-    Jit,
-)
+from jaxquad._compile import brief_options, compiler_options, engine, hasty_options, Jit
+from jaxquad._xla import _stablehlo, _switch, _trial, as_one_kernel
 
 
 TAG = "xla_cpu_small_call"
@@ -87,34 +77,34 @@ def test_an_outermost_loop_has_the_compilers_options_and_others_have_none():
 def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch):
     here = compiler_options()
     assert engine().vector_bits == here["xla_cpu_prefer_vector_width"]
-    monkeypatch.setattr(_engine, "TESTED", ())
-    monkeypatch.setattr(_engine, "_WIDEST", {"xla_of_another_age": 1})
-    _engine._known.cache_clear()
+    monkeypatch.setattr(_switch, "TESTED", ())
+    monkeypatch.setattr(_switch, "_WIDEST", {"xla_of_another_age": 1})
+    _switch._known.cache_clear()
     with pytest.warns(UserWarning, match="up to a tenth slower.*xla_of_another_age"):
         assert compiler_options() == {}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert engine().vector_bits is None
     monkeypatch.undo()
-    _engine._known.cache_clear()
+    _switch._known.cache_clear()
     assert compiler_options() == here
 
 
 def test_tested_versions_are_not_asked_about_options_and_get_those_that_they_know(monkeypatch):
-    options, unknown = _engine._WIDEST | _engine._BRIEF, {"xla_of_another_age": 1}
+    options, unknown = _switch._WIDEST | _switch._BRIEF, {"xla_of_another_age": 1}
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     with monkeypatch.context() as patch:
-        patch.setattr(_engine, "TESTED", (jaxlib.version.__version__,))
-        assert _engine._refusal(unknown) is None  # nobody asks
+        patch.setattr(_switch, "TESTED", (jaxlib.version.__version__,))
+        assert _switch._refusal(unknown) is None  # nobody asks
     given = brief_options() | hasty_options()
-    monkeypatch.setattr(_engine, "TESTED", ())
-    assert "xla_of_another_age" in str(_engine._refusal(unknown))
-    known = {k for k, v in options.items() if _engine._refusal({k: v}) is None}
-    assert set(given) == known >= {"xla_backend_optimization_level", *_engine._WIDEST}
+    monkeypatch.setattr(_switch, "TESTED", ())
+    assert "xla_of_another_age" in str(_switch._refusal(unknown))
+    known = {k for k, v in options.items() if _switch._refusal({k: v}) is None}
+    assert set(given) == known >= {"xla_backend_optimization_level", *_switch._WIDEST}
 
 
 def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silence, monkeypatch):
-    monkeypatch.setattr(_kernel_limits, "WIDEST", 10**9)  # lets in what XLA cannot compile
+    monkeypatch.setattr(_stablehlo, "WIDEST", 10**9)  # lets in what XLA cannot compile
     traced = []
 
     def totals(x):
@@ -137,12 +127,12 @@ def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silen
 @pytest.fixture
 def untested(silence, monkeypatch, tmp_path):
     """A jaxlib that no test ran on, and an empty cache folder."""
-    monkeypatch.setattr(_canary, "TESTED", ())
-    monkeypatch.setattr(_canary.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
+    monkeypatch.setattr(_trial, "TESTED", ())
+    monkeypatch.setattr(_trial.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
     monkeypatch.delenv("JAXQUAD_CACHE", raising=False)
-    _canary.why_not_trusted.cache_clear()
+    _trial.why_not_trusted.cache_clear()
     yield tmp_path
-    _canary.why_not_trusted.cache_clear()
+    _trial.why_not_trusted.cache_clear()
 
 
 def test_kernels_pass_their_trial_with_this_jaxlib(untested):
@@ -153,10 +143,10 @@ def test_kernels_pass_their_trial_with_this_jaxlib(untested):
 
 def test_an_answer_is_kept_and_a_failed_trial_is_warned_of(untested, monkeypatch):
     asked = []
-    monkeypatch.setattr(_canary, "_ask_child", lambda: asked.append(1) or "status -6: aborted")
+    monkeypatch.setattr(_trial, "_ask_child", lambda: asked.append(1) or "status -6: aborted")
     for _ in range(2):
         _switch._said.clear()
-        _canary.why_not_trusted.cache_clear()
+        _trial.why_not_trusted.cache_clear()
         with pytest.warns(UserWarning, match="did not pass the trial.*status -6: aborted"):
             assert not engine().one_kernel
         assert not is_kernel()
@@ -165,16 +155,16 @@ def test_an_answer_is_kept_and_a_failed_trial_is_warned_of(untested, monkeypatch
 
 def test_without_a_cache_every_process_asks_anew(untested, monkeypatch):
     monkeypatch.setenv("JAXQUAD_CACHE", "off")
-    monkeypatch.setattr(_canary, "_ask_child", lambda: "")
+    monkeypatch.setattr(_trial, "_ask_child", lambda: "")
     assert engine().one_kernel and not list(untested.iterdir())
 
 
 def test_an_answer_that_cannot_be_read_is_asked_for_again(untested, monkeypatch):
-    path = _canary._answer_path()
+    path = _trial._answer_path()
     assert path is not None
     path.parent.mkdir(parents=True)
     path.write_text("{")
-    monkeypatch.setattr(_canary, "_ask_child", lambda: "")
+    monkeypatch.setattr(_trial, "_ask_child", lambda: "")
     with pytest.warns(UserWarning, match="cannot be read"):
         assert engine().one_kernel
     assert json.loads(path.read_text()) == {"why_not": ""}
@@ -182,7 +172,7 @@ def test_an_answer_that_cannot_be_read_is_asked_for_again(untested, monkeypatch)
 
 def test_a_child_that_dies_tells_its_last_words(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/no/such/python")
-    assert "/no/such/python" in _canary._ask_child()
+    assert "/no/such/python" in _trial._ask_child()
 
 
 def run_program(name, first, last):

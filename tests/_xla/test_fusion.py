@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import evaluate_once, FEW, no_fuse
+from jaxquad._compile import evaluate_once, FEW, no_fuse
 
 
 def lag_with_delay(values, omega):

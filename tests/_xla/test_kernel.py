@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import _kernel_limits, as_one_kernel, engine
+from jaxquad._compile import engine
+from jaxquad._xla import _stablehlo, as_one_kernel
 
 
 STEPS = 40
@@ -127,7 +128,7 @@ def test_what_a_kernel_cannot_hold_is_left_to_the_plain_compiler(name):
 
 def test_more_operations_than_compile_in_time_are_left_to_the_plain_compiler(monkeypatch):
     run = jax.jit(lambda x, p: kernel(x, p))
-    monkeypatch.setattr(_kernel_limits, "_MOST_OPERATIONS", 10)
+    monkeypatch.setattr(_stablehlo, "_MOST_OPERATIONS", 10)
     assert TAG not in run.lower(START, GAIN).as_text()
     assert any(" operations, " in line for line in engine().left_plain)
 
@@ -218,9 +219,7 @@ MISSING = """
 import sys
 import equinox, jax  # equinox needs some of them itself
 {how}
-from jaxquad._xla import as_one_kernel, engine
-from jaxquad._xla._kernel import enter
-assert enter is None
+from jaxquad._compile import _plain, engine
 import warnings
 with warnings.catch_warnings(record=True) as said:
     warnings.simplefilter('always')
@@ -228,7 +227,9 @@ with warnings.catch_warnings(record=True) as said:
 assert not told.one_kernel and 'lacks what kernels are made with' in told.why_not
 assert told.why_not in str(said[-1].message)
 x = jax.numpy.ones(3)
-assert jax.numpy.allclose(jax.jit(lambda x: as_one_kernel(jax.numpy.sin, x))(x), jax.numpy.sin(1.0))
+from jaxquad._compile._door import compilers
+assert compilers() is _plain
+assert jax.numpy.allclose(_plain.as_one_kernel(jax.numpy.sin, x), jax.numpy.sin(1.0))
 print("plain")
 """
 WITHOUT = {
@@ -244,7 +245,7 @@ def test_without_the_compilers_interfaces_a_loop_is_plain(what):
 
 
 def test_an_interface_that_fails_leaves_a_program_that_runs_and_is_warned_of(monkeypatch):
-    monkeypatch.setattr(_kernel_limits, "_sum_of_firsts", None)
+    monkeypatch.setattr(_stablehlo, "_sum_of_firsts", None)
     run = jax.jit(lambda x, p: 2 * kernel(x, p))
     with pytest.warns(UserWarning, match="cannot mark a kernel"):
         assert TAG not in run.lower(START, GAIN).as_text()

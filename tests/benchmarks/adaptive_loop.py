@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxquad._xla import sincos
+from jaxquad.models import sincos
 from jaxquad.simulation import run_ensemble, runge_kutta
 
 

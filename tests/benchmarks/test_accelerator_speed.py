@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import engine
+from jaxquad._compile import engine
 
 
 STEPS, ROUNDS = 5000, 5

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import brief_options, compiler_options
+from jaxquad._compile import brief_options, compiler_options
 from jaxquad.control import AdaptiveLADRC, certainty_equivalence, LADRC, RecursiveInertia
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._xla import compiler_options
+from jaxquad._compile import compiler_options
 
 
 jax.config.update("jax_enable_x64", True)

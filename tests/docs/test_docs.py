@@ -17,7 +17,6 @@ from test_notebooks import words
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 RUN = (
-    "comparison.md",
     "first_steps.md",
     "how_to.md",
     "limits.md",

@@ -63,6 +63,13 @@ def test_the_main_job_prints_what_its_page_shows(tmp_path):
     assert files <= {path.name for path in tmp_path.iterdir()}
 
 
+@pytest.mark.slow
+def test_the_estimates_beside_scipy_are_those_that_the_comparison_shows(tmp_path):
+    (shown,) = [text for text in blocks(page("comparison.md")) if "scipy, u to y" in text]
+    printed = run(sys.executable, str(ROOT / "fits" / "beside_scipy.py"), folder=tmp_path)
+    assert words(printed) == words(shown)
+
+
 def test_there_are_exactly_two_commands_to_set_up():
     assert len(re.findall(r"python3 -m venv", README)) == 2
 

@@ -173,7 +173,8 @@ def test_numbers_of_draws_that_make_no_sense_are_refused(n):
 
 
 def test_a_fit_without_a_minimum_is_refused():
-    lost = dataclasses.replace(sharp_fit(), remarks=("no minimum: one more step ...",))
+    remark = jq.spectra.Remark("no minimum: one more step ...", kind="no minimum")
+    lost = dataclasses.replace(sharp_fit(), remarks=(remark,))
     for hold in (False, True):
         with pytest.raises(ValueError, match="no minimum"):
             lost.ensemble(5, KEY, hold_undetermined=hold)

@@ -10,7 +10,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad._xla import _kept_programs
+from jaxquad._compile import _programs
 from jaxquad.identify.frequency_domain._condition import require_conditions
 
 
@@ -56,10 +56,10 @@ def test_it_changes_models_of_numpys_arrays_too():
 
 
 def test_its_numbers_are_no_part_of_a_program_which_is_kept(monkeypatch, tmp_path):
-    monkeypatch.setattr(_kept_programs, "_folder", lambda: tmp_path)
-    lowered, kept = [], _kept_programs._lowered
+    monkeypatch.setattr(_programs, "_folder", lambda: tmp_path)
+    lowered, lower = [], _programs._Program._lower
     monkeypatch.setattr(
-        _kept_programs, "_lowered", lambda *given: lowered.append(given[1]) or kept(*given)
+        _programs._Program, "_lower", lambda *args: lowered.append(args[1]) or lower(*args)
     )
     omega = np.geomspace(0.5, 20.0, 23)  # as no other test has them
     few = response_of(RIG, seed=2, omega=omega), response_of(loaded(RIG), seed=3, omega=omega)

@@ -8,7 +8,7 @@ from sweep_logs import swept
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad._xla import arctan2, evaluate_once, in_real_parts, NotInRealPartsError
+from jaxquad._compile import evaluate_once
 from jaxquad.identify import select_parameters
 from jaxquad.identify.batch._fit_batch import solve_batch
 from jaxquad.identify.frequency_domain._condition import UNCHANGED
@@ -190,33 +190,3 @@ def test_expensive_functions_evaluated_once_are_the_same_functions():
 
     for got, expected in zip(jax.jit(evaluate_once(function))(x, y), function(x, y), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-14)
-
-
-def test_complex_arithmetic_in_real_parts_is_the_same_arithmetic():
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(-3.0, 3.0, (2, 500))
-
-    def function(x, y):
-        z = jax.lax.complex(x, y)
-        s = jax.lax.complex(jnp.zeros_like(x), y)
-        terms = jnp.exp(-s) / (z + 2j), z**-3, jnp.conj(z) * s, jnp.where(x > 0, z, s), jnp.log(z)
-        parts = [(jnp.real(term), jnp.imag(term)) for term in terms]
-        return parts, jnp.abs(z - s), jnp.arctan2(y, x), jnp.sum(jnp.stack([z, s]), axis=0).imag
-
-    found, expected = (
-        jax.tree.leaves(each) for each in (in_real_parts(function, x, y), function(x, y))
-    )
-    for got, wanted in zip(found, expected, strict=True):
-        np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-15)
-    with pytest.raises(NotInRealPartsError):
-        in_real_parts(lambda x: jnp.linalg.inv(jnp.reshape(x[:4], (2, 2))), x)
-
-
-def test_arctangents_of_all_quadrants():
-    angle = np.linspace(-np.pi, np.pi, 4001)[1:-1]
-    for size in (1e-150, 1.0, 1e150):
-        found = arctan2(size * np.sin(angle), size * np.cos(angle))
-        np.testing.assert_allclose(
-            found, np.arctan2(size * np.sin(angle), size * np.cos(angle)), atol=5e-16
-        )
-    assert arctan2(jnp.zeros(()), jnp.zeros(())) == 0

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 import jaxquad as jq
 from jaxquad.control import LinearController, PID
 from jaxquad.identify import refine
-from jaxquad.identify.output_error._known_loop import close_loop, feedback_response, invert_series
+from jaxquad.identify.output_error._problem import close_loop, feedback_response, invert_series
 
 
 DT, SAMPLES = 0.02, 1500
@@ -58,6 +58,7 @@ def flown(seed):
     return jq.Record(TIME, u, y, hold=DT), slow
 
 
+@pytest.mark.slow
 def test_the_series_of_a_loop_is_its_sensitivity():
     record, slow = flown(0)
     _, whole, closed = loop_filters()

@@ -45,7 +45,7 @@ def flown(*chains, noise=1.0, seconds=30.0, seed=0):
 def test_notches_that_no_parameter_holds_are_in_the_measured_chain(instrument, known):
     unfiltered, filtered, stick = flown(LOW_PASS, NOTCHES)
     found = measured_chain(
-        unfiltered, filtered, DT, known=known, reference=stick if instrument else None
+        unfiltered, filtered, DT, filters=known, reference=stick if instrument else None
     )
     assert isinstance(found, KnownFilter) and found.misfit < 1.6
     truth = np.asarray(LOW_PASS.response(AT)) * np.asarray(NOTCHES.response(AT))
@@ -58,7 +58,7 @@ def test_notches_that_no_parameter_holds_are_in_the_measured_chain(instrument, k
 
 def test_where_the_parameters_hold_all_of_it_nothing_is_added():
     unfiltered, filtered, stick = flown(LOW_PASS)
-    found = measured_chain(unfiltered, filtered, DT, known=(LOW_PASS,), reference=stick)
+    found = measured_chain(unfiltered, filtered, DT, filters=(LOW_PASS,), reference=stick)
     assert np.all(np.abs(found.delay_ms(AT) - np.asarray(LOW_PASS.delay_ms(AT))) < 0.03)
     assert "by the parameters" in str(found) and "ms at 10 Hz" in str(found)
 
@@ -67,7 +67,7 @@ def test_the_standard_error_is_that_of_many_flights():
     found = []
     for seed in range(12):
         unfiltered, filtered, stick = flown(LOW_PASS, seed=seed, noise=3.0)
-        found.append(measured_chain(unfiltered, filtered, DT, known=(LOW_PASS,), reference=stick))
+        found.append(measured_chain(unfiltered, filtered, DT, filters=(LOW_PASS,), reference=stick))
     away = [np.angle(each.response(AT) / np.asarray(LOW_PASS.response(AT)))[2] for each in found]
     errors = [each.error(AT)[2] for each in found]
     assert 0.5 < np.sqrt(np.mean(np.square(away))) / np.mean(errors) < 1.8
@@ -80,7 +80,7 @@ def test_a_chain_without_noise_is_exact_and_goes_on_beyond_the_band():
         lfilter([0.1], [1.0, -0.9], unfiltered)
     )  # white noise would pass for folded noise
     plain = FilterChain((PT1(40.0),), 1 / DT)
-    found = measured_chain(unfiltered, passed(plain, unfiltered), DT, known=(plain,))
+    found = measured_chain(unfiltered, passed(plain, unfiltered), DT, filters=(plain,))
     far = np.array([1.0, 100.0, 450.0])
     away = np.abs(found.response(far) / np.asarray(plain.response(far)) - 1)
     assert np.all(away < 3 * found.error(far)) and found.error(far)[0] < 1e-3
@@ -112,7 +112,7 @@ def test_betaflights_own_chain_is_that_of_its_header_and_half_a_period(data, nam
     record = read(path, inputs=f"setpoint[{axis}]", outputs=list(names), start=8.5)
     unfiltered, filtered = (record.channel(each) for each in names)
     found = measured_chain(
-        unfiltered, filtered, record.dt, known=known, reference=record.inputs[:, 0], names=names
+        unfiltered, filtered, record.dt, filters=known, reference=record.inputs[:, 0], names=names
     )
     by_header = sum(float(each.delay_ms([10.0])[0]) for each in known)
     error = 1e3 * float(found.error(np.array([10.0]))[0]) / (2 * np.pi * 10)

@@ -10,13 +10,13 @@ from scipy.signal import lfilter
 
 import jaxquad as jq
 from jaxquad.identify import ARMA, AutoRegressive, refine
-from jaxquad.identify.output_error._noise_model import (
+from jaxquad.identify.output_error._noise import (
     estimate_noise,
+    make_whitener,
     NoiseModel,
     shock_slopes,
     shocks_of,
 )
-from jaxquad.identify.output_error._whitening import make_whitener
 
 
 DT, SAMPLES = 0.02, 1000
@@ -129,6 +129,7 @@ def test_a_fit_is_refined_with_its_own_ties():
     np.testing.assert_array_less(np.abs(again.values - fit.values), 0.1 * fit.standard_errors)
 
 
+@pytest.mark.slow
 def test_noise_that_cannot_be_modelled_is_refused():
     with pytest.raises(ValueError, match="and a noise model exclude each other"):
         refine(TRUTH, record(8), noise="auto", band=(1.0, 10.0))

@@ -29,6 +29,7 @@ def fitted(frf):
     return jq.fit(TRUTH, frf)
 
 
+@pytest.mark.slow
 def test_the_flight_that_is_asked_for_makes_a_loose_parameter_known():
     frf = response_of(TRUTH, error=0.02, seed=3, omega=BELOW)
     fit = fitted(frf)
@@ -71,7 +72,8 @@ def test_what_no_flight_tells_apart_asks_for_no_flight():
 
 def test_a_log_of_feedback_alone_answers_nothing_about_the_vehicle():
     frf = response_of(TRUTH, error=0.005, seed=0)
-    said = jq.spectra.Remark("feedback-dominated: {where}", np.asarray(frf.omega))
+    omega = np.asarray(frf.omega)
+    said = jq.spectra.Remark("feedback-dominated: {where}", omega, kind=jq.spectra.DOMINATED)
     hover = dataclasses.replace(frf, remarks=(said,))
     found = answer_section(fitted(hover), hover, record(), {})
     assert "the controller, and not the vehicle" in found["plain"]

@@ -106,6 +106,7 @@ SECTIONS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, frf, fit, monkeypatch, name):
     record = record_of(("u0", "y0", "r"), ("V", "rad/s", "V"))
@@ -228,7 +229,9 @@ def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
     named = dataclasses.replace(
         frf, input_names=(u,), output_names=(y,), remarks=(jq.spectra.Remark(words),)
     )
-    outside = dataclasses.replace(fit, remarks=HOSTILE, names=(r, u, "delay"))
+    outside = dataclasses.replace(
+        fit, remarks=tuple(map(jq.spectra.Remark, HOSTILE)), names=(r, u, "delay")
+    )
     path = write_report(
         tmp_path / "report.html", fit=outside, frf={unit: named}, others={source: named},
         record=record, checks={words: jq.verify(TRUTH, record)}, title=r, formula=u,
@@ -279,7 +282,9 @@ def header_of(tmp_path, **content):
 
 
 def test_a_misfit_and_a_failed_verification_are_in_the_header(tmp_path, frf, fit, record):
-    off = dataclasses.replace(fit, chi_squared=16.0, remarks=("the misfit is 4.0 times",))
+    off = dataclasses.replace(
+        fit, chi_squared=16.0, remarks=(jq.spectra.Remark("the misfit is 4.0 times"),)
+    )
     check = jq.verify(jq.LaggedIntegrator(-280.0, 0.016, 0.011), record)
     header = header_of(tmp_path, fit=off, frf=frf, checks={"b": check})
     assert "! IDENTIFIED, but the misfit is 4.0 times the random error" in header
@@ -287,7 +292,9 @@ def test_a_misfit_and_a_failed_verification_are_in_the_header(tmp_path, frf, fit
 
 
 def test_remarks_and_missing_certificates_are_in_the_header(tmp_path, frf, fit):
-    remarked = dataclasses.replace(fit, remarks=("one", "two"))
+    remarked = dataclasses.replace(
+        fit, remarks=(jq.spectra.Remark("one"), jq.spectra.Remark("two"))
+    )
     tuned = dataclasses.replace(tuned_by_hand(), certificate=None)
     header = header_of(tmp_path, fit=remarked, frf=frf, tuned=tuned)
     assert "! IDENTIFIED, with 2 remarks" in header and "! NOT CERTIFIED" in header

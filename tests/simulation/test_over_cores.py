@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxquad as jq
-from jaxquad._xla import Jit
+from jaxquad._compile import Jit
 from jaxquad.simulation import _memory, _over_cores, _simulate
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import jaxquad as jq
 from jaxquad.spectra import ErrorCovariance
-from jaxquad.spectra._atoms import add_effects, reach_of
+from jaxquad.spectra._error_covariance import add_effects, reach_of
 
 
 FREQUENCIES, OUTPUTS, INPUTS, PARAMETERS = 70, 2, 3, 4
@@ -72,6 +72,7 @@ def plain():
     return plain_covariance(WHOLE).reshape(*SHAPE, *SHAPE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", (ERRORS, WHOLE), ids=("reach", "whole"))
 def test_all_forms_of_the_covariance_are_the_plain_one(errors, plain):
     for first, second in (((0, 0), (0, 0)), ((1, 2), (1, 2)), ((0, 1), (1, 2))):

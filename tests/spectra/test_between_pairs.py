@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxquad as jq
-from jaxquad.spectra._local_noise import smooth_noise
+from jaxquad.spectra._noise import smooth_noise
 
 
 @pytest.mark.parametrize("estimator", [None, jq.spectra.Composite(windows=(4.0, 8.0))])

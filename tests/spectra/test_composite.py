@@ -10,7 +10,7 @@ from jaxquad.excitation import sweep
 from jaxquad.records import Record
 from jaxquad.spectra import Composite, frequency_response, Welch
 from jaxquad.spectra._average import combine, Conditioned
-from jaxquad.spectra._noise_freedom import kept_if_few
+from jaxquad.spectra._noise import kept_if_few
 
 
 RATE = 250.0
@@ -86,7 +86,7 @@ def spectra(seed, groups=3, frequencies=7):
         response=response,
         solver=np.zeros((groups, frequencies, 1, 1), complex),
         power=gain,
-        own_share=ones,
+        alone=ones,
         output_power=np.abs(response) ** 2 * gain[..., None] / coherence,
         coherence=coherence,
         instrument_share=ones,

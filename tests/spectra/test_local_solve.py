@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxquad.spectra._local_solve import solve_polynomial, solve_rational
+from jaxquad.spectra._local_fit import solve_polynomial, solve_rational
 
 
 FREQUENCIES, WINDOW, ORDER = 3, 40, 2

@@ -4,9 +4,15 @@ import functools as ft
 
 import numpy as np
 
-from jaxquad.spectra._model_noise import noise_left, rough_noise, running_power
-from jaxquad.spectra._model_order import next_order, refine_orders, search_orders
-from jaxquad.spectra._rational_fit import descend, Equations, make_basis
+from jaxquad.spectra._global_model import noise_left, rough_noise, running_power
+from jaxquad.spectra._rational_fit import (
+    descend,
+    Equations,
+    make_basis,
+    next_order,
+    refine_orders,
+    search_orders,
+)
 
 
 MOST = 10

@@ -7,13 +7,13 @@ import pytest
 
 from jaxquad.records import read, RecordWarning
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
-from jaxquad.spectra._model_order import search_orders
 from jaxquad.spectra._rational_fit import (
     Basis,
     descend,
     Equations,
     make_basis,
     parts_of,
+    search_orders,
     solve_linear,
 )
 
@@ -82,6 +82,7 @@ def test_a_descent_leaves_no_more_than_it_began_with_and_reaches_the_noise():
     assert found.cost < truth < found.cost * (1 + 5 * parameters / (2 * BINS))
 
 
+@pytest.mark.slow
 def test_the_last_digit_of_a_flight_does_not_choose_its_models(data):
     """Of an order above that of the vehicle: poles and zeros that cancel leave directions open."""
     path = data / "antx_pitch" / "antx_log3_prbs.npz"

@@ -3,11 +3,9 @@ import pytest
 
 from jaxquad.records import Record
 from jaxquad.spectra import Composite, Welch
-from jaxquad.spectra._basis import merged_basis, sample_basis
-from jaxquad.spectra._blocks import lattice_windows
-from jaxquad.spectra._transform import plan_transform, Taper, transform_tapers, transform_windows
+from jaxquad.spectra._fourier_sums import _block_functions, fourier_sums, Taper
 from jaxquad.spectra._welch import transform_records
-from jaxquad.spectra._window import segment_starts, window
+from jaxquad.spectra._windows import lattice_windows, segment_starts, window
 
 
 # Lengths of whole blocks and odd ones, short and very short; starts on and off blocks.
@@ -30,6 +28,11 @@ def direct_sums(x, angle, length, starts, shape="hann", detrend="constant", orig
         waves = np.exp(-1j * np.multiply.outer(angle, origin + start + n))
         sums.append(waves @ (window(shape, length)[:, None] * segment))
     return np.stack(sums, axis=1)
+
+
+def transform_windows(x, angle, windows, *, shape="hann", detrend="constant", origin=0.0):
+    taper = (Taper(shape, x.shape[1]),)
+    return fourier_sums((x,), angle, windows, taper, detrend=detrend, origin=origin)[0]
 
 
 def assert_sums(found, expected, relative):
@@ -96,7 +99,7 @@ def test_a_second_record_of_the_same_layout_reuses_the_tables():
 @pytest.mark.parametrize("overlap", [0.0, 0.5, 0.8])
 def test_lattice_windows_reach_both_ends_and_keep_their_overlap(samples, overlap):
     lengths = (15_000, 9_999, 2500, 100)
-    windows = lattice_windows(samples, lengths, overlap, np.geomspace(6e-4, 0.2, 9))
+    windows = lattice_windows(samples, lengths, overlap, 0.2)
     for asked, (length, starts) in zip(lengths, windows, strict=True):
         assert starts[0] == 0 and starts[-1] + length == samples
         assert length == pytest.approx(asked, rel=0.1)
@@ -107,9 +110,8 @@ def test_lattice_windows_reach_both_ends_and_keep_their_overlap(samples, overlap
 
 @pytest.mark.parametrize("dt", [1 / 500, 1 / 400, 1 / 307])
 def test_lattice_windows_share_their_blocks(dt):
-    omega = np.geomspace(0.3, 100, 9)
-    lengths = [round(seconds / dt) for seconds in (30, 20, 12, 8, 5)]
-    windows = lattice_windows(round(121.3 / dt), lengths, 0.5, omega * dt)
+    lengths = tuple(round(seconds / dt) for seconds in (30, 20, 12, 8, 5))
+    windows = lattice_windows(round(121.3 / dt), lengths, 0.5, 100 * dt)
     lengths = [length for length, _ in windows]
     # All but the first window of each length, which starts at the first sample.
     shifts = [start - starts[-1] for _, starts in windows for start in starts[1:]]
@@ -118,31 +120,23 @@ def test_lattice_windows_share_their_blocks(dt):
 
 def test_sums_on_a_lattice_equal_those_term_by_term():
     x = RECORD[:1573]
-    windows = lattice_windows(1573, (1000, 700), 0.5, np.array([0.2]))
+    windows = lattice_windows(1573, (1000, 700), 0.5, 0.2)
     found = transform_windows(x, np.array([0.01, 0.2]), windows)
     for (length, starts), sums in zip(windows, found, strict=True):
         expected = direct_sums(x, np.array([0.01, 0.2]), length, starts)
         assert_sums(np.asarray(sums), expected, 1e-12)
 
 
-def test_functions_on_blocks_are_even_or_odd_and_span_the_band():
-    single = sample_basis(120, [0.02, 0.3])
-    longer = merged_basis(single, 5, [0.02, 0.3])
-    waves = np.exp(1j * np.multiply.outer(np.linspace(-0.3, 0.3, 77), np.arange(121)))
-    values = single.weights / np.where(np.arange(121) % 120, 1.0, 0.5)[:, None]
-    assert np.array_equal(values[::-1], values * single.signs)
-    np.testing.assert_allclose(waves @ single.weights @ values.T, waves, atol=1e-12)
-    # Of a longer block, by way of the coefficients of the shorter ones.
-    mirrored = longer.weights.reshape(5, single.signs.size, -1)[::-1] * single.signs[:, None]
-    assert np.array_equal(mirrored.reshape(longer.weights.shape), longer.weights * longer.signs)
-    np.testing.assert_allclose(
-        longer.weights.T @ longer.weights, np.eye(longer.signs.size), atol=1e-12
-    )
-    for basis in (single, longer):
-        grid = np.linspace(-0.3, 0.3, 77)
-        # A wave has the energy of its samples, the two at the ends counting half.
-        energy = np.sum(np.abs(basis.spin(grid)) ** 2, axis=1)
-        np.testing.assert_allclose(energy, basis.samples, rtol=1e-12)
+@pytest.mark.parametrize("samples", [120, 121])
+def test_functions_on_blocks_are_even_or_odd_and_span_the_band(samples):
+    even, odd = _block_functions(samples, 0.3)
+    assert even.shape[1] + odd.shape[1] < samples / 2
+    place = np.arange(samples) - (samples - 1) / 2
+    for functions, wave, sign in ((even, np.cos, 1), (odd, np.sin, -1)):
+        rows = wave(np.multiply.outer(np.linspace(-0.3, 0.3, 77), place))
+        np.testing.assert_allclose(rows @ functions @ functions.T, rows, atol=1e-12)
+        np.testing.assert_allclose(rows[:, ::-1], sign * rows)
+        np.testing.assert_allclose(functions.T @ functions, np.eye(functions.shape[1]), atol=1e-12)
 
 
 # Windows of 8, 6 and 5 blocks of 125 samples, whose steps are 4, 3 and 5 of these.
@@ -159,26 +153,12 @@ def test_windows_of_shared_blocks_equal_those_term_by_term_behind_each_derivativ
         np.geomspace(0.004, 0.3, 9),
         (Taper("hann", 3), Taper("hann'", 3, 1), Taper("hann''", 2)),
     )
-    made = transform_tapers(
-        (x[:, :1], x[:, 1:]), angle, SHARED, tapers, detrend=detrend, origin=7.0
-    )
+    made = fourier_sums((x[:, :1], x[:, 1:]), angle, SHARED, tapers, detrend=detrend, origin=7.0)
     for taper, found in zip(tapers, made, strict=True):
         for (length, starts), sums in zip(SHARED[taper.first :], found, strict=True):
             part = x[:, : taper.channels]
             expected = direct_sums(part, angle, length, starts, taper.shape, detrend, 7.0)
             assert_sums(sums, expected, 1e-12)
-
-
-def test_long_blocks_serve_windows_that_they_divide():
-    windows = lattice_windows(60_000, (15_000, 10_000, 6000, 4000, 2500), 0.5, np.array([0.2]))
-    angle = tuple(np.geomspace(1e-3, 0.2, 100).tolist())
-    plan = plan_transform(60_000, angle, windows, (Taper("hann", 1),), "constant")
-    for (length, starts), parts in zip(windows, plan.parts, strict=True):
-        (part,) = parts
-        assert part.level is not None
-        block = plan.levels[part.level].many * plan.lattice.block
-        assert block > plan.lattice.block and length % block == 0
-        assert [start % block for start in starts] == [0] * len(starts)
 
 
 ESTIMATORS = [
@@ -248,4 +228,4 @@ def test_unusable_input_is_named(angle, windows, options, words):
 @pytest.mark.parametrize(("length", "overlap", "words"), [(200, 0.5, "200"), (50, 1.0, "1.0")])
 def test_unusable_lattices_are_named(length, overlap, words):
     with pytest.raises(ValueError, match=words):
-        lattice_windows(130, (length,), overlap, np.array([0.1]))
+        lattice_windows(130, (length,), overlap, 0.1)

@@ -99,7 +99,6 @@ TAIL = """\
 ## Numbers of others, and measured flights
 
 - A fit that CIFER 6.3 printed, `python fits/cessna_navfit.py`: [Comparison](comparison.md).
-- Five published flights: [Measured flights](measured.md).
 - Loops and simulations equal python-control's and scipy's: [Comparison](comparison.md).
 - The paper's figures: [equations](equations.md), `python fits/paper.py`.
 """
@@ -149,8 +148,8 @@ def _notes(table: dict) -> str:
 
 
 def _section(table: dict) -> str:
-    title = table["title"]
-    parts = [f"## {title}", fill(FINDINGS.get(title, table.get("text", "")), 110)]
+    title = str(table["title"])
+    parts = [f"## {title}", fill(FINDINGS.get(title) or table.get("text", ""), 110)]
     if title == "Healthy plants without options":
         places = [table["columns"].index(name) for name in SHORT]
         rows = [[*SHORT.values()], ["---"] * len(SHORT)]

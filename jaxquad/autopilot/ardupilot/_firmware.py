@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from jaxquad._core import Message
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain, PT1
@@ -79,11 +80,19 @@ def ardupilot_loop(
     )  # fmt: skip
     switched = {
         **{f"ATC_RAT_{x}_SMAX": "the slew limiter lowers P and D" for x in ("RLL", "PIT", "YAW")},
-        **{f"ATC_RAT_{x}_{n}": "a notch" for x in ("RLL", "PIT", "YAW") for n in ("NTF", "NEF")},
+        **{
+            f"ATC_RAT_{x}_{n}": Message("a notch", "notch")
+            for x in ("RLL", "PIT", "YAW")
+            for n in ("NTF", "NEF")
+        },
         "FSTRATE_ENABLE": "the rate loop runs faster than SCHED_LOOP_RATE",
     }
-    found = [f"{k}: {words}" for k, words in switched.items() if read.number(k, 0.0) > 0]
-    flown = FlownArduPilot(law, (*found, *notches.unmodelled), notches.tracking)
+    left_out = [
+        Message(f"{name}: {what}", Message(what).kind)
+        for name, what in switched.items()
+        if read.number(name, 0.0) > 0
+    ]
+    flown = FlownArduPilot(law, (*left_out, *notches.unmodelled), notches.tracking)
     return dataclasses.replace(flown, law=flown.at(throttle))
 
 

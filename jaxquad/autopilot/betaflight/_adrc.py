@@ -8,7 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
+from jaxquad._core import (
+    as_float,
+    as_messages,
+    broadcast_gain,
+    Message,
+    per_member,
+    require_positive,
+)
 from jaxquad.control import Reference
 from jaxquad.identify import B0Law, B0Schedule
 from jaxquad.records import AXES
@@ -293,15 +300,15 @@ def _schedule(values: Mapping[str, str]) -> B0Schedule:
     )
 
 
-def _unmodelled(values: Mapping[str, str], pid: FlownBetaflight) -> tuple[str, ...]:
+def _unmodelled(values: Mapping[str, str], pid: FlownBetaflight) -> tuple[Message, ...]:
     # What concerns P, I and D did not fly.
-    common = [each for each in pid.unmodelled if "gyro" in each or "feedforward" in each]
+    common: list[str] = [each for each in pid.unmodelled if each.kind in ("notch", "feedforward")]
     common.append("the gate before liftoff, and wc on the ground")
     if _number(values, "adrc_sat_z3_inhibit", 0.0) > 0:
         common.append("adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits")
     if any(float(x) != 100 for k in values if "adrc_zeta" in k for x in values[k].split(",")):
         common.append("adrc_zeta: the damping ratio is taken as 1")
-    return tuple(common)
+    return as_messages(common)
 
 
 def _three(values: Mapping[str, str], name: str) -> list[float]:

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxquad._core import as_messages, Message
+
 from .._filters import betaflight_quality, Butterworth, Filter, FilterChain, Notch, PT1, PT2, PT3
 from .._firmware import cutoff_of, LowPass, Stage
 from .._law import DEGREES, FlownLoop
@@ -295,24 +297,29 @@ class _Header:
         cutoff = self.number("iterm_relax_cutoff", default=15.0)
         return ItermRelax(cutoff, 40.0, share, kind, mode in (3, 4))
 
-    def unmodelled(self) -> tuple[str, ...]:
-        found = []
+    def unmodelled(self) -> tuple[Message, ...]:
+        left_out: list[str] = []
         if self.version < (4, 4):
-            found.append("anti-gravity: the integral grows faster while the throttle moves")
+            text = "anti-gravity: the integral grows faster while the throttle moves"
+            left_out.append(Message(text, "anti-gravity"))
         harmonics = self.number("rpm_filter_harmonics", "gyro_rpm_notch_harmonics", default=0.0)
         if harmonics > 0:
-            found.append(f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors")
+            text = f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors"
+            left_out.append(Message(text, "notch"))
         if self.number("dyn_notch_count", "dyn_notch_q", default=0.0) > 0:
-            found.append("dynamic notches on the gyro: they follow its spectrum")
+            left_out.append(
+                Message("dynamic notches on the gyro: they follow its spectrum", "notch")
+            )
         if (transition := self.number("feedforward_transition", default=0.0)) > 0:
-            found.append(
+            text = (
                 f"feedforward_transition {transition:g}: F grows with the sticks' deflection; the "
                 "law is that of centred sticks, without F"
             )
+            left_out.append(Message(text, "feedforward"))
         for name, words in _UNUSUAL.items():
             if self.number(name, default=0.0) > 0:
-                found.append(f"{name}: {words}")
-        return tuple(found)
+                left_out.append(f"{name}: {words}")
+        return as_messages(left_out)
 
 
 _UNUSUAL = {

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
+from jaxquad._core import as_float, broadcast_gain, Message, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
 from jaxquad.records import AXES
 
@@ -246,9 +246,11 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
     )  # fmt: skip
     unmodelled = []
     if read.number("IMU_GYRO_DNF_EN", 0.0) > 0:
-        unmodelled.append("IMU_GYRO_DNF_EN: dynamic notches follow motors or spectrum")
+        text = "IMU_GYRO_DNF_EN: dynamic notches follow motors or spectrum"
+        unmodelled.append(Message(text, "notch"))
     if read.number("MC_BAT_SCALE_EN", 0.0) > 0:
-        unmodelled.append("MC_BAT_SCALE_EN: the torque is scaled by the battery's voltage")
+        text = "MC_BAT_SCALE_EN: the torque is scaled by the battery's voltage"
+        unmodelled.append(Message(text))
     return FlownLoop(law, tuple(unmodelled))
 
 

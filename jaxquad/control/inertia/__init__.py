@@ -1,3 +1,4 @@
+from ._estimator import NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._lock_in import LockInInertia as LockInInertia
 from ._maps import (
     certainty_equivalence as certainty_equivalence,
@@ -15,7 +16,6 @@ from ._paper import (
     observe_disturbance as observe_disturbance,
     paper_inertia as paper_inertia,
 )
-from ._probe_tones import NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._regression import (
     RecursiveInertia as RecursiveInertia,
     WindowedInertia as WindowedInertia,

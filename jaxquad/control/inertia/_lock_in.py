@@ -9,9 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxquad._core import require_all_positive, signal_shape
 
-from ._estimate import AbstractInertia, LastEstimate
-from ._filters import empty_past, motion, Past
-from ._probe_tones import ProbeTones
+from ._estimator import AbstractInertia, empty_past, LastEstimate, motion, Past, ProbeTones
 
 
 class LockInSolution(NamedTuple):
@@ -51,8 +49,8 @@ def solve(
 def _ratios(acceleration, torque, contrast):
     a, u = acceleration[:, :, 1], torque[:, :, 1]
     power = jnp.sum(a**2, axis=0)
-    beside = jnp.sum(acceleration[:, :, ::2] ** 2, axis=(0, 2)) / 2
-    out = power > contrast * beside
+    neighbours = jnp.sum(acceleration[:, :, ::2] ** 2, axis=(0, 2)) / 2
+    out = power > contrast * neighbours
     inverse = jnp.where(out, 1 / jnp.where(out, power, 1), 0)
     real = jnp.sum(a * u, axis=0) * inverse
     imaginary = (a[0] * u[1] - a[1] * u[0]) * inverse
@@ -95,7 +93,7 @@ BESIDE = 2  # periods per window: the nearest that a Hann window separates from 
 
 class WindowSums(NamedTuple):
     correlations: Float[Array, " windows parts lines signals axes *ensemble"]
-    whole: Float[Array, " windows axes *ensemble"]  # 1 while nothing was missing
+    valid: Float[Array, " windows axes *ensemble"]  # 1 while nothing was missing
     index: Int[Array, ""]  # sample within the first window
 
 
@@ -115,8 +113,8 @@ class LockInWindows(eqx.Module):
             )
         for frequency in self.frequencies:
             self._require_whole(frequency)
-        apart = np.diff(sorted(self.periods))
-        if np.any(apart < 2 * BESIDE):
+        spacing = np.diff(sorted(self.periods))
+        if np.any(spacing < 2 * BESIDE):
             raise ValueError(
                 f"Tones of {self.frequencies} Hz are closer than {2 * BESIDE / self.window:g} Hz, "
                 f"the resolution of a window of {self.window} s: give a longer window."
@@ -156,8 +154,8 @@ class LockInWindows(eqx.Module):
     def init(self, like: Float[Array, " axes *ensemble"]) -> WindowSums:
         lines = 3 * len(self.frequencies)
         correlations = jnp.zeros((2, 2, lines, 2, *like.shape), like.dtype)
-        whole = jnp.zeros((2, *like.shape), like.dtype)
-        return WindowSums(correlations, whole, jnp.zeros((), jnp.int32))
+        valid = jnp.zeros((2, *like.shape), like.dtype)
+        return WindowSums(correlations, valid, jnp.zeros((), jnp.int32))
 
     def add(
         self,
@@ -171,8 +169,8 @@ class LockInWindows(eqx.Module):
         weights = self._weights(sums.index, place).astype(signals.dtype)
         weights = weights.reshape(weights.shape + (1,) * signals.ndim)
         correlations = going * sums.correlations + weights * signals[None, None, None]
-        whole = jnp.where(_over(place == 0, sums.whole), 1, sums.whole) * counts[None]
-        return WindowSums(correlations, whole, (sums.index + 1) % self.samples)
+        valid = jnp.where(_over(place == 0, sums.valid), 1, sums.valid) * counts[None]
+        return WindowSums(correlations, valid, (sums.index + 1) % self.samples)
 
     def ends(self, sums: WindowSums) -> Bool[Array, ""]:
         """Whether the last sample ended one of the windows."""
@@ -181,8 +179,8 @@ class LockInWindows(eqx.Module):
     def ended(self, sums: WindowSums) -> tuple[Array, Array]:
         """Its correlations [parts, tones, places, signals, ...] and whether it counts."""
         first = sums.index == 0
-        chosen, whole = (jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.whole))
-        return chosen.reshape(2, len(self.frequencies), 3, *chosen.shape[2:]), whole
+        chosen, valid = (jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.valid))
+        return chosen.reshape(2, len(self.frequencies), 3, *chosen.shape[2:]), valid
 
     def _place(self, index):
         """Of the sample within each window."""
@@ -299,13 +297,13 @@ class LockInInertia(AbstractInertia):
 
     def _renew(self, windows, sums, last, stiffness):
         """The estimate of the window that has just ended, where it shows one."""
-        done, whole = windows.ended(sums)
+        done, valid = windows.ended(sums)
         solved = solve(
-            done[:, :, :, 0], done[:, :, :, 1], windows.square(whole),
+            done[:, :, :, 0], done[:, :, :, 1], windows.square(valid),
             contrast=self.contrast, stiff=bool(self.nuisance),
         )  # fmt: skip
-        new = LastEstimate(solved.inertia, solved.variance, jnp.zeros_like(whole), solved.informed)
-        renew = ft.partial(jnp.where, (whole > 0) & (solved.informed > 0))
+        new = LastEstimate(solved.inertia, solved.variance, jnp.zeros_like(valid), solved.informed)
+        renew = ft.partial(jnp.where, (valid > 0) & (solved.informed > 0))
         return jax.tree.map(renew, (new, solved.stiffness), (last, stiffness))
 
     def stiffness(self, state: LockInState) -> Float[Array, " axes *ensemble"]:

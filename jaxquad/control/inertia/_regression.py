@@ -11,9 +11,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxquad._core import as_float, require_all_positive, signal_shape
 
-from ._estimate import AbstractInertia, LastEstimate
-from ._filters import FilterState, has_settled, MatchedFilters
-from ._probe_tones import NoProbe, ProbeState, ProbeTones
+from ._estimator import (
+    AbstractInertia,
+    FilterState,
+    has_settled,
+    LastEstimate,
+    MatchedFilters,
+    NoProbe,
+    ProbeState,
+    ProbeTones,
+)
 
 
 NUISANCES = ("offset", "rate", "angle")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
+from jaxquad._compile import Jit
 from jaxquad._core import (
     advance,
     available_cores,
@@ -15,6 +16,7 @@ from jaxquad._core import (
     CONVERGED,
     decrement,
     Descent,
+    Message,
     Normal,
     require_x64,
     RUNNING,
@@ -22,7 +24,6 @@ from jaxquad._core import (
     STALLED,
     TOLERANCE,
 )
-from jaxquad._xla import Jit
 from jaxquad.models import evaluate_response, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
@@ -41,7 +42,7 @@ from ..frequency_domain._mixing import Mixing, mixings_of
 from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ..frequency_domain._problem import make_problem
 from ..frequency_domain._result import Fit
-from ..frequency_domain._solve import once_if_alike, solution_at, stopped_early
+from ..frequency_domain._solve import solution_at, stopped_early
 from ..uncertainty._assess import assess, Counted, discrepancy_at, records_at
 from ._normal import Batch, Evaluate, evaluates_singly, Member, normal_equations_of
 
@@ -94,13 +95,10 @@ def solve_batch(
             f"measured has shape {measured.shape} and weights {weights.shape}: give at least one "
             "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
         )
-    omega, count = np.asarray(omega), len(omega)
-    where = Batch(model, parameters, hold, _pad(omega), np.asarray(count))
+    omega = np.asarray(omega)
+    where = Batch(model, parameters, hold, _pad(omega))
     _check_pointwise(where, measured.shape[2:])
-    weights = np.asarray(weights)
-    if evaluates_singly(where):
-        weights = once_if_alike(weights)
-    members = _members(np.asarray(measured), weights, mixings)
+    members = _members(np.asarray(measured), np.asarray(weights), mixings)
     if start is None:
         start = np.broadcast_to(
             parameters.start[: parameters.count], (len(measured), parameters.count)
@@ -173,8 +171,10 @@ def _check_pointwise(where: Batch, shape: tuple[int, ...]) -> None:
     whole, single = (np.asarray(part) for part in _both_ways(where.model, where.omega))
     if whole.shape != (*where.omega.shape, *shape):
         raise ValueError(
-            f"the model's response has shape {whole.shape[1:]}, the measured ones {shape} (outputs,"
-            " inputs): pick channels with jq.records.select, or extend the model"
+            Message(
+                f"the model's response has shape {whole.shape[1:]}, the measured ones {shape} "
+                "(outputs, inputs): «pick channels with jq.records.select», or extend the model"
+            )
         )
     if not np.allclose(whole, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(whole))):
         raise ValueError(
@@ -440,7 +440,7 @@ def _ratios(
 ) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
     """|model / measurement| of every member; 1 where a fit ran away."""
     batch, count = len(found.z), data.omega.size
-    where = Batch(model, parameters, data.hold, _pad(data.omega), np.asarray(count))
+    where = Batch(model, parameters, data.hold, _pad(data.omega))
     parts = [_sizes(where, found.z[each]) for each in _places(batch, _CHUNK)]
     sizes = np.concatenate([np.asarray(part) for part in parts])
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Normal equations of many fits side by side: members on the last axis, one frequency at a time."""
+"""Normal equations of many fits side by side: members on the last axis."""
 
 import functools as ft
 import math
@@ -9,34 +9,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxquad._compile import evaluate_once
 from jaxquad._core import Normal
-from jaxquad._xla import (
-    as_one_kernel,
-    evaluate_once,
-    in_real_parts,
-    NotInRealPartsError,
-    why_no_kernels,
-)
 from jaxquad.models import evaluate_response, StateSpace
 
 from ..frequency_domain._condition import UNCHANGED
 from ..frequency_domain._held import held
 from ..frequency_domain._mixing import Mixing
-from ..frequency_domain._normal import problem_normal
 from ..frequency_domain._parameters import Numbers, Parameters, Place
-from ..frequency_domain._problem import Problem
+from ..frequency_domain._problem import Problem, problem_normal
 
 
 class Member(NamedTuple):
     """What members are fitted to, after the axes of each array that are named here.
 
-    Frequencies are filled up to a length that many records share; only `count` of them count.
+    Frequencies are filled up to a length that many records share, with weights of 0.
     """
 
     inverse: tuple[Numbers, Numbers]  # frequencies outputs inputs: 1 / measured, real, imaginary
-    weights: Numbers  # frequencies outputs inputs parts: one of both for single evaluation
+    weights: Numbers  # frequencies outputs inputs parts
     factor: tuple[Numbers, Numbers] | None  # frequencies frequencies outputs inputs, a `Mixing`'s
     across: tuple[Numbers, Numbers] | None = None  # frequencies pairs pairs, of several pairs
 
@@ -48,7 +41,6 @@ class Batch(NamedTuple):
     parameters: Parameters
     hold: float  # s
     omega: Float[Numbers, " frequencies"]
-    count: Int[Numbers, ""]  # of the frequencies
 
 
 Column = tuple[Array, Array]  # of slopes or misfits: magnitudes and phases, weighted
@@ -59,28 +51,17 @@ Evaluate = Callable[[Float[Array, "parameters members"], Active], Normal]
 def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
     """Cost, gradient and Gauss-Newton Hessian of members on the last axis of `member`.
 
-    A plain `jq.StateSpace` has slopes of its own, one member after the other, without those that
-    are not active. Any other model of plain arithmetic becomes one kernel, at a quarter of the cost
-    of what evaluates the rest: at all frequencies at once.
+    A `jq.StateSpace` is evaluated one member after the other, without those that are not active:
+    its states are a loop of their own. Any other model of plain arithmetic becomes one kernel, at a
+    quarter of the cost of what evaluates the rest: at all frequencies at once.
     """
-
     if evaluates_singly(batch):
         return _one_by_one(batch, member)
-
-    def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
-        if why_no_kernels() is None and _fits_a_kernel(z, member):
-            accumulate = ft.partial(_accumulate, batch)
-            try:
-                return _assemble(as_one_kernel(accumulate, z, batch.omega, batch.count, member))
-            except NotInRealPartsError:
-                pass
-        return _at_all_frequencies(batch, z, member)
-
-    return evaluate
+    return lambda z, active: _at_all_frequencies(batch, z, member)
 
 
 def evaluates_singly(batch: Batch) -> bool:
-    """Whether members are evaluated one after the other, by a plain `jq.StateSpace`'s slopes."""
+    """Whether members are evaluated one after the other: a `jq.StateSpace` without ties."""
     return type(batch.model) is StateSpace and not batch.parameters.ties and not batch.hold
 
 
@@ -146,103 +127,8 @@ def _problem_of_one(batch: Batch, member: _Single) -> Problem:
     )
 
 
-_WIDEST = 4096  # numbers of one array's arithmetic in a kernel
-_MOST_PARAMETERS = 12  # of a kernel; it grows with their square
-
-
-def _fits_a_kernel(z: Array, member: Member) -> bool:
-    wide = member.weights[0].size // 2
-    if member.factor is not None:
-        wide *= len(z) + 1
-    if member.across is not None:
-        wide *= member.across[0].shape[1]
-    return wide < _WIDEST and len(z) <= _MOST_PARAMETERS
-
-
 def _lower(columns: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(columns) for j in range(i + 1)]
-
-
-def _accumulate(
-    batch: Batch, z: Array, omega: Array, count: Int[Array, ""], member: Member
-) -> list[Float[Array, " members"]]:
-    """The scalar products of all columns, frequency by frequency."""
-    columns_at = ft.partial(_columns_at, batch, z, omega, member)
-    if member.factor is not None:
-        columns_at = _mix(columns_at, omega, count, member, len(z) + 1)
-    pairs = _lower(len(z) + 1)
-
-    def add(k, total):
-        columns = columns_at(k)
-        return [t + _dot(columns[i], columns[j]) for t, (i, j) in zip(total, pairs, strict=True)]
-
-    return jax.lax.fori_loop(0, count, add, [jnp.zeros_like(z[0]) for _ in pairs])
-
-
-def _dot(a: Column, b: Column) -> Float[Array, " members"]:
-    return jnp.sum(a[0] * b[0] + a[1] * b[1], axis=(0, 1))
-
-
-def _columns_at(batch: Batch, z: Array, omega: Array, member: Member, k: Array) -> list[Column]:
-    point = jax.vmap(ft.partial(_point, batch), in_axes=(0, None, -1, -1, -1), out_axes=-1)
-    here = lambda array: jax.lax.dynamic_index_in_dim(array, k, keepdims=False)
-    data = *map(here, member.inverse), here(member.weights)
-    return in_real_parts(point, list(z), here(omega), *data)
-
-
-def _mix(
-    columns_at: Callable[[Array], list[Column]],
-    omega: Array,
-    count: Int[Array, ""],
-    member: Member,
-    columns: int,
-) -> Callable[[Array], list[Column]]:
-    """The same columns with points that share noise taken together, by triangular factors."""
-    factor, across = member.factor, member.across
-    assert factor is not None
-    shape = (omega.size, columns, *factor[0].shape[2:])
-    zero = jnp.zeros(shape, omega.dtype), jnp.zeros(shape, omega.dtype)
-
-    def store(k, stored):
-        parts = map(jnp.stack, zip(*columns_at(k), strict=True))
-        pairs = zip(stored, parts, strict=True)
-        return tuple(jax.lax.dynamic_update_index_in_dim(s, part, k, 0) for s, part in pairs)
-
-    stored = jax.lax.fori_loop(0, count, store, zero)
-
-    def mixed_at(k):
-        def add(g, total):
-            c, s = (_two_indices(part, k, g) for part in factor)
-            real, imag = (jax.lax.dynamic_index_in_dim(x, g, keepdims=False) for x in stored)
-            return total[0] + (c * real - s * imag), total[1] + (s * real + c * imag)
-
-        zero = jnp.zeros(shape[1:], omega.dtype), jnp.zeros(shape[1:], omega.dtype)
-        real, imag = jax.lax.fori_loop(0, k + 1, add, zero)
-        if across is not None:
-            here = [jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in across]
-            real, imag = _turn_pairs(here[0], here[1], real, imag)
-        return [(real[n], imag[n]) for n in range(columns)]
-
-    return mixed_at
-
-
-def _turn_pairs(
-    c: Float[Array, "pairs pairs members"],
-    s: Float[Array, "pairs pairs members"],
-    real: Float[Array, "columns outputs inputs members"],
-    imag: Float[Array, "columns outputs inputs members"],
-) -> tuple[Array, Array]:
-    """Products of matrices and vectors, members last."""
-    shape, flat = real.shape, (real.shape[0], 1, -1, real.shape[-1])
-    a, b, c, s = real.reshape(flat), imag.reshape(flat), c[None], s[None]
-    turned = jnp.sum(c * a - s * b, axis=2), jnp.sum(s * a + c * b, axis=2)
-    return turned[0].reshape(shape), turned[1].reshape(shape)
-
-
-def _two_indices(array: Numbers, k: Array, g: Array) -> Array:
-    first, rest = (1, 1), array.shape[2:]
-    start = (k, g, *(jnp.zeros_like(k) for _ in rest))
-    return jax.lax.dynamic_slice(array, start, (*first, *rest))[0]
 
 
 def _at_all_frequencies(batch: Batch, z: Array, member: Member) -> Normal:

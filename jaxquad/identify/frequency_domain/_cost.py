@@ -8,8 +8,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jaxquad._core import pytree_node
-from jaxquad.spectra import FrequencyResponse
+from jaxquad._core import Message, pytree_node
+from jaxquad.spectra import DOMINATED, FrequencyResponse
 
 
 _COHERENT, _POOR = 0.6, 0.05  # least coherence: in general, and beside coherent points
@@ -178,22 +178,23 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
 
 _DECADE = 10.0
 _SURE = 0.1  # random error that noise alone does not reach
-_FEEDBACK = "feedback-dominated"  # as the remark of such a response begins
+WIDER_BAND = "wider band"  # kind of a remedy
 
 
-def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> str:
+def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> Message | None:
     """The advice to excite more than the band of the points `seen`, with numbers.
 
-    Empty where that is a decade or more, or nothing.
+    None where that is a decade or more, or nothing.
     """
     rows = [np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in zip(frfs, seen, strict=True)]
     omega = np.concatenate(rows)
     if not omega.size or np.max(omega) >= _DECADE * np.min(omega):
-        return ""
+        return None
     low, high = float(np.min(omega)), float(np.max(omega))
-    return (
-        f"excite the axis (jq.sweep) over more than {_in_both(low, high)}, the band that counts "
-        f"here: for instance {_in_both(low, _DECADE * low)}"
+    return Message(
+        f"excite the axis («jq.sweep») over more than {_in_both(low, high)}, the band that counts "
+        f"here: for instance {_in_both(low, _DECADE * low)}",
+        WIDER_BAND,
     )
 
 
@@ -208,7 +209,7 @@ def known_points(frf: FrequencyResponse) -> Mask:
     None where feedback dominates: what is known there is the controller, and not the plant.
     """
     error = np.nan_to_num(np.asarray(frf.random_error), nan=1.0)
-    dominated = any(remark.startswith(_FEEDBACK) for remark in frf.remarks)
+    dominated = any(remark.kind == DOMINATED for remark in frf.remarks)
     return np.isfinite(np.asarray(frf.response)) & (error <= _SURE) & (not dominated)
 
 

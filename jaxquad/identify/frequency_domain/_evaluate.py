@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import evaluate_once, FEW, hasty_options, KeptPrograms
+from jaxquad._compile import evaluate_once, FEW, hasty_options, KeptPrograms
 
 from ._mixing import mix_complex, Mixing
 from ._parameters import Numbers

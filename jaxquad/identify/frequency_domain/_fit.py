@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import one_blas_thread, require_x64
+from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
@@ -33,9 +33,9 @@ from ._cost import (
 )
 from ._mixing import Mixing, mixings_of
 from ._model_checks import require_model, require_model_response
-from ._origin import Options, Origin
 from ._parameters import Free, Parameters, select_parameters, Tie
 from ._problem import make_problem, Prior, Problem, require_priors
+from ._refits import Options, Origin
 from ._result import Fit
 from ._solve import Solution
 from ._starts import Minimum, solve_from_many, spread_starts
@@ -222,8 +222,8 @@ def _too_few_points(
         f"{describe_usable(frfs, points, least)}{f' (band {band} rad/s)' if band else ''}, and "
         f"{parameters.count} parameters need at least {needed}"
     )
-    wider = widen_band(frfs, [known_points(frf) for frf in frfs]) if band is None else ""
-    remedies = ("excite the axis (jq.sweep), record longer, or use a longer window",)
+    wider = widen_band(frfs, [known_points(frf) for frf in frfs]) if band is None else None
+    remedies = ("excite the axis («jq.sweep»), record longer, or use a longer window",)
     if wider:
         remedies = (wider, "fit fewer parameters (free=): a delay, say, known from another source")
     return without_numbers("too few points", parameters.names, reason, *remedies)
@@ -360,8 +360,10 @@ def _check_priors_against(model: PyTree, priors: Sequence[Prior], cost: Cost) ->
     require_priors(model, priors)
     if priors and not isinstance(cost, MaximumLikelihood):
         raise ValueError(
-            "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave cost= "
-            "at its default, jq.identify.MaximumLikelihood()"
+            Message(
+                "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave "
+                "«cost=» at its default, jq.identify.MaximumLikelihood()"
+            )
         )
 
 
@@ -370,8 +372,11 @@ def _check_finite(solution: Solution) -> None:
     finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
     if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
         raise ValueError(
-            f"the fit diverged: {solution.message or 'the response of the model is not finite'}; "
-            "start from other values, or leave solver= at its default"
+            Message(
+                "the fit diverged: "
+                f"{solution.message or 'the response of the model is not finite'}; «start from "
+                "other values, or leave solver= at its default»"
+            )
         )
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from jaxquad._core import pytree_node
+from jaxquad._core import Message, pytree_node
 from jaxquad.models import evaluate_response, imaginary
 from jaxquad.spectra import FrequencyResponse
 
@@ -132,8 +132,8 @@ def remarks_on_hold(
                 "it is not known how long the input keeps each value: if it is held for a sample "
                 f"({1e3 * frf.dt:.3g} ms), the gain is {100 * lost[k]:.2g} % too low at "
                 f"{_frequency(np.asarray(frf.omega)[k[0]])}, {over[k]:.2g} times the random error, "
-                "and the delay half a sample too long; give hold= in s, the loop's period for a "
-                "command, 0 for a quantity that was measured (jq.Record, jq.read)"
+                "and the delay half a sample too long; give «hold=» in s, the loop's period for a "
+                "command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
             ]
     return []
 
@@ -166,8 +166,10 @@ def _require_finite(response: np.ndarray, omega: np.ndarray, others: Float[Numbe
     if bad.any():
         first = np.concatenate([omega, np.ravel(others)])[int(np.argmax(bad))]
         raise ValueError(
-            f"the response of the model is not finite at its starting values, first at {first:.4g} "
-            "rad/s: start from other values"
+            Message(
+                "the response of the model is not finite at its starting values, first at "
+                f"{first:.4g} rad/s: «start from other values»"
+            )
         )
 
 

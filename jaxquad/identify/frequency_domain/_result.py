@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Key, PyTree
 
-from jaxquad._core import plain_content, pytree_node
+from jaxquad._core import Message, plain_content, pytree_node
 from jaxquad.records import Record
 
-from ..output_error._noise_model import NoiseModel
+from ..output_error._noise import NoiseModel
 from ..output_error._simulated import linear_model
 from ..output_error._verify import Verification, verify
 from ..uncertainty._accuracy import Matrix
@@ -33,11 +33,9 @@ from ..uncertainty._verdict import (
     USUAL,
     Verdict,
 )
-from ._explain import explain_misfit, Explanation
 from ._fit_content import fit_content, fit_table
-from ._half_bands import Bands, fit_bands
-from ._origin import Origin
 from ._parameters import Parameters
+from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
 from ._starts import Minimum
 
 
@@ -70,7 +68,7 @@ class Fit:
     points: int  # frequencies used, over all responses
     steps: int
     verdict: Verdict
-    remarks: tuple[str, ...] = eqx.field(static=True)
+    remarks: tuple[Message, ...] = eqx.field(static=True)
     parameters: Parameters
     units: Float[np.ndarray, " parameters"]  # what relative changes are relative to
     relative_covariance: Float[np.ndarray, "parameters parameters"]

@@ -19,9 +19,8 @@ from jaxquad._core import (
     TOLERANCE,
 )
 
-from ._normal import problem_normal
 from ._parameters import Numbers, Parameters
-from ._problem import Problem, residuals
+from ._problem import Problem, problem_normal, residuals
 from ._solve import least_squares, Solution, solution_at, stopped_early
 
 
@@ -242,8 +241,8 @@ def remarks_on_minima(
     remarks = []
     if falls_aside:
         remarks.append(
-            "stationary, but no minimum: the cost falls to one side; start from other values, or "
-            "give starts=20"
+            "stationary, but no minimum: the cost falls to one side; «start from other values»"
+            "«, or give starts=20»"
         )
     found = [point for point in minima if point.is_minimum]
     rivals = [p for p in found[1:] if p.cost <= _NEAR * found[0].cost]

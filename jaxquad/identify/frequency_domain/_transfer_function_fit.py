@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.polynomial import polyfromroots, polyroots
 
-from jaxquad._core import require_x64
+from jaxquad._core import Message, require_x64
 from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
@@ -86,15 +86,16 @@ def _refused(fit: Fit, reason: str, remedy: str) -> Fit:
         kind="not identifiable",
         undetermined=fit.names,
         combinations=(),
-        reasons=(reason,),
-        remedies=(remedy,),
+        reasons=(Message(reason),),
+        remedies=(Message(remedy),),
         curved=fit.names,
     )
     return dataclasses.replace(fit, verdict=verdict)
 
 
 def _with_reason(fit: Fit, reason: str, remedy: str) -> Fit:
-    verdict = dataclasses.replace(fit.verdict, reasons=(reason,), remedies=(remedy,))
+    reasons, remedies = (Message(reason),), (Message(remedy),)
+    verdict = dataclasses.replace(fit.verdict, reasons=reasons, remedies=remedies)
     return dataclasses.replace(fit, verdict=verdict)
 
 
@@ -210,7 +211,7 @@ def _refined(
         result = solve(start, pair, free=_free(start, structure, samples))
     if not ran_to_zero:
         return result
-    remark = "the delay ran to zero: it is fixed at 0"
+    remark = Message("the delay ran to zero: it is fixed at 0")
     return dataclasses.replace(result, remarks=(*result.remarks, remark))
 
 

@@ -1,6 +1,7 @@
-"""The descent of an output-error fit to its minimum."""
+"""The descent of an output-error fit: noise level, or noise model, and parameters by turns."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,13 +13,34 @@ from jaxquad._core import minimise_on_host, RUNNING, STALLED
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution, solution_at
 from ._filtered import filtered_point, FilteredPoint, is_filtered
-from ._noise_model import NoiseModel
+from ._noise import (
+    ARMA,
+    AutoRegressive,
+    estimate_noise,
+    make_whitener,
+    Noise,
+    NoiseModel,
+    shock_slopes,
+    shocks_of,
+    WHITE,
+)
 from ._problem import evaluate_misfits, Evaluation, OutputError
 
 
 CLOSE = 1e-6  # last step of a descent, relative to 1 + |z|
 _PASSES = 4  # of noise level and parameters by turns
 _LEVEL = 0.01  # change of the noise level that no longer matters
+_FAR = 7.0  # in ln: a parameter that shrank by a factor of 1000 ran to zero
+_TURNS = 40  # of noise models and parameters, at most
+_FREE = 2  # turns that choose the orders; later ones keep them
+_NEAR = 1e-4  # last step of each turn's descent; Gauss-Newton leaves about its square
+_STILL = 0.01  # standard errors: a change of the estimate that no longer matters
+_NEXT = 0.3  # standard errors between ends of turns that are taken for one
+_STEP_FIXED_SLOPES = 1e-5  # relative; its square is the error
+
+Vector = Float[np.ndarray, " n"]  # free parameters and initial states
+Residuals = list[Float[np.ndarray, "samples outputs"]]  # of each record
+Models = list[list[NoiseModel]]  # of each output of each record
 
 
 class RecordNoise(NamedTuple):
@@ -32,9 +54,9 @@ class Descent(NamedTuple):
     """Where the descent ended, and all that the result is made from."""
 
     problem: OutputError  # under the final noise level
-    z: Float[np.ndarray, " n"]  # free parameters and initial states
+    z: Vector
     solution: Solution
-    found: Evaluation
+    evaluation: Evaluation
     noise: tuple[RecordNoise, ...] = ()  # of each record, where it has a model
 
 
@@ -42,88 +64,33 @@ class Point(NamedTuple):
     """Where the descent stands. Changes of z below 1e-6 count as none: errors are far larger."""
 
     problem: OutputError
-    z: Float[np.ndarray, " n"]
-    found: Evaluation
+    z: Vector
+    evaluation: Evaluation
 
     @property
     def cost(self) -> float:
-        finite = all(np.all(np.isfinite(np.asarray(part))) for part in self.found.normal)
-        return float(self.found.normal.cost) if finite else np.inf
+        finite = all(np.all(np.isfinite(np.asarray(part))) for part in self.evaluation.normal)
+        return float(self.evaluation.normal.cost) if finite else np.inf
 
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.asarray(self.found.normal.gradient), np.asarray(self.found.normal.hessian)
+        normal = self.evaluation.normal
+        return np.asarray(normal.gradient), np.asarray(normal.hessian)
 
-    def moved(self, change: Float[np.ndarray, " n"]) -> "Point":
+    def moved(self, change: Vector) -> "Point":
         return _point(self.problem, self.z + change)
 
 
-def _point(problem: OutputError, z: Float[np.ndarray, " n"]) -> Point:
+def _point(problem: OutputError, z: Vector) -> Point:
     return Point(problem, z, evaluate_misfits(np.asarray(z), problem))
 
 
-def _first_point(problem: OutputError, z: Float[np.ndarray, " n"]) -> Point | FilteredPoint:
-    if is_filtered(problem):
-        start = filtered_point(problem, z)
-        if start.is_precise:
-            return start
-    return _point(problem, z)
-
-
-def descend_by_turns(problem: OutputError, max_steps: int, tolerance: float = CLOSE) -> Descent:
-    """Parameters and noise level by turns: the maximum of the likelihood of both."""
-    base, steps = problem.base, 0
-    count = base.parameters.count
-    z = np.concatenate([np.asarray(base.parameters.start)[:count], np.zeros(problem.unknown)])
-    # A factor common to all residuals moves no minimum.
-    common = len(problem.terms) == problem.terms[0].weights.size == 1
-    common = common and not base.quantities and not problem.unknown
-    for turn in range(_PASSES):
-        stop, status, taken = descend(problem, z, max_steps, tolerance)
-        z, steps, found, message = stop.z, steps + taken, stop.found, message_of(status, taken)
-        sizes = sizes_of(problem, found)
-        changed = max(float(np.max(np.abs(np.log(size)))) for size in sizes)
-        problem = problem.reweighted(sizes)
-        if common or changed < _LEVEL or message or turn == _PASSES - 1:
-            break
-    found = found.reweighted(sizes)
-    return Descent(problem, np.asarray(z), describe_stop(base, z, message, steps), found)
-
-
-def describe_stop(base: Problem, z: Float[np.ndarray, " n"], message: str, steps: int) -> Solution:
-    """The model, its values and the priors' slopes where the descent stopped."""
-    at = np.asarray(z)[: base.parameters.count]
-    low, sizes = _at_zero(base, at)
-    return solution_at(base, at, message, steps)._replace(at_zero=low, units_at_zero=sizes)
-
-
-_FAR = 7.0  # in ln: a parameter that shrank by a factor of 1000 ran to zero
-
-
-def _at_zero(
-    base: Problem, z: Float[np.ndarray, " parameters"]
-) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Parameters that ran to zero, and their sizes at the start."""
-    start, scale = (np.asarray(x)[: z.size] for x in (base.parameters.start, base.parameters.scale))
-    logarithmic = np.array(base.parameters.logarithmic[: z.size])
-    low = np.flatnonzero(logarithmic & (np.asarray(z) - start < -_FAR))
-    return tuple(low.tolist()), tuple((scale[low] * np.exp(start[low])).tolist())
-
-
-def sizes_of(problem: OutputError, found: Evaluation) -> list[Float[np.ndarray, " outputs"]]:
-    """Standard deviations of the weighted residuals."""
-    sizes = []
-    for term, misfit in zip(problem.terms, found.misfits, strict=True):
-        size = np.sqrt(np.sum(np.asarray(misfit) ** 2, axis=0) / term.counted)
-        least = 1e-9 * np.std(np.asarray(term.y), axis=0) * np.asarray(term.weights)
-        sizes.append(np.maximum(size, least))
-    return sizes
-
-
 def descend(
-    problem: OutputError, z: Float[np.ndarray, " n"], max_steps: int, tolerance: float = CLOSE
-) -> tuple[Point, int, int]:
-    """The minimum near `z`, to a last step of `tolerance`; why it ended, and after what steps."""
-    start = _first_point(problem, z)
+    problem: OutputError, z: Vector, max_steps: int, tolerance: float = CLOSE
+) -> tuple[Point, int, str]:
+    """The minimum near `z`, to a last step of `tolerance`; the steps, and why it is none."""
+    start = filtered_point(problem, z) if is_filtered(problem) else None
+    if start is None or not start.is_precise:
+        start = _point(problem, z)
     if not np.isfinite(start.cost):
         raise ValueError(
             "the simulated output of the model, or its derivative, is not finite at the starting "
@@ -131,29 +98,219 @@ def descend(
             "Start from other values, cut the record with jq.records.trim, or fit in the "
             "frequency domain with jq.fit"
         )
-    if isinstance(start, FilteredPoint):
-        stop, status, steps = minimise_on_host(
-            start, FilteredPoint.moved, max_steps, tolerance=tolerance
-        )
-        if stop.is_precise:
-            return Point(problem, stop.z, stop.found), status, steps
+    stop, status, steps = minimise_on_host(start, type(start).moved, max_steps, tolerance=tolerance)
+    if isinstance(stop, FilteredPoint) and not stop.is_precise:
         start = _point(problem, stop.z)
-    return minimise_on_host(start, Point.moved, max_steps, tolerance=tolerance)
-
-
-def message_of(status: int, steps: int) -> str:
-    """Why the descent stopped before a minimum; empty at one."""
+        stop, status, steps = minimise_on_host(start, Point.moved, max_steps, tolerance=tolerance)
+    if isinstance(stop, FilteredPoint):
+        stop = Point(problem, stop.z, stop.evaluation)
+    message = ""
     if status == RUNNING:
-        return f"the maximum of {steps} steps was reached"
+        message = f"the maximum of {steps} steps was reached"
     if status == STALLED:
-        return (
+        message = (
             "every shorter step fails too: the simulation is not finite or not smooth nearby "
             f"(after {steps} steps)"
         )
-    return ""
+    return stop, steps, message
 
 
-_STEP_FIXED_SLOPES = 1e-5  # relative; its square is the error
+def descend_by_turns(problem: OutputError, max_steps: int, tolerance: float = CLOSE) -> Descent:
+    """Parameters and noise level by turns: the maximum of the likelihood of both."""
+    base, steps = problem.base, 0
+    z = _start_of(problem)
+    # A factor common to all residuals moves no minimum.
+    common = len(problem.terms) == problem.terms[0].weights.size == 1
+    common = common and not base.quantities and not problem.unknown
+    for turn in range(_PASSES):
+        stop, more, message = descend(problem, z, max_steps, tolerance)
+        z, steps = stop.z, steps + more
+        sizes = sizes_of(problem, stop.evaluation)
+        changed = max(float(np.max(np.abs(np.log(size)))) for size in sizes)
+        problem = problem.reweighted(sizes)
+        if common or changed < _LEVEL or message or turn == _PASSES - 1:
+            break
+    solution = _solution(base, z, message, steps)
+    return Descent(problem, np.asarray(z), solution, stop.evaluation.reweighted(sizes))
+
+
+def _start_of(problem: OutputError) -> Vector:
+    parameters = problem.base.parameters
+    values = np.asarray(parameters.start)[: parameters.count]
+    return np.concatenate([values, np.zeros(problem.unknown)])
+
+
+def _solution(base: Problem, z: Vector, message: str, steps: int) -> Solution:
+    """The model, its values and the priors' slopes; with parameters that ran to zero, and sizes."""
+    at = np.asarray(z)[: base.parameters.count]
+    start, scale = (
+        np.asarray(x)[: at.size] for x in (base.parameters.start, base.parameters.scale)
+    )
+    logarithmic = np.array(base.parameters.logarithmic[: at.size])
+    low = np.flatnonzero(logarithmic & (at - start < -_FAR))
+    sizes = tuple((scale[low] * np.exp(start[low])).tolist())
+    solution = solution_at(base, at, message, steps)
+    return solution._replace(at_zero=tuple(low.tolist()), units_at_zero=sizes)
+
+
+def sizes_of(problem: OutputError, evaluation: Evaluation) -> list[Float[np.ndarray, " outputs"]]:
+    """Standard deviations of the weighted residuals."""
+    sizes = []
+    for term, misfit in zip(problem.terms, evaluation.misfits, strict=True):
+        size = np.sqrt(np.sum(np.asarray(misfit) ** 2, axis=0) / term.counted)
+        least = 1e-9 * np.std(np.asarray(term.y), axis=0) * np.asarray(term.weights)
+        sizes.append(np.maximum(size, least))
+    return sizes
+
+
+class _Start(NamedTuple):
+    """A problem whose residuals have unit size at `z`."""
+
+    problem: OutputError
+    z: Vector
+    evaluation: Evaluation
+    steps: int
+
+
+class _End(NamedTuple):
+    """Where the turns ended."""
+
+    plain: OutputError  # the problem of the residuals themselves
+    problem: OutputError  # that of their shocks
+    stop: Point
+    steps: int
+    message: str
+    residuals: Residuals
+    models: Models
+
+
+def descend_with_noise(
+    problem: OutputError, noise: Noise, max_steps: int, *, near: bool
+) -> Descent:
+    """Parameters and noise models by turns: the least mean square of one-step prediction errors.
+
+    They begin with the noise that the starting values leave. If these are not known to be `near`,
+    they begin once more with what output error leaves, and the likelier end counts: far off, a
+    noise model takes for noise what the values do not explain, and in a closed loop output error
+    is far off itself.
+    Source: Ljung, System Identification, sec. 7.2 and 13.4 (direct method in a closed loop).
+    """
+    ends: list[_End] = []
+    for begin in (_at_start,) if near else (_at_start, _after_output_error):
+        ends.append(_alternate(begin(problem, max_steps), noise, max_steps, ends))
+    plain, problem, stop, steps, message, residuals, models = min(ends, key=_akaike)
+    noises = []
+    for term, residual, row in zip(plain.terms, residuals, models, strict=True):
+        blocks = [shock_slopes(v, model) for v, model in zip(residual.T, row, strict=True)]
+        slopes, at = np.zeros((*residual.shape, sum(block.shape[1] for block in blocks))), 0
+        for output, block in enumerate(blocks):
+            slopes[:, output, at : at + block.shape[1]] = block
+            at += block.shape[1]
+        sizes = np.array([model.deviation for model in row]) / np.asarray(term.weights)
+        pairs = zip(row, sizes, strict=True)
+        scaled = [dataclasses.replace(model, deviation=float(size)) for model, size in pairs]
+        noises.append(RecordNoise(tuple(scaled), slopes))
+    sizes = sizes_of(problem, stop.evaluation)
+    solution = _solution(problem.base, stop.z, message, steps)
+    evaluation = stop.evaluation.reweighted(sizes)
+    return Descent(
+        problem.reweighted(sizes), np.asarray(stop.z), solution, evaluation, tuple(noises)
+    )
+
+
+def _at_start(plain: OutputError, max_steps: int) -> _Start:
+    z = _start_of(plain)
+    evaluation = evaluate_misfits(z, plain)
+    if not all(np.all(np.isfinite(misfit)) for misfit in evaluation.misfits):
+        return _after_output_error(plain, max_steps)
+    sizes = sizes_of(plain, evaluation)
+    return _Start(plain.reweighted(sizes), z, evaluation.reweighted(sizes), 0)
+
+
+def _after_output_error(plain: OutputError, max_steps: int) -> _Start:
+    first = descend_by_turns(plain, max_steps, _NEAR)
+    return _Start(first.problem, np.asarray(first.z), first.evaluation, first.solution.steps)
+
+
+def _alternate(start: _Start, noise: Noise, max_steps: int, ends: Sequence[_End]) -> _End:
+    """The end of the turns from a start; one of the `ends`, if the first turn leads next to it."""
+    plain, z, evaluation, steps = start
+    # Least squares alone makes the initial state follow slow noise, at the price of a jump in the
+    # first samples: residuals of one that suits coloured noise.
+    misfits = [np.asarray(misfit) for misfit in evaluation.misfits]
+    kinds: list[list[Noise]] = [[AutoRegressive()] * misfit.shape[1] for misfit in misfits]
+    residuals = _residuals(evaluation, _estimate_all(misfits, kinds))
+    kinds = [[noise] * term.y.shape[1] for term in plain.terms]
+    for turn in range(_TURNS):
+        models = _estimate_all(residuals, kinds)
+        if turn >= _FREE:
+            kinds = [[_same_order(model) for model in row] for row in models]
+        # The problem of the shocks, in units of their deviation.
+        terms = [
+            dataclasses.replace(
+                term,
+                whitener=make_whitener(row, len(term.y)),
+                weights=term.weights / np.array([model.deviation for model in row]),
+            )
+            for term, row in zip(plain.terms, models, strict=True)
+        ]
+        problem = dataclasses.replace(plain, terms=tuple(terms))
+        stop, more, message = descend(problem, z, max_steps, _NEAR)
+        change, steps, z = stop.z - z, steps + more, stop.z
+        for end in () if turn else ends:
+            if _distance(stop, z - end.stop.z) < _NEXT:
+                return end
+        residuals = _residuals(evaluate_misfits(np.asarray(z), plain), models)
+        if message or (turn and _distance(stop, change) < _STILL):
+            break
+    else:
+        message = f"the noise model still changed after {_TURNS} turns"
+    return _End(plain, problem, stop, steps, message, residuals, models)
+
+
+def _distance(stop: Point, change: Vector) -> float:
+    """Of a change of z, in standard errors."""
+    return float(np.sqrt(max(change @ stop.slopes()[1] @ change, 0.0)))
+
+
+def _akaike(end: _End) -> float:
+    """Akaike's criterion, with the deviation of all samples' shocks that of those predicted."""
+    total = 0.0
+    sizes = sizes_of(end.problem, end.stop.evaluation)
+    for term, size, models in zip(end.problem.terms, sizes, end.models, strict=True):
+        total += 2 * len(term.y) * float(np.sum(np.log(size / np.asarray(term.weights))))
+        total += 2 * sum(sum(model.order) for model in models)
+    return total if np.isfinite(total) else np.inf
+
+
+def _estimate_all(residuals: Residuals, kinds: list[list[Noise]]) -> Models:
+    # Residuals have unit size, unless the record is exact and they are rounding.
+    estimate = lambda v, kind: estimate_noise(v, kind) if np.mean(v**2) > 0.25 else WHITE
+    return [
+        [estimate(v, kind) for v, kind in zip(residual.T, row, strict=True)]
+        for residual, row in zip(residuals, kinds, strict=True)
+    ]
+
+
+def _same_order(model: NoiseModel) -> Noise:
+    poles, zeros = model.order
+    return ARMA(poles, zeros) if zeros else AutoRegressive(poles)
+
+
+def _residuals(plain: Evaluation, models: Models) -> Residuals:
+    """Residuals with initial state, trim and shift as the noise models weigh them."""
+    residuals = []
+    for misfit, columns, row in zip(plain.misfits, plain.columns, models, strict=True):
+        misfit, columns = np.asarray(misfit), np.asarray(columns)
+        shocks = [
+            shocks_of(v, model) / model.deviation for v, model in zip(misfit.T, row, strict=True)
+        ]
+        ways = [shocks_of(columns[:, o], model) / model.deviation for o, model in enumerate(row)]
+        ways = np.concatenate(ways)
+        scale = np.maximum(np.linalg.norm(ways, axis=0), 1e-300)
+        unknowns = np.linalg.lstsq(ways / scale, np.concatenate(shocks), rcond=1e-9)[0] / scale
+        residuals.append(misfit - columns @ unknowns)
+    return residuals
 
 
 def with_fixed_slopes(descent: Descent) -> Evaluation:
@@ -161,25 +318,21 @@ def with_fixed_slopes(descent: Descent) -> Evaluation:
 
     Central differences: they serve for names alone, and compile nothing anew.
     """
-    parameters, found = descent.problem.base.parameters, descent.found
-    count, values = parameters.count, np.asarray(descent.solution.values)
-    fixed = [_slopes(descent, k, values) for k in range(count, values.size)]
+    problem, step = descent.problem, _STEP_FIXED_SLOPES
+    parameters, values = problem.base.parameters, np.asarray(descent.solution.values)
+    count, fixed = parameters.count, []
+    for k in range(count, values.size):
+        ends = []
+        for change in (step, -step):
+            moved = values.copy()
+            moved[k] *= np.exp(change)
+            model = parameters.replace(problem.base.model, moved)
+            base = dataclasses.replace(problem.base, model=model)
+            other = dataclasses.replace(problem, base=base)
+            ends.append(evaluate_misfits(descent.z, other).misfits)
+        fixed.append([(after - before) / (2 * step) for after, before in zip(*ends, strict=True)])
     slopes = [
         jnp.concatenate([mine[:, :, :count], jnp.stack(others, axis=2), mine[:, :, count:]], axis=2)
-        for mine, *others in zip(found.slopes, *fixed, strict=True)
+        for mine, *others in zip(descent.evaluation.slopes, *fixed, strict=True)
     ]
-    return found._replace(slopes=slopes)
-
-
-def _slopes(descent: Descent, k: int, values: np.ndarray) -> list:
-    problem = descent.problem
-    ends = []
-    for step in (_STEP_FIXED_SLOPES, -_STEP_FIXED_SLOPES):
-        moved = values.copy()
-        moved[k] *= np.exp(step)
-        model = problem.base.parameters.replace(problem.base.model, moved)
-        base = dataclasses.replace(problem.base, model=model)
-        ends.append(evaluate_misfits(descent.z, dataclasses.replace(problem, base=base)).misfits)
-    return [
-        (after - before) / (2 * _STEP_FIXED_SLOPES) for after, before in zip(*ends, strict=True)
-    ]
+    return descent.evaluation._replace(slopes=slopes)

@@ -60,28 +60,28 @@ class Columns(NamedTuple):
 
     shift: Float[np.ndarray, " samples"]  # within the band
     free: Float[np.ndarray, "motions moving"]
-    seen: Float[np.ndarray, "motions moving"]  # these within the band, in which they last longer
+    filtered: Float[np.ndarray, "motions moving"]  # within the band, in which they last longer
     scale: Float[np.ndarray, " rows"]  # that brings shift and motions to unit length
     normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
 
     def products(self, x: Float[np.ndarray, "*series samples"]) -> Float[np.ndarray, "rows ..."]:
         """Shift and motions times one series, or times each of several."""
-        moving = self.seen.shape[1]
-        return np.concatenate([(x @ self.shift)[None], self.seen @ x[..., :moving].T])
+        moving = self.filtered.shape[1]
+        return np.concatenate([(x @ self.shift)[None], self.filtered @ x[..., :moving].T])
 
     def taken_off(
         self, x: Float[np.ndarray, " samples"], unknowns: Float[np.ndarray, " rows"]
     ) -> Float[np.ndarray, " samples"]:
         """The series without so much of each."""
         left = x - unknowns[0] * self.shift
-        left[: self.seen.shape[1]] -= unknowns[1:] @ self.seen
+        left[: self.filtered.shape[1]] -= unknowns[1:] @ self.filtered
         return left
 
     @property
     def rows(self) -> Rows:
         """Shift and motions within the band, over all samples."""
         rows = np.zeros((len(self.scale), self.shift.size))
-        rows[0], rows[1:, : self.seen.shape[1]] = self.shift, self.seen
+        rows[0], rows[1:, : self.filtered.shape[1]] = self.shift, self.filtered
         return rows
 
 
@@ -141,8 +141,16 @@ class FilteredPoint:
         """The slopes of each record's misfit, up to what start and trim can do."""
         if self.next_to is not None:
             return self.next_to.rows
-        parts = zip(self.problem.terms, self.records, self.behind, strict=True)
-        return [_slope_rows(*each) for each in parts]
+        rows = []
+        for term, one, behind in zip(self.problem.terms, self.records, self.behind, strict=True):
+            model, driven = one.sampled, -one.driven
+            late = [(driven, k) for k in range(model.above.size)]
+            late += [(behind, k + 1) for k in range(model.below.size)]
+            signals = np.empty((len(late), len(behind)))
+            for row, (signal, k) in zip(signals, late, strict=True):
+                row[:k], row[k:] = 0.0, signal[: len(signal) - k]
+            rows.append(_in_band(term, float(term.weights[0]) * model.slopes.T @ signals))
+        return rows
 
     @ft.cached_property
     def normal(self) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +159,11 @@ class FilteredPoint:
         hessian = self.prior_slopes.T @ self.prior_slopes
         for one, rows in zip(self.records, self.rows, strict=True):
             gradient = gradient + rows @ one.misfit
-            hessian = hessian + _without_columns(rows, one.columns)
+            # Products of the rows' parts orthogonal to the columns.
+            columns = one.columns
+            shared = columns.scale[:, None] * columns.products(rows)
+            products = row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
+            hessian = hessian + products
         return gradient, hessian
 
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -186,10 +198,16 @@ class FilteredPoint:
     @property
     def is_precise(self) -> bool:
         """Whether rounding of the coefficients leaves the digits that a fit needs."""
-        return all(map(_is_precise, self.records, self.behind))
+        for one, behind in zip(self.records, self.behind, strict=True):
+            above, size = np.sum(np.abs(one.sampled.above)), float(np.max(np.abs(one.output)))
+            driven = float(above * np.max(np.abs(one.driven)))
+            needed = max(float(np.max(np.abs(behind))), driven)
+            if not (np.isfinite(needed) and needed <= _DIGITS * size):
+                return False
+        return True
 
     @property
-    def found(self) -> Evaluation:
+    def evaluation(self) -> Evaluation:
         """As the general way gives it."""
         misfits = [one.misfit[:, None] for one in self.records]
         slopes = [rows.T[:, None] for rows in self.rows]
@@ -201,8 +219,20 @@ class FilteredPoint:
 def filtered_point(problem: OutputError, z: Float[np.ndarray, " parameters"]) -> FilteredPoint:
     """Where a descent begins."""
     frame, arrays = take_apart(OutputError(problem.base, (), problem.zeros))
-    programs = [_sampler(frame, arrays, term.hold, term.dt) for term in problem.terms]
-    return _point(problem, programs, np.asarray(z))
+
+    def sampler(term: RecordTerm) -> Program:
+        run = _program(frame, term.hold)
+
+        def sample(z: Float[np.ndarray, " parameters"]) -> Sampled:
+            coefficients, motion, shift = map(np.asarray, run(z, term.dt, arrays))
+            both = motion.shape[1]
+            above, below = np.split(coefficients[:, 0], [both // 2 + 2])
+            parts = (motion[:both], motion[both], coefficients[:, 1:])
+            return Sampled(above, below, int(shift), *parts)
+
+        return sample
+
+    return _point(problem, [sampler(term) for term in problem.terms], np.asarray(z))
 
 
 def _point(problem: OutputError, programs: list[Program], z: np.ndarray) -> FilteredPoint:
@@ -213,18 +243,6 @@ def _point(problem: OutputError, programs: list[Program], z: np.ndarray) -> Filt
         priors = evaluate(problem.base, z)
         misfits, slopes = priors.misfits, priors.slopes.T[:, : z.size]
     return FilteredPoint(problem, programs, z, records, misfits, slopes)
-
-
-def _sampler(frame: Frame, arrays: list[Numbers], hold: str, dt: float) -> Program:
-    run = _program(frame, hold)
-
-    def sample(z: Float[np.ndarray, " parameters"]) -> Sampled:
-        coefficients, motion, shift = map(np.asarray, run(z, dt, arrays))
-        both = motion.shape[1]
-        above, below = np.split(coefficients[:, 0], [both // 2 + 2])
-        return Sampled(above, below, int(shift), motion[:both], motion[both], coefficients[:, 1:])
-
-    return sample
 
 
 @ft.lru_cache(maxsize=64)
@@ -248,38 +266,23 @@ def _program(frame: Frame, hold: str) -> Callable[[np.ndarray, float, list[Numbe
 
 
 def _simulated(term: RecordTerm, sampled: Sampled) -> Simulated:
-    samples = len(term.y)
-    late = _shifted(np.asarray(term.u)[:, 0], sampled.shift)
+    u, samples, shift = np.asarray(term.u)[:, 0], len(term.y), sampled.shift
+    # The input from its first value, so many samples later; after the record it stays as it is.
+    late, kept = np.zeros(len(u)), max(len(u) - abs(shift), 0)
+    if shift < 0:
+        late[:kept], late[kept:] = u[len(u) - kept :], u[-1]
+        late = late - u[0]
+    else:
+        late[len(u) - kept :] = u[:kept] - u[0]
     with np.errstate(all="ignore"):  # an unstable model is a failed step
         driven = _over(sampled.below, late)
         forced = np.convolve(driven, sampled.above)[:samples]
         columns = _columns(term, _free_motions(term, sampled, samples))
-        moving = columns.free.shape[1]
         left = np.asarray(term.y)[:, 0] - _in_band(term, forced)
         misfit, unknowns = _project_out(left, columns)
         # A shift stays what it is, whatever A does.
-        forced[:moving] += unknowns[1:] @ columns.free
+        forced[: columns.free.shape[1]] += unknowns[1:] @ columns.free
     return Simulated(sampled, driven, forced, columns, float(term.weights[0]) * misfit)
-
-
-def _shifted(u: Float[np.ndarray, " samples"], shift: int) -> Float[np.ndarray, " samples"]:
-    """From its first value, so many samples later; after the record it stays as it is."""
-    late, kept = np.zeros(len(u)), max(len(u) - abs(shift), 0)
-    if shift < 0:
-        late[:kept], late[kept:] = u[len(u) - kept :], u[-1]
-        return late - u[0]
-    late[len(u) - kept :] = u[:kept] - u[0]
-    return late
-
-
-def _slope_rows(term: RecordTerm, one: Simulated, behind: Float[np.ndarray, " samples"]) -> Rows:
-    model, driven = one.sampled, -one.driven
-    late = [(driven, k) for k in range(model.above.size)]
-    late += [(behind, k + 1) for k in range(model.below.size)]
-    signals = np.empty((len(late), len(behind)))
-    for row, (signal, k) in zip(signals, late, strict=True):
-        row[:k], row[k:] = 0.0, signal[: len(signal) - k]
-    return _in_band(term, float(term.weights[0]) * model.slopes.T @ signals)
 
 
 def _over(below: Float[np.ndarray, " poles"], x: Float[np.ndarray, " samples"]) -> np.ndarray:
@@ -297,48 +300,38 @@ def _in_band(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndar
 def _free_motions(
     term: RecordTerm, sampled: Sampled, samples: int
 ) -> Float[np.ndarray, "motions moving"]:
-    """Biases on the slow motions and initial values of the fast ones, as rows."""
+    """Biases on the slow motions and initial values of the fast ones, as far as any is left."""
     assert term.motions is not None
-    slow, fast = (np.asarray(each) for each in term.motions)
+    slow, fast = map(np.asarray, term.motions)
     states = len(slow)
-    if not slow.shape[1]:  # the biases are those of no one
+    if not slow.shape[1]:  # there are no biases
         step, row, ways = sampled.step[:states, :states], sampled.row[:states], fast.T
     else:
         step, row = sampled.step, sampled.row
         ways = np.zeros((slow.shape[1] + fast.shape[1], 2 * states))
         ways[: slow.shape[1], states:], ways[slow.shape[1] :, :states] = slow.T, fast.T
-    return ways @ _motion(row, step, samples)
-
-
-def _motion(
-    row: Float[np.ndarray, " both"], step: Float[np.ndarray, "both both"], samples: int
-) -> Float[np.ndarray, "both moving"]:
-    """`row` step^k for each sample k, as far as anything is left of it."""
-    found = np.empty((len(row), samples))
-    found[:, 0], done = row, 1
-    power = step.T
+    # `row` step^k for each sample k.
+    motion = np.empty((len(row), samples))
+    motion[:, 0], done, power = row, 1, step.T
     while done < samples and np.max(np.abs(power)) > _GONE:
         more = min(done, samples - done)
-        np.matmul(power, found[:, :more], out=found[:, done : done + more])
+        np.matmul(power, motion[:, :more], out=motion[:, done : done + more])
         power, done = power @ power, done + more
-    return found[:, :done]
-
-
-def _lengthened(rows: Rows, samples: int) -> Rows:
-    return np.pad(rows, ((0, 0), (0, samples - rows.shape[1])))
+    return ways @ motion[:, :done]
 
 
 def _columns(term: RecordTerm, free: Float[np.ndarray, "motions moving"]) -> Columns:
     samples = len(term.y)
-    shift = _in_band(term, np.ones(samples))
-    seen = free if term.gain is None else _in_band(term, _lengthened(free, samples))
-    normal = np.empty((len(seen) + 1,) * 2)
-    normal[0, 0], normal[1:, 1:] = shift @ shift, row_products(seen)
-    normal[0, 1:] = normal[1:, 0] = seen @ shift[: seen.shape[1]]
+    shift, filtered = _in_band(term, np.ones(samples)), free
+    if term.gain is not None:
+        filtered = _in_band(term, np.pad(free, ((0, 0), (0, samples - free.shape[1]))))
+    normal = np.empty((len(filtered) + 1,) * 2)
+    normal[0, 0], normal[1:, 1:] = shift @ shift, row_products(filtered)
+    normal[0, 1:] = normal[1:, 0] = filtered @ shift[: filtered.shape[1]]
     square = np.diagonal(normal)
     scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
     ridged = normal * np.outer(scale, scale) + _RIDGE * np.eye(len(normal))
-    return Columns(shift, free, seen, scale, ridged)
+    return Columns(shift, free, filtered, scale, ridged)
 
 
 def _project_out(
@@ -353,15 +346,3 @@ def _project_out(
         unknowns = unknowns + np.linalg.solve(columns.normal, aim - plain @ unknowns)
     unknowns = columns.scale * unknowns
     return columns.taken_off(misfit, unknowns), unknowns
-
-
-def _without_columns(rows: Rows, columns: Columns) -> Float[np.ndarray, "parameters parameters"]:
-    """Products of the rows' parts orthogonal to the columns."""
-    shared = columns.scale[:, None] * columns.products(rows)
-    return row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
-
-
-def _is_precise(one: Simulated, behind: Float[np.ndarray, " samples"]) -> bool:
-    above, size = np.sum(np.abs(one.sampled.above)), float(np.max(np.abs(one.output)))
-    needed = max(float(np.max(np.abs(behind))), float(above * np.max(np.abs(one.driven))))
-    return np.isfinite(needed) and needed <= _DIGITS * size

@@ -1,20 +1,23 @@
-"""The least-squares problem of an output-error fit."""
+"""The least-squares problem of an output-error fit, and of a record from a known loop."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxquad._core import Normal, solve_definite
+from jaxquad._core import Message, Normal, solve_definite
+from jaxquad.models import simulate_linear, StateSpace, TransferFunction
+from jaxquad.records import Record
 
 from ..frequency_domain._parameters import Numbers
 from ..frequency_domain._problem import prior_misfits, Problem
-from ._known_loop import close_loop
+from ._noise import Whitener
 from ._simulated import (
     band_filter,
     forced_response,
@@ -23,11 +26,124 @@ from ._simulated import (
     linear_model,
     Motions,
 )
-from ._whitening import Whitener
 
 
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
 _LOOSE = 1e-2  # standard errors per unit of initial state: holds what has no effect
+_FIRST = 64  # samples of a series that are inverted by a triangular solve
+
+
+@runtime_checkable
+class SampledFeedback(Protocol):
+    """x[k+1] = A x + By y, u = C x + Dy y: a controller from the output to the input.
+
+    Its reference does not matter. By and Dy carry the sign of the feedback.
+    """
+
+    @property
+    def A(self) -> Float[Array, "states states"]: ...
+    @property
+    def measurement_in(self) -> Float[Array, " states"]: ...  # By
+    @property
+    def C(self) -> Float[Array, " states"]: ...
+    @property
+    def measurement_through(self) -> Float[Array, ""]: ...  # Dy
+    @property
+    def dt(self) -> float: ...  # s
+
+
+@runtime_checkable
+class KnownController(Protocol):
+    """A controller that can say what it does without its limits, as `jq.PID` and `jq.LADRC` do."""
+
+    def linear(self, axis: int = 0) -> SampledFeedback:
+        """One axis."""
+        ...
+
+
+def feedback_response(
+    loop: KnownController, record: Record, hold: str
+) -> Float[np.ndarray, " samples"]:
+    """The command of a controller after a unit sample of the output, over the record.
+
+    Raise ValueError for a record that it cannot have closed a loop in.
+    """
+    if not isinstance(loop, KnownController):
+        raise ValueError(
+            f"loop is a {type(loop).__name__}: give the controller that closed the loop, with a "
+            "method linear(), as jq.PID and jq.LADRC"
+        )
+    if len(record.input_names) != 1 or len(record.output_names) != 1:
+        raise ValueError(
+            Message(
+                "loop= is for one input and one output, the record has "
+                f"{', '.join(record.input_names)} and {', '.join(record.output_names)}: "
+                "«pick channels with jq.records.select»"
+            )
+        )
+    controller = loop.linear()
+    if not np.isclose(controller.dt, record.dt, rtol=1e-6) or hold != "zero":
+        raise ValueError(
+            Message(
+                f"the controller computes every {controller.dt:.6g} s a command that it holds, but "
+                f"the record has samples every {record.dt:.6g} s and an input that is "
+                f"{'held' if hold == 'zero' else 'not held'}: give a record at the controller's "
+                "rate with «hold=» its interval"
+            )
+        )
+    parts = (controller.A, controller.measurement_in, controller.C)
+    A, state, C = (np.asarray(part, float) for part in parts)
+    command = np.zeros(record.samples)
+    command[0] = float(controller.measurement_through)
+    for k in range(1, record.samples):
+        command[k], state = C @ state, A @ state
+    return command
+
+
+def close_loop(
+    plant: TransferFunction | StateSpace,
+    x: Float[Array, "samples outputs *columns"],
+    feedback: Float[Array, " samples"],
+    dt: float,
+) -> Float[Array, "samples outputs *columns"]:
+    """What a disturbance `x` of the output becomes in the loop, which rested before: S x.
+
+    S = 1 / (1 - G C) as a series in the delay, with the sampled plant G and C from the output to
+    the input. Of x = y - G u it leaves y - T r, with the response T of the loop to its references:
+    the noise that feedback returns to u is gone.
+    Source: Ljung, System Identification, sec. 13.5 (indirect identification).
+    """
+    samples = len(x)
+    pulse = jnp.zeros(samples).at[0].set(1.0)
+    inputs = pulse if isinstance(plant, TransferFunction) else pulse[:, None]
+    response = jnp.asarray(simulate_linear(plant, inputs, dt)).reshape(samples)
+    sensitivity = invert_series(pulse - convolve(response, feedback))
+    return convolve(sensitivity, x)
+
+
+def convolve(
+    kernel: Float[Array, " samples"], x: Float[Array, " samples *columns"]
+) -> Float[Array, " samples *columns"]:
+    """The first samples of a convolution; both begin at rest."""
+    length = 2 * len(x)
+    spectrum = jnp.fft.rfft(kernel, length).reshape(-1, *(1,) * (x.ndim - 1))
+    return jnp.fft.irfft(spectrum * jnp.fft.rfft(x, length, axis=0), length, axis=0)[: len(x)]
+
+
+def invert_series(a: Float[Array, " samples"]) -> Float[Array, " samples"]:
+    """The series b with a * b = 1, 0, 0, ..., by Newton's method: each step doubles what is right.
+
+    Source: Knuth, The Art of Computer Programming, vol. 2, sec. 4.7.
+    """
+    count = min(_FIRST, len(a))
+    late = jnp.arange(count)[:, None] - jnp.arange(count)[None, :]
+    matrix = jnp.where(late >= 0, a[jnp.abs(late)], 0.0)
+    b = jsl.solve_triangular(matrix, jnp.zeros(count).at[0].set(1.0), lower=True)
+    while count < len(a):
+        count = min(2 * count, len(a))
+        b = jnp.pad(b, (0, count - len(b)))
+        b = convolve(b, (2 * jnp.zeros(count).at[0].set(1.0)) - convolve(a[:count], b))
+    return b
 
 
 class RecordTerm(eqx.Module):
@@ -49,8 +165,8 @@ class RecordTerm(eqx.Module):
     ) -> Float[Array, "samples outputs *columns"]:
         """What counts of outputs: within the band, unpredicted by the noise, in units of it."""
         x = jnp.asarray(x)
-        seen = band_filter(x, self.gain) if self.whitener is None else self.whitener(x)
-        return jnp.asarray(seen) * self.weights.reshape(1, -1, *(1,) * (x.ndim - 2))
+        counted = band_filter(x, self.gain) if self.whitener is None else self.whitener(x)
+        return jnp.asarray(counted) * self.weights.reshape(1, -1, *(1,) * (x.ndim - 2))
 
     @property
     def measured(self) -> Float[Numbers, "samples outputs"]:
@@ -61,8 +177,8 @@ class RecordTerm(eqx.Module):
     def counted(self) -> Int[np.ndarray, " outputs"]:
         """Samples of each output that the noise model predicts."""
         samples, outputs = self.y.shape
-        unseen = np.zeros(outputs, int) if self.whitener is None else self.whitener.start
-        return samples - np.asarray(unseen)
+        first = np.zeros(outputs, int) if self.whitener is None else self.whitener.start
+        return samples - np.asarray(first)
 
 
 class OutputError(eqx.Module):
@@ -84,13 +200,6 @@ class OutputError(eqx.Module):
     def unknown(self) -> int:
         """How many initial states follow the parameters in z."""
         return sum(term.start.size for term in self.terms)
-
-
-def split(z: Float[Numbers, " n"], problem: OutputError) -> list[Float[Numbers, " part"]]:
-    """The parameters, and then each record's initial state."""
-    ends = np.cumsum([0, *(term.start.size for term in problem.terms)])
-    count = z.size - problem.unknown
-    return [z[:count], *(z[count + a : count + b] for a, b in zip(ends, ends[1:], strict=False))]
 
 
 def insert_parameters(z: Float[Numbers, " n"], problem: OutputError) -> PyTree:
@@ -116,29 +225,29 @@ def misfit_and_columns(
         simulated = forced_response(plant, term.u, term.dt, term.hold)
         motions = Motions(*term.motions, ())
         columns = free_response(plant, motions, len(term.u), term.dt)
-        if (feedback := term.feedback) is not None:
-            late = jnp.asarray(feedback)
-            closed = lambda x: term.weighted(close_loop(plant, x, late, term.dt))
+        if term.feedback is not None:
+            feedback = jnp.asarray(term.feedback)
+            closed = lambda x: term.weighted(close_loop(plant, x, feedback, term.dt))
             return closed(term.y - simulated), closed(columns)
     return jnp.asarray(term.measured) - term.weighted(simulated), term.weighted(columns)
 
 
 def project_out(
-    found: Float[Array, "samples outputs"], columns: Float[Array, "samples outputs unknowns"]
+    misfit: Float[Array, "samples outputs"], columns: Float[Array, "samples outputs unknowns"]
 ) -> Float[Array, "samples outputs"]:
-    """The misfit that no start, trim or shift explains (variable projection)."""
-    flat = columns.reshape(found.size, -1)
+    """The `misfit` that no start, trim or shift explains (variable projection)."""
+    flat = columns.reshape(misfit.size, -1)
     square = jax.lax.stop_gradient(jnp.sum(flat**2, axis=0))
     flat = flat / jnp.sqrt(jnp.where(square > 1e-20 * jnp.max(square), square, 1.0))[None]
     normal = jnp.dot(flat.T, flat, precision="highest")
-    aim = flat.T @ found.reshape(-1)
+    aim = flat.T @ misfit.reshape(-1)
     ridged = normal + _RIDGE * jnp.eye(aim.size)
 
     def refine(_, unknowns):
         return unknowns + solve_definite(ridged, aim - normal @ unknowns)[0]
 
     unknowns = jax.lax.fori_loop(0, 3, refine, jnp.zeros_like(aim))
-    return found - (flat @ unknowns).reshape(found.shape)
+    return misfit - (flat @ unknowns).reshape(misfit.shape)
 
 
 class Evaluation(NamedTuple):
@@ -164,11 +273,12 @@ def evaluate_misfits(z: Float[Numbers, " n"], problem: OutputError) -> Evaluatio
     """Everything at the first parameters and the initial states `z`."""
 
     def simulated(z):
-        values, *starts = map(jnp.asarray, split(z, problem))
+        # The parameters, and then each record's initial state.
+        ends = z.size - problem.unknown + np.cumsum([0, *(t.start.size for t in problem.terms)])
+        values, *starts = map(jnp.asarray, jnp.split(z, ends[:-1]))
         model = insert_parameters(values, problem)
-        pairs = [
-            misfit_and_columns(model, *each) for each in zip(starts, problem.terms, strict=True)
-        ]
+        parts = zip(starts, problem.terms, strict=True)
+        pairs = [misfit_and_columns(model, start, term) for start, term in parts]
         left = [project_out(*pair) for pair in pairs]
         rest = [prior_misfits(values, problem.base), *(_LOOSE * start for start in starts)]
         return (left, rest), (left, rest, [columns for _, columns in pairs])

@@ -1,3 +1,5 @@
+"""Fits of models to records in the time domain."""
+
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -8,20 +10,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
+from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
 from ..frequency_domain._fit import check_priors
 from ..frequency_domain._model_checks import require_model
-from ..frequency_domain._parameters import Free, Parameters, Positive, Real, select_parameters, Tie
-from ..frequency_domain._problem import Prior, Problem, quantity_of, require_priors
+from ..frequency_domain._parameters import Free, select_parameters, Tie
+from ..frequency_domain._problem import make_problem, Prior, require_priors
+from ..frequency_domain._refits import free_again
 from ..frequency_domain._result import Fit
-from ._descent import descend_by_turns
-from ._known_loop import feedback_response, KnownController
-from ._noise_descent import descend_with_noise
-from ._noise_model import ARMA, AutoRegressive, Noise
-from ._problem import evaluate_misfits, OutputError, RecordTerm
+from ._descent import descend_by_turns, descend_with_noise
+from ._noise import ARMA, AutoRegressive, Noise
+from ._problem import (
+    evaluate_misfits,
+    feedback_response,
+    KnownController,
+    OutputError,
+    RecordTerm,
+)
 from ._result import assess_output_error
 from ._simulated import (
     band_filter,
@@ -35,6 +42,9 @@ from ._simulated import (
     linear_model,
     unknown_motions,
 )
+
+
+_SHORT = 200_000  # samples, up to which a second thread of BLAS waits about as long as it works
 
 
 def refine(
@@ -100,28 +110,30 @@ def refine(
     require_x64("an output-error fit")
     if isinstance(model, Record):
         require_model("refine", model)
-    records = _checked(record, max_steps)
-    _check_noise(noise, band)
-    if loop is not None and band is not None:
-        raise ValueError(
-            f"band {band} rad/s and a loop exclude each other: leave the band out, a noise model "
-            'weights each frequency by its noise (noise="auto")'
-        )
+    records = [record] if isinstance(record, Record) else list(record)
+    _check(records, noise, loop, band, max_steps)
     longest = max(one.samples for one in records)
-    keep_freed_memory(8 * _HELD * longest)
     near = isinstance(model, Fit)
-    if not near:
+    if isinstance(model, Fit):  # its choice of parameters holds where no other is given
+        if tied is None:
+            tied = {place.name: tie for place, tie in model.parameters.ties}
+        free = free_again(model.parameters) if free is None else free
+        model = model.model
+    else:
         require_model("refine", model)
-    if isinstance(model, Fit):
-        model, free, tied = _continued(model, free, tied)
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
-    base = _base(model, parameters, priors)
+    require_priors(model, priors)
+    base = make_problem(model, parameters, (), priors=priors)
     if noise == "auto" and loop is not None:
         noise = AutoRegressive()  # a loop shapes its noise by more poles than a few zeros follow
     with one_blas_thread() if longest <= _SHORT else contextlib.nullcontext():
         terms = tuple(_term(model, one, hold, band, loop) for one in records)
-        problem = _with_units(OutputError(base, terms, _fixed_zeros(model, parameters)))
+        changed = {p.leaf for p in parameters.places} | {p.leaf for p, _ in parameters.ties}
+        leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+        still = [k for k, leaf in enumerate(leaves) if not np.any(np.asarray(leaf))]
+        zeros = tuple(k for k in still if k not in changed)
+        problem = _with_units(OutputError(base, terms, zeros))
         if noise is None:
             descent = descend_by_turns(problem, max_steps)
         else:
@@ -130,11 +142,14 @@ def refine(
         return assess_output_error(descent, records)
 
 
-_SHORT = 200_000  # samples, up to which a second thread of BLAS waits about as long as it works
-
-
-def _checked(record: Record | Sequence[Record], max_steps: int) -> list[Record]:
-    records = [record] if isinstance(record, Record) else list(record)
+def _check(
+    records: list[Record],
+    noise: Noise | None,
+    loop: KnownController | None,
+    band: tuple[float, float] | None,
+    max_steps: int,
+) -> None:
+    """Raise ValueError for arguments that make no sense."""
     if not records or not all(isinstance(one, Record) for one in records):
         kinds = ", ".join(sorted({type(one).__name__ for one in records})) or "nothing"
         raise ValueError(f"refine needs a jq.Record or a list of them, not {kinds}: see jq.read")
@@ -143,14 +158,9 @@ def _checked(record: Record | Sequence[Record], max_steps: int) -> list[Record]:
     for one in records:
         still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
         if still:
-            raise ValueError(f"output {still[0]} is constant: leave it out with jq.records.select")
-    return records
-
-
-_HELD = 64  # numbers of each sample that a fit holds at a time
-
-
-def _check_noise(noise: Noise | None, band: tuple[float, float] | None) -> None:
+            raise ValueError(
+                Message(f"output {still[0]} is constant: leave it out« with jq.records.select»")
+            )
     if not (noise in (None, "auto") or isinstance(noise, AutoRegressive | ARMA)):
         raise ValueError(
             f"noise is {noise!r}: give None (white), jq.identify.AutoRegressive(order), "
@@ -161,37 +171,11 @@ def _check_noise(noise: Noise | None, band: tuple[float, float] | None) -> None:
             f"band {band} rad/s and a noise model exclude each other: outside the band there is no "
             "noise left to model. Give noise alone: it weights each frequency by its noise"
         )
-
-
-def _continued(
-    fit: Fit, free: Free, tied: Mapping[str, Tie] | None
-) -> tuple[PyTree, Free, Mapping[str, Tie] | None]:
-    """The fit's model, with its choice of parameters where no other is given."""
-    known = fit.parameters
-    if tied is None:
-        tied = {place.name: tie for place, tie in known.ties}
-    if free is None:
-        logarithmic = known.logarithmic[: known.count]
-        free = [
-            Positive(name) if log else Real(name, abs(float(scale)))
-            for name, log, scale in zip(known.names, logarithmic, known.scale, strict=False)
-        ]
-    return fit.model, free, tied
-
-
-def _base(model: PyTree, parameters: Parameters, priors: Sequence[Prior]) -> Problem:
-    require_priors(model, priors)
-    numbers = [[prior.value, prior.standard_error] for prior in priors]
-    return Problem(
-        model=model,
-        parameters=parameters,
-        conditions=(),
-        quantities=tuple(quantity_of(prior.quantity) for prior in priors),
-        omega=(),
-        measured=(),
-        weights=(),
-        known=np.asarray(numbers, dtype=float).reshape(-1, 2),
-    )
+    if loop is not None and band is not None:
+        raise ValueError(
+            f"band {band} rad/s and a loop exclude each other: leave the band out, a noise model "
+            'weights each frequency by its noise (noise="auto")'
+        )
 
 
 def _term(
@@ -211,25 +195,22 @@ def _term(
                 "linear model: give a jq.TransferFunction or a jq.StateSpace"
             )
         motions, start = None, np.ones(count_states(model))
-        _check_measured(model, record)
+        measured = jnp.size(model.measure(model.init()))
+        if measured != len(record.output_names):
+            raise ValueError(
+                Message(
+                    f"the model measures {measured} outputs, the record has "
+                    f"{', '.join(record.output_names)}: «pick channels with jq.records.select»"
+                )
+            )
     else:
         plant = linear_model(model)
         check_channels(plant, record)
         check_growth(plant, record)
-        found = unknown_motions(plant, record.duration)
-        motions, start = (found.slow, found.fast), np.zeros(0)
+        motions, start = unknown_motions(plant, record.duration)[:2], np.zeros(0)
     y = band_filter(np.asarray(record.outputs), gain)
     weights = 1 / np.std(y, axis=0)
     return RecordTerm(u, y, weights, gain, motions, start, record.dt, between, feedback=feedback)
-
-
-def _check_measured(model: DifferentialModel, record: Record) -> None:
-    measured = jnp.size(model.measure(model.init()))
-    if measured != len(record.output_names):
-        raise ValueError(
-            f"the model measures {measured} outputs, the record has "
-            f"{', '.join(record.output_names)}: pick channels with jq.records.select"
-        )
 
 
 def _with_units(problem: OutputError) -> OutputError:
@@ -240,8 +221,8 @@ def _with_units(problem: OutputError) -> OutputError:
     z = np.concatenate([problem.base.parameters.start[:count], np.zeros(problem.unknown)])
     slopes = evaluate_misfits(z, problem).slopes
     terms, at = [], count
-    for term, one in zip(problem.terms, slopes, strict=True):
-        mine = np.asarray(one)[:, :, at : at + term.start.size]
+    for term, by_record in zip(problem.terms, slopes, strict=True):
+        mine = np.asarray(by_record)[:, :, at : at + term.start.size]
         sizes = np.sqrt(np.mean(mine**2, axis=(0, 1)))
         if not np.all(np.isfinite(sizes)):
             raise ValueError(
@@ -249,15 +230,8 @@ def _with_units(problem: OutputError) -> OutputError:
                 "diverges or is too stiff. Start from other values, or cut the record with "
                 "jq.records.trim"
             )
-        seen = sizes > 1e-6 * np.max(sizes, initial=0.0)
-        start = np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0)
+        shows = sizes > 1e-6 * np.max(sizes, initial=0.0)
+        start = np.where(shows, 1 / np.where(shows, sizes, 1.0), 0.0)
         terms.append(dataclasses.replace(term, start=start))
         at += term.start.size
     return dataclasses.replace(problem, terms=tuple(terms))
-
-
-def _fixed_zeros(model: PyTree, parameters: Parameters) -> tuple[int, ...]:
-    changed = {place.leaf for place in parameters.places} | {p.leaf for p, _ in parameters.ties}
-    leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
-    still = [k for k, leaf in enumerate(leaves) if not np.any(np.asarray(leaf))]
-    return tuple(k for k in still if k not in changed)

@@ -9,7 +9,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import brief_options, Jit
+from jaxquad._compile import brief_options, Jit
+from jaxquad._core import Message
 from jaxquad.models import (
     explicit,
     free_responses,
@@ -35,10 +36,12 @@ def band_gain(
         return None
     nyquist = np.pi / record.dt
     if np.shape(band) != (2,) or not 0 < band[0] < band[1] < nyquist:
-        ends = " .. ".join(f"{float(each):.4g}" for each in np.ravel(band))
+        ends = " .. ".join(f"{float(end):.4g}" for end in np.ravel(band))
         raise ValueError(
-            f"band {ends} rad/s must rise and lie between 0 and the record's Nyquist frequency "
-            f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz): give another band (band=)"
+            Message(
+                f"band {ends} rad/s must rise and lie between 0 and the record's Nyquist frequency "
+                f"{nyquist:.4g} rad/s ({nyquist / (2 * np.pi):.4g} Hz): give another band («band=»)"
+            )
         )
     from scipy.signal import butter, sosfreqz
 
@@ -168,13 +171,13 @@ def integrate_plant(
         return ravel_pytree(plant.derivative(rebuild(state), inputs, calm))[0]
 
     def sample(state, line):
-        found = dfx.diffeqsolve(
+        solution = dfx.diffeqsolve(
             dfx.ODETerm(slope), dfx.Tsit5(), 0.0, dt, dt, state, line,
             stepsize_controller=controller, adjoint=dfx.ForwardMode(),
             max_steps=_STEPS, throw=False,
         )  # fmt: skip
-        assert found.ys is not None
-        after = jnp.where(found.result == dfx.RESULTS.successful, found.ys[0], jnp.nan)
+        assert solution.ys is not None
+        after = jnp.where(solution.result == dfx.RESULTS.successful, solution.ys[0], jnp.nan)
         return after, jnp.atleast_1d(plant.measure(rebuild(state)))
 
     change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
@@ -221,10 +224,13 @@ def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None
     if isinstance(plant, StateSpace):
         inputs, outputs = plant.G.shape[1], len(plant.H0)
     if (len(record.input_names), len(record.output_names)) != (inputs, outputs):
+        count = lambda number, what: f"one {what}" if number == 1 else f"{number} {what}s"
         raise ValueError(
-            f"the model has {_count(inputs, 'input')} and {_count(outputs, 'output')}, the record "
-            f"has {', '.join(record.input_names)} and {', '.join(record.output_names)}: pick "
-            "channels with jq.records.select"
+            Message(
+                f"the model has {count(inputs, 'input')} and {count(outputs, 'output')}, the "
+                f"record has {', '.join(record.input_names)} and {', '.join(record.output_names)}: "
+                "«pick channels with jq.records.select»"
+            )
         )
 
 
@@ -255,14 +261,30 @@ def forced_response(
 
 def unknown_motions(plant: TransferFunction | StateSpace, duration: float) -> Motions:
     """The invariant subspaces of all speeds; slow is what a fifth of the record does not damp."""
-    A = _dynamics(plant)
+    A = np.asarray((explicit(plant) if isinstance(plant, StateSpace) else realise(plant))[0])
     if not len(A):
         return Motions(np.zeros((0, 0)), np.zeros((0, 0)), ())
-    speeds = -np.real(np.linalg.eigvals(A)) * duration / _SLOW
-    edges = _edges(speeds)
-    within = lambda low, high: _subspace(A * duration / _SLOW, speeds, low, high)
-    slow = within(-np.inf, edges[0])
-    parts = [within(low, high) for low, high in zip(edges, edges[1:], strict=False)]
+    speeds, A = -np.real(np.linalg.eigvals(A)) * duration / _SLOW, A * duration / _SLOW
+    # One speed ends and the next begins between poles, from the end of the slow ones at 1 on.
+    # Equal poles scatter by a root of the rounding, and have to stay together.
+    ordered = np.sort(np.maximum(speeds, 0.2))
+    gaps = np.flatnonzero(ordered[1:] > 1.001 * ordered[:-1])
+    middles = np.sqrt(ordered[gaps] * ordered[gaps + 1])
+    edges = [0.0] if ordered[0] > 1 else []
+    edges += [*middles[ordered[gaps + 1] > 1].tolist(), np.inf]
+
+    def basis(low: float, high: float) -> Float[np.ndarray, "states within"]:
+        """Orthonormal, of the motions that decay faster than at `low`, up to `high`."""
+        inside = (low < speeds) & (speeds <= high)
+        if not np.any(inside) or np.all(inside):
+            return np.eye(len(A), int(np.sum(inside)))
+        from scipy.linalg import schur
+
+        _, vectors, count = schur(A, output="real", sort=lambda re, im: low < -re <= high)
+        return vectors[:, : int(count)]
+
+    slow = basis(-np.inf, edges[0])
+    parts = [basis(low, high) for low, high in zip(edges, edges[1:], strict=False)]
     parts = parts or [slow[:, :0]]
     groups = tuple(part.shape[1] for part in parts if part.shape[1])
     return Motions(slow, np.concatenate(parts, axis=1), groups)
@@ -298,38 +320,3 @@ def forced_and_free(
     dt = jnp.asarray(dt)
     free = free_response(plant, motions, len(u), dt)
     return forced_response(plant, u, dt, hold), free
-
-
-def _dynamics(plant: TransferFunction | StateSpace) -> Float[np.ndarray, "states states"]:
-    parts = explicit(plant) if isinstance(plant, StateSpace) else realise(plant)
-    return np.asarray(parts[0])
-
-
-def _edges(speed: Float[np.ndarray, " states"]) -> list[float]:
-    """Where one speed ends and the next begins, from the end of the slow ones at 1."""
-    # Equal poles scatter by a root of the rounding, and have to stay together.
-    speed = np.sort(np.maximum(speed, 0.2))
-    gaps = np.flatnonzero(speed[1:] > 1.001 * speed[:-1])
-    middles = np.sqrt(speed[gaps] * speed[gaps + 1])
-    first = [0.0] if speed[0] > 1 else []
-    return [*first, *middles[speed[gaps + 1] > 1].tolist(), np.inf]
-
-
-def _subspace(
-    A: Float[np.ndarray, "states states"],
-    speeds: Float[np.ndarray, " states"],
-    low: float,
-    high: float,
-) -> Float[np.ndarray, "states within"]:
-    """An orthonormal basis of the motions that decay faster than at `low`, up to `high`."""
-    inside = (low < speeds) & (speeds <= high)
-    if not np.any(inside) or np.all(inside):
-        return np.eye(len(A), int(np.sum(inside)))
-    from scipy.linalg import schur
-
-    found = schur(A, output="real", sort=lambda re, im: low < -re <= high)
-    return found[1][:, : int(found[-1])]
-
-
-def _count(number: int, what: str) -> str:
-    return f"one {what}" if number == 1 else f"{number} {what}s"

@@ -1,12 +1,13 @@
-from collections.abc import Sequence
+"""Models against records that they were not fitted to: one verified, several compared."""
+
+from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxquad._core import require_x64
-from jaxquad.models import StateSpace, TransferFunction
+from jaxquad._core import Message, require_x64
 from jaxquad.records import Record
 
 from ..uncertainty._accuracy import orthonormal, projected_noise
@@ -82,49 +83,27 @@ class Verification(eqx.Module):
             hertz = f"{low / (2 * np.pi):.3g}..{high / (2 * np.pi):.3g} Hz"
             where = f"{low:.4g}..{high:.4g} rad/s ({hertz})"
         numbers = (self.rms, self.tic, self.fit_percent, self.variance_percent)
-        whole = Agreement(self.output_name, self.output_unit, *numbers)
-        lines = [f"verification on {self.output_name}, {where}: {whole}"]
+        together = Agreement(self.output_name, self.output_unit, *numbers)
+        lines = [f"verification on {self.output_name}, {where}: {together}"]
         if len(self.outputs) > 1:
             lines += [f"  {one.name}: {one}" for one in self.outputs]
         return "\n".join(lines)
 
 
-def agreement(
+def _agreement(
     name: str,
     unit: str,
     measured: Float[np.ndarray, "samples outputs"],
     simulated: Float[np.ndarray, "samples outputs"],
     weights: Float[np.ndarray, " outputs"],
 ) -> Agreement:
-    """The textbook's measures over some outputs.
-
-    Source: Tischler & Remple, sec. 14.2, J_rms and TIC with a diagonal weight W.
-    """
+    """J_rms and TIC with a diagonal weight W. Source: Tischler & Remple, sec. 14.2."""
     size = lambda x: float(np.sqrt(np.mean(x**2 * weights)))
     rms, spread = size(measured - simulated), size(measured - measured.mean(axis=0))
+    tic = rms / (size(measured) + size(simulated))
     return Agreement(
-        name,
-        unit,
-        rms,
-        rms / (size(measured) + size(simulated)),
-        100 * (1 - rms / spread),
-        100 * (1 - (rms / spread) ** 2),
+        name, unit, rms, tic, 100 * (1 - rms / spread), 100 * (1 - (rms / spread) ** 2)
     )
-
-
-def agreements(
-    record: Record,
-    measured: Float[np.ndarray, "samples outputs"],
-    simulated: Float[np.ndarray, "samples outputs"],
-    weights: Float[np.ndarray, " outputs"],
-) -> tuple[Agreement, tuple[Agreement, ...]]:
-    """Of all outputs together, and of each."""
-    one = np.ones(1)
-    each = [
-        agreement(name, unit, measured[:, [k]], simulated[:, [k]], one)
-        for k, (name, unit) in enumerate(zip(record.output_names, record.output_units, strict=True))
-    ]
-    return agreement("", "", measured, simulated, weights), tuple(each)
 
 
 @runtime_checkable
@@ -137,8 +116,13 @@ class _Fitted(Protocol):
     @property
     def used_band(self) -> tuple[float, float] | None: ...
 
+    def __call__(
+        self, record: Record, *, band: tuple[float, float] | None, hold: str | None
+    ) -> Verification: ...
+
 
 _SIGNIFICANT = 3.0  # standard errors from which a starting transient is estimated
+_PER_OCTAVE = 8  # lengths of records for which there is a program
 
 
 def verify(
@@ -190,114 +174,156 @@ def verify(
         model, band = model.model, model.used_band if band is None else band
     plant = linear_model(model)
     check_channels(plant, record)
-    gain, shares = band_gain(band, record), _weights(weights, record)
-    u, between = inputs_between_samples(record, hold)
-    check_growth(plant, record)
-    motions = unknown_motions(plant, record.duration)
-    parts = [np.asarray(record.outputs), *_simulated(plant, motions, u, record.dt, between)]
-    measured, driven, columns = (np.asarray(band_filter(part, gain)) for part in parts)
-    unknowns, kept = _unknowns(measured - driven, columns, motions, _spread(record, measured))
-    simulated = driven + columns[:, :, :kept] @ unknowns
-    whole, each = agreements(record, measured, simulated, shares)
-    shift, bias, initial = _physical(unknowns, motions, measured.shape[1])
-    shown = slice(None) if len(each) > 1 else 0
-    return Verification(
-        time=record.time,
-        measured=measured[:, shown],
-        simulated=simulated[:, shown],
-        rms=whole.rms,
-        tic=whole.tic,
-        fit_percent=whole.fit_percent,
-        variance_percent=whole.variance_percent,
-        outputs=each,
-        shift=shift,
-        bias=bias,
-        initial=initial,
-        omitted=columns.shape[2] - kept,
-        band=band,
-    )
-
-
-def _weights(weights: Sequence[float] | None, record: Record) -> Float[np.ndarray, " outputs"]:
-    count = len(record.output_names)
+    gain, count = band_gain(band, record), len(record.output_names)
     shares = np.ones(count) if weights is None else np.asarray(weights, float)
     if shares.shape != (count,) or not np.all(np.isfinite(shares) & (shares > 0)):
         raise ValueError(
             f"weights={weights}: give one positive number for each output: "
             f"{', '.join(record.output_names)}"
         )
-    return shares
-
-
-_PER_OCTAVE = 8  # lengths of records for which there is a program
-
-
-def _simulated(
-    plant: TransferFunction | StateSpace,
-    motions: Motions,
-    u: Float[np.ndarray, "samples inputs"],
-    dt: float,
-    hold: str,
-) -> tuple[Float[np.ndarray, "samples outputs"], Float[np.ndarray, "samples outputs unknowns"]]:
-    """What inputs and unknown motions do, by a program for records of about this length."""
-    samples = len(u)
-    step = max(2 ** (samples.bit_length() - 1) // _PER_OCTAVE, 1)
-    padded = np.pad(u, ((0, -samples % step), (0, 0)), mode="edge")
-    driven, columns = forced_and_free(plant, motions, padded, np.asarray(dt), hold)
-    return np.asarray(driven)[:samples], np.asarray(columns)[:samples]
-
-
-def _spread(record: Record, measured: np.ndarray) -> Float[np.ndarray, " outputs"]:
+    u, between = inputs_between_samples(record, hold)
+    check_growth(plant, record)
+    motions = unknown_motions(plant, record.duration)
+    # One program serves records of about this length.
+    step = max(2 ** (record.samples.bit_length() - 1) // _PER_OCTAVE, 1)
+    padded = np.pad(u, ((0, -record.samples % step), (0, 0)), mode="edge")
+    parts = forced_and_free(plant, motions, padded, np.asarray(record.dt), between)
+    parts = [np.asarray(record.outputs), *(np.asarray(part)[: record.samples] for part in parts)]
+    measured, driven, columns = (np.asarray(band_filter(part, gain)) for part in parts)
     spread = np.std(measured, axis=0)
-    for name, one in zip(record.output_names, spread, strict=True):
-        if one == 0:
-            raise ValueError(f"output {name} is constant: leave it out with jq.records.select")
-    return spread
+    for name, size in zip(record.output_names, spread, strict=True):
+        if size == 0:
+            raise ValueError(
+                Message(f"output {name} is constant: leave it out« with jq.records.select»")
+            )
+    scaled = columns / spread[None, :, None]
+    unknowns = _significant_unknowns((measured - driven) / spread[None], scaled, motions)
+    simulated = driven + columns[:, :, : unknowns.size] @ unknowns
+    together = _agreement("", "", measured, simulated, shares)
+    outputs = tuple(
+        _agreement(name, unit, measured[:, [k]], simulated[:, [k]], np.ones(1))
+        for k, (name, unit) in enumerate(zip(record.output_names, record.output_units, strict=True))
+    )
+    slow, fast = np.asarray(motions.slow), np.asarray(motions.fast)
+    shift, bias, start = np.split(unknowns, [count, count + slow.shape[1]])
+    shown = slice(None) if len(outputs) > 1 else 0
+    return Verification(
+        time=record.time,
+        measured=measured[:, shown],
+        simulated=simulated[:, shown],
+        rms=together.rms,
+        tic=together.tic,
+        fit_percent=together.fit_percent,
+        variance_percent=together.variance_percent,
+        outputs=outputs,
+        shift=shift,
+        bias=slow @ bias,
+        initial=fast[:, : start.size] @ start,
+        omitted=columns.shape[2] - unknowns.size,
+        band=band,
+    )
 
 
-def _unknowns(
+def _significant_unknowns(
     rest: Float[np.ndarray, "samples outputs"],
     columns: Float[np.ndarray, "samples outputs unknowns"],
     motions: Motions,
-    spread: Float[np.ndarray, " outputs"],
-) -> tuple[Float[np.ndarray, " kept"], int]:
-    """Least squares without the fast transients that do not stand out, the fastest first."""
-    rest, columns = rest / spread[None], columns / spread[None, :, None]
-    kept, groups = columns.shape[2], list(motions.groups)
+) -> Float[np.ndarray, " significant"]:
+    """Least squares without the fast transients that do not stand out, the fastest first.
+
+    They stand out where they are beyond their errors, in noise like what is left.
+    """
+    groups = list(motions.groups)
     while True:
-        found, left = _least_squares(rest, columns[:, :, :kept])
-        if not groups or _stands_out(columns[:, :, :kept], left, found, groups[-1]):
-            return found, kept
-        kept -= groups.pop()
+        flat = columns.reshape(rest.size, -1)
+        scale = np.linalg.norm(flat, axis=0)
+        scale = np.where(scale > 1e-12 * scale.max(), scale, np.inf)
+        unknowns = np.linalg.lstsq(flat / scale, rest.reshape(-1), rcond=1e-9)[0] / scale
+        if not groups:
+            return unknowns
+        last, left = groups.pop(), rest - columns @ unknowns
+        inverse = np.linalg.pinv(flat / scale, rcond=1e-9)[-last:]
+        ways = inverse.T.reshape(*left.shape, last)
+        covariance = projected_noise(ways, left, orthonormal(columns), 0)
+        tested = unknowns[-last:] * np.where(np.isfinite(scale[-last:]), scale[-last:], 0.0)
+        size = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
+        scaled = np.linalg.pinv(covariance / np.outer(size, size)) @ (tested / size)
+        if float(tested / size @ scaled) > last * _SIGNIFICANT**2:
+            return unknowns
+        columns = columns[:, :, :-last]
 
 
-def _least_squares(
-    rest: np.ndarray, columns: np.ndarray
-) -> tuple[Float[np.ndarray, " unknowns"], Float[np.ndarray, "samples outputs"]]:
-    flat = columns.reshape(rest.size, -1)
-    scale = np.linalg.norm(flat, axis=0)
-    scale = np.where(scale > 1e-12 * scale.max(), scale, np.inf)
-    found = np.linalg.lstsq(flat / scale, rest.reshape(-1), rcond=1e-9)[0] / scale
-    return found, rest - columns @ found
+class Comparison(eqx.Module):
+    """How well each of several models predicts one record; prints as a table.
+
+    `jq.plot.compare` draws it. `checks[name].simulated` is what a model predicts.
+    """
+
+    checks: dict[str, Verification]  # by the models' names
+    source: str = eqx.field(static=True)  # of the record
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """100 (1 - |difference| / |measured - mean|) of each model, over all outputs."""
+        return {name: check.fit_percent for name, check in self.checks.items()}
+
+    @property
+    def best(self) -> str:
+        """The name of the model that predicts the record best."""
+        return max(self.fit_percent, key=lambda name: np.nan_to_num(self.fit_percent[name]))
+
+    def __str__(self) -> str:
+        heads = ("model", "output", "fit %", "accounted for %", "TIC", "rms difference")
+        rows: list[tuple[str, ...]] = [heads]
+        for name, check in self.checks.items():
+            for one in check.outputs:
+                numbers = (f"{one.fit_percent:.1f}", f"{one.variance_percent:.1f}")
+                numbers = (*numbers, f"{one.tic:.3f}", f"{one.rms:.4g} {one.unit}".rstrip())
+                rows.append((name, one.name, *numbers))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        texts = lambda row: [f"{c:<{w}}" for c, w in zip(row[:2], widths, strict=False)]
+        numbers = lambda row: [f"{c:>{w}}" for c, w in zip(row[2:], widths[2:], strict=True)]
+        lines = ["  ".join([*texts(row), *numbers(row)]).rstrip() for row in rows]
+        return "\n".join(lines + ["(TIC: Theil inequality coefficient, good below 0.25)"])
 
 
-def _stands_out(columns: np.ndarray, left: np.ndarray, found: np.ndarray, last: int) -> bool:
-    """Whether the last unknowns are beyond their errors, in noise like what is left."""
-    flat = columns.reshape(left.size, -1)
-    scale = np.linalg.norm(flat, axis=0)
-    scale = np.where(scale > 1e-12 * scale.max(), scale, np.inf)
-    inverse = np.linalg.pinv(flat / scale, rcond=1e-9)[-last:]
-    ways = inverse.T.reshape(*left.shape, last)
-    covariance = projected_noise(ways, left, orthonormal(columns), 0)
-    tested = found[-last:] * np.where(np.isfinite(scale[-last:]), scale[-last:], 0.0)
-    size = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
-    scaled = np.linalg.pinv(covariance / np.outer(size, size)) @ (tested / size)
-    return float(tested / size @ scaled) > last * _SIGNIFICANT**2
+def compare(
+    models: PyTree | Mapping[str, PyTree] | Sequence[PyTree],
+    record: Record,
+    *,
+    band: tuple[float, float] | None = None,
+    hold: str | None = None,
+) -> Comparison:
+    """Simulate models on a record that none of them was fitted to, and compare them.
 
+    !!! example
 
-def _physical(
-    unknowns: Float[np.ndarray, " kept"], motions: Motions, outputs: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    slow, fast = np.asarray(motions.slow), np.asarray(motions.fast)
-    shift, bias, start = np.split(unknowns, [outputs, outputs + slow.shape[1]])
-    return shift, slow @ bias, fast[:, : start.size] @ start
+        ```python
+        print(jq.compare({"with lag": one, "without": other}, second_flight))
+        ```
+
+    **Arguments:**
+
+    - `models`: by name, or a list, or one: models as `jq.verify` takes them, or fits.
+    - `record`: with their inputs and outputs.
+    - `band`, `hold`: as in `jq.verify`.
+
+    **Returns:** a `jq.identify.Comparison`.
+
+    **Raises:** what `jq.verify` raises; ValueError for no model, and for a fit that found none.
+    """
+    if isinstance(models, Mapping):
+        named = {str(name): model for name, model in models.items()}
+    elif isinstance(models, list | tuple):
+        named = {f"model {k}": model for k, model in enumerate(models, start=1)}
+    else:
+        named = {"model": models}
+    if not named:
+        raise ValueError("there is no model to compare: give one or more, by name")
+    checks = {
+        name: model(record, band=band, hold=hold)
+        if isinstance(model, _Fitted)
+        else verify(model, record, band=band, hold=hold)
+        for name, model in named.items()
+    }
+    return Comparison(checks, record.source)

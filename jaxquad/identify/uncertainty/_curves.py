@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float, Inexact, PyTree
 
-from jaxquad._xla import hasty_options, Jit
+from jaxquad._compile import hasty_options, Jit
 from jaxquad.models import evaluate_response, simulate_linear, StateSpace, TransferFunction
 
 from ..output_error._simulated import linear_model

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._xla import run_shared
-
 from ..frequency_domain._parameters import number_at
 from ._identifiability import LIMIT
 from ._verdict import Combination, reach_of_interval, UndeterminedError, USUAL
@@ -59,8 +57,8 @@ def derive(fit: "Fit", quantity: Quantity, name: str, *, model_error: bool) -> C
     if found.is_open:
         lost = ", ".join(fit.verdict.undetermined)
         raise UndeterminedError(
-            f"{name} depends on what this record does not determine ({lost}): fit with a "
-            "jq.identify.Prior or a second record, or ask for a determined combination"
+            f"{name} depends on what this record does not determine ({lost}): «fit with a "
+            "jq.identify.Prior or a second record, or ask for a determined combination»"
         )
     slope = found.slope
     covariance = fit.relative_covariance if model_error else fit.relative_noise_covariance
@@ -122,17 +120,13 @@ def _values_and_gradients(
     arrays, rest = eqx.partition(fit.model, eqx.is_inexact_array)
 
     def of_values(x, arrays):
-        return quantity(fit.parameters.replace(eqx.combine(arrays, rest), x))
+        value = quantity(fit.parameters.replace(eqx.combine(arrays, rest), x))
+        if jnp.shape(value):
+            raise ValueError(
+                "the quantity is an array: ask for each of its numbers, by a function of its own"
+            )
+        return value
 
     function = jax.value_and_grad(of_values)
-    try:
-        found = run_shared(function, [(values, arrays) for values in places])
-    except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
-        found = [function(jnp.asarray(values), arrays) for values in places]
-    except TypeError as error:
-        if "scalar-output" not in str(error):
-            raise
-        raise ValueError(
-            "the quantity is an array: ask for each of its numbers, by a function of its own"
-        ) from error
+    found = [function(jnp.asarray(values), arrays) for values in places]
     return [(float(value), np.asarray(gradient)) for value, gradient in found]

@@ -12,7 +12,7 @@ from jaxquad._core import as_array
 
 from ..frequency_domain._parameters import Parameters
 from ._accuracy import Matrix
-from ._verdict import UndeterminedError
+from ._verdict import NO_MINIMUM, UndeterminedError
 
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def check_drawable(fit: "Fit", hold_undetermined: bool) -> None:
     """Raise ValueError for a fit that cannot be drawn from, as `Fit.ensemble` says."""
     if not fit.verdict.fitted:
         raise UndeterminedError(f"there is nothing to draw from: {fit.verdict.summary}")
-    stopped = [remark for remark in fit.remarks if remark.startswith("no minimum")]
+    stopped = [remark for remark in fit.remarks if remark.kind == NO_MINIMUM]
     if stopped:
         raise ValueError(
             f"the fit did not converge, so there is nothing to draw from: {stopped[0]}"

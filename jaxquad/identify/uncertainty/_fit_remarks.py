@@ -5,11 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from jaxquad._core import Message
+
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution, solution_at
 from ._accuracy import Matrix
 from ._discrepancy import Discrepancy
-from ._verdict import Verdict, without_numbers
+from ._verdict import NO_MINIMUM, Verdict, without_numbers
 
 
 def no_minimum(
@@ -45,7 +47,7 @@ NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
 _LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
 _POOR = 10.0  # ratio above which a local minimum is likely
 _EXACT = 1e-9  # cost of a response without noise: no step lowers what rounding has left
-_LOCAL = ", or this is a local minimum: try other starting values"
+_LOCAL = ", or this is a local minimum: «try other starting values»"
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
 
 
@@ -65,8 +67,12 @@ def remarks_on_fit(
     if no_minimum:
         more = "take more steps (max_steps=), or " if solution.message else ""
         remarks.append(
-            f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
-            f"{2 * decrement:.3g}; {more}try other starting values{_opposite(problem, solution)}"
+            Message(
+                f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
+                f"{2 * decrement:.3g}; {more}«try other starting values»"
+                f"{_opposite(problem, solution)}",
+                NO_MINIMUM,
+            )
         )
     if chi_squared > MISFIT**2:
         ratio = np.sqrt(chi_squared)
@@ -81,9 +87,9 @@ def no_model(names: tuple[str, ...], unexplained: float) -> Verdict:
     """The verdict on a fit that leaves more than half of the response `unexplained`."""
     reason = f"it leaves {100 * min(unexplained, 1.0):.0f} % of the response unexplained"
     remedies = (
-        "fit the part of the band where it holds (band=)",
-        "fit a model that explains more (Fit.explain() names terms)",
-        "start from other values: this may be a local minimum",
+        "fit the part of the band where it holds («band=»)",
+        "fit a model that explains more («Fit.explain()» names terms)",
+        "«start from other values»: this may be a local minimum",
     )
     return without_numbers("no model", names, reason, *remedies)
 
@@ -100,9 +106,9 @@ def remarks_on_bounds(pulled: Mapping[str, float], verdict: Verdict) -> list[str
     names, free = " and ".join(far), ", ".join(f"jq.identify.Real({name!r})" for name in far)
     return [
         f"{names} came out as 0, and the data pull {'it' if len(far) == 1 else 'them'} beyond by "
-        f"{max(far.values()):.0f} random errors: start with the other sign, or let the sign change "
-        f"with {free}; where that cannot be, the model lacks something, or the time stamps of "
-        "input and output are shifted"
+        f"{max(far.values()):.0f} random errors«other sign|: start with the other sign, or let the "
+        f"sign change with {free}; where that cannot be, the model» lacks something, or the time "
+        "stamps of input and output are shifted"
     ]
 
 
@@ -111,29 +117,30 @@ def remarks_on_growth(growth: float) -> list[str]:
     return [
         f"the model grows by e in {1 / growth:.2g} s (a pole at +{growth:.3g} rad/s), which no "
         "record in open loop can do: a controller flew, and the direct estimate is biased towards "
-        "its -1/C; name an external reference (references=)"
+        "its -1/C; name an external reference («references=»)"
     ]
 
 
 def fed_back(names: tuple[str, ...], dominated: int, used: int) -> Verdict:
     """The verdict on a fit most of whose points show the controller."""
-    reason = (
-        f"{_FEEDBACK} {dominated} of the {used} points in use: they show -1/C, the inverse of the "
-        "controller, and not the plant"
+    reason = Message(
+        f"feedback dominates {dominated} of the {used} points in use: they show -1/C, the inverse "
+        "of the controller, and not the plant",
+        _FEEDBACK,
     )
     remedies = (
-        "name the external reference (references=)",
-        "excite the axis (jq.sweep), and record what excites it as the reference",
+        "name the external reference («references=»)",
+        "excite the axis («jq.sweep»), and record what excites it as the reference",
     )
     return without_numbers("no model", names, reason, *remedies)
 
 
-_FEEDBACK = "feedback dominates"
+_FEEDBACK = "feedback"  # kind of a reason
 
 
 def is_fed_back(verdict: Verdict) -> bool:
     """Whether feedback is why no model holds."""
-    return any(reason.startswith(_FEEDBACK) for reason in verdict.reasons)
+    return any(reason.kind == _FEEDBACK for reason in verdict.reasons)
 
 
 def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
@@ -142,8 +149,8 @@ def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[str]:
         return []
     return [
         f"the model leaves {100 * discrepancy.amplitude:.0f} % of the response unexplained: the "
-        "intervals are rough; fit the part of the band where it holds (band=), or a model that "
-        "explains more (Fit.explain() names terms)"
+        "intervals are rough; fit the part of the band where it holds («band=»), or a model that "
+        "explains more («Fit.explain()» names terms)"
     ]
 
 
@@ -203,14 +210,16 @@ def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[str
             "the phase at the start is off by about 180 deg: start with the other sign of the gain"
         ]
     remarks = [
-        f"{names[k]} ran to zero: leave it out, or let its sign change with "
-        f"jq.identify.Real({names[k]!r})"
+        f"{names[k]} ran to zero: leave it out«sign|, or let its sign change with "
+        f"jq.identify.Real({names[k]!r})»"
         for k in solution.at_zero
         if names[k] in lost
     ]
     for k in np.flatnonzero(_change_of_z(problem, solution) > 2 * _FAR):
         if problem.parameters.logarithmic[k] and names[k] in lost:
-            remarks.append(f"{names[k]} ran to infinity: start from other values, or leave it out")
+            remarks.append(
+                f"{names[k]} ran to infinity: «start from other values», or leave it out"
+            )
     return remarks
 
 

@@ -6,12 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, PyTree
 
-from ..frequency_domain._origin import Origin
+from jaxquad._core import as_messages
+
 from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
+from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._solve import Solution
 from ..frequency_domain._starts import Minimum
+from ..output_error._noise import NoiseModel
 from ._accuracy import condition_number, cramer_rao, insensitivity, Matrix
 from ._discrepancy import Discrepancy
 from ._fit_remarks import is_fed_back, runaways
@@ -51,6 +54,7 @@ def make_fit(
     freedom: Float[np.ndarray, " parameters"] | None = None,
     discrepancy: Discrepancy | None = None,
     origin: Origin | None = None,
+    noise_models: tuple[tuple[NoiseModel, ...], ...] = (),
 ) -> Fit:
     """A result in physical units; `freedom` is that of the noise estimate, infinite without."""
     bread, covariance, _, units, verdict, decrement = estimate
@@ -80,7 +84,7 @@ def make_fit(
         points=points,
         steps=solution.steps,
         verdict=verdict,
-        remarks=remarks,
+        remarks=as_messages(remarks),
         parameters=problem.parameters,
         units=units,
         relative_covariance=covariance,
@@ -88,6 +92,7 @@ def make_fit(
         minima=minima,
         degrees_of_freedom=freedom,
         discrepancy=discrepancy,
+        noise_models=noise_models,
         origin=origin,
     )
 
@@ -159,7 +164,7 @@ def unfitted(
         points=0,
         steps=0,
         verdict=verdict,
-        remarks=remarks,
+        remarks=as_messages(remarks),
         parameters=parameters,
         units=np.asarray(parameters.slopes(parameters.start[:count])),
         relative_covariance=np.full((count, count), np.nan),

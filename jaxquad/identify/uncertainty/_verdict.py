@@ -6,14 +6,18 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import pytree_node
+from jaxquad._core import as_messages, Message, pytree_node
 
 
 Kind = Literal["identifiable", "not identifiable", "no minimum", "no model", "too few points"]
+NO_MINIMUM: Kind = "no minimum"  # of a remark, too
 
 
 class UndeterminedError(ValueError):
     """A number was asked for that the record does not determine; a ValueError."""
+
+    def __init__(self, reason: str):
+        super().__init__(Message(reason))
 
 
 USUAL = 0.95  # level of an interval
@@ -61,6 +65,11 @@ class Combination(NamedTuple):
     standard_error: float
     degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard error
     unit: str = ""  # where it is known
+    sum_of: tuple[str, ...] = ()  # the parameters of a sum
+
+    def content(self) -> dict[str, object]:
+        """Its numbers and its unit, for JSON."""
+        return {name: value for name, value in self._asdict().items() if name != "sum_of"}
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -125,8 +134,8 @@ class Verdict:
     undetermined: tuple[str, ...] = eqx.field(static=True)  # parameters
     combinations: tuple[Combination, ...]  # what is determined of the undetermined ones
     null_directions: tuple[dict[str, float], ...]  # unit vectors of relative changes
-    reasons: tuple[str, ...] = eqx.field(static=True)
-    remedies: tuple[str, ...] = eqx.field(static=True)
+    reasons: tuple[Message, ...] = eqx.field(static=True)
+    remedies: tuple[Message, ...] = eqx.field(static=True)
     exact: Float[np.ndarray, "null parameters"]  # null directions that no noise explains
     alternatives: tuple[Float[np.ndarray, " parameters"], ...]  # other values, equal responses
     curved: tuple[str, ...] = eqx.field(static=True)  # determined as neither a product nor a sum
@@ -148,18 +157,21 @@ class Verdict:
         if self.identifiable:
             known = "identifiable: the record determines every free parameter individually"
             return "; ".join([known, *map(str, self.bounds)])
-        if not self.fitted:
-            return f"not identifiable from this record: {'; '.join(self.reasons)}"
-        if self.kind == "no model":
-            reasons = "; ".join(self.reasons)
-            return f"no model of this structure holds, so no parameter is determined: {reasons}"
-        if self.kind == "no minimum":
-            return f"no minimum was found, so no parameter is determined: {'; '.join(self.reasons)}"
+        if self.kind != "not identifiable":
+            return " ".join(self._refusal())
         known = ", ".join(str(combination) for combination in self.combinations)
         it = "it" if len(self.undetermined) == 1 else "them"
         rest = f"only {known}" if known else f"nothing about {it} is determined"
         lost = " and ".join(self.undetermined)
         return f"not identifiable from this record, individually: {lost}; {rest}"
+
+    def _refusal(self) -> tuple[str, str]:
+        """Where there are no numbers: what is the matter, and why."""
+        reasons = "; ".join(self.reasons)
+        if not self.fitted:
+            return "not identifiable", f"from this record: {reasons}"
+        what = "of this structure holds" if self.kind == "no model" else "was found"
+        return self.kind, f"{what}, so no parameter is determined: {reasons}"
 
     def __bool__(self) -> bool:
         return self.identifiable
@@ -168,8 +180,8 @@ class Verdict:
         if self.identifiable:
             return self.summary
         if self.kind != "not identifiable":
-            head = "not identifiable" if self.kind == "too few points" else self.kind
-            lines = [self.summary.replace(head, head.upper(), 1)]
+            kind, why = self._refusal()
+            lines = [f"{kind.upper()} {why}"]
         else:
             lines = [
                 "NOT IDENTIFIABLE from this record, individually: " + ", ".join(self.undetermined),
@@ -206,15 +218,16 @@ class Verdict:
         return [f"  to resolve it: {first}", *(f"  or {other}" for other in others)]
 
 
-def remedies_for(lost: tuple[str, ...]) -> tuple[str, ...]:
+def remedies_for(lost: tuple[str, ...]) -> tuple[Message, ...]:
     """What determines parameters that one record leaves open."""
     names = " or ".join(lost)
-    return (
-        f"fix {names} at a measured value (leave it out of free=)",
+    texts = (
+        f"fix {names} at a measured value« (leave it out of free=)»",
         "give a known value: priors=[jq.identify.Prior(name or function, value, standard error)]",
         f"fit a second record under a known change of {names}: "
         "conditions=(None, jq.identify.Changed(name, change))",
     )
+    return as_messages(texts)
 
 
 def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: str) -> Verdict:
@@ -224,8 +237,8 @@ def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: 
         undetermined=names,
         combinations=(),
         null_directions=(),
-        reasons=(reason,),
-        remedies=remedies,
+        reasons=as_messages([reason]),
+        remedies=as_messages(remedies),
         exact=np.eye(len(names)),
         alternatives=(),
         curved=(),

@@ -23,11 +23,11 @@ class Event(NamedTuple):
 
 
 Positions = Int[np.ndarray, " frames"]
-SLACK = 16  # bytes that may be looked at beyond a frame
+_SLACK = 16  # bytes that may be looked at beyond a frame
 _TOO_LONG = 6  # bytes: a 32-bit number takes at most 5
 
 
-class Block(NamedTuple):
+class _Block(NamedTuple):
     """A piece of the log and, for every byte of it, the number that would begin there."""
 
     raw: np.ndarray  # uint8
@@ -36,11 +36,11 @@ class Block(NamedTuple):
     signed: np.ndarray  # int32, after ZigZag
 
 
-def block(raw: np.ndarray) -> Block:
-    """Prepare bytes that end in SLACK bytes of padding."""
+def _prepare(raw: np.ndarray) -> _Block:
+    """Bytes that end in _SLACK bytes of padding, decoded as if a number began at every one."""
     value = (raw & 0x7F).astype(np.uint32)
     length = np.ones(raw.size, np.uint8)
-    first = np.flatnonzero(raw[:-SLACK] & 0x80)
+    first = np.flatnonzero(raw[:-_SLACK] & 0x80)
     following = first + 1
     for shift in (7, 14, 21, 28):
         value[first] |= (raw[following] & 0x7F).astype(np.uint32) << np.uint32(shift)
@@ -49,11 +49,11 @@ def block(raw: np.ndarray) -> Block:
         first, following = first[more], following[more] + 1
     length[first] = _TOO_LONG
     signed = (value >> 1) ^ -(value & 1)
-    return Block(raw, length, value.view(np.int32), signed.view(np.int32))
+    return _Block(raw, length, value.view(np.int32), signed.view(np.int32))
 
 
-def fields(
-    data: Block, frame: Frame, starts: Positions
+def _fields(
+    data: _Block, frame: Frame, starts: Positions
 ) -> tuple[Int[np.ndarray, "frames fields"], Positions]:
     """What the frames whose letters stand at `starts` would hold, and where each would end.
 
@@ -65,27 +65,25 @@ def fields(
     for encoding, first, count in frame.groups:
         part = out[:, first : first + count]
         if encoding in (0, 1, 3):
-            part[:, 0] = _single(data, encoding, at)
+            number = data.signed[at] if encoding == 0 else data.unsigned[at]
+            # Encoding 3: 14 bits with a sign.
+            part[:, 0] = -((number & 0x3FFF) << 18 >> 18) if encoding == 3 else number
             length = data.length[at]
             np.maximum(worst, length, out=worst)
             at += length
         elif encoding == 6 and count == 1:
             part[:, 0] = data.signed[at]
             at += data.length[at]
+        elif encoding == 6:
+            at = _flagged(data, at, part)
+        elif encoding == 8:
+            at = _four_nibbles(data, at, part)
         elif encoding != 9:
-            at = _CODED_TOGETHER[encoding](data, at, part)
+            at = _three(data, at, part, variable=encoding == 10)
     return out, np.where(worst < _TOO_LONG, at, -1)
 
 
-def _single(data: Block, encoding: int, at: Positions) -> np.ndarray:
-    if encoding == 0:
-        return data.signed[at]
-    if encoding == 1:
-        return data.unsigned[at]
-    return -((data.unsigned[at] & 0x3FFF) << 18 >> 18)  # 14 bits with a sign
-
-
-def _flagged(data: Block, at: Positions, out: np.ndarray) -> Positions:
+def _flagged(data: _Block, at: Positions, out: np.ndarray) -> Positions:
     """TAG8_8SVB: a bit for each field that is not zero, then those numbers."""
     flags = data.raw[at]
     at = at + 1
@@ -99,7 +97,7 @@ def _flagged(data: Block, at: Positions, out: np.ndarray) -> Positions:
     return at
 
 
-def _four_nibbles(data: Block, at: Positions, out: np.ndarray) -> Positions:
+def _four_nibbles(data: _Block, at: Positions, out: np.ndarray) -> Positions:
     """TAG8_4S16: two bits for the width of each field (0, 4, 8, 16), then a stream of bits."""
     tags = data.raw[at]
     at = at + 1
@@ -115,23 +113,14 @@ def _four_nibbles(data: Block, at: Positions, out: np.ndarray) -> Positions:
     return at
 
 
-def _three(data: Block, at: Positions, out: np.ndarray) -> Positions:
-    """TAG2_3S32: three fields of 2, 4, 6 bits, or of 1 to 4 bytes each."""
-    return _three_of(data, at, out, ((4, 4, 4), (6, 6, 6)), ((4, 8, 12), (2, 10, 18)))
+def _three(data: _Block, at: Positions, out: np.ndarray, *, variable: bool) -> Positions:
+    """TAG2_3S32 or TAG2_3SVARIABLE.
 
-
-def _three_variable(data: Block, at: Positions, out: np.ndarray) -> Positions:
-    """TAG2_3SVARIABLE: three fields of 2, of 5, 5, 4, of 8, 7, 7 bits, or of 1 to 4 bytes each."""
-    return _three_of(data, at, out, ((5, 5, 4), (8, 7, 7)), ((2, 7, 12), (2, 10, 17)))
-
-
-def _three_of(
-    data: Block,
-    at: Positions,
-    out: np.ndarray,
-    widths: tuple[tuple[int, ...], ...],
-    begins: tuple[tuple[int, ...], ...],
-) -> Positions:
+    Three fields of 2, of 4, of 6 bits, or of 1 to 4 bytes each. In the second they have 2 bits, 5,
+    5, 4 bits, 8, 7, 7 bits, or 1 to 4 bytes.
+    """
+    widths = ((5, 5, 4), (8, 7, 7)) if variable else ((4, 4, 4), (6, 6, 6))
+    begins = ((2, 7, 12), (2, 10, 17)) if variable else ((4, 8, 12), (2, 10, 18))
     tags = data.raw[at]
     out[:] = _PAIRS[tags]
     for choice in (1, 2):
@@ -162,10 +151,9 @@ def _word(raw: np.ndarray, at: Positions, shifts: tuple[int, ...]) -> np.ndarray
 
 _NIBBLES = np.array([0, 1, 2, 4], np.int32)
 _PAIRS = np.stack([(np.arange(256, dtype=np.int32) << s) >> 30 for s in (26, 28, 30)], axis=1)
-_CODED_TOGETHER = {6: _flagged, 7: _three, 8: _four_nibbles, 10: _three_variable}
 
 
-BLOCK = 1 << 20  # bytes decoded at a time
+_BLOCK = 1 << 20  # bytes decoded at a time
 STRAY = 8  # bytes between two frames behind which both may be intact
 _NUMBERS = 1 << 22  # decoded at a time, wherever a frame may begin
 
@@ -195,7 +183,7 @@ class Payload(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """All places in a stretch of the log where a frame may begin, and the frame found there."""
+    """All places in a stretch of the log where a frame may begin, and what is coded there."""
 
     stop: int
     places: Int[np.ndarray, " places"]
@@ -206,41 +194,37 @@ class _Piece(NamedTuple):
 
 def payload(data: bytes, header: Header) -> Payload:
     """Walk from frame to frame; after damage, on to the next place from which that works."""
-    result = Payload(_nothing(header, "I"), {}, [], [])
-    found: dict[str, list[Frames]] = {}
+    fields = len(header.frames["I"].names)
+    none = Frames(np.empty(0, int), np.empty((0, fields), np.int32), np.empty(0, bool))
+    result = Payload(none, {}, [], [])
+    frames: dict[str, list[Frames]] = {}
     at, stored = header.payload, 0
     while at < header.stop:
-        piece = _piece(data, header, at)
-        at, on_path = _walk(data, header, piece, at, result)
+        piece = _decode_piece(data, header, at)
+        at, path = _walk(data, header, piece, at, result)
+        on_path = np.zeros(piece.places.size, bool)
+        on_path[path] = True
         for letter, every in piece.coded.items():
             taken = on_path[np.searchsorted(piece.places, every.offsets)]
-            found.setdefault(letter, []).append(Frames(*(part[taken] for part in every)))
-            stored += found[letter][-1].coded.nbytes
+            frames.setdefault(letter, []).append(Frames(*(part[taken] for part in every)))
+            stored += frames[letter][-1].coded.nbytes
         check_size("the blackbox log", stored, len(data), offset=header.offset)
-    _forgive_cut(result.damage, header)
-    joined = {letter: _joined(parts) for letter, parts in found.items()}
+    # A log may stop in the middle of its last frame, which loses nothing else.
+    most = max(frame.most_bytes for frame in header.frames.values())
+    damage = result.damage
+    if damage and sum(damage[-1]) == header.stop and damage[-1].size < most:
+        damage.pop()
+    joined = {letter: _join(parts) for letter, parts in frames.items()}
     return result._replace(main=joined.pop("M", result.main), slow=joined)
 
 
-def _forgive_cut(damage: list[Damage], header: Header) -> None:
-    """A log may stop in the middle of its last frame, which loses nothing else."""
-    most = max(frame.most_bytes for frame in header.frames.values())
-    if damage and sum(damage[-1]) == header.stop and damage[-1].size < most:
-        damage.pop()
-
-
-def _joined(parts: list[Frames]) -> Frames:
+def _join(parts: list[Frames]) -> Frames:
     return Frames(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _nothing(header: Header, letter: str) -> Frames:
-    fields = len(header.frames[letter].names)
-    return Frames(np.empty(0, int), np.empty((0, fields), np.int32), np.empty(0, bool))
-
-
-def _piece(data: bytes, header: Header, at: int) -> _Piece:
-    stop = min(at + BLOCK, header.stop)
-    margin = max(frame.most_bytes for frame in header.frames.values()) + SLACK
+def _decode_piece(data: bytes, header: Header, at: int) -> _Piece:
+    stop = min(at + _BLOCK, header.stop)
+    margin = max(frame.most_bytes for frame in header.frames.values()) + _SLACK
     raw = np.zeros(stop - at + margin, np.uint8)
     inside = np.frombuffer(data, np.uint8, min(raw.size, header.stop - at), at)
     raw[: inside.size] = inside
@@ -250,38 +234,28 @@ def _piece(data: bytes, header: Header, at: int) -> _Piece:
     most = _NUMBERS // max(len(frame.names) for frame in header.frames.values())
     if places.size > most:
         stop, places = at + int(places[most]), places[:most]
-    coded, ends = _decoded(raw, header, places)
+    prepared, letters = _prepare(raw), raw[places]
+    ends, coded = np.full(places.size, -1), {}
+    for letter, frame in header.frames.items():
+        rows = np.flatnonzero(letters == ord(letter))
+        values, ends[rows] = _fields(prepared, frame, places[rows])
+        coded[letter] = Frames(places[rows] + at, values, np.full(rows.size, letter == "I"))
+    key, between = coded.pop("I"), coded.pop("P")
+    order = np.argsort(np.concatenate([key.offsets, between.offsets]))
+    coded["M"] = Frames(*(part[order] for part in _join([key, between])))
     follows = begins[raw]
     follows[header.stop - at :] = False
     if header.stop - at < raw.size:
         follows[header.stop - at] = True
     reach = np.where(ends >= 0, ends + at, -1)
     ends = np.where((ends >= 0) & follows[np.maximum(ends, 0)], ends + at, -1)
-    moved = {letter: f._replace(offsets=f.offsets + at) for letter, f in coded.items()}
-    return _Piece(stop, places + at, ends, reach, moved)
-
-
-def _decoded(
-    raw: np.ndarray, header: Header, places: np.ndarray
-) -> tuple[dict[str, Frames], np.ndarray]:
-    prepared = block(raw)
-    letters = raw[places]
-    ends = np.full(places.size, -1)
-    coded = {}
-    for letter, frame in header.frames.items():
-        rows = np.flatnonzero(letters == ord(letter))
-        values, ends[rows] = fields(prepared, frame, places[rows])
-        coded[letter] = Frames(places[rows], values, np.full(rows.size, letter == "I"))
-    key, between = coded.pop("I"), coded.pop("P")
-    order = np.argsort(np.concatenate([key.offsets, between.offsets]))
-    coded["M"] = Frames(*(part[order] for part in _joined([key, between])))
-    return coded, ends
+    return _Piece(stop, places + at, ends, reach, coded)
 
 
 def _walk(
     data: bytes, header: Header, piece: _Piece, at: int, result: Payload
-) -> tuple[int, Bool[np.ndarray, " places"]]:
-    """Where the walk leaves the piece, and which places it came through."""
+) -> tuple[int, list[int]]:
+    """Where the walk leaves the piece, and the numbers of the places it came through."""
     places, ends = piece.places.tolist(), piece.ends.tolist()
     good = piece.ends >= 0
     following = np.where(good, np.searchsorted(piece.places, piece.ends), -1).tolist() + [-1]
@@ -289,7 +263,7 @@ def _walk(
     path, rank = [], bisect_left(places, at)
     while rank < len(places):
         if skipped := places[rank] > at:
-            _damaged(result.damage, at, places[rank])
+            _add_damage(result.damage, at, places[rank])
         begin = rank
         while (after := following[rank]) >= 0:
             path.append(rank)
@@ -297,45 +271,32 @@ def _walk(
         at = ends[path[-1]] if rank > begin else places[rank]
         if rank == len(places):
             break
-        noted = event(data, at, header.stop)
-        if noted and noted.name == LOG_END:
-            result.events.append(noted)
-            return header.stop, _mask(path, len(places))
-        resumed = None if skipped and rank == begin else _behind_key(data, piece, following, rank)
-        if resumed is not None:
-            path.append(rank)
-            at, rank = int(piece.reach[rank]), resumed
-            continue
+        event = _event(data, at, header.stop)
+        if event and event.name == LOG_END:
+            result.events.append(event)
+            return header.stop, path
+        end = int(piece.reach[rank])
+        if data[places[rank]] == ord("I") and end >= 0 and not (skipped and rank == begin):
+            # An I frame that begins where the frame before it ends: a few stray bytes may follow
+            # it, behind which frames go on.
+            first, last = np.searchsorted(piece.places, [end, end + STRAY + 1])
+            resumed = next((k for k in range(first, last) if following[k] >= 0), None)
+            if resumed is not None:
+                path.append(rank)
+                at, rank = end, resumed
+                continue
         rank += 1
-        if noted and (noted.end == header.stop or data[noted.end] in letters):
-            result.events.append(noted)
-            at = noted.end
+        if event and (event.end == header.stop or data[event.end] in letters):
+            result.events.append(event)
+            at = event.end
             rank = bisect_left(places, at, rank)
     if at < piece.stop:
-        _damaged(result.damage, at, piece.stop)
+        _add_damage(result.damage, at, piece.stop)
         at = piece.stop
-    return at, _mask(path, len(places))
+    return at, path
 
 
-def _behind_key(data: bytes, piece: _Piece, following: list[int], rank: int) -> int | None:
-    """Where frames go on behind an I frame that a few stray bytes follow; None where they do not.
-
-    The I frame begins where the frame before it ends.
-    """
-    end = int(piece.reach[rank])
-    if data[int(piece.places[rank])] != ord("I") or end < 0:
-        return None
-    first, last = np.searchsorted(piece.places, [end, end + STRAY + 1])
-    return next((k for k in range(first, last) if following[k] >= 0), None)
-
-
-def _mask(path: list[int], places: int) -> Bool[np.ndarray, " places"]:
-    mask = np.zeros(places, bool)
-    mask[path] = True
-    return mask
-
-
-def _damaged(damage: list[Damage], begin: int, end: int) -> None:
+def _add_damage(damage: list[Damage], begin: int, end: int) -> None:
     """Note the bytes `begin` .. `end`, as part of the stretch before where they follow on it."""
     if damage and damage[-1].offset + damage[-1].size == begin:
         damage[-1] = Damage(damage[-1].offset, end - damage[-1].offset)
@@ -347,7 +308,6 @@ LOG_END = "log end"
 RESUME = "logging resume"
 ADJUSTMENT = "inflight adjustment"
 
-
 # Event type: its name and how many variable-byte numbers it carries.
 _COUNTED = {
     0: ("sync beep", 1),
@@ -357,18 +317,24 @@ _COUNTED = {
 }
 _ADJUSTED = 13
 _END = 255
-_END_TEXT = b"End of log"
 
 
-def event(data: bytes, at: int, stop: int) -> Event | None:
+def _event(data: bytes, at: int, stop: int) -> Event | None:
     """The event frame at `at`, or None where there is none that is known and whole."""
     if data[at : at + 1] != b"E" or at + 2 >= stop:
         return None
     kind = data[at + 1]
     if kind == _END:
-        return _log_end(data, at, stop)
-    if kind == _ADJUSTED:
-        return _adjustment(data, at, stop)
+        null = data.find(b"\0", at + 2, min(stop, at + 80))
+        ends = null >= 0 and data.startswith(b"End of log", at + 2)
+        return Event(at, LOG_END, (), null + 1) if ends else None
+    if kind == _ADJUSTED:  # the number of a setting, and its value unless that is a float
+        setting = data[at + 2]
+        if setting >= 128:
+            return Event(at, ADJUSTMENT, (setting,), at + 7) if at + 7 <= stop else None
+        value, end = _variable(data, at + 3, stop)
+        values = [setting, value >> 1 ^ -(value & 1)]
+        return Event(at, ADJUSTMENT, tuple(values), end) if end <= stop else None
     if kind not in _COUNTED:
         return None
     name, count = _COUNTED[kind]
@@ -377,23 +343,6 @@ def event(data: bytes, at: int, stop: int) -> Event | None:
         value, end = _variable(data, end, stop)
         values.append(value)
     return Event(at, name, tuple(values), end) if end <= stop else None
-
-
-def _log_end(data: bytes, at: int, stop: int) -> Event | None:
-    if not data.startswith(_END_TEXT, at + 2):
-        return None
-    null = data.find(b"\0", at + 2, min(stop, at + 80))
-    return Event(at, LOG_END, (), null + 1) if null >= 0 else None
-
-
-def _adjustment(data: bytes, at: int, stop: int) -> Event | None:
-    """A setting changed in flight: its number, and its value unless that is a float."""
-    setting = data[at + 2]
-    if setting >= 128:
-        return Event(at, ADJUSTMENT, (setting,), at + 7) if at + 7 <= stop else None
-    value, end = _variable(data, at + 3, stop)
-    signed = value >> 1 ^ -(value & 1)
-    return Event(at, ADJUSTMENT, (setting, signed), end) if end <= stop else None
 
 
 def _variable(data: bytes, at: int, stop: int) -> tuple[int, int]:

@@ -15,21 +15,13 @@ from .._errors import ReadError
 
 
 MARKER = b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n"
-MOST_LOGS = 1000
-MOST_FIELDS = 256
-MOST_INTERVAL = 65536  # loop iterations between key frames
+_MOST_LOGS = 1000
+_MOST_FIELDS = 256
+_MOST_INTERVAL = 65536  # loop iterations between key frames
 _LINE = re.compile(rb"H ([^:\x00-\x1f]{1,80}):([^\n]{0,16384})\n")
 _GROUP = {0: 1, 1: 1, 3: 1, 6: 8, 7: 3, 8: 4, 9: 1, 10: 3}  # encoding: fields coded together
 _PREDICTORS = {"I": {0, 4, 5, 8, 9, 11}, "P": set(range(12)) - {7, 10}}
 _SLOW_PREDICTORS = {0, 4, 7, 8, 9, 10, 11}
-
-
-class Group(NamedTuple):
-    """Fields `first` .. `first + count` of a frame, which one encoding writes together."""
-
-    encoding: int
-    first: int
-    count: int
 
 
 class Frame(NamedTuple):
@@ -39,7 +31,7 @@ class Frame(NamedTuple):
     names: tuple[str, ...]
     signed: np.ndarray  # bool (fields,)
     predictors: np.ndarray  # int (fields,)
-    groups: tuple[Group, ...]
+    groups: tuple[tuple[int, int, int], ...]  # encoding, first field, fields that it writes as one
 
     @property
     def most_bytes(self) -> int:
@@ -62,25 +54,19 @@ class Header(NamedTuple):
 
 def headers(data: bytes) -> list[Header | ReadError]:
     """The logs in a file, in order; for one whose header is damaged, what is wrong with it."""
-    limits = [*_starts(data), len(data)]
-    return [_guarded(data, start, stop) for start, stop in pairwise(limits)]
-
-
-def _starts(data: bytes) -> list[int]:
     starts, at = [], data.find(MARKER)
     while at >= 0:
         starts.append(at)
-        if len(starts) > MOST_LOGS:
-            raise ReadError(f"the file holds more than {MOST_LOGS} blackbox logs", offset=at)
+        if len(starts) > _MOST_LOGS:
+            raise ReadError(f"the file holds more than {_MOST_LOGS} blackbox logs", offset=at)
         at = data.find(MARKER, at + len(MARKER))
-    return starts
-
-
-def _guarded(data: bytes, start: int, stop: int) -> Header | ReadError:
-    try:
-        return _header(data, start, stop)
-    except ReadError as error:
-        return ReadError(error.args[0], offset=start)
+    logs: list[Header | ReadError] = []
+    for start, stop in pairwise([*starts, len(data)]):
+        try:
+            logs.append(_header(data, start, stop))
+        except ReadError as error:
+            logs.append(ReadError(error.reason, offset=start))
+    return logs
 
 
 def _header(data: bytes, start: int, stop: int) -> Header:
@@ -90,24 +76,35 @@ def _header(data: bytes, start: int, stop: int) -> Header:
         at = line.end()
     if settings.get("Data version", "2") != "2":
         raise ReadError(f"blackbox data version {settings['Data version']!r}: only 2 is read")
-    frames = {letter: _frame(settings, letter) for letter in "IP"}
     slow = [letter for letter in "SGH" if f"Field {letter} name" in settings]
-    frames |= {letter: _frame(settings, letter) for letter in slow}
-    logged, every = _logged(settings)
-    return Header(start, at, stop, settings, frames, _interval(settings), logged, every)
+    frames = {letter: _frame(settings, letter) for letter in ("I", "P", *slow)}
+    # `1/4` and, since Betaflight 4, `4` both mean one of four; 0 means key frames only.
+    text = settings.get("P interval", "1/1")
+    parts = text.split("/") if "/" in text else ["1", text]
+    if len(parts) != 2 or not all(p.isascii() and p.isdecimal() and len(p) < 7 for p in parts):
+        raise ReadError(f"P interval {text[:20]!r}: an integer or a fraction is valid")
+    logged, every = map(int, parts)
+    if logged > every > 0 or (logged == 0 and every > 0):
+        raise ReadError(f"P interval {text[:20]!r}: a fraction of at most 1 is valid")
+    key = settings.get("I interval", "32")
+    if not (key.isascii() and key.isdecimal() and 0 < int(key[:9]) <= _MOST_INTERVAL):
+        raise ReadError(f"I interval {key[:20]!r}: 1 .. {_MOST_INTERVAL} loop iterations are valid")
+    return Header(start, at, stop, settings, frames, int(key), logged, every)
 
 
 def _frame(settings: dict[str, str], letter: str) -> Frame:
-    names = tuple(_setting(settings, f"Field {'I' if letter == 'P' else letter} name").split(","))
-    if len(names) > MOST_FIELDS or len(set(names)) < len(names):
+    described = "I" if letter == "P" else letter
+    names = tuple(_setting(settings, f"Field {described} name").split(","))
+    if len(names) > _MOST_FIELDS or len(set(names)) < len(names):
         raise ReadError(
-            f"frame {letter} has {len(names)} fields: at most {MOST_FIELDS} are allowed, none twice"
+            f"frame {letter} has {len(names)} fields: at most {_MOST_FIELDS} are allowed, none "
+            f"twice"
         )
     if not all(name.isascii() and name.isprintable() and 0 < len(name) < 80 for name in names):
         raise ReadError(f"a field name of frame {letter} is empty, too long or not plain text")
     if letter in "IP" and names[:2] != ("loopIteration", "time"):
         raise ReadError(f"frame {letter} begins with {names[:2]}, not with loopIteration, time")
-    signs = f"Field {'I' if letter == 'P' else letter} signed"
+    signs = f"Field {described} signed"
     signed = _integers(settings, signs, len(names)) if signs in settings else [0] * len(names)
     predictors = _integers(settings, f"Field {letter} predictor", len(names))
     strange = set(predictors) - _PREDICTORS.get(letter, _SLOW_PREDICTORS)
@@ -116,13 +113,6 @@ def _frame(settings: dict[str, str], letter: str) -> Frame:
     if 5 in predictors and "motor[0]" not in names[: predictors.index(5)]:
         raise ReadError(f"predictor 5 in frame {letter} needs motor[0] before it")
     encodings = _integers(settings, f"Field {letter} encoding", len(names))
-    groups = _groups(encodings, letter)
-    if encodings.count(9) > 4 and letter in "IP":
-        raise ReadError(f"{encodings.count(9)} fields of frame {letter} are empty (limit 4)")
-    return Frame(letter, names, np.array(signed) != 0, np.array(predictors), groups)
-
-
-def _groups(encodings: list[int], letter: str) -> tuple[Group, ...]:
     groups, at = [], 0
     while at < len(encodings):
         encoding = encodings[at]
@@ -136,28 +126,11 @@ def _groups(encodings: list[int], letter: str) -> tuple[Group, ...]:
             count += 1
         if encoding != 6 and count < size:
             raise ReadError(f"encoding {encoding} in frame {letter} needs {size} fields together")
-        groups.append(Group(encoding, at, count))
+        groups.append((encoding, at, count))
         at += count
-    return tuple(groups)
-
-
-def _interval(settings: dict[str, str]) -> int:
-    text = settings.get("I interval", "32")
-    if not (text.isascii() and text.isdecimal() and 0 < int(text[:9]) <= MOST_INTERVAL):
-        raise ReadError(f"I interval {text[:20]!r}: 1 .. {MOST_INTERVAL} loop iterations are valid")
-    return int(text)
-
-
-def _logged(settings: dict[str, str]) -> tuple[int, int]:
-    """`1/4` and, since Betaflight 4, `4` both mean one of four; 0 means key frames only."""
-    text = settings.get("P interval", "1/1")
-    parts = text.split("/") if "/" in text else ["1", text]
-    if len(parts) != 2 or not all(p.isascii() and p.isdecimal() and len(p) < 7 for p in parts):
-        raise ReadError(f"P interval {text[:20]!r}: an integer or a fraction is valid")
-    logged, every = map(int, parts)
-    if logged > every > 0 or (logged == 0 and every > 0):
-        raise ReadError(f"P interval {text[:20]!r}: a fraction of at most 1 is valid")
-    return logged, every
+    if encodings.count(9) > 4 and letter in "IP":
+        raise ReadError(f"{encodings.count(9)} fields of frame {letter} are empty (limit 4)")
+    return Frame(letter, names, np.array(signed) != 0, np.array(predictors), tuple(groups))
 
 
 def _setting(settings: dict[str, str], name: str) -> str:
@@ -177,6 +150,8 @@ def _integers(settings: dict[str, str], name: str, count: int) -> list[int]:
 
 
 _FINE = ("gyroADC", "gyroUnfilt", "rcCommand", "setpoint")  # tenths in high-resolution logs
+_TURN = 2 * np.pi * 5e3  # of debug[0] in debug mode CHIRP
+_FEWEST_TURNS = 3
 
 
 def scaled(names: tuple[str, ...], settings: dict[str, str]) -> dict[str, tuple[float, str]]:
@@ -186,23 +161,32 @@ def scaled(names: tuple[str, ...], settings: dict[str, str]) -> dict[str, tuple[
     `acc_1G`. Where `blackbox_high_resolution` is set, gyro, set-points and sticks are tenths.
     """
     fine = 0.1 if settings.get("blackbox_high_resolution", "0").strip() == "1" else 1.0
-    gyro = _gyro_scale(settings)
-    one_g = _number(settings.get("acc_1G", ""))
-    known = {}
+    text = settings.get("gyro_scale", settings.get("gyro.scale", "")).strip()
+    try:  # deg/s per count
+        if text.lower().startswith("0x"):
+            [gyro] = struct.unpack(">f", int(text, 16).to_bytes(4, "big"))
+        else:
+            gyro = float(text)
+    except (ValueError, OverflowError):
+        gyro = 0.0
+    plausible = np.isfinite(gyro) and 1e-4 < gyro < 10
+    text = settings.get("acc_1G", "")
+    one_g = float(text) if text.isascii() and text.isdecimal() and len(text) < 9 else 0.0
+    factors = {}
     for name in names:
         kind, index = name.partition("[")[::2]
         tenth = fine if kind in _FINE else 1.0
-        if kind in ("gyroADC", "gyroUnfilt") and gyro:
-            known[name] = gyro * tenth, "deg/s"
+        if kind in ("gyroADC", "gyroUnfilt") and plausible:
+            factors[name] = gyro * tenth, "deg/s"
         elif (kind == "setpoint" and index != "3]") or kind == "axisRate":
-            known[name] = tenth, "deg/s"
+            factors[name] = tenth, "deg/s"
         elif kind == "accSmooth" and one_g > 0:
-            known[name] = 1 / one_g, "g"
+            factors[name] = 1 / one_g, "g"
         elif kind == "GPS_coord":
-            known[name] = 1e-7, "deg"
+            factors[name] = 1e-7, "deg"
         elif tenth != 1.0:
-            known[name] = tenth, ""
-    return known
+            factors[name] = tenth, ""
+    return factors
 
 
 def with_derived(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -220,40 +204,14 @@ def with_derived(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         logged = [columns[term] for term in terms if term in columns]
         if logged and f"axisSum[{axis}]" not in columns:
             sums[f"axisSum[{axis}]"] = sum(logged[1:], start=logged[0])
-    return {**columns, **sums, **_chirp_of_phase(columns)}
-
-
-_TURN = 2 * np.pi * 5e3  # of debug[0] in debug mode CHIRP
-_FEWEST_TURNS = 3
-
-
-def _chirp_of_phase(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The sine of debug[0] where that is a phase: within a turn, from whose end it jumps back.
-
-    The other debug channels rest, which later firmware fills.
-    """
+    derived = {**columns, **sums}
+    # A phase lies within a turn, and jumps back from its end. The other debug channels rest, which
+    # later firmware fills.
     debug = [columns[name] for i in range(4) if (name := f"debug[{i}]") in columns]
     if "chirp" in columns or not debug or any(x.ndim != 1 or x.any() for x in debug[1:]):
-        return {}
+        return derived
     phase = np.nan_to_num(np.asarray(debug[0], np.float64))
     if not phase.size or phase.min() < 0 or not 0.9 * _TURN < phase.max() <= _TURN + 1:
-        return {}
+        return derived
     turns = (phase[:-1] > 0.9 * _TURN) & (phase[1:] < 0.1 * _TURN)
-    return {"chirp": np.sin(phase / 5e3)} if turns.sum() >= _FEWEST_TURNS else {}
-
-
-def _gyro_scale(settings: dict[str, str]) -> float:
-    """deg/s per count, 0 where the header gives none that a gyro could have."""
-    text = settings.get("gyro_scale", settings.get("gyro.scale", "")).strip()
-    try:
-        if text.lower().startswith("0x"):
-            [scale] = struct.unpack(">f", int(text, 16).to_bytes(4, "big"))
-        else:
-            scale = float(text)
-    except (ValueError, OverflowError):
-        return 0.0
-    return scale if np.isfinite(scale) and 1e-4 < scale < 10 else 0.0
-
-
-def _number(text: str) -> float:
-    return float(text) if text.isascii() and text.isdecimal() and len(text) < 9 else 0.0
+    return derived | ({"chirp": np.sin(phase / 5e3)} if turns.sum() >= _FEWEST_TURNS else {})

@@ -356,7 +356,7 @@ def _numbers(
             ) from error
         raise _BlankCell(
             f"{place}: the cell is blank. Fill it in, delete the row, or write nan and let gaps be "
-            "interpolated (max_gap=)"
+            "interpolated («max_gap=»)"
         ) from error
 
 

@@ -6,20 +6,19 @@ that every log begins with.
 
 import collections
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
 from .._errors import ReadError
 from .._log import changes_of, describe_skips, Log, Table
-from ._dataflash_boots import choose_log, CUT_IT, firmware_of, MOST_PARTS, Part, span_of
 
 
-FORMAT_TYPE = 128
-HEAD_SIZE = 3  # bytes of a message before its columns
+_FORMAT_TYPE = 128
 _CODES = {
     "a": "(32,)<i2", "b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4",
     "f": "<f4", "d": "<f8", "g": "<f2", "n": "S4", "N": "S16", "Z": "S64", "c": "<i2", "C": "<u2",
@@ -49,16 +48,11 @@ class Format(NamedTuple):
         if len(set(columns)) < len(columns) or "" in columns or not self.name:
             return None
         formats = [np.dtype(_CODES[code]) for code in self.codes]
-        ends = np.cumsum([HEAD_SIZE, *(each.itemsize for each in formats)]).tolist()
-        if ends[-1] != self.length:
+        *offsets, size = np.cumsum([3, *(dtype.itemsize for dtype in formats)]).tolist()
+        if size != self.length:
             return None
         return np.dtype(
-            {
-                "names": list(columns),
-                "formats": formats,
-                "offsets": ends[:-1],
-                "itemsize": self.length,
-            }
+            {"names": list(columns), "formats": formats, "offsets": offsets, "itemsize": size}
         )
 
 
@@ -70,13 +64,13 @@ class Scaling(NamedTuple):
     letters: Mapping[str, tuple[str, str]]  # by message: one letter per column, of either kind
 
 
-HEAD = b"\xa3\x95"
+_HEAD = b"\xa3\x95"  # of a message, before its type
 _FMT_LENGTH = 89
 ABOUT = ("FMT", "FMTU", "UNIT", "MULT", "PARM")  # tables about the log, not of signals
 
 
 def sniff(head: bytes, path: Path) -> bool:
-    return head.startswith(HEAD + bytes([FORMAT_TYPE]))
+    return head.startswith(_HEAD + bytes([_FORMAT_TYPE]))
 
 
 def load(path: Path) -> Log:
@@ -94,27 +88,24 @@ def load(path: Path) -> Log:
     remarks += left_out
     if odd:
         remarks.append(f"messages with an inconsistent format were left out: {', '.join(odd)}")
-    scaled = scaling(rows, {kind: each.name for kind, each in formats.items()})
+    scaled = _scaling(rows, {kind: layout.name for kind, layout in formats.items()})
     tables: dict[str, Table] = {}
-    for each in formats.values():
-        if each.name in rows and each.name not in ABOUT:
-            columns = {name: rows[each.name][name] for name in each.columns}
-            tables |= tables_of(each, columns, scaled)
+    for layout in formats.values():
+        if layout.name in rows and layout.name not in ABOUT:
+            columns = {name: rows[layout.name][name] for name in layout.columns}
+            tables |= tables_of(layout, columns, scaled)
     remarks += find_rate_unit(tables, scaled)
-    stamped = _parameters(rows.get("PARM"))
+    parameters = list(_cells(rows.get("PARM"), "Name", "Value"))
+    times = [1e-6 * time for (time,) in _cells(rows.get("PARM"), "TimeUS")]
+    stamped = [
+        (time, name.decode("latin-1"), f"{value:.9g}")
+        for time, (name, value) in zip(times or [None] * len(parameters), parameters, strict=False)
+    ]
+    named = (*_cells(rows.get("VER"), "FWS"), *_cells(rows.get("MSG"), "Message"))
+    firmware = firmware_of(text(message) for (message,) in named)
     settings = {name: value for _, name, value in stamped}
     changes = changes_of(stamped, lambda time: time)
-    firmware = firmware_of(_texts(rows))
     return Log(tables, tuple(remarks), "ardupilot", settings, changes, firmware)
-
-
-def _texts(rows: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """What the messages that name the firmware say."""
-    for name, column in (("VER", "FWS"), ("MSG", "Message")):
-        table = rows.get(name)
-        if table is not None and column in (table.dtype.names or ()):
-            if table.dtype[column].kind == "S":
-                yield from map(text, table[column].tolist())
 
 
 def _all_rows(
@@ -122,13 +113,15 @@ def _all_rows(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """The messages by name as structured arrays, and the names of what cannot be laid out."""
     rows, odd = {}, []
-    for kind, each in formats.items():
-        dtype = each.dtype()
-        if dtype is None or each.name in rows:
-            odd += [each.name] if offsets.get(kind) else []
-        elif offsets.get(kind):
-            windows = np.lib.stride_tricks.sliding_window_view(buffer, each.length)
-            rows[each.name] = windows[np.array(offsets[kind])].view(dtype)[:, 0]
+    for kind, layout in formats.items():
+        dtype = layout.dtype()
+        if not offsets.get(kind):
+            continue
+        if dtype is None or layout.name in rows:
+            odd.append(layout.name)
+        else:
+            windows = np.lib.stride_tricks.sliding_window_view(buffer, layout.length)
+            rows[layout.name] = windows[np.array(offsets[kind])].view(dtype)[:, 0]
     return rows, odd
 
 
@@ -149,7 +142,7 @@ class _Part:
     redefined: list[tuple[int, Format, Format]] = dataclasses.field(default_factory=list)
 
 
-_FIRST = HEAD + bytes([FORMAT_TYPE, FORMAT_TYPE, _FMT_LENGTH])  # of a log: the FMT of FMT
+_FIRST = _HEAD + bytes([_FORMAT_TYPE, _FORMAT_TYPE, _FMT_LENGTH])  # of a log: the FMT of FMT
 
 
 def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
@@ -159,7 +152,7 @@ def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
     """
     parts = [part := _Part(0, {})]
     lengths = [0] * 256
-    lengths[FORMAT_TYPE] = _FMT_LENGTH
+    lengths[_FORMAT_TYPE] = _FMT_LENGTH
     skipped: list[tuple[int, int]] = []
     place, last, end = 0, -1, len(data)
     while place + 3 <= end:
@@ -177,9 +170,8 @@ def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
         elif place + length > end:
             break
         else:
-            if kind == FORMAT_TYPE:
-                part = _part_at(place, data[place + 3], parts)
-                _define(data, place, part, lengths)
+            if kind == _FORMAT_TYPE:
+                part = _define(data, place, parts, lengths)
             part.offsets[kind].append(place)
             last = place
             place += length
@@ -188,10 +180,11 @@ def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
     return parts, describe_skips(skipped, end, end)
 
 
-def _part_at(place: int, kind: int, parts: list[_Part]) -> _Part:
-    """The part that a definition belongs to: a new one where its type is defined once more."""
-    part = parts[-1]
-    if kind in part.defined and part.offsets.keys() != {FORMAT_TYPE}:
+def _define(data: bytes, place: int, parts: list[_Part], lengths: list[int]) -> _Part:
+    """Take a FMT message; returns its part: a new one where it defines its type once more."""
+    body, part = data[place + 3 : place + _FMT_LENGTH], parts[-1]
+    kind, length = body[0], body[1]
+    if kind in part.defined and part.offsets.keys() != {_FORMAT_TYPE}:
         if len(parts) == MOST_PARTS:
             raise ReadError(
                 f"the file defines its messages more than {MOST_PARTS} times: {CUT_IT}",
@@ -199,20 +192,17 @@ def _part_at(place: int, kind: int, parts: list[_Part]) -> _Part:
             )
         parts.append(part := _Part(place, dict(part.formats)))
     part.defined.add(kind)
-    return part
-
-
-def _define(data: bytes, place: int, part: _Part, lengths: list[int]) -> None:
-    new = parse_format(data[place + 3 : place + _FMT_LENGTH])
-    old = part.formats.get(new.kind)
+    name, codes, columns = (text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
+    new, old = Format(kind, length, name, codes, tuple(columns.split(","))), part.formats.get(kind)
     if old is not None and old != new:
         part.redefined.append((place, old, new))
-    if new.kind == FORMAT_TYPE and new.length != _FMT_LENGTH:
+    if kind == _FORMAT_TYPE and length != _FMT_LENGTH:
         raise ReadError(
-            f"the FMT message declares a length of {new.length} bytes; it has 89", offset=place
+            f"the FMT message declares a length of {length} bytes; it has 89", offset=place
         )
-    part.formats[new.kind] = new
-    lengths[new.kind] = new.length if new.length > 3 else 0
+    part.formats[kind] = new
+    lengths[kind] = length if length > 3 else 0
+    return part
 
 
 def _one_log(
@@ -220,83 +210,44 @@ def _one_log(
 ) -> tuple[Mapping[int, Format], Offsets, list[str]]:
     """Formats and offsets of one of the logs that a file holds, and a remark on the others."""
     ends = [*(part.begin for part in parts[1:]), buffer.size]
-    described = [
-        Part(
-            part.begin,
-            end,
-            _span(buffer, part),
-            _holds(part, "SIDD"),
-            bool(part.redefined) and FORMAT_TYPE in part.defined,
-        )
-        for part, end in zip(parts, ends, strict=True)
-    ]
+    described = []
+    for part, end in zip(parts, ends, strict=True):
+        stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
+        timed = [x for x in stored if x.columns[0] in CLOCKS and x.name not in ABOUT]
+        timed = [layout for layout in timed if layout.dtype() is not None]
+        span = None
+        if timed:
+            most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
+            rows, _ = _all_rows(buffer, {most.kind: most}, part.offsets)
+            clock = most.columns[0]
+            span = span_of(CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
+        chirped = any(layout.name == "SIDD" for layout in stored)
+        anew = bool(part.redefined) and _FORMAT_TYPE in part.defined
+        described.append(LogPart(part.begin, end, span, chirped, anew))
     numbers, remarks = choose_log(described)
     offsets: Offsets = collections.defaultdict(list)
     for i in numbers:
         if parts[i].redefined and (i == 0 or i - 1 in numbers):
-            _refuse_other_definition(*parts[i].redefined[0])
+            place, old, new = parts[i].redefined[0]
+            raise ReadError(
+                f"message type {new.kind} ({old.name}) is defined a second time, differently "
+                f"({new.name}): if the file holds two logs, cut it there",
+                offset=place,
+            )
         for kind, places in parts[i].offsets.items():
             offsets[kind] += places
     return parts[numbers[-1]].formats, offsets, remarks
 
 
-def _refuse_other_definition(place: int, old: Format, new: Format) -> NoReturn:
-    raise ReadError(
-        f"message type {new.kind} ({old.name}) is defined a second time, differently "
-        f"({new.name}): if the file holds two logs, cut it there",
-        offset=place,
-    )
-
-
-def _span(buffer: UInt8[np.ndarray, " bytes"], part: _Part) -> tuple[float, float] | None:
-    """First and last time of a part in s, by its most frequent messages with a time."""
-    timed = [layout for layout in part.formats.values() if layout.columns[0] in CLOCKS]
-    timed = [x for x in timed if part.offsets.get(x.kind) and x.name not in ABOUT]
-    timed = [layout for layout in timed if layout.dtype() is not None]
-    if not timed:
-        return None
-    most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
-    rows, _ = _all_rows(buffer, {most.kind: most}, part.offsets)
-    return span_of(CLOCKS[most.columns[0]] * rows[most.name][most.columns[0]].astype(np.float64))
-
-
-def _holds(part: _Part, name: str) -> bool:
-    return any(x.name == name and part.offsets.get(kind) for kind, x in part.formats.items())
-
-
 def _next_message(data: bytes, place: int, lengths: list[int]) -> int:
     """Where a message begins that another one, or the end of the file, follows."""
-    while (place := data.find(HEAD, place)) >= 0 and place + 3 <= len(data):
+    while (place := data.find(_HEAD, place)) >= 0 and place + 3 <= len(data):
         length = lengths[data[place + 2]]
         after = place + length
-        if length and (after == len(data) or data[after : after + 2] == HEAD):
+        if length and (after == len(data) or data[after : after + 2] == _HEAD):
             return place
         place += 1
     return len(data)
-
-
-def _parameters(rows: np.ndarray | None) -> list[tuple[float | None, str, str]]:
-    """Time in s where the messages have one, name and value of each."""
-    columns = set() if rows is None else set(rows.dtype.names or ())
-    if rows is None or not {"Name", "Value"} <= columns:
-        return []
-    if rows["Name"].dtype.kind != "S" or rows["Value"].dtype.kind != "f":
-        return []
-    timed = "TimeUS" in columns and rows["TimeUS"].dtype.kind in "iuf"
-    times = (1e-6 * rows["TimeUS"]).tolist() if timed else [None] * len(rows)
-    names = (name.decode("latin-1") for name in rows["Name"].tolist())
-    values = (f"{value:.9g}" for value in rows["Value"].tolist())
-    return list(zip(times, names, values, strict=True))
-
-
-_MOST_INSTANCES = 64
-_INSTANCE = "#"  # the unit letter of the column that numbers the sensors of one kind
-
-
-def parse_format(body: bytes) -> Format:
-    """From the 86 bytes of a FMT message."""
-    name, codes, columns = (text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
-    return Format(body[0], body[1], name, codes, tuple(columns.split(",")))
 
 
 def text(field: bytes) -> str:
@@ -304,8 +255,8 @@ def text(field: bytes) -> str:
     return field.split(b"\0")[0].decode("latin-1").strip()
 
 
-def scaling(rows: Mapping[str, np.ndarray], names: Mapping[int, str]) -> Scaling:
-    """From the rows of those three messages, where the log has them."""
+def _scaling(rows: Mapping[str, np.ndarray], names: Mapping[int, str]) -> Scaling:
+    """From the rows of UNIT, MULT and FMTU, where the log has them."""
     units = dict(_cells(rows.get("UNIT"), "Id", "Label"))
     multipliers = dict(_cells(rows.get("MULT"), "Id", "Mult"))
     letters = {
@@ -320,13 +271,22 @@ def scaling(rows: Mapping[str, np.ndarray], names: Mapping[int, str]) -> Scaling
     )
 
 
+_KINDS = {
+    "Label": "S", "UnitIds": "S", "MultIds": "S", "Mult": "f", "Id": "iu", "FmtType": "iu",
+    "Name": "S", "Value": "f", "TimeUS": "iuf", "FWS": "S", "Message": "S",
+}  # fmt: skip
+
+
 def _cells(rows: np.ndarray | None, *columns: str) -> Iterator[tuple]:
-    kinds = {"Label": "S", "UnitIds": "S", "MultIds": "S", "Mult": "f", "Id": "iu", "FmtType": "iu"}
+    """The rows of the columns; none where one is missing, or of another type than it should be."""
     if rows is None or not set(columns) <= set(rows.dtype.names or ()):
         return iter(())
-    if not all(rows.dtype[column].kind in kinds[column] for column in columns):
+    if not all(rows.dtype[column].kind in _KINDS[column] for column in columns):
         return iter(())
     return zip(*(rows[column].tolist() for column in columns), strict=True)
+
+
+_MOST_INSTANCES = 64
 
 
 def tables_of(
@@ -343,7 +303,16 @@ def tables_of(
     if rows[clock].ndim != 1 or rows[clock].dtype.kind not in "iuf":
         return {}
     time = rows[clock] * CLOCKS[clock]
-    units, scales, instance = _labels(layout, scaled, applied)
+    unit_ids, mult_ids = scaled.letters.get(layout.name, ("", ""))
+    units, scales, instance = {}, {}, ""
+    for i, (name, code) in enumerate(zip(layout.columns, layout.codes, strict=True)):
+        letter = unit_ids[i : i + 1]
+        units[name] = scaled.units.get(letter, "")
+        scales[name] = scaled.multipliers.get(mult_ids[i : i + 1], 1.0)
+        if code in _BUILT_IN:
+            scales[name] = 1.0 if applied else _BUILT_IN[code]
+        if letter == "#":  # of the column that numbers the sensors of one kind
+            instance = name
     columns = {name: rows[name] for name in layout.columns if name in rows and name != clock}
     numbers = np.unique(columns[instance]) if instance in columns else np.empty(0)
     if not 0 < numbers.size <= _MOST_INSTANCES:
@@ -351,25 +320,9 @@ def tables_of(
     tables = {}
     for number in numbers.tolist():
         kept = columns[instance] == number
-        own = {name: values[kept] for name, values in columns.items() if name != instance}
-        tables[f"{layout.name}[{number:.0f}]"] = Table(own, time[kept], units, scales)
+        values = {name: column[kept] for name, column in columns.items() if name != instance}
+        tables[f"{layout.name}[{number:.0f}]"] = Table(values, time[kept], units, scales)
     return tables
-
-
-def _labels(
-    layout: Format, scaled: Scaling, applied: bool
-) -> tuple[dict[str, str], dict[str, float], str]:
-    """Units and scales by column, and the column that numbers the instances."""
-    unit_ids, mult_ids = scaled.letters.get(layout.name, ("", ""))
-    units, scales, instance = {}, {}, ""
-    for i, (name, code) in enumerate(zip(layout.columns, layout.codes, strict=True)):
-        letter = unit_ids[i : i + 1]
-        units[name] = scaled.units.get(letter, "")
-        own = 1.0 if applied else _BUILT_IN.get(code, 1.0)
-        multiplier = scaled.multipliers.get(mult_ids[i : i + 1], 1.0)
-        scales[name] = own if code in _BUILT_IN else multiplier
-        instance = name if letter == _INSTANCE else instance
-    return units, scales, instance
 
 
 _RATES = ("RDes", "R", "PDes", "P", "YDes", "Y")  # of RATE: set-points and rates
@@ -379,36 +332,98 @@ _DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)} 
 
 def find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
     """Give RATE its unit in logs before FMTU, by the size of IMU's gyro; returns the remark."""
-    rate, imu = tables.get("RATE"), tables.get(_first_instance(tables, "IMU"))
+    rate = tables.get("RATE")
     if rate is None or scaled.letters.get("RATE"):
         return []
-    ratio = _rate_over_gyro(rate, imu)
-    near = 57.3 if ratio is None else min(_DEGREES, key=lambda each: abs(np.log(ratio / each)))
-    unit, scale = _DEGREES[near]
-    named = [name for name in _RATES if name in rate.columns]
-    tables["RATE"] = Table(
-        rate.columns,
-        rate.time,
-        {**rate.units, **dict.fromkeys(named, unit)},
-        {**rate.scales, **dict.fromkeys(named, scale)},
-    )
+    # The first gyro, as `IMU` or `IMU[0]`; by the deviations over all axes.
+    imu = tables.get(min((name for name in tables if name.partition("[")[0] == "IMU"), default=""))
+    pairs = [] if imu is None else [(rate.columns.get(r), imu.columns.get(g)) for r, g in
+                                    _GYROS.items()]  # fmt: skip
+    pairs = [(r, g) for r, g in pairs if r is not None and g is not None]
+    turned = np.sqrt(sum(float(np.var(r)) for r, _ in pairs))
+    measured = np.sqrt(sum(float(np.var(g)) for _, g in pairs))
+    unit, scale = _DEGREES[57.3]
     why = "as ArduPilot 3.4 and later log it"
-    if ratio is not None:
+    if measured > 1e-3 and turned > 0:
+        ratio = float(turned / measured)
+        unit, scale = _DEGREES[min(_DEGREES, key=lambda usual: abs(np.log(ratio / usual)))]
         why = f"because its rates are {ratio:.3g} times those of IMU's gyro in rad/s"
+    named = [name for name in _RATES if name in rate.columns]
+    tables["RATE"] = dataclasses.replace(
+        rate,
+        units={**rate.units, **dict.fromkeys(named, unit)},
+        scales={**rate.scales, **dict.fromkeys(named, scale)},
+    )
     hundredths = " (logged in hundredths)" if scale != 1.0 else ""
     return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
 
 
-def _first_instance(tables: Mapping[str, Table], kind: str) -> str:
-    """Messages of a kind without instances, or of the first one: `IMU`, `IMU[0]`, ..."""
-    return min((name for name in tables if name.partition("[")[0] == kind), default="")
+class LogPart(NamedTuple):
+    """A part of a file from definitions of its messages to the next ones.
+
+    `begin` and `end` are its first byte and the one after its last, `span` its first and last time
+    in s, None where nothing has a time, and `chirped` says whether it holds a SystemID chirp. One
+    of `other_layout` begins anew, and defines messages otherwise than the part before.
+    """
+
+    begin: int
+    end: int
+    span: tuple[float, float] | None
+    chirped: bool
+    other_layout: bool = False
 
 
-def _rate_over_gyro(rate: Table, imu: Table | None) -> float | None:
-    """Of the deviations over all axes; None where there is no gyro, or nothing turned."""
-    pairs = [] if imu is None else [(rate.columns.get(r), imu.columns.get(g)) for r, g in
-                                    _GYROS.items()]  # fmt: skip
-    known = [(r, g) for r, g in pairs if r is not None and g is not None]
-    turned, measured = (np.sqrt(sum(float(np.var(c)) for c in each)) for each in
-                        (zip(*known, strict=True) if known else ((), ())))  # fmt: skip
-    return float(turned / measured) if measured > 1e-3 and turned > 0 else None
+MOST_PARTS = 100  # of one file
+CUT_IT = "it is damaged, or holds too many logs: cut it into files of one log each"
+_BACKWARD = 1.0  # s by which the clock goes back at a restart: messages are not quite in order
+_ENDS = 5  # messages at each end of a part whose median is its first and last time
+
+
+def span_of(times: np.ndarray) -> tuple[float, float] | None:
+    """First and last time of the messages of one type, whatever a damaged one says."""
+    if not times.size:
+        return None
+    return float(np.median(times[:_ENDS])), float(np.median(times[-_ENDS:]))
+
+
+def choose_log(parts: Sequence[LogPart]) -> tuple[list[int], list[str]]:
+    """The numbers of the parts of the log to read, and a remark on those that are left out.
+
+    It is the longest one with a chirp, else the longest.
+    """
+    logs: list[list[int]] = [[]]
+    last = -np.inf
+    for i, part in enumerate(parts):  # a log begins where the clock goes back, or definitions do
+        restarted = part.span is not None and part.span[0] < last - _BACKWARD
+        if i and (restarted or part.other_layout):
+            logs.append([])
+        logs[-1].append(i)
+        last = last if part.span is None else part.span[1]
+    if len(logs) == 1:
+        return logs[0], []
+    spans = [[span for i in log if (span := parts[i].span) is not None] for log in logs]
+    ends = [(span[0][0], span[-1][1]) if span else (0.0, 0.0) for span in spans]
+    chirped = [any(parts[i].chirped for i in log) for log in logs]
+    best = max(range(len(logs)), key=lambda k: (chirped[k], ends[k][1] - ends[k][0]))
+    why = "the longest one with a chirp" if chirped[best] else "the longest one"
+    left_out = ", ".join(
+        f"number {k + 1} (t = {ends[k][0]:.6g} .. {ends[k][1]:.6g} s, bytes {parts[log[0]].begin} "
+        f".. {parts[log[-1]].end - 1})"
+        for k, log in enumerate(logs)
+        if k != best
+    )
+    remark = (
+        f"the file holds {len(logs)} logs, as after a restart of the flight controller: number "
+        f"{best + 1} is read (t = {ends[best][0]:.6g} .. {ends[best][1]:.6g} s), {why}. Left out: "
+        f"{left_out}. To read another one, cut it out into its own file"
+    )
+    return logs[best], [remark]
+
+
+_FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
+
+
+def firmware_of(messages: Iterable[str]) -> str:
+    """Name and version, `ArduCopter V4.5.7 (2a3dc4b7)`, from the texts of VER and MSG."""
+    hit = next(filter(None, map(_FIRMWARE.search, messages)), None)
+    return "" if hit is None else hit.group().strip()

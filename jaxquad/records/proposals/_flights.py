@@ -52,7 +52,7 @@ def choose_flight(log: Log, axis: str | None, number: int | None) -> tuple[Log, 
     if chosen is None:
         listed = "; ".join(map(str, every)) or "none"
         raise RecordError(
-            f"flight is {number}, but the file holds: {listed}. Choose one (flight=)."
+            f"flight is {number}, but the file holds: {listed}. Choose one («flight=»)."
         )
     if not chosen.log:
         return log, ()

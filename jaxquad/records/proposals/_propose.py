@@ -2,6 +2,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxquad._core import marked_text
+
 from .._errors import printable, RecordError
 from .._firmwares import firmware_log, firmware_names
 from .._log import Log
@@ -56,8 +58,8 @@ def propose(
         known = ", ".join(firmware_names())
         raise RecordError(
             f"{path}: not a log of a known autopilot ({known}), so the meaning of its channels is "
-            "unknown. jaxquad identify takes it all the same: list them (jaxquad channels, "
-            "jq.records.channels) and name inputs, outputs and references yourself."
+            "unknown. jaxquad identify takes it all the same: list them (jaxquad channels"
+            "«, jq.records.channels») and «name inputs, outputs and references yourself»."
         )
     if chirp is not None and not firmware.numbers_chirps:
         raise RecordError(
@@ -68,7 +70,7 @@ def propose(
         low, high = (None if end is None else float(end) for end in (start, stop))
         return _proposed(str(path), log, firmware, Selection(axis, chirp, low, high), flight)
     except RecordError as error:
-        raise RecordError(f"{path}: {error}") from error
+        raise RecordError(f"{path}: {marked_text(error)}") from error
     # A log may call anything by the names that its vehicle uses.
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise RecordError(

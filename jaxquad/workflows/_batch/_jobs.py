@@ -72,8 +72,8 @@ def identify_log(job: Job) -> Content:
     """Identify one log; its report and figures go to `logs/` in the folder of the batch."""
     import matplotlib
 
+    from jaxquad._compile import enable_compile_cache, share_programs
     from jaxquad._core import enable_x64
-    from jaxquad._xla import enable_compile_cache, share_programs
 
     from .._identify import identify  # here: a process with other work starts in half the time
 

@@ -1,0 +1,283 @@
+"""Scans over the members of an ensemble: the one entry to kernels, and what needs no compiler.
+
+Long scans run in blocks and large ensembles in chunks, which keeps gradients and caches small.
+"""
+
+import math
+import sys
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from ._door import compilers
+
+
+# What reverse mode keeps of a sample, by `checkpoint_name`. Otherwise it would compute each sample
+# twice, for these numbers and for the derivatives.
+KEPT = "kept_of_sample"
+_POLICY = jax.checkpoint_policies.save_only_these_names(KEPT)
+_SHORT = 128  # samples that need no blocks
+SINGLE, _SOME = 8, 64  # members up to which a loop is compiled as a single one, and briefly
+Step = Callable[..., tuple[PyTree, PyTree]]
+
+
+class Queue(NamedTuple):
+    """Inputs on their way to the plant, for as many samples as every member waits."""
+
+    rows: Float[Array, "rows inputs *ensemble"] | None  # in the order of their places; None for one
+    newest: Float[Array, " inputs *ensemble"]
+
+    def exchange(self, index: Int[Array, ""]) -> tuple["Queue", Array]:
+        """At sample `index` the newest input takes the oldest one's place. Also the oldest."""
+        if self.rows is None:
+            return self, self.newest
+        place = index % len(self.rows)
+        oldest = jax.lax.dynamic_index_in_dim(self.rows, place, 0, keepdims=False)
+        rows = jax.lax.dynamic_update_index_in_dim(self.rows, self.newest, place, 0)
+        return Queue(rows, self.newest), oldest
+
+    def in_order(self) -> tuple[Array, ...]:
+        """The inputs, the oldest first."""
+        return (*(() if self.rows is None else self.rows), self.newest)
+
+
+def scan_members(
+    step: Step,
+    carry: PyTree,
+    parts: PyTree,
+    signals: PyTree,
+    *,
+    members: int | None = None,
+    queue: Queue | None = None,
+) -> tuple[PyTree, PyTree]:
+    """`jax.lax.scan` of `step(carry, parts, now)`: the last carry, and what each sample stored.
+
+    A CPU runs it as one kernel, and an NVIDIA GPU the loop of an ensemble, where the compilers can
+    make them; else it is a plain scan of the same numbers. All arguments but `step` are arrays.
+
+    **Arguments:**
+
+    - `parts`: what does not change with time.
+    - `signals`: [samples, ...], of which `now` is one sample.
+    - `members`: on the last axis of the carry; None for a single loop, or for more axes.
+    - `queue`: then `step(carry, parts, now, oldest)` returns (carry, (newest, stored)).
+    """
+    few = members is not None and are_few(members)
+
+    def blocks(
+        carry: PyTree, parts: PyTree, signals: PyTree, queue: Queue | None
+    ) -> tuple[PyTree, PyTree]:
+        advance = lambda carry, *now: step(carry, parts, *now)
+        return scan_in_blocks(advance, carry, signals, queue, few)
+
+    if members is not None and compilers().why_no_device_kernels() is None:
+        advance, begun = lambda carry, *now: step(carry, parts, *now), carry
+        if queue is not None:
+            advance, begun = _with_rows(advance), (queue.in_order(), carry)
+        result = compilers().scan_on_device(advance, begun, signals, members, scan_in_blocks)
+        if result is not None:
+            return result if queue is None else (result[0][1], result[1])
+    return compilers().as_one_kernel(blocks, carry, parts, signals, queue)
+
+
+def are_few(members: int) -> bool:
+    """Whether a loop of so many takes longer to compile than to run, and is no single loop."""
+    return SINGLE < members <= _SOME
+
+
+def _with_rows(step: Step) -> Step:
+    """A step that hands its queue on row by row: a kernel has no place that is known only later."""
+
+    def queued(both: tuple[tuple[Array, ...], PyTree], now: PyTree) -> tuple[PyTree, PyTree]:
+        (oldest, *rows), carry = both
+        carry, (newest, out) = step(carry, now, oldest)
+        return ((*rows, newest), carry), out
+
+    return queued
+
+
+def scan_in_blocks(
+    step: Step, carry: PyTree, xs: PyTree, queue: Queue | None = None, few: bool = False
+) -> tuple[PyTree, PyTree]:
+    """`jax.lax.scan` whose reverse keeps the carry of blocks only, and of the one it is in.
+
+    Twice the square root of the samples' number of carries instead of all, for one forward pass
+    more. With a `queue`, of which only blocks are kept, `step(carry, x, oldest)` returns
+    (carry, (newest, y)). The reverse of `few` members is kernels that two cores compile at once.
+    """
+    count = len(jax.tree.leaves(xs)[0])
+    size = _block_size(count)
+    length = -(-count // size) * size
+    if length > count:
+        step, xs = _until(count, step), (jnp.arange(length), jax.tree.map(_lengthened(length), xs))
+    # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
+    step = jax.checkpoint(step, prevent_cse=False, policy=_POLICY)
+    if queue is not None:
+        step, carry, xs = _with_queue(step), (queue, carry), (jnp.arange(length), xs)
+
+    def jaxquad_block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
+        return jax.lax.scan(step, carry, xs)
+
+    # A function of this name becomes kernels of its own where it is computed again and reversed:
+    # two cores compile these two at once, and the time of both grows faster than their operations.
+    block = jax.checkpoint(jax.jit(jaxquad_block) if few else jaxquad_block, prevent_cse=False)
+
+    if length == size:
+        carry, out = block(carry, xs)
+    else:
+        in_rows = lambda x: x.reshape(length // size, size, *x.shape[1:])
+        carry, out = jax.lax.scan(block, carry, jax.tree.map(in_rows, xs))
+        out = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:])[:count], out)
+    return (carry if queue is None else carry[1]), out
+
+
+def _with_queue(step: Step) -> Step:
+    """The queue changes outside of what reverse mode computes again: that would have to keep it."""
+
+    def queued(both: tuple[Queue, PyTree], xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
+        (queue, carry), (index, now) = both, xs
+        queue, oldest = queue.exchange(index)
+        carry, (newest, out) = step(carry, now, oldest)
+        return (queue._replace(newest=newest), carry), out
+
+    return queued
+
+
+def _until(count: int, step: Step) -> Step:
+    """The step, which leaves the carry as it is after `count` samples.
+
+    A last block of another length would be compiled as a second loop.
+    """
+
+    def masked(carry: PyTree, xs: tuple[Array, PyTree], *oldest: Array) -> tuple[PyTree, PyTree]:
+        index, now = xs
+        after, out = step(carry, now, *oldest)
+        return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), after, carry), out
+
+    return masked
+
+
+def _lengthened(length: int) -> Callable[[Array], Array]:
+    """With the last sample repeated."""
+    return lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], length - x.shape[0], axis=0)])
+
+
+def _block_size(count: int) -> int:
+    """Near the square root of `count`, and a divisor if there is one."""
+    if count <= _SHORT:
+        return count
+    root = math.isqrt(count)
+    near = sorted(range(root // 2, 2 * root + 1), key=lambda size: abs(size - root))
+    return next((size for size in near if count % size == 0), root)
+
+
+_CHUNK = 128  # members: some hundred arrays of them fit a core's second cache
+_VECTOR = 16  # members that are computed at once
+_WIDEST = 4095  # numbers of an array in a kernel
+
+
+def run_ensemble(
+    step: Callable[[PyTree, PyTree, PyTree], tuple[PyTree, PyTree]],
+    carry: PyTree,
+    parts: PyTree,
+    signals: PyTree,
+    *,
+    own: PyTree,
+    chunk: int | None = None,
+) -> tuple[PyTree, PyTree]:
+    """`jax.lax.scan` of an ensemble of loops: the last carry, and what each sample left.
+
+    On a CPU each chunk of members is one compiled kernel, if it is plain arithmetic. Other devices
+    take all members at once, and an NVIDIA GPU runs the whole loop as one kernel. Reverse mode
+    keeps blocks of samples of one chunk at a time. To be called under `jax.jit`, with
+    `compiler_options()` if that is the outermost one.
+
+    **Arguments:**
+
+    - `step`: `step(carry, parts, now)` returns the next carry and what is stored of a sample, for
+        any number of members, which are on the last axis of all that it returns.
+    - `carry`: before the first sample, with the members on the last axis.
+    - `parts`: what does not change with time.
+    - `signals`: [samples, ...], of which `now` is one sample.
+    - `own`: True for the arrays of (parts, signals) that have the members on their last axis; a
+        tree like these, or the top of one.
+    - `chunk`: members at a time; None is 128 on a CPU, or as many as a kernel holds.
+
+    **Raises:** ValueError for a result that does not have the members on its last axis.
+    """
+
+    def scan(given: PyTree) -> tuple[PyTree, PyTree]:
+        carry, (parts, signals) = given
+        members = jax.tree.leaves(carry)[0].shape[-1]
+        return scan_members(step, carry, parts, signals, members=members)
+
+    chunk = chunk or most_at_once(carry, jax.tree.leaves(carry)[0].shape[-1])
+    return in_chunks(scan, (carry, (parts, signals)), (True, own), chunk)
+
+
+def in_chunks(
+    function: Callable[[PyTree], PyTree], given: PyTree, own: PyTree, chunk: int | None = None
+) -> PyTree:
+    """`function(given)` for `chunk` members after the others, where there are more than these.
+
+    None: 128 on a CPU, all of them elsewhere. `own` tells which arrays of `given` have the members
+    on the last axis; all results must have them there. Raises ValueError for one that has not.
+    """
+    theirs, common = eqx.partition(given, own)
+    members = jax.tree.leaves(theirs)[0].shape[-1]
+    size = _chunk_size(members, chunk or most_at_once())
+    if members <= size:
+        return function(given)
+    firsts = np.minimum(np.arange(0, members, size), members - size)  # the last two may overlap
+    few = jax.tree.map(lambda x: _split(x, len(firsts), size), theirs)
+    # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
+    run = jax.checkpoint(lambda x: function(eqx.combine(x, common)), prevent_cse=False)
+
+    def put(room: PyTree, now: tuple[Array, PyTree]) -> tuple[PyTree, None]:
+        first, few = now
+        return jax.tree.map(lambda whole, x: _placed(whole, x, first), room, run(few)), None
+
+    shapes = jax.eval_shape(run, jax.tree.map(lambda x: x[0], few))
+    room = jax.tree.map(lambda x: _room(x, size, members), shapes)
+    return jax.lax.scan(put, room, (jnp.asarray(firsts), few))[0]
+
+
+def _chunk_size(members: int, most: int) -> int:
+    """Of equal chunks, whole vectors of members long; all members where they fit one chunk."""
+    number = -(-members // most)
+    return members if number == 1 else -(-members // (number * _VECTOR)) * _VECTOR
+
+
+def most_at_once(carry: PyTree = None, members: int = 1) -> int:
+    """Members of a chunk: as many as a kernel holds of the widest array in the `carry` of all."""
+    if jax.default_backend() != "cpu":
+        return sys.maxsize
+    theirs = [x.size for x in jax.tree.leaves(carry) if x.shape[-1:] == (members,)]
+    fitting = _WIDEST * members // max(theirs, default=members) // _VECTOR * _VECTOR
+    return min(_CHUNK, fitting) or _CHUNK
+
+
+def _split(x: Array, number: int, size: int) -> Array:
+    """[number, ..., size], of which the last are the last of all."""
+    first = x[..., : (number - 1) * size].reshape(*x.shape[:-1], number - 1, size)
+    whole = jnp.concatenate([first, x[..., None, -size:]], axis=-2)
+    return jnp.moveaxis(whole, -2, 0)
+
+
+def _room(x: jax.ShapeDtypeStruct, size: int, members: int) -> Array:
+    """For the results of all members: joined at the end, they would be written twice."""
+    if len(x.shape) < 1 or x.shape[-1] != size:
+        raise ValueError(
+            f"a result has the shape {x.shape}, but the {size} members of a chunk belong on "
+            "its last axis: return what each member gives, and nothing that they share"
+        )
+    return jnp.zeros((*x.shape[:-1], members), x.dtype)
+
+
+def _placed(whole: Array, part: Array, first: Int[Array, ""]) -> Array:
+    return jax.lax.dynamic_update_slice_in_dim(whole, part, first, whole.ndim - 1)

@@ -1,0 +1,327 @@
+"""What the kernels of a time loop are made of: a sample in lanes, forward and in reverse.
+
+One kernel is the loop and one its reverse pass. Each thread of a kernel runs one member from the
+first sample to the last, with its numbers in registers. The forward kernel can keep the carry of
+every segment's first sample. The reverse kernel takes segments from the last to the first: it
+computes a segment's carries again, writes them to memory, and goes back over them.
+"""
+
+import functools as ft
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun, JaxprEqn, Var
+from jax.typing import DTypeLike
+from jaxtyping import Array
+
+from ._cuda_text import EXPRESSIONS
+from ._lanes import as_cells, CALLS, Cells, cells_of, Lane, Lanes, NotInLanes, NUMBERS, numbers
+
+
+# How often the forward kernel of a time loop keeps the carry for the reverse one.
+#
+# The reverse kernel computes the samples between two kept carries once more, and puts their
+# carries down until it comes back to them. In the memory that a processor of the GPU shares among
+# its threads they cost next to nothing, but few have room there: so carries are kept as often as a
+# part of the device's memory allows. Where that is not often enough, they are kept every
+# sqrt(samples) samples, and put down in the device's memory.
+#
+# What a thread holds from sample to sample (constants, the sums of their cotangents, the carry's
+# cotangents) goes to the shared memory first where its registers have no room for it, as in double
+# precision: what the compiler has no register for it puts down in memory that is slow.
+
+_LEAST = 2  # samples: a carry is then written in less time than a sample takes
+_SHARE = 0.15  # of the device's free memory, for what is kept: a program may have some loops
+BLOCKS = 2  # that a processor runs at once, by their registers
+_OF_DRIVER = 1024  # bytes of a block that are the driver's
+# Bytes of shared memory of a processor, by compute capability; 64 KB are everywhere.
+_SHARED = {"8.0": 164, "8.7": 164, "9.0": 228, "10.0": 228, "10.3": 228, "8.6": 100, "8.9": 100}
+_SHARED |= {"12.0": 100, "12.1": 100}
+_KILOBYTE = 1024
+_HELD = 170  # of 255 registers, that leave room for a sample's own numbers
+
+
+class Segments(NamedTuple):
+    """Of a loop of `count` samples."""
+
+    count: int
+    length: int  # samples, of all but the last
+    are_shared: bool  # whether a segment's carries lie in shared memory
+    held: int = 0  # bytes of a thread there, for numbers of eight bytes that it holds
+
+    @property
+    def number(self) -> int:
+        return -(-self.count // self.length)
+
+
+def segments_of(count: int, carry: int, members: int, block: int, held: int = 0) -> Segments:
+    """For `members` whose carry has so many bytes, in blocks of so many threads.
+
+    `held` are the bytes of each that `held_bytes` found.
+    """
+    room = _memory()[0]
+    most = (_shared_by_block() - held * block) // max(carry * block, 1)
+    length = max(_LEAST, math.ceil(count * carry * members / (_SHARE * room))) if room else count
+    if length <= min(most, count):
+        return Segments(count, length, True, held)
+    return Segments(count, math.isqrt(max(count - 1, 0)) + 1, False, held)
+
+
+def held_bytes(held: int, of_eight: int, block: int) -> int:
+    """Bytes of a thread that go to shared memory, of those that it holds from sample to sample.
+
+    `of_eight` are those of numbers with eight bytes. None where registers have room for all, and
+    where that memory has none.
+    """
+    registers = held // 4
+    return of_eight if registers > _HELD and of_eight * block <= _shared_by_block() else 0
+
+
+def _shared_by_block() -> int:
+    return _memory()[1] // BLOCKS - _OF_DRIVER
+
+
+def _memory() -> tuple[int, int]:
+    """Bytes that are free on this machine's GPU, and shared ones; 0 where there is no GPU."""
+    try:
+        device = jax.local_devices(backend="gpu")[0]
+    except RuntimeError:  # a program for another machine
+        return 0, 0
+    known = device.memory_stats() or {}
+    free = known.get("bytes_limit", 0) - known.get("bytes_in_use", 0)
+    return free, _KILOBYTE * _SHARED.get(str(device.compute_capability), 64)
+
+
+T = TypeVar("T")
+Flat = list[Array]
+Shaped = jax.ShapeDtypeStruct
+
+
+class Loop(NamedTuple):
+    """Samples of a step for `members`, which is a jaxpr of (consts, carry, now)."""
+
+    step: ClosedJaxpr
+    consts: int
+    carry: int
+    members: int
+    segments: Segments
+
+    @property
+    def count(self) -> int:
+        """Samples."""
+        return self.segments.count
+
+    @property
+    def given(self) -> list[Shaped]:
+        """Shapes and types of the step's arguments."""
+        return _shaped(self.step.in_avals)
+
+    @property
+    def out(self) -> list[Shaped]:
+        """Those of the step's results."""
+        return _shaped(self.step.out_avals)
+
+    @property
+    def avals(self) -> tuple[list[Shaped], list[Shaped], list[Shaped]]:
+        """Those of consts, carry and one sample of the signals."""
+        consts, carry, now = split(self.given, self.consts, self.carry)
+        return consts, carry, now
+
+    @property
+    def results(self) -> tuple[list[Shaped], list[Shaped]]:
+        """Those of the carry, and of what one sample stores."""
+        carry, stored = split(self.out, self.carry)
+        return carry, stored
+
+
+def _shaped(avals: Sequence[Any]) -> list[Shaped]:
+    return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in avals]
+
+
+def split(items: Sequence[T], *lengths: int) -> list[list[T]]:
+    """The first of these lengths, the next, and the rest."""
+    bounds = [0, *np.cumsum(lengths).tolist(), len(items)]
+    return [list(items[a:b]) for a, b in zip(bounds, bounds[1:], strict=False)]
+
+
+def is_float(kind: DTypeLike) -> bool:
+    return jnp.issubdtype(kind, jnp.floating)
+
+
+def is_wide(loop: Loop, aval: Shaped) -> bool:
+    """Whether an array has the members' axis."""
+    return loop.members in aval.shape
+
+
+def size(loop: Loop, aval: Shaped) -> int:
+    """The numbers of one member."""
+    return numbers(aval.shape, loop.members)
+
+
+def in_lanes(loop: Loop, jaxpr: ClosedJaxpr, *, leave_sums: bool = False) -> ClosedJaxpr:
+    """A jaxpr of arrays as one of their lanes. Raises `NotInLanes` for what they do not hold."""
+    lanes = Lanes(loop.members, leave_sums=leave_sums)
+    given, shapes = [], []
+    for aval in _shaped(jaxpr.in_avals):
+        shapes.append(lanes.small(aval.shape))
+        given += [jax.ShapeDtypeStruct((), aval.dtype)] * size(loop, aval)
+
+    def flat(*args: Lane) -> list[Lane]:
+        parts = split(args, *map(math.prod, shapes))
+        cells = [cells_of(part, shape) for part, shape in zip(parts, shapes, strict=False)]
+        out = lanes.evaluate(jaxpr.jaxpr, jaxpr.consts, cells)
+        return [lane for x in out for lane in _listed(x)]
+
+    made = jax.make_jaxpr(flat)(*given)
+    unknown = {x.primitive.name for x in made.jaxpr.eqns} - EXPRESSIONS.keys()
+    if unknown:
+        raise NotInLanes(f"{', '.join(sorted(unknown))} of a member's numbers")
+    return made
+
+
+def _listed(x: Cells) -> list[Lane]:
+    return as_cells(x).reshape(-1).tolist()
+
+
+@ft.lru_cache(maxsize=16)
+def step_in_lanes(loop: Loop) -> ClosedJaxpr:
+    return in_lanes(loop, loop.step)
+
+
+@ft.lru_cache(maxsize=16)
+def reverse_in_lanes(loop: Loop, which: tuple[bool, ...]) -> ClosedJaxpr:
+    """From (consts, carry, now, cotangents) to the cotangents of those in `which` and the carry."""
+    step = jaxpr_as_fun(loop.step)
+    out = [x for x in loop.out if is_float(x.dtype)]
+    wanted = reverse_wanted(loop, which)
+
+    def back(*args: Array) -> list[Array]:
+        given, cotangents = split(args, len(loop.given))
+
+        def moved(*some: Array) -> list[Array]:
+            fresh = iter(some)
+            whole = [next(fresh) if w else x for w, x in zip(wanted, given, strict=True)]
+            return [x for x in step(*whole) if is_float(x.dtype)]
+
+        _, pull = jax.vjp(moved, *(x for w, x in zip(wanted, given, strict=True) if w))
+        return list(pull(cotangents))
+
+    jaxpr = jax.make_jaxpr(back)(*loop.given, *out)
+    return in_lanes(loop, jaxpr, leave_sums=True)
+
+
+def reverse_wanted(loop: Loop, which: tuple[bool, ...]) -> tuple[bool, ...]:
+    """What one sample is differentiated by: the carry too, whose first is one of many."""
+    first, last = loop.consts, loop.consts + loop.carry
+    avals = loop.given
+    return tuple(is_float(x.dtype) if first <= k < last else which[k] for k, x in enumerate(avals))
+
+
+def bounds(loop: Loop) -> list[str]:
+    """The first sample of a segment, and the first after it."""
+    length = loop.segments.length
+    last = f"first + {length}"
+    return [
+        f"const int first = segment * {length};",
+        f"const int end = {last} < {loop.count} ? {last} : {loop.count};",
+    ]
+
+
+# What of a loop's step is the same in every sample, computed once, before the loop.
+#
+# A compiler does so, too, but not with derivatives: in reverse, every sample would pass its part on
+# to what the step's constants are made of. Here that is done once, with the sums over all samples.
+
+_MORE = 16  # numbers of a member, and arrays, that the loop may take for it beside those before
+
+
+def without_invariants(
+    step: ClosedJaxpr, consts: Sequence[Array], members: int
+) -> tuple[ClosedJaxpr, list[Array]]:
+    """A step of (consts, carry, now) as one of other consts, which are computed from these."""
+    body = step.jaxpr
+    own, rest = body.invars[: len(consts)], body.invars[len(consts) :]
+    parts = _Parts(body, own)
+    each = _used(parts.each, parts.outs)
+    read = dict.fromkeys(v for v in (*_read(each), *parts.outs) if isinstance(v, Var))
+    needed = [v for v in read if v in parts.once or v in own]
+    grown = max(_size(needed, members) - _size(own, members), len(needed) - len(own))
+    if grown > _MORE:
+        return step, list(consts)
+    first = body.replace(invars=own, outvars=needed, eqns=_used(parts.steady, needed))
+    within = body.replace(invars=[*needed, *rest], outvars=parts.outs, eqns=each)
+    made = jaxpr_as_fun(ClosedJaxpr(first, step.consts))(*consts)
+    return ClosedJaxpr(within, step.consts), made
+
+
+class _Parts:
+    """A step's equations, sorted, with one of each that are the same."""
+
+    def __init__(self, body: Jaxpr, own: Sequence[Var]):
+        self.steady: list[JaxprEqn] = []  # what is the same in every sample
+        self.each: list[JaxprEqn] = []  # what a sample has to compute
+        self.once: set[Var] = set()  # results that need not be computed in a sample
+        self._still, self._from_own = {*own, *body.constvars}, {*own}
+        self._same: dict[Var, Var] = {}
+        self._seen: dict[Any, Sequence[Var]] = {}
+        for equation in body.eqns:
+            self._sort(equation.replace(invars=[self._first(v) for v in equation.invars]))
+        self.outs = [self._first(v) for v in body.outvars]
+
+    def _first(self, v: Any) -> Any:
+        return self._same.get(v, v) if isinstance(v, Var) else v
+
+    def _sort(self, equation: JaxprEqn) -> None:
+        given = [v for v in equation.invars if isinstance(v, Var)]
+        if not self._still.issuperset(given):
+            self.each.append(equation)
+            return
+        seen = self._seen.setdefault(_content(equation), equation.outvars)
+        if seen is not equation.outvars:
+            self._same.update(zip(equation.outvars, seen, strict=True))
+            return
+        self._still.update(equation.outvars)
+        self.steady.append(equation)
+        if not self._from_own.isdisjoint(given):
+            self._from_own.update(equation.outvars)
+            if _computes(equation):
+                self.once.update(equation.outvars)
+                return
+        self.each.append(equation)  # what only moves numbers costs nothing there
+
+
+def _content(equation: JaxprEqn) -> Any:
+    """Equal for operations of equal results; a function may have a derivative of its own."""
+    if equation.primitive.name in CALLS:
+        return id(equation)
+    given = [v if isinstance(v, Var) else (str(v.val), v.aval) for v in equation.invars]
+    return equation.primitive, str(equation.params), *given
+
+
+def _computes(equation: JaxprEqn) -> bool:
+    name = equation.primitive.name
+    kinds = {v.aval.dtype for v in equation.outvars}  # pyright: ignore[reportAttributeAccessIssue]
+    return (name in EXPRESSIONS or name in CALLS) and kinds.issubset(NUMBERS)
+
+
+def _read(equations: Iterable[JaxprEqn]) -> list[Any]:
+    return [v for equation in equations for v in equation.invars]
+
+
+def _used(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[JaxprEqn]:
+    """Those on which some results depend."""
+    found, open_ = [], {v for v in results if isinstance(v, Var)}
+    for equation in reversed(equations):
+        if not open_.isdisjoint(equation.outvars):
+            found.append(equation)
+            open_.update(v for v in equation.invars if isinstance(v, Var))
+    return found[::-1]
+
+
+def _size(variables: Iterable[Var], members: int) -> int:
+    shapes = (v.aval.shape for v in variables)  # pyright: ignore[reportAttributeAccessIssue]
+    return sum(numbers(shape, members) for shape in shapes)

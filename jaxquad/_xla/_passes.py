@@ -1,0 +1,278 @@
+"""The forward and the reverse pass of a time loop, one kernel each. See `_loop`."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from . import _kernel_memory
+from ._cuda_text import statements, type_of
+from ._kernel_memory import (
+    assigned,
+    declared,
+    fetch_before,
+    Held,
+    kept_avals,
+    Lines,
+    load_all,
+    load_tiles,
+    nested,
+    out_like,
+    pack,
+    Rows,
+    rows_of,
+    run,
+    store_all,
+    store_tiles,
+    tiles_of,
+    unpack,
+    variables,
+)
+from ._loop import (
+    bounds,
+    Flat,
+    is_float,
+    is_wide,
+    Loop,
+    reverse_in_lanes,
+    Shaped,
+    size,
+    split,
+    step_in_lanes,
+)
+
+
+def run_forward(loop: Loop, *args: Array, keep: bool) -> Flat:
+    """The last carry, what was stored, and, with `keep`, the carries that begin a segment."""
+    return _Forward(loop, keep).run(args)
+
+
+class _Forward:
+    """What goes into the kernel, and in which order."""
+
+    def __init__(self, loop: Loop, keep: bool):
+        self.loop, self.keep = loop, keep
+        self.consts, self.carry, self.signals = loop.avals
+        self.stored = loop.results[1]
+        self.fixed = rows_of(loop, "fixed", self.consts)
+        self.begun = rows_of(loop, "begun", self.carry)
+        self.now = rows_of(loop, "now", self.signals)
+        self.last = rows_of(loop, "last", self.carry, all_wide=True)
+        self.left = rows_of(loop, "left", self.stored, all_wide=True)
+        self.kept = tiles_of(loop, "kept", loop.segments.number) if keep else []
+
+    def run(self, args: Sequence[Array]) -> Flat:
+        loop = self.loop
+        given, made = [*self.fixed, *self.begun, *self.now], [*self.last, *self.left, *self.kept]
+        found = run(loop, self.lines(), (given, self._packed(args)), (made, self._outs()))
+        last, left, kept = split(found, len(self.carry), len(self.stored))
+        out = [unpack(loop, *pair) for pair in zip(last, self.carry, strict=True)]
+        out += [unpack(loop, *pair, timed=True) for pair in zip(left, self.stored, strict=True)]
+        return [*out, *kept]
+
+    def _packed(self, args: Sequence[Array]) -> Flat:
+        loop = self.loop
+        still, signals = split(args, len(self.consts) + len(self.carry))
+        avals = [*self.consts, *self.carry]
+        out = [pack(loop, *pair) for pair in zip(still, avals, strict=True)]
+        pairs = zip(signals, self.signals, strict=True)
+        return [*out, *(pack(loop, *pair, timed=True) for pair in pairs)]
+
+    def _outs(self) -> list[Shaped]:
+        loop = self.loop
+        outs = [out_like(loop, size(loop, x), dtype=x.dtype) for x in self.carry]
+        outs += [out_like(loop, loop.count, size(loop, x), dtype=x.dtype) for x in self.stored]
+        return outs + (kept_avals(loop) if self.keep else [])
+
+    def lines(self) -> Lines:
+        loop = self.loop
+        loads, fixed = load_all(self.fixed)
+        begun, first = load_all(self.begun)
+        begins, state = variables(loop, "state", self.carry, first)
+        now, signals = load_all(self.now, time="t")
+        step, out = statements(step_in_lanes(loop), [*fixed, *state, *signals], "v")
+        after, left = split(out, len(state))
+        sample = [*now, *step, *store_all(self.left, left, "t"), *assigned(state, after)]
+        if self.keep:
+            each = nested("for (int t = first; t < end; ++t)", sample)
+            segment = [*bounds(loop), *store_tiles(self.kept, state, "segment"), *each]
+            samples = nested(
+                f"for (int segment = 0; segment < {loop.segments.number}; ++segment)", segment
+            )
+        else:
+            samples = nested(f"for (int t = 0; t < {loop.count}; ++t)", sample)
+        return [*loads, *begun, *begins, *samples, *store_all(self.last, state)]
+
+
+def holds_cotangents(loop: Loop, given: Sequence[bool]) -> bool:
+    """Whether those of the float results that are `given` differ between members.
+
+    What all members share would be felt by each: the kernel has no place for it.
+    """
+    floats = [x for x in loop.out if is_float(x.dtype)]
+    pairs = zip(floats, given, strict=True)
+    return all(is_wide(loop, aval) for aval, is_given in pairs if is_given)
+
+
+def run_reverse(loop: Loop, *args: Array, which: tuple[bool, ...]) -> Flat:
+    """The cotangents of the arguments in `which`.
+
+    The arguments are consts, carry, signals, the carries that were kept, and the cotangents of the
+    float results.
+    """
+    return _Reverse(loop, which).run(args)
+
+
+class _Reverse:
+    """What goes into the kernel, and in which order."""
+
+    def __init__(self, loop: Loop, which: tuple[bool, ...]):
+        self.loop, self.which = loop, which
+        self.consts, self.carry, self.signals = loop.avals
+        self.stored = [x for x in loop.results[1] if is_float(x.dtype) and is_wide(loop, x)]
+        self.moving = [x for x in self.carry if is_float(x.dtype)]
+        wanted = split(which, len(self.consts), len(self.carry))
+        self.wanted_carry = wanted[1]
+        pick = lambda avals, flags: [x for x, flag in zip(avals, flags, strict=True) if flag]
+        self.wanted_consts = pick(self.consts, wanted[0])
+        self.wanted_signals = pick(self.signals, wanted[2])
+        self.fixed = rows_of(loop, "fixed", self.consts)
+        self.now = rows_of(loop, "now", self.signals)
+        self.kept = tiles_of(loop, "kept", loop.segments.number)
+        self.felt = rows_of(loop, "felt", self.moving)
+        self.left = rows_of(loop, "left", self.stored)
+        self.to_fixed = rows_of(loop, "to_fixed", self.wanted_consts, all_wide=True)
+        self.to_carry = rows_of(loop, "to_carry", self.moving, all_wide=True)
+        self.to_now = rows_of(loop, "to_now", self.wanted_signals)
+        length, shared = loop.segments.length, loop.segments.are_shared
+        self.again = tiles_of(loop, "again", length, shared=shared)
+        self.shelf = self.again if shared else []
+
+    def run(self, args: Sequence[Array]) -> Flat:
+        given = [*self.fixed, *self.now, *self.kept, *self.felt, *self.left]
+        made = [*self.to_fixed, *self.to_carry, *self.to_now, *(() if self.shelf else self.again)]
+        pairs = (given, self._packed(args)), (made, self._outs())
+        held = Held(bool(self.loop.segments.held))
+        lines = self.lines(held)
+        own = held.size + sum(tile.size for tile in self.shelf)
+        found = run(self.loop, lines, *pairs, shared=own)
+        consts, carry, signals, _ = split(
+            found, len(self.wanted_consts), len(self.moving), len(self.wanted_signals)
+        )
+        out = [self._gathered(*pair) for pair in zip(consts, self.wanted_consts, strict=True)]
+        floats = iter(zip(carry, self.moving, strict=True))
+        for aval, wanted in zip(self.carry, self.wanted_carry, strict=True):
+            if is_float(aval.dtype):
+                pair = next(floats)
+                out += [self._gathered(*pair)] if wanted else []
+        return out + [
+            self._gathered(x, aval, timed=True)
+            for x, aval in zip(signals, self.wanted_signals, strict=True)
+        ]
+
+    def _gathered(self, x: Array, aval: Shaped, timed: bool = False) -> Array:
+        """The cotangent of an array; what members share gets the sum of their parts."""
+        if is_wide(self.loop, aval):
+            return unpack(self.loop, x, aval, timed=timed)
+        return jnp.sum(x, axis=-1).reshape(*x.shape[:timed], *aval.shape).astype(aval.dtype)
+
+    def _packed(self, args: Sequence[Array]) -> Flat:
+        loop = self.loop
+        consts, _, signals, kept, last, left = split(
+            args, len(self.consts), len(self.carry), len(self.signals), len(self.kept),
+            len(self.moving),
+        )  # fmt: skip
+        floats = [x for x in loop.results[1] if is_float(x.dtype)]
+        out = [pack(loop, *pair) for pair in zip(consts, self.consts, strict=True)]
+        out += [pack(loop, *pair, timed=True) for pair in zip(signals, self.signals, strict=True)]
+        out += kept
+        out += [pack(loop, *pair) for pair in zip(last, self.moving, strict=True)]
+        pairs = (pair for pair in zip(left, floats, strict=True) if is_wide(loop, pair[1]))
+        return [*out, *(pack(loop, *pair, timed=True) for pair in pairs)]
+
+    def _outs(self) -> list[Shaped]:
+        loop = self.loop
+        still = [*self.wanted_consts, *self.moving]
+        outs = [out_like(loop, size(loop, x), dtype=x.dtype) for x in still]
+        for x in self.wanted_signals:
+            last = loop.members if is_wide(loop, x) else -(-loop.members // _kernel_memory.WARP)
+            outs.append(jax.ShapeDtypeStruct((loop.count, size(loop, x), last), x.dtype))
+        return outs if self.shelf else outs + [x.out(loop) for x in self.again]
+
+    def lines(self, held: Held) -> Lines:
+        loop = self.loop
+        loads, fixed = load_all(self.fixed)
+        fixed_begin, fixed = held.variables(loop, "still", self.consts, fixed)
+        felt, last = load_all(self.felt)
+        begins, moved = held.variables(loop, "moved", self.moving, last)
+        zeros = ["0"] * sum(size(loop, x) for x in self.wanted_consts)
+        sums_begin, sums = held.variables(loop, "sum", self.wanted_consts, zeros)
+        kept, first = load_tiles(self.kept, "segment")
+        kept += nested("if (segment > 0)", fetch_before(self.kept)) if self.shelf else []
+        state_begins, state = variables(loop, "state", self.carry, first)
+        segment = [
+            *bounds(loop), *kept, *state_begins,
+            *nested("for (int t = first; t < end - 1; ++t)", self._once_more(fixed, state)),
+            *store_tiles(self.again, state, "end - 1 - first"),
+            *nested("for (int t = end - 1; t >= first; --t)", self._back(fixed, moved, sums)),
+        ]  # fmt: skip
+        head = f"for (int segment = {loop.segments.number - 1}; segment >= 0; --segment)"
+        ends = [*store_all(self.to_carry, moved), *store_all(self.to_fixed, sums)]
+        shelf = declared(held, self.shelf) if held.size or self.shelf else []
+        begins = [*loads, *fixed_begin, *felt, *begins, *sums_begin]
+        return [*shelf, *begins, *nested(head, segment), *ends]
+
+    def _once_more(self, fixed: Lines, state: Lines) -> Lines:
+        """A sample of the forward pass, whose carry is written to memory."""
+        now, signals = load_all(self.now, time="t")
+        step, out = statements(step_in_lanes(self.loop), [*fixed, *state, *signals], "v")
+        written = store_tiles(self.again, state, "t - first")
+        return [*written, *now, *step, *assigned(state, out[: len(state)])]
+
+    def _back(self, fixed: Lines, moved: Lines, sums: Lines) -> Lines:
+        """A sample of the reverse pass."""
+        again, state = load_tiles(self.again, "t - first")
+        again += [] if self.shelf else nested("if (t > first)", fetch_before(self.again))
+        now, signals = load_all(self.now, time="t")
+        left, stored = self._stored_cotangents()
+        given = [*fixed, *state, *signals, *moved, *stored]
+        step, out = statements(reverse_in_lanes(self.loop, self.which), given, "v")
+        to_fixed, before, to_now = split(out, len(sums), len(moved))
+        added = [f"{total} += {part};" for total, part in zip(sums, to_fixed, strict=True)]
+        return [*again, *now, *left, *step, *added, *assigned(moved, before), *self._to_now(to_now)]
+
+    def _stored_cotangents(self) -> tuple[Lines, Lines]:
+        rows, lines, names = iter(self.left), [], []
+        for x in self.loop.results[1]:
+            if is_float(x.dtype) and is_wide(self.loop, x):
+                found = load_all([next(rows)], time="t")
+                lines += found[0]
+                names += found[1]
+            elif is_float(x.dtype):  # `holds_cotangents`: these are zero
+                names += [f"({type_of(x.dtype)})0"] * size(self.loop, x)
+        return lines, names
+
+    def _to_now(self, names: Lines) -> Lines:
+        parts = split(names, *(row.count for row in self.to_now))
+        lines = []
+        for row, part in zip(self.to_now, parts, strict=False):
+            lines += row.store(part, "t") if row.wide else _shared(row, part)
+        return lines
+
+
+def _shared(row: Rows, names: Lines) -> Lines:
+    """What all members share gets a sum of each warp."""
+    warp = _kernel_memory.WARP
+    place = f"* ((members + {warp - 1}) / {warp}) + place / {warp}"
+    lines = []
+    for k, name in enumerate(names):
+        total = f"total_{row.name}_{k}"
+        halve = f"{total} += __shfl_down_sync(~0u, {total}, k);"
+        lines += [
+            f"auto {total} = is_member ? {name} : 0;",
+            f"for (int k = {warp // 2}; k > 0; k /= 2) {halve}",
+            f"if (is_member && place % {warp} == 0)",
+            f"    {row.name}[(t * {row.count} + {k}) {place}] = {total};",
+        ]
+    return lines

@@ -1,0 +1,307 @@
+"""Fourier sums of tapered windows of several lengths, at any frequencies.
+
+A raised cosine is a constant and two waves: behind it, the sum at w is made of those of plain
+windows at w and w +- 2 pi / length. Those are differences of running sums over blocks of samples,
+which all windows share, so the cost depends neither on their overlap nor on the number of tapers.
+Of a block only the few even and odd functions count that these frequencies can tell apart: with
+c = w block / 2, about 2 c / pi + O(log c) of them (Slepian; Landau and Widom, 1980).
+"""
+
+import functools as ft
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from jaxquad._core import require_x64
+
+from ._windows import Layout, waves, window
+
+
+_SHORT = 128  # samples below which a window is summed directly
+_BLOCKS = (32, 1024)  # samples to a block
+_TOLERANCE = 6e-14  # of a block's waves; leaves 2e-13 of the largest Fourier sum
+_THIN = 256  # samples that show a constant well enough
+_TRENDS = ("none", "constant", "linear")
+
+Angles = Float[np.ndarray, " frequencies"]
+Sums = Complex[np.ndarray, "frequencies channels windows"]
+
+
+class Taper(NamedTuple):
+    """A window's shape and what it acts on: so many of the channels, windows from `first` on."""
+
+    shape: str
+    channels: int
+    first: int = 0
+
+
+def fourier_sums(
+    signals: tuple[Float[np.ndarray, "samples _"], ...],
+    angle: Angles,
+    windows: Layout,
+    tapers: tuple[Taper, ...],
+    *,
+    detrend: str,
+    origin: float,
+) -> list[list[Complex[np.ndarray, "frequencies segments _"]]]:
+    """`sum_n taper[n] x[start + n] exp(-j angle (origin + start + n))`, by taper and by length.
+
+    `signals` lie side by side, `angle` is in rad per sample, and the phase is that of a record
+    whose first sample is number `origin`. `detrend` removes the "constant" or the "linear"
+    least-squares trend of every window before the taper, or "none". Accurate to about 2e-13 of the
+    largest sum. Raises `ValueError` for windows outside the record or frequencies above the Nyquist
+    frequency, `PrecisionError` in 32 bits. In memory, the windows of one channel are neighbours.
+    """
+    require_x64("a transform")
+    angle = np.asarray(angle, float)
+    samples = len(signals[0])
+    _check(samples, angle, windows, detrend)
+    rows, end = np.empty((sum(x.shape[1] for x in signals), samples)), 0
+    for part in signals:
+        columns = np.asarray(part, float).T
+        begin, end = end, end + len(columns)
+        # Near each channel's mean: no trend is left of it, but its rounding errors would be.
+        few = columns[:, :: max(samples // _THIN, 1)] if detrend != "none" else np.zeros((1, 1))
+        np.subtract(columns, np.mean(few, axis=1, keepdims=True), out=rows[begin:end])
+    sums = [
+        [np.empty((angle.size, taper.channels, len(s)), complex) for _, s in windows[taper.first :]]
+        for taper in tapers
+    ]
+    long = [each for each in windows if each[0] >= _SHORT]
+    blocks = _share_blocks(samples, angle, long) if long else None
+    running = [_Channel(row, blocks, detrend) for row in rows] if blocks else []
+    for number, (length, starts) in enumerate(windows):
+        mine = [(t.shape, part[number - t.first]) for t, part in zip(tapers, sums, strict=True)
+                if t.first <= number]  # fmt: skip
+        if blocks is None or length < _SHORT:
+            _sum_directly(rows, angle, length, starts, mine, detrend)
+            continue
+        for c, channel in enumerate(running):
+            channel.sum_windows(length, starts, [(s, x[:, c]) for s, x in mine if c < x.shape[1]])
+    if origin:
+        turn = np.exp(-1j * origin * angle)[:, None, None]
+        for part in (part for parts in sums for part in parts):
+            part *= turn
+    return [[np.swapaxes(part, 1, 2) for part in parts] for parts in sums]
+
+
+def _check(samples: int, angle: Angles, windows: Layout, detrend: str) -> None:
+    if detrend not in _TRENDS:
+        raise ValueError(f"detrend is {detrend!r}: use none, constant or linear")
+    if not angle.size or not np.all(np.abs(angle) <= np.pi):
+        worst = max(angle.tolist(), key=abs, default=None)
+        raise ValueError(
+            f"angle {worst} rad per sample is not within -pi to pi, the Nyquist frequency: give at "
+            "least one frequency, and none above half the sample rate"
+        )
+    if not windows:
+        raise ValueError("there are no windows: give at least one pair (length, starts)")
+    for length, starts in windows:
+        if length < 2 or not starts or min(starts) < 0 or max(starts) + length > samples:
+            raise ValueError(
+                f"windows of {length} samples that start at {min(starts, default=None)} to "
+                f"{max(starts, default=None)} do not fit a record of {samples} samples: starts "
+                f"must lie between 0 and {samples - length}, and a window must hold 2 samples"
+            )
+
+
+class _Blocks(NamedTuple):
+    """Blocks that cover a record: `size` samples each, `lead` of the first before the record."""
+
+    size: int
+    lead: int
+    count: int
+    angle: tuple[float, ...]  # rad per sample
+    reach: float  # rad per sample, of the shifted frequencies
+
+
+class _Waves(NamedTuple):
+    """exp(-j w n) on blocks at some frequencies, as coefficients of the blocks' functions."""
+
+    even: Float[np.ndarray, "frequencies even"]
+    odd: Float[np.ndarray, "frequencies odd"]
+    phase: Complex[np.ndarray, "frequencies blocks"]  # at the blocks' middles
+
+    def sums(
+        self, coefficients: Sequence[Float[np.ndarray, "_ blocks"]]
+    ) -> Complex[np.ndarray, "_ blocks"]:
+        """Fourier sums of blocks, but for the phase of their middles."""
+        sums = np.empty((len(self.even), coefficients[0].shape[1]), complex)
+        sums.real, sums.imag = self.even @ coefficients[0], self.odd @ coefficients[1]
+        return sums
+
+
+def _share_blocks(samples: int, angle: Angles, windows: Sequence) -> _Blocks:
+    """Blocks of about 50 rad, at whose ends as many windows as possible begin and end.
+
+    But for the first of each length, windows lie on blocks where one divides all their steps.
+    """
+    highest = float(np.max(np.abs(angle)))
+    ideal = int(np.clip(50 / max(highest, 1e-9), *_BLOCKS))
+    origin = windows[0][1][-1]
+    steps = [[length, *np.array((*starts[1:], origin)) - origin] for length, starts in windows]
+    common = int(np.gcd.reduce(np.concatenate(steps).astype(int)))
+    fitting = [n for n in range(max(ideal // 3, _BLOCKS[0]), 2 * ideal + 1) if common % n == 0]
+    size = min(fitting, key=lambda n: abs(np.log(n / ideal)), default=ideal)
+    lead = -origin % size if fitting else 0
+    reach = highest + 2 * np.pi / min(length for length, _ in windows)
+    return _Blocks(size, lead, -(-(lead + samples) // size), tuple(angle.tolist()), reach)
+
+
+@ft.lru_cache(maxsize=8)
+def _block_functions(size: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal even and odd functions on a block that span all waves up to `reach`."""
+    place, nodes = np.arange(size) - (size - 1) / 2, int(reach * size / 2) + 20
+    grid = reach * np.cos(np.pi / 2 * np.arange(nodes) / nodes)
+    functions = []
+    for wave in (np.cos, np.sin):
+        vectors, strength, _ = np.linalg.svd(wave(place[:, None] * grid), full_matrices=False)
+        few = strength > _TOLERANCE * np.sqrt(size * nodes)
+        functions.append(np.ascontiguousarray(vectors[:, few]))
+    return functions[0], functions[1]
+
+
+@ft.lru_cache(maxsize=16)
+def _block_waves(blocks: _Blocks, shift: float) -> _Waves:
+    """At all frequencies; with a shift, at these less it and then at these and it."""
+    angle = np.array(blocks.angle)
+    angle = np.concatenate([angle - shift, angle + shift]) if shift else angle
+    even, odd = _block_functions(blocks.size, blocks.reach)
+    place = angle[:, None] * (np.arange(blocks.size) - (blocks.size - 1) / 2)
+    # Powers of one turn, whose errors grow slowly: a large angle is rounded before its sine.
+    first = np.exp(-1j * angle * ((blocks.size - 1) / 2 - blocks.lead))
+    turn = np.repeat(np.exp(-1j * angle * blocks.size)[:, None], blocks.count - 1, axis=1)
+    phase = np.cumprod(np.concatenate([first[:, None], turn], axis=1), axis=1)
+    return _Waves(np.cos(place) @ even, -np.sin(place) @ odd, phase)
+
+
+class _Channel:
+    """One channel's blocks, their coefficients, and its running sums."""
+
+    def __init__(self, row: Float[np.ndarray, " samples"], blocks: _Blocks, detrend: str):
+        self.shared, self.trends = blocks, _TRENDS.index(detrend)
+        padded = np.zeros(blocks.count * blocks.size)
+        padded[blocks.lead : blocks.lead + row.size] = row
+        self.blocks = padded.reshape(blocks.count, blocks.size)
+        functions = _block_functions(blocks.size, blocks.reach)
+        self.coefficients = [each.T @ self.blocks.T for each in functions]
+        still = _block_waves(blocks, 0.0)
+        self.still = still.sums(self.coefficients) * still.phase
+        time = np.arange(row.size) - row.size / 2
+        moments = [row, row * time][: self.trends]
+        self.moments = [np.concatenate([[0.0], np.cumsum(each)]) for each in moments]
+
+    def sum_windows(
+        self,
+        length: int,
+        starts: tuple[int, ...],
+        into: Sequence[tuple[str, Complex[np.ndarray, "frequencies windows"]]],
+    ) -> None:
+        """Fill in the sums behind each taper."""
+        start, shift = np.array(starts), 2 * np.pi / length
+        still, below, above = self._plain(start, length, shift)
+        turn = np.exp(1j * shift * start)
+        below, above = below * turn.conj(), above * turn
+        angle = np.array(self.shared.angle)
+        middle = np.exp(-1j * angle[:, None] * (start + length / 2))
+        trends = self._trends(start, length)
+        for shape, sums in into:
+            level, cosine, sine = waves(shape)
+            sums[...] = level * still - cosine / 2 * (below + above)
+            if sine:
+                sums += 0.5j * sine * (below - above)
+            if self.trends:
+                sums -= _trend_sums(self.shared.angle, length, shape, self.trends) @ trends * middle
+
+    def _plain(
+        self, start: Int[np.ndarray, " windows"], length: int, shift: float
+    ) -> Complex[np.ndarray, "3 frequencies windows"]:
+        """Sums without a taper: at all frequencies, at these less the shift, and more."""
+        still, shifted = (_block_waves(self.shared, each) for each in (0.0, shift))
+        ends, back = np.unique(
+            np.concatenate([start, start + length]) + self.shared.lead, return_inverse=True
+        )
+        place, beyond = np.divmod(ends, self.shared.size)
+        whole, again = np.unique(place, return_inverse=True)
+        used = slice(whole[0], whole[-1])
+        moving = shifted.sums([each[:, used] for each in self.coefficients])
+        moving *= shifted.phase[:, used]
+        running = np.zeros((3 * len(still.even), whole.size), complex)
+        if whole.size > 1:
+            sums = np.concatenate([self.still[:, used], moving])
+            sums = np.add.reduceat(sums, whole[:-1] - whole[0], axis=1)
+            np.cumsum(sums, axis=1, out=running[:, 1:])
+        running = running[:, again]
+        part = np.flatnonzero(beyond)
+        if part.size:  # ends within a block
+            inside = np.arange(self.shared.size) < beyond[part, None]
+            samples = (self.blocks[place[part]] * inside).T
+            functions = _block_functions(self.shared.size, self.shared.reach)
+            few = [each.T @ samples for each in functions]
+            rest = [each.sums(few) * each.phase[:, place[part]] for each in (still, shifted)]
+            running[:, part] += np.concatenate(rest)
+        running = running[:, back]
+        plain = running[:, start.size :] - running[:, : start.size]
+        return plain.reshape(3, -1, start.size)
+
+    def _trends(
+        self, start: Int[np.ndarray, " windows"], length: int
+    ) -> Float[np.ndarray, "trends windows"]:
+        """Mean and slope of each window."""
+        parts = [each[start + length] - each[start] for each in self.moments]
+        if self.trends > 1:
+            middle = start + (length - 1) / 2 - (self.moments[0].size - 1) / 2
+            parts[1] = (parts[1] - parts[0] * middle) * 12 / (length * (length**2 - 1.0))
+        return np.stack([parts[0] / length, *parts[1:]]) if parts else np.zeros((0, start.size))
+
+
+@ft.lru_cache(maxsize=32)
+def _trend_sums(
+    angle: tuple[float, ...], length: int, shape: str, trends: int
+) -> Complex[np.ndarray, "frequencies trends"]:
+    """Those of a tapered constant, and of a ramp of slope 1."""
+    rows = np.stack([np.ones(length), np.arange(length) - (length - 1) / 2][:trends])
+    return _from_middle(rows[:, None] * window(shape, length), np.array(angle))[:, :, 0]
+
+
+def _sum_directly(
+    rows: Float[np.ndarray, "channels samples"],
+    angle: Angles,
+    length: int,
+    starts: tuple[int, ...],
+    into: Sequence[tuple[str, Sums]],
+    detrend: str,
+) -> None:
+    """The sums of short windows."""
+    start = np.array(starts)
+    segments = np.lib.stride_tricks.sliding_window_view(rows, length, axis=1)[:, start]
+    if detrend != "none":
+        segments = segments - np.mean(segments, axis=2, keepdims=True)
+    if detrend == "linear":
+        ramp = np.linspace(-1.0, 1.0, length)
+        segments -= (segments @ ramp / np.sum(ramp**2))[:, :, None] * ramp
+    middle = np.exp(-1j * angle[:, None] * (start + length / 2))[:, None]
+    for shape, sums in into:
+        tapered = segments[: sums.shape[1]] * window(shape, length)
+        sums[...] = _from_middle(tapered, angle) * middle
+
+
+def _from_middle(
+    segments: Float[np.ndarray, "channels windows samples"], angle: Angles
+) -> Complex[np.ndarray, "frequencies channels windows"]:
+    """Fourier sums with phases from the middle of a window.
+
+    Within short blocks and then over the blocks, so that few exponentials are needed.
+    """
+    *many, length = segments.shape
+    block = max(int(np.sqrt(length)), 1)
+    count = -(-length // block)
+    padded = np.pad(segments, ((0, 0), (0, 0), (0, count * block - length)))
+    inner = np.exp(-1j * np.arange(block)[:, None] * angle)
+    outer = np.exp(-1j * (np.arange(count)[:, None] * block - length / 2) * angle)
+    # Real factors: a product of a real with a complex array would double the arithmetic.
+    parts = padded.reshape(-1, block) @ np.hstack([np.real(inner), np.imag(inner)])
+    real, imag = np.split(parts.reshape(*many, count, -1), 2, axis=3)
+    return np.einsum("cwbf,bf->fcw", real + 1j * imag, outer)
