@@ -71,12 +71,12 @@ class Jit:
         """The same for arguments that the caller has taken apart."""
         if not _is_outermost(leaves):
             return self._plain(*args)
-        kind = lambda: (self._function, str(structure), *map(_kind, _apart(leaves)[0]))
+        kind = lambda: (self._function, str(structure), *map(_kind, _arrays_and_others(leaves)[0]))
         run = lambda: self._run(args, leaves, structure)
         return compilers().or_plain(self._function.__name__, kind, run)
 
     def _run(self, args: PyTree, leaves: list, structure: PyTree) -> PyTree:
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         try:
             with _Silence():  # errors of what runs are raised here
                 return jax.block_until_ready(self._programs.of(structure, others)(arrays))
@@ -88,7 +88,7 @@ class Jit:
     def lower(self, *args: PyTree) -> jax.stages.Lowered:
         """What a call with such arguments, outside of other programs, compiles."""
         leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         return self._programs.of(structure, others).plain.lower(arrays)
 
     def is_outermost(self, *args: PyTree) -> bool:
@@ -98,7 +98,7 @@ class Jit:
     def is_new(self, *args: PyTree) -> bool:
         """Whether nobody has asked before for arguments that have the same program."""
         leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         kind = structure, others, _kinds(arrays)
         is_new = kind not in self._met
         self._met.add(kind)
@@ -107,7 +107,7 @@ class Jit:
     def begin(self, *args: PyTree) -> None:
         """Trace and lower what the first call with such arguments will compile."""
         leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         self._programs.of(structure, others).begin(arrays)
 
 
@@ -119,7 +119,7 @@ class KeptPrograms:
 
     def __call__(self, *args: PyTree) -> PyTree:
         leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         return self.of(structure, others)(arrays)
 
     def of_arrays(
@@ -134,7 +134,7 @@ class KeptPrograms:
         def run(arrays: Sequence[Numbers]) -> PyTree:
             if not program:
                 leaves, structure = jax.tree.flatten(fill(arrays))
-                in_order, others = _apart(leaves)
+                in_order, others = _arrays_and_others(leaves)
                 if list(map(id, in_order)) != list(map(id, arrays)):
                     raise ValueError(
                         "the arrays are not those of the arguments' leaves, in their order"
@@ -145,7 +145,7 @@ class KeptPrograms:
         return run
 
 
-def _apart(leaves: Sequence[Any]) -> tuple[list[Any], Others]:
+def _arrays_and_others(leaves: Sequence[Any]) -> tuple[list[Any], Others]:
     arrays = [x for x in leaves if isinstance(x, _ARRAYS)]
     if len(arrays) == len(leaves):
         return arrays, ()
@@ -181,7 +181,7 @@ class _Program:
         def run(arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
             args = jax.tree.unflatten(structure, _together(arrays, others))
             leaves, form = jax.tree.flatten(function(*args))
-            results, rest = _apart(leaves)
+            results, rest = _arrays_and_others(leaves)
             return results, _Form(form, rest)
 
         run.__name__ = function.__name__

@@ -187,7 +187,7 @@ def run_ensemble(
     parts: PyTree,
     signals: PyTree,
     *,
-    own: PyTree,
+    of_members: PyTree,
     chunk: int | None = None,
 ) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` of an ensemble of loops: the last carry, and what each sample left.
@@ -204,35 +204,35 @@ def run_ensemble(
     - `carry`: before the first sample, with the members on the last axis.
     - `parts`: what does not change with time.
     - `signals`: [samples, ...], of which `now` is one sample.
-    - `own`: True for the arrays of (parts, signals) that have the members on their last axis; a
-        tree like these, or the top of one.
+    - `of_members`: True for the arrays of (parts, signals) that have the members on their last
+        axis; a tree like these, or the top of one.
     - `chunk`: members at a time; None is 128 on a CPU, or as many as a kernel holds.
 
     **Raises:** ValueError for a result that does not have the members on its last axis.
     """
 
-    def scan(given: PyTree) -> tuple[PyTree, PyTree]:
-        carry, (parts, signals) = given
+    def scan(args: PyTree) -> tuple[PyTree, PyTree]:
+        carry, (parts, signals) = args
         members = jax.tree.leaves(carry)[0].shape[-1]
         return scan_members(step, carry, parts, signals, members=members)
 
     chunk = chunk or most_at_once(carry, jax.tree.leaves(carry)[0].shape[-1])
-    return in_chunks(scan, (carry, (parts, signals)), (True, own), chunk)
+    return in_chunks(scan, (carry, (parts, signals)), (True, of_members), chunk)
 
 
 def in_chunks(
-    function: Callable[[PyTree], PyTree], given: PyTree, own: PyTree, chunk: int | None = None
+    function: Callable[[PyTree], PyTree], args: PyTree, of_members: PyTree, chunk: int | None = None
 ) -> PyTree:
-    """`function(given)` for `chunk` members after the others, where there are more than these.
+    """`function(args)` for `chunk` members after the others, where there are more than these.
 
-    None: 128 on a CPU, all of them elsewhere. `own` tells which arrays of `given` have the members
-    on the last axis; all results must have them there. Raises ValueError for one that has not.
+    None: 128 on a CPU, all of them elsewhere. `of_members` tells which arrays of `args` have the
+    members on the last axis; all results must have them there, or a ValueError is raised.
     """
-    theirs, common = eqx.partition(given, own)
+    theirs, common = eqx.partition(args, of_members)
     members = jax.tree.leaves(theirs)[0].shape[-1]
     size = _chunk_size(members, chunk or most_at_once())
     if members <= size:
-        return function(given)
+        return function(args)
     firsts = np.minimum(np.arange(0, members, size), members - size)  # the last two may overlap
     few = jax.tree.map(lambda x: _split(x, len(firsts), size), theirs)
     # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
@@ -240,7 +240,7 @@ def in_chunks(
 
     def put(room: PyTree, now: tuple[Array, PyTree]) -> tuple[PyTree, None]:
         first, few = now
-        return jax.tree.map(lambda whole, x: _placed(whole, x, first), room, run(few)), None
+        return jax.tree.map(lambda joined, x: _placed(joined, x, first), room, run(few)), None
 
     shapes = jax.eval_shape(run, jax.tree.map(lambda x: x[0], few))
     room = jax.tree.map(lambda x: _room(x, size, members), shapes)
@@ -265,8 +265,8 @@ def most_at_once(carry: PyTree = None, members: int = 1) -> int:
 def _split(x: Array, number: int, size: int) -> Array:
     """[number, ..., size], of which the last are the last of all."""
     first = x[..., : (number - 1) * size].reshape(*x.shape[:-1], number - 1, size)
-    whole = jnp.concatenate([first, x[..., None, -size:]], axis=-2)
-    return jnp.moveaxis(whole, -2, 0)
+    rows = jnp.concatenate([first, x[..., None, -size:]], axis=-2)
+    return jnp.moveaxis(rows, -2, 0)
 
 
 def _room(x: jax.ShapeDtypeStruct, size: int, members: int) -> Array:
@@ -279,5 +279,5 @@ def _room(x: jax.ShapeDtypeStruct, size: int, members: int) -> Array:
     return jnp.zeros((*x.shape[:-1], members), x.dtype)
 
 
-def _placed(whole: Array, part: Array, first: Int[Array, ""]) -> Array:
-    return jax.lax.dynamic_update_slice_in_dim(whole, part, first, whole.ndim - 1)
+def _placed(joined: Array, part: Array, first: Int[Array, ""]) -> Array:
+    return jax.lax.dynamic_update_slice_in_dim(joined, part, first, joined.ndim - 1)
