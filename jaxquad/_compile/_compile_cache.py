@@ -45,11 +45,16 @@ def enable_compile_cache() -> Path | None:
     jax_folder = _jax_folder()
     if jax_folder is not None:
         return jax_folder.parent if _is_own(jax_folder) else jax_folder
-    shared = _shared_folder()
+    folder = os.environ.get(_VARIABLE)
+    default = Path(platformdirs.user_cache_dir("jaxquad")) / f"programs-{_processor()}"
+    shared = Path(folder).absolute() if folder else default
     try:
         shared.mkdir(parents=True, exist_ok=True)
         _prune(shared)
-        mine = _linked(shared)
+        mine = Path(tempfile.mkdtemp(prefix=_OWN, dir=shared))
+        for path in shared.glob(_ENTRIES):
+            with contextlib.suppress(FileNotFoundError):  # Another process has just removed it.
+                os.link(path, mine / path.name)
     except OSError as error:
         warnings.warn(
             f"compiled programs are not kept: {error}. Name another folder by {_VARIABLE}, or "
@@ -57,7 +62,13 @@ def enable_compile_cache() -> Path | None:
             stacklevel=2,
         )
         return None
-    _use(mine)
+    jax.config.update("jax_compilation_cache_dir", str(mine))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST)
+    # Else the name of this process's folder is part of what programs are found by.
+    jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
+    compilation_cache.reset_cache()  # An earlier compilation has fixed that there is none.
+    atexit.register(shutil.rmtree, mine, ignore_errors=True)
+    atexit.register(share_programs)
     return shared
 
 
@@ -75,13 +86,6 @@ def own_folder() -> Path | None:
 
 def _is_own(folder: Path) -> bool:
     return folder.name.startswith(_OWN)
-
-
-def _shared_folder() -> Path:
-    folder = os.environ.get(_VARIABLE)
-    if folder:
-        return Path(folder).absolute()
-    return Path(platformdirs.user_cache_dir("jaxquad")) / f"programs-{_processor()}"
 
 
 def _processor() -> str:
@@ -106,26 +110,6 @@ def _prune(shared: Path) -> None:
     for folder in shared.glob(f"{_OWN}*"):
         if folder.stat().st_mtime < time.time() - _ABANDONED:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _linked(shared: Path) -> Path:
-    mine = Path(tempfile.mkdtemp(prefix=_OWN, dir=shared))
-    for path in shared.glob(_ENTRIES):
-        try:
-            os.link(path, mine / path.name)
-        except FileNotFoundError:  # Another process has just removed it.
-            continue
-    return mine
-
-
-def _use(mine: Path) -> None:
-    jax.config.update("jax_compilation_cache_dir", str(mine))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST)
-    # Else the name of this process's folder is part of what programs are found by.
-    jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
-    compilation_cache.reset_cache()  # An earlier compilation has fixed that there is none.
-    atexit.register(shutil.rmtree, mine, ignore_errors=True)
-    atexit.register(share_programs)
 
 
 def share_programs() -> None:

@@ -104,12 +104,6 @@ class Jit:
         self._met.add(kind)
         return is_new
 
-    def begin(self, *args: PyTree) -> None:
-        """Trace and lower what the first call with such arguments will compile."""
-        leaves, structure = jax.tree.flatten(args)
-        arrays, others = _arrays_and_others(leaves)
-        self._programs.of(structure, others).begin(arrays)
-
 
 class KeptPrograms:
     """`function` of arrays and settings, by programs that can outlive the process."""
@@ -169,7 +163,6 @@ class _Form:
 
 
 _Call = Callable[[Sequence[Numbers]], PyTree]
-_Lowered = tuple[jax.stages.Lowered, _Form]
 
 
 class _Program:
@@ -189,7 +182,6 @@ class _Program:
         self._settings = structure, others
         self.plain = jax.jit(run, compiler_options=options() or None)
         self._compiled: dict[tuple, _Call] = {}
-        self._lowered: dict[tuple, _Lowered] = {}
         self._lock = threading.Lock()
 
     def __call__(self, arrays: Sequence[Numbers]) -> PyTree:
@@ -199,21 +191,10 @@ class _Program:
         kinds = _kinds(arrays)
         with self._lock:
             if kinds not in self._compiled:
-                self._compiled[kinds] = self._find(arrays, kinds, folder)
+                self._compiled[kinds] = self._find(arrays, folder)
         return self._compiled[kinds](arrays)
 
-    def begin(self, arrays: Sequence[Numbers]) -> None:
-        """Trace and lower the program, unless it is there."""
-        folder, name = _folder(), self._name(arrays)
-        if folder is None or name is None:
-            self.plain.lower(arrays)
-            return
-        kinds = _kinds(arrays)
-        with self._lock:
-            if not ((folder / name).is_file() or kinds in self._compiled):
-                self._lowered[kinds] = self._lower(name, arrays)
-
-    def _find(self, arrays: Sequence[Numbers], kinds: tuple, folder: Path) -> _Call:
+    def _find(self, arrays: Sequence[Numbers], folder: Path) -> _Call:
         """From the disk or the compiler; by `jax.jit` where it has no name."""
         name = self._name(arrays)
         if name is None:
@@ -222,7 +203,7 @@ class _Program:
         program = _read(path, len(arrays)) if path.is_file() else None
         if program is not None:
             return program
-        lowered, form = self._lowered.pop(kinds, None) or self._lower(name, arrays)
+        lowered, form = self._lower(name, arrays)
         _remove_of_jax(name)  # what JAX takes from its own files cannot be written again
         run = lowered.compile()
         _remove_of_jax(name)
@@ -233,7 +214,7 @@ class _Program:
         results, form = self.plain(arrays)
         return form.filled(results)
 
-    def _lower(self, name: str, arrays: Sequence[Numbers]) -> _Lowered:
+    def _lower(self, name: str, arrays: Sequence[Numbers]) -> tuple[jax.stages.Lowered, _Form]:
         forms: list[_Form] = []
 
         def run(arrays: Sequence[Any]) -> list[Any]:

@@ -64,7 +64,8 @@ def make_grid(distributions: Sequence[Distribution], members: int) -> Shares:
         near = " or ".join(str(k ** len(distributions)) for k in (below, below + 1))
         raise ValueError(
             f"a grid over {len(distributions)} quantities has equally many levels of each, so "
-            f'{members} members do not fill one: draw {near}, or use sampling="latin" for any number'
+            f"{members} members do not fill one: draw {near}, or use "
+            'sampling="latin" for any number'
         )
     levels = np.meshgrid(*(one.grid_levels(count) for one in distributions), indexing="ij")
     return np.stack([level.ravel() for level in levels])
