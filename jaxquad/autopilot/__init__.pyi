@@ -1,6 +1,6 @@
 from ._adrc import ADRCProposal as ADRCProposal, propose_adrc as propose_adrc
 from ._adrc_loops import Flown as Flown, gyro_filters as gyro_filters
-from ._adrc_result import ADRCAutopilot as ADRCAutopilot
+from ._adrc_result import ADRCAutopilot as ADRCAutopilot, doubted_throttle as doubted_throttle
 from ._adrc_stages import ADRCStage as ADRCStage, ADRCTargets as ADRCTargets
 from ._axes_proposal import AxesProposal as AxesProposal
 from ._choices import (

@@ -222,7 +222,7 @@ class AutopilotProposal:
         plant = "plant up to the gyro's filters, in the firmware's units"
         lines += ["", f"{plant}:\n{self.identification.fit}"]
         again = self.reproduction
-        if again is not None and again.verdict not in self.verdict:
+        if again is not None and again.kind == "flown":  # else the verdict says it
             lines += ["", f"flown loop: {again.verdict}"]
         if self.stages:
             lines += ["", _stage_table(self.stages)]

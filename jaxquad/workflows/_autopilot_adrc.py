@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxquad.autopilot import (
     ADRCTargets,
     betaflight_adrc_loop,
     betaflight_loop,
+    doubted_throttle,
     FilterChain,
     flies_adrc,
     FlightChannels,
@@ -92,7 +93,10 @@ def _tuned(found: ADRCAutopilot, plant: GainOverThrottle, asked: IdentifySetting
             for level, x in enumerate(plant.throttle)
         }
         found = dataclasses.replace(found, reproductions=again)
-        if why := _doubt(again):
+        if (doubted := doubted_throttle(again)) is not None:
+            why = again[doubted].verdict
+            if again[doubted].kind == "not flown":
+                why = f"this log cannot tell: at {doubted:.2f} throttle {why}"
             return dataclasses.replace(found, verdict=why)
         made = propose_adrc(
             plant, found.flown, found.axis, hover=settings.hover, members=settings.members,
@@ -195,13 +199,3 @@ def _respond(path: Path, asked: IdentifySettings, plant: GainOverThrottle) -> Fr
         list(read_records(path, asked)), np.geomspace(*band, _LINES),
         estimator=JointInputOutput(local) if asked.reference else local,
     )  # fmt: skip
-
-
-def _doubt(again: Mapping[float, Reproduction]) -> str:
-    """Why the flown loop is not reproduced; empty where it is at one level, and off at none."""
-    for throttle, each in again.items():
-        if each.kind == "not flown":
-            return f"this log cannot tell: at {throttle:.2f} throttle {each.verdict}"
-    if all(each.kind == "unknown" for each in again.values()):
-        return next(each.verdict for each in again.values())
-    return ""

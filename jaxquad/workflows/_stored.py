@@ -47,7 +47,7 @@ def write_identification(found: Identification, folder: Path) -> Path:
         "band_rad_per_s": found.band,
         "band_hz": [omega / (2 * np.pi) for omega in found.band],
         "used_band_rad_per_s": found.fit.used_band,
-        "derived": [each._asdict() for each in found.combinations],
+        "derived": [each.content() for each in found.combinations],
         "provenance": origin.content(),
         **({"gyro_filters": found.flown.content()} if found.flown and found.filters else {}),
         **_content_beside(found),
