@@ -185,11 +185,7 @@ def fit_content(fit: "Fit") -> dict[str, object]:
         **known,
         "parameters": [_parameter(fit, k) for k in range(len(fit.names))],
         "tied": [_tied_content(each) for each in fit.tied],
-        "combinations": [
-            {key: value for key, value in combination._asdict().items() if key != "sum_of"}
-            | {"interval_95": combination.interval}
-            for combination in fit.combinations
-        ],
+        "combinations": [combination.to_dict() for combination in fit.combinations],
         "null_directions": fit.verdict.null_directions,
         "covariance": fit.covariance,
         "noise_covariance": fit.noise_covariance,

@@ -77,6 +77,11 @@ class Combination(NamedTuple):
         reach = reach_of_interval(self.degrees_of_freedom, level) * self.standard_error
         return self.value - reach, self.value + reach
 
+    def to_dict(self) -> dict[str, object]:
+        """As in result files."""
+        content = {key: value for key, value in self._asdict().items() if key != "sum_of"}
+        return content | {"interval_95": self.interval}
+
     def __str__(self) -> str:
         low, high = self.interval
         unit = f" {self.unit}" if self.unit else ""
