@@ -291,6 +291,7 @@ class GainOverThrottle(eqx.Module):
     def to_dict(self) -> dict[str, object]:
         """All numbers as JSON holds them: None for what is not finite or not determined."""
         curve, line = self.curve, self._line()
+        content = lambda number: {**number.content(), "interval_95": number.interval}
         levels = [
             {
                 "throttle": self.throttle[k],
@@ -299,7 +300,7 @@ class GainOverThrottle(eqx.Module):
                 "gain": self.gain[k],
                 "gain_standard_error": self.gain_errors[k],
                 "gain_interval_95": self.fit.interval(f"gain[{k}]"),
-                "b0": self.b0(k).to_dict() if self._knows_lag else None,
+                "b0": content(self.b0(k)) if self._knows_lag else None,
             }
             for k in range(self.throttle.size)
         ]
@@ -308,7 +309,7 @@ class GainOverThrottle(eqx.Module):
                 "input_unit": self.input_unit,
                 "output_unit": self.output_unit,
                 "levels": levels,
-                "curve": None if curve is None else curve.to_dict(),
+                "curve": None if curve is None else content(curve),
                 "curve_flown": self.flown,
                 "probability_of_curve": None if line is None else line.probability,
                 "firmware": [value.content() for value in self._firmware_values()],

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Complex, Float
 
-from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
+from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._average import average, Averaged, Channels
@@ -268,7 +268,6 @@ def remarks_on_leakage(
 
 
 Method = Literal["direct", "joint"]
-_HELD = 4  # numbers to each sample of a channel that an estimate holds at a time
 _CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
     "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
@@ -288,7 +287,6 @@ def average_windows(
         (spectra,) if isinstance(spectra, Welch) else Composite.windowed(spectra, records, omega)
     )
     omega = frequencies_for(omega, records, members[0])
-    keep_freed_memory(8 * _HELD * sum(record.samples * len(record.names) for record in records))
     segments = transform_records(records, omega, members, derivatives=2)
     channels = _channels(records[0], method)
     independent = _independent(records, segments.groups)

@@ -185,7 +185,10 @@ def fit_content(fit: "Fit") -> dict[str, object]:
         **known,
         "parameters": [_parameter(fit, k) for k in range(len(fit.names))],
         "tied": [_tied_content(each) for each in fit.tied],
-        "combinations": [combination.to_dict() for combination in fit.combinations],
+        "combinations": [
+            combination.content() | {"interval_95": combination.interval}
+            for combination in fit.combinations
+        ],
         "null_directions": fit.verdict.null_directions,
         "covariance": fit.covariance,
         "noise_covariance": fit.noise_covariance,
