@@ -11,10 +11,10 @@ from jaxquad.models import Model
 from jaxquad.records import Record
 
 from ._checks import check_compatible, check_references, in_hertz
-from ._density import spectral_density
 from ._estimators import Welch
 from ._frequency_response import FrequencyResponse
 from ._remarks import Remark
+from ._welch import spectral_density
 
 
 _AMPLIFIED = 10.0  # factor on the relative error from which a remark is made
