@@ -1,10 +1,8 @@
-from ._broken_loop import (
+from ._closed_loop import (
     BrokenLoop as BrokenLoop,
+    deembed as deembed,
     Entry as Entry,
     estimate_broken_loop as estimate_broken_loop,
-)
-from ._closed_loop import (
-    deembed as deembed,
     feedback_bias as feedback_bias,
     FeedbackBias as FeedbackBias,
 )
