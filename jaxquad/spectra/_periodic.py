@@ -335,8 +335,8 @@ def _remarks(
     departures = [one.departure for one in periods if one.departure > _UNSETTLED]
     if departures:
         text = (
-            f"the first period differs from the later ones by {max(departures):.3g} times the noise "
-            "power, because a transient remains: discard more periods"
+            f"the first period differs from the later ones by {max(departures):.3g} times the "
+            "noise power, because a transient remains: discard more periods"
         )
         remarks.append(Remark(text))
     if np.any(scatter.significant):
