@@ -5,6 +5,7 @@ from ._arrays import (
     as_float_or_none as as_float_or_none,
     is_zero as is_zero,
     on_host as on_host,
+    pytree_node as pytree_node,
 )
 from ._checks import (
     is_concrete as is_concrete,
@@ -18,7 +19,6 @@ from ._checks import (
     require_vector as require_vector,
     whole_samples as whole_samples,
 )
-from ._files import write_file as write_file
 from ._gains import (
     broadcast_gain as broadcast_gain,
     match_reference as match_reference,
@@ -30,8 +30,6 @@ from ._gains import (
     require_sample_interval as require_sample_interval,
     signal_shape as signal_shape,
 )
-from ._garbage import collect_seldom as collect_seldom
-from ._json import plain_content as plain_content
 from ._levenberg_marquardt import (
     advance as advance,
     begin as begin,
@@ -54,20 +52,27 @@ from ._members import (
     mark_members as mark_members,
     per_member as per_member,
 )
-from ._message import as_messages as as_messages, marked_text as marked_text, Message as Message
-from ._ours import is_ours as is_ours
-from ._process import (
+from ._message import (
+    as_messages as as_messages,
+    is_ours as is_ours,
+    marked_text as marked_text,
+    Message as Message,
+)
+from ._output import (
+    announce as announce,
+    plain_content as plain_content,
+    STAGES as STAGES,
+    write_file as write_file,
+)
+from ._precision import (
     enable_x64 as enable_x64,
-    keep_freed_memory as keep_freed_memory,
-    one_blas_thread as one_blas_thread,
     PrecisionError as PrecisionError,
     require_float64 as require_float64,
     require_x64 as require_x64,
 )
-from ._pytree_node import pytree_node as pytree_node
-from ._stages import announce as announce, STAGES as STAGES
 from ._threads import (
     available_cores as available_cores,
     map_in_threads as map_in_threads,
+    one_blas_thread as one_blas_thread,
     thread_settings as thread_settings,
 )

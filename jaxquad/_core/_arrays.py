@@ -1,8 +1,10 @@
-"""Arrays of JAX from what a user gives."""
+"""Arrays of JAX from what a user gives, and data that JAX looks into."""
 
-from collections.abc import Sequence
-from typing import TypeVar
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import dataclass_transform, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +19,7 @@ Tree = TypeVar("Tree")
 def as_float(x: ArrayLike | Sequence) -> Array:
     """`x` as an array of the default float type (a list of integers too)."""
     dtype = jnp.result_type(float)
-    if any(isinstance(each, jax.Array) for each in jax.tree.leaves(x)):
+    if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(x)):
         return jnp.asarray(x, dtype=dtype)
     # Of numbers jnp.asarray compiles a program for each new shape.
     return jax.device_put(np.asarray(x, dtype=dtype))
@@ -30,8 +32,8 @@ def as_array(x: ArrayLike) -> Array:
 
 def on_host(tree: Tree) -> Tree:
     """With the arrays of JAX as NumPy's, whose operations compile nothing; those traced stay."""
-    known = lambda x: isinstance(x, jax.Array) and is_concrete(x)
-    return jax.tree.map(lambda x: np.asarray(x) if known(x) else x, tree)
+    has_values = lambda x: isinstance(x, jax.Array) and is_concrete(x)
+    return jax.tree.map(lambda x: np.asarray(x) if has_values(x) else x, tree)
 
 
 def as_float_or_none(x: ArrayLike | Sequence | None) -> Array | None:
@@ -52,3 +54,38 @@ def align(parameter: Array, state: Array) -> Array:
 def is_zero(x: Array | np.ndarray) -> bool:
     """Whether `x` is known to be 0 everywhere."""
     return is_concrete(x) and not np.any(np.asarray(x))  # jnp would trace even a constant
+
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, eqx.field))
+def pytree_node(cls: type[T]) -> type[T]:
+    """A frozen dataclass that is a pytree; fields with `eqx.field(static=True)` are static.
+
+    An `eqx.Module` checks itself when it is made, and wraps each of its methods when it is looked
+    up: tens of microseconds that add up to half of a small fit. Copies that JAX makes run no
+    `__init__` (those of `jax.tree_util.register_dataclass` do): they hold what stands for arrays.
+    """
+    cls.__repr__ = lambda self: eqx.tree_pformat(self)
+    cls = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
+    fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+    static = [x.name for x in fields if x.metadata.get("static", False)]
+    data = [x.name for x in fields if x.name not in static]
+    keys = [jax.tree_util.GetAttrKey(name) for name in data]
+
+    def flatten(node: T) -> tuple[list, tuple]:
+        values = vars(node)
+        return [values[name] for name in data], tuple([values[name] for name in static])
+
+    def flatten_with_keys(node: T) -> tuple[list, tuple]:
+        leaves, rest = flatten(node)
+        return list(zip(keys, leaves, strict=True)), rest
+
+    def unflatten(rest: tuple, leaves: Iterable) -> T:
+        node = object.__new__(cls)
+        vars(node).update(zip([*data, *static], [*leaves, *rest], strict=True))
+        return node
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls

@@ -46,3 +46,8 @@ def marked_text(text: object) -> str:
 def as_messages(texts: Iterable[str]) -> tuple[Message, ...]:
     """Each text as a message; what is one stays what it is."""
     return tuple(text if isinstance(text, Message) else Message(text) for text in texts)
+
+
+def is_ours(kind: type[BaseException]) -> bool:
+    """Whether a class of errors or warnings is the package's; those of NumPy, for one, are not."""
+    return kind.__module__.partition(".")[0] == "jaxquad"

@@ -1,33 +1,28 @@
-"""Threads beside that of a caller, which compute only what they would compute in its place."""
+"""Threads and cores: which compute only what a caller would compute in their place."""
 
+import contextlib
+import functools as ft
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-
-Given = TypeVar("Given")
-Found = TypeVar("Found")
+import threadpoolctl
 
 
-def map_in_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> list[Found]:
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """`function` of each, on all cores, while the next ones are drawn from an iterator.
 
     One after the other where JAX is set differently for the caller's thread alone.
     """
-    settings, items = thread_settings(), []
-
-    def remember() -> Iterable[Given]:
-        for each in given:
-            items.append(each)
-            yield each
-
-    def run(each: Given) -> tuple[Found] | None:
-        return (function(each),) if thread_settings() == settings else None
-
     with ThreadPoolExecutor(max(available_cores(), 2)) as pool:
-        found = list(pool.map(run, remember()))
-    return [function(x) if y is None else y[0] for x, y in zip(items, found, strict=True)]
+        if pool.submit(thread_settings).result() != thread_settings():
+            return [function(x) for x in items]
+        return list(pool.map(function, items))
 
 
 def available_cores() -> int:
@@ -52,3 +47,21 @@ def thread_settings() -> tuple[object, ...]:
         config.jax_numpy_rank_promotion,  # pyright: ignore[reportAttributeAccessIssue]
         config.jax_numpy_dtype_promotion,  # pyright: ignore[reportAttributeAccessIssue]
     )
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Within it, NumPy's and SciPy's BLAS has one thread, in the whole process.
+
+    The environment's OPENBLAS_NUM_THREADS and its kin count only before NumPy is imported.
+    """
+    with _libraries().limit(limits=1, user_api="blas"):
+        yield
+
+
+@ft.cache  # to look for them takes as long as a small fit
+def _libraries() -> threadpoolctl.ThreadpoolController:
+    import scipy.linalg.lapack  # SciPy has a BLAS of its own, and only loaded ones are limited
+
+    del scipy
+    return threadpoolctl.ThreadpoolController()

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from jaxquad._core import plain_content
 
 from ._flight_channels import FlightChannels
-from ._flown import FlownLoop
-from ._law import pick_axis
+from ._law import FlownLoop, pick_axis
 from ._replay import replay_terms
 
 
@@ -176,7 +175,7 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
     )  # fmt: skip
     if flight.slewed is not None:
         terms |= {name: terms[name] * flight.slewed[:, None] for name in "PD"}
-    if "I" in logged and any("anti-gravity" in each for each in law.unmodelled):
+    if "I" in logged and any(each.kind == "anti-gravity" for each in law.unmodelled):
         terms["I"] = np.repeat(logged.pop("I")[:, None], many, axis=1)  # not judged
     if forward is not None:
         terms["F"] = np.repeat(forward[:, None], many, axis=1)

@@ -1,7 +1,9 @@
 """What several commands share: how a command is declared, and how results are shown."""
 
 import argparse
+import atexit
 import contextlib
+import gc
 import json
 import os
 import sys
@@ -9,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jaxquad._core import collect_seldom
 from jaxquad.workflows import (
     AutopilotSettings,
     BatchSettings,
@@ -188,7 +189,7 @@ def start_computing() -> None:
 
     What a command can say without JAX it says before.
     """
-    collect_seldom()
+    atexit.register(gc.freeze)  # Python's last look for garbage takes half a second
     from jaxquad._compile import enable_compile_cache
     from jaxquad._core import enable_x64
 

@@ -1,11 +1,5 @@
 """Predicted accuracy of a test, and multisines optimised for it."""
 
-from ._criteria import (
-    AOptimal as AOptimal,
-    Criterion as Criterion,
-    DOptimal as DOptimal,
-    LargestError as LargestError,
-)
 from ._optimal_multisine import Design as Design, optimal_multisine as optimal_multisine
 from ._prediction import (
     information_per_energy as information_per_energy,
@@ -15,7 +9,11 @@ from ._prediction import (
     Prediction as Prediction,
 )
 from ._search import (
+    AOptimal as AOptimal,
     certify_powers as certify_powers,
+    Criterion as Criterion,
+    DOptimal as DOptimal,
+    LargestError as LargestError,
     least_peak_phases as least_peak_phases,
     multisine_peaks as multisine_peaks,
     multisine_signals as multisine_signals,

@@ -8,9 +8,16 @@ from jaxquad._core import require_all_positive, require_x64, whole_samples
 from jaxquad.excitation import check_lines, Excitation, harmonics
 from jaxquad.identify import Free, select_parameters
 
-from ._criteria import Criterion, DOptimal
 from ._prediction import check_distinct, Noise, Prediction, unit_information
-from ._search import gather_limits, multisine_signals, Plan, search, Trial
+from ._search import (
+    Criterion,
+    DOptimal,
+    gather_limits,
+    multisine_signals,
+    Plan,
+    search,
+    Trial,
+)
 
 
 class Design(eqx.Module):
@@ -139,91 +146,51 @@ def optimal_multisine(
     """
     require_x64("a design")
     models = list(model) if isinstance(model, list | tuple) else [model]
-    samples = _whole_period(models, amplitude, period, periods, sample_rate)
-    offered = _offered(band, omega, period, sample_rate)
-    parameters = [select_parameters(each, free) for each in models]
-    if len({each.names for each in parameters}) > 1:
-        sets = "; ".join(", ".join(each.names) for each in parameters)
-        raise ValueError(
-            f"the models have different free parameters: {sets}; give models of one form"
-        )
-    names, seconds = parameters[0].names, float(period * periods)
-    found = [
-        unit_information(m, p, offered, noise, input)
-        for m, p in zip(models, parameters, strict=True)
-    ]
-    for _, unit in found:
-        check_distinct(unit.sum(axis=0), names)
-    limits = gather_limits(offered, [r for r, _ in found], amplitude, rate, output_amplitude)
-    per_power = seconds * np.stack([unit for _, unit in found])
-    orders = np.round(offered * period / (2 * np.pi)).astype(int)
-    plan = Plan(offered, orders, samples, names, per_power, limits, criterion)
-    best = search(plan, _least_lines(lines, len(names), offered.size), seed)
-    return _design(plan, best, periods, float(sample_rate))
-
-
-def _whole_period(
-    models: list[PyTree], amplitude: Number, period: Number, periods: int, sample_rate: Number
-) -> int:
-    """Samples of a period."""
     if not models:
         raise ValueError("the list of models is empty: give one, or several that may be true")
     require_all_positive(amplitude=amplitude, period=period, sample_rate=sample_rate)
     if periods < 1 or periods != int(periods):
         raise ValueError(f"periods is {periods}: give a whole number, 1 or more")
-    return whole_samples("period", period, sample_rate)
-
-
-def _offered(
-    band: tuple[Number, Number] | None, omega: Lines | None, period: Number, sample_rate: Number
-) -> Lines:
+    samples = whole_samples("period", period, sample_rate)
     if (band is None) == (omega is None):
         raise ValueError(
             "give either band=(low, high) or omega=, the lines to choose from, in rad/s"
         )
-    omega = np.asarray(omega, float) if band is None else harmonics(*band, period=period)
-    check_lines(omega, period, sample_rate)
-    return omega
-
-
-def _least_lines(lines: int | None, parameters: int, offered: int) -> tuple[int, ...]:
-    """The least numbers of lines to try."""
+    offered = np.asarray(omega, float) if band is None else harmonics(*band, period=period)
+    check_lines(offered, period, sample_rate)
+    parameters = [select_parameters(one, free) for one in models]
+    names, seconds = parameters[0].names, float(period * periods)
+    if any(one.names != names for one in parameters):
+        sets = "; ".join(", ".join(one.names) for one in parameters)
+        raise ValueError(
+            f"the models have different free parameters: {sets}; give models of one form"
+        )
+    pairs = zip(models, parameters, strict=True)
+    parts = [unit_information(*pair, offered, noise, input) for pair in pairs]
+    responses, units = zip(*parts, strict=True)
+    for unit in units:
+        check_distinct(unit.sum(axis=0), names)
+    limits = gather_limits(offered, responses, amplitude, rate, output_amplitude)
+    orders = np.round(offered * period / (2 * np.pi)).astype(int)
+    plan = Plan(offered, orders, samples, names, seconds * np.stack(units), limits, criterion)
     if lines is None:
-        tried = [each * parameters for each in _LINES if each * parameters <= offered // 2]
-        return tuple(tried) or (max(1, offered // 2),)
-    if not 1 <= lines <= offered:
-        raise ValueError(f"lines is {lines}, but {offered} lines are offered: give 1 to {offered}")
-    return (int(lines),)
+        least = [k * len(names) for k in _LINES if k * len(names) <= offered.size // 2]
+        least = least or [max(1, offered.size // 2)]
+    elif 1 <= lines <= offered.size:
+        least = [int(lines)]
+    else:
+        raise ValueError(
+            f"lines is {lines}, but {offered.size} lines are offered: give 1 to {offered.size}"
+        )
+    return _design(plan, search(plan, tuple(least), seed), periods, float(sample_rate))
 
 
 def _design(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Design:
-    totals = np.einsum("f,mfpq->mpq", best.power, plan.per_power)
-    names, peaks = plan.limits.names, plan.limits.peaks
-    seconds = plan.samples * periods / sample_rate
-    return Design(
-        excitation=_excitation(plan, best, periods, sample_rate),
-        power=best.power[best.power > 0],
-        predictions=tuple(Prediction(plan.names, total, seconds) for total in totals),
-        offered=plan.omega,
-        dispersion=best.dispersion,
-        efficiency=best.efficiency,
-        limits={
-            name: (float(share * limit), float(limit))
-            for name, share, limit in zip(names, best.peaks, peaks, strict=True)
-        },
-        crest_factor=float(best.peaks[0] * peaks[0] / np.sqrt(best.power.sum())),
-        criterion=plan.criterion,
-        lines=best.lines,
-    )
-
-
-def _excitation(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Excitation:
-    """The signal from its sample nearest to zero on."""
     amplitudes = np.sqrt(2 * best.power).astype(complex)[None, :]
     wave = multisine_signals(plan.orders, best.phase, amplitudes, plan.samples)[0]
-    wave = np.roll(wave, -int(np.abs(wave).argmin()))
-    lines = plan.omega[best.power > 0]
-    return Excitation(
+    wave = np.roll(wave, -int(np.abs(wave).argmin()))  # from its sample nearest to zero on
+    lines, duration = plan.omega[best.power > 0], plan.samples * periods / sample_rate
+    excitation = Excitation(
         np.arange(plan.samples * periods) / sample_rate,
         np.tile(wave, periods),
         lines,
@@ -231,6 +198,20 @@ def _excitation(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Ex
         omega_min=float(lines[0]),
         omega_max=float(lines[-1]),
         amplitude=float(np.abs(wave).max()),
-        sample_rate=float(sample_rate),
-        duration=float(plan.samples * periods / sample_rate),
+        sample_rate=sample_rate,
+        duration=float(duration),
+    )
+    totals = np.einsum("f,mfpq->mpq", best.power, plan.per_power)
+    peaks = zip(plan.limits.names, best.peaks, plan.limits.peaks, strict=True)
+    return Design(
+        excitation=excitation,
+        power=best.power[best.power > 0],
+        predictions=tuple(Prediction(plan.names, total, duration) for total in totals),
+        offered=plan.omega,
+        dispersion=best.dispersion,
+        efficiency=best.efficiency,
+        limits={name: (float(share * limit), float(limit)) for name, share, limit in peaks},
+        crest_factor=float(best.peaks[0] * plan.limits.peaks[0] / np.sqrt(best.power.sum())),
+        criterion=plan.criterion,
+        lines=best.lines,
     )

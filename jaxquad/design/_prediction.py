@@ -26,44 +26,44 @@ class MeasuredNoise(eqx.Module):
 
     - `density`: of a record at rest, or of an excited one.
     - `outputs`: names of its channels.
-    - `given`: channels whose share is taken out, such as the input of an excited record. Only for
+    - `removed`: channels whose share is taken out, such as the input of an excited record. Only for
         an open loop: with feedback, part of the noise would count as explained.
     """
 
     density: SpectralDensity
     outputs: tuple[str, ...] = eqx.field(static=True)
-    given: tuple[str, ...] = eqx.field(static=True, default=())
+    removed: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __call__(self, omega: Lines) -> Matrices:
         """Covariances E[V V^H], one-sided, in output units squared per Hz."""
-        known = np.asarray(self.density.omega)
-        outside = (omega < known[0] * (1 - 1e-9)) | (omega > known[-1] * (1 + 1e-9))
+        measured = np.asarray(self.density.omega)
+        outside = (omega < measured[0] * (1 - 1e-9)) | (omega > measured[-1] * (1 + 1e-9))
         if outside.any():
             raise ValueError(
-                f"the noise is known from {known[0]:.4g} to {known[-1]:.4g} rad/s, not at "
+                f"the noise is known from {measured[0]:.4g} to {measured[-1]:.4g} rad/s, not at "
                 f"{omega[outside][0]:.4g} rad/s: narrow the band, or give spectral_density omega="
             )
-        place, values = np.log(known), self._unexplained()
-        flat = values.reshape(known.size, -1).T
+        place, values = np.log(measured), self._unexplained()
+        flat = values.reshape(measured.size, -1).T
         columns = [np.interp(np.log(omega), place, column) for column in flat]
         return np.stack(columns, axis=1).reshape(omega.size, *values.shape[1:])
 
     def _unexplained(self) -> Matrices:
-        own, given = (self._places(names) for names in (self.outputs, self.given))
-        # A density averages conj(X_a) X_b; the covariance of a column of outputs is its transpose.
-        covariance = np.swapaxes(np.asarray(self.density.density), 1, 2)
-        noise = covariance[:, own[:, None], own]
-        if given.size == 0:
-            return noise
-        cross = covariance[:, own[:, None], given]
-        gain = cross @ np.linalg.inv(covariance[:, given[:, None], given])
-        return noise - gain @ np.conj(np.swapaxes(cross, 1, 2))
-
-    def _places(self, names: tuple[str, ...]) -> np.ndarray:
-        for name in names:
+        for name in (*self.outputs, *self.removed):
             if name not in self.density.names:
                 raise ValueError(f"no channel {name!r}; there are: {', '.join(self.density.names)}")
-        return np.array([self.density.names.index(name) for name in names], int)
+        outputs, removed = (
+            np.array([self.density.names.index(name) for name in names], int)
+            for names in (self.outputs, self.removed)
+        )
+        # A density averages conj(X_a) X_b; the covariance of a column of outputs is its transpose.
+        covariance = np.swapaxes(np.asarray(self.density.density), 1, 2)
+        noise = covariance[:, outputs[:, None], outputs]
+        if removed.size == 0:
+            return noise
+        cross = covariance[:, outputs[:, None], removed]
+        gain = cross @ np.linalg.inv(covariance[:, removed[:, None], removed])
+        return noise - gain @ np.conj(np.swapaxes(cross, 1, 2))
 
 
 Noise = float | int | Sequence[float] | Callable[[Lines], np.ndarray] | MeasuredNoise
@@ -82,34 +82,31 @@ def noise_covariance(noise: Noise, omega: Lines, outputs: int) -> Matrices:
 
     - `ValueError`: a density of another shape, not finite or not above 0.
     """
-    found = np.asarray(noise(omega) if callable(noise) else noise)
-    if found.ndim == 1 and callable(noise):
-        found = found[:, None]
-    if found.ndim < 3:
+    density = np.asarray(noise(omega) if callable(noise) else noise)
+    if density.ndim == 1 and callable(noise):
+        density = density[:, None]
+    if density.ndim < 3:
         try:
-            powers = np.broadcast_to(found, (omega.size, outputs))
+            powers = np.broadcast_to(density, (omega.size, outputs))
         except ValueError as error:
             raise ValueError(
-                f"noise of shape {found.shape} for {omega.size} lines and {outputs} outputs: give "
-                "one density in units^2/Hz, one for each output, or a function of omega in rad/s"
+                f"noise of shape {density.shape} for {omega.size} lines and {outputs} outputs: "
+                "give one density in units^2/Hz, one for each output, or a function of omega in "
+                "rad/s"
             ) from error
-        found = powers[:, :, None] * np.eye(outputs)
-    if found.shape != (omega.size, outputs, outputs):
-        raise ValueError(f"the noise is of {found.shape[1]} outputs, but the model has {outputs}")
-    _check(found, omega)
-    return found.astype(complex)
-
-
-def _check(covariance: np.ndarray, omega: Lines) -> None:
-    if not np.all(np.isfinite(covariance)):
+        density = powers[:, :, None] * np.eye(outputs)
+    if density.shape != (omega.size, outputs, outputs):
+        raise ValueError(f"the noise is of {density.shape[1]} outputs, but the model has {outputs}")
+    if not np.all(np.isfinite(density)):
         raise ValueError("the noise density is not finite at every line: check it for NaN and inf")
-    least = np.linalg.eigvalsh(covariance)[:, 0]
+    least = np.linalg.eigvalsh(density)[:, 0]
     if least.min() <= 0:
         worst = least.argmin()
         raise ValueError(
             f"the noise density at {omega[worst]:.4g} rad/s is {least[worst]:.4g} units^2/Hz, but "
             "it must be above 0. White noise of standard deviation s, sampled at f Hz, has 2 s^2/f"
         )
+    return density.astype(complex)
 
 
 Informations = Float[np.ndarray, "frequencies parameters parameters"]
@@ -152,8 +149,8 @@ def check_distinct(
 ) -> None:
     """Raise ValueError where excitation at these lines does not determine every parameter."""
     size = np.sqrt(np.diagonal(total))
-    for name, each in zip(names, size, strict=True):
-        if not each > 0:
+    for name, effect in zip(names, size, strict=True):
+        if not effect > 0:
             raise ValueError(f"{name} does not change the response: leave it out of free=")
     values, vectors = np.linalg.eigh(total / np.outer(size, size))
     if values[0] < _SINGULAR * values[-1]:
@@ -244,7 +241,11 @@ def predict_accuracy(
     require_x64("a design")
     model = with_arrays(model)
     parameters = select_parameters(model, free)
-    omega, energy = _energy(excitation)
+    # Without padding, the harmonics of a periodic signal fall on single points.
+    points = excitation.samples * (1 if excitation.kind == "multisine" else 2)
+    dt = 1 / excitation.sample_rate
+    omega = 2 * np.pi * np.fft.rfftfreq(points, dt)
+    energy = 2 * dt * np.abs(np.fft.rfft(excitation.signal, points)) ** 2 / points
     low, high = (excitation.omega_min, excitation.omega_max) if band is None else band
     inside = (omega >= low * (1 - 1e-9)) & (omega <= high * (1 + 1e-9)) & (omega > 0)
     if not inside.any():
@@ -265,8 +266,8 @@ def unit_information(
     input: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The response to one input, (frequencies, outputs), and the information per energy."""
-    found = response_and_slopes(model, parameters, jnp.asarray(omega), input)
-    response, slopes = (np.asarray(part) for part in found)
+    parts = response_and_slopes(model, parameters, jnp.asarray(omega), input)
+    response, slopes = map(np.asarray, parts)
     for part in (response, slopes):
         finite = np.isfinite(part).reshape(omega.size, -1).all(axis=1)
         if not finite.all():
@@ -274,15 +275,3 @@ def unit_information(
     return response, information_per_energy(
         slopes, noise_covariance(noise, omega, response.shape[1])
     )
-
-
-def _energy(
-    excitation: Excitation,
-) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, " frequencies"]]:
-    """Frequencies in rad/s, and the energy of each: together the signal's square over time."""
-    # Without padding, the harmonics of a periodic signal fall on single points.
-    points = excitation.samples * (1 if excitation.kind == "multisine" else 2)
-    dt = 1 / excitation.sample_rate
-    spectrum = np.fft.rfft(excitation.signal, points)
-    omega = 2 * np.pi * np.fft.rfftfreq(points, dt)
-    return omega, 2 * dt * np.abs(spectrum) ** 2 / points

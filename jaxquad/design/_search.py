@@ -1,7 +1,7 @@
 """Powers and phases in turn: which power is best depends on the crest factors of the phases."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -9,41 +9,133 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from ._criteria import Criterion
 
-
-_NORMS = (4, 16, 64, 256)  # each the start of the next; the last is almost the peak
+_NORMS = (4, 16, 64, 256)  # one the start of the next; the last is almost the peak
 _PHASE_STEPS = 60  # of each
 _STARTS = 4
 _COARSE, _FINE = 8, 64  # least points to a cycle of the highest line: to search, and to judge
+_STEPS = 40_000
+_BETWEEN = 25  # steps between two looks at the certificate
+_TOLERANCE = 3e-4  # of the flight time
+_CREST = 1.5  # before phases are known
+_ROUNDS = 2  # of powers, phases, and the crest factors that they have
+_FAINT = 3e-3  # power, to that of the strongest line in its share of the limits, that is left out
 
-Phase = Float[np.ndarray, " frequencies"]
+Orders = Int[np.ndarray, " frequencies"]
+Lines = Float[np.ndarray, " frequencies"]
 Amplitudes = Complex[np.ndarray, "signals frequencies"]
+Power = Float[Array, " frequencies"]
+PerPower = Float[Array, "models frequencies parameters parameters"]
+Costs = Float[Array, "limits frequencies"]
+Share = Float[Array, ""]
+Information = Float[Array, "parameters parameters"]
 
 
-def least_peak_phases(
-    orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes, *, seed: int
-) -> Phase:
-    """Phases of the lines under which several signals peak least, relative to their limits.
+@runtime_checkable
+class Criterion(Protocol):
+    """What a design maximises: the logarithm of an amount of information.
+
+    The amount has to be concave in the information matrix, and twice as large for two flights as
+    for one, so that the ratio of two amounts is a ratio of flight times. `exponent` is that of the
+    multiplicative update under which it never falls. Any object with these two members will do.
+    """
+
+    @property
+    def exponent(self) -> float: ...
+
+    def log_information(
+        self, information: Information, names: tuple[str, ...]
+    ) -> Float[Array, ""]: ...
+
+
+class DOptimal(eqx.Module):
+    """The smallest joint confidence region: log det M, over the number of parameters."""
+
+    @property
+    def exponent(self) -> float:
+        return 1.0
+
+    def log_information(self, information: Information, names: tuple[str, ...]) -> Float[Array, ""]:
+        return jnp.linalg.slogdet(information)[1] / len(names)
+
+
+class AOptimal(eqx.Module):
+    """The smallest sum of the relative variances of the named parameters, or of all.
+
+    With one name it is c-optimality: the smallest standard error of that parameter alone.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def exponent(self) -> float:
+        return 0.5
+
+    def log_information(self, information: Information, names: tuple[str, ...]) -> Float[Array, ""]:
+        for name in self.names:
+            if name not in names:
+                raise ValueError(f"{name!r} is no free parameter; free are: {', '.join(names)}")
+        wanted = np.array([names.index(name) for name in self.names or names])
+        return -jnp.log(jnp.sum(jnp.diagonal(jnp.linalg.inv(information))[wanted]))
+
+
+class LargestError(eqx.Module):
+    """The smallest worst relative error, as the `power` norm of the relative variances.
+
+    A higher power is closer to the maximum, and slower: at 8, the worst of p equal variances
+    counts p^(1/8) times itself.
+    """
+
+    power: int = eqx.field(static=True, default=8)
+
+    def __check_init__(self):
+        if not 1 <= self.power <= 32:
+            raise ValueError(
+                f"power is {self.power}: give 1 (the sum of variances) to 32; 8 is usual"
+            )
+
+    @property
+    def exponent(self) -> float:
+        return 1 / (1 + self.power)
+
+    def log_information(self, information: Information, names: tuple[str, ...]) -> Float[Array, ""]:
+        logs = jnp.log(jnp.diagonal(jnp.linalg.inv(information)))
+        top = jnp.max(logs)
+        return -top - jnp.log(jnp.sum(jnp.exp(self.power * (logs - top)))) / self.power
+
+
+def least_peak_phases(orders: Orders, amplitudes: Amplitudes, *, seed: int) -> Lines:
+    """Liness of the lines under which several signals peak least, relative to their limits.
 
     The signals are sums of `amplitudes` times cos(order 2 pi t + phase), `orders` per period, in
     units of their limits. The p-norm over all of them is lowered for a rising p, from several
     starts. Source: Guillaume, Schoukens, Pintelon and Kollar (1991), for one signal.
     """
+    from scipy.optimize import minimize
+
     used = np.flatnonzero(amplitudes[0])
     few, heights = orders[used], amplitudes[:, used]
-    rng = np.random.default_rng(seed)
-    starts = [_schroeder(few, heights[0])]
+    # Delays in proportion to the power of the lines below (Schroeder, 1970), and random starts.
+    power, rng = np.abs(heights[0]) ** 2, np.random.default_rng(seed)
+    below = np.concatenate([[0.0], np.cumsum(power)[:-1]]) / power.sum()
+    starts = [-2 * np.pi * np.concatenate([[0.0], np.cumsum(below[1:] * np.diff(few))])]
     starts += [rng.uniform(-np.pi, np.pi, used.size) for _ in range(_STARTS - 1)]
-    found = [_lower_norm(start, few, heights) for start in starts]
-    highest = [multisine_peaks(few, phase, heights).max() for phase in found]
+    points, ends = 1 << int(np.ceil(np.log2(_COARSE * few.max()))), []
+    for phase in starts:
+        for norm in _NORMS:
+            phase = minimize(
+                _log_norm, phase, (few, heights, points, norm),
+                jac=True, method="CG", options=dict(maxiter=_PHASE_STEPS),
+            ).x  # fmt: skip
+        ends.append(phase)
+    highest = [multisine_peaks(few, phase, heights).max() for phase in ends]
     phase = np.zeros(orders.size)
-    phase[used] = found[int(np.argmin(highest))]
+    phase[used] = ends[int(np.argmin(highest))]
     return phase
 
 
 def multisine_peaks(
-    orders: Int[np.ndarray, " frequencies"], phase: Phase, amplitudes: Amplitudes
+    orders: Orders, phase: Lines, amplitudes: Amplitudes
 ) -> Float[np.ndarray, " signals"]:
     """A bound on each signal's peak at any time, from its values at many points.
 
@@ -56,7 +148,7 @@ def multisine_peaks(
 
 
 def multisine_signals(
-    orders: Int[np.ndarray, " frequencies"], phase: Phase, amplitudes: Amplitudes, points: int
+    orders: Orders, phase: Lines, amplitudes: Amplitudes, points: int
 ) -> Float[np.ndarray, "signals points"]:
     """One period of each multisine, at evenly spaced points.
 
@@ -70,37 +162,13 @@ def multisine_signals(
     return _synthesise(orders, amplitudes * np.exp(1j * phase), points)
 
 
-def _schroeder(
-    orders: Int[np.ndarray, " frequencies"], amplitudes: Complex[np.ndarray, " frequencies"]
-) -> Phase:
-    """Each line's delay in proportion to the power of the lines below it (Schroeder, 1970)."""
-    power = np.abs(amplitudes) ** 2
-    below = np.concatenate([[0.0], np.cumsum(power)[:-1]]) / power.sum()
-    return -2 * np.pi * np.concatenate([[0.0], np.cumsum(below[1:] * np.diff(orders))])
-
-
-def _lower_norm(
-    phase: Phase, orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes
-) -> Phase:
-    from scipy.optimize import minimize
-
-    points = 1 << int(np.ceil(np.log2(_COARSE * orders.max())))
-    for norm in _NORMS:
-        lowered = minimize(
-            _log_norm, phase, (orders, amplitudes, points, norm),
-            jac=True, method="CG", options=dict(maxiter=_PHASE_STEPS),
-        )  # fmt: skip
-        phase = lowered.x
-    return phase
-
-
 def _log_norm(
-    phase: Phase,
-    orders: Int[np.ndarray, " frequencies"],
+    phase: Lines,
+    orders: Orders,
     amplitudes: Amplitudes,
     points: int,
     norm: int,
-) -> tuple[float, Phase]:
+) -> tuple[float, Lines]:
     """Logarithm of the norm over all signals and points, and its gradient."""
     turned = amplitudes * np.exp(1j * phase)
     signals = _synthesise(orders, turned, points)
@@ -114,21 +182,11 @@ def _log_norm(
 
 
 def _synthesise(
-    orders: Int[np.ndarray, " frequencies"], amplitudes: Amplitudes, points: int
+    orders: Orders, amplitudes: Amplitudes, points: int
 ) -> Float[np.ndarray, "signals points"]:
     spectrum = np.zeros((len(amplitudes), points // 2 + 1), complex)
     spectrum[:, orders] = 0.5 * points * amplitudes
     return np.fft.irfft(spectrum, points, axis=1)
-
-
-_STEPS = 40_000
-_BETWEEN = 25  # steps between two looks at the certificate
-_TOLERANCE = 3e-4  # of the flight time
-
-Power = Float[Array, " frequencies"]
-PerPower = Float[Array, "models frequencies parameters parameters"]
-Costs = Float[Array, "limits frequencies"]
-Share = Float[Array, ""]
 
 
 class Powers(NamedTuple):
@@ -157,27 +215,28 @@ def optimal_powers(
     """
     price = jnp.full(costs.shape[0], 1 / costs.shape[0], costs.dtype)
     start = Powers(_feasible(_cap(costs, share), costs), price)
-    return _improve(start, per_power, costs, criterion, names, share, jnp.asarray(_STEPS))[0]
+    steps = jnp.asarray(_STEPS)
+    return _improve(start, per_power, costs, criterion, names, share, steps)[0]
 
 
 def certify_powers(
-    found: Powers,
+    powers: Powers,
     per_power: PerPower,
     costs: Costs,
     criterion: Criterion,
     names: tuple[str, ...],
     share: Share,
 ) -> Certificate:
-    """Bound what any powers within the limits could gain over those found, whatever these are.
+    """Bound what any powers within the limits could gain over these, whatever they are.
 
     Weak duality; with one limit and no cap, the equivalence theorem of Kiefer and Wolfowitz (1960).
     """
-    return _improve(found, per_power, costs, criterion, names, share, jnp.asarray(0))[1]
+    return _improve(powers, per_power, costs, criterion, names, share, jnp.asarray(0))[1]
 
 
 @eqx.filter_jit
 def _improve(
-    found: Powers,
+    powers: Powers,
     per_power: PerPower,
     costs: Costs,
     criterion: Criterion,
@@ -186,20 +245,39 @@ def _improve(
     steps: Int[Array, ""],
 ) -> tuple[Powers, Certificate]:
     """At most so many steps on; with none, only the certificate, at no second compilation."""
-    slope = _slope(per_power, criterion, names)
     cap = _cap(costs, share)
+
+    def information(power):
+        totals = jnp.einsum("f,mfpq->mpq", power, per_power)
+        return jnp.mean(jax.vmap(lambda m: criterion.log_information(m, names))(totals))
+
+    slope = jax.grad(information)
 
     def step(_, state):
         price = state.price * (costs @ state.power)
         price = price / jnp.sum(price)
         cost = price @ costs
-        gain = (slope(state.power) / cost) ** criterion.exponent
-        return Powers(_fill_limits(state.power * gain, cost, cap), price)
+        wanted = state.power * (slope(state.power) / cost) ** criterion.exponent
+
+        # Scaled to a cost of 1; what exceeds a line's cap goes to the other lines.
+        def rescale(_, scale):
+            full = scale * wanted >= cap
+            left = 1 - jnp.sum(jnp.where(full, cost * cap, 0.0))
+            open = jnp.sum(jnp.where(full, 0.0, cost * wanted))
+            return jnp.where(open > 0, left / jnp.where(open > 0, open, 1.0), scale)
+
+        scale = jax.lax.fori_loop(0, 12, rescale, 1 / jnp.sum(cost * wanted))
+        return Powers(jnp.minimum(scale * wanted, cap), price)
 
     def certificate(state):
         power, cost = _feasible(state.power, costs), state.price @ costs
         slopes = slope(power)
-        return Certificate(slopes / cost, _gap(slopes, cost, cap, power))
+        # Any powers within the limits could do better by so much: concavity, and the best filling.
+        order = jnp.argsort(-slopes / cost)
+        room = (cost * cap)[order]
+        taken = jnp.clip(1 - (jnp.cumsum(room) - room), 0, room)
+        gap = jnp.sum(taken * (slopes / cost)[order]) - slopes @ power
+        return Certificate(slopes / cost, gap)
 
     def improve(carry):
         state, _, done = carry
@@ -210,20 +288,10 @@ def _improve(
         _, proof, done = carry
         return (done == 0) | ((proof.gap > _TOLERANCE) & (done < steps))
 
-    unknown = Certificate(jnp.zeros_like(found.power), jnp.asarray(jnp.inf))
-    start = (found, unknown, jnp.zeros_like(steps))
+    unknown = Certificate(jnp.zeros_like(powers.power), jnp.asarray(jnp.inf))
+    start = (powers, unknown, jnp.zeros_like(steps))
     state, proof, _ = jax.lax.while_loop(unfinished, improve, start)
     return state._replace(power=_feasible(state.power, costs)), proof
-
-
-def _slope(
-    per_power: PerPower, criterion: Criterion, names: tuple[str, ...]
-) -> Callable[[Power], Power]:
-    def information(power):
-        each = jnp.einsum("f,mfpq->mpq", power, per_power)
-        return jnp.mean(jax.vmap(lambda m: criterion.log_information(m, names))(each))
-
-    return jax.grad(information)
 
 
 def _cap(costs: Costs, share: Share) -> Power:
@@ -232,28 +300,6 @@ def _cap(costs: Costs, share: Share) -> Power:
 
 def _feasible(power: Power, costs: Costs) -> Power:
     return power / jnp.maximum(jnp.max(costs @ power), 1.0)
-
-
-def _fill_limits(wanted: Power, cost: Power, cap: Power) -> Power:
-    """`wanted` scaled to a cost of 1; what exceeds a line's cap goes to the other lines."""
-
-    def again(_, scale):
-        full = scale * wanted >= cap
-        left = 1 - jnp.sum(jnp.where(full, cost * cap, 0.0))
-        open = jnp.sum(jnp.where(full, 0.0, cost * wanted))
-        return jnp.where(open > 0, left / jnp.where(open > 0, open, 1.0), scale)
-
-    scale = jax.lax.fori_loop(0, 12, again, 1 / jnp.sum(cost * wanted))
-    return jnp.minimum(scale * wanted, cap)
-
-
-def _gap(slope: Power, cost: Power, cap: Power, power: Power) -> Float[Array, ""]:
-    """By how much any powers within the limits could do better: concavity, and the best filling."""
-    order = jnp.argsort(-slope / cost)
-    room = (cost * cap)[order]
-    before = jnp.cumsum(room) - room
-    taken = jnp.clip(1 - before, 0, room)
-    return jnp.sum(taken * (slope / cost)[order]) - slope @ power
 
 
 class Limits(NamedTuple):
@@ -275,12 +321,21 @@ def gather_limits(
     rate: float | int | None,
     output_amplitude: float | int | Sequence[float] | None,
 ) -> Limits:
-    """The limits that are asked for; an output's holds for every model of an ensemble."""
+    """All limits of a design; an output's holds for every model of an ensemble."""
     names, filters, peaks = ["amplitude"], [np.ones(omega.size, complex)], [amplitude]
     if rate is not None:
         names, filters, peaks = [*names, "rate"], [*filters, 1j * omega], [*peaks, rate]
     outputs = responses[0].shape[1]
-    for o, peak in enumerate(_per_output(output_amplitude, outputs)):
+    if output_amplitude is None or isinstance(output_amplitude, int | float):
+        output_peaks = [np.inf if output_amplitude is None else float(output_amplitude)] * outputs
+    else:
+        output_peaks = list(output_amplitude)
+    if len(output_peaks) != outputs:
+        raise ValueError(
+            f"output_amplitude has {len(output_peaks)} values for {outputs} outputs: give one for "
+            "each, inf where there is no limit"
+        )
+    for o, peak in enumerate(output_peaks):
         for m, response in enumerate(responses):
             if peak < np.inf:
                 which = f" {o}" if outputs > 1 else ""
@@ -291,25 +346,6 @@ def gather_limits(
         if not 0 < peak < np.inf:
             raise ValueError(f"the limit of {name} is {peak}: it has to be positive and finite")
     return Limits(tuple(names), np.array(filters), np.array(peaks, float))
-
-
-def _per_output(limit: float | int | Sequence[float] | None, outputs: int) -> list[float]:
-    if limit is None:
-        return [np.inf] * outputs
-    given = [float(limit)] * outputs if isinstance(limit, int | float) else list(limit)
-    if len(given) != outputs:
-        raise ValueError(
-            f"output_amplitude has {len(given)} values for {outputs} outputs: give one for each, "
-            "inf where there is no limit"
-        )
-    return given
-
-
-_CREST = 1.5  # before phases are known
-_ROUNDS = 2  # of powers, phases, and the crest factors that they have
-_FAINT = 3e-3  # power, to that of the strongest line in its share of the limits, that is left out
-
-Lines = Float[np.ndarray, " frequencies"]
 
 
 class Plan(NamedTuple):
@@ -334,6 +370,7 @@ class Trial(NamedTuple):
     efficiency: float
     value: float  # log information
     lines: int
+    crest: Float[np.ndarray, " limits"]  # factors of the limited signals
 
 
 def search(plan: Plan, lines: tuple[int, ...], seed: int) -> Trial:
@@ -342,43 +379,35 @@ def search(plan: Plan, lines: tuple[int, ...], seed: int) -> Trial:
     for least in lines:
         crest = np.full(plan.limits.peaks.size, _CREST)
         for _ in range(_ROUNDS):
-            trial, crest = _trial(plan, least, crest, seed)
-            trials.append(trial)
+            trials.append(_trial(plan, least, crest, seed))
+            crest = trials[-1].crest
     return max(trials, key=lambda trial: trial.value)
 
 
-def _trial(
-    plan: Plan, lines: int, crest: Float[np.ndarray, " limits"], seed: int
-) -> tuple[Trial, Float[np.ndarray, " limits"]]:
-    """One design for these crest factors, and those that it has."""
-    costs, problem = plan.limits.costs(crest), jnp.asarray(plan.per_power)
-    share = jnp.asarray(1 / lines, dtype=problem.dtype)
-    found = optimal_powers(problem, jnp.asarray(costs), plan.criterion, plan.names, share)
-    power = _drop_faint(np.asarray(found.power), costs)
-    phase = least_peak_phases(plan.orders, _signals(plan, power), seed=seed)
-    reached = multisine_peaks(plan.orders, phase, _signals(plan, power))
+def _trial(plan: Plan, lines: int, crest: Float[np.ndarray, " limits"], seed: int) -> Trial:
+    """One design for these crest factors."""
+    costs, per_power = plan.limits.costs(crest), jnp.asarray(plan.per_power)
+    share = jnp.asarray(1 / lines, dtype=per_power.dtype)
+
+    def signals(power: Lines) -> Complex[np.ndarray, "limits frequencies"]:
+        """Complex amplitudes of the limited signals, in units of their limits."""
+        return plan.limits.filters * np.sqrt(2 * power) / plan.limits.peaks[:, None]
+
+    best = optimal_powers(per_power, jnp.asarray(costs), plan.criterion, plan.names, share)
+    power = np.asarray(best.power)
+    used = costs.max(axis=0) * power
+    power = np.where(used > _FAINT * used.max(), power, 0.0)
+    phase = least_peak_phases(plan.orders, signals(power), seed=seed)
+    reached = multisine_peaks(plan.orders, phase, signals(power))
     power, reached = power / reached.max() ** 2, reached / reached.max()
-    crest = reached / np.sqrt(0.5 * np.sum(np.abs(_signals(plan, power)) ** 2, axis=1))
+    crest = reached / np.sqrt(0.5 * np.sum(np.abs(signals(power)) ** 2, axis=1))
     proof = certify_powers(
-        Powers(jnp.asarray(power), found.price), problem, jnp.asarray(plan.limits.costs(crest)),
+        Powers(jnp.asarray(power), best.price), per_power, jnp.asarray(plan.limits.costs(crest)),
         plan.criterion, plan.names, share,
     )  # fmt: skip
     dispersion = len(plan.names) * np.asarray(proof.dispersion)
     efficiency = min(1.0, float(np.exp(-np.asarray(proof.gap))))
-    return Trial(power, phase, reached, dispersion, efficiency, _value(plan, power), lines), crest
-
-
-def _drop_faint(power: Lines, costs: Float[np.ndarray, "limits frequencies"]) -> Lines:
-    share = costs.max(axis=0) * power
-    return np.where(share > _FAINT * share.max(), power, 0.0)
-
-
-def _signals(plan: Plan, power: Lines) -> Complex[np.ndarray, "limits frequencies"]:
-    """Complex amplitudes of the limited signals, in units of their limits."""
-    return plan.limits.filters * np.sqrt(2 * power) / plan.limits.peaks[:, None]
-
-
-def _value(plan: Plan, power: Lines) -> float:
     totals = np.einsum("f,mfpq->mpq", power, plan.per_power)
-    each = [plan.criterion.log_information(jnp.asarray(m), plan.names) for m in totals]
-    return float(np.mean([float(value) for value in each]))
+    values = [plan.criterion.log_information(jnp.asarray(m), plan.names) for m in totals]
+    value = float(np.mean([float(value) for value in values]))
+    return Trial(power, phase, reached, dispersion, efficiency, value, lines, crest)

@@ -38,12 +38,8 @@ from .frequency_domain._cost import (
     usable as usable,
     WIDER_BAND as WIDER_BAND,
 )
-from .frequency_domain._damped import fit_damped as fit_damped
-from .frequency_domain._explain import Candidate as Candidate, Explanation as Explanation
 from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
-from .frequency_domain._half_bands import Bands as Bands
 from .frequency_domain._held import as_sampled as as_sampled
-from .frequency_domain._normal import problem_normal as problem_normal
 from .frequency_domain._parameters import (
     Free as Free,
     name_places as name_places,
@@ -60,13 +56,22 @@ from .frequency_domain._problem import (
     Problem as Problem,
     residuals as residuals,
 )
-from .frequency_domain._reduce import reduce_structure as reduce_structure, Reduction as Reduction
+from .frequency_domain._refits import (
+    Bands as Bands,
+    Candidate as Candidate,
+    Explanation as Explanation,
+)
 from .frequency_domain._result import Fit as Fit
 from .frequency_domain._solve import least_squares as least_squares
 from .frequency_domain._starts import (
     Minimum as Minimum,
     solve_from_many as solve_from_many,
     spread_starts as spread_starts,
+)
+from .frequency_domain._structure import (
+    fit_damped as fit_damped,
+    reduce_structure as reduce_structure,
+    Reduction as Reduction,
 )
 from .frequency_domain._transfer_function_fit import fit_transfer_function as fit_transfer_function
 from .frequency_domain._transfer_function_guess import (

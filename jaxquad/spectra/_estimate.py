@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
-from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
+from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._checks import (
@@ -26,7 +26,6 @@ from ._remarks import Remark, Remarks
 from ._welch import average_windows
 
 
-_HELD = 64  # numbers to each sample of a channel that an estimate holds at a time
 _CYCLES = 2.0  # of the longest record, in the lowest frequency by default
 
 Method = Literal["direct", "joint"]
@@ -39,7 +38,6 @@ def _by_polynomial(
 ) -> FrequencyResponse:
     """Response by local polynomials in frequency."""
     check_excitation(records, method)
-    keep_freed_memory(8 * _HELD * sum(record.samples * len(record.names) for record in records))
     if omega is None:
         lowest = 2 * np.pi * _CYCLES / max(record.duration for record in records)
         omega = np.geomspace(lowest, 2 * np.pi / (10 * records[0].dt), 100)

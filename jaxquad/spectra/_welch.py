@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
-from jaxquad._core import keep_freed_memory, one_blas_thread, require_x64
+from jaxquad._core import one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._average import average, Averaged, Channels
@@ -33,7 +33,6 @@ _CORRELATED = 0.5  # average coherence of inputs above which Tischler & Remple, 
 _LOST = 0.9999
 _LEAKED = 3.0  # bias over random error, averaged over a third of an octave, that is remarked
 _AVERAGED = 0.2  # in ln(omega)
-_MEMORY = 4  # numbers to each sample of a channel that an estimate needs at a time
 _CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
     "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
@@ -202,7 +201,6 @@ def average_windows(
     single = isinstance(spectra, Welch)
     members = (spectra,) if single else Composite.windowed(spectra, records, omega)
     omega, welch = frequencies_for(omega, records, members[0]), members[0]
-    keep_freed_memory(8 * _MEMORY * sum(record.samples * len(record.names) for record in records))
     segments = transform_records(records, omega, members, derivatives=2)
     first, dt, groups = records[0], records[0].dt, segments.groups
     instruments = len(first.reference_names) if method == "joint" else 0

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxquad._core import announce
+from jaxquad._core import announce, Message
 from jaxquad.autopilot import (
     ADRCAutopilot,
     AutopilotProposal,
@@ -15,18 +15,18 @@ from jaxquad.autopilot import (
     check_law,
     check_loop,
     design_gains,
+    firmware_named,
     FlightChannels,
     FlownAutopilot,
-    gyro_chains,
     read_channels_if_any,
     read_flown,
     settings_of,
     study_throttle,
-    what_to_fly,
 )
 from jaxquad.records import AXES, Proposal
 
 from ._autopilot_adrc import flew_adrc, tune_adrc
+from ._command_line import in_options
 from ._identify import identify_plant
 from ._kinds import SettingsError
 from ._log import propose_settings, read_records
@@ -107,7 +107,7 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
         filters = filters or axes[axis].shared_filters
     if not axes:
         raise next(iter(errors.values()))
-    return AxesProposal(settings, axes, {axis: str(error) for axis, error in errors.items()})
+    return AxesProposal(settings, axes, {axis: in_options(error) for axis, error in errors.items()})
 
 
 def _of_one_flight(settings: AutopilotSettings, proposal: Proposal) -> AutopilotSettings:
@@ -142,10 +142,10 @@ def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotPropos
     plant = identify_plant(path, asked, proposal, flown.filters)
     known = (settings, plant, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
-    recipe = what_to_fly(flown.firmware, AXES[flown.axis])
+    recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
-        return unsure(f"this log cannot tell: {summary}. {recipe}", None)
+        return unsure(Message(f"this log cannot tell: «plant|{summary}». {recipe}"), None)
     if flight is None:
         return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")
@@ -192,6 +192,6 @@ def _read_flight(
         settings = dataclasses.replace(settings, throttle=flight.middle)
     tracked = {} if flight is None else flight.tracked_hz
     flown = read_flown(path, proposal, settings, tracked)
-    chains = tuple(each for each in gyro_chains(flown.law) if each.filters)
+    chains = tuple(chain for chain in flown.law.gyro_chains() if chain.filters)
     filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
     return dataclasses.replace(flown, filters=filters, filters_text=text), flight

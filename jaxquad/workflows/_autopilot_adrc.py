@@ -2,18 +2,20 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, marked_text, Message
 from jaxquad.autopilot import (
     ADRCAutopilot,
     ADRCTargets,
     betaflight_adrc_loop,
     betaflight_loop,
+    doubted_throttle,
     FilterChain,
+    firmware_named,
     flies_adrc,
     FlightChannels,
     Flown,
@@ -46,7 +48,8 @@ _LINES = 40  # frequencies of a reproduced response
 
 def flew_adrc(path: Path, proposal: Proposal) -> bool:
     """Whether a log is of a flight with Betaflight's proposed ADRC."""
-    return proposal.vehicle == "betaflight" and flies_adrc(settings_of(path, proposal).values)
+    firmware = firmware_named(proposal.vehicle)
+    return firmware.has_adrc and firmware.flies_adrc(settings_of(path, proposal).values)
 
 
 def tune_adrc(
@@ -56,7 +59,7 @@ def tune_adrc(
 
     Raises `SettingsError` for another firmware, and for a hover throttle other than the flown one.
     """
-    if proposed.vehicle != "betaflight":
+    if not firmware_named(proposed.vehicle).has_adrc:
         raise SettingsError(
             f"`law` is adrc, which is proposed for Betaflight alone (its pull request 15400), and "
             f"{path} is a log of {proposed.vehicle}: leave it out"
@@ -77,7 +80,7 @@ def tune_adrc(
             band=None if settings.band is None else _in_radians(settings.band),
         )  # fmt: skip
     except ValueError as error:  # says what to fly
-        return _unsure(found, str(error))
+        return _unsure(found, error)
     return _tuned(dataclasses.replace(found, plant=plant), plant, asked)
 
 
@@ -92,20 +95,24 @@ def _tuned(found: ADRCAutopilot, plant: GainOverThrottle, asked: IdentifySetting
             for level, x in enumerate(plant.throttle)
         }
         found = dataclasses.replace(found, reproductions=again)
-        if why := _doubt(again):
-            return _unsure(found, why)
+        if (doubted := doubted_throttle(again)) is not None:
+            why = again[doubted].verdict
+            if again[doubted].kind == "not flown":
+                why = f"this log cannot tell: at {doubted:.2f} throttle {why}"
+            return dataclasses.replace(found, verdict=why)
         made = propose_adrc(
             plant, found.flown, found.axis, hover=settings.hover, members=settings.members,
             fresh=settings.fresh, seed=settings.seed, targets=_targets(settings),
         )  # fmt: skip
     except UndeterminedError as error:
-        return _unsure(found, str(error))
+        return _unsure(found, error)
     return dataclasses.replace(found, kind=made.kind, verdict=made.verdict, proposal=made)
 
 
-def _unsure(found: ADRCAutopilot, why: str) -> ADRCAutopilot:
-    start = "" if why.startswith("this log cannot tell") else "this log cannot tell: "
-    return dataclasses.replace(found, verdict=f"{start}{why}")
+def _unsure(found: ADRCAutopilot, error: ValueError) -> ADRCAutopilot:
+    return dataclasses.replace(
+        found, verdict=Message(f"this log cannot tell: {marked_text(error)}")
+    )
 
 
 def _chains(found: ADRCAutopilot) -> list[FilterChain]:
@@ -194,13 +201,3 @@ def _respond(path: Path, asked: IdentifySettings, plant: GainOverThrottle) -> Fr
         list(read_records(path, asked)), np.geomspace(*band, _LINES),
         estimator=JointInputOutput(local) if asked.reference else local,
     )  # fmt: skip
-
-
-def _doubt(again: Mapping[float, Reproduction]) -> str:
-    """Why the flown loop is not reproduced; empty where it is at one level, and off at none."""
-    for throttle, each in again.items():
-        if each.kind == "not flown":
-            return f"at {throttle:.2f} throttle {each.verdict}"
-    if all(each.kind == "unknown" for each in again.values()):
-        return next(each.verdict for each in again.values())
-    return ""

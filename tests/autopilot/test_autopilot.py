@@ -12,6 +12,7 @@ from log_writers import DataFlash
 from px4_flights import GYRO_HZ as SAMPLED_HZ, Vehicle, write_log
 from scipy import signal
 
+from jaxquad._core import Message
 from jaxquad.autopilot import betaflight_loop, px4_loop
 from jaxquad.autopilot._proposal import AutopilotProposal
 from jaxquad.cli import main
@@ -113,8 +114,11 @@ class PoorFit(SimpleNamespace):
         return f"NOT {POOR}"
 
 
-@pytest.mark.parametrize("verdict", [f"this log cannot tell: {POOR}. Fly a chirp", AGAIN])
-def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict):
+CANNOT_TELL = Message(f"this log cannot tell: «plant|{POOR}». Fly a chirp")
+
+
+@pytest.mark.parametrize(("verdict", "kind"), [(CANNOT_TELL, "flown"), (AGAIN, "not flown")])
+def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict, kind):
     """Of stand-ins: such fits and loops were printed of a measured flight, each sentence twice."""
     flown = SimpleNamespace(version=(4, 2), axis=0, firmware="betaflight", unmodelled=(), old={})
     vars(flown).update(filters_text="", angle=None, measured=None)
@@ -122,7 +126,8 @@ def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict):
     vars(found).update(
         kind="cannot tell", verdict=verdict, flown=flown, stages=(), throttle=None, filters=None,
         new={},
-        identification=SimpleNamespace(fit=PoorFit()), reproduction=SimpleNamespace(verdict=AGAIN),
+        identification=SimpleNamespace(fit=PoorFit()),
+        reproduction=SimpleNamespace(verdict=AGAIN, kind=kind),
     )  # fmt: skip
     text = str(found)
     assert text.count(AGAIN) == text.count(POOR) == 1

@@ -52,6 +52,7 @@ def test_advice_names_the_option_that_was_typed_for_the_argument(
     assert option in said and python not in said and "jq." not in said
 
 
+@pytest.mark.slow
 def test_an_argument_that_has_an_option_is_said_as_the_option():
     texts = [in_options(text) for place, text in messages() if SEEN.match(place)]
     argument = re.compile(rf"\b({'|'.join(ARGUMENTS)})=(?=[\s),;.:{{]|$)")

@@ -11,8 +11,8 @@ from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad.identify import fit_damped
-from jaxquad.identify.frequency_domain import _damped
-from jaxquad.identify.frequency_domain._half_bands import require_origin
+from jaxquad.identify.frequency_domain._refits import Origin, require_origin
+from jaxquad.identify.frequency_domain._structure import damping_by_phase
 from jaxquad.workflows import AutopilotSettings
 
 
@@ -75,6 +75,7 @@ def holds(fit, name, value):
     return low <= value <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.0, 0.1, 0.5, 2.1, 5.0])
 def test_the_intervals_hold_with_and_without_damping(damping):
     """95 % of 20, less two standard deviations."""
@@ -89,6 +90,7 @@ def test_the_intervals_hold_with_and_without_damping(damping):
         assert sum(holds(fit, "damping", damping) for fit in fits) >= 17
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.0, 2.1])
 def test_a_flown_chirp_shows_a_damping_where_there_is_one(damping):
     frf = jq.frequency_response(closed_loop(damping, seed=0))
@@ -103,14 +105,14 @@ def test_a_flown_chirp_shows_a_damping_where_there_is_one(damping):
 
 def test_a_strong_damping_starts_from_the_phase_at_the_lowest_frequencies():
     plain = jq.fit(START, flown(1.0, seed=0))
-    start = _damped._starts(plain, require_origin(plain))[0]
+    start = damping_by_phase(plain, require_origin(plain))
     assert 0.4 < start < 1.5
 
 
 def test_one_more_fit_is_made_where_the_first_one_ends_well(monkeypatch):
     plain, calls = jq.fit(START, flown(2.1, seed=0)), []
-    run = _damped._run
-    monkeypatch.setattr(_damped, "_run", lambda *args: calls.append(args) or run(*args))
+    run = Origin.fit_again
+    monkeypatch.setattr(Origin, "fit_again", lambda *args: calls.append(args) or run(*args))
     fit_damped(plain)
     assert len(calls) == 1
 
@@ -153,6 +155,7 @@ def test_other_models_are_refused_and_nothing_fitted_stays_so():
     assert not empty.verdict.fitted and fit_damped(empty) is empty
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log", ["mixer_chirp_roll", "rate_chirp_pitch"])
 def test_a_firmware_s_gain_is_right_beside_a_small_damping(data, log, without_type_checks):
     """437.5 rad/s^2 and 30 ms, and a damping of 0.12 and 0.11 1/s."""

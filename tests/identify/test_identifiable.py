@@ -157,6 +157,7 @@ def test_along_the_null_direction_the_posterior_is_the_prior_and_is_called_so():
     assert any("determined by the prior alone" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("band", [(3.0, 12.0), (1.0, 6.0)], ids=["inside", "delay runs to zero"])
 def test_lag_and_delay_of_a_narrow_band_are_determined_as_a_sum(band):
     truth = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -194,6 +195,7 @@ def test_no_wider_band_is_advised_where_none_would_help(alone):
     )
 
 
+@pytest.mark.slow
 def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
     truth = jq.TransferFunction([8.0], [1.0, 3.0, 9.0])
     fit = jq.fit(truth, response_of(truth, seed=0), cost=ML, free=("numerator", "denominator"))
@@ -203,6 +205,7 @@ def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
     assert len(fit.combinations) == 3
 
 
+@pytest.mark.slow
 def test_a_parameter_without_effect_is_named():
     frf = response_of(RIG, seed=0)
     fit = jq.fit(start(), frf, free=("K_t", "lag", jq.identify.Real("K_af", scale=1e-9)), cost=ML)
@@ -281,6 +284,7 @@ def test_where_there_is_no_minimum_no_number_is_given():
     assert "the fit found no minimum: where the solver stopped" in str(fit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 5])
 def test_a_fit_that_still_moves_by_a_quarter_of_an_error_has_no_numbers(steps):
     frf = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), seed=0)
@@ -334,6 +338,7 @@ def test_a_combination_whose_error_is_a_third_of_its_size_is_not_determined(nois
         assert found.standard_error <= 0.3 * abs(found.value)
 
 
+@pytest.mark.slow
 def test_a_value_that_the_record_does_not_determine_is_not_given_by_its_name():
     truth = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.05)
     fit = jq.fit(truth, response_of(truth, seed=0), free=("K_t", "J_x", "lag"), cost=ML)

@@ -99,7 +99,6 @@ TAIL = """\
 ## Numbers of others, and measured flights
 
 - A fit that CIFER 6.3 printed, `python fits/cessna_navfit.py`: [Comparison](comparison.md).
-- Five published flights: [Measured flights](measured.md).
 - Loops and simulations equal python-control's and scipy's: [Comparison](comparison.md).
 - The paper's figures: [equations](equations.md), `python fits/paper.py`.
 """

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._core import as_float, is_concrete, per_member, require_positive
+from jaxquad._core import as_float, is_concrete, Message, per_member, require_positive
 
 from .._filters import Notch, Section
 
@@ -138,7 +138,7 @@ class GyroNotches(NamedTuple):
 
     filters: tuple[HarmonicNotch, ...]
     tracking: tuple[Tracking, ...]
-    unmodelled: tuple[str, ...]
+    unmodelled: tuple[Message, ...]
 
 
 _FOLLOWED = {
@@ -157,7 +157,7 @@ def read_harmonic_notches(
     """
     filters: list[HarmonicNotch] = []
     tracking: list[Tracking] = []
-    unmodelled: list[str] = []
+    unmodelled: list[Message] = []
     for name in ("INS_HNTCH", "INS_HNTC2"):
         read = lambda end, default, name=name: number(f"{name}_{end}", default)
         mask = round(read("HMNCS", 3.0))
@@ -177,10 +177,11 @@ def read_harmonic_notches(
         elif sources := tracked_hz.get(mode):
             filters += _followed(notch, mode, reference, bool(options & 2), sources)
         else:
-            unmodelled.append(
+            text = (
                 f"{name}_MODE {mode}: the harmonic notch follows {_FOLLOWED[mode]}, from "
                 f"{frequency:g} Hz on; give what it followed in Hz (`tracked_hz={{{mode}: [...]}}`)"
             )
+            unmodelled.append(Message(text, "notch"))
     return GyroNotches(tuple(filters), tuple(tracking), tuple(unmodelled))
 
 

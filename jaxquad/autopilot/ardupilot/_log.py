@@ -46,8 +46,9 @@ class _Place(NamedTuple):
 _ANGLE = _Place("the pilot's angle set-point", "angle")
 _RECOVERY = _Place("the angle set-point of the attitude loop", "angle")
 _RATE, _MIXER = _Place("the rate set-point", "rate"), _Place("the mixer", "mixer")
+_SHAPED = (1, 2, 3)  # SID_AXIS of chirps that pass the input shaping
 _PLACES: Mapping[int, _Place] = {  # by SID_AXIS, of which each three are roll, pitch and yaw
-    **dict.fromkeys((1, 2, 3), _ANGLE),
+    **dict.fromkeys(_SHAPED, _ANGLE),
     **dict.fromkeys((4, 5, 6), _RECOVERY),
     **dict.fromkeys((7, 8, 9), _RATE),
     **dict.fromkeys((10, 11, 12), _MIXER),
@@ -110,10 +111,14 @@ def _chirps(log: Log) -> list[NumberedChirp]:
         begin, end = float(table.time[rows[0]]), float(table.time[active[-1]])
         number, low, high = _announced(log.tables.get("SIDS"), log, begin)
         if number in _PLACES and end - begin >= _SHORTEST:
-            words, point = _PLACES[number]
-            axis, place = AXES[(number - 1) % 3] if point else "", f"{words} (SID_AXIS {number})"
+            point, place = _PLACES[number].point, _place_of(number)
+            axis = AXES[(number - 1) % 3] if point else ""
             chirps.append(NumberedChirp(len(chirps) + 1, axis, place, point, begin, end, low, high))
     return chirps
+
+
+def _place_of(number: int) -> str:
+    return f"{_PLACES[number].words} (SID_AXIS {number})"
 
 
 def _announced(table: Table | None, log: Log, begin: float) -> tuple[int, float, float]:
@@ -147,7 +152,7 @@ def _chirped(log: Log, chirps: list[NumberedChirp]) -> Setup:
             f"turns no axis: {_FLY}, or say which other part to use (start, stop)."
         )
     rate, remarks = f"RATE.{_LETTERS[axis]}", []
-    if place.startswith(_ANGLE.words):
+    if place in map(_place_of, _SHAPED):
         remarks.append("the chirp passes the input shaping, which is nonlinear for large steps")
     remarks.append(
         f"{rate} is measured after the gyro filter, which identify divides out where the log has "
@@ -224,5 +229,5 @@ LOG = FirmwareLog(
         "ATC_", "INS_GYRO_", "INS_HNTC", "MOT_", "SCHED_LOOP_RATE", "PSC_", "FSTRATE_",
     ),
     learned=("MOT_THST_HOVER",),  # in flight, and stored at the end of it: the hover's throttle
-    numbers_chirps=True,
+    numbers_chirps=True, gyro_cutoffs=("INS_GYRO_FILTER",),
 )  # fmt: skip

@@ -33,9 +33,9 @@ from ._cost import (
 )
 from ._mixing import Mixing, mixings_of
 from ._model_checks import require_model, require_model_response
-from ._origin import Options, Origin
 from ._parameters import Free, Parameters, select_parameters, Tie
 from ._problem import make_problem, Prior, Problem, require_priors
+from ._refits import Options, Origin
 from ._result import Fit
 from ._solve import Solution
 from ._starts import Minimum, solve_from_many, spread_starts

@@ -33,11 +33,9 @@ from ..uncertainty._verdict import (
     USUAL,
     Verdict,
 )
-from ._explain import explain_misfit, Explanation
 from ._fit_content import fit_content, fit_table
-from ._half_bands import Bands, fit_bands
-from ._origin import Origin
 from ._parameters import Parameters
+from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
 from ._starts import Minimum
 
 

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import keep_freed_memory, Message, one_blas_thread, require_x64
+from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
 from ..frequency_domain._fit import check_priors
 from ..frequency_domain._model_checks import require_model
-from ..frequency_domain._origin import free_again
 from ..frequency_domain._parameters import Free, select_parameters, Tie
 from ..frequency_domain._problem import make_problem, Prior, require_priors
+from ..frequency_domain._refits import free_again
 from ..frequency_domain._result import Fit
 from ._descent import descend_by_turns, descend_with_noise
 from ._noise import ARMA, AutoRegressive, Noise
@@ -45,7 +45,6 @@ from ._simulated import (
 
 
 _SHORT = 200_000  # samples, up to which a second thread of BLAS waits about as long as it works
-_HELD = 64  # numbers of each sample that a fit holds at a time
 
 
 def refine(
@@ -114,7 +113,6 @@ def refine(
     records = [record] if isinstance(record, Record) else list(record)
     _check(records, noise, loop, band, max_steps)
     longest = max(one.samples for one in records)
-    keep_freed_memory(8 * _HELD * longest)
     near = isinstance(model, Fit)
     if isinstance(model, Fit):  # its choice of parameters holds where no other is given
         if tied is None:

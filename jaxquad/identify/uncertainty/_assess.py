@@ -15,9 +15,9 @@ from ..frequency_domain._aside import look_aside
 from ..frequency_domain._cost import Points, Weights, widen_band
 from ..frequency_domain._held import remarks_on_hold
 from ..frequency_domain._mixing import Mixing
-from ..frequency_domain._origin import Origin
 from ..frequency_domain._parameters import Place
 from ..frequency_domain._problem import on_device, Problem
+from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._solve import same_responses, Solution
 from ..frequency_domain._starts import Minimum, remarks_on_minima

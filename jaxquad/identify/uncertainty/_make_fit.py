@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, PyTree
 
 from jaxquad._core import as_messages
 
-from ..frequency_domain._origin import Origin
 from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
+from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._solve import Solution
 from ..frequency_domain._starts import Minimum

@@ -1,6 +1,8 @@
 """Local processes, or the workers of a Dask cluster: one that dies takes no other job with it."""
 
+import atexit
 import contextlib
+import gc
 import math
 import multiprocessing
 import os
@@ -11,8 +13,6 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-
-from jaxquad._core import collect_seldom
 
 from ._jobs import Content, failure, Job, perform, store_result, stored_result, Work
 
@@ -140,7 +140,7 @@ def _serve(work: Work, connection: Connection) -> None:
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)  # What it starts ends with it, see _kill.
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
-    collect_seldom()
+    atexit.register(gc.freeze)  # Python's last look for garbage takes half a second
     while True:
         try:
             job = connection.recv()

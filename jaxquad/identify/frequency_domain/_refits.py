@@ -1,0 +1,365 @@
+"""What a fit was made from, and fits made again: in half of the band, or with a further term."""
+
+import functools as ft
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, PyTree
+
+from jaxquad._core import pytree_node
+from jaxquad.spectra import FrequencyResponse
+
+from ._condition import Condition
+from ._cost import Band, Cost, MaximumLikelihood, Points, Range
+from ._parameters import Free, Parameters, Positive, Real, Tie, with_values
+from ._problem import on_device, Prior
+
+
+_MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+_FAR = 20.0  # times the edges of the band
+_GAIN = 6.0  # of BIC, from which one structure is strongly preferred (Kass & Raftery, 1995)
+
+
+class Options(NamedTuple):
+    """Those of `jq.fit`."""
+
+    free: Free
+    tied: Mapping[str, Tie] | None
+    cost: Cost
+    conditions: Sequence[Condition | None] | None
+    priors: Sequence[Prior]
+    band: Band
+    min_coherence: float | None
+    starts: int
+    solver: eqx.Module | None
+    max_steps: int
+
+
+@pytree_node
+class Origin:
+    """The responses and options of a fit.
+
+    `run(model, responses, options, rounds=...)` fits as `jq.fit` does; 0 rounds leave out what the
+    model does not explain, so that costs compare structures.
+    """
+
+    run: Callable[..., PyTree] = eqx.field(static=True)
+    points: tuple[Points, ...]
+    options: Options
+
+    @property
+    def frfs(self) -> tuple[FrequencyResponse, ...]:
+        """The responses."""
+        return tuple(points.frf for points in self.points)
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """The lowest and the highest frequency in use, over all responses, in rad/s."""
+        used = [np.asarray(p.frf.omega)[np.any(p.used, axis=(1, 2))] for p in self.points]
+        omega = np.concatenate(used)
+        return float(omega.min()), float(omega.max())
+
+    @property
+    def independent_points(self) -> float:
+        """How many points in use there would be if none shared their noise."""
+        return sum(float(np.sum(1 / points.shared[points.used])) for points in self.points)
+
+    def fit_again(self, model: PyTree, options: Options, rounds: int = 3) -> PyTree:
+        """A `jq.identify.Fit`; None where the solver diverged."""
+        try:
+            return self.run(model, self.frfs, options, rounds=rounds)
+        except ValueError:
+            return None
+
+
+def free_again(parameters: Parameters) -> list[Positive | Real]:
+    """The same free parameters, fitted in the same way, with the sizes they had at the start."""
+    sizes = np.abs(np.asarray(parameters.scale))
+    rows = zip(parameters.names, parameters.logarithmic, sizes, strict=False)
+    return [Positive(name) if log else Real(name, float(size)) for name, log, size in rows]
+
+
+def require_origin(fit: PyTree) -> Origin:
+    """The origin of a fit of `jq.fit`. Raise ValueError for any other."""
+    if fit.origin is None or not fit.verdict.fitted:
+        raise ValueError(
+            "this fit cannot be made again: it is none of jq.fit, or nothing was fitted; fit the "
+            "response with jq.fit first"
+        )
+    return fit.origin
+
+
+def model_to_start_from(fit: PyTree) -> PyTree:
+    """The fitted model; a parameter that came out as 0 starts at a small part of its size."""
+    parameters, values = fit.parameters, np.asarray(fit.values)
+    small = 0.05 * np.asarray(parameters.scale)[: values.size]
+    places = parameters.places[: values.size]
+    return on_device(with_values(fit.model, places, np.where(values == 0, small, values)))
+
+
+def _table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of cells in columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(f"{c:<{w}}" for c, w in zip(row, widths, strict=True)) for row in rows)
+    return [line.rstrip() for line in lines]
+
+
+class Bands(NamedTuple):
+    """One model fitted to the lower and to the upper half of the band; prints as a table.
+
+    **Attributes:**
+
+    - `full`, `lower`, `upper`: each a `jq.identify.Fit`; the halves are None where the solver
+      diverged.
+    - `split`: the frequency between them, in rad/s.
+    """
+
+    full: PyTree
+    lower: PyTree
+    upper: PyTree
+    split: float
+
+    def overlap(self, name: str) -> bool | None:
+        """Whether the 95 % intervals of both halves overlap; None where one determines nothing."""
+        halves = [half for half in (self.lower, self.upper) if _determines(half, name)]
+        if len(halves) < 2:
+            return None
+        (low, high), (other_low, other_high) = (half.interval(name) for half in halves)
+        return low <= other_high and other_low <= high
+
+    def __str__(self) -> str:
+        low, high = self.full.origin.band
+        heads = ("parameter", "whole band", f"{low:.3g} .. {self.split:.3g} rad/s")
+        rows = [(*heads, f"{self.split:.3g} .. {high:.3g} rad/s", "overlap")]
+        words = {True: "yes", False: "NO", None: "-"}
+        for name in self.full.names:
+            cells = []
+            for fit in (self.full, self.lower, self.upper):
+                text = "the fit diverged" if fit is None else "not determined"
+                if _determines(fit, name):
+                    text = "{:.4g} .. {:.4g}".format(*fit.interval(name))
+                cells.append(text)
+            rows.append((name, *cells, words[self.overlap(name)]))
+        hertz = self.split / (2 * np.pi)
+        halves = f"the halves meet at {self.split:.3g} rad/s, {hertz:.3g} Hz"
+        return "\n".join([*_table(rows), f"(95 % intervals, with model error; {halves})"])
+
+
+def _determines(fit: PyTree, name: str) -> bool:
+    if fit is None or not fit.verdict.fitted:
+        return False
+    return bool(fit.determined[fit.names.index(name)])
+
+
+def fit_bands(fit: PyTree) -> Bands:
+    """Fit both halves of the band, as `Fit.bands` says."""
+    origin = require_origin(fit)
+    low, high = origin.band
+    split = float(np.sqrt(low * high))
+
+    def fit_within(half: Range) -> PyTree:
+        band: Band = half
+        if isinstance(origin.options.band, Mapping):  # what of each pair's band lies within it
+            frf, band = origin.frfs[0], {}
+            for pair in ((o, i) for o in frf.output_names for i in frf.input_names):
+                limits = origin.options.band.get(pair, half)
+                if limits is not None:
+                    limits = max(limits[0], half[0]), min(limits[1], half[1])
+                band[pair] = limits if limits is not None and limits[0] < limits[1] else None
+        free = free_again(fit.parameters)
+        options = origin.options._replace(free=free, starts=1, band=band)
+        return origin.fit_again(model_to_start_from(fit), options)
+
+    return Bands(fit, fit_within((low, split)), fit_within((split, high)), split)
+
+
+class _Term(NamedTuple):
+    """A factor of the response; `starts` are in units of the band's edges and middle (rad/s)."""
+
+    title: str
+    formula: str
+    factor: Callable[[Complex[Array, " f"], Float[Array, " extra"]], Complex[Array, " f"]]
+    names: tuple[str, ...]
+    starts: Callable[[float, float, float], list[list[float]]]
+
+
+def _pair(s, omega, damping):
+    return s * s + 2 * damping * omega * s + omega**2
+
+
+_TERMS = (
+    _Term(
+        "a further lag (real pole)", "1 / (T s + 1)", lambda s, x: 1 / (x[0] * s + 1), ("T",),
+        lambda low, mid, high: [[0.3 / high], [1 / mid]],
+    ),
+    _Term(
+        "a zero", "T s + 1", lambda s, x: x[0] * s + 1, ("T",),
+        lambda low, mid, high: [[0.3 / high], [-0.3 / high], [1 / mid]],
+    ),
+    _Term(
+        "rate damping", "s / (s + d)", lambda s, x: s / (s + x[0]), ("d",),
+        lambda low, mid, high: [[0.3 * low], [mid]],
+    ),
+    _Term(
+        "a hovering vehicle's slow pair", "s^2 / (s^2 + 2 z w s + w^2)",
+        lambda s, x: s * s / _pair(s, x[0], x[1]), ("w", "z"),
+        lambda low, mid, high: [[0.5 * low, 0.3], [low, 0.5]],
+    ),
+    _Term(
+        "a pole pair", "w^2 / (s^2 + 2 z w s + w^2)",
+        lambda s, x: x[0] ** 2 / _pair(s, x[0], x[1]), ("w", "z"),
+        lambda low, mid, high: [[2 * high, 0.3], [mid, 0.5]],
+    ),
+    _Term(
+        "a flexible mode (pole and zero pair)",
+        "(s^2 + 2 z r w s + (r w)^2) / (s^2 + 2 z w s + w^2) / r^2",
+        lambda s, x: (s * s + 2 * x[1] * x[0] * x[2] * s + (x[0] * x[2]) ** 2)
+        / _pair(s, x[0], x[1]) / x[2] ** 2, ("w", "z", "r"),
+        lambda low, mid, high: [[np.sqrt(low * mid), 0.1, 1.1], [mid, 0.1, 0.9],
+                                [mid, 0.1, 1.1], [np.sqrt(mid * high), 0.1, 1.1]],
+    ),
+)  # fmt: skip
+
+
+class Extended(eqx.Module):
+    """A model whose responses are all multiplied by one further factor."""
+
+    model: PyTree
+    extra: Float[Array, " extra"]
+    term: _Term = eqx.field(static=True)
+
+    def frequency_response(self, omega: Float[Array, " f"]) -> Complex[Array, "f ..."]:
+        """Of the model, times the factor."""
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
+        response = self.model.frequency_response(omega)
+        factor = self.term.factor(s, self.extra.astype(s.dtype))
+        return response * factor.reshape(-1, *(1,) * (response.ndim - 1))
+
+
+class Candidate(NamedTuple):
+    """A structure that was tried; `gain` is by how much it lowers BIC."""
+
+    title: str
+    formula: str
+    fit: PyTree  # `jq.identify.Fit`; None where the solver diverged
+    gain: float
+
+
+class Explanation(eqx.Module):
+    """Structures that were tried on a misfit, and the one that the responses want, if any.
+
+    **Attributes:**
+
+    - `fit`: the one that was to be explained.
+    - `candidates`: what was tried, the best first.
+    - `best`: a `jq.identify.Fit` of the preferred structure, whose model is an `Extended` one; None
+      where no term lowers BIC by 6 or more.
+    """
+
+    fit: PyTree
+    candidates: tuple[Candidate, ...]
+    best: PyTree
+
+    @property
+    def summary(self) -> str:
+        """Which term the model lacks, in a sentence or two."""
+        before = float(np.sqrt(self.fit.chi_squared))
+        if self.best is None:
+            return (
+                f"None of {len(self.candidates)} further terms explains the misfit of "
+                f"{before:.1f} random errors: rely on the intervals with model error, or fit the "
+                "part of the band where the model holds"
+            )
+        first = self.candidates[0]
+        after = float(np.sqrt(first.fit.chi_squared))
+        names = self.best.model.term.names
+        numbers = zip(names, self.best.values[len(self.fit.names) :], strict=True)
+        values = ", ".join(f"{name} = {value:.4g}" for name, value in numbers)
+        rest = "" if after < _MISFIT else ", which is still more than noise"
+        return (
+            f"The model lacks {first.title}, {first.formula} with {values}: with it the misfit "
+            f"falls from {before:.1f} to {after:.1f} random errors{rest}"
+        )
+
+    def __str__(self) -> str:
+        names = self.fit.names
+        values = lambda fit: [f"{value:.4g}" for value in fit.values[: len(names)]]
+        misfit = lambda fit: f"{fit.chi_squared**0.5:.2f}"
+        rows = [("structure", "misfit / error", "BIC lower by", *names)]
+        rows.append(("as fitted", misfit(self.fit), "-", *values(self.fit)))
+        for title, _, fit, gain in self.candidates:
+            if fit is None:
+                rows.append((title, "diverged", "-", *("-" for _ in names)))
+            else:
+                rows.append((title, misfit(fit), f"{gain:.1f}", *values(fit)))
+        return "\n".join([*_table(rows), f"{self.summary}."])
+
+
+def explain_misfit(fit: PyTree) -> Explanation:
+    """Fit again with one further term after the other, as `Fit.explain` says."""
+    origin = require_origin(fit)
+    low, high = origin.band
+    model, middle = model_to_start_from(fit), float(np.sqrt(low * high))
+    plain = origin.fit_again(model, _options(fit, origin, None), 0) or fit
+    tried = []
+    for term in _TERMS:
+        options, fits = _options(fit, origin, term), []
+        for start in term.starts(low, middle, high):
+            other = origin.fit_again(Extended(model, jnp.asarray(start), term), options, 0)
+            if other is None or not np.isfinite(other.cost):
+                continue
+            # A frequency far from the band makes the term a gain, or nothing.
+            place = float(np.asarray(other.model.extra)[0])
+            if term.names[0] == "T" or low / _FAR < place < high * _FAR:
+                fits.append(other)
+        tried.append((term, min(fits, key=lambda other: other.cost, default=None)))
+    # A misfit that is left in all of them counts as noise here.
+    left = min((other.chi_squared for _, other in tried if other is not None), default=1.0)
+    left, price, candidates = max(1.0, left), np.log(2 * origin.independent_points), []
+    for term, other in tried:
+        gain = -np.inf
+        if other is not None:
+            gain = (plain.cost - other.cost) / left - len(term.names) * price
+        candidates.append(Candidate(term.title, term.formula, other, float(gain)))
+    candidates.sort(key=lambda candidate: -candidate.gain)
+    if not candidates[0].gain > _GAIN:
+        return Explanation(fit, tuple(candidates), None)
+    best = candidates[0].fit
+    again = origin.fit_again(best.model, _options(fit, origin, best.model.term), 3)
+    return Explanation(fit, tuple(candidates), best if again is None else again)
+
+
+def _options(fit: PyTree, origin: Origin, term: _Term | None) -> Options:
+    """Those of the fit by maximum likelihood, for a model that is one part of an `Extended`."""
+    free, options = free_again(fit.parameters), origin.options
+    options = options._replace(cost=MaximumLikelihood(), starts=1, free=free)
+    if term is None:
+        return options
+    extra = [
+        Real(f"extra[{k}]", 1 / origin.band[1]) if name == "T" else Positive(f"extra[{k}]")
+        for k, name in enumerate(term.names)
+    ]
+    tied, conditions, priors = options.tied, options.conditions, []
+    if tied is not None:
+        tied = {f"model.{name}": ft.partial(_of_model, tie) for name, tie in tied.items()}
+    if conditions is not None:
+        conditions = [c if c is None else ft.partial(_change_model, c) for c in conditions]
+    for prior in options.priors:
+        quantity = prior.quantity
+        named = isinstance(quantity, str)
+        inner = f"model.{quantity}" if named else ft.partial(_of_model, quantity)
+        priors.append(Prior(inner, prior.value, prior.standard_error))
+    free = [*(parameter._replace(name=f"model.{parameter.name}") for parameter in free), *extra]
+    return options._replace(free=free, tied=tied, conditions=conditions, priors=priors)
+
+
+def _of_model(quantity: Callable[[PyTree], Float[Array, ""]], model: Extended) -> Float[Array, ""]:
+    return quantity(model.model)
+
+
+def _change_model(condition: Condition, model: Extended) -> Extended:
+    return Extended(condition(model.model), model.extra, model.term)
